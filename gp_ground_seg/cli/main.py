@@ -1,0 +1,84 @@
+"""Entry point of ``gp-ground-seg``: commands, and errors mapped to exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from gp_ground_seg import __version__
+from gp_ground_seg.errors import GroundSegError
+
+EXIT_OK = 0
+EXIT_ERROR = 2
+EXIT_INTERRUPTED = 130
+
+# Module of each command: `add_parser(subparsers)` declares its options and
+# sets the default `run`, a function of the parsed arguments that returns an exit code.
+COMMAND_MODULES = (
+    'gp_ground_seg.cli.segment',
+    'gp_ground_seg.cli.evaluate',
+    'gp_ground_seg.cli.kitti_to_bag',
+    'gp_ground_seg.cli.play',
+    'gp_ground_seg.cli.demo',
+    'gp_ground_seg.cli.config',
+    'gp_ground_seg.cli.node',
+)
+
+EXAMPLES = """\
+examples:
+  gp-ground-seg demo                             see it work, no data needed
+  gp-ground-seg segment scan.bin                 label one KITTI scan
+  gp-ground-seg segment drive.mcap -o out.mcap   ground and obstacle clouds of a bag
+  gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
+  gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 00 drive.mcap
+  gp-ground-seg play drive.mcap --clock
+  gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    parser = argparse.ArgumentParser(
+        prog='gp-ground-seg',
+        description='Split LiDAR scans into ground and obstacles with Gaussian processes.',
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('--version', action='version', version=__version__)
+    subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
+    for module in COMMAND_MODULES:
+        importlib.import_module(module).add_parser(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Words after the program's name; those of the process by default.
+
+    Returns
+    -------
+    int
+        Exit code: 0, 2 for an error said in one line, 130 when interrupted.
+    """
+    arguments = build_parser().parse_args(argv)
+    try:
+        code: int = arguments.run(arguments)
+        sys.stdout.flush()
+        return code
+    except GroundSegError as error:
+        print(f'gp-ground-seg: error: {error}', file=sys.stderr)
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        print('gp-ground-seg: interrupted', file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output went away (as in `| head`); nothing is wrong here.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_OK

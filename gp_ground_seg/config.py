@@ -1,0 +1,556 @@
+"""The one declaration of every parameter.
+
+YAML files, ROS parameter descriptors, command-line ``--set`` options and the
+README table are derived from the dataclasses below.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import numbers
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gp_ground_seg.errors import ConfigError
+
+ParameterValue = bool | int | float | str
+
+ROS_NODE_KEY = '/**'
+ROS_PARAMETERS_KEY = 'ros__parameters'
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """What is declared of one parameter.
+
+    Attributes
+    ----------
+    name : str
+        Dotted name, ``group.field``.
+    type : type
+        ``bool``, ``int``, ``float`` or ``str``.
+    default : bool, int, float or str
+        Value used when nothing else is given.
+    description : str
+        One line on what it does.
+    unit : str
+        SI unit; empty for a pure number.
+    symbol : str
+        The paper's symbol, empty if it has none.
+    minimum, maximum : float or None
+        Inclusive bounds of a number; ``None`` for other types.
+    choices : tuple of str
+        Accepted values of a string; empty for other types.
+    """
+
+    name: str
+    type: type
+    default: ParameterValue
+    description: str
+    unit: str
+    symbol: str
+    minimum: float | None
+    maximum: float | None
+    choices: tuple[str, ...]
+
+    @property
+    def accepted(self) -> str:
+        """Accepted values in words."""
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        if self.type is bool:
+            return 'true or false'
+        unit = f' {self.unit}' if self.unit else ''
+        kind = 'an integer' if self.type is int else 'a number'
+        return f'{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
+
+    def check(self, value: object) -> ParameterValue:
+        """Return `value` in the declared type.
+
+        Raises
+        ------
+        ConfigError
+            If the type is wrong or the value is out of range.
+        """
+        if self.type is bool:
+            if isinstance(value, bool):
+                return value
+        elif self.type is str:
+            if isinstance(value, str) and value in self.choices:
+                return value
+        elif isinstance(value, numbers.Real) and not isinstance(value, bool):
+            assert self.minimum is not None and self.maximum is not None
+            integral = isinstance(value, numbers.Integral)
+            in_range = math.isfinite(value) and self.minimum <= value <= self.maximum
+            if in_range and self.type is int and integral:
+                return int(value)
+            if in_range and self.type is float:
+                return float(value)
+        raise ConfigError(f'{self.name} = {value!r}: must be {self.accepted}')
+
+
+def _parameter(
+    default: ParameterValue,
+    description: str,
+    *,
+    unit: str = '',
+    symbol: str = '',
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    metadata = {
+        'description': description,
+        'unit': unit,
+        'symbol': symbol,
+        'minimum': low,
+        'maximum': high,
+        'choices': choices,
+    }
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """Where the sensor is."""
+
+    height: float = _parameter(
+        1.73,
+        'height of the sensor above the ground it stands on',
+        unit='m',
+        low=0.05,
+        high=20.0,
+    )
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """Radial grid map."""
+
+    n_segments: int = _parameter(
+        180, 'angular segments of the radial grid', symbol='M', low=4, high=2048
+    )
+    n_bins: int = _parameter(
+        120, 'radial bins of each segment', symbol='N', low=4, high=1024
+    )
+    r_min: float = _parameter(
+        2.0,
+        'horizontal range where the first bin starts; nearer points belong to that bin',
+        unit='m',
+        low=0.0,
+        high=50.0,
+    )
+    r_max: float = _parameter(
+        90.0,
+        'horizontal range where the last bin ends; beyond it there is no model',
+        unit='m',
+        low=1.0,
+        high=500.0,
+    )
+    bin_growth: float = _parameter(
+        1.5,
+        'exponent of the bin edges over range: 1 = equal bins, more = finer bins near the sensor',
+        low=1.0,
+        high=4.0,
+    )
+
+
+@dataclass(frozen=True)
+class LinesConfig:
+    """Line extraction over the ground candidates of a segment."""
+
+    slope_tolerance: float = _parameter(
+        0.02,
+        'change of slope that ends a line',
+        unit='rad',
+        symbol='zeta_m',
+        low=0.001,
+        high=1.0,
+    )
+    offset_tolerance: float = _parameter(
+        0.15,
+        "change of the line's height at the new point that ends a line",
+        unit='m',
+        symbol='zeta_b',
+        low=0.005,
+        high=5.0,
+    )
+    max_line_distance: float = _parameter(
+        0.10,
+        'distance of a point to the line that ends it',
+        unit='m',
+        symbol='delta',
+        low=0.005,
+        high=5.0,
+    )
+    max_gap: float = _parameter(
+        1.5,
+        'horizontal gap to the next candidate that ends a line, next to the sensor',
+        unit='m',
+        low=0.05,
+        high=50.0,
+    )
+    max_gap_growth: float = _parameter(
+        0.15,
+        'growth of the largest gap with range',
+        unit='m/m',
+        low=0.0,
+        high=2.0,
+    )
+    error_ratio: float = _parameter(
+        1.0,
+        'variance of the height error over that of the range error in the line regression',
+        symbol='lambda',
+        low=0.0001,
+        high=1e6,
+    )
+
+
+@dataclass(frozen=True)
+class LengthScaleConfig:
+    """Length-scale of the observation process along a segment."""
+
+    model: str = _parameter(
+        'line_gradient',
+        'where the length-scales come from: slopes of the extracted lines, or one constant',
+        choices=('line_gradient', 'constant'),
+    )
+    constant: float = _parameter(
+        10.0, 'length-scale of the constant model', unit='m', low=0.05, high=200.0
+    )
+    gradient_gain: float = _parameter(
+        2.5,
+        'a in l = a log(1/|slope|)',
+        unit='m',
+        symbol='a',
+        low=0.05,
+        high=100.0,
+    )
+    flat_gradient: float = _parameter(
+        0.02,
+        'slope below which a line counts as flat',
+        symbol='g_def',
+        low=0.0001,
+        high=0.9,
+    )
+    min: float = _parameter(
+        1.0, 'smallest length-scale', unit='m', low=0.05, high=200.0
+    )
+    max: float = _parameter(
+        50.0, 'largest length-scale', unit='m', low=0.05, high=500.0
+    )
+
+
+@dataclass(frozen=True)
+class ObservationConfig:
+    """Hyper-parameters of the observation process GP_z."""
+
+    sigma_f: float = _parameter(
+        0.5,
+        'prior standard deviation of the ground height about its mean',
+        unit='m',
+        symbol='sigma_f',
+        low=0.001,
+        high=10.0,
+    )
+    sigma_n: float = _parameter(
+        0.05,
+        'standard deviation of the height noise of a ground candidate',
+        unit='m',
+        symbol='sigma_n',
+        low=0.001,
+        high=5.0,
+    )
+
+
+@dataclass(frozen=True)
+class GrowthConfig:
+    """Iterative growth of the inlier set (outlier rejection)."""
+
+    seed_range: float = _parameter(
+        20.0,
+        'horizontal range within which low candidates start the inlier set',
+        unit='m',
+        low=0.5,
+        high=200.0,
+    )
+    seed_height_tolerance: float = _parameter(
+        0.3,
+        'largest height of a seed above or below the expected ground',
+        unit='m',
+        low=0.01,
+        high=5.0,
+    )
+    max_std: float = _parameter(
+        0.3,
+        'predictive standard deviation above which a candidate has to wait',
+        unit='m',
+        low=0.001,
+        high=10.0,
+    )
+    max_standardised_residual: float = _parameter(
+        3.0,
+        'residual over predictive standard deviation above which a candidate is an outlier',
+        low=0.1,
+        high=50.0,
+    )
+
+
+@dataclass(frozen=True)
+class LabelConfig:
+    """Labels from the distance to the surface."""
+
+    ground_tolerance: float = _parameter(
+        0.2,
+        'largest distance of a ground point from the surface, above or below',
+        unit='m',
+        symbol='zeta_g',
+        low=0.001,
+        high=5.0,
+    )
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """Learning of the hyper-parameters."""
+
+    mode: str = _parameter(
+        'fixed',
+        'when the hyper-parameters are learned: fixed = never, the values given here are used',
+        choices=('fixed',),
+    )
+
+
+@dataclass(frozen=True)
+class RuntimeConfig:
+    """How the work is done; nothing here changes a label."""
+
+    n_threads: int = _parameter(
+        0, 'threads of the compiled code; 0 = all cores', low=0, high=256
+    )
+    backend: str = _parameter(
+        'auto',
+        'auto = compiled code where numba is installed, numpy otherwise; or either by name',
+        choices=('auto', 'numba', 'numpy'),
+    )
+
+
+@dataclass(frozen=True)
+class DiagnosticsConfig:
+    """What the node says of itself on /diagnostics."""
+
+    period: float = _parameter(
+        1.0, 'time between two diagnostics messages', unit='s', low=0.1, high=60.0
+    )
+    stale_after: float = _parameter(
+        2.0,
+        'time without any cloud after which the input is reported STALE',
+        unit='s',
+        low=0.1,
+        high=600.0,
+    )
+    max_latency: float = _parameter(
+        0.1,
+        'median time from arrival to publication above which processing is reported WARN',
+        unit='s',
+        low=0.001,
+        high=10.0,
+    )
+
+
+@dataclass(frozen=True)
+class Config:
+    """All parameters, immutable and valid by construction.
+
+    Raises
+    ------
+    ConfigError
+        If a value has the wrong type, is out of range, or contradicts another.
+    """
+
+    sensor: SensorConfig = SensorConfig()
+    grid: GridConfig = GridConfig()
+    lines: LinesConfig = LinesConfig()
+    length_scale: LengthScaleConfig = LengthScaleConfig()
+    observation: ObservationConfig = ObservationConfig()
+    growth: GrowthConfig = GrowthConfig()
+    label: LabelConfig = LabelConfig()
+    learning: LearningConfig = LearningConfig()
+    runtime: RuntimeConfig = RuntimeConfig()
+    diagnostics: DiagnosticsConfig = DiagnosticsConfig()
+
+    def __post_init__(self) -> None:
+        """Check every value, then the rules between values."""
+        checked = {spec.name: spec.check(self[spec.name]) for spec in parameter_specs()}
+        for group_name, values in _nest(checked).items():
+            # A whole number given for a float becomes one, in a group of our own.
+            group = dataclasses.replace(getattr(self, group_name), **values)
+            object.__setattr__(self, group_name, group)
+        _require_order(self, 'grid.r_min', 'grid.r_max')
+        _require_order(self, 'length_scale.min', 'length_scale.max')
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        """Value of the parameter with the dotted `name`."""
+        spec = find_spec(name)
+        group_name, field_name = spec.name.split('.')
+        value: ParameterValue = getattr(getattr(self, group_name), field_name)
+        return value
+
+    def flat(self) -> dict[str, ParameterValue]:
+        """Every value by its dotted name, in order of declaration."""
+        return {spec.name: self[spec.name] for spec in parameter_specs()}
+
+    def nested(self) -> dict[str, dict[str, ParameterValue]]:
+        """Every value as ``{group: {field: value}}``."""
+        return _nest(self.flat())
+
+    def replace(self, **changes: object) -> Config:
+        """Copy with some values changed.
+
+        Parameters
+        ----------
+        **changes
+            Dotted name -> value, as in
+            ``config.replace(**{'label.ground_tolerance': 0.15})``.
+
+        Raises
+        ------
+        ConfigError
+            If a name is unknown or the changed configuration is invalid.
+        """
+        checked = {name: find_spec(name).check(value) for name, value in changes.items()}
+        groups: dict[str, Any] = {
+            group_name: dataclasses.replace(getattr(self, group_name), **values)
+            for group_name, values in _nest(checked).items()
+        }
+        return dataclasses.replace(self, **groups)
+
+    @classmethod
+    def from_flat(cls, values: Mapping[str, object]) -> Config:
+        """Defaults with the given dotted names replaced (see `replace`)."""
+        return cls().replace(**values)
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> Config:
+        """Read a YAML file: ROS form (``/**: ros__parameters:``) or bare groups.
+
+        Parameters not in the file keep their defaults.
+
+        Raises
+        ------
+        ConfigError
+            If the file cannot be read or parsed, a name is unknown, or a value
+            is not accepted. The message starts with the path.
+        """
+        try:
+            text = Path(path).read_text(encoding='utf-8')
+            document = yaml.safe_load(text)
+            return cls.from_flat(dict(_flatten(_unwrap_ros(document))))
+        except OSError as error:
+            raise ConfigError(f'{path}: {error.strerror or error}') from error
+        except UnicodeDecodeError as error:
+            raise ConfigError(f'{path}: not a text file') from error
+        except yaml.YAMLError as error:
+            problem = ' '.join(str(error).split())
+            raise ConfigError(f'{path}: not valid YAML: {problem}') from error
+        except ConfigError as error:
+            raise ConfigError(f'{path}: {error}') from error
+
+
+def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterValue]]:
+    """``{'group.field': value}`` as ``{group: {field: value}}``."""
+    result: dict[str, dict[str, ParameterValue]] = {}
+    for name, value in flat.items():
+        group_name, field_name = name.split('.')
+        result.setdefault(group_name, {})[field_name] = value
+    return result
+
+
+def _require_order(config: Config, lower: str, upper: str) -> None:
+    low, high = config[lower], config[upper]
+    assert isinstance(low, float) and isinstance(high, float)
+    if not low < high:
+        raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
+
+
+def _unwrap_ros(document: object) -> Mapping[str, object]:
+    """Parameters of a ROS parameter file, or of a file of bare groups."""
+    if document is None:
+        return {}
+    if not isinstance(document, Mapping):
+        raise ConfigError('must be a mapping of parameter groups')
+    if not any(str(key).startswith('/') or _is_ros_node(document[key]) for key in document):
+        return document
+    if len(document) != 1:
+        raise ConfigError(f'parameters of {len(document)} nodes; keep one, keyed {ROS_NODE_KEY}')
+    (node,) = document.values()
+    if not isinstance(node, Mapping) or not isinstance(node.get(ROS_PARAMETERS_KEY), Mapping):
+        raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
+    parameters: Mapping[str, object] = node[ROS_PARAMETERS_KEY]
+    # Names that every ROS node has; they say nothing of the segmentation.
+    return {
+        key: value
+        for key, value in parameters.items()
+        if key != 'use_sim_time' and not str(key).startswith('qos_overrides')
+    }
+
+
+def _is_ros_node(value: object) -> bool:
+    return isinstance(value, Mapping) and ROS_PARAMETERS_KEY in value
+
+
+def _flatten(tree: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:
+    for key, value in tree.items():
+        name = f'{prefix}{key}'
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f'{name}.')
+        else:
+            yield name, value
+
+
+def _build_specs() -> tuple[ParameterSpec, ...]:
+    specs = []
+    for group in dataclasses.fields(Config):
+        default_group = group.default
+        assert dataclasses.is_dataclass(default_group)
+        for entry in dataclasses.fields(default_group):
+            specs.append(
+                ParameterSpec(
+                    name=f'{group.name}.{entry.name}',
+                    type=type(entry.default),
+                    default=entry.default,
+                    **entry.metadata,
+                )
+            )
+    return tuple(specs)
+
+
+_SPECS = _build_specs()
+_SPEC_BY_NAME = {spec.name: spec for spec in _SPECS}
+
+
+def parameter_specs() -> tuple[ParameterSpec, ...]:
+    """Return every declared parameter, in order of declaration."""
+    return _SPECS
+
+
+def find_spec(name: str) -> ParameterSpec:
+    """Return the declaration of one parameter.
+
+    Raises
+    ------
+    ConfigError
+        If there is none; the message names the nearest one.
+    """
+    spec = _SPEC_BY_NAME.get(name)
+    if spec is None:
+        near = difflib.get_close_matches(name, _SPEC_BY_NAME, n=1, cutoff=0.5)
+        hint = f'; did you mean {near[0]}?' if near else ''
+        raise ConfigError(f'unknown parameter {name!r}{hint}')
+    return spec

@@ -1,0 +1,1 @@
+"""Data that scans come from: KITTI frames, bags, simulated scenes."""

@@ -1,0 +1,136 @@
+"""SemanticKITTI folders: frames, labels, times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.errors import DataError
+
+BYTES_PER_POINT = 16
+FRAME_PERIOD = 0.1
+"""Time between frames [s] where a sequence has no times.txt."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One scan on disk.
+
+    Attributes
+    ----------
+    sequence : str
+        Name of the sequence folder.
+    index : str
+        Name of the file, without its ending.
+    points_path : Path
+        The ``.bin`` file.
+    labels_path : Path or None
+        The ``.label`` file, if there is one.
+    time : float
+        Time since the start of the sequence [s].
+    """
+
+    sequence: str
+    index: str
+    points_path: Path
+    labels_path: Path | None
+    time: float
+
+
+def list_sequences(root: str | Path) -> list[str]:
+    """Names of the sequences below ``root/sequences``.
+
+    Raises
+    ------
+    DataError
+        If there is none.
+    """
+    folder = Path(root) / 'sequences'
+    names = sorted(path.parent.name for path in folder.glob('*/velodyne') if path.is_dir())
+    if not names:
+        raise DataError(f'{root}: no sequences/*/velodyne folder below it (SemanticKITTI layout)')
+    return names
+
+
+def list_frames(root: str | Path, sequence: str) -> list[Frame]:
+    """Frames of one sequence, in order.
+
+    Raises
+    ------
+    DataError
+        If the sequence is missing or empty, or times.txt has too few lines.
+    """
+    folder = Path(root) / 'sequences' / sequence
+    if not (folder / 'velodyne').is_dir():
+        known = ', '.join(list_sequences(root))
+        raise DataError(f'{folder}: no velodyne folder in it; sequences here: {known}')
+    paths = sorted((folder / 'velodyne').glob('*.bin'))
+    if not paths:
+        raise DataError(f'{folder / "velodyne"}: no .bin file in it')
+    times = _read_times(folder / 'times.txt', paths)
+    frames = []
+    for path, time in zip(paths, times, strict=True):
+        labels = folder / 'labels' / f'{path.stem}.label'
+        frames.append(Frame(sequence, path.stem, path, labels if labels.exists() else None, time))
+    return frames
+
+
+def _read_times(path: Path, frames: list[Path]) -> list[float]:
+    """Time of each frame: line k of times.txt belongs to the file numbered k."""
+    if not path.exists():
+        return [FRAME_PERIOD * k for k in range(len(frames))]
+    try:
+        lines = [float(line) for line in path.read_text(encoding='utf-8').split()]
+        return [lines[int(frame.stem)] for frame in frames]
+    except ValueError as error:
+        raise DataError(f'{path}: {error}') from error
+    except IndexError as error:
+        raise DataError(
+            f'{path}: {len(lines)} times, too few for frame {frames[-1].stem}'
+        ) from error
+
+
+def read_points(path: str | Path) -> npt.NDArray[np.float32]:
+    """Points of a KITTI ``.bin`` file.
+
+    Returns
+    -------
+    (N, 4) float32
+        x, y, z [m] and intensity.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read or its size is not a whole number of points.
+    """
+    data = _read_bytes(path)
+    if len(data) % BYTES_PER_POINT:
+        raise DataError(
+            f'{path}: {len(data)} bytes is not a whole number of points '
+            f'({BYTES_PER_POINT} bytes each); truncated?'
+        )
+    return np.frombuffer(data, dtype='<f4').astype(np.float32).reshape(-1, 4)
+
+
+def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
+    """Semantic classes of a ``.label`` file, (n_points,) uint16.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read or holds another number of labels.
+    """
+    data = _read_bytes(path)
+    if len(data) != 4 * n_points:
+        raise DataError(f'{path}: {len(data)} bytes, expected {4 * n_points} for {n_points} points')
+    return (np.frombuffer(data, dtype='<u4') & 0xFFFF).astype(np.uint16)
+
+
+def _read_bytes(path: str | Path) -> bytes:
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise DataError(f'{path}: {error.strerror or error}') from error

@@ -1,0 +1,1 @@
+"""Gaussian processes over range: kernels, posterior, inlier growth."""

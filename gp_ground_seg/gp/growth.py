@@ -1,0 +1,186 @@
+"""Inlier growth and the surface of every segment.
+
+Two implementations of one procedure: `grow_surface_reference` says it plainly,
+`grow_surface_compiled` appends rows to a Cholesky factor and never factors anew.
+They agree to rounding.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.compiled import compiled
+from gp_ground_seg.config import GrowthConfig, ObservationConfig
+from gp_ground_seg.gp.observation import posterior
+from gp_ground_seg.polar_grid import FloatArray, IntArray
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+def grow_surface_reference(
+    offsets: IntArray,
+    r: FloatArray,
+    z: FloatArray,
+    length_scale: FloatArray,
+    seed: BoolArray,
+    knots: FloatArray,
+    knot_length_scale: FloatArray,
+    observation: ObservationConfig,
+    growth: GrowthConfig,
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Grow the inliers of each segment from its seeds and predict the surface.
+
+    A candidate joins when the predictive standard deviation is at most
+    ``growth.max_std`` and its standardised residual is at most
+    ``growth.max_standardised_residual``; repeated until none joins (GP-INSAC of
+    Chen et al. 2014; the paper's outlier rejection).
+
+    Parameters
+    ----------
+    offsets : (M + 1,) int64
+        Candidates of segment m are ``offsets[m]:offsets[m + 1]``.
+    r, z, length_scale : (C,) float64
+        Range, height about the prior mean, and length-scale of the candidates [m].
+    seed : (C,) bool
+        Candidates that start the inlier set.
+    knots : (K,) float64
+        Ranges where the surface is wanted [m].
+    knot_length_scale : (M, K) float64
+        Length-scale there [m].
+    observation : ObservationConfig
+        sigma_f and sigma_n.
+    growth : GrowthConfig
+        Bounds for joining.
+
+    Returns
+    -------
+    inlier : (C,) bool
+        Candidates that made the surface.
+    mean, std : (M, K) float64
+        Height about the prior mean and its standard deviation [m]; NaN in
+        segments without an inlier.
+    """
+    n_segments = len(offsets) - 1
+    inlier = seed.copy()
+    mean = np.full((n_segments, len(knots)), np.nan)
+    std = np.full((n_segments, len(knots)), np.nan)
+    for m in range(n_segments):
+        own = slice(offsets[m], offsets[m + 1])
+        r_own, z_own, l_own, chosen = r[own], z[own], length_scale[own], inlier[own]
+        if not chosen.any():
+            continue
+        while True:
+            height, variance = posterior(
+                r_own[chosen],
+                z_own[chosen],
+                l_own[chosen],
+                r_own,
+                l_own,
+                observation.sigma_f,
+                observation.sigma_n,
+            )
+            residual = np.abs(z_own - height) / np.sqrt(variance + observation.sigma_n**2)
+            joining = (
+                ~chosen
+                & (variance <= growth.max_std**2)
+                & (residual <= growth.max_standardised_residual)
+            )
+            if not joining.any():
+                break
+            chosen |= joining
+        mean[m], variance = posterior(
+            r_own[chosen],
+            z_own[chosen],
+            l_own[chosen],
+            knots,
+            knot_length_scale[m],
+            observation.sigma_f,
+            observation.sigma_n,
+        )
+        std[m] = np.sqrt(variance)
+    return inlier, mean, std
+
+
+@compiled
+def grow_surface_compiled(
+    start: int,
+    stop: int,
+    offsets: IntArray,
+    r: FloatArray,
+    z: FloatArray,
+    length_scale: FloatArray,
+    seed: BoolArray,
+    knots: FloatArray,
+    knot_length_scale: FloatArray,
+    sigma_f: float,
+    sigma_n: float,
+    max_std: float,
+    max_standardised_residual: float,
+    inlier: BoolArray,
+    mean: FloatArray,
+    std: FloatArray,
+) -> None:
+    """Do what `grow_surface_reference` does for segments `start` to `stop`, in place.
+
+    ``whitened[k]`` is row k of ``L^-1 K(inliers, candidates and knots)``. Adding
+    an inlier appends one row, after which means and variances everywhere follow
+    by one multiplication: a whole segment costs one factorisation.
+    """
+    n_knots = len(knots)
+    for m in range(start, stop):
+        first = offsets[m]
+        n = offsets[m + 1] - first
+        joining = seed[first : first + n].copy()
+        if not joining.any():
+            continue
+        all_r = np.empty(n + n_knots)
+        all_l = np.empty(n + n_knots)
+        all_r[:n] = r[first : first + n]
+        all_r[n:] = knots
+        all_l[:n] = length_scale[first : first + n]
+        all_l[n:] = knot_length_scale[m]
+        whitened = np.empty((n, n + n_knots))
+        height = np.zeros(n + n_knots)
+        variance = np.full(n + n_knots, sigma_f**2)
+        n_inliers = 0
+        grown = True
+        while grown:
+            for i in range(n):
+                if not joining[i]:
+                    continue
+                inlier[first + i] = True
+                row = whitened[n_inliers]
+                for j in range(n + n_knots):
+                    spread = all_l[i] ** 2 + all_l[j] ** 2
+                    distance = all_r[i] - all_r[j]
+                    row[j] = (
+                        sigma_f**2
+                        * math.sqrt(2.0 * all_l[i] * all_l[j] / spread)
+                        * math.exp(-distance * distance / spread)
+                    )
+                for k in range(n_inliers):
+                    weight = whitened[k, i]
+                    for j in range(n + n_knots):
+                        row[j] -= weight * whitened[k, j]
+                pivot = math.sqrt(variance[i] + sigma_n**2)
+                innovation = (z[first + i] - height[i]) / pivot
+                for j in range(n + n_knots):
+                    row[j] /= pivot
+                    height[j] += row[j] * innovation
+                    variance[j] -= row[j] * row[j]
+                n_inliers += 1
+            grown = False
+            for i in range(n):
+                spread = math.sqrt(max(variance[i], 0.0) + sigma_n**2)
+                joining[i] = (
+                    not inlier[first + i]
+                    and variance[i] <= max_std**2
+                    and abs(z[first + i] - height[i]) <= max_standardised_residual * spread
+                )
+                grown = grown or joining[i]
+        for j in range(n_knots):
+            mean[m, j] = height[n + j]
+            std[m, j] = math.sqrt(max(variance[n + j], 0.0))

@@ -1,0 +1,46 @@
+"""Observation process GP_z: ground height over range in one segment."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from gp_ground_seg.gp.kernels import paciorek
+from gp_ground_seg.polar_grid import FloatArray
+
+
+def posterior(
+    r: FloatArray,
+    z: FloatArray,
+    length_scale: FloatArray,
+    r_star: FloatArray,
+    length_scale_star: FloatArray,
+    sigma_f: float,
+    sigma_n: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and variance of the ground height at `r_star` (paper, eqs. 6 and 7).
+
+    Parameters
+    ----------
+    r, z, length_scale : (n,) float64
+        Ranges, heights about the prior mean, and length-scales of the inliers [m].
+    r_star, length_scale_star : (k,) float64
+        Ranges wanted and the length-scales there [m].
+    sigma_f, sigma_n : float
+        Standard deviations of the process and of the noise [m].
+
+    Returns
+    -------
+    mean : (k,) float64
+        Height about the prior mean [m].
+    variance : (k,) float64
+        Variance of the height, without the noise [m^2].
+    """
+    covariance = paciorek(r, length_scale, r, length_scale, sigma_f)
+    covariance[np.diag_indices_from(covariance)] += sigma_n**2
+    cross = paciorek(r, length_scale, r_star, length_scale_star, sigma_f)
+    factor = cho_factor(covariance, lower=True)
+    mean = cross.T @ cho_solve(factor, z)
+    whitened = solve_triangular(factor[0], cross, lower=True)
+    variance = np.maximum(sigma_f**2 - np.sum(whitened**2, axis=0), 0.0)
+    return mean, variance

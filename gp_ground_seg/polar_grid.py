@@ -1,0 +1,129 @@
+"""Radial grid map: points to segments and bins, lowest point per bin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.config import GridConfig
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+OUTSIDE = -1
+"""Bin of a point that is beyond the grid or not finite."""
+
+
+@dataclass(frozen=True)
+class PolarGrid:
+    """Where each point lies in the radial grid.
+
+    Attributes
+    ----------
+    segment : (N,) int64
+        Angular segment, 0 to M - 1, counter-clockwise from -x.
+    bin : (N,) int64
+        Radial bin, 0 to n_bins - 1, or `OUTSIDE`.
+    r : (N,) float64
+        Horizontal range [m]; NaN for points that are not finite.
+    edges : (n_bins + 1,) float64
+        Range of the bin edges [m].
+    n_segments : int
+        Number of segments M.
+    """
+
+    segment: IntArray
+    bin: IntArray
+    r: FloatArray
+    edges: FloatArray
+    n_segments: int
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Ground candidates PG_m of all segments, near to far in each.
+
+    Attributes
+    ----------
+    r, z : (C,) float64
+        Horizontal range and height [m] of the lowest point of each occupied bin.
+    bin : (C,) int64
+        Bin of each candidate.
+    offsets : (M + 1,) int64
+        Candidates of segment m are ``offsets[m]:offsets[m + 1]``.
+    """
+
+    r: FloatArray
+    z: FloatArray
+    bin: IntArray
+    offsets: IntArray
+
+    @property
+    def segment(self) -> IntArray:
+        """Segment of each candidate, (C,) int64."""
+        return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
+
+
+def bin_edges(grid: GridConfig) -> FloatArray:
+    """Ranges of the bin edges [m], (n_bins + 1,)."""
+    fraction = np.arange(grid.n_bins + 1) / grid.n_bins
+    return grid.r_min + (grid.r_max - grid.r_min) * fraction**grid.bin_growth
+
+
+def build_polar_grid(xyz: FloatArray, finite: npt.NDArray[np.bool_], grid: GridConfig) -> PolarGrid:
+    """Sort points into segments and bins (paper, section II).
+
+    Parameters
+    ----------
+    xyz : (N, 3) float64
+        Points [m].
+    finite : (N,) bool
+        Points to use; the others get the bin `OUTSIDE`.
+    grid : GridConfig
+        Size of the grid.
+    """
+    edges = bin_edges(grid)
+    x = np.where(finite, xyz[:, 0], 0.0)
+    y = np.where(finite, xyz[:, 1], 0.0)
+    r = np.hypot(x, y)
+    turn = np.arctan2(y, x) / (2.0 * np.pi) + 0.5
+    # arctan2 reaches +pi, and rounding may reach M: that is segment 0 again.
+    segment = (turn * grid.n_segments).astype(np.int64) % grid.n_segments
+    # Points nearer than the first edge belong to the first bin.
+    index = np.maximum(np.searchsorted(edges, r, side='right') - 1, 0)
+    index[(index >= grid.n_bins) | ~finite] = OUTSIDE
+    return PolarGrid(segment, index, np.where(finite, r, np.nan), edges, grid.n_segments)
+
+
+def lowest_points(grid: PolarGrid, z: FloatArray) -> Candidates:
+    """Lowest point of each occupied bin (paper, section II, PG_m).
+
+    Equal heights are settled by the smaller range, so that the order of the
+    points does not matter.
+
+    Parameters
+    ----------
+    grid : PolarGrid
+        Bins of the points.
+    z : (N,) float64
+        Heights [m].
+    """
+    n_bins = len(grid.edges) - 1
+    inside = grid.bin != OUTSIDE
+    cell = grid.segment[inside] * n_bins + grid.bin[inside]
+    z_inside, r_inside = z[inside], grid.r[inside]
+    lowest_z = np.full(grid.n_segments * n_bins, np.inf)
+    np.minimum.at(lowest_z, cell, z_inside)
+    is_lowest = z_inside == lowest_z[cell]
+    lowest_r = np.full(grid.n_segments * n_bins, np.inf)
+    np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest])
+    occupied = np.isfinite(lowest_z)
+    per_segment = occupied.reshape(grid.n_segments, n_bins).sum(axis=1)
+    return Candidates(
+        r=lowest_r[occupied],
+        z=lowest_z[occupied],
+        bin=np.flatnonzero(occupied) % n_bins,
+        offsets=np.concatenate([[0], np.cumsum(per_segment)]),
+    )

@@ -1,0 +1,69 @@
+"""Package description for pip and colcon."""
+
+import re
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'gp_ground_seg'
+
+version = re.search(
+    r"^__version__ = '([^']+)'$",
+    Path(PACKAGE, '__init__.py').read_text(encoding='utf-8'),
+    re.MULTILINE,
+).group(1)
+
+BAGS = ['rosbags>=0.10']
+PLOT = ['matplotlib>=3.6']
+# Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
+ROS = [
+    'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
+    'ros-jazzy-common-interfaces>=5.3,<6',
+    'ros-jazzy-rmw-fastrtps-cpp>=8.4,<9',
+]
+DEV = [
+    'colcon-common-extensions',
+    'hypothesis>=6.100',
+    'mypy>=1.10',
+    'pypatchworkpp>=1.4',
+    'pytest>=7.4',
+    'ruff>=0.6',
+    'setuptools<80',  # colcon's ament_python build needs `setup.py develop` and `install`
+    'types-PyYAML',
+    'types-tqdm',
+]
+
+setup(
+    name=PACKAGE,
+    version=version,
+    description='Ground segmentation of LiDAR scans with two coupled Gaussian processes',
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    license='Apache-2.0',
+    author='gp_ground_seg maintainers',
+    maintainer='gp_ground_seg maintainers',
+    maintainer_email='maintainers@users.noreply.h-seed-aac284b4.example',
+    python_requires='>=3.10',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    package_data={PACKAGE: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/config', sorted(glob('config/*'))),
+    ],
+    install_requires=['numpy>=1.26', 'scipy>=1.11', 'numba>=0.60', 'PyYAML>=6.0', 'tqdm>=4.60'],
+    extras_require={
+        'bags': BAGS,
+        'plot': PLOT,
+        'ros': ROS + BAGS + PLOT,
+        'dev': DEV,
+    },
+    zip_safe=False,
+    entry_points={
+        'console_scripts': [
+            'gp-ground-seg = gp_ground_seg.cli.main:main',
+            'ground_segmentation_node = gp_ground_seg.ros.node:main',
+        ],
+    },
+)
