@@ -1,0 +1,97 @@
+"""``evaluate``: score the segmentation against labels."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterable, Sequence
+
+from tqdm import tqdm
+
+from gp_ground_seg.cli.evaluation_text import evaluation_text
+from gp_ground_seg.cli.options import add_config_options, config_from_options
+from gp_ground_seg.datasets.semantic_kitti import Frame
+from gp_ground_seg.evaluation.environment import describe_environment
+from gp_ground_seg.evaluation.evaluate import evaluate, labelled_frames
+from gp_ground_seg.evaluation.methods import PATCHWORKPP, Method, OurMethod, PatchworkppMethod
+from gp_ground_seg.evaluation.output_file import check_writable
+from gp_ground_seg.evaluation.report import report, write_json
+
+EXAMPLES = """\
+examples:
+  gp-ground-seg evaluate KITTI_ROOT
+  gp-ground-seg evaluate KITTI_ROOT --sequences 00,08 --json scores.json
+  gp-ground-seg evaluate KITTI_ROOT --set label.ground_tolerance=0.15
+  gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
+
+KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI).
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the command."""
+    parser = subparsers.add_parser(
+        'evaluate',
+        help='score against SemanticKITTI labels',
+        description='Segment labelled frames and score the labels in both conventions '
+        'of the field: precision, recall, F1, accuracy, IoU, time per frame.',
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('root', metavar='ROOT', help='folder in SemanticKITTI layout')
+    parser.add_argument(
+        '--sequences', metavar='LIST', help='sequences, as in 00,08 (default: all there are)'
+    )
+    parser.add_argument('--json', metavar='FILE', help='write every number to this file as well')
+    parser.add_argument('--force', action='store_true', help='overwrite the JSON file')
+    parser.add_argument(
+        '--peer', choices=(PATCHWORKPP,), help='run this one on the same frames, alternately'
+    )
+    add_config_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Evaluate, print the tables, write the JSON."""
+    config = config_from_options(arguments)
+    if arguments.json:
+        check_writable(arguments.json, overwrite=arguments.force)
+    sequences = None
+    if arguments.sequences is not None:
+        sequences = [name for name in arguments.sequences.split(',') if name]
+    frames = labelled_frames(arguments.root, sequences)
+
+    ours = OurMethod(config)
+    methods: list[Method] = [ours]
+    packages = []
+    if arguments.peer == PATCHWORKPP:
+        methods.append(PatchworkppMethod())
+        packages.append('pypatchworkpp')
+    try:
+        scores = evaluate(frames, methods, progress=_progress_bar)
+        fit = ours.fit
+    finally:
+        ours.close()
+
+    document = report(
+        scores,
+        config,
+        describe_environment(*packages),
+        n_threads=fit.n_threads,
+        backend=fit.backend,
+        data=arguments.root,
+    )
+    print(evaluation_text(scores, document))
+    if arguments.json:
+        check_writable(arguments.json, overwrite=arguments.force)
+        write_json(document, arguments.json)
+        print(f'\nEvery number: {arguments.json}')
+    return 0
+
+
+def _progress_bar(frames: Sequence[Frame]) -> Iterable[Frame]:
+    # `disable=None`: no bar where standard error is not a terminal.
+    bar: Iterable[Frame] = tqdm(
+        frames, unit='frame', desc='evaluate', file=sys.stderr, disable=None, leave=False
+    )
+    return bar

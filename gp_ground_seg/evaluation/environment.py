@@ -1,0 +1,91 @@
+"""What a measurement ran on: a number without it cannot be compared."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import gp_ground_seg
+
+_VERSIONED = ('numpy', 'scipy', 'numba')
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Machine and software of a run.
+
+    Attributes
+    ----------
+    cpu : str
+        Name of the processor.
+    n_cores : int
+        Cores this process may use.
+    platform, python : str
+        Operating system, and version of Python.
+    versions : dict of str to str or None
+        Version of this package and of those it computes with; None = not installed.
+    commit : str or None
+        Commit of the source, with ``-dirty`` if changed since; None outside git.
+    """
+
+    cpu: str
+    n_cores: int
+    platform: str
+    python: str
+    versions: dict[str, str | None]
+    commit: str | None
+
+
+def describe_environment(*packages: str) -> Environment:
+    """Describe where we run; `packages` are further ones whose version matters."""
+    versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
+    for package in (*_VERSIONED, *packages):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return Environment(
+        cpu=_cpu_name(),
+        n_cores=len(os.sched_getaffinity(0)),
+        platform=platform.platform(),
+        python=platform.python_version(),
+        versions=versions,
+        commit=_commit(Path(gp_ground_seg.__file__)),
+    )
+
+
+def _cpu_name() -> str:
+    try:
+        lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        key, _, value = line.partition(':')
+        if key.strip() == 'model name':
+            return value.strip()
+    return platform.processor() or platform.machine()
+
+
+def _commit(source: Path) -> str | None:
+    """Commit that holds the file `source`, None if git does not know the file.
+
+    An installed package may lie inside somebody else's repository, whose
+    commit would say nothing: the file itself has to be tracked.
+    """
+    if _git(source.parent, 'ls-files', '--error-unmatch', source.name) is None:
+        return None
+    return _git(source.parent, 'describe', '--always', '--abbrev=40', '--dirty', '--exclude=*')
+
+
+def _git(folder: Path, *words: str) -> str | None:
+    try:
+        run = subprocess.run(
+            ['git', *words], cwd=folder, capture_output=True, text=True, timeout=10.0
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return run.stdout.strip() if run.returncode == 0 else None

@@ -1,0 +1,145 @@
+"""Methods that can be evaluated, behind one small interface."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import os
+import sys
+from collections.abc import Iterator
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.config import Config
+from gp_ground_seg.errors import MissingDependencyError
+from gp_ground_seg.labels import Label
+from gp_ground_seg.segmentation import FitReport
+from gp_ground_seg.segmenter import GroundSegmenter
+
+OURS = 'gp_ground_seg'
+PATCHWORKPP = 'patchworkpp'
+
+
+class Method(Protocol):
+    """Something that labels scans, one sequence after the other."""
+
+    name: str
+
+    def start_sequence(self) -> None:
+        """Forget what was learnt from earlier frames."""
+
+    def run(self, points: npt.NDArray[np.float32]) -> None:
+        """Segment a scan of (N, 4) x, y, z, intensity: the part that is timed."""
+
+    def label(self) -> npt.NDArray[np.uint8]:
+        """Labels of the scan last run, (N,)."""
+
+    def stages(self) -> dict[str, float]:
+        """Seconds by stage of the scan last run; empty if it does not tell."""
+
+
+class OurMethod:
+    """`GroundSegmenter` as a method.
+
+    Parameters
+    ----------
+    config : Config
+        Its parameters.
+    """
+
+    name = OURS
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._segmenter: GroundSegmenter | None = None
+
+    def start_sequence(self) -> None:
+        """Start a segmenter without a past."""
+        self.close()
+        self._segmenter = GroundSegmenter(self._config)
+
+    def run(self, points: npt.NDArray[np.float32]) -> None:
+        """Segment a scan."""
+        assert self._segmenter is not None, 'start_sequence comes first'
+        self._result = self._segmenter.segment(points)
+
+    def label(self) -> npt.NDArray[np.uint8]:
+        """Labels of the scan last run."""
+        return self._result.label
+
+    def stages(self) -> dict[str, float]:
+        """Seconds by stage of the scan last run."""
+        return {stage: s for stage, s in self._result.timings.items() if stage != 'total'}
+
+    @property
+    def fit(self) -> FitReport:
+        """Fit report of the scan last run: backend and threads are in it."""
+        return self._result.fit
+
+    def close(self) -> None:
+        """End the worker threads."""
+        if self._segmenter is not None:
+            self._segmenter.close()
+            self._segmenter = None
+
+
+class PatchworkppMethod:
+    """Patchwork++ (Lee, Lim, Myung, IROS 2022) from PyPI, with its published parameters.
+
+    Only its estimation is timed, not the fetching of the indices. Its adaptive
+    thresholds are learnt over a sequence, so each sequence gets a new one.
+
+    Raises
+    ------
+    MissingDependencyError
+        If pypatchworkpp is not installed.
+    """
+
+    name = PATCHWORKPP
+
+    def __init__(self) -> None:
+        try:
+            import pypatchworkpp
+        except ImportError as error:
+            raise MissingDependencyError(
+                'the peer patchworkpp needs pypatchworkpp: pip install pypatchworkpp'
+            ) from error
+        self._module = pypatchworkpp
+        self.version = importlib.metadata.version('pypatchworkpp')
+
+    def start_sequence(self) -> None:
+        """Start with its default thresholds."""
+        with _c_stdout_silenced():  # it greets on standard output, where our tables go
+            self._estimator = self._module.patchworkpp(self._module.Parameters())
+
+    def run(self, points: npt.NDArray[np.float32]) -> None:
+        """Segment a scan."""
+        self._n_points = len(points)
+        self._estimator.estimateGround(points)
+
+    def label(self) -> npt.NDArray[np.uint8]:
+        """Labels of the scan last run."""
+        label = np.full(self._n_points, Label.OBSTACLE, dtype=np.uint8)
+        label[self._estimator.getGroundIndices()] = Label.GROUND
+        return label
+
+    def stages(self) -> dict[str, float]:
+        """Nothing: it tells only its total."""
+        return {}
+
+
+@contextlib.contextmanager
+def _c_stdout_silenced() -> Iterator[None]:
+    """Keep what C++ code writes to standard output away from it."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(sink)
+        os.close(kept)

@@ -1,0 +1,129 @@
+"""An evaluation as plain data, ready for JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from gp_ground_seg.config import Config, ParameterValue, parameter_specs
+from gp_ground_seg.evaluation.conventions import CONVENTIONS
+from gp_ground_seg.evaluation.environment import Environment
+from gp_ground_seg.evaluation.output_file import written_whole
+from gp_ground_seg.evaluation.scores import RATIOS, Confusion, MethodScore
+from gp_ground_seg.evaluation.semantic_classes import class_name
+
+
+def changed_parameters(config: Config) -> dict[str, ParameterValue]:
+    """Parameters that differ from their defaults, by dotted name."""
+    return {
+        spec.name: config[spec.name]
+        for spec in parameter_specs()
+        if config[spec.name] != spec.default
+    }
+
+
+def report(
+    scores: list[MethodScore],
+    config: Config,
+    environment: Environment,
+    n_threads: int,
+    backend: str,
+    data: str,
+) -> dict[str, Any]:
+    """Everything of an evaluation in JSON's own types; NaN as None.
+
+    Parameters
+    ----------
+    scores : list of MethodScore
+        Ours first, then peers.
+    config : Config
+        Parameters of ours.
+    environment : Environment
+        Where it ran.
+    n_threads, backend : int, str
+        What ours really used.
+    data : str
+        Where the frames are.
+    """
+    ours = scores[0]
+    document = {
+        'data': data,
+        'n_frames': len(ours.frames),
+        'sequences': ours.sequences,
+        'config_changes': changed_parameters(config),
+        'config': config.nested(),
+        'n_threads': n_threads,
+        'backend': backend,
+        'environment': dataclasses.asdict(environment),
+        'conventions': {convention.key: convention.rule for convention in CONVENTIONS},
+        'methods': {score.name: _method(score) for score in scores},
+        'median_time_ratio': {
+            peer.name: ours.median_seconds / peer.median_seconds for peer in scores[1:]
+        },
+    }
+    plain: dict[str, Any] = _without_nan(document)
+    return plain
+
+
+def write_json(document: dict[str, Any], path: str | Path) -> None:
+    """Write a report, whole or not at all.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be written.
+    """
+    text = json.dumps(document, indent=2, allow_nan=False) + '\n'
+    with written_whole(path) as file:
+        file.write(text.encode('utf-8'))
+
+
+def _method(score: MethodScore) -> dict[str, Any]:
+    return {
+        'pooled': {c.key: _confusion(score.pooled(c.key)) for c in CONVENTIONS},
+        'sequences': {
+            sequence: {c.key: _confusion(score.pooled(c.key, sequence)) for c in CONVENTIONS}
+            for sequence in score.sequences
+        },
+        'classes': {
+            str(number): {
+                'name': class_name(number),
+                'points': count.points,
+                'labelled_ground': count.labelled_ground,
+                'share_ground': count.share_ground,
+            }
+            for number, count in score.classes().items()
+        },
+        'ms_per_frame': {
+            'median': 1e3 * score.median_seconds,
+            'mean': 1e3 * score.mean_seconds,
+            'median_of_stages': {
+                stage: 1e3 * seconds for stage, seconds in score.median_stage_seconds().items()
+            },
+        },
+        'frames': [
+            {
+                'sequence': frame.sequence,
+                'index': frame.index,
+                'ms': 1e3 * frame.seconds,
+                **{c.key: _confusion(frame.confusions[c.key]) for c in CONVENTIONS},
+            }
+            for frame in score.frames
+        ],
+    }
+
+
+def _confusion(confusion: Confusion) -> dict[str, int | float]:
+    ratios = {name: getattr(confusion, name) for name in RATIOS}
+    return {**dataclasses.asdict(confusion), **ratios}
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(entry) for entry in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
