@@ -1,0 +1,120 @@
+"""Small bags of every kind, for the tests."""
+
+import numpy as np
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from gp_ground_seg.datasets.bags import (
+    BagWriter,
+    CloudMessage,
+    PointField,
+    cloud_topic,
+    encode_cloud,
+    jazzy_topic,
+)
+
+START = 1_317_000_000_123_456_789
+PERIOD = 100_000_000
+CUSTOM = 'my_msgs/msg/Odd'
+CUSTOM_DEFINITION = 'Header header\ntime when\nuint8[] bytes\nfloat64 value\n'
+
+
+def scan(seed=0, n_ground=1500, n_wall=300):
+    """Flat ground 1.73 m below the sensor, a wall, a NaN: (N, 4) float32."""
+    rng = np.random.default_rng(seed)
+    ground = rng.uniform(-25, 25, (n_ground, 3))
+    ground[:, 2] = -1.73 + rng.normal(0, 0.01, n_ground)
+    wall = rng.uniform(-5, 5, (n_wall, 3))
+    wall[:, 0], wall[:, 2] = 10.0, rng.uniform(-1, 1, n_wall)
+    points = np.vstack([ground, wall, [[np.nan, 0, 0]]]).astype('<f4')
+    return np.hstack([points, rng.random((len(points), 1), dtype=np.float32)])
+
+
+def cloud(index=0, **changes):
+    """Cloud with a ring and padding, organised in one row unless told otherwise."""
+    points = scan(index, **changes)
+    fields = (
+        PointField('x', 0, 7), PointField('y', 4, 7), PointField('z', 8, 7),
+        PointField('i', 12, 7), PointField('ring', 17, 4),
+    )  # fmt: skip
+    rng = np.random.default_rng(index)
+    data = rng.integers(0, 256, (len(points), 22), dtype=np.uint8)
+    data[:, :16] = points.view(np.uint8)
+    seconds, nanoseconds = divmod(START - 5_000 + index * PERIOD, 10**9)
+    return CloudMessage(
+        (seconds, nanoseconds), 'velo_link', 1, len(points), fields,
+        22, 22 * len(points), data.reshape(-1),
+    )  # fmt: skip
+
+
+def string_message(text):
+    types = get_typestore(Stores.ROS2_JAZZY)
+    return bytes(
+        types.serialize_cdr(types.types['std_msgs/msg/String'](text), 'std_msgs/msg/String')
+    )
+
+
+def write_ros2_bag(path, n_clouds=3, topics=('/points',), storage=None, **changes):
+    """Clouds on each topic, a string before every one of them; returns what was written."""
+    written = []
+    with BagWriter(path, storage=storage) as bag:
+        for topic in topics:
+            bag.add_topic(cloud_topic(topic))
+        bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
+        for k in range(n_clouds):
+            time = START + k * PERIOD
+            entries = [('/note', time - 7, string_message(f'cloud {k}'))]
+            entries += [(topic, time, encode_cloud(cloud(k, **changes))) for topic in topics]
+            for entry in entries:
+                bag.write(*entry)
+                written.append(entry)
+    return written
+
+
+def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud', extras=True):
+    """A bag as kitti2bag makes, with a message of a custom type and one ROS 2 changed."""
+    types = get_typestore(Stores.ROS1_NOETIC)
+    types.register(get_types_from_msg(CUSTOM_DEFINITION, CUSTOM))
+    new = types.types
+    time_type = new['builtin_interfaces/msg/Time']
+    header_type = new['std_msgs/msg/Header']
+    with Ros1Writer(path) as bag:
+        clouds = bag.add_connection(topic, 'sensor_msgs/msg/PointCloud2', typestore=types)
+        if extras:
+            odd = bag.add_connection('/odd', CUSTOM, typestore=types)
+            text = bag.add_connection(
+                '/text', 'std_msgs/msg/String', typestore=types, callerid='/a', latching=1
+            )
+            again = bag.add_connection(
+                '/text', 'std_msgs/msg/String', typestore=types, callerid='/b'
+            )
+            distance = bag.add_connection('/range', 'sensor_msgs/msg/Range', typestore=types)
+        for k in range(n_clouds):
+            time = START + k * PERIOD
+            sample = cloud(k)
+            header = header_type(seq=k, stamp=time_type(*sample.stamp), frame_id=sample.frame_id)
+            message = new['sensor_msgs/msg/PointCloud2'](
+                header=header,
+                height=sample.height,
+                width=sample.width,
+                fields=[
+                    new['sensor_msgs/msg/PointField'](f.name, f.offset, f.datatype, f.count)
+                    for f in sample.fields
+                ],
+                is_bigendian=False,
+                point_step=sample.point_step,
+                row_step=sample.row_step,
+                data=sample.data,
+                is_dense=False,
+            )
+            bag.write(clouds, time, types.serialize_ros1(message, 'sensor_msgs/msg/PointCloud2'))
+            if not extras:
+                continue
+            body = new[CUSTOM](header, time_type(k, 5), np.arange(k, dtype=np.uint8), k / 3)
+            bag.write(odd, time + 1, types.serialize_ros1(body, CUSTOM))
+            for offset, connection in ((2, text), (3, again)):
+                body = new['std_msgs/msg/String'](f'{k} {offset}')
+                raw = types.serialize_ros1(body, 'std_msgs/msg/String')
+                bag.write(connection, time + offset, raw)
+            body = new['sensor_msgs/msg/Range'](header, 1, 0.1, 0.2, 30.0, 1.0 + k)
+            bag.write(distance, time + 4, types.serialize_ros1(body, 'sensor_msgs/msg/Range'))
