@@ -5,17 +5,20 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from tqdm import tqdm
 
 from gp_ground_seg.cli.evaluation_text import evaluation_text
 from gp_ground_seg.cli.options import add_config_options, config_from_options
+from gp_ground_seg.config import Config
 from gp_ground_seg.datasets.semantic_kitti import Frame
+from gp_ground_seg.datasets.staging import staged_file
 from gp_ground_seg.evaluation.environment import describe_environment
 from gp_ground_seg.evaluation.evaluate import evaluate, labelled_frames
 from gp_ground_seg.evaluation.methods import PATCHWORKPP, Method, OurMethod, PatchworkppMethod
-from gp_ground_seg.evaluation.output_file import check_writable
 from gp_ground_seg.evaluation.report import report, write_json
+from gp_ground_seg.evaluation.scores import MethodScore
 
 EXAMPLES = """\
 examples:
@@ -52,15 +55,28 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate, print the tables, write the JSON."""
+    """Evaluate, write the JSON, print the tables."""
     config = config_from_options(arguments)
-    if arguments.json:
-        check_writable(arguments.json, overwrite=arguments.force)
+    if arguments.json is None:
+        scores, document = _measure(arguments, config)
+    else:
+        # Around the measurement: a target that is refused is so before the work.
+        with staged_file(arguments.json, force=arguments.force) as part:
+            scores, document = _measure(arguments, config)
+            write_json(document, part)
+    print(evaluation_text(scores, document))
+    if arguments.json is not None:
+        print(f'\nevery number: {arguments.json}')
+    return 0
+
+
+def _measure(
+    arguments: argparse.Namespace, config: Config
+) -> tuple[list[MethodScore], dict[str, Any]]:
     sequences = None
     if arguments.sequences is not None:
         sequences = [name for name in arguments.sequences.split(',') if name]
     frames = labelled_frames(arguments.root, sequences)
-
     ours = OurMethod(config)
     methods: list[Method] = [ours]
     packages = []
@@ -72,7 +88,6 @@ def run(arguments: argparse.Namespace) -> int:
         fit = ours.fit
     finally:
         ours.close()
-
     document = report(
         scores,
         config,
@@ -81,12 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
         backend=fit.backend,
         data=arguments.root,
     )
-    print(evaluation_text(scores, document))
-    if arguments.json:
-        check_writable(arguments.json, overwrite=arguments.force)
-        write_json(document, arguments.json)
-        print(f'\nEvery number: {arguments.json}')
-    return 0
+    return scores, document
 
 
 def _progress_bar(frames: Sequence[Frame]) -> Iterable[Frame]:

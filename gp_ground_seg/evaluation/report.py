@@ -11,7 +11,6 @@ from typing import Any
 from gp_ground_seg.config import Config, ParameterValue, parameter_specs
 from gp_ground_seg.evaluation.conventions import CONVENTIONS
 from gp_ground_seg.evaluation.environment import Environment
-from gp_ground_seg.evaluation.output_file import written_whole
 from gp_ground_seg.evaluation.scores import RATIOS, Confusion, MethodScore
 from gp_ground_seg.evaluation.semantic_classes import class_name
 
@@ -69,16 +68,9 @@ def report(
 
 
 def write_json(document: dict[str, Any], path: str | Path) -> None:
-    """Write a report, whole or not at all.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
-    """
+    """Write a report."""
     text = json.dumps(document, indent=2, allow_nan=False) + '\n'
-    with written_whole(path) as file:
-        file.write(text.encode('utf-8'))
+    Path(path).write_text(text, encoding='utf-8')
 
 
 def _method(score: MethodScore) -> dict[str, Any]:
