@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
 import numbers
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,13 +85,14 @@ class ParameterSpec:
             if isinstance(value, str) and value in self.choices:
                 return value
         elif isinstance(value, numbers.Real) and not isinstance(value, bool):
-            assert self.minimum is not None and self.maximum is not None
-            integral = isinstance(value, numbers.Integral)
-            in_range = math.isfinite(value) and self.minimum <= value <= self.maximum
-            if in_range and self.type is int and integral:
-                return int(value)
-            if in_range and self.type is float:
-                return float(value)
+            assert self.minimum is not None
+            assert self.maximum is not None
+            # The bounds are finite: NaN and the infinities are never within.
+            if value <= self.maximum and not value < self.minimum:
+                if self.type is float:
+                    return float(value)
+                if isinstance(value, numbers.Integral):
+                    return int(value)
         raise ConfigError(f'{self.name} = {value!r}: must be {self.accepted}')
 
 
@@ -136,9 +137,7 @@ class GridConfig:
     n_segments: int = _parameter(
         180, 'angular segments of the radial grid', symbol='M', low=4, high=2048
     )
-    n_bins: int = _parameter(
-        120, 'radial bins of each segment', symbol='N', low=4, high=1024
-    )
+    n_bins: int = _parameter(120, 'radial bins of each segment', symbol='N', low=4, high=1024)
     r_min: float = _parameter(
         2.0,
         'horizontal range where the first bin starts; nearer points belong to that bin',
@@ -166,7 +165,7 @@ class LinesConfig:
     """Line extraction over the ground candidates of a segment."""
 
     slope_tolerance: float = _parameter(
-        0.02,
+        0.1,
         'change of slope that ends a line',
         unit='rad',
         symbol='zeta_m',
@@ -225,7 +224,7 @@ class LengthScaleConfig:
         10.0, 'length-scale of the constant model', unit='m', low=0.05, high=200.0
     )
     gradient_gain: float = _parameter(
-        2.5,
+        2.0,
         'a in l = a log(1/|slope|)',
         unit='m',
         symbol='a',
@@ -233,18 +232,14 @@ class LengthScaleConfig:
         high=100.0,
     )
     flat_gradient: float = _parameter(
-        0.02,
+        0.1,
         'slope below which a line counts as flat',
         symbol='g_def',
         low=0.0001,
         high=0.9,
     )
-    min: float = _parameter(
-        1.0, 'smallest length-scale', unit='m', low=0.05, high=200.0
-    )
-    max: float = _parameter(
-        50.0, 'largest length-scale', unit='m', low=0.05, high=500.0
-    )
+    min: float = _parameter(1.0, 'smallest length-scale', unit='m', low=0.05, high=200.0)
+    max: float = _parameter(50.0, 'largest length-scale', unit='m', low=0.05, high=500.0)
 
 
 @dataclass(frozen=True)
@@ -252,20 +247,26 @@ class ObservationConfig:
     """Hyper-parameters of the observation process GP_z."""
 
     sigma_f: float = _parameter(
-        0.5,
-        'prior standard deviation of the ground height about its mean',
+        0.2,
+        'prior standard deviation of the ground height about its mean line',
         unit='m',
         symbol='sigma_f',
         low=0.001,
         high=10.0,
     )
     sigma_n: float = _parameter(
-        0.05,
+        0.07,
         'standard deviation of the height noise of a ground candidate',
         unit='m',
         symbol='sigma_n',
         low=0.001,
         high=5.0,
+    )
+    slope_std: float = _parameter(
+        0.05,
+        "prior standard deviation of the mean line's slope; 0 = a level mean",
+        low=0.0,
+        high=2.0,
     )
 
 
@@ -281,7 +282,7 @@ class GrowthConfig:
         high=200.0,
     )
     seed_height_tolerance: float = _parameter(
-        0.3,
+        0.45,
         'largest height of a seed above or below the expected ground',
         unit='m',
         low=0.01,
@@ -303,6 +304,18 @@ class GrowthConfig:
 
 
 @dataclass(frozen=True)
+class SurfaceConfig:
+    """From the segments' surfaces to the surface of the frame."""
+
+    n_neighbours: int = _parameter(
+        2,
+        "segments on either side whose surfaces are fused with a segment's own; 0 = none",
+        low=0,
+        high=16,
+    )
+
+
+@dataclass(frozen=True)
 class LabelConfig:
     """Labels from the distance to the surface."""
 
@@ -313,6 +326,33 @@ class LabelConfig:
         symbol='zeta_g',
         low=0.001,
         high=5.0,
+    )
+    slope_allowance: float = _parameter(
+        1.0,
+        'widening of the tolerance in multiples of the rise of the surface across the bin',
+        low=0.0,
+        high=10.0,
+    )
+    obstacle_tolerance: float = _parameter(
+        0.1,
+        'largest height of a ground point above the surface in a bin that an obstacle stands in',
+        unit='m',
+        low=0.001,
+        high=5.0,
+    )
+    obstacle_min_height: float = _parameter(
+        0.4,
+        'height above the surface from which a return shows that an obstacle stands in its bin',
+        unit='m',
+        low=0.01,
+        high=10.0,
+    )
+    obstacle_max_height: float = _parameter(
+        2.0,
+        'height above the surface up to which a return shows that; higher ones overhang',
+        unit='m',
+        low=0.02,
+        high=50.0,
     )
 
 
@@ -331,9 +371,7 @@ class LearningConfig:
 class RuntimeConfig:
     """How the work is done; nothing here changes a label."""
 
-    n_threads: int = _parameter(
-        0, 'threads of the compiled code; 0 = all cores', low=0, high=256
-    )
+    n_threads: int = _parameter(0, 'threads of the compiled code; 0 = all cores', low=0, high=256)
     backend: str = _parameter(
         'auto',
         'auto = compiled code where numba is installed, numpy otherwise; or either by name',
@@ -380,6 +418,7 @@ class Config:
     length_scale: LengthScaleConfig = LengthScaleConfig()
     observation: ObservationConfig = ObservationConfig()
     growth: GrowthConfig = GrowthConfig()
+    surface: SurfaceConfig = SurfaceConfig()
     label: LabelConfig = LabelConfig()
     learning: LearningConfig = LearningConfig()
     runtime: RuntimeConfig = RuntimeConfig()
@@ -394,6 +433,12 @@ class Config:
             object.__setattr__(self, group_name, group)
         _require_order(self, 'grid.r_min', 'grid.r_max')
         _require_order(self, 'length_scale.min', 'length_scale.max')
+        _require_order(self, 'label.obstacle_min_height', 'label.obstacle_max_height')
+        if 2 * self.surface.n_neighbours >= self.grid.n_segments:
+            raise ConfigError(
+                f'surface.n_neighbours = {self.surface.n_neighbours}: must be below half of '
+                f'grid.n_segments = {self.grid.n_segments}'
+            )
 
     def __getitem__(self, name: str) -> ParameterValue:
         """Value of the parameter with the dotted `name`."""
@@ -449,18 +494,56 @@ class Config:
             is not accepted. The message starts with the path.
         """
         try:
-            text = Path(path).read_text(encoding='utf-8')
-            document = yaml.safe_load(text)
-            return cls.from_flat(dict(_flatten(_unwrap_ros(document))))
+            document = load_yaml(Path(path).read_text(encoding='utf-8'))
+            values: dict[str, object] = {}
+            for name, value in _flatten(_unwrap_ros(document)):
+                if name in values:
+                    raise ConfigError(f'{name}: given twice')
+                values[name] = value
+            return cls.from_flat(values)
         except OSError as error:
             raise ConfigError(f'{path}: {error.strerror or error}') from error
         except UnicodeDecodeError as error:
             raise ConfigError(f'{path}: not a text file') from error
-        except yaml.YAMLError as error:
-            problem = ' '.join(str(error).split())
-            raise ConfigError(f'{path}: not valid YAML: {problem}') from error
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            # ValueError: what looks like a date or a number and is none, as in 2011-99-99.
+            problem = ' '.join(str(error).split())
+            raise ConfigError(f'{path}: not valid YAML: {problem}') from error
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, without two of its surprises (see `load_yaml`)."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse a key that is there twice; the last would win silently."""
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for key in keys:
+            if key != '<<' and keys.count(key) > 1:
+                raise ConfigError(f'{key}: given twice, from line {node.start_mark.line + 1} on')
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float',
+    re.compile(r'^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
+    list('-+.0123456789'),
+)
+
+
+def load_yaml(text: str) -> object:
+    """Read YAML, keys given twice refused and 1e-3 a number as it is to ROS.
+
+    Raises
+    ------
+    ConfigError
+        If a key is given twice.
+    yaml.YAMLError
+        If it is not YAML.
+    """
+    document: object = yaml.load(text, Loader=_Loader)
+    return document
 
 
 def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterValue]]:
@@ -474,7 +557,8 @@ def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterVa
 
 def _require_order(config: Config, lower: str, upper: str) -> None:
     low, high = config[lower], config[upper]
-    assert isinstance(low, float) and isinstance(high, float)
+    assert isinstance(low, float)
+    assert isinstance(high, float)
     if not low < high:
         raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
 
@@ -520,11 +604,12 @@ def _build_specs() -> tuple[ParameterSpec, ...]:
         default_group = group.default
         assert dataclasses.is_dataclass(default_group)
         for entry in dataclasses.fields(default_group):
+            default: ParameterValue = getattr(default_group, entry.name)
             specs.append(
                 ParameterSpec(
                     name=f'{group.name}.{entry.name}',
-                    type=type(entry.default),
-                    default=entry.default,
+                    type=type(default),
+                    default=default,
                     **entry.metadata,
                 )
             )
@@ -550,6 +635,9 @@ def find_spec(name: str) -> ParameterSpec:
     """
     spec = _SPEC_BY_NAME.get(name)
     if spec is None:
+        members = [known for known in _SPEC_BY_NAME if known.startswith(f'{name}.')]
+        if members:
+            raise ConfigError(f'{name!r} is a group of parameters: {", ".join(members)}')
         near = difflib.get_close_matches(name, _SPEC_BY_NAME, n=1, cutoff=0.5)
         hint = f'; did you mean {near[0]}?' if near else ''
         raise ConfigError(f'unknown parameter {name!r}{hint}')

@@ -39,4 +39,5 @@ def check_points(points: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool
             f'points of shape {array.shape} and type {array.dtype}: must be floating point'
         )
     xyz = array[:, :3].astype(np.float64)
-    return xyz, np.isfinite(xyz).all(axis=1)
+    finite: npt.NDArray[np.bool_] = np.all(np.isfinite(xyz), axis=1)
+    return xyz, finite

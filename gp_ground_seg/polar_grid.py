@@ -72,7 +72,9 @@ def bin_edges(grid: GridConfig) -> FloatArray:
     return grid.r_min + (grid.r_max - grid.r_min) * fraction**grid.bin_growth
 
 
-def build_polar_grid(xyz: FloatArray, finite: npt.NDArray[np.bool_], grid: GridConfig) -> PolarGrid:
+def build_polar_grid(
+    xyz: FloatArray, finite: npt.NDArray[np.bool_], grid: GridConfig
+) -> PolarGrid:
     """Sort points into segments and bins (paper, section II).
 
     Parameters

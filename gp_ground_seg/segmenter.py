@@ -10,14 +10,14 @@ import numpy.typing as npt
 
 from gp_ground_seg.config import Config
 from gp_ground_seg.gp.fit import choose_backend, fit_surface
-from gp_ground_seg.labels import Label
+from gp_ground_seg.labelling import label_points
 from gp_ground_seg.length_scale import candidate_log_length_scale, interpolate_along_segments
 from gp_ground_seg.line_extraction import extract_lines
 from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.points import check_points
 from gp_ground_seg.polar_grid import build_polar_grid, lowest_points
 from gp_ground_seg.segmentation import FitReport, Segmentation
-from gp_ground_seg.surface import GroundSurface
+from gp_ground_seg.surface import GroundSurface, fuse_neighbours
 from gp_ground_seg.timing import StageTimer
 
 
@@ -41,8 +41,9 @@ class GroundSegmenter:
         self, config: Config | None = None, clock: Callable[[], float] = time.perf_counter
     ) -> None:
         self._clock = clock
-        self._pool: RowPool | None = None
-        self.configure(config if config is not None else Config())
+        self._config = config if config is not None else Config()
+        self._backend = choose_backend(self._config.runtime.backend)
+        self._pool = RowPool(self._config.runtime.n_threads)
 
     @property
     def config(self) -> Config:
@@ -51,16 +52,15 @@ class GroundSegmenter:
 
     def configure(self, config: Config) -> None:
         """Use `config` from the next scan on."""
-        backend = choose_backend(config.runtime.backend)
-        if self._pool is None or config.runtime.n_threads != self._config.runtime.n_threads:
-            self.close()
+        self._backend = choose_backend(config.runtime.backend)
+        if config.runtime.n_threads != self._config.runtime.n_threads:
+            self._pool.close()
             self._pool = RowPool(config.runtime.n_threads)
-        self._backend, self._config = backend, config
+        self._config = config
 
     def close(self) -> None:
         """End the worker threads; the segmenter is of no use afterwards."""
-        if self._pool is not None:
-            self._pool.close()
+        self._pool.close()
 
     def segment(self, points: npt.ArrayLike) -> Segmentation:
         """Label every point of a scan.
@@ -101,13 +101,14 @@ class GroundSegmenter:
             candidates, height, np.exp(log_length_scale), seed,
             knots, np.exp(knot_log_length_scale), config, self._backend, self._pool,
         )  # fmt: skip
+        mean, std = fuse_neighbours(
+            mean, std, knots, config.surface.n_neighbours, config.observation.slope_std
+        )
         surface = GroundSurface(knots, mean + expected_ground, std, inlier)
         timer.mark('surface')
 
         ground_z, ground_std = surface.at(grid)
-        is_ground = np.abs(z - ground_z) <= config.label.ground_tolerance
-        label = np.where(is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
-        label[~finite] = Label.UNKNOWN
+        label = label_points(z - ground_z, grid, surface, config.label)
         timer.mark('label')
 
         fit = FitReport(

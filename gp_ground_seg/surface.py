@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, PolarGrid
 from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, PolarGrid
 
 
 @dataclass(frozen=True)
@@ -47,3 +47,53 @@ class GroundSurface:
             value[outside] = np.nan
             values.append(value)
         return values[0], values[1]
+
+    def rise(self, grid: PolarGrid) -> FloatArray:
+        """Rise of the surface across the bin of each point, (N,) float64 [m]; unsigned."""
+        rise = np.abs(np.diff(self.mean, axis=1))
+        value: FloatArray = rise[grid.segment, np.maximum(grid.bin, 0)]
+        return value
+
+
+def fuse_neighbours(
+    mean: FloatArray, std: FloatArray, knots: FloatArray, n_neighbours: int, slope_std: float
+) -> tuple[FloatArray, FloatArray]:
+    """Fuse each segment's surface with those of its neighbours.
+
+    The surface of the segment k steps aside predicts this one with the variance
+    ``std^2 + (slope_std s_k)^2``, where ``s_k`` is the arc between the two at the
+    knot's range: the same prior slope as along the range. The predictions are
+    weighted by their inverse variances. A segment without a model gets one from
+    its neighbours, if they have any.
+
+    Parameters
+    ----------
+    mean, std : (M, K) float64
+        Height and standard deviation at the knots [m]; NaN where there is no model.
+    knots : (K,) float64
+        Ranges of the knots [m].
+    n_neighbours : int
+        Segments on either side.
+    slope_std : float
+        Standard deviation of the ground's slope.
+
+    Returns
+    -------
+    mean, std : (M, K) float64
+        Fused height and standard deviation [m].
+    """
+    if n_neighbours == 0:
+        return mean, std
+    step = 2.0 * np.pi / len(mean)
+    total_weight = np.zeros_like(mean)
+    weighted = np.zeros_like(mean)
+    for k in range(-n_neighbours, n_neighbours + 1):
+        variance = np.roll(std, k, axis=0) ** 2 + (slope_std * abs(k) * step * knots) ** 2
+        known = np.isfinite(variance)
+        # A surface that is certain to a tenth of a millimetre is as certain as any.
+        weight = np.where(known, 1.0 / np.maximum(np.where(known, variance, 1.0), 1e-8), 0.0)
+        total_weight += weight
+        weighted += weight * np.where(known, np.roll(mean, k, axis=0), 0.0)
+    known = total_weight > 0.0
+    safe = np.where(known, total_weight, 1.0)
+    return np.where(known, weighted / safe, np.nan), np.where(known, 1.0 / np.sqrt(safe), np.nan)

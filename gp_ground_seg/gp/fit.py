@@ -91,6 +91,7 @@ def fit_surface(
         knot_length_scale,
         config.observation.sigma_f,
         config.observation.sigma_n,
+        config.observation.slope_std,
         config.growth.max_std,
         config.growth.max_standardised_residual,
         inlier,

@@ -51,7 +51,7 @@ def grow_surface_reference(
     knot_length_scale : (M, K) float64
         Length-scale there [m].
     observation : ObservationConfig
-        sigma_f and sigma_n.
+        sigma_f, sigma_n and slope_std.
     growth : GrowthConfig
         Bounds for joining.
 
@@ -81,6 +81,7 @@ def grow_surface_reference(
                 l_own,
                 observation.sigma_f,
                 observation.sigma_n,
+                observation.slope_std,
             )
             residual = np.abs(z_own - height) / np.sqrt(variance + observation.sigma_n**2)
             joining = (
@@ -99,6 +100,7 @@ def grow_surface_reference(
             knot_length_scale[m],
             observation.sigma_f,
             observation.sigma_n,
+            observation.slope_std,
         )
         std[m] = np.sqrt(variance)
     return inlier, mean, std
@@ -117,6 +119,7 @@ def grow_surface_compiled(
     knot_length_scale: FloatArray,
     sigma_f: float,
     sigma_n: float,
+    slope_std: float,
     max_std: float,
     max_standardised_residual: float,
     inlier: BoolArray,
@@ -144,7 +147,7 @@ def grow_surface_compiled(
         all_l[n:] = knot_length_scale[m]
         whitened = np.empty((n, n + n_knots))
         height = np.zeros(n + n_knots)
-        variance = np.full(n + n_knots, sigma_f**2)
+        variance = sigma_f**2 + slope_std**2 * all_r**2
         n_inliers = 0
         grown = True
         while grown:
@@ -160,6 +163,7 @@ def grow_surface_compiled(
                         sigma_f**2
                         * math.sqrt(2.0 * all_l[i] * all_l[j] / spread)
                         * math.exp(-distance * distance / spread)
+                        + slope_std**2 * all_r[i] * all_r[j]
                     )
                 for k in range(n_inliers):
                     weight = whitened[k, i]

@@ -17,6 +17,7 @@ def posterior(
     length_scale_star: FloatArray,
     sigma_f: float,
     sigma_n: float,
+    slope_std: float = 0.0,
 ) -> tuple[FloatArray, FloatArray]:
     """Mean and variance of the ground height at `r_star` (paper, eqs. 6 and 7).
 
@@ -28,6 +29,10 @@ def posterior(
         Ranges wanted and the length-scales there [m].
     sigma_f, sigma_n : float
         Standard deviations of the process and of the noise [m].
+    slope_std : float
+        Prior standard deviation of the slope of the mean line through the sensor's
+        foot. The line is marginalised, which adds ``slope_std^2 r r'`` to the
+        kernel (Rasmussen and Williams 2006, section 2.7).
 
     Returns
     -------
@@ -37,10 +42,13 @@ def posterior(
         Variance of the height, without the noise [m^2].
     """
     covariance = paciorek(r, length_scale, r, length_scale, sigma_f)
+    covariance += slope_std**2 * np.outer(r, r)
     covariance[np.diag_indices_from(covariance)] += sigma_n**2
     cross = paciorek(r, length_scale, r_star, length_scale_star, sigma_f)
+    cross += slope_std**2 * np.outer(r, r_star)
+    prior = sigma_f**2 + slope_std**2 * r_star**2
     factor = cho_factor(covariance, lower=True)
     mean = cross.T @ cho_solve(factor, z)
     whitened = solve_triangular(factor[0], cross, lower=True)
-    variance = np.maximum(sigma_f**2 - np.sum(whitened**2, axis=0), 0.0)
+    variance = np.maximum(prior - np.sum(whitened**2, axis=0), 0.0)
     return mean, variance
