@@ -15,8 +15,11 @@ EXIT_OK = 0
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
 
+ROS_ARGS = '--ros-args'
+
 # Module of each command: `add_parser(subparsers)` declares its options and
 # sets the default `run`, a function of the parsed arguments that returns an exit code.
+# A command that sets the default `accepts_ros_args` finds `ros_args` in them.
 COMMAND_MODULES = (
     'gp_ground_seg.cli.segment',
     'gp_ground_seg.cli.evaluate',
@@ -54,6 +57,17 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _parse(words: list[str]) -> argparse.Namespace:
+    """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
+    n_own = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
+    parser = build_parser()
+    arguments = parser.parse_args(words[:n_own])
+    arguments.ros_args = words[n_own:]
+    if arguments.ros_args and not getattr(arguments, 'accepts_ros_args', False):
+        parser.error(f'{ROS_ARGS}: this command takes none')
+    return arguments
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -67,7 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         Exit code: 0, 2 for an error said in one line, 130 when interrupted.
     """
-    arguments = build_parser().parse_args(argv)
+    words = list(sys.argv[1:] if argv is None else argv)
+    arguments = _parse(words)
     try:
         code: int = arguments.run(arguments)
         sys.stdout.flush()

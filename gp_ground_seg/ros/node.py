@@ -1,0 +1,182 @@
+"""The ROS 2 node: clouds in, ground and obstacles out."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from sensor_msgs.msg import PointCloud2
+
+from gp_ground_seg.config import Config
+from gp_ground_seg.errors import GroundSegError, PointCloudError
+from gp_ground_seg.gp.fit import choose_backend
+from gp_ground_seg.ros.cloud_subscription import Arrival, CloudSubscription
+from gp_ground_seg.ros.diagnostics import DiagnosticsPublisher
+from gp_ground_seg.ros.outputs import OutputPublishers
+from gp_ground_seg.ros.parameters import ConfiguredNode, describe
+from gp_ground_seg.ros.point_cloud2 import read_xyz
+from gp_ground_seg.ros.qos import in_words
+from gp_ground_seg.ros.signals import stop_on_signals
+from gp_ground_seg.ros.startup import initialize, start_errors
+from gp_ground_seg.ros.statistics import (
+    InputFacts,
+    InputStatistics,
+    ProcessingStatistics,
+    Status,
+)
+from gp_ground_seg.ros.warm_up import warm_up
+from gp_ground_seg.segmenter import GroundSegmenter
+
+NODE_NAME = 'ground_segmentation_node'
+INPUT_TOPIC = 'points'
+LOG_PERIOD = 5.0
+"""Shortest time between two messages about bad clouds [s]."""
+LONGEST_WAIT = 0.2
+"""Time after which a signal is seen at the latest [s]."""
+
+
+class GroundSegmentationNode(ConfiguredNode):
+    """Subscribes to ``points``, publishes ``ground``, ``obstacles`` and /diagnostics.
+
+    Each output keeps the header and every field of the input, bit for bit; a
+    finite point is in exactly one of the two clouds, another one in neither.
+    Parameters are those of `gp_ground_seg.config` and may change at any time;
+    a change takes effect with the next cloud.
+
+    Latency is the time between the arrival of a cloud in this process and the
+    publication of the results, its wait in the queue included. Clouds are counted
+    as dropped where the publisher's own numbering has a hole, see `SequenceGaps`.
+
+    Parameters
+    ----------
+    **options
+        Those of `rclpy.node.Node`.
+
+    Raises
+    ------
+    ConfigError
+        If a given parameter is not accepted.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NODE_NAME, **options)
+        logger = self.get_logger()
+        logger.info(f'effective configuration:\n{describe(self.config)}')
+        self._segmenter = GroundSegmenter(self.config)
+        # For throttled messages; the default system clock may jump.
+        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        with start_errors():
+            self._outputs = OutputPublishers(self)
+        logger.info('compiling; this takes some seconds if it was not done before')
+        logger.info(f'ready to segment after {warm_up(self._segmenter):.1f} s')
+        self._input_statistics = InputStatistics(time.monotonic())
+        self._processing_statistics = ProcessingStatistics()
+        # Only now: a cloud that came earlier would have waited for the compiler.
+        with start_errors():
+            self._input = CloudSubscription(self, INPUT_TOPIC, self.is_given, self._on_cloud)
+        self._diagnostics = DiagnosticsPublisher(
+            self, self._report, self.config.diagnostics.period
+        )
+        self.warn_of_unused_parameters()
+        logger.info(f'listening to {self._input.topic} ({in_words(self._input.qos)})')
+
+    def check_config(self, config: Config) -> None:
+        """Raise a GroundSegError if the backend asked for is not installed."""
+        choose_backend(config.runtime.backend)
+
+    def apply_config(self, config: Config) -> None:
+        """Use `config` from the next cloud on."""
+        self._segmenter.configure(config)
+        self._diagnostics.set_period(config.diagnostics.period)
+
+    def destroy_node(self) -> None:
+        """Free what the node holds, the worker threads too."""
+        self._segmenter.close()
+        super().destroy_node()
+
+    def _on_cloud(self, cloud: PointCloud2, arrival: Arrival) -> None:
+        start = time.monotonic()
+        stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
+        fields = [field.name for field in cloud.fields]
+        self._input_statistics.arrived(start, stamp, cloud.header.frame_id, fields)
+        self._processing_statistics.dropped(arrival.n_lost)
+        try:
+            segmentation = self._segmenter.segment(read_xyz(cloud))
+            self._outputs.publish(cloud, segmentation)
+        except PointCloudError as error:
+            self._refuse(cloud, str(error))
+        except Exception as error:
+            # Whatever one cloud brings about, the next one may be good.
+            self._refuse(cloud, f'{type(error).__name__}: {error}')
+        else:
+            latency = arrival.wait + time.monotonic() - start
+            fit = segmentation.fit
+            self._processing_statistics.processed(
+                latency, segmentation.timings, fit.backend, fit.n_threads
+            )
+
+    def _refuse(self, cloud: PointCloud2, reason: str) -> None:
+        if not self.context.ok():
+            return  # publishing failed because the process ends
+        self._input_statistics.refused(reason)
+        self.get_logger().error(
+            f'cloud on {self._input.topic} in frame {cloud.header.frame_id!r} refused: {reason}',
+            throttle_duration_sec=LOG_PERIOD,
+            throttle_time_source_type=self._steady_clock,
+        )
+
+    def _report(self) -> list[Status]:
+        facts = InputFacts(
+            topic=self._input.topic,
+            qos=in_words(self._input.qos),
+            n_publishers=self._input.n_publishers,
+            ros_time=1e-9 * self.get_clock().now().nanoseconds,
+        )
+        limits = self.config.diagnostics
+        return [
+            self._input_statistics.report(time.monotonic(), facts, limits),
+            self._processing_statistics.report(limits),
+        ]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node until SIGINT, SIGTERM or a shutdown of its context.
+
+    Parameters
+    ----------
+    args : sequence of str, optional
+        Words after the program's name, ``--ros-args`` among them; those of the
+        process by default.
+
+    Returns
+    -------
+    int
+        Exit code: 0, or 2 for an error at start, said in one line.
+    """
+    words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
+    node = None
+    with stop_on_signals() as stop:
+        try:
+            initialize(words)
+            node = GroundSegmentationNode()
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            while rclpy.ok() and not stop.made:
+                # Python handles a signal after the wait, not within it.
+                executor.spin_once(timeout_sec=LONGEST_WAIT)
+        except GroundSegError as error:
+            sys.stderr.write(f'{NODE_NAME}: error: {error}\n')
+            return 2
+        except (KeyboardInterrupt, ExternalShutdownException):
+            pass
+        finally:
+            if node is not None:
+                node.destroy_node()
+            rclpy.try_shutdown()
+    return 0

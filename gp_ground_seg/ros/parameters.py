@@ -1,0 +1,195 @@
+"""The parameters of `gp_ground_seg.config` as ROS parameters of a node."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from gp_ground_seg.config import Config, ParameterSpec, find_spec, parameter_specs
+from gp_ground_seg.errors import ConfigError, GroundSegError
+from gp_ground_seg.ros.startup import start_errors
+
+QOS_OVERRIDES = 'qos_overrides.'
+OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
+_OWN_NAMES = frozenset(spec.name for spec in parameter_specs())
+
+
+def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
+    """Return what ``ros2 param describe`` and rqt_reconfigure show of a parameter."""
+    notes = [f'[{spec.unit}]'] if spec.unit else []
+    notes += [f'({spec.symbol} in the paper)'] if spec.symbol else []
+    result = ParameterDescriptor(
+        description=' '.join([spec.description, *notes]),
+        additional_constraints=f'must be {spec.accepted}',
+    )
+    # No step: rclpy would refuse every value off the grid.
+    if spec.type is float:
+        result.floating_point_range = [
+            FloatingPointRange(from_value=spec.minimum, to_value=spec.maximum)
+        ]
+    elif spec.type is int:
+        assert spec.minimum is not None and spec.maximum is not None
+        result.integer_range = [
+            IntegerRange(from_value=int(spec.minimum), to_value=int(spec.maximum))
+        ]
+    return result
+
+
+def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
+    """Return `config` with those of the `parameters` that it declares.
+
+    Raises
+    ------
+    ConfigError
+        If a value has another type, is out of range or contradicts another.
+    """
+    return config.replace(
+        **{
+            parameter.name: _typed(find_spec(parameter.name), parameter.value)
+            for parameter in parameters
+            if parameter.name in _OWN_NAMES
+        }
+    )
+
+
+def _typed(spec: ParameterSpec, value: object) -> object:
+    # A ROS parameter keeps its type: an integer is no double, as everywhere in ROS.
+    if spec.type is float and isinstance(value, int) and not isinstance(value, bool):
+        raise ConfigError(
+            f'{spec.name} = {value}: must be {spec.accepted}, with a decimal point as in {value}.0'
+        )
+    return spec.check(value)
+
+
+def describe(config: Config) -> str:
+    """One line per parameter: name, value, unit, and the default where it differs."""
+    lines = []
+    for spec in parameter_specs():
+        value = config[spec.name]
+        unit = f' {spec.unit}' if spec.unit else ''
+        note = '' if value == spec.default else f'  (default {spec.default})'
+        lines.append(f'  {spec.name}: {value}{unit}{note}')
+    return '\n'.join(lines)
+
+
+class ConfiguredNode(Node):  # type: ignore[misc]
+    """A node whose ROS parameters are a `Config`.
+
+    Values set at run time are checked as a whole before anything changes, then
+    handed to `apply_config` between two callbacks.
+
+    Parameters
+    ----------
+    name : str
+        Name of the node.
+    **options
+        Those of `rclpy.node.Node`.
+
+    Raises
+    ------
+    ConfigError
+        If a parameter file or ``-p`` gives a value that is not accepted.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
+        # Declared from the overrides to learn which names were given; then again, typed.
+        with start_errors():
+            super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
+        given = {
+            parameter_name: parameter
+            for parameter_name, parameter in self.get_parameters_by_prefix('').items()
+            if parameter_name not in OF_EVERY_NODE
+        }
+        use_sim_time = self.get_parameter('use_sim_time').value
+        if not isinstance(use_sim_time, bool):
+            raise ConfigError(f'use_sim_time = {use_sim_time!r}: must be true or false')
+        self._config = changed(Config(), given.values())
+        self.check_config(self._config)
+        for parameter_name in given:
+            self.undeclare_parameter(parameter_name)
+        with start_errors():
+            for spec in parameter_specs():
+                self.declare_parameter(spec.name, spec.default, descriptor(spec))
+        self._given_names = frozenset(given)
+        self.add_on_set_parameters_callback(self._on_set)
+        self.add_post_set_parameters_callback(self._post_set)
+
+    @property
+    def config(self) -> Config:
+        """Parameters in force."""
+        return self._config
+
+    def is_given(self, name: str) -> bool:
+        """Whether a parameter file or ``-p`` gave the parameter `name`."""
+        return name in self._given_names
+
+    def check_config(self, config: Config) -> None:
+        """Raise a GroundSegError if `config` cannot be used here; change nothing."""
+
+    def apply_config(self, config: Config) -> None:
+        """Use `config`, which `check_config` has accepted, from now on."""
+
+    def warn_of_unused_parameters(self) -> None:
+        """Log the given names that nobody declared; call it when all topics are there."""
+        for name in sorted(self._given_names):
+            if self.has_parameter(name):
+                continue
+            if name.startswith(QOS_OVERRIDES):
+                reason = 'no such topic or policy here'
+            else:
+                reason = _unknown(name)
+            self.get_logger().warning(f'parameter {name} is not used: {reason}')
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set all or none, as the services do.
+
+        Checks before rclpy does, whose reasons for a wrong type or an unknown
+        name do not say which parameter is meant.
+        """
+        for parameter in parameter_list:
+            if parameter.name not in _OWN_NAMES and not self.has_parameter(parameter.name):
+                return SetParametersResult(successful=False, reason=_unknown(parameter.name))
+        result = self._on_set(parameter_list)
+        if not result.successful:
+            return result
+        return super().set_parameters_atomically(parameter_list)
+
+    def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
+        # An exception out of here would end the executor and leave the caller waiting.
+        try:
+            self.check_config(changed(self._config, parameters))
+        except GroundSegError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            reason = f'{type(error).__name__}: {error}'
+            self.get_logger().error(f'parameters could not be checked: {reason}')
+            return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    def _post_set(self, parameters: list[Parameter]) -> None:
+        try:
+            config = changed(self._config, parameters)
+            if config != self._config:
+                self.apply_config(config)
+                self._config = config
+        except Exception as error:
+            self.get_logger().error(
+                f'parameters could not be applied: {type(error).__name__}: {error}'
+            )
+
+
+def _unknown(name: str) -> str:
+    try:
+        find_spec(name)
+    except ConfigError as error:
+        return str(error)
+    return f'{name} is not declared'

@@ -1,0 +1,41 @@
+"""Quality of service of the cloud topics."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+DEPTH = 5
+"""Clouds that may wait: half a second of a LiDAR at 10 Hz."""
+
+
+def cloud_profile() -> QoSProfile:
+    """Return what a cloud topic starts with: reliable, volatile, shallow."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
+def matching_reliability(offered: Collection[ReliabilityPolicy]) -> ReliabilityPolicy:
+    """Return the strongest reliability that receives from every publisher.
+
+    Large clouds need reliable delivery: a best-effort reader loses most of a
+    replayed KITTI bag with stock Fast DDS. A reliable reader gets nothing from
+    a best-effort LiDAR driver.
+    """
+    if ReliabilityPolicy.BEST_EFFORT in offered:
+        return ReliabilityPolicy.BEST_EFFORT
+    return ReliabilityPolicy.RELIABLE
+
+
+def in_words(profile: QoSProfile) -> str:
+    """Return `profile` as in ``reliable, keep_last 5, volatile``."""
+    reliability, history, durability = (
+        policy.name.lower()
+        for policy in (profile.reliability, profile.history, profile.durability)
+    )
+    return f'{reliability}, {history} {profile.depth}, {durability}'

@@ -1,0 +1,37 @@
+"""A first frame that costs nobody anything."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gp_ground_seg.config import Config
+from gp_ground_seg.segmenter import GroundSegmenter
+
+_RINGS = 24
+_DIRECTIONS = 64
+
+
+def warm_up(segmenter: GroundSegmenter) -> float:
+    """Segment a small made-up frame, so that all code is compiled before a cloud waits for it.
+
+    Returns
+    -------
+    float
+        Time it took [s].
+    """
+    return segmenter.segment(_flat_ground(segmenter.config)).timings['total']
+
+
+def _flat_ground(config: Config) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """Rings on level ground as the sensor would see them, (N, 3) [m]."""
+    nearest = config.grid.r_min
+    radius, azimuth = np.meshgrid(
+        np.linspace(nearest, min(nearest + 30.0, config.grid.r_max), _RINGS),
+        np.linspace(-math.pi, math.pi, _DIRECTIONS, endpoint=False),
+    )
+    height = np.full(radius.shape, -config.sensor.height)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=-1).reshape(
+        -1, 3
+    )
