@@ -111,7 +111,7 @@ def crest(seed: int) -> Scene:
 def urban(seed: int) -> Scene:
     """Street: kerbs, parked cars, a truck, houses, awnings, poles, trees, a bridge, puddles."""
     rng = np.random.default_rng(seed)
-    road, front = 5.0, 9.0
+    road, front = 6.0, 10.0
     terrain = landforms.kerb(road, 0.15)
     solids: list[Solid] = []
     wet: list[WetPatch] = []
@@ -126,16 +126,16 @@ def urban(seed: int) -> Scene:
         for x in np.arange(URBAN_X[0], URBAN_X[1], 9.0) + rng.uniform(0.0, 2.0):
             if rng.random() < 0.6:
                 solids += car(terrain, x, side * (road - 1.1), rng.normal(0.0, 0.02))
-                wet.append(WetPatch(x + rng.uniform(-3.0, 3.0), side * 2.0, rng.uniform(0.8, 1.8)))
+                wet.append(WetPatch(x + rng.uniform(-3.0, 3.0), side * 2.5, rng.uniform(0.8, 1.8)))
         for x in np.arange(URBAN_X[0], URBAN_X[1], 22.0) + rng.uniform(0.0, 10.0):
-            solids.append(pole(terrain, x, side * 6.0))
-            solids += tree(terrain, x + 8.0, side * 7.0)
-    solids += truck(terrain, rng.uniform(25.0, 35.0), 1.8, math.pi)
+            solids.append(pole(terrain, x, side * 7.0))
+            solids += tree(terrain, x + 8.0, side * 8.0)
+    solids += truck(terrain, rng.uniform(25.0, 35.0), 2.6, math.pi)
     # Low enough for the flat upper beams of an HDL-64E to meet it.
     solids += bridge(terrain, rng.uniform(40.0, 50.0), 0.0, 2.0 * front, 5.0, 2.8)
     for x in np.arange(URBAN_X[0], URBAN_X[1], 30.0) + rng.uniform(0.0, 20.0):
         solids.append(floating_box(terrain, x, front - 1.0, (6.0, 2.0, 0.2), 2.1))
-    solids.append(standing_box(terrain, rng.uniform(10.0, 20.0), -7.0, (0.5, 0.5, 0.4)))
+    solids.append(standing_box(terrain, rng.uniform(10.0, 20.0), -8.0, (0.5, 0.5, 0.4)))
     return Scene('urban', terrain, tuple(solids), tuple(wet))
 
 
