@@ -1,0 +1,81 @@
+"""Small SemanticKITTI folders, and where the real frames are."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gp_ground_seg.evaluation.semantic_classes import SemanticClass
+from gp_ground_seg.labels import Label
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def real_kitti() -> Path:
+    """Root of the real frames; the test is skipped on machines without them."""
+    root = Path(os.environ.get('GP_GROUND_SEG_KITTI', REPOSITORY.parent / 'shared' / 'kitti'))
+    if not (root / 'sequences').is_dir():
+        pytest.skip('no KITTI frames: set GP_GROUND_SEG_KITTI')
+    return root
+
+
+def street(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A level road with a wall, a tree, low grass and an outlier: points (N, 4), classes (N,)."""
+    rng = np.random.default_rng(seed)
+
+    def block(n, low, high, semantic):
+        xyz = rng.uniform(low, high, (n, 3))
+        return np.column_stack([xyz, rng.uniform(0, 1, n)]), np.full(n, semantic)
+
+    parts = [
+        block(4000, (-30, -20, -1.75), (30, 20, -1.71), SemanticClass.ROAD),
+        block(900, (15, -20, -1.6), (15.3, 20, 1.5), SemanticClass.BUILDING),
+        block(300, (-8, 6, -0.5), (-5, 9, 2.0), SemanticClass.VEGETATION),
+        block(200, (-8, 6, -1.72), (-5, 9, -1.65), SemanticClass.VEGETATION),
+        block(50, (3, 3, -1.75), (4, 4, -1.71), SemanticClass.UNLABELLED),
+        block(5, (3, 3, 5), (4, 4, 9), SemanticClass.OUTLIER),
+    ]
+    points = np.concatenate([p for p, _ in parts]).astype('<f4')
+    return points, np.concatenate([c for _, c in parts]).astype('<u4')
+
+
+def write_frame(root: Path, sequence: str, index: int, points: np.ndarray, semantic=None) -> None:
+    """Write one frame; `semantic` None leaves it without labels."""
+    folder = root / 'sequences' / sequence
+    for name, ending, data in (('velodyne', 'bin', points), ('labels', 'label', semantic)):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        if data is not None:
+            (folder / name / f'{index:06d}.{ending}').write_bytes(data.tobytes())
+
+
+def write_streets(root: Path, **n_frames: int) -> Path:
+    """Write sequences of streets: ``write_streets(root, s00=2)`` makes two frames of 00."""
+    for name, n in n_frames.items():
+        for k in range(n):
+            points, semantic = street(seed=k)
+            # An instance number in the upper half, as in the real files.
+            write_frame(root, name.removeprefix('s'), k, points, semantic | np.uint32(7 << 16))
+    return root
+
+
+class HeightRule:
+    """Ground is below a fixed height: a method simple enough to know its scores by hand."""
+
+    def __init__(self, name: str, height: float, journal: list | None = None) -> None:
+        self.name = name
+        self.height = height
+        self.journal = [] if journal is None else journal
+
+    def start_sequence(self) -> None:
+        self.journal.append((self.name, 'start'))
+
+    def run(self, points: np.ndarray) -> None:
+        self.journal.append((self.name, len(points)))
+        self._label = np.where(points[:, 2] < self.height, Label.GROUND, Label.OBSTACLE)
+
+    def label(self) -> np.ndarray:
+        return self._label.astype(np.uint8)
+
+    def stages(self) -> dict[str, float]:
+        return {}
