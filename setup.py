@@ -25,10 +25,10 @@ ROS = [
 DEV = [
     'colcon-common-extensions',
     'hypothesis>=6.100',
-    'mypy>=1.10',
+    'mypy>=1.10,<2.5',
     'pypatchworkpp>=1.4',
     'pytest>=7.4',
-    'ruff>=0.6',
+    'ruff>=0.6,<0.18',
     'setuptools<80',  # colcon's ament_python build needs `setup.py develop` and `install`
     'types-PyYAML',
     'types-tqdm',

@@ -1,0 +1,50 @@
+# make demo | make test | make lint: each creates the environment it needs.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+KITTI ?= $(wildcard ../shared/kitti)
+
+.PHONY: help demo test lint format generate clean
+
+help:
+	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
+	@echo 'make test      the whole test suite (KITTI=PATH adds labelled frames)'
+	@echo 'make lint      ruff and mypy'
+	@echo 'make format    format the code'
+	@echo 'make generate  rewrite what is derived from gp_ground_seg/config.py'
+	@echo 'make clean     remove the environment and build results'
+
+$(VENV)/.python:
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'pip>=23.2' wheel
+	@touch $@
+
+$(VENV)/.ros: setup.py $(VENV)/.python
+	@echo 'Installing gp_ground_seg and ROS 2 Jazzy wheels into $(VENV) (about 600 MB, a minute or two) ...'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros]'
+	@touch $@
+
+$(VENV)/.dev: setup.py $(VENV)/.ros
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros,dev]'
+	@touch $@
+
+demo: $(VENV)/.ros
+	$(BIN)/gp-ground-seg demo --force $(if $(KITTI_ROOT),--kitti $(KITTI_ROOT))
+
+test: $(VENV)/.dev
+	GP_GROUND_SEG_KITTI=$(KITTI) $(BIN)/python -m pytest
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+generate: $(VENV)/.dev
+	$(BIN)/gp-ground-seg config generate .
+
+clean:
+	rm -rf $(VENV) build install log .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,0 +1,41 @@
+"""What several test modules use: labelled frames where they are at hand, small scans."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def find_kitti() -> Path | None:
+    """Folder of labelled KITTI frames: GP_GROUND_SEG_KITTI, or beside the repository."""
+    named = os.environ.get('GP_GROUND_SEG_KITTI')
+    folder = Path(named) if named else REPOSITORY.parent / 'shared' / 'kitti'
+    return folder if (folder / 'sequences').is_dir() else None
+
+
+@pytest.fixture(scope='session')
+def kitti() -> Path:
+    folder = find_kitti()
+    if folder is None:
+        pytest.skip('no labelled KITTI frames: set GP_GROUND_SEG_KITTI to their folder')
+    return folder
+
+
+def hilly_scan(n_points: int = 4000, seed: int = 0, sensor_height: float = 1.73) -> np.ndarray:
+    """Ground that rises gently with boxes on it, (N, 3) float64; cheap, for unit tests."""
+    rng = np.random.default_rng(seed)
+    r = 3.0 + 37.0 * rng.random(n_points) ** 1.5
+    azimuth = rng.uniform(-np.pi, np.pi, n_points)
+    x, y = r * np.cos(azimuth), r * np.sin(azimuth)
+    z = -sensor_height + 0.02 * x + 0.1 * np.sin(0.3 * x) + rng.normal(0.0, 0.02, n_points)
+    standing = rng.random(n_points) < 0.2
+    z[standing] += rng.uniform(0.5, 2.0, standing.sum())
+    return np.column_stack([x, y, z])
+
+
+@pytest.fixture
+def scan() -> np.ndarray:
+    return hilly_scan()

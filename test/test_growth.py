@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gp_ground_seg.config import GrowthConfig, ObservationConfig
+from gp_ground_seg.gp.growth import grow_surface_compiled, grow_surface_reference
+
+KNOTS = np.linspace(2.0, 60.0, 30)
+
+
+def random_frame(seed, n_segments=5):
+    """Ragged segments of gentle ground with a fifth of the candidates lifted off it."""
+    rng = np.random.default_rng(seed)
+    counts = rng.integers(0, 30, n_segments)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    r = np.concatenate([np.sort(rng.uniform(2, 50, n)) for n in counts] or [np.empty(0)])
+    z = 0.05 * np.sin(0.2 * r) + rng.normal(0, 0.03, len(r))
+    lifted = rng.random(len(r)) < 0.2
+    z[lifted] += rng.uniform(0.4, 2.0, lifted.sum())
+    length_scale = rng.uniform(1.0, 12.0, len(r))
+    knot_length_scale = rng.uniform(1.0, 12.0, (n_segments, len(KNOTS)))
+    seed_mask = (r < 15.0) & (np.abs(z) < 0.2)
+    return offsets, r, z, length_scale, seed_mask, KNOTS, knot_length_scale
+
+
+def compiled(frame, observation, growth, chunks=1):
+    offsets, r = frame[0], frame[1]
+    n_segments = len(offsets) - 1
+    inlier = np.zeros(len(r), dtype=bool)
+    mean = np.full((n_segments, len(KNOTS)), np.nan)
+    std = np.full((n_segments, len(KNOTS)), np.nan)
+    for start, stop in zip(
+        np.linspace(0, n_segments, chunks + 1)[:-1].astype(int),
+        np.linspace(0, n_segments, chunks + 1)[1:].astype(int),
+        strict=True,
+    ):
+        grow_surface_compiled(
+            start,
+            stop,
+            *frame,
+            observation.sigma_f,
+            observation.sigma_n,
+            observation.slope_std,
+            growth.max_std,
+            growth.max_standardised_residual,
+            inlier,
+            mean,
+            std,
+        )
+    return inlier, mean, std
+
+
+@settings(deadline=None)
+@given(st.integers(0, 100_000), st.sampled_from([0.0, 0.05]))
+def test_appending_rows_gives_what_refitting_gives(seed, slope_std):
+    frame = random_frame(seed)
+    observation = ObservationConfig(slope_std=slope_std)
+    growth = GrowthConfig()
+    expected = grow_surface_reference(*frame, observation, growth)
+    found = compiled(frame, observation, growth)
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-8)
+    np.testing.assert_allclose(found[2], expected[2], atol=1e-6)
+
+
+def test_chunks_do_not_matter():
+    frame = random_frame(3, n_segments=12)
+    whole = compiled(frame, ObservationConfig(), GrowthConfig())
+    parts = compiled(frame, ObservationConfig(), GrowthConfig(), chunks=5)
+    for a, b in zip(whole, parts, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def grow_line(z, r=None, seed=None, **bounds):
+    r = np.arange(3.0, 3.0 + len(z)) if r is None else r
+    seed = np.arange(len(z)) < 3 if seed is None else seed
+    flat = np.full(len(z), 8.0)
+    return grow_surface_reference(
+        np.array([0, len(z)]),
+        r,
+        np.asarray(z, dtype=float),
+        flat,
+        seed,
+        KNOTS,
+        np.full((1, len(KNOTS)), 8.0),
+        ObservationConfig(),
+        GrowthConfig(**bounds),
+    )
+
+
+def test_growth_follows_ground_and_leaves_obstacles_out():
+    z = np.zeros(20)
+    z[8:11] = 1.0
+    inlier, mean, _ = grow_line(z)
+    assert list(np.flatnonzero(~inlier)) == [8, 9, 10]
+    assert np.abs(mean[0, KNOTS < 20]).max() < 0.02
+
+
+def test_growth_stops_where_the_surface_is_uncertain():
+    r = np.concatenate([np.arange(3.0, 10.0), [60.0]])
+    inlier, _, std = grow_line(np.zeros(8), r=r)
+    assert list(inlier) == [True] * 7 + [False]
+    assert std[0, -1] > GrowthConfig().max_std
+
+
+def test_no_seed_no_model():
+    inlier, mean, std = grow_line(np.zeros(5), seed=np.zeros(5, dtype=bool))
+    assert not inlier.any()
+    assert np.isnan(mean).all()
+    assert np.isnan(std).all()
+
+
+def test_looser_bounds_take_more():
+    z = np.where(np.arange(20) % 4 == 3, 0.35, 0.0)
+    strict = grow_line(z, max_standardised_residual=1.0)[0].sum()
+    loose = grow_line(z, max_standardised_residual=8.0)[0].sum()
+    assert strict < loose == pytest.approx(20)

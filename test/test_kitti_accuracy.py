@@ -1,0 +1,50 @@
+"""Regression on real frames: the worth of the defaults must not fall."""
+
+import numpy as np
+import pytest
+
+from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.datasets.semantic_kitti import (
+    list_frames,
+    list_sequences,
+    read_labels,
+    read_points,
+)
+
+GROUND_CLASSES = [40, 44, 48, 49, 60, 72]
+LEFT_OUT = [0, 1, 70]
+FLOOR = {'00': 97.3, '01': 98.8, '03': 91.2, '05': 94.1, '08': 96.5, '10': 95.2}
+
+
+def test_iou_on_labelled_frames(kitti):
+    """GroundGrid convention, counted here on its own: no code of evaluation/."""
+    segmenter = GroundSegmenter()
+    counts = {}
+    for sequence in list_sequences(kitti):
+        total = np.zeros(3)
+        for frame in list_frames(kitti, sequence):
+            points = read_points(frame.points_path)
+            classes = read_labels(frame.labels_path, len(points))
+            truth, kept = np.isin(classes, GROUND_CLASSES), ~np.isin(classes, LEFT_OUT)
+            said = segmenter.segment(points).label == Label.GROUND
+            total += [
+                (said & truth & kept).sum(),
+                (said & ~truth & kept).sum(),
+                (~said & truth & kept).sum(),
+            ]
+        counts[sequence] = total
+    iou = {name: 100 * total[0] / total.sum() for name, total in counts.items()}
+    pooled = sum(counts.values())
+    assert 100 * pooled[0] / pooled.sum() >= 96.3
+    for sequence, floor in FLOOR.items():
+        if sequence in iou:
+            assert iou[sequence] >= floor, sequence
+
+
+@pytest.mark.parametrize('sequence', ['00', '10'])
+def test_backends_agree_on_a_real_frame(kitti, sequence):
+    points = read_points(list_frames(kitti, sequence)[3].points_path)
+    fast = GroundSegmenter().segment(points)
+    slow = GroundSegmenter(Config().replace(**{'runtime.backend': 'numpy'})).segment(points)
+    assert (fast.label != slow.label).sum() <= 2
+    np.testing.assert_allclose(fast.ground_z, slow.ground_z, atol=1e-6)

@@ -1,0 +1,83 @@
+"""The package as a whole: versions, layers, dependencies."""
+
+import ast
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+from conftest import REPOSITORY
+
+import gp_ground_seg
+
+SOURCES = sorted((REPOSITORY / 'gp_ground_seg').rglob('*.py'))
+ROS_MODULES = {
+    'rclpy',
+    'sensor_msgs',
+    'std_msgs',
+    'diagnostic_msgs',
+    'rcl_interfaces',
+    'rosgraph_msgs',
+    'builtin_interfaces',
+    'ament_index_python',
+    'sensor_msgs_py',
+    'tf2_ros',
+    'visualization_msgs',
+}
+# What may not be imported from a layer below.
+UPPER_LAYERS = ('cli', 'ros', 'plotting', 'evaluation', 'datasets')
+
+
+def imports(path):
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+
+
+def test_versions_agree():
+    package = ElementTree.parse(REPOSITORY / 'package.xml').getroot()
+    assert package.findtext('version') == gp_ground_seg.__version__
+    changelog = (REPOSITORY / 'CHANGELOG.rst').read_text(encoding='utf-8')
+    assert re.search(r'^(\d+\.\d+\.\d+|Forthcoming)\b', changelog, re.MULTILINE)
+
+
+def test_package_xml_is_an_ament_python_package():
+    package = ElementTree.parse(REPOSITORY / 'package.xml').getroot()
+    assert package.get('format') == '3'
+    assert package.findtext('export/build_type') == 'ament_python'
+    depends = {element.text for element in package.iter('exec_depend')}
+    imported = {name.split('.')[0] for path in SOURCES for name in imports(path)}
+    assert imported & ROS_MODULES <= depends
+
+
+@pytest.mark.parametrize('path', SOURCES, ids=lambda path: path.stem)
+def test_only_ros_imports_ros(path):
+    parts = path.relative_to(REPOSITORY / 'gp_ground_seg').parts
+    roots = {name.split('.')[0] for name in imports(path)}
+    if parts[0] != 'ros':
+        assert not roots & ROS_MODULES
+    if parts[0] not in UPPER_LAYERS and parts[0] != '__main__.py':
+        for name in imports(path):
+            assert name.split('.')[:2] not in [['gp_ground_seg', layer] for layer in UPPER_LAYERS]
+
+
+def test_importing_the_library_imports_neither_ros_nor_tools():
+    script = 'import sys, gp_ground_seg; print(*sys.modules)'
+    done = subprocess.run(
+        [sys.executable, '-c', script], capture_output=True, text=True, check=True
+    )
+    loaded = {name.split('.')[0] for name in done.stdout.split()}
+    assert not loaded & {'rclpy', 'sensor_msgs', 'matplotlib', 'rosbags', 'tqdm'}
+
+
+def test_no_path_of_one_machine_and_no_data_is_tracked():
+    listed = subprocess.run(
+        ['git', 'ls-files'], cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
+    if listed.returncode:
+        pytest.skip('not a git checkout')
+    files = listed.stdout.split()
+    assert not [name for name in files if name.endswith(('.bin', '.label', '.mcap', '.db3'))]

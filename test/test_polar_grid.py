@@ -1,0 +1,108 @@
+import math
+
+import numpy as np
+import pytest
+from conftest import hilly_scan
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gp_ground_seg.config import Config, GridConfig
+from gp_ground_seg.polar_grid import OUTSIDE, bin_edges, build_polar_grid, lowest_points
+
+
+def build(points, grid=None):
+    xyz = np.asarray(points, dtype=np.float64)
+    return build_polar_grid(xyz, np.isfinite(xyz).all(axis=1), grid or GridConfig())
+
+
+def slow_cell(x, y, grid):
+    """Segment and bin of one point, said plainly."""
+    r = math.hypot(x, y)
+    segment = int((math.atan2(y, x) / (2 * math.pi) + 0.5) * grid.n_segments) % grid.n_segments
+    edges = bin_edges(grid)
+    if r >= edges[-1]:
+        return segment, OUTSIDE
+    for n in range(grid.n_bins):
+        if r < edges[n + 1]:
+            return segment, n
+    raise AssertionError
+
+
+@given(
+    st.floats(-120, 120),
+    st.floats(-120, 120),
+    st.integers(4, 50),
+    st.integers(4, 50),
+    st.floats(1.0, 3.0),
+)
+def test_cell_of_a_point_is_the_one_said_plainly(x, y, n_segments, n_bins, growth):
+    grid = GridConfig(n_segments=n_segments, n_bins=n_bins, bin_growth=growth)
+    built = build([[x, y, 0.0]], grid)
+    assert (built.segment[0], built.bin[0]) == slow_cell(x, y, grid)
+    assert built.r[0] == math.hypot(x, y)
+
+
+def test_edges_span_the_range_and_grow():
+    edges = bin_edges(GridConfig(n_bins=10, r_min=1.0, r_max=101.0, bin_growth=2.0))
+    assert edges[0] == 1.0
+    assert edges[-1] == 101.0
+    np.testing.assert_allclose(np.diff(edges), 1.0 + 2.0 * np.arange(10))
+
+
+def test_points_that_are_not_finite_are_outside_with_no_range():
+    built = build([[np.nan, 1.0, 0.0], [np.inf, 1.0, 0.0], [5.0, 0.0, np.nan], [5.0, 0.0, 0.0]])
+    assert list(built.bin[:3]) == [OUTSIDE] * 3
+    assert np.isnan(built.r[:3]).all()
+    assert built.bin[3] != OUTSIDE
+
+
+def test_both_sides_of_the_negative_x_axis():
+    built = build([[-10.0, 0.0, 0.0], [-10.0, -0.0, 0.0], [-10.0, 1e-9, 0.0], [-10.0, -1e-9, 0.0]])
+    assert list(built.segment) == [0, 0, 179, 0]
+
+
+def test_lowest_point_of_every_bin():
+    xyz = hilly_scan(3000, seed=1)
+    grid = build(xyz)
+    candidates = lowest_points(grid, xyz[:, 2])
+    best = {}
+    for segment, index, r, z in zip(grid.segment, grid.bin, grid.r, xyz[:, 2], strict=True):
+        cell = (segment, index)
+        best[cell] = min(best.get(cell, (np.inf, np.inf)), (z, r))
+    expected = [(*cell, *best[cell]) for cell in sorted(best)]
+    found = zip(candidates.segment, candidates.bin, candidates.z, candidates.r, strict=True)
+    assert list(found) == expected
+    assert candidates.offsets[-1] == len(candidates.r)
+
+
+def test_equal_heights_are_settled_by_range_not_by_order():
+    points = np.array([[5.02, 0.0, -1.7], [5.01, 0.0, -1.7], [5.03, 0.0, -1.7]])
+    for order in ([0, 1, 2], [2, 1, 0], [1, 2, 0]):
+        shuffled = points[order]
+        candidates = lowest_points(build(shuffled), shuffled[:, 2])
+        assert list(candidates.r) == [5.01]
+
+
+def test_candidates_of_a_segment_come_in_order_of_range():
+    xyz = hilly_scan(5000, seed=2)
+    candidates = lowest_points(build(xyz), xyz[:, 2])
+    for first, last in zip(candidates.offsets[:-1], candidates.offsets[1:], strict=True):
+        assert (np.diff(candidates.r[first:last]) > 0).all()
+
+
+def test_empty_grid():
+    candidates = lowest_points(build(np.empty((0, 3))), np.empty(0))
+    assert len(candidates.r) == 0
+    assert list(candidates.offsets) == [0] * (Config().grid.n_segments + 1)
+
+
+@pytest.mark.parametrize('segments_turned', [1, 7, 90])
+def test_turning_the_scan_by_segments_turns_the_segments(segments_turned):
+    xyz = hilly_scan(2000, seed=3)
+    angle = segments_turned * 2 * np.pi / 180
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turned = xyz.copy()
+    turned[:, :2] = xyz[:, :2] @ rotation.T
+    np.testing.assert_array_equal(
+        build(turned).segment, (build(xyz).segment + segments_turned) % 180
+    )
