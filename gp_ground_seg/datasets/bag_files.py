@@ -33,7 +33,9 @@ def check_is_bag(path: Path) -> None:
     """Raise `DataError` with the next step if `path` cannot be a bag."""
     if not path.exists():
         raise DataError(f'{path}: no such file or folder')
-    check_sqlite_path(path)
+    for file in path.glob('*.db3') if path.is_dir() else [path]:
+        if file.suffix == '.db3':
+            _check_sqlite_file(file)
     if path.is_dir() and not is_bag(path):
         files = sorted(child.name for child in path.iterdir() if child.suffix in BAG_SUFFIXES)
         hint = f'; bag files in it, to be given one by one: {", ".join(files)}' if files else ''
@@ -45,14 +47,26 @@ def check_is_bag(path: Path) -> None:
 
 
 def check_sqlite_path(path: Path) -> None:
-    """Raise `DataError` for a .db3 file, or the folder of one, that sqlite would not find.
+    """Raise `DataError` for a sqlite file that would not be found under its name.
 
     rosbags hands the path to sqlite as a URI, where some letters end or alter
     it: another file than the one named would be opened.
     """
     awkward = sorted(set('?#%') & set(str(path.absolute())))
-    if awkward and (path.suffix == '.db3' or any(path.glob('*.db3'))):
+    if awkward:
         raise DataError(f'{path}: a sqlite3 bag cannot have {" ".join(awkward)} in its path')
+
+
+def _check_sqlite_file(path: Path) -> None:
+    """Raise `DataError` where part of a sqlite file is in a journal, which rosbags ignores."""
+    check_sqlite_path(path)
+    for ending in ('-wal', '-journal'):
+        journal = path.with_name(path.name + ending)
+        if journal.exists() and journal.stat().st_size > 0:
+            raise DataError(
+                f'{path}: was not closed, some of it is in {journal.name}; '
+                f'`sqlite3 {path.name} vacuum` completes it'
+            )
 
 
 def is_ros1_bag(path: Path) -> bool:

@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any
 
 from gp_ground_seg.datasets.bag_files import (
+    METADATA_FILE,
     check_is_bag,
     in_one_line,
     is_ros1_bag,
@@ -91,6 +92,14 @@ class BagReader:
         self._reader.close()
 
     @property
+    def storage(self) -> str:
+        """``ros1``, ``mcap`` or ``sqlite3``."""
+        if is_ros1_bag(self.path):
+            return 'ros1'
+        files = self.path.glob('*.db3*') if self.path.is_dir() else [self.path]
+        return 'sqlite3' if any('.db3' in file.suffixes for file in files) else 'mcap'
+
+    @property
     def topics(self) -> dict[str, str]:
         """Message type of each topic, as in ``sensor_msgs/msg/PointCloud2``."""
         return {name: topic.msgtype for name, topic in self._topics.items()}
@@ -158,7 +167,7 @@ class BagReader:
         return recorded[0]
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """Messages in order of their recorded time.
+        """Messages in order of their recorded time; file after file in a split bag.
 
         Parameters
         ----------
@@ -207,7 +216,8 @@ class BagReader:
             if found[name] != expected[name]:
                 raise DataError(
                     f'{self.path}: topic {name} lists {expected[name]} messages, '
-                    f'{found[name]} could be read; the bag is damaged'
+                    f'{found[name]} could be read; the bag is damaged, '
+                    f'or its {METADATA_FILE} belongs to another one'
                 )
 
     def _listing(self) -> str:

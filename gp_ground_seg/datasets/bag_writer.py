@@ -49,7 +49,7 @@ def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
         )
     storage = wanted or implied or DEFAULT_STORAGE
     if storage == 'sqlite3':
-        check_sqlite_path(Path(path).with_suffix('.db3'))
+        check_sqlite_path(Path(path))
     return storage
 
 

@@ -71,15 +71,17 @@ class CloudMessage:
     def select(self, mask: npt.NDArray[np.bool_]) -> CloudMessage:
         """Cloud of the points where `mask` is true: same header, same fields, one row.
 
-        Raises as `select_rows` does.
+        ``is_dense`` says whether the kept points are all finite, as in the node's clouds.
+        Raises as `select_rows` and `read_xyz` do.
         """
         data = select_rows(
             self.height, self.width, self.point_step, self.row_step, self.data, mask
         )
         width = int(np.count_nonzero(mask))
-        return dataclasses.replace(
+        kept = dataclasses.replace(
             self, height=1, width=width, row_step=width * self.point_step, data=data
         )
+        return dataclasses.replace(kept, is_dense=bool(np.isfinite(kept.xyz()).all()))
 
 
 def cloud_from_columns(

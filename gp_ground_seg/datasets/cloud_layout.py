@@ -91,10 +91,12 @@ def read_xyz(
     order = '>' if is_bigendian else '<'
     wide = any(code == 'f8' for _, code in columns)
     xyz = np.empty((height, width, 3), dtype=np.float64 if wide else np.float32)
-    for axis, (offset, code) in enumerate(columns):
-        xyz[:, :, axis] = np.ndarray(
-            (height, width), order + code, raw, offset, (row_step, point_step)
-        )
+    # Arbitrary bytes may be a signalling NaN, one more value that is not finite.
+    with np.errstate(invalid='ignore'):
+        for axis, (offset, code) in enumerate(columns):
+            xyz[:, :, axis] = np.ndarray(
+                (height, width), order + code, raw, offset, (row_step, point_step)
+            )
     return xyz.reshape(-1, 3)
 
 

@@ -1,0 +1,617 @@
+"""Bags: every kind in, rosbag2 out, whole or not at all."""
+
+import dataclasses
+import importlib.util
+import shutil
+import sqlite3
+import subprocess
+import sys
+
+import bag_samples as samples
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosReliability
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from gp_ground_seg.datasets.bag_writer import is_bag_folder
+from gp_ground_seg.datasets.bags import (
+    POINT_CLOUD2,
+    BagReader,
+    BagTopic,
+    BagWriter,
+    cloud_from_columns,
+    cloud_topic,
+    decode_cloud,
+    encode_cloud,
+    is_bag,
+    jazzy_topic,
+    open_bag,
+    resolve_storage,
+)
+from gp_ground_seg.datasets.staging import leftovers, staged_files
+from gp_ground_seg.errors import DataError, PointCloudError
+
+SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
+
+
+def read_all(path):
+    with open_bag(path) as bag:
+        return list(bag.messages())
+
+
+def one_line(error):
+    return '\n' not in str(error.value)
+
+
+def error_of(kind, function, *arguments):
+    """What the function said when it raised an error of that kind; None if it did not."""
+    try:
+        function(*arguments)
+    except kind as error:
+        return str(error)
+    return None
+
+
+# --- clouds -------------------------------------------------------------------------------
+
+
+def assert_same_cloud(cloud, expected):
+    for field in dataclasses.fields(expected):
+        np.testing.assert_equal(getattr(cloud, field.name), getattr(expected, field.name))
+
+
+def test_cloud_survives_encoding():
+    cloud = samples.cloud(3)
+    assert_same_cloud(decode_cloud(encode_cloud(cloud)), cloud)
+
+
+ROS_ROUND_TRIP = """
+import sys
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2
+raw = open(sys.argv[1], 'rb').read()
+message = deserialize_message(raw, PointCloud2)
+open(sys.argv[1], 'wb').write(serialize_message(message))
+print(message.header.stamp.sec, message.header.stamp.nanosec, message.header.frame_id)
+print(message.height, message.width, message.point_step, message.row_step)
+print([(f.name, f.offset, f.datatype, f.count) for f in message.fields])
+"""
+
+
+@pytest.mark.skipif(not importlib.util.find_spec('rclpy'), reason='library-only environment')
+def test_ros_itself_reads_the_encoded_cloud(tmp_path):
+    cloud = samples.cloud(1)
+    (tmp_path / 'raw').write_bytes(encode_cloud(cloud))
+    # In a process of its own: importing rclpy may restart the interpreter.
+    done = subprocess.run(
+        [sys.executable, '-c', ROS_ROUND_TRIP, str(tmp_path / 'raw')],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == [
+        '{} {} {}'.format(*cloud.stamp, cloud.frame_id),
+        f'{cloud.height} {cloud.width} {cloud.point_step} {cloud.row_step}',
+        str([dataclasses.astuple(field) for field in cloud.fields]),
+    ]
+    assert_same_cloud(decode_cloud((tmp_path / 'raw').read_bytes()), cloud)
+
+
+def test_select_keeps_header_fields_and_bytes():
+    cloud = samples.cloud(2)
+    mask = np.isfinite(cloud.xyz()).all(axis=1)
+    kept = decode_cloud(encode_cloud(cloud.select(mask)))
+    assert (kept.stamp, kept.frame_id, kept.fields) == (cloud.stamp, cloud.frame_id, cloud.fields)
+    assert (kept.height, kept.width, kept.point_step) == (1, mask.sum(), cloud.point_step)
+    np.testing.assert_array_equal(
+        kept.data.reshape(-1, cloud.point_step), cloud.data.reshape(-1, cloud.point_step)[mask]
+    )
+    assert kept.is_dense
+    assert not cloud.select(~mask).is_dense
+
+
+def test_cloud_from_columns_is_packed_and_typed():
+    points = samples.scan(1)
+    label = np.arange(len(points), dtype=np.uint32)
+    cloud = cloud_from_columns(
+        (5, 6), 'lidar', {'x': points[:, 0], 'y': points[:, 1], 'z': points[:, 2], 'label': label}
+    )
+    assert [(f.name, f.offset, f.datatype) for f in cloud.fields] == [
+        ('x', 0, 7), ('y', 4, 7), ('z', 8, 7), ('label', 12, 6),
+    ]  # fmt: skip
+    np.testing.assert_array_equal(cloud.xyz(), points[:, :3])
+    np.testing.assert_array_equal(
+        cloud.data.reshape(-1, 16)[:, 12:].copy().view('<u4')[:, 0], label
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 400), st.binary(max_size=8))
+def test_bytes_that_are_no_cloud_are_refused_or_read(length, junk):
+    raw = encode_cloud(samples.cloud(0, n_ground=5, n_wall=1))
+    damaged = raw[:length] + junk
+    said = error_of(PointCloudError, decode_cloud, damaged)
+    assert said is None or f'{len(damaged)} bytes that are no {POINT_CLOUD2}' in said
+
+
+# --- reading what we write ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(('name', 'storage'), SHAPES)
+def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
+    path = tmp_path / name
+    written = samples.write_ros2_bag(path, storage=storage)
+    assert is_bag(path)
+    with open_bag(path) as bag:
+        assert bag.topics == {'/points': POINT_CLOUD2, '/note': 'std_msgs/msg/String'}
+        assert bag.n_messages('/points') == 3
+        assert bag.pick_point_cloud_topic() == '/points'
+        assert bag.storage == resolve_storage(path, storage)
+        assert list(bag.messages()) == written
+        assert list(bag.messages(['/note'])) == written[::2]
+        assert list(bag.messages([])) == []
+
+
+@pytest.mark.parametrize(('name', 'storage'), SHAPES)
+def test_rosbags_accepts_definitions_and_hashes(tmp_path, name, storage):
+    samples.write_ros2_bag(tmp_path / name, storage=storage)
+    # AnyReader compares the stored hash of each type with that of the stored definition.
+    with AnyReader([tmp_path / name]) as bag:
+        assert bag.message_count == 6
+        (connection,) = [c for c in bag.connections if c.topic == '/points']
+        (profile,) = connection.ext.offered_qos_profiles
+        assert profile.reliability is QosReliability.RELIABLE
+        *_, raw = next(bag.messages([connection]))
+        assert bag.deserialize(raw, POINT_CLOUD2).header.frame_id == 'velo_link'
+
+
+def test_folder_is_named_as_its_file_says(tmp_path):
+    samples.write_ros2_bag(tmp_path / 'drive')
+    assert sorted(p.name for p in (tmp_path / 'drive').iterdir()) == [
+        'drive.mcap',
+        'metadata.yaml',
+    ]
+    assert is_bag_folder(tmp_path / 'drive')
+    assert 'partial' not in (tmp_path / 'drive' / 'metadata.yaml').read_text()
+
+
+def test_topics_copied_from_bag_to_bag_keep_definition_and_qos(tmp_path):
+    samples.write_ros2_bag(tmp_path / 'a.mcap')
+    with open_bag(tmp_path / 'a.mcap') as source, BagWriter(tmp_path / 'b.db3') as copy:
+        originals = [source.topic(name) for name in source.topics]
+        for topic in originals:
+            copy.add_topic(topic)
+        for message in source.messages():
+            copy.write(*message)
+    with open_bag(tmp_path / 'b.db3') as bag:
+        assert [bag.topic(name) for name in bag.topics] == originals
+
+
+def old_sqlite_bag(path, types):
+    """A bag of Foxy's time: no definitions, no hashes."""
+    with sqlite3.connect(path) as connection:
+        connection.executescript(
+            'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL,'
+            ' serialization_format TEXT NOT NULL, offered_qos_profiles TEXT NOT NULL);'
+            'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER NOT NULL,'
+            ' timestamp INTEGER NOT NULL, data BLOB NOT NULL);'
+        )
+        for k, (name, (msgtype, raw)) in enumerate(types.items()):
+            connection.execute('INSERT INTO topics VALUES(?, ?, ?, "cdr", "")', (k, name, msgtype))
+            connection.execute('INSERT INTO messages VALUES(?, ?, ?, ?)', (k, k, 1000 + k, raw))
+    connection.close()
+
+
+def test_bags_without_definitions_are_read_and_copied(tmp_path):
+    raw = encode_cloud(samples.cloud(0))
+    contents = {'/points': (POINT_CLOUD2, raw), '/secret': ('my_msgs/msg/Unheard', b'\0\1\0\0abc')}
+    old_sqlite_bag(tmp_path / 'old.db3', contents)
+    with open_bag(tmp_path / 'old.db3') as old, BagWriter(tmp_path / 'new') as new:
+        assert 'MSG: sensor_msgs/PointField' in old.topic('/points').definition
+        assert old.topic('/secret').definition == ''
+        for name in old.topics:
+            new.add_topic(old.topic(name))
+        for message in old.messages():
+            new.write(*message)
+    expected = [('/points', 1000, raw), ('/secret', 1001, b'\0\1\0\0abc')]
+    assert read_all(tmp_path / 'new') == expected
+
+
+# --- ROS 1 --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope='module')
+def ros1_bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp('ros1') / 'drive.bag'
+    samples.write_ros1_bag(path)
+    return path
+
+
+def test_ros1_clouds_are_the_same_in_ros2(ros1_bag):
+    with open_bag(ros1_bag) as bag:
+        assert bag.storage == 'ros1'
+        topic = bag.pick_point_cloud_topic()
+        assert topic == '/kitti/velo/pointcloud'
+        messages = list(bag.messages([topic]))
+    assert [time for _, time, _ in messages] == [
+        samples.START + k * samples.PERIOD for k in range(3)
+    ]
+    for k, (_, _, raw) in enumerate(messages):
+        assert raw == encode_cloud(samples.cloud(k))
+
+
+def test_ros1_order_and_merged_publishers(ros1_bag):
+    with open_bag(ros1_bag) as bag:
+        messages = list(bag.messages())
+        assert bag.n_messages('/text') == 6
+        # One of the two publishers latches.
+        assert [q.durability.name for q in bag.topic('/text').qos] == ['TRANSIENT_LOCAL']
+    assert [name for name, *_ in messages] == 3 * [
+        '/kitti/velo/pointcloud', '/odd', '/text', '/text', '/range',
+    ]  # fmt: skip
+    assert [time for _, time, _ in messages] == sorted(time for _, time, _ in messages)
+
+
+def test_ros1_types_unknown_to_ros2_are_carried_over(ros1_bag):
+    with open_bag(ros1_bag) as bag:
+        topic = bag.topic('/odd')
+        messages = [raw for _, _, raw in bag.messages(['/odd'])]
+    types = get_typestore(Stores.EMPTY)
+    types.register(get_types_from_msg(topic.definition, topic.msgtype))
+    assert topic.type_hash == types.hash_rihs01(topic.msgtype)
+    for k, raw in enumerate(messages):
+        message = types.deserialize_cdr(raw, topic.msgtype)
+        assert message.header.frame_id == 'velo_link'
+        assert not hasattr(message.header, 'seq')
+        assert (message.when.sec, message.when.nanosec, message.value) == (k, 5, k / 3)
+        np.testing.assert_array_equal(message.bytes, np.arange(k))
+
+
+def test_ros1_type_that_ros2_changed_is_migrated_and_said(ros1_bag):
+    types = get_typestore(Stores.ROS2_JAZZY)
+    with open_bag(ros1_bag) as bag:
+        assert bag.migrated_topics == ['/range']
+        for k, (_, _, raw) in enumerate(bag.messages(['/range'])):
+            message = types.deserialize_cdr(raw, 'sensor_msgs/msg/Range')
+            assert (message.range, message.variance) == (1.0 + k, 0.0)
+
+
+def test_ros1_definition_that_cannot_be_parsed_concerns_its_topic_only(tmp_path, ros1_bag):
+    text = ros1_bag.read_bytes()
+    assert text.count(b'float64 value') >= 1
+    broken = tmp_path / 'broken.bag'
+    broken.write_bytes(text.replace(b'float64 value', b'float64 **** '))
+    with open_bag(broken) as bag:
+        assert len(list(bag.messages(['/kitti/velo/pointcloud', '/range']))) == 6
+        with pytest.raises(
+            DataError, match=r'topic /odd .*cannot be converted from ROS 1'
+        ) as error:
+            next(bag.messages())
+        assert one_line(error)
+
+
+# --- choosing a topic ---------------------------------------------------------------------
+
+
+def test_several_cloud_topics_are_listed(tmp_path):
+    samples.write_ros2_bag(tmp_path / 'two', topics=('/front', '/rear'))
+    with open_bag(tmp_path / 'two') as bag:
+        assert bag.point_cloud_topics == ['/front', '/rear']
+        with pytest.raises(DataError, match=r'2 .*PointCloud2 topics, choose one.*/front, /rear'):
+            bag.pick_point_cloud_topic()
+        assert bag.pick_point_cloud_topic('/rear') == '/rear'
+        with pytest.raises(DataError, match=r'no topic /left; topics here: /front \(sensor_msgs'):
+            bag.pick_point_cloud_topic('/left')
+        with pytest.raises(DataError, match=r'/note is of type std_msgs/msg/String, must be'):
+            bag.pick_point_cloud_topic('/note')
+        with pytest.raises(DataError, match=r'no topic /left'):
+            list(bag.messages(['/left']))
+
+
+def test_bag_without_clouds(tmp_path):
+    with BagWriter(tmp_path / 'none.mcap') as bag:
+        bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
+        bag.write('/note', 5, samples.string_message('hello'))
+    with open_bag(tmp_path / 'none.mcap') as bag:
+        said = error_of(DataError, bag.pick_point_cloud_topic)
+    assert f'no {POINT_CLOUD2} topic; topics here: /note (std_msgs/msg/String)' in said
+
+
+@pytest.mark.parametrize(('name', 'storage'), SHAPES)
+def test_topic_without_messages(tmp_path, name, storage):
+    with BagWriter(tmp_path / name, storage=storage) as bag:
+        bag.add_topic(cloud_topic('/silent'))
+        bag.add_topic(cloud_topic('/points'))
+        bag.write('/points', 5, encode_cloud(samples.cloud()))
+    with open_bag(tmp_path / name) as bag:
+        # A topic that was never published on does not make the choice unclear.
+        assert bag.pick_point_cloud_topic() == '/points'
+        with pytest.raises(DataError, match='no message on /silent'):
+            bag.pick_point_cloud_topic('/silent')
+
+
+# --- damaged and missing bags -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ('name', 'content', 'message'),
+    [
+        ('missing.mcap', None, 'no such file or folder'),
+        ('notes.txt', b'hello', r'not a bag; accepted are ROS 1 \.bag, \.mcap, \.db3'),
+        ('empty.mcap', b'', 'cannot be read as a bag: .*empty'),
+        ('empty.bag', b'', 'cannot be read as a bag: .*empty'),
+        ('empty.db3', b'', 'cannot be read as a bag'),
+        ('text.mcap', b'hello', 'cannot be read as a bag'),
+        ('text.bag', b'hello', 'cannot be read as a bag'),
+        ('text.db3', b'hello', 'cannot be read as a bag'),
+    ],
+)
+def test_what_is_no_bag_is_refused_in_one_line(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(DataError, match=message) as error:
+        open_bag(tmp_path / name)
+    assert str(tmp_path / name) in str(error.value)
+    assert one_line(error)
+
+
+def test_folder_without_metadata_names_the_files(tmp_path):
+    samples.write_ros2_bag(tmp_path / 'drive')
+    (tmp_path / 'drive' / 'metadata.yaml').unlink()
+    with pytest.raises(DataError, match=r'no metadata\.yaml in it\).*one by one: drive\.mcap'):
+        open_bag(tmp_path / 'drive')
+
+
+@pytest.mark.parametrize('text', ['', 'a: [', 'rosbag2_bagfile_information: {version: 9}', '- 1'])
+def test_bad_metadata(tmp_path, text):
+    samples.write_ros2_bag(tmp_path / 'drive')
+    (tmp_path / 'drive' / 'metadata.yaml').write_text(text)
+    with pytest.raises(DataError, match='cannot be read as a bag') as error:
+        open_bag(tmp_path / 'drive')
+    assert one_line(error)
+
+
+def test_messages_missing_from_a_bag_are_noticed(tmp_path):
+    samples.write_ros2_bag(tmp_path / 'drive', storage='sqlite3')
+    with sqlite3.connect(tmp_path / 'drive' / 'drive.db3') as connection:
+        connection.execute('DELETE FROM messages WHERE id = 4')
+    connection.close()
+    with pytest.raises(DataError, match='topic /points lists 3 messages, 2 could be read'):
+        read_all(tmp_path / 'drive')
+
+
+def test_unmerged_journal_is_noticed(tmp_path):
+    samples.write_ros2_bag(tmp_path / 'drive.db3')
+    (tmp_path / 'drive.db3-wal').write_bytes(b'left by a crash')
+    with pytest.raises(DataError, match=r'was not closed, some of it is in drive\.db3-wal'):
+        open_bag(tmp_path / 'drive.db3')
+
+
+@pytest.fixture(scope='module')
+def small_bags(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('small')
+    for name in ('drive.mcap', 'drive.db3'):
+        samples.write_ros2_bag(folder / name, n_clouds=2, n_ground=20, n_wall=5)
+    samples.write_ros1_bag(folder / 'drive.bag', n_clouds=1)
+    return folder
+
+
+@pytest.mark.parametrize('name', ['drive.mcap', 'drive.db3', 'drive.bag'])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_truncated_bag_is_refused_or_still_whole(small_bags, tmp_path, name, data):
+    whole = (small_bags / name).read_bytes()
+    length = data.draw(st.integers(0, len(whole) - 1))
+    damaged = tmp_path / name
+    damaged.write_bytes(whole[:length])
+    said = error_of(DataError, read_all, damaged)
+    if said is None:
+        assert read_all(damaged) == read_all(small_bags / name)
+    else:
+        assert '\n' not in said
+
+
+@pytest.mark.parametrize('name', ['drive.mcap', 'drive.db3', 'drive.bag'])
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_overwritten_bytes_never_end_in_a_traceback(small_bags, tmp_path, name, data):
+    content = bytearray((small_bags / name).read_bytes())
+    start = data.draw(st.integers(0, len(content) - 1))
+    junk = data.draw(st.binary(min_size=1, max_size=16))
+    content[start : start + len(junk)] = junk
+    (tmp_path / name).write_bytes(content)
+    said = error_of(DataError, read_all, tmp_path / name)
+    assert said is None or '\n' not in said
+
+
+def test_errors_of_the_caller_pass_unchanged(tmp_path):
+    samples.write_ros2_bag(tmp_path / 'drive')
+
+    def fail_on_first_message():
+        with open_bag(tmp_path / 'drive') as bag:
+            for _ in bag.messages():
+                raise KeyError('mine')
+
+    with pytest.raises(KeyError, match='mine'):
+        fail_on_first_message()
+
+
+# --- writing whole or not at all ----------------------------------------------------------
+
+
+def listing(folder):
+    return sorted(path.name for path in folder.rglob('*'))
+
+
+@pytest.mark.parametrize(('name', 'storage'), SHAPES)
+def test_existing_bag_is_replaced_only_with_force(tmp_path, name, storage):
+    path = tmp_path / name
+    before = samples.write_ros2_bag(path, storage=storage)
+    with pytest.raises(DataError, match='exists already; --force replaces it'):
+        BagWriter(path, storage=storage).__enter__()
+    assert read_all(path) == before
+    with BagWriter(path, storage=storage, force=True) as bag:
+        bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
+        bag.write('/note', 1, samples.string_message('new'))
+        # Until the new one is complete, the old one is there.
+        assert read_all(path) == before
+    assert read_all(path) == [('/note', 1, samples.string_message('new'))]
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize('force', [False, True])
+@pytest.mark.parametrize(('name', 'storage'), SHAPES)
+def test_after_an_error_nothing_is_left_and_nothing_is_lost(tmp_path, name, storage, force):
+    path = tmp_path / name
+    before = samples.write_ros2_bag(path, storage=storage) if force else None
+    files = listing(tmp_path)
+
+    def fail_in_the_middle():
+        with BagWriter(path, storage=storage, force=force) as bag:
+            bag.add_topic(cloud_topic('/points'))
+            bag.write('/points', 5, encode_cloud(samples.cloud()))
+            assert leftovers(path)
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail_in_the_middle()
+    assert listing(tmp_path) == files
+    assert not leftovers(path)
+    if force:
+        assert read_all(path) == before
+
+
+def test_force_never_replaces_what_is_no_bag(tmp_path):
+    home = tmp_path / 'home'
+    home.mkdir()
+    (home / 'thesis.tex').write_text('years of work')
+    (home / 'metadata.yaml').write_text('')
+    file = tmp_path / 'file'
+    file.write_text('notes')
+    folder = tmp_path / 'folder.mcap'
+    folder.mkdir()
+    for path in (home, file, folder):
+        with pytest.raises(DataError, match='not replaced'):
+            BagWriter(path, force=True).__enter__()
+    assert (home / 'thesis.tex').read_text() == 'years of work'
+    assert file.read_text() == 'notes'
+    assert folder.is_dir()
+
+
+def test_output_that_appeared_meanwhile_is_kept(tmp_path):
+    def write(path):
+        with BagWriter(path) as bag:
+            bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
+            path.write_text("another process's")
+
+    for name in ('drive', 'drive.mcap'):
+        with pytest.raises(DataError, match='exists already'):
+            write(tmp_path / name)
+        assert (tmp_path / name).read_text() == "another process's"
+
+
+@pytest.mark.parametrize(
+    ('name', 'storage', 'message'),
+    [
+        ('a.mcap', 'sqlite3', r'ends in \.mcap, which is not sqlite3 \(\.db3\)'),
+        ('a.db3', 'mcap', r'ends in \.db3, which is not mcap'),
+        ('a.bag', None, 'only ROS 2 bags are written'),
+        ('a#1', 'sqlite3', 'sqlite3 bag cannot have # in its path'),
+        ('100%.db3', None, 'sqlite3 bag cannot have % in its path'),
+        ('no/such/folder.mcap', None, 'the folder .*no/such does not exist'),
+    ],
+)
+def test_impossible_output_is_refused(tmp_path, name, storage, message):
+    with pytest.raises(DataError, match=message), BagWriter(tmp_path / name, storage=storage):
+        pass
+    assert listing(tmp_path) == []
+
+
+def test_sqlite_bag_whose_path_is_no_uri_is_not_mixed_up(tmp_path):
+    samples.write_ros2_bag(tmp_path / 'a.db3')
+    shutil.copy(tmp_path / 'a.db3', tmp_path / 'a.db3#2.db3')
+    with pytest.raises(DataError, match='cannot have # in its path'):
+        open_bag(tmp_path / 'a.db3#2.db3')
+
+
+@pytest.mark.parametrize('name', ['a#1?.mcap', 'a [x]', 'ä ö'])
+def test_unusual_names_work_with_mcap(tmp_path, name):
+    written = samples.write_ros2_bag(tmp_path / name)
+    assert read_all(tmp_path / name) == written
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    (tmp_path / f'.{name}.partial-1').mkdir()
+    assert [p.name for p in leftovers(tmp_path / name)] == [f'.{name}.partial-1']
+
+
+def test_topic_declared_twice(tmp_path):
+    with BagWriter(tmp_path / 'x') as bag:
+        bag.add_topic(cloud_topic('/a'))
+        with pytest.raises(DataError, match='topic /a twice'):
+            bag.add_topic(cloud_topic('/a'))
+
+
+def test_two_types_on_one_topic_are_refused(tmp_path):
+    with BagWriter(tmp_path / 'x.mcap') as bag:
+        bag.add_topic(cloud_topic('/same'))
+        bag.add_topic(jazzy_topic('/diff', 'std_msgs/msg/String'))
+        bag.write('/same', 1, encode_cloud(samples.cloud(n_ground=1, n_wall=1)))
+        bag.write('/diff', 2, samples.string_message('x'))
+    content = (tmp_path / 'x.mcap').read_bytes()
+    (tmp_path / 'y.mcap').write_bytes(content.replace(b'/diff', b'/same'))
+    with pytest.raises(DataError, match='topic /same has messages of two types'):
+        open_bag(tmp_path / 'y.mcap')
+
+
+def test_files_into_an_existing_folder_leave_the_others(tmp_path):
+    (tmp_path / 'labels').mkdir()
+    (tmp_path / 'labels' / 'mine').write_text('kept')
+    with staged_files(tmp_path / 'labels', ['a', 'b'], force=False) as folder:
+        (folder / 'a').write_text('1')
+        assert listing(tmp_path / 'labels') == ['mine']
+        (folder / 'b').write_text('2')
+    assert listing(tmp_path / 'labels') == ['a', 'b', 'mine']
+    with (
+        pytest.raises(DataError, match=r'labels/b: exists already \(1 of 2 files to write do\)'),
+        staged_files(tmp_path / 'labels', ['b', 'c'], force=False),
+    ):
+        pass
+    with staged_files(tmp_path / 'labels', ['b'], force=True) as folder:
+        (folder / 'b').write_text('3')
+    assert (tmp_path / 'labels' / 'b').read_text() == '3'
+    assert (tmp_path / 'labels' / 'mine').read_text() == 'kept'
+
+
+def test_unwritable_folder_is_said(tmp_path):
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(DataError, match='does not exist'), BagWriter(tmp_path / 'file' / 'bag'):
+        pass
+
+
+def test_bag_topic_and_reader_are_what_is_exported():
+    assert BagTopic('/a', 'b', 'c', 'd').encoding == 'cdr'
+    assert isinstance(BagReader, type)
+
+
+def test_without_rosbags_the_error_says_what_to_install(tmp_path):
+    samples.write_ros2_bag(tmp_path / 'drive.mcap')
+    code = (
+        'import sys\n'
+        'sys.modules["rosbags"] = None\n'
+        'from gp_ground_seg.datasets import bags\n'
+        'from gp_ground_seg.errors import MissingDependencyError\n'
+        'for call in (bags.open_bag, bags.BagWriter, bags.decode_cloud):\n'
+        '    try:\n'
+        '        call(sys.argv[1])\n'
+        '    except MissingDependencyError as error:\n'
+        '        print(error)\n'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code, str(tmp_path / 'drive.mcap')],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.count("pip install 'gp_ground_seg[bags]'") == 3
