@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,7 +62,7 @@ def list_frames(root: str | Path, sequence: str) -> list[Frame]:
     Raises
     ------
     DataError
-        If the sequence is missing or empty, or times.txt has too few lines.
+        If the sequence is missing or empty, or times.txt does not fit it.
     """
     folder = Path(root) / 'sequences' / sequence
     if not (folder / 'velodyne').is_dir():
@@ -83,14 +84,22 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
     if not path.exists():
         return [FRAME_PERIOD * k for k in range(len(frames))]
     try:
-        lines = [float(line) for line in path.read_text(encoding='utf-8').split()]
-        return [lines[int(frame.stem)] for frame in frames]
+        lines = [float(word) for word in path.read_text(encoding='utf-8').split()]
+    except OSError as error:
+        raise DataError(f'{path}: {error.strerror or error}') from error
     except ValueError as error:
         raise DataError(f'{path}: {error}') from error
-    except IndexError as error:
-        raise DataError(
-            f'{path}: {len(lines)} times, too few for frame {frames[-1].stem}'
-        ) from error
+    times: list[float] = []
+    for frame in frames:
+        if not frame.stem.isdecimal():
+            raise DataError(f'{frame}: the name must be a number, that of its line in {path.name}')
+        if int(frame.stem) >= len(lines):
+            raise DataError(f'{path}: {len(lines)} times, too few for frame {frame.stem}')
+        time = lines[int(frame.stem)]
+        if not math.isfinite(time) or (times and time <= times[-1]):
+            raise DataError(f'{path}: {time:g} s of frame {frame.stem}: times must increase')
+        times.append(time)
+    return times
 
 
 def read_points(path: str | Path) -> npt.NDArray[np.float32]:
@@ -125,7 +134,9 @@ def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
     """
     data = _read_bytes(path)
     if len(data) != 4 * n_points:
-        raise DataError(f'{path}: {len(data)} bytes, expected {4 * n_points} for {n_points} points')
+        raise DataError(
+            f'{path}: {len(data)} bytes, expected {4 * n_points} for {n_points} points'
+        )
     return (np.frombuffer(data, dtype='<u4') & 0xFFFF).astype(np.uint16)
 
 

@@ -1,0 +1,154 @@
+"""SemanticKITTI folders: what is read, and what is refused."""
+
+import numpy as np
+import pytest
+from evaluation_samples import real_kitti, street, write_frame, write_streets
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from gp_ground_seg.datasets.semantic_kitti import (
+    FRAME_PERIOD,
+    list_frames,
+    list_sequences,
+    read_labels,
+    read_points,
+)
+from gp_ground_seg.errors import DataError
+
+FLOATS = st.floats(width=32, allow_nan=True, allow_infinity=True)
+
+
+@given(hnp.arrays('<f4', st.tuples(st.integers(0, 20), st.just(4)), elements=FLOATS))
+def test_points_come_back_bit_for_bit(tmp_path_factory, points):
+    path = tmp_path_factory.mktemp('points') / 'a.bin'
+    path.write_bytes(points.tobytes())
+    read = read_points(path)
+    assert read.dtype == np.float32
+    assert read.shape == points.shape
+    assert read.tobytes() == points.tobytes()
+    assert read.flags.writeable
+
+
+@given(hnp.arrays('<u4', st.integers(0, 20)))
+def test_labels_are_the_lower_half(tmp_path_factory, entries):
+    path = tmp_path_factory.mktemp('labels') / 'a.label'
+    path.write_bytes(entries.tobytes())
+    assert read_labels(path, len(entries)).tolist() == [int(entry) % 65536 for entry in entries]
+
+
+@pytest.mark.parametrize('n_bytes', [1, 15, 17, 100])
+def test_a_truncated_scan_is_refused(tmp_path, n_bytes):
+    path = tmp_path / 'a.bin'
+    path.write_bytes(bytes(n_bytes))
+    with pytest.raises(DataError, match=rf'a\.bin: {n_bytes} bytes is not a whole number'):
+        read_points(path)
+
+
+@pytest.mark.parametrize('n_points', [0, 4, 6])
+def test_labels_of_another_scan_are_refused(tmp_path, n_points):
+    path = tmp_path / 'a.label'
+    path.write_bytes(bytes(20))
+    with pytest.raises(DataError, match=f'20 bytes, expected {4 * n_points} for {n_points}'):
+        read_labels(path, n_points)
+
+
+@pytest.mark.parametrize('name', ['missing.bin', ''])
+def test_a_file_that_cannot_be_read_is_named(tmp_path, name):
+    with pytest.raises(DataError, match=str(tmp_path / name)):
+        read_points(tmp_path / name)
+    with pytest.raises(DataError, match=str(tmp_path / name)):
+        read_labels(tmp_path / name, 0)
+
+
+def test_sequences_are_sorted_and_need_scans(tmp_path):
+    write_streets(tmp_path, s08=1, s00=1, s10=1)
+    (tmp_path / 'sequences' / '03').mkdir()
+    (tmp_path / 'sequences' / 'notes.txt').write_text('')
+    assert list_sequences(tmp_path) == ['00', '08', '10']
+    assert list_sequences(str(tmp_path)) == ['00', '08', '10']
+
+
+@pytest.mark.parametrize('name', ['', 'missing'])
+def test_a_root_without_sequences_is_refused(tmp_path, name):
+    with pytest.raises(DataError, match='no sequences/'):
+        list_sequences(tmp_path / name)
+    with pytest.raises(DataError, match='no sequences/'):
+        list_frames(tmp_path / name, '00')
+
+
+def test_frames_in_order_with_and_without_labels(tmp_path):
+    points, semantic = street()
+    for index in (10, 2, 1):
+        write_frame(tmp_path, '00', index, points, semantic if index != 2 else None)
+    frames = list_frames(tmp_path, '00')
+    assert [frame.index for frame in frames] == ['000001', '000002', '000010']
+    assert [frame.labels_path is not None for frame in frames] == [True, False, True]
+    assert all(frame.sequence == '00' for frame in frames)
+    assert frames[0].points_path.read_bytes() == points.tobytes()
+
+
+def test_times_belong_to_the_numbers_of_the_files(tmp_path):
+    for index in (1, 3):
+        write_frame(tmp_path, '00', index, street()[0])
+    times = tmp_path / 'sequences/00/times.txt'
+    times.write_text('0.000000e+00\n1.036e-01\n2.1e-01\n3.2e-01\n')
+    assert [frame.time for frame in list_frames(tmp_path, '00')] == [0.1036, 0.32]
+
+
+def test_times_without_a_file_are_at_ten_hertz(tmp_path):
+    write_streets(tmp_path, s00=3)
+    times = [frame.time for frame in list_frames(tmp_path, '00')]
+    assert times == pytest.approx([0.0, FRAME_PERIOD, 2 * FRAME_PERIOD])
+
+
+@pytest.mark.parametrize(
+    ('content', 'message'),
+    [
+        (b'0.0\n0.1\n', '2 times, too few for frame 000002'),
+        (b'', '0 times, too few'),
+        (b'0.0\nnow\n0.2\n', 'now'),
+        (b'0.0\nnan\n0.2\n', 'nan'),
+        (b'0.0 0.2 0.1', '0.1'),
+        (b'\xff\xfe', r'times\.txt'),
+        (None, r'times\.txt'),
+    ],
+)
+def test_times_that_cannot_be_used_are_refused(tmp_path, content, message):
+    write_streets(tmp_path, s00=3)
+    path = tmp_path / 'sequences/00/times.txt'
+    path.mkdir() if content is None else path.write_bytes(content)
+    with pytest.raises(DataError, match=message) as caught:
+        list_frames(tmp_path, '00')
+    assert str(caught.value).startswith(str(path))
+
+
+def test_scans_without_numbers_cannot_have_times(tmp_path):
+    write_streets(tmp_path, s00=1)
+    folder = tmp_path / 'sequences/00'
+    (folder / 'velodyne/000000.bin').rename(folder / 'velodyne/first.bin')
+    assert [frame.time for frame in list_frames(tmp_path, '00')] == [0.0]
+    (folder / 'times.txt').write_text('0.0\n')
+    with pytest.raises(DataError, match=r'first\.bin.*number'):
+        list_frames(tmp_path, '00')
+
+
+def test_an_unknown_or_empty_sequence_is_refused(tmp_path):
+    write_streets(tmp_path, s00=1, s08=1)
+    with pytest.raises(DataError, match='sequences here: 00, 08'):
+        list_frames(tmp_path, '01')
+    (tmp_path / 'sequences/00/velodyne/000000.bin').unlink()
+    with pytest.raises(DataError, match=r'no \.bin file'):
+        list_frames(tmp_path, '00')
+
+
+def test_real_frames():
+    root = real_kitti()
+    sequence = list_sequences(root)[0]
+    frame = list_frames(root, sequence)[0]
+    points = read_points(frame.points_path)
+    assert 100_000 < len(points) < 140_000
+    assert np.isfinite(points).all()
+    assert np.linalg.norm(points[:, :3], axis=1).max() < 130.0
+    semantic = read_labels(frame.labels_path, len(points))
+    assert np.median(points[semantic == 40, 2]) == pytest.approx(-1.73, abs=0.15)
