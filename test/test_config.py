@@ -1,0 +1,344 @@
+"""The contract of the configuration: what is accepted, what is refused, and how it is said."""
+
+import copy
+import dataclasses
+import math
+import pickle
+import re
+
+import numpy as np
+import pytest
+import yaml
+from config_samples import accepted_values, configs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gp_ground_seg import Config, ConfigError, GroundSegError
+from gp_ground_seg.config import find_spec, parameter_specs
+
+SPECS = parameter_specs()
+NUMBERS = [spec for spec in SPECS if spec.type in (int, float)]
+FLOATS = [spec for spec in SPECS if spec.type is float]
+INTEGERS = [spec for spec in SPECS if spec.type is int]
+STRINGS = [spec for spec in SPECS if spec.type is str]
+
+
+def by_name(spec):
+    return spec.name
+
+
+@pytest.fixture
+def from_text(tmp_path):
+    """Configuration read from a file of this text."""
+
+    def read(text):
+        path = tmp_path / 'parameters.yaml'
+        path.write_text(text, encoding='utf-8')
+        return Config.from_yaml(path)
+
+    return read
+
+
+# The declarations themselves
+
+
+@pytest.mark.parametrize('spec', SPECS, ids=by_name)
+def test_declarations_are_complete(spec):
+    assert re.fullmatch(r'[a-z_]+\.[a-z_]+', spec.name)
+    assert spec.description
+    assert '\n' not in spec.description
+    assert spec.type in (bool, int, float, str)
+    if spec.type in (int, float):
+        assert math.isfinite(spec.minimum)
+        assert math.isfinite(spec.maximum)
+        assert spec.minimum < spec.maximum
+        assert spec.choices == ()
+    elif spec.type is str:
+        assert spec.choices
+    default = spec.check(spec.default)
+    assert default == spec.default
+    assert type(default) is spec.type
+
+
+def test_names_that_other_tools_rely_on():
+    defaults = Config().flat()
+    assert isinstance(defaults['label.ground_tolerance'], float)
+    assert defaults['learning.mode'] in find_spec('learning.mode').choices
+    assert 'fixed' in find_spec('learning.mode').choices
+    assert 'sensor.height' in defaults
+    assert defaults['runtime.n_threads'] == 0
+    assert len(defaults) == len(SPECS) == len({spec.name for spec in SPECS})
+
+
+# Single values
+
+
+@pytest.mark.parametrize('spec', NUMBERS, ids=by_name)
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, True, False, '1', None, [1]])
+def test_numbers_refuse_what_is_none(spec, value):
+    with pytest.raises(ConfigError, match=re.escape(spec.name)):
+        Config().replace(**{spec.name: value})
+
+
+@pytest.mark.parametrize('spec', NUMBERS, ids=by_name)
+def test_ranges_include_their_ends_only(spec):
+    for end, outside in ((spec.minimum, -1), (spec.maximum, 1)):
+        end = spec.type(end)
+        assert spec.check(end) == end
+        beyond = end + outside if spec.type is int else math.nextafter(end, outside * math.inf)
+        with pytest.raises(ConfigError) as caught:
+            spec.check(beyond)
+        message = str(caught.value)
+        assert message.startswith(f'{spec.name} = {beyond!r}: must be ')
+        assert f'[{spec.minimum:g}, {spec.maximum:g}]' in message
+        assert message.endswith(spec.unit)
+    with pytest.raises(ConfigError):
+        spec.check(10**400)  # beyond what a float can hold
+
+
+@pytest.mark.parametrize('spec', INTEGERS, ids=by_name)
+def test_integers_refuse_fractions(spec):
+    with pytest.raises(ConfigError, match='an integer'):
+        spec.check(float(spec.default))
+
+
+@pytest.mark.parametrize('spec', FLOATS, ids=by_name)
+def test_whole_numbers_become_floats(spec):
+    whole = math.ceil(spec.minimum)
+    if whole <= spec.maximum:
+        assert type(spec.check(whole)) is float
+    assert type(spec.check(np.float64(spec.default))) is float
+
+
+def test_groups_given_whole_are_checked_and_converted():
+    groups = {field.name: field.default for field in dataclasses.fields(Config)}
+    label = dataclasses.replace(groups['label'], ground_tolerance=1)
+    assert type(Config(label=label).label.ground_tolerance) is float
+    assert label.ground_tolerance == 1
+    with pytest.raises(ConfigError, match=r'label\.ground_tolerance'):
+        Config(label=dataclasses.replace(groups['label'], ground_tolerance='wide'))
+
+
+@pytest.mark.parametrize('spec', STRINGS, ids=by_name)
+@pytest.mark.parametrize('value', ['', 'nonsense', 1, True, None])
+def test_strings_accept_their_choices_only(spec, value):
+    with pytest.raises(ConfigError, match='one of ' + ', '.join(spec.choices)):
+        spec.check(value)
+    for choice in spec.choices:
+        assert spec.check(choice) == choice
+        with pytest.raises(ConfigError):
+            spec.check(choice.upper())
+
+
+@given(st.sampled_from(SPECS), st.data())
+def test_check_accepts_what_is_in_range_and_keeps_it(spec, data):
+    value = data.draw(accepted_values(spec))
+    assert spec.check(value) == value
+    assert spec.check(spec.check(value)) == value
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    ('name', 'hint'),
+    [
+        ('label.ground_tolerence', 'label.ground_tolerance'),
+        ('ground_tolerance', 'label.ground_tolerance'),
+        ('Sensor.height', 'sensor.height'),
+        ('grid.rmax', 'grid.r_max'),
+    ],
+)
+def test_unknown_names_come_with_the_nearest(name, hint):
+    with pytest.raises(ConfigError, match=rf'unknown parameter .*{hint}\?'):
+        Config().replace(**{name: 1.0})
+    with pytest.raises(ConfigError, match=hint):
+        Config()[name]
+
+
+def test_names_like_nothing_have_no_hint():
+    with pytest.raises(ConfigError) as caught:
+        find_spec('qqqqqq')
+    assert 'did you mean' not in str(caught.value)
+
+
+def test_a_group_is_no_parameter():
+    with pytest.raises(ConfigError, match=r"'label' is a group of parameters: label\.ground_tol"):
+        Config().replace(label=0.2)
+
+
+# Rules between values
+
+
+@pytest.mark.parametrize(
+    ('changes', 'names'),
+    [
+        ({'grid.r_min': 30.0, 'grid.r_max': 30.0}, ('grid.r_min', 'grid.r_max')),
+        ({'grid.r_min': 30.0, 'grid.r_max': 20.0}, ('grid.r_min', 'grid.r_max')),
+        ({'length_scale.min': 60.0}, ('length_scale.min', 'length_scale.max')),
+        ({'length_scale.max': 0.06}, ('length_scale.min', 'length_scale.max')),
+    ],
+)
+def test_rules_between_values(changes, names):
+    with pytest.raises(ConfigError) as caught:
+        Config().replace(**changes)
+    for name in names:
+        assert name in str(caught.value)
+
+
+def test_rules_see_the_whole_change_at_once():
+    """Each alone would break a rule; together they keep it."""
+    config = Config().replace(**{'grid.r_min': 1.0, 'grid.r_max': 5.0})
+    moved = config.replace(**{'grid.r_min': 10.0, 'grid.r_max': 20.0})
+    assert (moved.grid.r_min, moved.grid.r_max) == (10.0, 20.0)
+    with pytest.raises(ConfigError):
+        config.replace(**{'grid.r_min': 10.0})
+
+
+# Values and copies
+
+
+def test_immutable():
+    config = Config()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.label = None
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.label.ground_tolerance = 1.0
+    config.flat()['label.ground_tolerance'] = 9.0
+    config.nested()['label']['ground_tolerance'] = 9.0
+    assert config == Config()
+    assert hash(config) == hash(Config())
+
+
+@given(configs(), configs())
+def test_replace_changes_what_is_named_and_only_in_the_copy(config, other):
+    before = config.flat()
+    assert config.replace(**other.flat()) == other
+    assert config.replace() == config
+    assert config.flat() == before
+
+
+@given(configs())
+def test_forms_agree(config):
+    flat = config.flat()
+    assert list(flat) == [spec.name for spec in SPECS]
+    assert Config.from_flat(flat) == config
+    assert {f'{g}.{f}': v for g, vs in config.nested().items() for f, v in vs.items()} == flat
+    assert all(config[name] == value for name, value in flat.items())
+    assert all(type(value) is find_spec(name).type for name, value in flat.items())
+    assert pickle.loads(pickle.dumps(config)) == config
+    assert copy.deepcopy(config) == config
+
+
+def test_a_refused_change_changes_nothing():
+    config = Config()
+    with pytest.raises(ConfigError):
+        config.replace(**{'label.ground_tolerance': 0.15, 'sensor.height': -1.0})
+    assert config == Config()
+
+
+# Files
+
+
+BARE = 'label: {ground_tolerance: 0.15}\nsensor:\n  height: 2\n'
+FORMS = {
+    'bare': BARE,
+    'dotted': 'label.ground_tolerance: 0.15\nsensor.height: 2\n',
+    'wildcard': '/**:\n  ros__parameters:\n    label: {ground_tolerance: 0.15}\n'
+    '    sensor.height: 2\n',
+    'node': 'ground:\n  ros__parameters:\n    label: {ground_tolerance: 0.15}\n'
+    '    sensor: {height: 2.0}\n',
+    'namespace': '/robot/ground:\n  ros__parameters: {label: {ground_tolerance: 0.15}, '
+    'sensor: {height: 2.0}}\n',
+    'ros extras': '/**:\n  ros__parameters:\n    use_sim_time: true\n'
+    '    qos_overrides: {/points: {subscription: {depth: 3}}}\n'
+    '    label: {ground_tolerance: 0.15}\n    sensor: {height: 2.0}\n',
+}
+
+
+@pytest.mark.parametrize('form', FORMS)
+def test_forms_of_files(from_text, form):
+    expected = Config().replace(**{'label.ground_tolerance': 0.15, 'sensor.height': 2.0})
+    assert from_text(FORMS[form]) == expected
+
+
+@pytest.mark.parametrize('text', ['', '# nothing\n', '{}', '/**:\n  ros__parameters: {}\n'])
+def test_files_without_parameters_are_the_defaults(from_text, text):
+    assert from_text(text) == Config()
+
+
+@pytest.mark.parametrize('number', ['1e-1', '1E-1', '.1', '.1e0', '1.0e-1', '10e-2', '+0.1'])
+def test_numbers_are_read_as_ros_reads_them(from_text, number):
+    assert from_text(f'label: {{ground_tolerance: {number}}}').label.ground_tolerance == 0.1
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('label: {ground_tolerence: 1.0}', 'did you mean label.ground_tolerance?'),
+        ('label: {ground_tolerance: "0.1"}', "label.ground_tolerance = '0.1': must be a number"),
+        ('label: {ground_tolerance: 99.0}', 'must be a number in [0.001, 5] m'),
+        ('label: {ground_tolerance: .nan}', 'must be a number in'),
+        ('label: {ground_tolerance: [0.1]}', 'must be a number in'),
+        ('runtime: {n_threads: 2.0}', 'must be an integer in [0, 256]'),
+        ('runtime: {n_threads: yes}', 'must be an integer in [0, 256]'),
+        ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
+        ('label:\n  # ground_tolerance: 0.1\n', "'label' is a group of parameters"),
+        ('label: {ground_tolerance: {deep: 1.0}}', 'unknown parameter'),
+        ('1: 2', "unknown parameter '1'"),
+        ('label: {ground_tolerance: 0.1, ground_tolerance: 0.2}', 'ground_tolerance: given twice'),
+        ('label: {ground_tolerance: 0.1}\nlabel: {ground_tolerance: 0.1}', 'label: given twice'),
+        ('label: {ground_tolerance: 0.1}\nlabel.ground_tolerance: 0.1', 'given twice'),
+        ('- label', 'must be a mapping'),
+        ('just words', 'must be a mapping'),
+        ('a: [', 'not valid YAML'),
+        ('label: {ground_tolerance: 2011-99-99}', 'not valid YAML'),
+        ('label: &a {ground_tolerance: *a}', 'not valid YAML'),
+        ('/**: {label: {ground_tolerance: 0.1}}', 'ros__parameters'),
+        ('/**:\n  ros__parameters: 3\n', 'ros__parameters'),
+        ('/a: {ros__parameters: {}}\n/b: {ros__parameters: {}}\n', 'parameters of 2 nodes'),
+        ('a: {ros__parameters: {}}\nlabel: {ground_tolerance: 0.1}', 'parameters of 2 nodes'),
+        ('/**: {ros__parameters: {use_sim_tme: true}}', 'unknown parameter'),
+    ],
+)
+def test_files_that_are_refused(from_text, tmp_path, text, message):
+    with pytest.raises(ConfigError) as caught:
+        from_text(text)
+    said = str(caught.value)
+    assert said.startswith(f'{tmp_path / "parameters.yaml"}: ')
+    assert message in said
+    assert '\n' not in said
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    for path, content in (('missing.yaml', None), ('', None), ('binary.yaml', b'\xff\xfe\x00')):
+        if content:
+            (tmp_path / path).write_bytes(content)
+        with pytest.raises(ConfigError) as caught:
+            Config.from_yaml(tmp_path / path)
+        assert str(caught.value).startswith(f'{tmp_path / path}: ')
+    assert issubclass(ConfigError, GroundSegError)
+
+
+YAML_ALPHABET = st.sampled_from('{}[]:,-&*!#"\'\n\t ab0.e~%@|>?<=/_\u00e9\0')
+
+
+@given(st.one_of(st.text(max_size=60), st.text(YAML_ALPHABET, max_size=30)))
+def test_any_text_is_read_or_refused(tmp_path_factory, text):
+    path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
+    path.write_text(text, encoding='utf-8', errors='replace')
+    said = f'{path}: '
+    try:
+        assert Config.from_yaml(path) == Config()
+    except ConfigError as error:
+        said = str(error)
+    assert said.startswith(f'{path}: ')
+    assert '\n' not in said
+
+
+@given(configs(), st.booleans(), st.booleans())
+def test_any_yaml_writer_will_do(tmp_path_factory, config, flow, ros):
+    path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
+    tree = {'/**': {'ros__parameters': config.nested()}} if ros else config.nested()
+    path.write_text(yaml.safe_dump(tree, default_flow_style=flow))
+    assert Config.from_yaml(path) == config

@@ -1,0 +1,170 @@
+"""Files made from the declarations equal the declarations."""
+
+import argparse
+import os
+from pathlib import Path
+
+import pytest
+import yaml
+from config_samples import configs
+from hypothesis import given
+
+from gp_ground_seg import Config
+from gp_ground_seg.cli import config as command
+from gp_ground_seg.config import parameter_specs
+from gp_ground_seg.config_export import (
+    README_BEGIN,
+    README_END,
+    replace_readme_table,
+    to_markdown_table,
+    to_yaml,
+)
+from gp_ground_seg.errors import ConfigError, DataError
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def run(*words):
+    parser = argparse.ArgumentParser()
+    command.add_parser(parser.add_subparsers(required=True))
+    arguments = parser.parse_args(['config', *(str(word) for word in words)])
+    return arguments.run(arguments)
+
+
+@given(configs())
+def test_yaml_reads_back(tmp_path_factory, config):
+    path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
+    path.write_text(to_yaml(config), encoding='utf-8')
+    assert Config.from_yaml(path) == config
+
+
+@given(configs())
+def test_yaml_has_the_types_ros_wants(config):
+    """ROS parameters are typed: 2 is not a double, and 1e-05 without a point is no number."""
+    document = yaml.safe_load(to_yaml(config))
+    assert list(document) == ['/**']
+    assert list(document['/**']) == ['ros__parameters']
+    parameters = document['/**']['ros__parameters']
+    assert parameters == config.nested()
+    for spec in parameter_specs():
+        group, name = spec.name.split('.')
+        assert type(parameters[group][name]) is spec.type
+
+
+def test_every_parameter_is_explained_above_it():
+    lines = to_yaml(Config()).splitlines()
+    assert max(len(line) for line in lines) <= 99
+    assert all(line == line.rstrip() for line in lines)
+    group = None
+    seen = []
+    for k, line in enumerate(lines):
+        if line.startswith('    ') and line[4] not in ' #':
+            group = line.strip().rstrip(':')
+        if line.startswith('      ') and line[6] != '#':
+            name = f'{group}.{line.split(":")[0].strip()}'
+            seen.append(name)
+            start = k
+            while lines[start - 1].startswith('      #'):
+                start -= 1
+            words = ' '.join(part.strip(' #') for part in lines[start:k])
+            spec = next(s for s in parameter_specs() if s.name == name)
+            assert spec.description in words
+            assert spec.unit in words
+            assert spec.symbol in words
+            expected = spec.choices or (f'{spec.minimum:.10g} to {spec.maximum:.10g}',)
+            assert all(choice in words for choice in expected)
+    assert seen == [spec.name for spec in parameter_specs()]
+
+
+def test_the_shipped_yaml_is_the_dump(capsys):
+    assert run('dump') == 0
+    shipped = (REPOSITORY / 'config' / 'ground_segmentation.yaml').read_text(encoding='utf-8')
+    assert capsys.readouterr().out == shipped, 'run: python -m gp_ground_seg config generate'
+
+
+def test_the_table_in_the_readme_is_the_table():
+    readme = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
+    assert README_BEGIN in readme
+    assert README_END in readme
+    section = readme.partition(README_BEGIN)[2].partition(README_END)[0]
+    assert section.strip() == to_markdown_table().strip(), (
+        'run: python -m gp_ground_seg config generate'
+    )
+
+
+def test_table_has_a_row_for_each_parameter(capsys):
+    assert run('table') == 0
+    header, rule, *rows = capsys.readouterr().out.splitlines()
+    assert set(rule) <= set('| -')
+    assert len(rows) == len(parameter_specs())
+    for row, spec in zip(rows, parameter_specs(), strict=True):
+        cells = row.replace(r'\|', '\0').split('|')
+        assert len(cells) == len(header.split('|'))
+        cells = [cell.strip().replace('\0', '|') for cell in cells[1:-1]]
+        assert cells[0] == f'`{spec.name}`'
+        assert yaml.safe_load(cells[1].strip('`')) == spec.default
+        assert cells[3:] == [
+            spec.unit,
+            f'`{spec.symbol}`' if spec.symbol else '',
+            spec.description,
+        ]
+
+
+def test_dump_of_a_changed_configuration_reads_back(tmp_path, capsys):
+    first = tmp_path / 'first.yaml'
+    first.write_text('label: {ground_tolerance: 0.15}\n')
+    run('dump', '--config', first, '--set', 'sensor.height=2.5')
+    second = tmp_path / 'second.yaml'
+    second.write_text(capsys.readouterr().out)
+    changes = {'label.ground_tolerance': 0.15, 'sensor.height': 2.5}
+    assert Config.from_yaml(second) == Config().replace(**changes)
+    with pytest.raises(ConfigError, match=r'sensor\.height'):
+        run('dump', '--set', 'sensor.hight=2.5')
+
+
+def test_generate_rewrites_what_is_generated_and_nothing_else(tmp_path, capsys):
+    readme = tmp_path / 'README.md'
+    head, tail = '# Title — ünïcode\r\n\r\ntext\n', '\n\nmore\n'
+    readme.write_bytes(f'{head}{README_BEGIN}\nold\n{README_END}{tail}'.encode())
+    assert run('generate', tmp_path) == 0
+    assert capsys.readouterr().out.count('rewritten') == 2
+    text = readme.read_bytes().decode()
+    assert text.startswith(f'{head}{README_BEGIN}\n')
+    assert text.endswith(f'\n{README_END}{tail}')
+    assert to_markdown_table() in text
+    assert 'old' not in text.partition(README_BEGIN)[2]
+    generated = tmp_path / 'config' / 'ground_segmentation.yaml'
+    assert generated.read_text(encoding='utf-8') == to_yaml(Config())
+
+    before = [os.stat(path).st_mtime_ns for path in (readme, generated)]
+    assert run('generate', tmp_path) == 0
+    assert capsys.readouterr().out.count('unchanged') == 2
+    assert [os.stat(path).st_mtime_ns for path in (readme, generated)] == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['README.md', 'config']
+
+
+@pytest.mark.parametrize(
+    'readme',
+    [
+        '',
+        README_BEGIN,
+        README_END,
+        f'{README_END}\n{README_BEGIN}',
+        f'{README_BEGIN}\n{README_BEGIN}\n{README_END}',
+        f'{README_BEGIN}\n{README_END}\n{README_END}',
+    ],
+)
+def test_a_readme_without_its_markers_is_refused_and_kept(tmp_path, readme):
+    with pytest.raises(DataError, match='once each'):
+        replace_readme_table(readme)
+    path = tmp_path / 'README.md'
+    path.write_text(readme)
+    with pytest.raises(DataError, match=r'README\.md'):
+        run('generate', tmp_path)
+    assert path.read_text() == readme
+
+
+def test_generate_needs_a_checkout(tmp_path):
+    with pytest.raises(DataError, match='root of a checkout'):
+        run('generate', tmp_path)
+    assert list(tmp_path.iterdir()) == []
