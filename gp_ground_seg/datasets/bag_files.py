@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -100,4 +101,5 @@ def reading(path: Path) -> Iterator[None]:
 
 def in_one_line(error: Exception) -> str:
     """Return what an error says, or its name if it says nothing."""
-    return ' '.join(str(error).split()) or type(error).__name__
+    # Some of rosbags' messages quote a whole message definition.
+    return textwrap.shorten(str(error), 200, placeholder=' ...') or type(error).__name__
