@@ -287,7 +287,7 @@ def test_damaged_bag(segment, tmp_path, capsys, name):
     file = next(path for path in (source / 'drive.mcap', source) if path.is_file())
     file.write_bytes(file.read_bytes()[:9000])
     assert segment(source) == 2
-    assert 'cannot be read as a bag' in cli_runner.error_line(capsys)
+    assert re.search('cannot be read as a bag|truncated', cli_runner.error_line(capsys))
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
@@ -510,7 +510,8 @@ def test_an_interrupted_run_cleans_up(tmp_path, long_inputs):
     code, said = stop_in_the_middle(
         tmp_path, long_inputs / 'long.mcap', tmp_path / 'out', signal.SIGINT
     )
-    assert (code, said) == (130, 'gp-ground-seg: interrupted\n')
+    # Where numba is missing, a line says so first.
+    assert (code, said.splitlines()[-1]) == (130, 'gp-ground-seg: interrupted')
     assert list(tmp_path.iterdir()) == []
 
 
@@ -530,7 +531,9 @@ def test_a_full_disk_is_one_line(tmp_path, long_inputs, source, out):
     )  # fmt: skip
     output, said = process.communicate(timeout=120)
     assert (process.returncode, output) == (2, '')
-    assert re.fullmatch(rf'gp-ground-seg: error: .*{out}.*: cannot be written: .*\n', said)
+    last_line = said.splitlines()[-1]
+    assert re.fullmatch(rf'gp-ground-seg: error: .*{out}.*: cannot be written: .*', last_line)
+    assert 'Traceback' not in said
     assert [path.name for path in tmp_path.iterdir()] == ['in']
 
 
