@@ -25,7 +25,7 @@ LONE_PERIOD = 0.1
 
 Pause = Callable[[float], None]
 """Waits for at most that long [s]."""
-Watch = Callable[[str, bytes, int], None]
+Watch = Callable[[str, bytes, int], object]
 """Told of each cloud right before it is sent: topic of the bag, bytes, system time [ns]."""
 
 
@@ -125,7 +125,7 @@ class Player:
         return [p.topic for p in self._publishers.values() if p.n_subscribers == 0]
 
     def wait_for_subscribers(self, limit: float | None = None) -> bool:
-        """Return whether all topics found a subscriber before `limit` [s]; None = wait for ever."""
+        """Return whether all topics have a subscriber within `limit` [s]; None = no limit."""
         end = None if limit is None else time.monotonic() + limit
         while self.topics_without_subscriber():
             left = SLICE if end is None else end - time.monotonic()

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+import numpy as np
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.datasets.bags import CloudMessage, decode_cloud
+from gp_ground_seg.datasets.bags import CloudMessage, decode_cloud, encode_cloud
 from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.ros.qos import cloud_profile
 from gp_ground_seg.ros.session import Session
@@ -18,9 +22,11 @@ from gp_ground_seg.ros.session import Session
 DEPTH = 50
 """Clouds that may wait while others are looked at."""
 PROBE_FRAME = 'gp_ground_seg_probe'
-"""Frame of the empty clouds that only test the connection."""
+"""Frame of the clouds that only test the connection."""
 PROBE_PERIOD = 0.2
 """Time between two of them [s]."""
+POLL_PERIOD = 0.02
+"""Longest wait for a message in one piece [s]."""
 
 
 class OutputReceiver:
@@ -49,7 +55,10 @@ class OutputReceiver:
         )
         self._session = session
         self._on_cloud = on_cloud
-        self._unanswered = set(topics)
+        self._topics = tuple(topics)
+        self._unanswered: set[str] = set()
+        self._n_probes = 0
+        self._probe_stamp = (0, 0)
         for topic in topics:
             session.node.create_subscription(
                 PointCloud2, topic, partial(self._receive, topic), profile, raw=True
@@ -77,32 +86,80 @@ class OutputReceiver:
         GroundSegError
             If a topic has not answered in time.
         """
-        node = self._session.node
-        publisher = node.create_publisher(PointCloud2, input_topic, cloud_profile())
-        probe = PointCloud2()
-        probe.header.frame_id = PROBE_FRAME
-        end = time.monotonic() + timeout
-        next_probe = 0.0
+        nothing = CloudMessage((0, 0), '', 1, 0, (), 0, 0, np.empty(0, np.uint8))
+        with self._publisher(input_topic) as publisher:
+            self._ask(publisher, nothing, PROBE_PERIOD, timeout, check)
+
+    def time_answer(
+        self, input_topic: str, cloud: CloudMessage, n_times: int, timeout: float
+    ) -> float:
+        """Return the median time until each of the topics has answered to `cloud` [s].
+
+        Parameters
+        ----------
+        input_topic : str
+            Topic the node listens to, after `connect`.
+        cloud : CloudMessage
+            What to send; in a frame of its own, so that the answer is not taken for data.
+        n_times : int
+            How often, one after the other.
+        timeout : float
+            How long to wait for an answer [s].
+
+        Raises
+        ------
+        GroundSegError
+            If a topic has not answered in time.
+        """
+        with self._publisher(input_topic) as publisher:
+            end = time.monotonic() + timeout
+            while publisher.get_subscription_count() == 0 and time.monotonic() < end:
+                self._session.spin(POLL_PERIOD)
+            times = [self._ask(publisher, cloud, timeout, timeout) for _ in range(n_times)]
+        return statistics.median(times)
+
+    @contextmanager
+    def _publisher(self, topic: str) -> Iterator[Any]:
+        publisher = self._session.node.create_publisher(PointCloud2, topic, cloud_profile())
         try:
-            while self._unanswered:
-                check()
-                now = time.monotonic()
-                if now > end:
-                    raise GroundSegError(
-                        f'no answer on {", ".join(sorted(self._unanswered))} within '
-                        f'{timeout:g} s of sending empty clouds to {input_topic}'
-                    )
-                if now > next_probe:
-                    publisher.publish(probe)
-                    next_probe = now + PROBE_PERIOD
-                self._session.spin(0.02)
+            yield publisher
         finally:
-            node.destroy_publisher(publisher)
+            self._session.node.destroy_publisher(publisher)
+
+    def _ask(
+        self,
+        publisher: Any,
+        cloud: CloudMessage,
+        period: float,
+        timeout: float,
+        check: Callable[[], None] = lambda: None,
+    ) -> float:
+        """Send a cloud every `period` [s] until answered; return how long that took [s]."""
+        self._n_probes += 1
+        self._probe_stamp = (self._n_probes, 0)
+        self._unanswered = set(self._topics)
+        raw = encode_cloud(
+            dataclasses.replace(cloud, stamp=self._probe_stamp, frame_id=PROBE_FRAME)
+        )
+        start = next_time = time.monotonic()
+        while self._unanswered:
+            check()
+            now = time.monotonic()
+            if now > start + timeout:
+                raise GroundSegError(
+                    f'no answer on {", ".join(sorted(self._unanswered))} within {timeout:g} s '
+                    f'to what was sent to {publisher.topic_name}'
+                )
+            if now >= next_time:
+                publisher.publish(raw)
+                next_time = now + period
+            self._session.spin(POLL_PERIOD)
+        return time.monotonic() - start
 
     def _receive(self, topic: str, raw: bytes, info: dict[str, Any]) -> None:
         arrival = info.get('received_timestamp') or time.time_ns()
         cloud = decode_cloud(raw)
-        if cloud.frame_id == PROBE_FRAME:
-            self._unanswered.discard(topic)
-        else:
+        if cloud.frame_id != PROBE_FRAME:
             self._on_cloud(topic, cloud, arrival)
+        elif cloud.stamp == self._probe_stamp:
+            self._unanswered.discard(topic)
