@@ -203,7 +203,7 @@ class LinesConfig:
         high=2.0,
     )
     max_density_ratio: float = _parameter(
-        20.0,
+        8.0,
         'ratio of the vertical densities of two successive bins that ends a line',
         low=1.0,
         high=1e6,
@@ -261,7 +261,7 @@ class ObservationConfig:
     """Hyper-parameters of the observation process GP_z."""
 
     sigma_f: float = _parameter(
-        0.2,
+        0.3,
         'prior standard deviation of the ground height about its mean line',
         unit='m',
         symbol='sigma_f',
@@ -269,7 +269,7 @@ class ObservationConfig:
         high=10.0,
     )
     sigma_n: float = _parameter(
-        0.07,
+        0.04,
         'standard deviation of the height noise of a ground candidate',
         unit='m',
         symbol='sigma_n',
@@ -289,14 +289,14 @@ class LatentConfig:
     """Latent process GP_l over log length-scale, and its pseudo-inputs."""
 
     sigma_f_bar: float = _parameter(
-        0.7,
+        0.9,
         'prior standard deviation of the log length-scale about its mean',
         symbol='sigma_f_bar',
         low=0.01,
         high=100.0,
     )
     sigma_l_bar: float = _parameter(
-        5.0,
+        2.0,
         'length-scale of the latent process',
         unit='m',
         symbol='sigma_l_bar',
@@ -304,7 +304,7 @@ class LatentConfig:
         high=500.0,
     )
     sigma_n_bar: float = _parameter(
-        0.3,
+        0.25,
         'standard deviation of the noise of the log length-scale',
         symbol='sigma_n_bar',
         low=0.01,
@@ -349,14 +349,14 @@ class GrowthConfig:
         high=5.0,
     )
     max_std: float = _parameter(
-        0.3,
+        0.4,
         'predictive standard deviation above which a candidate has to wait',
         unit='m',
         low=0.001,
         high=10.0,
     )
     max_standardised_residual: float = _parameter(
-        3.0,
+        2.2,
         'residual over predictive standard deviation above which a candidate is an outlier',
         low=0.1,
         high=50.0,
@@ -401,7 +401,7 @@ class LabelConfig:
         high=5.0,
     )
     obstacle_min_height: float = _parameter(
-        0.4,
+        0.5,
         'height above the surface from which a return shows that an obstacle stands in its bin',
         unit='m',
         low=0.01,

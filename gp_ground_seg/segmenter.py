@@ -138,7 +138,7 @@ class GroundSegmenter:
         self._frames_since_learning += 1
         if self._theta is not None and (keeps is None or self._frames_since_learning < keeps):
             return self._theta, []
-        started = self._clock()
+        started = self._clock() if learning.max_time > 0.0 else 0.0
 
         def out_of_time() -> bool:
             return 0.0 < learning.max_time <= self._clock() - started

@@ -52,7 +52,7 @@ class Backend(Protocol):
         """See `gp_ground_seg.gp.growth.grow_surface_reference`."""
 
     def objective(
-        self, theta: FloatArray, frame: TrainingFrame, slope_std: float, full_prior: bool
+        self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
     ) -> tuple[float, FloatArray]:
         """See `gp_ground_seg.gp.objective.objective_reference`."""
 
@@ -134,10 +134,10 @@ class ReferenceBackend:
         )
 
     def objective(
-        self, theta: FloatArray, frame: TrainingFrame, slope_std: float, full_prior: bool
+        self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
     ) -> tuple[float, FloatArray]:
         """Whole-frame objective and gradient."""
-        return objective_reference(theta, frame, slope_std, full_prior)
+        return objective_reference(theta, frame, slope_std, latent_terms)
 
     def close(self) -> None:
         """Nothing to end."""
@@ -219,7 +219,7 @@ class CompiledBackend:
         return inlier, mean, std
 
     def objective(
-        self, theta: FloatArray, frame: TrainingFrame, slope_std: float, full_prior: bool
+        self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
     ) -> tuple[float, FloatArray]:
         """Whole-frame objective and gradient."""
         values = np.empty(frame.n_segments)
@@ -236,7 +236,7 @@ class CompiledBackend:
             frame.r_bar,
             frame.surface_class,
             slope_std,
-            full_prior,
+            latent_terms,
             values,
             gradients,
         )

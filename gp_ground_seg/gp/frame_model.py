@@ -117,7 +117,7 @@ class FrameModel:
         is_map = learning.objective == 'map'
         return learn(
             lambda theta: self.backend.objective(
-                theta, frame, self.config.observation.slope_std, is_map
+                theta, frame, self.config.observation.slope_std, not is_map
             ),
             self.space(),
             start,

@@ -9,7 +9,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.gp.kernels import squared_exponential
-from gp_ground_seg.gp.linalg import cholesky, solve_cholesky
+from gp_ground_seg.gp.linalg import factorise, solve
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 
@@ -133,13 +133,13 @@ def latent_rows_compiled(
             weight[i] = theta[m, 5 + surface_class[first + i]] - mean
             for j in range(i + 1):
                 d = r_bar[first + i] - r_bar[first + j]
-                factor[i, j] = variance * math.exp(-decay * d * d)
+                factor[j, i] = variance * math.exp(-decay * d * d)
             factor[i, i] += math.exp(2.0 * theta[m, 4])
-        if not cholesky(factor, p):
+        if not factorise(factor, p):
             # Rounding beat the noise term: the mean is what is left to say.
             weight[:] = 0.0
         else:
-            solve_cholesky(factor, p, weight)
+            solve(factor, p, weight)
         for i in range(offsets[m], offsets[m + 1]):
             value = mean
             for j in range(p):

@@ -1,4 +1,8 @@
-"""Small dense linear algebra for compiled code; works on the lower triangle."""
+"""Small dense linear algebra for compiled code.
+
+Factors are upper triangular, ``A = U^T U``, and every inner loop runs along a
+row, so that the compiler can use vector instructions.
+"""
 
 from __future__ import annotations
 
@@ -9,61 +13,67 @@ from gp_ground_seg.polar_grid import FloatArray
 
 
 @compiled
-def cholesky(a: FloatArray, n: int) -> bool:
-    """Factor the lower triangle of ``a[:n, :n]`` in place; False if not positive definite."""
-    for j in range(n):
-        pivot = a[j, j]
-        for k in range(j):
-            pivot -= a[j, k] * a[j, k]
-        if not pivot > 0.0:
+def factorise(a: FloatArray, n: int) -> bool:
+    """Replace the upper triangle of ``a[:n, :n]`` by U; False if not positive definite."""
+    for k in range(n):
+        row = a[k]
+        # Written so that NaN fails too.
+        if not row[k] > 0.0:
             return False
-        pivot = math.sqrt(pivot)
-        a[j, j] = pivot
-        for i in range(j + 1, n):
-            value = a[i, j]
-            for k in range(j):
-                value -= a[i, k] * a[j, k]
-            a[i, j] = value / pivot
+        pivot = math.sqrt(row[k])
+        row[k] = pivot
+        for j in range(k + 1, n):
+            row[j] /= pivot
+        for i in range(k + 1, n):
+            weight = row[i]
+            below = a[i]
+            for j in range(i, n):
+                below[j] -= weight * row[j]
     return True
 
 
 @compiled
-def invert_cholesky(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray) -> None:
-    """Inverse of the matrix with the given factor: ``L^-T L^-1``, both triangles."""
-    # Row i of `whitened` is row i of L^-1; its entries beyond i are not used.
+def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray) -> None:
+    """Inverse of ``U^T U``, both triangles, in `inverse`.
+
+    `whitened` is working space; its lower triangle becomes ``U^-T``.
+    """
     for i in range(n):
         row = whitened[i]
-        for j in range(i):
-            row[j] = 0.0
+        row[: i + 1] = 0.0
         for k in range(i):
-            weight = factor[i, k]
+            weight = factor[k, i]
+            above = whitened[k]
             for j in range(k + 1):
-                row[j] -= weight * whitened[k, j]
+                row[j] -= weight * above[j]
         scale = 1.0 / factor[i, i]
         for j in range(i):
             row[j] *= scale
         row[i] = scale
     for i in range(n):
-        for j in range(i + 1):
-            inverse[i, j] = 0.0
+        inverse[i, : i + 1] = 0.0
     for k in range(n):
+        row = whitened[k]
         for i in range(k + 1):
-            weight = whitened[k, i]
+            weight = row[i]
+            target = inverse[i]
             for j in range(i + 1):
-                inverse[i, j] += weight * whitened[k, j]
+                target[j] += weight * row[j]
     for i in range(n):
         for j in range(i):
             inverse[j, i] = inverse[i, j]
 
 
 @compiled
-def solve_cholesky(factor: FloatArray, n: int, vector: FloatArray) -> None:
-    """Solve ``L L^T x = vector`` in place for the factor L."""
+def solve(factor: FloatArray, n: int, vector: FloatArray) -> None:
+    """Replace `vector` by the solution of ``U^T U x = vector``."""
     for i in range(n):
-        for k in range(i):
-            vector[i] -= factor[i, k] * vector[k]
-        vector[i] /= factor[i, i]
-    for i in range(n - 1, -1, -1):
+        row = factor[i]
+        vector[i] /= row[i]
         for k in range(i + 1, n):
-            vector[i] -= factor[k, i] * vector[k]
-        vector[i] /= factor[i, i]
+            vector[k] -= row[k] * vector[i]
+    for i in range(n - 1, -1, -1):
+        row = factor[i]
+        for k in range(i + 1, n):
+            vector[i] -= row[k] * vector[k]
+        vector[i] /= row[i]

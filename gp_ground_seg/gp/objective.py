@@ -52,7 +52,7 @@ class TrainingFrame:
 
 
 def objective_reference(
-    theta: FloatArray, frame: TrainingFrame, slope_std: float, full_prior: bool
+    theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
 ) -> tuple[float, FloatArray]:
     """Log marginal likelihood of a frame and its gradient (paper, eqs. 19 and 20).
 
@@ -65,9 +65,9 @@ def objective_reference(
         Inliers and pseudo-inputs.
     slope_std : float
         Prior standard deviation of the mean line's slope.
-    full_prior : bool
-        Whether the latent process has its quadratic term
-        ``-1/2 (L_bar - mean)^T B^-1 (L_bar - mean)``, which the printed objective lacks.
+    latent_terms : bool
+        Whether the terms of the latent process, ``-1/2 log|B_m|``, are in: with
+        them the objective is the printed one, which has no upper bound.
 
     Returns
     -------
@@ -92,7 +92,7 @@ def objective_reference(
                 frame.r_bar[bar],
                 frame.surface_class[bar],
                 slope_std,
-                full_prior,
+                latent_terms,
             )
         except LinAlgError:
             return -np.inf, np.zeros(len(theta))
@@ -108,7 +108,7 @@ def _segment(
     r_bar: FloatArray,
     surface_class: IntArray,
     slope_std: float,
-    full_prior: bool,
+    latent_terms: bool,
 ) -> float:
     """Value of one segment; adds to `gradient`. Letters are those of the paper."""
     sigma_f, sigma_n, sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[:N_SCALARS])
@@ -143,13 +143,8 @@ def _segment(
     dlog_k = 0.5 - square[:, None] / spread + 2.0 * square[:, None] * distance2 / spread**2
     g_u = 2.0 * np.sum(g * k * dlog_k, axis=1)
 
-    value -= float(np.log(np.diag(b_factor[0])).sum()) + 0.5 * len(r_bar) * np.log(2.0 * np.pi)
-    b_inverse = cho_solve(b_factor, np.eye(len(r_bar)))
     weight = cho_solve(b_factor, k_star.T @ g_u)
     g_l_bar = weight + (g_u.sum() - weight.sum()) / len(r_bar)
-    if full_prior:
-        value -= 0.5 * float((l_bar - l_bar.mean()) @ beta)
-        g_l_bar -= beta - beta.mean()
     np.add.at(gradient, N_SCALARS + surface_class, g_l_bar)
 
     bar_distance2 = (r_bar[:, None] - r_bar[None, :]) ** 2
@@ -160,7 +155,10 @@ def _segment(
         (np.zeros_like(k_star), 2.0 * sigma_n_bar**2 * np.eye(len(r_bar))),
     )
     for q, (dk_star, db) in enumerate(derivatives):
-        gradient[2 + q] += g_u @ dk_star @ beta - weight @ db @ beta - 0.5 * np.sum(b_inverse * db)
-        if full_prior:
-            gradient[2 + q] += 0.5 * beta @ db @ beta
+        gradient[2 + q] += g_u @ dk_star @ beta - weight @ db @ beta
+        if latent_terms:
+            gradient[2 + q] -= 0.5 * np.trace(cho_solve(b_factor, db))
+    if latent_terms:
+        log_determinant = 2.0 * np.log(np.diag(b_factor[0])).sum()
+        value -= 0.5 * float(log_determinant + len(r_bar) * np.log(2.0 * np.pi))
     return value

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from gp_ground_seg.compiled import compiled
-from gp_ground_seg.gp.linalg import cholesky, invert_cholesky
+from gp_ground_seg.gp.linalg import factorise, invert
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -26,7 +26,7 @@ def objective_rows(
     r_bar: FloatArray,
     surface_class: IntArray,
     slope_std: float,
-    full_prior: bool,
+    latent_terms: bool,
     values: FloatArray,
     gradients: FloatArray,
 ) -> None:
@@ -61,10 +61,10 @@ def objective_rows(
                     k_bar[i, j] = sigma_f_bar**2 * math.exp(-d * d / (2.0 * sigma_l_bar**2))
                     b_factor[i, j] = k_bar[i, j]
                 b_factor[i, i] += sigma_n_bar**2
-            if not cholesky(b_factor, p):
+            if not factorise(b_factor, p):
                 values[m] = -np.inf
                 continue
-            invert_cholesky(b_factor, p, np.empty((p, p)), b_inverse)
+            invert(b_factor, p, np.empty((p, p)), b_inverse)
             for i in range(p):
                 for j in range(p):
                     beta[i] += b_inverse[i, j] * (l_bar[j] - mean)
@@ -92,13 +92,13 @@ def objective_rows(
                     * math.exp(-d * d / spread)
                 )
                 k[i, j] = value
-                factor[i, j] = value + slope_std**2 * r[first + i] * r[first + j]
+                factor[j, i] = value + slope_std**2 * r[first + i] * r[first + j]
             factor[i, i] += sigma_n**2
-        if not cholesky(factor, n):
+        if not factorise(factor, n):
             values[m] = -np.inf
             continue
         inverse = np.empty((n, n))
-        invert_cholesky(factor, n, np.empty((n, n)), inverse)
+        invert(factor, n, np.empty((n, n)), inverse)
         alpha = np.zeros(n)
         for i in range(n):
             for j in range(n):
@@ -135,20 +135,16 @@ def objective_rows(
             g_sum += g_u[i]
             for j in range(p):
                 raised[j] += k_star[i, j] * g_u[i]
-        weight_sum = beta_sum = 0.0
+        weight_sum = 0.0
         for i in range(p):
             for j in range(p):
                 weight[i] += b_inverse[i, j] * raised[j]
             weight_sum += weight[i]
-            beta_sum += beta[i]
-            value -= math.log(b_factor[i, i]) + 0.5 * _LOG_2PI
-            if full_prior:
-                value -= 0.5 * (l_bar[i] - mean) * beta[i]
+            if latent_terms:
+                value -= math.log(b_factor[i, i]) + 0.5 * _LOG_2PI
         for i in range(p):
             slot = 5 + surface_class[bar_first + i]
             gradients[m, slot] += weight[i] + (g_sum - weight_sum) / p
-            if full_prior:
-                gradients[m, slot] -= beta[i] - beta_sum / p
         for j in range(p):
             for i in range(n):
                 d = r[first + i] - r_bar[bar_first + j]
@@ -158,9 +154,9 @@ def objective_rows(
             for i in range(p):
                 d = r_bar[bar_first + i] - r_bar[bar_first + j]
                 # Adjoint of B: every derivative of B is contracted with it.
-                adjoint = -weight[i] * beta[j] - 0.5 * b_inverse[i, j]
-                if full_prior:
-                    adjoint += 0.5 * beta[i] * beta[j]
+                adjoint = -weight[i] * beta[j]
+                if latent_terms:
+                    adjoint -= 0.5 * b_inverse[i, j]
                 gradients[m, 2] += 2.0 * adjoint * k_bar[i, j]
                 gradients[m, 3] += adjoint * k_bar[i, j] * d * d / sigma_l_bar**2
                 if i == j:
