@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from config_samples import accepted_values, configs
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, ConfigError, GroundSegError
@@ -210,6 +210,7 @@ def test_immutable():
     assert hash(config) == hash(Config())
 
 
+@settings(max_examples=40)
 @given(configs(), configs())
 def test_replace_changes_what_is_named_and_only_in_the_copy(config, other):
     before = config.flat()
@@ -218,6 +219,7 @@ def test_replace_changes_what_is_named_and_only_in_the_copy(config, other):
     assert config.flat() == before
 
 
+@settings(max_examples=40)
 @given(configs())
 def test_forms_agree(config):
     flat = config.flat()
@@ -336,6 +338,7 @@ def test_any_text_is_read_or_refused(tmp_path_factory, text):
     assert '\n' not in said
 
 
+@settings(max_examples=40)
 @given(configs(), st.booleans(), st.booleans())
 def test_any_yaml_writer_will_do(tmp_path_factory, config, flow, ros):
     path = tmp_path_factory.mktemp('yaml') / 'a.yaml'

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 from config_samples import configs
-from hypothesis import given
+from hypothesis import given, settings
 
 from gp_ground_seg import Config
 from gp_ground_seg.cli import config as command
@@ -31,6 +31,7 @@ def run(*words):
     return arguments.run(arguments)
 
 
+@settings(max_examples=40)
 @given(configs())
 def test_yaml_reads_back(tmp_path_factory, config):
     path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
@@ -38,6 +39,7 @@ def test_yaml_reads_back(tmp_path_factory, config):
     assert Config.from_yaml(path) == config
 
 
+@settings(max_examples=40)
 @given(configs())
 def test_yaml_has_the_types_ros_wants(config):
     """ROS parameters are typed: 2 is not a double, and 1e-05 without a point is no number."""

@@ -144,7 +144,7 @@ def _footer(document: dict[str, Any]) -> str:
         for line in (
             f'parameters: {changes or "defaults"}',
             f'machine: {machine}',
-            f'versions: {versions}, Python {environment["python"]}',
+            f'versions: Python {environment["python"]}, {versions}',
         )
     )
 

@@ -7,7 +7,9 @@ import sys
 from collections.abc import Sequence
 
 from gp_ground_seg.errors import GroundSegError, MissingDependencyError
+from gp_ground_seg.ros.signals import stop_on_signals
 
+OWN_PACKAGE = 'gp_ground_seg'
 EXAMPLES = """\
 examples:
   gp-ground-seg node
@@ -42,16 +44,20 @@ def start(words: Sequence[str]) -> int:
     MissingDependencyError
         If rclpy or a message package is not installed.
     """
-    try:
-        from gp_ground_seg.ros.node import main as run_node
-    except ImportError as error:
-        if (error.name or '').startswith('gp_ground_seg'):
-            raise
-        raise MissingDependencyError(
-            f'the node needs ROS 2, and it cannot be imported ({error}): source the setup file '
-            "of a ROS 2 installation, or pip install 'gp_ground_seg[ros]'"
-        ) from error
-    return run_node(words)
+    # Importing ROS takes most of a second; a signal within it is obeyed as well.
+    with stop_on_signals() as stop:
+        try:
+            from gp_ground_seg.ros.node import main as run_node
+        except (ImportError, KeyboardInterrupt) as error:
+            if stop.made:
+                return 0
+            if not isinstance(error, ImportError) or (error.name or '').startswith(OWN_PACKAGE):
+                raise
+            raise MissingDependencyError(
+                f'the node needs ROS 2, which cannot be imported ({error}): source the setup '
+                "file of a ROS 2 installation, or pip install 'gp_ground_seg[ros]'"
+            ) from error
+        return run_node(words)
 
 
 def main() -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -58,8 +59,16 @@ def check_sqlite_path(path: Path) -> None:
 
 
 def _check_sqlite_file(path: Path) -> None:
-    """Raise `DataError` where part of a sqlite file is in a journal, which rosbags ignores."""
+    """Raise `DataError` where part of a sqlite file is cut off, or still in a journal.
+
+    sqlite reads what is missing from the last page as zeros, and rosbags ignores journals.
+    """
     check_sqlite_path(path)
+    with path.open('rb') as file:
+        header = file.read(100)
+    size, wanted = path.stat().st_size, _sqlite_size(header)
+    if size < wanted:
+        raise DataError(f'{path}: truncated, {size} bytes where its header says {wanted}')
     for ending in ('-wal', '-journal'):
         journal = path.with_name(path.name + ending)
         if journal.exists() and journal.stat().st_size > 0:
@@ -67,6 +76,19 @@ def _check_sqlite_file(path: Path) -> None:
                 f'{path}: was not closed, some of it is in {journal.name}; '
                 f'`sqlite3 {path.name} vacuum` completes it'
             )
+
+
+def _sqlite_size(header: bytes) -> int:
+    """Size of the file that a sqlite header tells, 0 if it does not.
+
+    Source: the database header in https://www.sqlite.org/fileformat.html
+    """
+    if len(header) < 100 or header[24:28] != header[92:96]:
+        return 0
+    page_size = int.from_bytes(header[16:18], 'big')
+    # 65536 does not fit into the two bytes.
+    page_size = 65536 if page_size == 1 else page_size
+    return page_size * int.from_bytes(header[28:32], 'big')
 
 
 def is_ros1_bag(path: Path) -> bool:
@@ -100,4 +122,5 @@ def reading(path: Path) -> Iterator[None]:
 
 def in_one_line(error: Exception) -> str:
     """Return what an error says, or its name if it says nothing."""
-    return ' '.join(str(error).split()) or type(error).__name__
+    # Some of rosbags' messages quote a whole message definition.
+    return textwrap.shorten(str(error), 200, placeholder=' ...') or type(error).__name__

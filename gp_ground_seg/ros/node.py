@@ -37,7 +37,7 @@ NODE_NAME = 'ground_segmentation_node'
 INPUT_TOPIC = 'points'
 LOG_PERIOD = 5.0
 """Shortest time between two messages about bad clouds [s]."""
-LONGEST_WAIT = 0.2
+LONGEST_WAIT = 0.1
 """Time after which a signal is seen at the latest [s]."""
 
 
@@ -66,18 +66,25 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
-        logger = self.get_logger()
-        logger.info(f'effective configuration:\n{describe(self.config)}')
         self._segmenter = GroundSegmenter(self.config)
         # For throttled messages; the default system clock may jump.
         self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._processing_statistics = ProcessingStatistics()
+        try:
+            self._start()
+        except BaseException:
+            self.destroy_node()
+            raise
+
+    def _start(self) -> None:
+        logger = self.get_logger()
+        logger.info(f'effective configuration:\n{describe(self.config)}')
         with start_errors():
             self._outputs = OutputPublishers(self)
         logger.info('compiling; this takes some seconds if it was not done before')
         logger.info(f'ready to segment after {warm_up(self._segmenter):.1f} s')
-        self._input_statistics = InputStatistics(time.monotonic())
-        self._processing_statistics = ProcessingStatistics()
         # Only now: a cloud that came earlier would have waited for the compiler.
+        self._input_statistics = InputStatistics(time.monotonic())
         with start_errors():
             self._input = CloudSubscription(self, INPUT_TOPIC, self.is_given, self._on_cloud)
         self._diagnostics = DiagnosticsPublisher(
@@ -97,8 +104,9 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def destroy_node(self) -> None:
         """Free what the node holds, the worker threads too."""
-        self._segmenter.close()
+        # The network first: worker threads may be compiling, and then end late.
         super().destroy_node()
+        self._segmenter.close()
 
     def _on_cloud(self, cloud: PointCloud2, arrival: Arrival) -> None:
         start = time.monotonic()

@@ -26,7 +26,8 @@ def polyline(
     heading : float
         Direction of u [rad].
     points : sequence of (u, z)
-        Corners in ascending u [m]; two corners with the same u are a vertical step.
+        Corners in ascending u [m]. Corners with the same u are a vertical step from the
+        first to the last of them.
     slope_before, slope_after : float
         Slope before the first and after the last corner.
 

@@ -1,0 +1,198 @@
+"""``kitti-to-bag``: a sequence in SemanticKITTI layout as a rosbag2."""
+
+import os
+import re
+from datetime import datetime, timezone
+from pathlib import Path
+
+import bag_samples as samples
+import cli_runner
+import numpy as np
+import pytest
+from rosbags.interfaces import QosReliability
+
+from gp_ground_seg.cli.kitti_to_bag import EPOCH
+from gp_ground_seg.datasets.bags import POINT_CLOUD2, decode_cloud, open_bag
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+KITTI = Path(os.environ.get('GP_GROUND_SEG_KITTI', REPOSITORY.parent / 'shared' / 'kitti'))
+needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason='no KITTI frames on this machine')
+
+TOPIC = '/kitti/velo/pointcloud'
+TIMES = [0.0, 0.1036219, 0.2072, 0.311, 0.415]
+
+
+@pytest.fixture
+def convert(monkeypatch):
+    return lambda *words: cli_runner.run(monkeypatch, 'kitti-to-bag', *words)
+
+
+def write_sequence(root, n_scans=5, n_labelled=5, times=TIMES):
+    folder = root / 'sequences' / '04'
+    (folder / 'velodyne').mkdir(parents=True)
+    (folder / 'labels').mkdir()
+    for k in range(n_scans):
+        scan = samples.scan(k)
+        scan.tofile(folder / 'velodyne' / f'{k:06d}.bin')
+        if k < n_labelled:
+            semantic_and_instance = np.arange(len(scan), dtype='<u4') % 260 + (7 << 16)
+            semantic_and_instance.tofile(folder / 'labels' / f'{k:06d}.label')
+    if times is not None:
+        (folder / 'times.txt').write_text(''.join(f'{time:e}\n' for time in times))
+    return folder
+
+
+def read_clouds(path):
+    with open_bag(path) as bag:
+        assert bag.topics == {TOPIC: POINT_CLOUD2}
+        return [(time, decode_cloud(raw)) for _, time, raw in bag.messages()]
+
+
+@pytest.mark.parametrize(
+    ('name', 'words', 'storage'),
+    [
+        ('out', [], 'mcap'),
+        ('out', ['--format', 'sqlite3'], 'sqlite3'),
+        ('out.mcap', [], 'mcap'),
+        ('out.db3', [], 'sqlite3'),
+    ],
+)
+def test_sequence_as_bag(convert, tmp_path, capsys, name, words, storage):
+    write_sequence(tmp_path / 'kitti')
+    out = tmp_path / name
+    assert convert(tmp_path / 'kitti', '--sequence', '04', out, *words) == 0
+    assert capsys.readouterr() == (
+        f'5 frames (5 with labels), {5 * 1801} points, 0.4 s, written to {out}\n', '',
+    )  # fmt: skip
+    assert out.is_file() == ('.' in name)
+    with open_bag(out) as bag:
+        assert bag.storage == storage
+        assert bag.topic(TOPIC).qos[0].reliability is QosReliability.RELIABLE
+    clouds = read_clouds(out)
+    assert len(clouds) == 5
+    for k, (recorded, cloud) in enumerate(clouds):
+        assert recorded == EPOCH * 10**9 + round(TIMES[k] * 1e9)
+        assert cloud.stamp == divmod(recorded, 10**9)
+        assert (cloud.frame_id, cloud.height, cloud.width) == ('velo_link', 1, 1801)
+        assert (cloud.point_step, cloud.row_step) == (20, 20 * 1801)
+        assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
+            ('x', 0, 7, 1), ('y', 4, 7, 1), ('z', 8, 7, 1), ('intensity', 12, 7, 1),
+            ('label', 16, 6, 1),
+        ]  # fmt: skip
+        points = cloud.data.reshape(-1, 20)
+        assert points[:, :16].tobytes() == samples.scan(k).tobytes()
+        label = points[:, 16:].copy().view('<u4')[:, 0]
+        np.testing.assert_array_equal(label, np.arange(1801) % 260)
+
+
+def test_stamps_are_of_the_day_that_the_help_says():
+    assert datetime.fromtimestamp(EPOCH, timezone.utc).isoformat() == '2011-09-26T00:00:00+00:00'
+
+
+def test_scans_without_labels_have_no_label_field(convert, tmp_path, capsys):
+    write_sequence(tmp_path, n_labelled=1)
+    assert convert(tmp_path, '--sequence', '04', tmp_path / 'out') == 0
+    assert capsys.readouterr().out.startswith('5 frames (1 with labels), ')
+    for k, (_, cloud) in enumerate(read_clouds(tmp_path / 'out')):
+        assert ('label' in [field.name for field in cloud.fields]) == (k == 0)
+        assert cloud.data.reshape(1801, -1)[:, :16].tobytes() == samples.scan(k).tobytes()
+
+
+def test_start_and_count(convert, tmp_path):
+    write_sequence(tmp_path)
+    words = ['--start', '2', '--count', '2']
+    assert convert(tmp_path, '--sequence', '04', tmp_path / 'out', *words) == 0
+    clouds = read_clouds(tmp_path / 'out')
+    # The times of those scans, not counted from the first one written.
+    assert [time - EPOCH * 10**9 for time, _ in clouds] == [207_200_000, 311_000_000]
+    assert clouds[0][1].data.reshape(-1, 20)[:, :16].tobytes() == samples.scan(2).tobytes()
+
+
+def test_ten_hertz_without_times(convert, tmp_path):
+    write_sequence(tmp_path, times=None)
+    assert convert(tmp_path, '--sequence', '04', tmp_path / 'out') == 0
+    recorded = [time - EPOCH * 10**9 for time, _ in read_clouds(tmp_path / 'out')]
+    assert recorded == [0, 100_000_000, 200_000_000, 300_000_000, 400_000_000]
+
+
+@pytest.mark.parametrize(
+    ('times', 'words', 'message'),
+    [
+        (TIMES, ['--start', '5'], r'--start 5: must be in \[0, 4\]; sequence 04: 5 scans there'),
+        (TIMES, ['--start', '-1'], r'--start -1: must be in \[0, 4\]'),
+        (
+            TIMES,
+            ['--start', '3', '--count', '3'],
+            r'--count 3: must be in \[1, 2\] from scan 3 on',
+        ),
+        (TIMES, ['--count', '0'], r'--count 0: must be in \[1, 5\]'),
+        (TIMES, ['--sequence', '99'], r'sequences/99: no velodyne folder.*sequences here: 04'),
+        (
+            TIMES,
+            ['--format', 'mcap', '--sequence', '04'],
+            r'out\.db3: ends in \.db3, which is not',
+        ),
+        (TIMES[:3], [], r'times\.txt: 3 times, too few for frame 000003'),
+        (
+            [0, 0.1, float('nan'), 0.3, 0.4],
+            [],
+            r'times\.txt: nan s of frame 000002: times must increase',
+        ),
+        ([-0.2, 0.1, 0.2, 0.3, 0.4], [], r'time -0\.2 s of frame 000000: must be in'),
+        ([0, 0.1, 0.2, 0.3, 1e10], [], r'time 1e\+10 s of frame 000004: must be in'),
+        ([0, 0.1, 0.1, 0.3, 0.4], [], r'0\.1 s of frame 000002: times must increase'),
+    ],
+)
+def test_refused(convert, tmp_path, capsys, times, words, message):
+    write_sequence(tmp_path / 'kitti', times=times)
+    assert convert(tmp_path / 'kitti', tmp_path / 'out.db3', '--sequence', '04', *words) == 2
+    assert re.search(message, cli_runner.error_line(capsys))
+    assert [path.name for path in tmp_path.iterdir()] == ['kitti']
+
+
+@pytest.mark.parametrize(
+    ('file', 'content', 'message'),
+    [
+        ('velodyne/000003.bin', b'0' * 33, r'000003\.bin: 33 bytes is not a whole number'),
+        ('labels/000003.label', b'0' * 8, r'000003\.label: 8 bytes, expected 7204'),
+        ('times.txt', b'0.0\nsoon\n', r'times\.txt: could not convert'),
+    ],
+)
+def test_damaged_file_leaves_nothing(convert, tmp_path, capsys, file, content, message):
+    folder = write_sequence(tmp_path / 'kitti')
+    (folder / file).write_bytes(content)
+    assert convert(tmp_path / 'kitti', '--sequence', '04', tmp_path / 'out') == 2
+    assert re.search(message, cli_runner.error_line(capsys))
+    assert [path.name for path in tmp_path.iterdir()] == ['kitti']
+
+
+def test_force(convert, tmp_path, capsys):
+    write_sequence(tmp_path)
+    words = ['--sequence', '04', tmp_path / 'out']
+    assert convert(tmp_path, *words) == 0
+    capsys.readouterr()
+    assert convert(tmp_path, *words) == 2
+    assert 'out: exists already; --force replaces it' in cli_runner.error_line(capsys)
+    assert len(read_clouds(tmp_path / 'out')) == 5
+    assert convert(tmp_path, *words, '--count', '1', '--force') == 0
+    assert len(read_clouds(tmp_path / 'out')) == 1
+
+
+def test_sequence_is_required(convert, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        convert(tmp_path, tmp_path / 'out')
+    assert stop.value.code == 2
+    assert '--sequence' in capsys.readouterr().err
+
+
+@needs_kitti
+def test_real_frames(convert, tmp_path):
+    assert convert(KITTI, '--sequence', '08', tmp_path / 'out.mcap', '--count', '3') == 0
+    folder = KITTI / 'sequences' / '08'
+    times = [float(text) for text in (folder / 'times.txt').read_text().split()]
+    for k, (recorded, cloud) in enumerate(read_clouds(tmp_path / 'out.mcap')):
+        assert recorded == EPOCH * 10**9 + round(times[k] * 1e9)
+        points = cloud.data.reshape(-1, 20)
+        assert points[:, :16].tobytes() == (folder / 'velodyne' / f'00000{k}.bin').read_bytes()
+        label = np.fromfile(folder / 'labels' / f'00000{k}.label', '<u4') & 0xFFFF
+        np.testing.assert_array_equal(points[:, 16:].copy().view('<u4')[:, 0], label)

@@ -1,0 +1,566 @@
+"""``segment``: scans and bags of every kind, and what happens when it goes wrong."""
+
+import dataclasses
+import io
+import os
+import re
+import resource
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import bag_samples as samples
+import cli_runner
+import numpy as np
+import pytest
+
+from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.datasets.bags import (
+    BagWriter,
+    cloud_topic,
+    decode_cloud,
+    encode_cloud,
+    open_bag,
+)
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+KITTI = Path(os.environ.get('GP_GROUND_SEG_KITTI', REPOSITORY.parent / 'shared' / 'kitti'))
+needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason='no KITTI frames on this machine')
+
+BAGS = ['drive', 'drive.mcap', 'drive.db3', 'drive.bag']
+SUMMARY = re.compile(
+    r'(\d+) frames?, (\d+) points?, (\d+\.\d)% ground, \d+\.\d ms per frame \(median, '
+    r'segmentation only\), written to (.*)\n'
+)
+
+
+@pytest.fixture
+def segment(monkeypatch):
+    return lambda *words: cli_runner.run(monkeypatch, 'segment', *words)
+
+
+@pytest.fixture(scope='module')
+def segmenter():
+    return GroundSegmenter(Config())
+
+
+def write_bag(path, **changes):
+    writer = samples.write_ros1_bag if path.suffix == '.bag' else samples.write_ros2_bag
+    writer(path, **changes)
+    return path
+
+
+def write_scans(folder, n_scans=3):
+    folder.mkdir(parents=True)
+    for k in range(n_scans):
+        samples.scan(k).tofile(folder / f'{k:06d}.bin')
+    return folder
+
+
+def read_messages(path):
+    with open_bag(path) as bag:
+        return list(bag.messages())
+
+
+def hidden(folder):
+    return [path.name for path in folder.iterdir() if '.partial-' in path.name]
+
+
+# --- bags ---------------------------------------------------------------------------------
+
+
+def assert_splits(source, result, topic, segmenter, ground='/ground', obstacles='/obstacles'):
+    """Input messages unchanged; every finite point in one of two clouds, bit for bit."""
+    before, after = read_messages(source), read_messages(result)
+    assert [m for m in after if m[0] not in (ground, obstacles)] == before
+    clouds = [m for m in before if m[0] == topic]
+    grounds = [m for m in after if m[0] == ground]
+    others = [m for m in after if m[0] == obstacles]
+    assert len(clouds) == len(grounds) == len(others) > 0
+    for (_, recorded, raw), (_, time_1, raw_1), (_, time_2, raw_2) in zip(
+        clouds, grounds, others, strict=True
+    ):
+        assert recorded == time_1 == time_2
+        cloud = decode_cloud(raw)
+        label = segmenter.segment(cloud.xyz()).label
+        assert {Label.GROUND, Label.OBSTACLE} <= set(label)
+        points = cloud.data.reshape(-1, cloud.point_step)
+        for part_raw, wanted in ((raw_1, Label.GROUND), (raw_2, Label.OBSTACLE)):
+            part = decode_cloud(part_raw)
+            assert (part.stamp, part.frame_id) == (cloud.stamp, cloud.frame_id)
+            assert (part.fields, part.point_step) == (cloud.fields, cloud.point_step)
+            kept = part.data.reshape(-1, cloud.point_step)
+            np.testing.assert_array_equal(kept, points[label == wanted])
+    return len(clouds)
+
+
+@pytest.mark.parametrize(
+    ('name', 'expected'),
+    [
+        ('drive', 'drive_ground'),
+        ('drive.mcap', 'drive_ground.mcap'),
+        ('drive.db3', 'drive_ground.db3'),
+        ('drive.bag', 'drive_ground'),
+    ],
+)
+def test_bag_gets_ground_and_obstacles(segment, segmenter, tmp_path, capsys, name, expected):
+    source = write_bag(tmp_path / name)
+    assert segment(source, '--quiet') == 0
+    said = capsys.readouterr()
+    n_frames, n_points, share, written_to = SUMMARY.fullmatch(said.out).groups()
+    assert (int(n_frames), int(n_points)) == (3, 3 * 1801)
+    assert 80 < float(share) < 84
+    assert written_to == str(tmp_path / expected)
+    assert said.err == ''
+    assert hidden(tmp_path) == []
+    topic = '/kitti/velo/pointcloud' if name == 'drive.bag' else '/points'
+    assert assert_splits(source, tmp_path / expected, topic, segmenter) == 3
+
+
+@pytest.mark.parametrize(
+    ('output', 'options', 'storage'),
+    [
+        ('out', [], 'sqlite3'),  # as the input
+        ('out', ['--format', 'mcap'], 'mcap'),
+        ('out.mcap', [], 'mcap'),
+        ('out.db3', [], 'sqlite3'),
+    ],
+)
+def test_format_of_the_output(segment, tmp_path, output, options, storage):
+    source = tmp_path / 'drive'
+    samples.write_ros2_bag(source, storage='sqlite3')
+    assert segment(source, '-o', tmp_path / output, *options) == 0
+    with open_bag(tmp_path / output) as bag:
+        assert bag.storage == storage
+
+
+def test_organised_big_endian_float64_cloud(segment, segmenter, tmp_path):
+    points = samples.scan(0)[:1800, :3].astype('>f8')
+    base = samples.cloud(0)
+    fields = tuple(type(base.fields[0])(name, 8 * k, 8) for k, name in enumerate(('x', 'y', 'z')))
+    rows = np.zeros((20, 90 * 24 + 5), dtype=np.uint8)
+    rows[:, : 90 * 24] = points.view(np.uint8).reshape(20, -1)
+    cloud = type(base)(
+        base.stamp, 'lidar', 20, 90, fields, 24, 90 * 24 + 5, rows.reshape(-1), is_bigendian=True
+    )
+    with BagWriter(tmp_path / 'in.mcap') as bag:
+        bag.add_topic(cloud_topic('/points'))
+        bag.write('/points', 7, encode_cloud(cloud))
+    assert segment(tmp_path / 'in.mcap') == 0
+    parts = {
+        topic: decode_cloud(raw) for topic, _, raw in read_messages(tmp_path / 'in_ground.mcap')
+    }
+    label = segmenter.segment(points.astype(np.float64)).label
+    for topic, wanted in (('/ground', Label.GROUND), ('/obstacles', Label.OBSTACLE)):
+        part = parts[topic]
+        assert part.is_bigendian
+        assert part.data.tobytes() == points[label == wanted].tobytes()
+        np.testing.assert_array_equal(part.xyz(), points[label == wanted])
+
+
+def test_empty_and_all_nan_clouds_give_empty_clouds(segment, tmp_path):
+    nothing = samples.cloud(0).select(np.zeros(1801, dtype=bool))
+    nan = samples.cloud(0).select(np.arange(1801) == 1800)
+    with BagWriter(tmp_path / 'in.mcap') as bag:
+        bag.add_topic(cloud_topic('/points'))
+        for k, cloud in enumerate((nothing, nan)):
+            bag.write('/points', k, encode_cloud(cloud))
+    assert segment(tmp_path / 'in.mcap') == 0
+    widths = [
+        (topic, decode_cloud(raw).width)
+        for topic, _, raw in read_messages(tmp_path / 'in_ground.mcap')
+    ]
+    outputs = [('/ground', 0), ('/obstacles', 0)]
+    assert widths == [('/points', 0), *outputs, ('/points', 1), *outputs]
+
+
+def test_topics_can_be_chosen_renamed_and_dropped(segment, segmenter, tmp_path, capsys):
+    source = tmp_path / 'two.mcap'
+    samples.write_ros2_bag(source, topics=('/front', '/ground'))
+    assert segment(source) == 2
+    assert '2 sensor_msgs/msg/PointCloud2 topics, choose one with --topic: /front, /ground' in (
+        error_line := cli_runner.error_line(capsys)
+    ), error_line
+    assert segment(source, '--topic', '/front') == 2
+    assert 'has a topic /ground already; choose another with --ground-topic' in (
+        cli_runner.error_line(capsys)
+    )
+    words = ['--topic', '/front', '--ground-topic', '/a/floor', '--obstacles-topic', '/a/rest']
+    assert segment(source, *words) == 0
+    result = tmp_path / 'two_ground.mcap'
+    assert_splits(source, result, '/front', segmenter, '/a/floor', '/a/rest')
+    # Dropping a topic frees its name, and the segmented one may be dropped as well.
+    words = ['--topic', '/front', '--drop', '/ground', '--drop', '/front', '--force']
+    assert segment(source, *words) == 0
+    with open_bag(result) as bag:
+        assert list(bag.topics) == ['/note', '/ground', '/obstacles']
+        assert [bag.n_messages(topic) for topic in bag.topics] == [3, 3, 3]
+
+
+@pytest.mark.parametrize(
+    ('words', 'message'),
+    [
+        (['--topic', '/left'], r'no topic /left; topics here: /points'),
+        (['--topic', '/note'], r'/note is of type std_msgs/msg/String, must be sensor_msgs'),
+        (['--drop', '/left'], r'no topic /left'),
+        (['--ground-topic', 'floor'], r'--ground-topic floor: must be a full topic name'),
+        (['--ground-topic', '/a b'], r'--ground-topic /a b: must be a full topic name'),
+        (['--ground-topic', '/points'], r'has a topic /points already'),
+        (['--ground-topic', '/obstacles'], r'--obstacles-topic /obstacles: is the topic of the'),
+        (['--raw'], r'--raw: is for scans'),
+        (['--format', 'sqlite3', '-o', 'x.mcap'], r'ends in \.mcap, which is not sqlite3'),
+        (['-o', 'x.bag'], r'only ROS 2 bags are written'),
+        (['-o', 'no/such/x'], r'the folder .*no/such does not exist'),
+        (['-o', 'drive.mcap', '--force'], r'is the input, or has it in it'),
+        (['-o', '.', '--force'], r'is the input, or has it in it'),
+        (['--set', 'label.ground_tolerance=-1'], r'label\.ground_tolerance'),
+    ],
+)
+def test_refused_for_bags(segment, tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    content = write_bag(Path('drive.mcap')).read_bytes()
+    assert segment('drive.mcap', *words) == 2
+    assert re.search(message, cli_runner.error_line(capsys))
+    assert [path.name for path in Path().iterdir()] == ['drive.mcap']
+    assert Path('drive.mcap').read_bytes() == content
+
+
+@pytest.mark.parametrize('name', BAGS)
+def test_second_run_needs_force(segment, tmp_path, capsys, name):
+    source = write_bag(tmp_path / name, n_clouds=1)
+    out = tmp_path / 'out'
+    assert segment(source, '-o', out) == 0
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    capsys.readouterr()
+    assert segment(source, '-o', out, '--quiet') == 2
+    assert 'out: exists already; --force replaces it' in cli_runner.error_line(capsys)
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+    assert segment(source, '-o', out, '--force', '--set', 'label.ground_tolerance=0.01') == 0
+    after = {path: path.read_bytes() for path in out.iterdir()}
+    assert after.keys() == before.keys()
+    assert after != before
+    assert hidden(tmp_path) == []
+
+
+def without_x(cloud):
+    fields = (dataclasses.replace(cloud.fields[0], name='q'), *cloud.fields[1:])
+    return dataclasses.replace(cloud, fields=fields)
+
+
+def write_bag_with_bad_cloud(path, damage):
+    with BagWriter(path) as bag:
+        bag.add_topic(cloud_topic('/points'))
+        for k in range(4):
+            raw = encode_cloud(samples.cloud(k))
+            bag.write('/points', 1000 + k, damage(raw) if k == 2 else raw)
+
+
+@pytest.mark.parametrize(
+    ('damage', 'message'),
+    [
+        (lambda raw: raw[:5000], r'5000 bytes that are no sensor_msgs/msg/PointCloud2'),
+        (
+            lambda raw: encode_cloud(without_x(decode_cloud(raw))),
+            r'point cloud: no field named x: must have exactly one; fields: q, y, z, i, ring',
+        ),
+    ],
+)
+def test_bad_cloud_stops_the_run_and_is_named(segment, tmp_path, capsys, damage, message):
+    write_bag_with_bad_cloud(tmp_path / 'in.mcap', damage)
+    for out, words in (('new', []), ('old', ['--force'])):
+        if words:
+            samples.write_ros2_bag(tmp_path / out)
+            before = read_messages(tmp_path / out)
+        assert segment(tmp_path / 'in.mcap', '-o', tmp_path / out, *words) == 2
+        line = cli_runner.error_line(capsys)
+        assert re.search(
+            r'in\.mcap: message 2 of topic /points, recorded at 1002 ns: ' + message, line
+        )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['in.mcap', 'old']
+    assert read_messages(tmp_path / 'old') == before
+
+
+@pytest.mark.parametrize('name', BAGS)
+def test_damaged_bag(segment, tmp_path, capsys, name):
+    source = write_bag(tmp_path / name)
+    file = next(path for path in (source / 'drive.mcap', source) if path.is_file())
+    file.write_bytes(file.read_bytes()[:9000])
+    assert segment(source) == 2
+    assert re.search('cannot be read as a bag|truncated', cli_runner.error_line(capsys))
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_note_on_migrated_topic(segment, tmp_path, capsys):
+    write_bag(tmp_path / 'drive.bag', n_clouds=1)
+    assert segment(tmp_path / 'drive.bag') == 0
+    assert 'note: topic /range: sensor_msgs/msg/Range has other fields' in capsys.readouterr().err
+    assert segment(tmp_path / 'drive.bag', '--drop', '/range', '--force') == 0
+    assert capsys.readouterr().err == ''
+
+
+# --- scans --------------------------------------------------------------------------------
+
+
+def expected_labels(segmenter, k, ground=40, obstacle=99):
+    label = segmenter.segment(samples.scan(k)).label
+    return np.select([label == Label.GROUND, label == Label.OBSTACLE], [ground, obstacle], 0)
+
+
+@pytest.mark.parametrize(
+    ('scans', 'given', 'expected'),
+    [
+        ('velodyne', 'velodyne', 'velodyne_ground'),
+        ('00/velodyne', '00', '00_ground'),
+        ('drive/velodyne_points/data', 'drive', 'drive_ground'),
+        ('velodyne', 'velodyne/000000.bin', 'velodyne/000000_ground'),
+    ],
+)
+def test_scans_give_label_files(segment, segmenter, tmp_path, capsys, scans, given, expected):
+    write_scans(tmp_path / scans)
+    assert segment(tmp_path / given) == 0
+    out = tmp_path / expected
+    n_scans = 1 if given.endswith('.bin') else 3
+    assert sorted(path.name for path in out.iterdir()) == [
+        f'{k:06d}.label' for k in range(n_scans)
+    ]
+    for k in range(n_scans):
+        written = np.fromfile(out / f'{k:06d}.label', dtype='<u4')
+        np.testing.assert_array_equal(written, expected_labels(segmenter, k))
+        assert set(written) == {0, 40, 99}
+    said = capsys.readouterr()
+    n_frames, n_points, _, written_to = SUMMARY.fullmatch(said.out).groups()
+    assert (int(n_frames), int(n_points), written_to) == (n_scans, n_scans * 1801, str(out))
+    assert said.err == ''
+    assert hidden(out.parent) == hidden(out) == []
+
+
+def test_raw_labels_into_one_file(segment, segmenter, tmp_path):
+    write_scans(tmp_path / 'velodyne')
+    words = ['-o', tmp_path / 'one.label', '--raw']
+    assert segment(tmp_path / 'velodyne' / '000001.bin', *words) == 0
+    written = np.fromfile(tmp_path / 'one.label', dtype='<u4')
+    np.testing.assert_array_equal(written, segmenter.segment(samples.scan(1)).label)
+    assert set(written) == {0, 1, 2}
+
+
+def test_default_name_for_the_folder_one_is_in(segment, tmp_path, monkeypatch):
+    monkeypatch.chdir(write_scans(tmp_path / 'velodyne', n_scans=1))
+    assert segment('.') == 0
+    assert (tmp_path / 'velodyne_ground' / '000000.label').is_file()
+
+
+def test_label_files_are_replaced_only_with_force(segment, segmenter, tmp_path, capsys):
+    write_scans(tmp_path / 'velodyne', n_scans=2)
+    out = tmp_path / 'labels'
+    out.mkdir()
+    (out / '000001.label').write_bytes(b'by hand')
+    (out / 'readme').write_text('mine')
+    assert segment(tmp_path / 'velodyne', '-o', out) == 2
+    assert '000001.label: exists already (1 of 2 files to write do); --force replaces them' in (
+        cli_runner.error_line(capsys)
+    )
+    assert (out / '000001.label').read_bytes() == b'by hand'
+    assert segment(tmp_path / 'velodyne', '-o', out, '--force') == 0
+    written = np.fromfile(out / '000001.label', dtype='<u4')
+    np.testing.assert_array_equal(written, expected_labels(segmenter, 1))
+    assert (out / 'readme').read_text() == 'mine'
+    assert segment(tmp_path / 'velodyne' / '000000.bin', '-o', out / '000001.label') == 2
+
+
+@pytest.mark.parametrize(
+    ('given', 'words', 'message'),
+    [
+        ('missing', [], r'missing: no such file or folder'),
+        ('missing.bin', [], r'missing\.bin: no such file or folder'),
+        ('empty', [], r'empty: no \.bin file in it, and not a rosbag2 folder$'),
+        ('root', [], r'give one of its sequences \(00, 08\), as in root/sequences/00'),
+        ('unfinished', [], r'no metadata\.yaml in it\); bag files in it.*: x_0\.mcap'),
+        ('cut', [], r'000000\.bin: 10 bytes is not a whole number of points'),
+        ('notes.txt', [], r'not a scan or bag; accepted are \.bin'),
+        ('good', ['--topic', '/a'], r'--topic: is for bags'),
+        ('good', ['--format', 'mcap'], r'--format: is for bags'),
+        ('good', ['--drop', '/a'], r'--drop: is for bags'),
+        ('good', ['-o', 'x.label'], r'x\.label: must be a folder'),
+        ('good', ['-o', 'notes.txt'], r'notes\.txt: is a file, must be a folder'),
+        ('good', ['-o', 'no/such/x'], r'the folder .*no/such does not exist'),
+    ],
+)
+def test_refused_for_scans(segment, tmp_path, capsys, monkeypatch, given, words, message):
+    monkeypatch.chdir(tmp_path)
+    write_scans(Path('good'), n_scans=1)
+    write_scans(Path('root/sequences/00/velodyne'), n_scans=1)
+    write_scans(Path('root/sequences/08/velodyne'), n_scans=1)
+    for folder in ('empty', 'unfinished', 'cut'):
+        Path(folder).mkdir()
+    Path('unfinished/x_0.mcap').write_bytes(b'')
+    Path('cut/000000.bin').write_bytes(b'0123456789')
+    Path('notes.txt').write_text('mine')
+    before = sorted(Path().rglob('*'))
+    assert segment(given, *words) == 2
+    assert re.search(message, cli_runner.error_line(capsys))
+    assert sorted(Path().rglob('*')) == before
+
+
+def test_a_truncated_scan_late_in_a_folder_leaves_nothing(segment, tmp_path, capsys):
+    write_scans(tmp_path / 'velodyne', n_scans=3)
+    (tmp_path / 'velodyne' / '000003.bin').write_bytes(b'0123456789')
+    assert segment(tmp_path / 'velodyne') == 2
+    assert '000003.bin: 10 bytes is not a whole number' in cli_runner.error_line(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ['velodyne']
+
+
+def test_settings_are_used(segment, tmp_path):
+    write_scans(tmp_path / 'velodyne', n_scans=1)
+    counts = []
+    for tolerance in (0.001, 0.2):
+        setting = f'label.ground_tolerance={tolerance}'
+        assert segment(tmp_path / 'velodyne', '--force', '--set', setting) == 0
+        label = np.fromfile(tmp_path / 'velodyne_ground' / '000000.label', dtype='<u4')
+        counts.append(np.count_nonzero(label == 40))
+    assert counts[0] < counts[1]
+
+
+# --- progress -----------------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(('words', 'shown'), [([], True), (['--quiet'], False)])
+def test_progress_bar_on_a_terminal(segment, tmp_path, monkeypatch, words, shown):
+    write_scans(tmp_path / 'velodyne')
+    terminal = Terminal()
+    monkeypatch.setattr('sys.stderr', terminal)
+    assert segment(tmp_path / 'velodyne', *words) == 0
+    assert ('segment:' in terminal.getvalue()) == shown
+    assert ('/3 [' in terminal.getvalue()) == shown
+
+
+# --- killed, interrupted, disk full -------------------------------------------------------
+
+
+def wait_until(condition, process):
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+@pytest.fixture(scope='module')
+def long_inputs(tmp_path_factory):
+    """Inputs that take a few seconds."""
+    folder = tmp_path_factory.mktemp('long')
+    samples.write_ros2_bag(folder / 'long.mcap', n_clouds=60, n_ground=30_000, n_wall=5000)
+    (folder / 'velodyne').mkdir()
+    scan = samples.scan(0, 30_000, 5000)
+    for k in range(100):
+        scan.tofile(folder / 'velodyne' / f'{k:06d}.bin')
+    return folder
+
+
+def stop_in_the_middle(tmp_path, source, out, how, *words):
+    """Stop `segment` once it has written something, and return its exit code."""
+    process = cli_runner.start('segment', source, '-o', out, *words)
+
+    def has_written():
+        parts = tmp_path.glob('.*.partial-*/**/*')
+        return sum(part.stat().st_size for part in parts if part.is_file()) > 2_000_000
+
+    wait_until(has_written, process)
+    process.send_signal(how)
+    _, said = process.communicate(timeout=30)
+    return process.returncode, said
+
+
+@pytest.mark.parametrize(
+    ('source', 'out'), [('long.mcap', 'out'), ('long.mcap', 'out.mcap'), ('velodyne', 'labels')]
+)
+def test_a_killed_run_leaves_nothing_under_the_final_name(
+    segment, tmp_path, capsys, long_inputs, source, out
+):
+    code, _ = stop_in_the_middle(tmp_path, long_inputs / source, tmp_path / out, signal.SIGKILL)
+    assert code == -signal.SIGKILL
+    assert not (tmp_path / out).exists()
+    (left,) = hidden(tmp_path)
+    # The next run is not in its way, and says that it is there.
+    short = tmp_path / 'short'
+    if source == 'velodyne':
+        write_scans(short, n_scans=1)
+    else:
+        samples.write_ros2_bag(short, n_clouds=1)
+    assert segment(short, '-o', tmp_path / out) == 0
+    assert (tmp_path / out).exists()
+    assert f'{left} is the unfinished output of another run' in capsys.readouterr().err
+
+
+def test_a_killed_run_with_force_leaves_the_old_bag(tmp_path, long_inputs):
+    before = samples.write_ros2_bag(tmp_path / 'out')
+    code, _ = stop_in_the_middle(
+        tmp_path, long_inputs / 'long.mcap', tmp_path / 'out', signal.SIGKILL, '--force'
+    )
+    assert code == -signal.SIGKILL
+    assert read_messages(tmp_path / 'out') == before
+
+
+def test_an_interrupted_run_cleans_up(tmp_path, long_inputs):
+    code, said = stop_in_the_middle(
+        tmp_path, long_inputs / 'long.mcap', tmp_path / 'out', signal.SIGINT
+    )
+    # Where numba is missing, a line says so first.
+    assert (code, said.splitlines()[-1]) == (130, 'gp-ground-seg: interrupted')
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('source', 'out'),
+    [('long.mcap', 'out.mcap'), ('long.mcap', 'out.db3'), ('velodyne', 'labels')],
+)
+def test_a_full_disk_is_one_line(tmp_path, long_inputs, source, out):
+    def limit_file_size():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+
+    shutil.copytree(long_inputs / 'velodyne', tmp_path / 'in' / 'velodyne')
+    shutil.copy(long_inputs / 'long.mcap', tmp_path / 'in')
+    process = cli_runner.start(
+        'segment', tmp_path / 'in' / source, '-o', tmp_path / out, '--quiet',
+        preexec_fn=limit_file_size, env={**os.environ, 'NUMBA_DISABLE_JIT': '0'},
+    )  # fmt: skip
+    output, said = process.communicate(timeout=120)
+    assert (process.returncode, output) == (2, '')
+    last_line = said.splitlines()[-1]
+    assert re.fullmatch(rf'gp-ground-seg: error: .*{out}.*: cannot be written: .*', last_line)
+    assert 'Traceback' not in said
+    assert [path.name for path in tmp_path.iterdir()] == ['in']
+
+
+# --- real frames --------------------------------------------------------------------------
+
+
+@needs_kitti
+def test_kitti_frames_as_scans_and_as_bag_get_the_same_labels(segment, monkeypatch, tmp_path):
+    sequence = KITTI / 'sequences' / '00'
+    (tmp_path / 'velodyne').mkdir()
+    for name in ('000000.bin', '000001.bin'):
+        shutil.copy(sequence / 'velodyne' / name, tmp_path / 'velodyne')
+    bag = tmp_path / 'kitti.mcap'
+    words = [KITTI, '--sequence', '00', bag, '--count', '2']
+    assert cli_runner.run(monkeypatch, 'kitti-to-bag', *words) == 0
+    assert segment(tmp_path / 'velodyne', '--raw') == 0
+    assert segment(bag) == 0
+    parts = {'/ground': [], '/obstacles': []}
+    for topic, _, raw in read_messages(tmp_path / 'kitti_ground.mcap'):
+        if topic in parts:
+            parts[topic].append(decode_cloud(raw))
+    for k in range(2):
+        points = np.fromfile(tmp_path / 'velodyne' / f'00000{k}.bin', '<f4').reshape(-1, 4)
+        label = np.fromfile(tmp_path / 'velodyne_ground' / f'00000{k}.label', '<u4')
+        for topic, value in (('/ground', 1), ('/obstacles', 2)):
+            cloud = parts[topic][k]
+            assert [field.name for field in cloud.fields] == ['x', 'y', 'z', 'intensity', 'label']
+            kept = cloud.data.reshape(-1, 20)[:, :16].copy().view('<f4')
+            np.testing.assert_array_equal(kept, points[label == value])
+        assert 0.2 < np.mean(label == 1) < 0.8

@@ -1,0 +1,245 @@
+"""The node in this process: what goes in, what comes out."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS is not installed')
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from ros_helpers import (
+    BEST_EFFORT,
+    NAMESPACE,
+    POINT,
+    RELIABLE,
+    Bench,
+    Collector,
+    bench,
+    isolated_context,
+    rows_of,
+    spinning,
+    street,
+    to_message,
+    wait_for,
+    xyz_of,
+)
+from sensor_msgs.msg import PointCloud2
+
+from gp_ground_seg import GroundSegmenter, Label
+from gp_ground_seg.ros.node import GroundSegmentationNode
+
+OFTEN = ('-p', 'diagnostics.period:=0.1')
+
+
+def assert_partition(message, points, ground, obstacles):
+    """Every finite point, bit for bit and in order, in the cloud of its label."""
+    label = GroundSegmenter().segment(xyz_of(points)).label
+    rows = rows_of(to_message(points))
+    for part, wanted in ((ground, Label.GROUND), (obstacles, Label.OBSTACLE)):
+        kept = [row for row, found in zip(rows, label, strict=True) if found == wanted]
+        assert rows_of(part) == kept
+        assert part.header == message.header
+        assert part.fields == message.fields
+        assert (part.height, part.width) == (1, len(kept))
+        assert part.point_step == message.point_step
+        assert part.row_step == len(kept) * message.point_step
+        assert not part.is_bigendian
+        assert part.is_dense
+    assert ground.width + obstacles.width == np.isfinite(xyz_of(points)).all(axis=1).sum()
+
+
+def test_every_finite_point_is_in_exactly_one_cloud_bit_for_bit():
+    points = street(20_000, n_invalid=200)
+    message = to_message(points, stamp=(1317383, 123456789), frame='velo_link')
+    with bench() as b:
+        ground, obstacles = b.segment(message)
+        assert min(ground.width, obstacles.width) > 1000
+        assert_partition(message, points, ground, obstacles)
+
+
+def test_odd_layouts():
+    points = street(6000)
+    with bench() as b:
+        message = to_message(points)
+        # Organised, rows padded with bytes that must not show up.
+        message.height, message.width = 60, 100
+        message.row_step = 100 * POINT.itemsize + 7
+        rows = bytes(message.data)
+        row_bytes = 100 * POINT.itemsize
+        message.data = b''.join(
+            rows[start : start + row_bytes] + b'padding'
+            for start in range(0, len(rows), row_bytes)
+        )
+        ground, obstacles = b.segment(message)
+        assert_partition(message, points, ground, obstacles)
+
+        # Big-endian doubles, z first.
+        swapped = np.zeros(6000, np.dtype([('z', '>f8'), ('y', '>f8'), ('x', '>f8')]))
+        for axis in 'xyz':
+            swapped[axis] = points[axis]
+        message = to_message(swapped)
+        message.is_bigendian = True
+        ground, obstacles = b.segment(message)
+        label = GroundSegmenter().segment(xyz_of(points)).label
+        assert bytes(ground.data) == swapped[label == Label.GROUND].tobytes()
+        assert bytes(obstacles.data) == swapped[label == Label.OBSTACLE].tobytes()
+        assert ground.is_bigendian
+        assert obstacles.is_bigendian
+
+
+def test_clouds_with_nothing_in_them_give_two_empty_clouds():
+    with bench() as b:
+        invalid = street(50, n_invalid=50)
+        for points in (street(0), invalid):
+            message = to_message(points, stamp=(5, 6), frame='lidar')
+            for part in b.segment(message):
+                assert (part.height, part.width, len(part.data)) == (1, 0, 0)
+                assert part.header == message.header
+                assert part.fields == message.fields
+
+
+def test_bad_cloud_is_refused_and_the_next_one_processed():
+    points = street(3000)
+    bad = to_message(points, frame='bad_frame')
+    bad.fields[3].name = 'height'
+    with bench(*OFTEN) as b:
+        b.publisher.publish(bad)
+        status = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.ERROR)
+        assert 'no field named z' in status.message
+        values = {entry.key: entry.value for entry in status.values}
+        assert values['Frame'] == 'bad_frame'
+        assert values['Refused since startup'] == '1'
+
+        message = to_message(points)
+        assert_partition(message, points, *b.segment(message))
+        assert len(b.ground.messages) == 1
+        b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
+
+
+def test_error_inside_the_library_does_not_end_the_node(monkeypatch):
+    message = to_message(street(3000))
+    with bench(*OFTEN) as b:
+        with monkeypatch.context() as patch:
+            patch.setattr(GroundSegmenter, 'segment', lambda *_: 1 / 0)
+            b.publisher.publish(message)
+            status = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.ERROR)
+            assert 'ZeroDivisionError' in status.message
+        b.segment(message)
+
+
+def test_diagnostics_of_a_stream():
+    message = to_message(street(3000), stamp=(1317383000, 0), frame='velo_link')
+    with bench(*OFTEN, '-p', 'diagnostics.stale_after:=0.3') as b:
+        stale = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.STALE)
+        assert f'{NAMESPACE}/points' in stale.message
+        for _ in range(3):
+            b.segment(message)
+        status = b.wait_for_status('processing', lambda v, _: v['Clouds since startup'] == '3')
+        assert status.level == DiagnosticStatus.OK
+        values = {entry.key: entry.value for entry in status.values}
+        assert 0.0 < float(values['Latency p50 (ms)']) <= float(values['Latency p99 (ms)'])
+        assert values['Dropped since startup'] == '0'
+        assert values['Backend'] in ('numba', 'numpy')
+        assert int(values['Threads']) >= 1
+
+        b.segment(message)
+        # A stamp of 2011 is old, and nothing is wrong with that.
+        status = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
+        values = {entry.key: entry.value for entry in status.values}
+        assert float(values['Age of last stamp (s)']) > 1e8
+        assert values['Fields'] == ' '.join(POINT.names)
+        assert values['QoS'] == 'reliable, keep_last 5, volatile'
+        assert values['Publishers'] == '1'
+        assert b.set('diagnostics.max_latency', 0.001).successful
+        b.wait_for_status('processing', lambda _, s: s.level == DiagnosticStatus.WARN)
+
+
+def test_diagnostics_come_without_a_clock_under_sim_time():
+    with bench(*OFTEN, '-p', 'use_sim_time:=true') as b:
+        assert b.node.get_clock().ros_time_is_active
+        b.segment(to_message(street(3000)))
+        b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
+
+
+def test_drops_are_counted_exactly():
+    message = to_message(street(20_000))
+    with bench(*OFTEN, '-p', f'qos_overrides.{NAMESPACE}/points.subscription.depth:=1') as b:
+        b.segment(message)
+        for _ in range(29):
+            b.publisher.publish(message)
+
+        def all_accounted_for(values, _status):
+            return int(values['Clouds since startup']) + int(values['Dropped since startup']) == 30
+
+        status = b.wait_for_status('processing', all_accounted_for)
+        values = {entry.key: entry.value for entry in status.values}
+        assert int(values['Dropped since startup']) > 0
+        assert int(values['Clouds since startup']) == len(b.ground.wait(2))
+
+
+def publish_until(publisher, message, condition, what):
+    def publish_once():
+        publisher.publish(message)
+        return condition()
+
+    wait_for(publish_once, what)
+
+
+def test_input_follows_the_reliability_of_its_publishers():
+    message = to_message(street(1000))
+    with bench() as b:
+        b.in_executor(b.probe.destroy_publisher, b.publisher)
+        driver = b.probe.create_publisher(PointCloud2, 'points', BEST_EFFORT)
+        publish_until(driver, message, lambda: b.ground.messages, 'cloud of a best-effort driver')
+        assert b.node._input.qos.reliability == BEST_EFFORT.reliability
+
+        # The driver ends, a bag is played: nothing of it may be lost.
+        b.in_executor(b.probe.destroy_publisher, driver)
+        player = b.probe.create_publisher(PointCloud2, 'points', RELIABLE)
+        wait_for(
+            lambda: b.node._input.qos.reliability == RELIABLE.reliability, 'reliable subscription'
+        )
+        wait_for(lambda: player.get_subscription_count() == 1, 'match')
+        count = len(b.ground.messages)
+        player.publish(message)
+        b.ground.wait(count + 1)
+
+
+@pytest.mark.parametrize('reliability', ['reliable', 'best_effort'])
+def test_reliability_asked_for_is_kept(reliability):
+    override = f'qos_overrides.{NAMESPACE}/points.subscription.reliability:={reliability}'
+    depth = f'qos_overrides.{NAMESPACE}/points.subscription.depth:=9'
+    message = to_message(street(1000))
+    with bench('-p', override, '-p', depth, *OFTEN) as b:
+        b.segment(message)
+        driver = b.probe.create_publisher(PointCloud2, 'points', BEST_EFFORT)
+        b.wait_for_status('input', lambda v, _: v['Publishers'] == '2')
+        publish_until(
+            driver, message, lambda: len(b.diagnostics.messages) > 15, 'a second of clouds'
+        )
+        assert b.node._input.qos.reliability.name.lower() == reliability
+        assert b.node._input.qos.depth == 9
+
+
+def test_two_nodes_side_by_side():
+    message = to_message(street(1000))
+    with isolated_context() as context:
+        b = Bench(context, ('-r', '__node:=front', '-p', 'label.ground_tolerance:=0.5'))
+        rear = GroundSegmentationNode(
+            context=context,
+            namespace=f'{NAMESPACE}/rear',
+            cli_args=['--ros-args', '-r', 'points:=cloud', '-r', 'ground:=floor'],
+        )
+        floor = Collector(b.probe, PointCloud2, 'rear/floor')
+        publisher = b.probe.create_publisher(PointCloud2, 'rear/cloud', RELIABLE)
+        assert b.node.get_name() == 'front'
+        with spinning(context, b.node, b.probe, rear):
+            wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription')
+            wait_for(lambda: floor.n_publishers == 1, 'floor')
+            publisher.publish(message)
+            floor.wait(1)
+            wait_for(lambda: b.publisher.get_subscription_count() == 1, 'subscription')
+            b.publisher.publish(message)
+            b.ground.wait(1)
+            assert len(floor.messages) == 1
+        assert b.node.config.label.ground_tolerance == 0.5
+        assert rear.config.label.ground_tolerance == 0.2

@@ -1,0 +1,232 @@
+"""The node in a process of its own: transport, signals, command line."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS is not installed')
+
+from rclpy.node import Node
+from ros_helpers import (
+    BEST_EFFORT,
+    ISOLATION,
+    MODULE,
+    NAMESPACE,
+    RELIABLE,
+    Collector,
+    Process,
+    isolated_context,
+    rows_of,
+    spinning,
+    street,
+    to_message,
+    wait_for,
+    xyz_of,
+)
+from sensor_msgs.msg import PointCloud2
+
+from gp_ground_seg import GroundSegmenter, Label
+
+IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}')
+REPOSITORY = Path(__file__).parents[1]
+PROFILE = REPOSITORY / 'config' / 'fastdds_large_clouds.xml'
+
+
+class Link:
+    """What this process sends to the node, and gets back from it."""
+
+    def __init__(self, context, qos=RELIABLE):
+        self.probe = Node('probe', context=context, namespace=NAMESPACE)
+        self.publisher = self.probe.create_publisher(PointCloud2, 'points', qos)
+        self.ground = Collector(self.probe, PointCloud2, 'ground')
+        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles')
+
+    def wait_until_connected(self):
+        wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription')
+        for collector in (self.ground, self.obstacles):
+            wait_for(lambda c=collector: c.n_publishers == 1, f'publisher of {collector.topic}')
+
+
+def test_clouds_of_two_megabytes_at_10_hz_all_come_back(tmp_path):
+    points = street(30_000, n_invalid=100)
+    message = to_message(points, frame='velo_link')
+    assert len(message.data) == 1_920_000
+    with Process(*IN_NAMESPACE, folder=tmp_path) as node, isolated_context() as context:
+        node.wait_until_ready()
+        link = Link(context)
+        with spinning(context, link.probe):
+            link.wait_until_connected()
+            next_time = time.monotonic()
+            for k in range(20):
+                message.header.stamp.sec = k
+                link.publisher.publish(message)
+                next_time += 0.1
+                time.sleep(max(0.0, next_time - time.monotonic()))
+            link.ground.wait(20)
+            link.obstacles.wait(20)
+            time_stamps = [
+                [part.header.stamp.sec for part in collector.messages]
+                for collector in (link.ground, link.obstacles)
+            ]
+            assert time_stamps == [list(range(20))] * 2
+
+    label = GroundSegmenter().segment(xyz_of(points)).label
+    rows = rows_of(message)
+    for collector, wanted in ((link.ground, Label.GROUND), (link.obstacles, Label.OBSTACLE)):
+        expected = [row for row, found in zip(rows, label, strict=True) if found == wanted]
+        for part in collector.messages:
+            assert part.fields == message.fields
+            assert part.header.frame_id == 'velo_link'
+            assert rows_of(part) == expected
+
+
+# Sends best-effort clouds of 1.9 MB until it is ended.
+DRIVER = f"""
+import sys, time
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from ros_helpers import *
+with isolated_context() as context:
+    node = Node('driver', context=context, namespace=sys.argv[1])
+    publisher = node.create_publisher(PointCloud2, 'points', BEST_EFFORT)
+    message = to_message(street(30_000))
+    while True:
+        publisher.publish(message)
+        time.sleep(0.1)
+"""
+
+
+def test_best_effort_driver_with_the_large_segment_profile(tmp_path):
+    environment = {
+        **os.environ,
+        **ISOLATION,
+        'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE),
+    }
+    with Process(*IN_NAMESPACE, folder=tmp_path) as node, isolated_context() as context:
+        node.wait_until_ready()
+        probe = Node('probe', context=context, namespace=NAMESPACE)
+        ground = Collector(probe, PointCloud2, 'ground')
+        with (tmp_path / 'driver.log').open('wb') as log:
+            driver = subprocess.Popen(
+                [sys.executable, '-c', DRIVER, NAMESPACE], env=environment, stderr=log
+            )
+        try:
+            with spinning(context, probe):
+                ground.wait(10)
+            assert driver.poll() is None
+        finally:
+            driver.kill()
+            driver.wait()
+        # Fast DDS only warns about a profile that it cannot read, and goes on without.
+        assert 'XML' not in (tmp_path / 'driver.log').read_text()
+        assert 'best_effort' in node.log
+
+
+def test_best_effort_driver_with_small_clouds(tmp_path):
+    message = to_message(street(2000))
+    with Process(*IN_NAMESPACE, folder=tmp_path) as node, isolated_context() as context:
+        node.wait_until_ready()
+        link = Link(context, BEST_EFFORT)
+
+        def publish_until_answered():
+            link.publisher.publish(message)
+            return len(link.ground.messages) >= 5
+
+        with spinning(context, link.probe):
+            wait_for(publish_until_answered, 'answer to a best-effort driver')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_under_load_with_code_0(tmp_path, number):
+    message = to_message(street(20_000))
+    with Process(*IN_NAMESPACE, folder=tmp_path) as node, isolated_context() as context:
+        node.wait_until_ready()
+        link = Link(context)
+        with spinning(context, link.probe):
+            link.wait_until_connected()
+
+            def publish_until_busy():
+                link.publisher.publish(message)
+                return len(link.ground.messages) >= 3
+
+            wait_for(publish_until_busy, 'cloud')
+            for _ in range(10):
+                link.publisher.publish(message)
+            code, duration = node.stop(number)
+    assert code == 0, node.log
+    # A second where nothing else runs; other tests may run beside this one.
+    assert duration < 5.0
+    assert 'Traceback' not in node.log
+    assert 'ERROR' not in node.log
+
+
+def test_second_signal_does_not_break_the_end(tmp_path):
+    with Process(*IN_NAMESPACE, folder=tmp_path) as node:
+        node.wait_until_ready()
+        node.popen.send_signal(signal.SIGINT)
+        node.popen.send_signal(signal.SIGINT)
+        assert node.stop(signal.SIGTERM)[0] == 0
+        assert 'Traceback' not in node.log
+
+
+def test_signal_while_compiling(tmp_path):
+    cache = tmp_path / 'cache'
+    cache.mkdir()
+    with Process(*IN_NAMESPACE, folder=tmp_path, NUMBA_CACHE_DIR=str(cache)) as node:
+        wait_for(lambda: 'compiling' in node.log, 'start')
+        code, duration = node.stop(signal.SIGTERM)
+    assert code == 0, node.log
+    assert duration < 5.0
+    assert 'Traceback' not in node.log
+
+
+def test_bad_parameter_file_is_exit_code_2(tmp_path):
+    path = tmp_path / 'bad.yaml'
+    path.write_text('/**:\n  ros__parameters:\n    label: {ground_tolerance: 9.0}\n')
+    with Process('--ros-args', '--params-file', str(path), folder=tmp_path) as node:
+        assert node.popen.wait(60.0) == 2
+    assert node.log == (
+        'ground_segmentation_node: error: label.ground_tolerance = 9.0: '
+        'must be a number in [0.001, 5] m\n'
+    )
+
+
+def test_command_line_hands_ros_arguments_on(tmp_path):
+    words = ('--ros-args', '-p', 'label.ground_tolerance:=0.3', '-r', f'__ns:={NAMESPACE}')
+    with Process(*words, folder=tmp_path, start=MODULE) as node:
+        node.wait_until_ready()
+        assert 'label.ground_tolerance: 0.3 m  (default 0.2)' in node.log
+        assert f'listening to {NAMESPACE}/points' in node.log
+        assert node.stop(signal.SIGTERM)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        (('config', 'dump', '--ros-args', '-p', 'a:=1'), '--ros-args: this command takes none'),
+        (('node', 'nonsense'), 'nonsense'),
+        (('node', '--ros-args', '--', 'nonsense'), 'nonsense'),
+    ],
+)
+def test_words_that_nobody_takes_are_refused(words, complaint):
+    result = subprocess.run(
+        [sys.executable, '-m', 'gp_ground_seg', *words], capture_output=True, text=True, timeout=60
+    )
+    assert result.returncode == 2
+    assert complaint in result.stderr
+    assert 'Traceback' not in result.stderr
+
+
+def test_missing_ros_is_said_in_one_line():
+    hide = "import sys; sys.modules['rclpy'] = None; "
+    code = hide + 'from gp_ground_seg.cli.node import main; sys.exit(main())'
+    result = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, timeout=60
+    )
+    assert result.returncode == 2
+    assert len(result.stderr.splitlines()) == 1
+    assert "pip install 'gp_ground_seg[ros]'" in result.stderr
