@@ -43,7 +43,7 @@ class GroundSegmenter:
     ) -> None:
         self._clock = clock
         self._config = config if config is not None else Config()
-        self._backend = make_backend(self._config.runtime.backend, self._config.runtime.n_threads)
+        self._backend = make_backend(self._config.runtime)
         self._theta: FloatArray | None = None
         self._frames_since_learning = 0
 
@@ -56,7 +56,7 @@ class GroundSegmenter:
         """Use `config` from the next scan on; what was learned is forgotten."""
         if config.runtime != self._config.runtime:
             self._backend.close()
-            self._backend = make_backend(config.runtime.backend, config.runtime.n_threads)
+            self._backend = make_backend(config.runtime)
         self._config = config
         self.reset()
 

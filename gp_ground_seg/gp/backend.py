@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from gp_ground_seg.compiled import HAVE_NUMBA
-from gp_ground_seg.config import GrowthConfig
+from gp_ground_seg.config import GrowthConfig, RuntimeConfig
 from gp_ground_seg.errors import MissingDependencyError
 from gp_ground_seg.gp.growth import (
     BoolArray,
@@ -60,8 +60,8 @@ class Backend(Protocol):
         """End worker threads."""
 
 
-def make_backend(wanted: str, n_threads: int) -> Backend:
-    """Backend for the parameters ``runtime.backend`` and ``runtime.n_threads``.
+def choose_backend(wanted: str) -> str:
+    """Return ``numba`` or ``numpy`` for the parameter ``runtime.backend``.
 
     Raises
     ------
@@ -74,16 +74,19 @@ def make_backend(wanted: str, n_threads: int) -> Backend:
             'runtime.backend = numba, but numba is not installed: pip install numba, '
             'or set runtime.backend to auto'
         )
-    if wanted == 'numpy':
-        return ReferenceBackend()
-    if HAVE_NUMBA:
-        return CompiledBackend(n_threads)
-    if not _said_slow:
+    if wanted == 'auto' and not HAVE_NUMBA and not _said_slow:
         _said_slow = True
         _LOGGER.warning(
             'numba is not installed: using numpy, several times slower (pip install numba)'
         )
-    return ReferenceBackend()
+    return 'numba' if HAVE_NUMBA and wanted != 'numpy' else 'numpy'
+
+
+def make_backend(runtime: RuntimeConfig) -> Backend:
+    """Backend for the parameters ``runtime``; raises as `choose_backend`."""
+    if choose_backend(runtime.backend) == 'numpy':
+        return ReferenceBackend()
+    return CompiledBackend(runtime.n_threads)
 
 
 class ReferenceBackend:
