@@ -14,7 +14,7 @@ version = re.search(
     re.MULTILINE,
 ).group(1)
 
-BAGS = ['rosbags>=0.10']
+BAGS = ['rosbags>=0.11.9']
 PLOT = ['matplotlib>=3.6']
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [

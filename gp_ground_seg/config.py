@@ -202,6 +202,19 @@ class LinesConfig:
         low=0.0,
         high=2.0,
     )
+    max_density_ratio: float = _parameter(
+        8.0,
+        'ratio of the vertical densities of two successive bins that ends a line',
+        low=1.0,
+        high=1e6,
+    )
+    min_density_extent: float = _parameter(
+        0.05,
+        'least height of a bin in its vertical density',
+        unit='m',
+        low=0.001,
+        high=1.0,
+    )
     error_ratio: float = _parameter(
         1.0,
         'variance of the height error over that of the range error in the line regression',
@@ -216,9 +229,10 @@ class LengthScaleConfig:
     """Length-scale of the observation process along a segment."""
 
     model: str = _parameter(
-        'line_gradient',
-        'where the length-scales come from: slopes of the extracted lines, or one constant',
-        choices=('line_gradient', 'constant'),
+        'latent',
+        'where the length-scales come from: the latent process, the slopes of the extracted '
+        'lines, or one constant',
+        choices=('latent', 'line_gradient', 'constant'),
     )
     constant: float = _parameter(
         10.0, 'length-scale of the constant model', unit='m', low=0.05, high=200.0
@@ -247,7 +261,7 @@ class ObservationConfig:
     """Hyper-parameters of the observation process GP_z."""
 
     sigma_f: float = _parameter(
-        0.2,
+        0.3,
         'prior standard deviation of the ground height about its mean line',
         unit='m',
         symbol='sigma_f',
@@ -255,7 +269,7 @@ class ObservationConfig:
         high=10.0,
     )
     sigma_n: float = _parameter(
-        0.07,
+        0.04,
         'standard deviation of the height noise of a ground candidate',
         unit='m',
         symbol='sigma_n',
@@ -267,6 +281,52 @@ class ObservationConfig:
         "prior standard deviation of the mean line's slope; 0 = a level mean",
         low=0.0,
         high=2.0,
+    )
+
+
+@dataclass(frozen=True)
+class LatentConfig:
+    """Latent process GP_l over log length-scale, and its pseudo-inputs."""
+
+    sigma_f_bar: float = _parameter(
+        0.9,
+        'prior standard deviation of the log length-scale about its mean',
+        symbol='sigma_f_bar',
+        low=0.01,
+        high=100.0,
+    )
+    sigma_l_bar: float = _parameter(
+        2.0,
+        'length-scale of the latent process',
+        unit='m',
+        symbol='sigma_l_bar',
+        low=0.1,
+        high=500.0,
+    )
+    sigma_n_bar: float = _parameter(
+        0.25,
+        'standard deviation of the noise of the log length-scale',
+        symbol='sigma_n_bar',
+        low=0.01,
+        high=100.0,
+    )
+    candidates_per_pseudo_input: float = _parameter(
+        3.0,
+        'ground candidates of a line for each pseudo-input: more = faster, less precise',
+        low=1.0,
+        high=100.0,
+    )
+    sloped_gradient: float = _parameter(
+        0.1, 'slope from which a line counts as sloped', low=0.001, high=10.0
+    )
+    steep_gradient: float = _parameter(
+        0.4, 'slope from which a line counts as steep', low=0.001, high=100.0
+    )
+    medium_extent: float = _parameter(
+        1.5, 'extent from which a line counts as medium', unit='m', low=0.01, high=200.0
+    )
+    long_extent: float = _parameter(
+        5.0, 'extent from which a line counts as long', unit='m', low=0.01, high=200.0
     )
 
 
@@ -289,14 +349,14 @@ class GrowthConfig:
         high=5.0,
     )
     max_std: float = _parameter(
-        0.3,
+        0.4,
         'predictive standard deviation above which a candidate has to wait',
         unit='m',
         low=0.001,
         high=10.0,
     )
     max_standardised_residual: float = _parameter(
-        3.0,
+        2.2,
         'residual over predictive standard deviation above which a candidate is an outlier',
         low=0.1,
         high=50.0,
@@ -341,7 +401,7 @@ class LabelConfig:
         high=5.0,
     )
     obstacle_min_height: float = _parameter(
-        0.4,
+        0.5,
         'height above the surface from which a return shows that an obstacle stands in its bin',
         unit='m',
         low=0.01,
@@ -361,9 +421,55 @@ class LearningConfig:
     """Learning of the hyper-parameters."""
 
     mode: str = _parameter(
-        'fixed',
-        'when the hyper-parameters are learned: fixed = never, the values given here are used',
-        choices=('fixed',),
+        'every_frame',
+        'when the hyper-parameters are learned; fixed = never, the values given here are used',
+        choices=('every_frame', 'every_k', 'first_frame', 'fixed'),
+    )
+    period: int = _parameter(
+        10, 'frames from one learning to the next in the mode every_k', low=1, high=10000
+    )
+    scope: str = _parameter(
+        'frame',
+        'frame = one set of hyper-parameters for the whole frame; segment = one for each '
+        'segment (slow, for comparison)',
+        choices=('frame', 'segment'),
+    )
+    objective: str = _parameter(
+        'map',
+        'map = with the latent quadratic term and the priors; paper = as printed, unbounded',
+        choices=('map', 'paper'),
+    )
+    warm_start: bool = _parameter(
+        False,
+        'start from the frame before: fewer evaluations, but the labels depend on the past',
+    )
+    max_evaluations: int = _parameter(
+        8, 'evaluations of the objective per frame; the best so far is used', low=1, high=1000
+    )
+    max_time: float = _parameter(
+        0.0,
+        'time for the learning of a frame, after which the best so far is used; 0 = no limit; '
+        'the labels then depend on the speed of the machine',
+        unit='s',
+        low=0.0,
+        high=60.0,
+    )
+    prior_std: float = _parameter(
+        1.0,
+        'standard deviation of the log-normal priors about the values given here',
+        low=0.01,
+        high=10.0,
+    )
+    bound_factor: float = _parameter(
+        20.0,
+        'largest factor by which a hyper-parameter may leave the value given here',
+        low=1.01,
+        high=1e6,
+    )
+    fixed: str = _parameter(
+        'none',
+        'hyper-parameters that are not learned',
+        choices=('none', 'sigma_f_bar', 'latent', 'length_scales'),
     )
 
 
@@ -417,6 +523,7 @@ class Config:
     lines: LinesConfig = LinesConfig()
     length_scale: LengthScaleConfig = LengthScaleConfig()
     observation: ObservationConfig = ObservationConfig()
+    latent: LatentConfig = LatentConfig()
     growth: GrowthConfig = GrowthConfig()
     surface: SurfaceConfig = SurfaceConfig()
     label: LabelConfig = LabelConfig()
@@ -433,6 +540,8 @@ class Config:
             object.__setattr__(self, group_name, group)
         _require_order(self, 'grid.r_min', 'grid.r_max')
         _require_order(self, 'length_scale.min', 'length_scale.max')
+        _require_order(self, 'latent.sloped_gradient', 'latent.steep_gradient')
+        _require_order(self, 'latent.medium_extent', 'latent.long_extent')
         _require_order(self, 'label.obstacle_min_height', 'label.obstacle_max_height')
         if 2 * self.surface.n_neighbours >= self.grid.n_segments:
             raise ConfigError(

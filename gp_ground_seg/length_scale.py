@@ -65,7 +65,7 @@ def interpolate_along_segments(
     n_segments = len(candidates.offsets) - 1
     result = np.full((n_segments, len(knots)), np.nan)
     occupied = np.flatnonzero(np.diff(candidates.offsets))
-    if len(occupied) == 0:
+    if len(occupied) == 0 or len(knots) == 0:
         return result
     # One call for all segments: they are laid end to end on one axis.
     stride = 2.0 * max(float(candidates.r.max()), float(knots.max())) + 1.0

@@ -22,19 +22,27 @@ class Lines:
         Line of each candidate.
     slope : (Q,) float64
         Slope dz/dr of each line; NaN for a line of one point.
+    start : (Q + 1,) int64
+        Candidates of line q are ``start[q]:start[q + 1]``.
     """
 
     line: IntArray
     slope: FloatArray
+    start: IntArray
+
+    def extent(self, candidates: Candidates) -> FloatArray:
+        """Horizontal extent of each line, (Q,) float64 [m]."""
+        value: FloatArray = candidates.r[self.start[1:] - 1] - candidates.r[self.start[:-1]]
+        return value
 
 
 def extract_lines(candidates: Candidates, lines: LinesConfig) -> Lines:
     """Cut each segment's candidates into lines (paper, section III-D and Algorithm 1).
 
     A line grows over the candidates in order of range until the next one makes
-    a critical point: a gap, a change of slope or of height at the new point, or
-    a distance from the line that is too large. The next line starts there, from
-    scratch.
+    a critical point: a gap, a change of slope or of height at the new point, a
+    distance from the line that is too large, or a sharp change of the vertical
+    density. The next line starts there, from scratch.
 
     Parameters
     ----------
@@ -47,14 +55,17 @@ def extract_lines(candidates: Candidates, lines: LinesConfig) -> Lines:
         candidates.offsets,
         candidates.r,
         candidates.z,
+        np.log(candidates.density),
         lines.slope_tolerance,
         lines.offset_tolerance,
         lines.max_line_distance,
         lines.max_gap,
         lines.max_gap_growth,
+        math.log(lines.max_density_ratio),
         lines.error_ratio,
     )
-    return Lines(line, slope[:n_lines])
+    start = np.searchsorted(line, np.arange(n_lines + 1))
+    return Lines(line, slope[:n_lines], start)
 
 
 def _deming_from_moments(s_rr: float, s_zz: float, s_rz: float, error_ratio: float) -> float:
@@ -85,11 +96,13 @@ def _extract(
     offsets: IntArray,
     r: FloatArray,
     z: FloatArray,
+    log_density: FloatArray,
     slope_tolerance: float,
     offset_tolerance: float,
     max_line_distance: float,
     max_gap: float,
     max_gap_growth: float,
+    max_log_density_change: float,
     error_ratio: float,
 ) -> tuple[IntArray, FloatArray, int]:
     line = np.empty(len(r), np.int64)
@@ -106,7 +119,10 @@ def _extract(
             j = i
             while j < offsets[m + 1]:
                 dr, dz = r[j] - r[i], z[j] - z[i]
-                if n > 0 and r[j] - r[j - 1] > max_gap + max_gap_growth * r[j]:
+                if n > 0 and (
+                    r[j] - r[j - 1] > max_gap + max_gap_growth * r[j]
+                    or abs(log_density[j] - log_density[j - 1]) > max_log_density_change
+                ):
                     break
                 new_r, new_z = (sum_r + dr) / (n + 1), (sum_z + dz) / (n + 1)
                 new_slope = np.nan

@@ -51,6 +51,8 @@ class Candidates:
         Horizontal range and height [m] of the lowest point of each occupied bin.
     bin : (C,) int64
         Bin of each candidate.
+    density : (C,) float64
+        Vertical density of each candidate's bin [points/m^2].
     offsets : (M + 1,) int64
         Candidates of segment m are ``offsets[m]:offsets[m + 1]``.
     """
@@ -58,6 +60,7 @@ class Candidates:
     r: FloatArray
     z: FloatArray
     bin: IntArray
+    density: FloatArray
     offsets: IntArray
 
     @property
@@ -99,8 +102,12 @@ def build_polar_grid(
     return PolarGrid(segment, index, np.where(finite, r, np.nan), edges, grid.n_segments)
 
 
-def lowest_points(grid: PolarGrid, z: FloatArray) -> Candidates:
-    """Lowest point of each occupied bin (paper, section II, PG_m).
+def lowest_points(grid: PolarGrid, z: FloatArray, min_extent: float) -> Candidates:
+    """Lowest point and vertical density of each occupied bin (paper, section II).
+
+    The paper cuts a bin into j slices and averages their densities: points over
+    area. The slices are equally high, so whatever j is, that mean is the number
+    of points over the area of the whole bin, width by height.
 
     Equal heights are settled by the smaller range, so that the order of the
     points does not matter.
@@ -111,6 +118,9 @@ def lowest_points(grid: PolarGrid, z: FloatArray) -> Candidates:
         Bins of the points.
     z : (N,) float64
         Heights [m].
+    min_extent : float
+        Least height of a bin in the density [m]: the points of a flat bin are no
+        closer together than the sensor's noise.
     """
     n_bins = len(grid.edges) - 1
     inside = grid.bin != OUTSIDE
@@ -121,11 +131,17 @@ def lowest_points(grid: PolarGrid, z: FloatArray) -> Candidates:
     is_lowest = z_inside == lowest_z[cell]
     lowest_r = np.full(grid.n_segments * n_bins, np.inf)
     np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest])
+    highest_z = np.full(grid.n_segments * n_bins, -np.inf)
+    np.maximum.at(highest_z, cell, z_inside)
+    count = np.bincount(cell, minlength=grid.n_segments * n_bins)
     occupied = np.isfinite(lowest_z)
+    own_bin = np.flatnonzero(occupied) % n_bins
+    extent = np.maximum(highest_z[occupied] - lowest_z[occupied], min_extent)
     per_segment = occupied.reshape(grid.n_segments, n_bins).sum(axis=1)
     return Candidates(
         r=lowest_r[occupied],
         z=lowest_z[occupied],
-        bin=np.flatnonzero(occupied) % n_bins,
+        bin=own_bin,
+        density=count[occupied] / (np.diff(grid.edges)[own_bin] * extent),
         offsets=np.concatenate([[0], np.cumsum(per_segment)]),
     )

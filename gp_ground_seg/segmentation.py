@@ -7,7 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.gp.frame_model import FrameModel
+from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.gp.learning import Learned
+from gp_ground_seg.gp.theta import theta_names
+from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid
+from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface
 
 
@@ -19,12 +25,23 @@ class FitReport:
     ----------
     mode : str
         ``learning.mode`` of the frame.
-    sigma_f, sigma_n : float
-        Hyper-parameters used [m].
+    status : str
+        ``converged``, ``budget`` or ``failed``; ``kept`` when nothing was learned on this frame.
+    n_evaluations : int
+        Evaluations of the objective, over all segments where each has its own.
+    objective : float
+        Objective per inlier at the end; NaN when nothing was learned.
+    theta : dict of str to float
+        Hyper-parameters used: sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m],
+        sigma_n_bar, and length_scale_bar_0 ... [m] of the surface classes. Means of
+        the logarithms where each segment has its own.
+    at_bound : tuple of str
+        Those that ended at a bound.
     n_segments : int
         Segments with a ground model.
-    n_candidates, n_inliers, n_lines : int
-        Ground candidates, those the surface rests on, and lines among them.
+    n_candidates, n_inliers, n_lines, n_pseudo_inputs : int
+        Ground candidates, those the surface rests on, lines among them, and
+        pseudo-inputs of the latent process.
     backend : str
         ``numba`` or ``numpy``.
     n_threads : int
@@ -32,14 +49,50 @@ class FitReport:
     """
 
     mode: str
-    sigma_f: float
-    sigma_n: float
+    status: str
+    n_evaluations: int
+    objective: float
+    theta: dict[str, float]
+    at_bound: tuple[str, ...]
     n_segments: int
     n_candidates: int
     n_inliers: int
     n_lines: int
+    n_pseudo_inputs: int
     backend: str
     n_threads: int
+
+    @classmethod
+    def of(
+        cls,
+        model: FrameModel,
+        theta: FloatArray,
+        learned: list[Learned],
+        inlier: BoolArray,
+        mean: FloatArray,
+    ) -> FitReport:
+        """Sum up one frame."""
+        names = theta_names(theta.shape[1])
+        values = np.exp(theta.mean(axis=0))
+        statuses = {one.status for one in learned}
+        at_bound = np.any([one.at_bound for one in learned], axis=0) if learned else []
+        n_inliers = int(inlier.sum())
+        total = sum(one.objective for one in learned)
+        return cls(
+            mode=model.config.learning.mode,
+            status=next((s for s in ('failed', 'budget', 'converged') if s in statuses), 'kept'),
+            n_evaluations=sum(one.n_evaluations for one in learned),
+            objective=total / n_inliers if learned and n_inliers else float('nan'),
+            theta={name: float(value) for name, value in zip(names, values, strict=True)},
+            at_bound=tuple(n for n, hit in zip(names, at_bound, strict=False) if hit),
+            n_segments=int(np.isfinite(mean[:, 0]).sum()),
+            n_candidates=len(model.candidates.r),
+            n_inliers=n_inliers,
+            n_lines=len(model.lines.slope),
+            n_pseudo_inputs=len(model.pseudo.r_bar),
+            backend=model.backend.name,
+            n_threads=model.backend.n_threads,
+        )
 
 
 @dataclass(frozen=True)
@@ -52,6 +105,8 @@ class Segmentation:
         `gp_ground_seg.Label` of each point. Finite points are GROUND or
         OBSTACLE; where there is no model nothing speaks for ground, and they
         are OBSTACLE. Points that are not finite are UNKNOWN.
+    height : (N,) float64
+        Height of each point over the surface [m], negative below it; NaN where there is no model.
     ground_z : (N,) float64
         Surface height under each point, sensor frame [m]; NaN where there is no model.
     ground_std : (N,) float64
@@ -60,15 +115,18 @@ class Segmentation:
         Seconds per stage, and ``total``.
     fit : FitReport
         What the learning did.
-    grid, candidates, surface
+    grid, candidates, lines, pseudo, surface
         Intermediate results, for plots and diagnostics.
     """
 
     label: npt.NDArray[np.uint8]
+    height: FloatArray
     ground_z: FloatArray
     ground_std: FloatArray
     timings: dict[str, float]
     fit: FitReport
     grid: PolarGrid
     candidates: Candidates
+    lines: Lines
+    pseudo: PseudoInputs
     surface: GroundSurface

@@ -9,13 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.config import Config
-from gp_ground_seg.gp.fit import choose_backend, fit_surface
+from gp_ground_seg.gp.backend import make_backend
+from gp_ground_seg.gp.frame_model import FrameModel
+from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.labelling import label_points
-from gp_ground_seg.length_scale import candidate_log_length_scale, interpolate_along_segments
 from gp_ground_seg.line_extraction import extract_lines
-from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.points import check_points
-from gp_ground_seg.polar_grid import build_polar_grid, lowest_points
+from gp_ground_seg.polar_grid import FloatArray, build_polar_grid, lowest_points
+from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
 from gp_ground_seg.segmentation import FitReport, Segmentation
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
 from gp_ground_seg.timing import StageTimer
@@ -29,7 +30,7 @@ class GroundSegmenter:
     config : Config
         Parameters; `configure` changes them between scans.
     clock : callable
-        Source of the seconds in ``Segmentation.timings``.
+        Source of the seconds in ``Segmentation.timings`` and of ``learning.max_time``.
 
     Raises
     ------
@@ -42,8 +43,9 @@ class GroundSegmenter:
     ) -> None:
         self._clock = clock
         self._config = config if config is not None else Config()
-        self._backend = choose_backend(self._config.runtime.backend)
-        self._pool = RowPool(self._config.runtime.n_threads)
+        self._backend = make_backend(self._config.runtime)
+        self._theta: FloatArray | None = None
+        self._frames_since_learning = 0
 
     @property
     def config(self) -> Config:
@@ -51,16 +53,20 @@ class GroundSegmenter:
         return self._config
 
     def configure(self, config: Config) -> None:
-        """Use `config` from the next scan on."""
-        self._backend = choose_backend(config.runtime.backend)
-        if config.runtime.n_threads != self._config.runtime.n_threads:
-            self._pool.close()
-            self._pool = RowPool(config.runtime.n_threads)
+        """Use `config` from the next scan on; what was learned is forgotten."""
+        if config.runtime != self._config.runtime:
+            self._backend.close()
+            self._backend = make_backend(config.runtime)
         self._config = config
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what earlier scans taught, as after a jump in time."""
+        self._theta = None
 
     def close(self) -> None:
         """End the worker threads; the segmenter is of no use afterwards."""
-        self._pool.close()
+        self._backend.close()
 
     def segment(self, points: npt.ArrayLike) -> Segmentation:
         """Label every point of a scan.
@@ -82,46 +88,62 @@ class GroundSegmenter:
         grid = build_polar_grid(xyz, finite, config.grid)
         timer.mark('grid')
 
-        candidates = lowest_points(grid, z)
+        candidates = lowest_points(grid, z, config.lines.min_density_extent)
         timer.mark('candidates')
+
+        lines = extract_lines(candidates, config.lines)
+        pseudo = select_pseudo_inputs(candidates, lines, config)
+        timer.mark('lines')
 
         # Heights are centred on the expected ground: a zero mean would pull it to the sensor.
         expected_ground = -config.sensor.height
         height = candidates.z - expected_ground
-        lines = extract_lines(candidates, config.lines)
-        log_length_scale = candidate_log_length_scale(candidates, lines, config.length_scale)
-        knots = grid.edges
-        knot_log_length_scale = interpolate_along_segments(candidates, log_length_scale, knots)
-        timer.mark('length_scale')
+        model = FrameModel(config, self._backend, candidates, height, lines, pseudo, grid.edges)
+        theta, learned = self._learn(model)
+        timer.mark('learning')
 
-        seed = (candidates.r <= config.growth.seed_range) & (
-            np.abs(height) <= config.growth.seed_height_tolerance
-        )
-        inlier, mean, std = fit_surface(
-            candidates, height, np.exp(log_length_scale), seed,
-            knots, np.exp(knot_log_length_scale), config, self._backend, self._pool,
-        )  # fmt: skip
+        inlier, mean, std = model.surface(theta)
         mean, std = fuse_neighbours(
-            mean, std, knots, config.surface.n_neighbours, config.observation.slope_std
+            mean, std, grid.edges, config.surface.n_neighbours, config.observation.slope_std
         )
-        surface = GroundSurface(knots, mean + expected_ground, std, inlier)
+        surface = GroundSurface(grid.edges, mean + expected_ground, std, inlier)
         timer.mark('surface')
 
         ground_z, ground_std = surface.at(grid)
         label = label_points(z - ground_z, grid, surface, config.label)
         timer.mark('label')
 
-        fit = FitReport(
-            mode=config.learning.mode,
-            sigma_f=config.observation.sigma_f,
-            sigma_n=config.observation.sigma_n,
-            n_segments=int(np.isfinite(mean[:, 0]).sum()),
-            n_candidates=len(candidates.r),
-            n_inliers=int(inlier.sum()),
-            n_lines=len(lines.slope),
-            backend=self._backend,
-            n_threads=self._pool.n_threads,
-        )
+        fit = FitReport.of(model, theta, learned, inlier, mean)
         return Segmentation(
-            label, ground_z, ground_std, timer.seconds, fit, grid, candidates, surface
+            label,
+            z - ground_z,
+            ground_z,
+            ground_std,
+            timer.seconds,
+            fit,
+            grid,
+            candidates,
+            lines,
+            pseudo,
+            surface,
         )
+
+    def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:
+        """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""
+        learning = self._config.learning
+        given = np.tile(model.space().centre, (self._config.grid.n_segments, 1))
+        if learning.mode == 'fixed':
+            return given, []
+        keeps = {'every_frame': 1, 'every_k': learning.period, 'first_frame': None}[learning.mode]
+        self._frames_since_learning += 1
+        if self._theta is not None and (keeps is None or self._frames_since_learning < keeps):
+            return self._theta, []
+        started = self._clock() if learning.max_time > 0.0 else 0.0
+
+        def out_of_time() -> bool:
+            return 0.0 < learning.max_time <= self._clock() - started
+
+        start = self._theta if self._theta is not None and learning.warm_start else given
+        self._theta, learned = model.learn(start, out_of_time)
+        self._frames_since_learning = 0
+        return self._theta, learned

@@ -73,7 +73,10 @@ def test_every_parameter_is_explained_above_it():
             assert spec.description in words
             assert spec.unit in words
             assert spec.symbol in words
-            expected = spec.choices or (f'{spec.minimum:.10g} to {spec.maximum:.10g}',)
+            if spec.type is bool:
+                expected = ('true or false',)
+            else:
+                expected = spec.choices or (f'{spec.minimum:.10g} to {spec.maximum:.10g}',)
             assert all(choice in words for choice in expected)
     assert seen == [spec.name for spec in parameter_specs()]
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg.config import GrowthConfig, ObservationConfig
+from gp_ground_seg.config import GrowthConfig
 from gp_ground_seg.gp.growth import grow_surface_compiled, grow_surface_reference
 
 KNOTS = np.linspace(2.0, 60.0, 30)
@@ -24,9 +24,11 @@ def random_frame(seed, n_segments=5):
     return offsets, r, z, length_scale, seed_mask, KNOTS, knot_length_scale
 
 
-def compiled(frame, observation, growth, chunks=1):
+def compiled(frame, growth, chunks=1, sigma_f=None, sigma_n=None, slope_std=0.05):
     offsets, r = frame[0], frame[1]
     n_segments = len(offsets) - 1
+    sigma_f = np.full(n_segments, 0.2) if sigma_f is None else sigma_f
+    sigma_n = np.full(n_segments, 0.07) if sigma_n is None else sigma_n
     inlier = np.zeros(len(r), dtype=bool)
     mean = np.full((n_segments, len(KNOTS)), np.nan)
     std = np.full((n_segments, len(KNOTS)), np.nan)
@@ -39,9 +41,9 @@ def compiled(frame, observation, growth, chunks=1):
             start,
             stop,
             *frame,
-            observation.sigma_f,
-            observation.sigma_n,
-            observation.slope_std,
+            sigma_f,
+            sigma_n,
+            slope_std,
             growth.max_std,
             growth.max_standardised_residual,
             inlier,
@@ -55,10 +57,11 @@ def compiled(frame, observation, growth, chunks=1):
 @given(st.integers(0, 100_000), st.sampled_from([0.0, 0.05]))
 def test_appending_rows_gives_what_refitting_gives(seed, slope_std):
     frame = random_frame(seed)
-    observation = ObservationConfig(slope_std=slope_std)
+    # Every segment may have its own.
+    sigma_f, sigma_n = np.linspace(0.1, 0.5, 5), np.linspace(0.1, 0.03, 5)
     growth = GrowthConfig()
-    expected = grow_surface_reference(*frame, observation, growth)
-    found = compiled(frame, observation, growth)
+    expected = grow_surface_reference(*frame, sigma_f, sigma_n, slope_std, growth)
+    found = compiled(frame, growth, sigma_f=sigma_f, sigma_n=sigma_n, slope_std=slope_std)
     np.testing.assert_array_equal(found[0], expected[0])
     np.testing.assert_allclose(found[1], expected[1], atol=1e-8)
     np.testing.assert_allclose(found[2], expected[2], atol=1e-6)
@@ -66,8 +69,8 @@ def test_appending_rows_gives_what_refitting_gives(seed, slope_std):
 
 def test_chunks_do_not_matter():
     frame = random_frame(3, n_segments=12)
-    whole = compiled(frame, ObservationConfig(), GrowthConfig())
-    parts = compiled(frame, ObservationConfig(), GrowthConfig(), chunks=5)
+    whole = compiled(frame, GrowthConfig())
+    parts = compiled(frame, GrowthConfig(), chunks=5)
     for a, b in zip(whole, parts, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -84,7 +87,9 @@ def grow_line(z, r=None, seed=None, **bounds):
         seed,
         KNOTS,
         np.full((1, len(KNOTS)), 8.0),
-        ObservationConfig(),
+        np.array([0.2]),
+        np.array([0.07]),
+        0.05,
         GrowthConfig(**bounds),
     )
 

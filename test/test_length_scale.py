@@ -14,6 +14,7 @@ CANDIDATES = Candidates(
     r=np.array([2.0, 4.0, 8.0, 5.0]),
     z=np.zeros(4),
     bin=np.arange(4),
+    density=np.ones(4),
     offsets=np.array([0, 3, 3, 4]),
 )
 
@@ -27,15 +28,15 @@ def test_formula_flat_limit_and_bounds():
 
 
 def test_each_candidate_takes_its_lines_length_scale():
-    lines = Lines(np.array([0, 0, 1, 2]), np.array([0.0, 0.5, np.nan]))
-    parameters = LengthScaleConfig()
+    lines = Lines(np.array([0, 0, 1, 2]), np.array([0.0, 0.5, np.nan]), np.array([0, 2, 3, 4]))
+    parameters = LengthScaleConfig(model='line_gradient')
     values = np.exp(candidate_log_length_scale(CANDIDATES, lines, parameters))
     by_line = line_gradient_length_scale(lines.slope, parameters)
     np.testing.assert_allclose(values, by_line[[0, 0, 1, 2]])
 
 
 def test_constant_model():
-    lines = Lines(np.zeros(4, dtype=int), np.array([0.3]))
+    lines = Lines(np.zeros(4, dtype=int), np.array([0.3]), np.array([0, 4]))
     values = candidate_log_length_scale(
         CANDIDATES, lines, LengthScaleConfig(model='constant', constant=7.0)
     )

@@ -12,9 +12,10 @@ from gp_ground_seg.line_extraction import deming_slope, extract_lines
 from gp_ground_seg.polar_grid import Candidates
 
 
-def one_segment(r, z):
+def one_segment(r, z, density=None):
     r, z = np.asarray(r, dtype=float), np.asarray(z, dtype=float)
-    return Candidates(r, z, np.arange(len(r)), np.array([0, len(r)]))
+    density = np.ones(len(r)) if density is None else np.asarray(density, dtype=float)
+    return Candidates(r, z, np.arange(len(r)), density, np.array([0, len(r)]))
 
 
 def moments(r, z):
@@ -66,7 +67,7 @@ def test_deming_of_a_vertical_line_is_infinite_and_of_a_point_is_level():
     assert deming_slope(4.0, 0.0, 0.0, 1.0) == 0.0
 
 
-def slow_extract(r, z, lines):
+def slow_extract(r, z, density, lines):
     """The same rule with every fit made anew by SVD (error ratio 1)."""
 
     def fit(rs, zs):
@@ -81,6 +82,9 @@ def slow_extract(r, z, lines):
         stop = start + 1
         while stop < len(r):
             if r[stop] - r[stop - 1] > lines.max_gap + lines.max_gap_growth * r[stop]:
+                break
+            ratio = density[stop] / density[stop - 1]
+            if max(ratio, 1 / ratio) > lines.max_density_ratio:
                 break
             if stop - start > 1:
                 old, _ = fit(r[start:stop], z[start:stop])
@@ -104,9 +108,12 @@ def test_running_sums_give_the_lines_of_fits_made_anew(seed, n):
     rng = np.random.default_rng(seed)
     r = 3.0 + np.cumsum(rng.uniform(0.2, 1.5, n))
     z = np.cumsum(rng.normal(0, 0.08, n))
+    density = np.exp(rng.normal(0, 0.8, n))
     lines = LinesConfig()
-    extracted = extract_lines(one_segment(r, z), lines)
-    assert list(extracted.line) == slow_extract(r, z, lines)
+    extracted = extract_lines(one_segment(r, z, density), lines)
+    assert list(extracted.line) == slow_extract(r, z, density, lines)
+    firsts = [0, *(np.flatnonzero(np.diff(extracted.line)) + 1), n]
+    assert list(extracted.start) == firsts
 
 
 @given(st.floats(-0.4, 0.4), st.floats(0.45, 0.8), st.booleans())
@@ -125,9 +132,22 @@ def test_a_gap_ends_a_line_and_may_be_wider_far_away():
     assert list(extract_lines(one_segment(r, np.zeros(5)), lines).line) == [0, 0, 1, 2, 2]
 
 
+def test_a_sharp_change_of_density_ends_a_line():
+    lines = LinesConfig(max_density_ratio=8.0)
+    density = [10.0, 20.0, 2.4, 2.4, 30.0]
+    found = extract_lines(one_segment([3, 4, 5, 6, 7], np.zeros(5), density), lines)
+    assert list(found.line) == [0, 0, 1, 1, 2]
+
+
+def test_extent_of_lines():
+    candidates = one_segment([3.0, 4.0, 6.0, 50.0], np.zeros(4))
+    lines = extract_lines(candidates, LinesConfig(max_gap=5.0))
+    np.testing.assert_array_equal(lines.extent(candidates), [3.0, 0.0])
+
+
 def test_lines_do_not_cross_segments_and_lone_points_have_no_slope():
     candidates = Candidates(
-        np.array([3.0, 4.0, 5.0]), np.zeros(3), np.arange(3), np.array([0, 2, 2, 3])
+        np.array([3.0, 4.0, 5.0]), np.zeros(3), np.arange(3), np.ones(3), np.array([0, 2, 2, 3])
     )
     lines = extract_lines(candidates, LinesConfig())
     assert list(lines.line) == [0, 0, 1]

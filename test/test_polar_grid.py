@@ -64,7 +64,7 @@ def test_both_sides_of_the_negative_x_axis():
 def test_lowest_point_of_every_bin():
     xyz = hilly_scan(3000, seed=1)
     grid = build(xyz)
-    candidates = lowest_points(grid, xyz[:, 2])
+    candidates = lowest_points(grid, xyz[:, 2], 0.05)
     best = {}
     for segment, index, r, z in zip(grid.segment, grid.bin, grid.r, xyz[:, 2], strict=True):
         cell = (segment, index)
@@ -79,19 +79,19 @@ def test_equal_heights_are_settled_by_range_not_by_order():
     points = np.array([[5.02, 0.0, -1.7], [5.01, 0.0, -1.7], [5.03, 0.0, -1.7]])
     for order in ([0, 1, 2], [2, 1, 0], [1, 2, 0]):
         shuffled = points[order]
-        candidates = lowest_points(build(shuffled), shuffled[:, 2])
+        candidates = lowest_points(build(shuffled), shuffled[:, 2], 0.05)
         assert list(candidates.r) == [5.01]
 
 
 def test_candidates_of_a_segment_come_in_order_of_range():
     xyz = hilly_scan(5000, seed=2)
-    candidates = lowest_points(build(xyz), xyz[:, 2])
+    candidates = lowest_points(build(xyz), xyz[:, 2], 0.05)
     for first, last in zip(candidates.offsets[:-1], candidates.offsets[1:], strict=True):
         assert (np.diff(candidates.r[first:last]) > 0).all()
 
 
 def test_empty_grid():
-    candidates = lowest_points(build(np.empty((0, 3))), np.empty(0))
+    candidates = lowest_points(build(np.empty((0, 3))), np.empty(0), 0.05)
     assert len(candidates.r) == 0
     assert list(candidates.offsets) == [0] * (Config().grid.n_segments + 1)
 
@@ -106,3 +106,20 @@ def test_turning_the_scan_by_segments_turns_the_segments(segments_turned):
     np.testing.assert_array_equal(
         build(turned).segment, (build(xyz).segment + segments_turned) % 180
     )
+
+
+@pytest.mark.parametrize('n_slices', [1, 2, 7])
+def test_vertical_density_is_the_mean_over_the_slices_however_many(n_slices):
+    """The paper's definition, slice by slice."""
+    xyz = hilly_scan(3000, seed=4)
+    grid = build(xyz)
+    candidates = lowest_points(grid, xyz[:, 2], 0.05)
+    widths = np.diff(grid.edges)
+    for m, n, density in list(
+        zip(candidates.segment, candidates.bin, candidates.density, strict=True)
+    )[::40]:
+        z = xyz[(grid.segment == m) & (grid.bin == n), 2]
+        top = max(z.max(), z.min() + 0.05)
+        counts, _ = np.histogram(z, bins=n_slices, range=(z.min(), top))
+        area = widths[n] * (top - z.min()) / n_slices
+        assert density == pytest.approx(np.mean(counts / area))

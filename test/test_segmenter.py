@@ -180,7 +180,10 @@ def test_times_come_from_the_clock_given(scan):
 def test_fit_report_counts(scan):
     fit = SEGMENTER.segment(scan).fit
     values = dataclasses.asdict(fit)
-    assert values['mode'] == 'fixed'
+    assert values['mode'] == 'every_frame'
+    assert 1 <= fit.n_evaluations <= Config().learning.max_evaluations
+    assert fit.theta['sigma_n'] > 0
+    assert fit.status in ('converged', 'budget')
     assert 0 < fit.n_inliers <= fit.n_candidates <= len(scan)
     assert 0 < fit.n_segments <= 180
     assert fit.n_lines > 0

@@ -6,7 +6,7 @@ import argparse
 
 import yaml
 
-from gp_ground_seg.config import Config
+from gp_ground_seg.config import Config, load_yaml
 from gp_ground_seg.errors import ConfigError
 
 
@@ -38,7 +38,7 @@ def config_from_options(arguments: argparse.Namespace) -> Config:
         if not separator:
             raise ConfigError(f'--set {setting}: must be NAME=VALUE')
         try:
-            changes[name.strip()] = yaml.safe_load(text)
+            changes[name.strip()] = load_yaml(text)
         except yaml.YAMLError as error:
             raise ConfigError(f'--set {setting}: {text!r} is not a value') from error
     return config.replace(**changes)

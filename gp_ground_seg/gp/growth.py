@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
-from gp_ground_seg.config import GrowthConfig, ObservationConfig
+from gp_ground_seg.config import GrowthConfig
 from gp_ground_seg.gp.observation import posterior
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
@@ -28,7 +28,9 @@ def grow_surface_reference(
     seed: BoolArray,
     knots: FloatArray,
     knot_length_scale: FloatArray,
-    observation: ObservationConfig,
+    sigma_f: FloatArray,
+    sigma_n: FloatArray,
+    slope_std: float,
     growth: GrowthConfig,
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Grow the inliers of each segment from its seeds and predict the surface.
@@ -50,8 +52,10 @@ def grow_surface_reference(
         Ranges where the surface is wanted [m].
     knot_length_scale : (M, K) float64
         Length-scale there [m].
-    observation : ObservationConfig
-        sigma_f, sigma_n and slope_std.
+    sigma_f, sigma_n : (M,) float64
+        Standard deviations of process and noise in each segment [m].
+    slope_std : float
+        Prior standard deviation of the mean line's slope.
     growth : GrowthConfig
         Bounds for joining.
 
@@ -79,11 +83,11 @@ def grow_surface_reference(
                 l_own[chosen],
                 r_own,
                 l_own,
-                observation.sigma_f,
-                observation.sigma_n,
-                observation.slope_std,
+                sigma_f[m],
+                sigma_n[m],
+                slope_std,
             )
-            residual = np.abs(z_own - height) / np.sqrt(variance + observation.sigma_n**2)
+            residual = np.abs(z_own - height) / np.sqrt(variance + sigma_n[m] ** 2)
             joining = (
                 ~chosen
                 & (variance <= growth.max_std**2)
@@ -98,9 +102,9 @@ def grow_surface_reference(
             l_own[chosen],
             knots,
             knot_length_scale[m],
-            observation.sigma_f,
-            observation.sigma_n,
-            observation.slope_std,
+            sigma_f[m],
+            sigma_n[m],
+            slope_std,
         )
         std[m] = np.sqrt(variance)
     return inlier, mean, std
@@ -117,8 +121,8 @@ def grow_surface_compiled(
     seed: BoolArray,
     knots: FloatArray,
     knot_length_scale: FloatArray,
-    sigma_f: float,
-    sigma_n: float,
+    sigma_f: FloatArray,
+    sigma_n: FloatArray,
     slope_std: float,
     max_std: float,
     max_standardised_residual: float,
@@ -147,7 +151,7 @@ def grow_surface_compiled(
         all_l[n:] = knot_length_scale[m]
         whitened = np.empty((n, n + n_knots))
         height = np.zeros(n + n_knots)
-        variance = sigma_f**2 + slope_std**2 * all_r**2
+        variance = sigma_f[m] ** 2 + slope_std**2 * all_r**2
         n_inliers = 0
         grown = True
         while grown:
@@ -160,7 +164,7 @@ def grow_surface_compiled(
                     spread = all_l[i] ** 2 + all_l[j] ** 2
                     distance = all_r[i] - all_r[j]
                     row[j] = (
-                        sigma_f**2
+                        sigma_f[m] ** 2
                         * math.sqrt(2.0 * all_l[i] * all_l[j] / spread)
                         * math.exp(-distance * distance / spread)
                         + slope_std**2 * all_r[i] * all_r[j]
@@ -169,7 +173,7 @@ def grow_surface_compiled(
                     weight = whitened[k, i]
                     for j in range(n + n_knots):
                         row[j] -= weight * whitened[k, j]
-                pivot = math.sqrt(variance[i] + sigma_n**2)
+                pivot = math.sqrt(variance[i] + sigma_n[m] ** 2)
                 innovation = (z[first + i] - height[i]) / pivot
                 for j in range(n + n_knots):
                     row[j] /= pivot
@@ -178,7 +182,7 @@ def grow_surface_compiled(
                 n_inliers += 1
             grown = False
             for i in range(n):
-                spread = math.sqrt(max(variance[i], 0.0) + sigma_n**2)
+                spread = math.sqrt(max(variance[i], 0.0) + sigma_n[m] ** 2)
                 joining[i] = (
                     not inlier[first + i]
                     and variance[i] <= max_std**2

@@ -32,3 +32,31 @@ def paciorek(
     ratio = 2.0 * l_a[:, None] * l_b[None, :] / spread
     distance = r_a[:, None] - r_b[None, :]
     return sigma_f**2 * np.sqrt(ratio) * np.exp(-(distance**2) / spread)
+
+
+def squared_exponential(
+    r_a: FloatArray, r_b: FloatArray, sigma_f: float, length_scale: float
+) -> FloatArray:
+    """Stationary covariance of the latent process (paper, eq. 12).
+
+    ``sigma_f^2 exp(-(r_a - r_b)^2 / (2 length_scale^2))``
+
+    Parameters
+    ----------
+    r_a : (A,) float64
+        Ranges [m].
+    r_b : (B,) float64
+        Ranges [m].
+    sigma_f : float
+        Prior standard deviation, in the unit of the process.
+    length_scale : float
+        Length-scale [m].
+
+    Returns
+    -------
+    (A, B) float64
+        Covariances.
+    """
+    distance = r_a[:, None] - r_b[None, :]
+    value: FloatArray = sigma_f**2 * np.exp(-(distance**2) / (2.0 * length_scale**2))
+    return value

@@ -15,7 +15,7 @@ from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.config import Config
 from gp_ground_seg.errors import GroundSegError, PointCloudError
-from gp_ground_seg.gp.fit import choose_backend
+from gp_ground_seg.gp.backend import choose_backend
 from gp_ground_seg.ros.cloud_subscription import Arrival, CloudSubscription
 from gp_ground_seg.ros.diagnostics import DiagnosticsPublisher
 from gp_ground_seg.ros.outputs import OutputPublishers

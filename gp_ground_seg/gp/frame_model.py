@@ -1,0 +1,165 @@
+"""The two coupled processes of one frame: inliers, learning, surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gp_ground_seg.config import Config
+from gp_ground_seg.gp.backend import Backend
+from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.gp.learning import Learned, learn
+from gp_ground_seg.gp.objective import TrainingFrame
+from gp_ground_seg.gp.theta import ThetaSpace, theta_space
+from gp_ground_seg.length_scale import (
+    candidate_log_length_scale,
+    interpolate_along_segments,
+)
+from gp_ground_seg.line_extraction import Lines
+from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
+from gp_ground_seg.pseudo_inputs import PseudoInputs
+
+_NO_KNOTS = np.empty(0)
+
+
+@dataclass(frozen=True)
+class FrameModel:
+    """One frame's candidates and pseudo-inputs under a configuration.
+
+    Theta has one row per segment, (M, 5 + K), so that segments may differ;
+    learned over the whole frame its rows are equal.
+
+    Attributes
+    ----------
+    config : Config
+        Parameters.
+    backend : Backend
+        Who computes.
+    candidates : Candidates
+        Ground candidates.
+    height : (C,) float64
+        Their heights about the prior mean [m].
+    lines : Lines
+        Lines through them.
+    pseudo : PseudoInputs
+        Pseudo-inputs of the latent process.
+    knots : (K,) float64
+        Ranges where the surface is wanted [m].
+    """
+
+    config: Config
+    backend: Backend
+    candidates: Candidates
+    height: FloatArray
+    lines: Lines
+    pseudo: PseudoInputs
+    knots: FloatArray
+
+    def space(self) -> ThetaSpace:
+        """Bounds, priors and starting values of theta for this frame."""
+        return theta_space(self.config, self.pseudo.first_guess)
+
+    def log_length_scales(
+        self, theta: FloatArray, knots: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Log length-scales at the candidates (C,) and knots (M, K) [log m]."""
+        if self.config.length_scale.model == 'latent':
+            return self.backend.log_length_scales(theta, self.pseudo, self.candidates, knots)
+        u = candidate_log_length_scale(self.candidates, self.lines, self.config.length_scale)
+        return u, interpolate_along_segments(self.candidates, u, knots)
+
+    def grow(
+        self, theta: FloatArray, knots: FloatArray
+    ) -> tuple[BoolArray, FloatArray, FloatArray]:
+        """Inliers (C,) that grow from low, near seeds, and the surface at the knots."""
+        growth = self.config.growth
+        seed = (self.candidates.r <= growth.seed_range) & (
+            np.abs(self.height) <= growth.seed_height_tolerance
+        )
+        u, knot_u = self.log_length_scales(theta, knots)
+        return self.backend.grow(
+            self.candidates,
+            self.height,
+            np.exp(u),
+            seed,
+            knots,
+            np.exp(knot_u),
+            theta,
+            self.config.observation.slope_std,
+            growth,
+        )
+
+    def surface(self, theta: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
+        """Inliers (C,), height about the prior mean and std (M, K) [m] at the knots."""
+        return self.grow(theta, self.knots)
+
+    def learn(
+        self, theta: FloatArray, out_of_time: Callable[[], bool]
+    ) -> tuple[FloatArray, list[Learned]]:
+        """Learn theta on the inliers that grow under it (paper, section III-E)."""
+        inlier, _, _ = self.grow(theta, _NO_KNOTS)
+        frame = self._training_frame(theta, inlier)
+        if self.config.learning.scope == 'frame':
+            learned = [self._learn_one(theta[0], frame, out_of_time)]
+            return np.tile(learned[0].theta, (len(theta), 1)), learned
+        learned = [
+            self._learn_one(row, _one_segment(frame, m), out_of_time)
+            for m, row in enumerate(theta)
+        ]
+        return np.array([one.theta for one in learned]), learned
+
+    def _learn_one(
+        self, start: FloatArray, frame: TrainingFrame, out_of_time: Callable[[], bool]
+    ) -> Learned:
+        learning = self.config.learning
+        is_map = learning.objective == 'map'
+        return learn(
+            lambda theta: self.backend.objective(
+                theta, frame, self.config.observation.slope_std, not is_map
+            ),
+            self.space(),
+            start,
+            len(frame.r),
+            use_priors=is_map,
+            max_evaluations=learning.max_evaluations,
+            out_of_time=out_of_time,
+        )
+
+    def _training_frame(self, theta: FloatArray, inlier: BoolArray) -> TrainingFrame:
+        offsets = self.candidates.offsets
+        taken = np.concatenate([[0], np.cumsum(inlier)])
+        latent = self.config.length_scale.model == 'latent'
+        u = (
+            np.zeros(int(inlier.sum()))
+            if latent
+            else self.log_length_scales(theta, _NO_KNOTS)[0][inlier]
+        )
+        return TrainingFrame(
+            offsets=taken[offsets],
+            r=self.candidates.r[inlier],
+            z=self.height[inlier],
+            log_length_scale=u,
+            bar_offsets=self.pseudo.offsets if latent else np.zeros_like(offsets),
+            r_bar=self.pseudo.r_bar,
+            surface_class=self.pseudo.surface_class,
+        )
+
+
+def _one_segment(frame: TrainingFrame, m: int) -> TrainingFrame:
+    own = slice(frame.offsets[m], frame.offsets[m + 1])
+    bar = slice(frame.bar_offsets[m], frame.bar_offsets[m + 1])
+
+    def ends(part: slice) -> IntArray:
+        return np.array([0, part.stop - part.start])
+
+    return TrainingFrame(
+        ends(own),
+        frame.r[own],
+        frame.z[own],
+        frame.log_length_scale[own],
+        ends(bar),
+        frame.r_bar[bar],
+        frame.surface_class[bar],
+    )

@@ -1,0 +1,154 @@
+"""Latent process GP_l: log length-scale over range in one segment."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from gp_ground_seg.compiled import compiled
+from gp_ground_seg.gp.kernels import squared_exponential
+from gp_ground_seg.gp.linalg import factorise, solve
+from gp_ground_seg.polar_grid import FloatArray, IntArray
+
+
+def log_length_scale(
+    r_bar: FloatArray,
+    log_length_scale_bar: FloatArray,
+    r_star: FloatArray,
+    sigma_f_bar: float,
+    sigma_l_bar: float,
+    sigma_n_bar: float,
+) -> FloatArray:
+    """Mean of the latent process at `r_star` (paper, eqs. 10 and 11).
+
+    The values are centred on their mean, so that equal pseudo-inputs give that
+    very value everywhere.
+
+    Parameters
+    ----------
+    r_bar, log_length_scale_bar : (p,) float64
+        Pseudo-inputs: ranges [m] and log length-scales [log m].
+    r_star : (k,) float64
+        Ranges wanted [m].
+    sigma_f_bar, sigma_n_bar : float
+        Standard deviations of the process and of its noise [log m].
+    sigma_l_bar : float
+        Length-scale of the process [m].
+
+    Returns
+    -------
+    (k,) float64
+        Log length-scales [log m].
+    """
+    mean = log_length_scale_bar.mean()
+    covariance = squared_exponential(r_bar, r_bar, sigma_f_bar, sigma_l_bar)
+    covariance[np.diag_indices_from(covariance)] += sigma_n_bar**2
+    weight = cho_solve(cho_factor(covariance, lower=True), log_length_scale_bar - mean)
+    value: FloatArray = (
+        mean + squared_exponential(r_star, r_bar, sigma_f_bar, sigma_l_bar) @ weight
+    )
+    return value
+
+
+def latent_rows_reference(
+    theta: FloatArray,
+    bar_offsets: IntArray,
+    r_bar: FloatArray,
+    surface_class: IntArray,
+    offsets: IntArray,
+    r: FloatArray,
+    knots: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Log length-scales at the candidates and knots of every segment.
+
+    Parameters
+    ----------
+    theta : (M, 5 + K) float64
+        Hyper-parameters of each segment (see `gp_ground_seg.gp.objective`).
+    bar_offsets, r_bar, surface_class
+        Pseudo-inputs (see `gp_ground_seg.pseudo_inputs.PseudoInputs`).
+    offsets : (M + 1,) int64
+        Candidates of segment m are ``offsets[m]:offsets[m + 1]``.
+    r : (C,) float64
+        Ranges of the candidates [m].
+    knots : (K,) float64
+        Ranges wanted in every segment [m].
+
+    Returns
+    -------
+    at_candidates : (C,) float64
+        Log length-scales [log m].
+    at_knots : (M, K) float64
+        The same at the knots; NaN in segments without candidates.
+    """
+    n_segments = len(offsets) - 1
+    at_candidates = np.empty(len(r))
+    at_knots = np.full((n_segments, len(knots)), np.nan)
+    for m in range(n_segments):
+        own = slice(offsets[m], offsets[m + 1])
+        bar = slice(bar_offsets[m], bar_offsets[m + 1])
+        if own.start == own.stop:
+            continue
+        values = log_length_scale(
+            r_bar[bar],
+            theta[m, 5 + surface_class[bar]],
+            np.concatenate([r[own], knots]),
+            *np.exp(theta[m, 2:5]),
+        )
+        at_candidates[own] = values[: own.stop - own.start]
+        at_knots[m] = values[own.stop - own.start :]
+    return at_candidates, at_knots
+
+
+@compiled
+def latent_rows_compiled(
+    start: int,
+    stop: int,
+    theta: FloatArray,
+    bar_offsets: IntArray,
+    r_bar: FloatArray,
+    surface_class: IntArray,
+    offsets: IntArray,
+    r: FloatArray,
+    knots: FloatArray,
+    at_candidates: FloatArray,
+    at_knots: FloatArray,
+) -> None:
+    """Do what `latent_rows_reference` does for segments `start` to `stop`, in place."""
+    for m in range(start, stop):
+        first, last = bar_offsets[m], bar_offsets[m + 1]
+        p = last - first
+        if p == 0:
+            continue
+        variance = math.exp(2.0 * theta[m, 2])
+        decay = 0.5 * math.exp(-2.0 * theta[m, 3])
+        factor = np.empty((p, p))
+        weight = np.empty(p)
+        mean = 0.0
+        for i in range(p):
+            mean += theta[m, 5 + surface_class[first + i]] / p
+        for i in range(p):
+            weight[i] = theta[m, 5 + surface_class[first + i]] - mean
+            for j in range(i + 1):
+                d = r_bar[first + i] - r_bar[first + j]
+                factor[j, i] = variance * math.exp(-decay * d * d)
+            factor[i, i] += math.exp(2.0 * theta[m, 4])
+        if not factorise(factor, p):
+            # Rounding beat the noise term: the mean is what is left to say.
+            weight[:] = 0.0
+        else:
+            solve(factor, p, weight)
+        for i in range(offsets[m], offsets[m + 1]):
+            value = mean
+            for j in range(p):
+                d = r[i] - r_bar[first + j]
+                value += weight[j] * variance * math.exp(-decay * d * d)
+            at_candidates[i] = value
+        for i in range(len(knots)):
+            value = mean
+            for j in range(p):
+                d = knots[i] - r_bar[first + j]
+                value += weight[j] * variance * math.exp(-decay * d * d)
+            at_knots[m, i] = value

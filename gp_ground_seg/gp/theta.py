@@ -1,0 +1,78 @@
+"""Hyper-parameters as a vector in log space: names, start, bounds, priors, fixed mask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.config import Config
+from gp_ground_seg.gp.objective import N_SCALARS
+from gp_ground_seg.polar_grid import FloatArray
+
+SCALAR_NAMES = ('sigma_f', 'sigma_n', 'sigma_f_bar', 'sigma_l_bar', 'sigma_n_bar')
+
+
+def theta_names(size: int) -> list[str]:
+    """Names of the entries of a theta of the given size."""
+    return [*SCALAR_NAMES, *(f'length_scale_bar_{k}' for k in range(size - N_SCALARS))]
+
+
+@dataclass(frozen=True)
+class ThetaSpace:
+    """Where the hyper-parameters may be, all in log space.
+
+    Attributes
+    ----------
+    centre : (T,) float64
+        Values given by the configuration and the first guess; centres of the priors.
+    lower, upper : (T,) float64
+        Bounds.
+    free : (T,) bool
+        Entries that are learned.
+    prior_std : float
+        Standard deviation of the priors.
+    """
+
+    centre: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    free: npt.NDArray[np.bool_]
+    prior_std: float
+
+
+def theta_space(config: Config, first_guess: FloatArray) -> ThetaSpace:
+    """Space of theta for a frame.
+
+    Parameters
+    ----------
+    config : Config
+        Values, bounds and fixed mask.
+    first_guess : (K,) float64
+        First guess of the surface classes' log length-scales [log m].
+    """
+    observation, latent, learning = config.observation, config.latent, config.learning
+    scalars = np.log(
+        [
+            observation.sigma_f,
+            observation.sigma_n,
+            latent.sigma_f_bar,
+            latent.sigma_l_bar,
+            latent.sigma_n_bar,
+        ]
+    )
+    centre = np.concatenate([scalars, first_guess])
+    width = np.log(learning.bound_factor)
+    lower, upper = centre - width, centre + width
+    lower[N_SCALARS:] = np.log(config.length_scale.min)
+    upper[N_SCALARS:] = np.log(config.length_scale.max)
+    centre[N_SCALARS:] = np.clip(first_guess, lower[N_SCALARS:], upper[N_SCALARS:])
+    free = np.ones(len(centre), dtype=np.bool_)
+    if config.length_scale.model != 'latent' or learning.fixed == 'length_scales':
+        free[2:] = False
+    elif learning.fixed == 'latent':
+        free[2:N_SCALARS] = False
+    elif learning.fixed == 'sigma_f_bar':
+        free[2] = False
+    return ThetaSpace(centre, lower, upper, free, learning.prior_std)
