@@ -137,7 +137,7 @@ class GridConfig:
     n_segments: int = _parameter(
         180, 'angular segments of the radial grid', symbol='M', low=4, high=2048
     )
-    n_bins: int = _parameter(120, 'radial bins of each segment', symbol='N', low=4, high=1024)
+    n_bins: int = _parameter(80, 'radial bins of each segment', symbol='N', low=4, high=1024)
     r_min: float = _parameter(
         2.0,
         'horizontal range where the first bin starts; nearer points belong to that bin',
@@ -436,7 +436,7 @@ class LearningConfig:
     )
     objective: str = _parameter(
         'map',
-        'map = with the latent quadratic term and the priors; paper = as printed, unbounded',
+        'map = likelihood of the heights and priors; paper = as printed, which has no upper bound',
         choices=('map', 'paper'),
     )
     warm_start: bool = _parameter(
@@ -444,7 +444,7 @@ class LearningConfig:
         'start from the frame before: fewer evaluations, but the labels depend on the past',
     )
     max_evaluations: int = _parameter(
-        8, 'evaluations of the objective per frame; the best so far is used', low=1, high=1000
+        5, 'evaluations of the objective per frame; the best so far is used', low=1, high=1000
     )
     max_time: float = _parameter(
         0.0,
