@@ -117,6 +117,11 @@ class Segmentation:
         What the learning did.
     grid, candidates, lines, pseudo, surface
         Intermediate results, for plots and diagnostics.
+    theta : (M, 5 + K) float64
+        Logarithms of the hyper-parameters of each segment, named by `theta_names`.
+    log_length_scale : (M, knots) float64
+        Log length-scale at the knots of the surface [log m]; NaN in segments
+        without candidates.
     """
 
     label: npt.NDArray[np.uint8]
@@ -130,3 +135,5 @@ class Segmentation:
     lines: Lines
     pseudo: PseudoInputs
     surface: GroundSurface
+    theta: FloatArray
+    log_length_scale: FloatArray

@@ -102,7 +102,7 @@ class GroundSegmenter:
         theta, learned = self._learn(model)
         timer.mark('learning')
 
-        inlier, mean, std = model.surface(theta)
+        inlier, mean, std, log_length_scale = model.surface(theta)
         mean, std = fuse_neighbours(
             mean, std, grid.edges, config.surface.n_neighbours, config.observation.slope_std
         )
@@ -126,6 +126,8 @@ class GroundSegmenter:
             lines,
             pseudo,
             surface,
+            theta,
+            log_length_scale,
         )
 
     def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:

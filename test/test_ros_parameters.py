@@ -181,7 +181,7 @@ def test_diagnostics_period_changes_live(shared_bench):
 def test_hundred_changes_during_playback_lose_no_frame():
     message = to_message(street(2000))
     tolerances = np.linspace(0.05, 0.5, 100)
-    with bench() as b:
+    with bench('-p', 'learning.mode:=fixed') as b:
         for k, tolerance in enumerate(tolerances):
             b.publisher.publish(message)
             is_bad = k % 10 == 9

@@ -72,14 +72,14 @@ class FrameModel:
 
     def grow(
         self, theta: FloatArray, knots: FloatArray
-    ) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Inliers (C,) that grow from low, near seeds, and the surface at the knots."""
+    ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
+        """Inliers (C,) that grow from low, near seeds; see `surface` for what else."""
         growth = self.config.growth
         seed = (self.candidates.r <= growth.seed_range) & (
             np.abs(self.height) <= growth.seed_height_tolerance
         )
         u, knot_u = self.log_length_scales(theta, knots)
-        return self.backend.grow(
+        inlier, mean, std = self.backend.grow(
             self.candidates,
             self.height,
             np.exp(u),
@@ -90,16 +90,17 @@ class FrameModel:
             self.config.observation.slope_std,
             growth,
         )
+        return inlier, mean, std, knot_u
 
-    def surface(self, theta: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Inliers (C,), height about the prior mean and std (M, K) [m] at the knots."""
+    def surface(self, theta: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
+        """Inliers (C,); at the knots (M, K): height about the prior mean, its std [m], log l."""
         return self.grow(theta, self.knots)
 
     def learn(
         self, theta: FloatArray, out_of_time: Callable[[], bool]
     ) -> tuple[FloatArray, list[Learned]]:
         """Learn theta on the inliers that grow under it (paper, section III-E)."""
-        inlier, _, _ = self.grow(theta, _NO_KNOTS)
+        inlier, *_ = self.grow(theta, _NO_KNOTS)
         frame = self._training_frame(theta, inlier)
         if self.config.learning.scope == 'frame':
             learned = [self._learn_one(theta[0], frame, out_of_time)]

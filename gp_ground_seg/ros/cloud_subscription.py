@@ -17,7 +17,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.ros.qos import cloud_profile, in_words, matching_reliability
+from gp_ground_seg.ros.qos import INPUT_DEPTH, cloud_profile, in_words, matching_reliability
 from gp_ground_seg.ros.statistics import SequenceGaps
 
 REVIEW_PERIOD = 1.0
@@ -76,7 +76,7 @@ class CloudSubscription:
         # executor; a guard condition runs after all that became ready with the event.
         self._review_soon = node.create_guard_condition(self._review)
         self._subscription = self._create(
-            cloud_profile(), QoSOverridingOptions.with_default_policies()
+            cloud_profile(INPUT_DEPTH), QoSOverridingOptions.with_default_policies()
         )
         # The event can come before the publisher is listed, and nothing tells
         # when the last best-effort publisher has gone.
