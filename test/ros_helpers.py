@@ -90,10 +90,14 @@ def spinning(context: Context, *nodes: Node) -> Iterator[SingleThreadedExecutor]
     for node in nodes:
         executor.add_node(node)
     errors: list[BaseException] = []
+    done = threading.Event()
 
+    # executor.spin() would have to be ended by a shutdown from this thread, which takes
+    # a handle away that a callback just finishing still triggers.
     def spin() -> None:
         try:
-            executor.spin()
+            while context.ok() and not done.is_set():
+                executor.spin_once(timeout_sec=0.05)
         except ExternalShutdownException:
             pass
         except BaseException as error:
@@ -104,8 +108,9 @@ def spinning(context: Context, *nodes: Node) -> Iterator[SingleThreadedExecutor]
     try:
         yield executor
     finally:
-        executor.shutdown()
+        done.set()
         thread.join()
+        executor.shutdown()
         for node in nodes:
             node.destroy_node()
     if errors:

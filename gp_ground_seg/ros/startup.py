@@ -62,6 +62,8 @@ def _plain(error: Exception) -> str:
         return f'unknown ROS arguments {text}'
     text = re.sub(r', at /\S+?:\d+', '', text)
     text = re.sub(r'^(failed to initialize rcl|Failed to parse ROS arguments): ', '', text)
+    # rcl's tokeniser speaks of lexeme numbers.
+    text = re.sub(r'Error: Expected lexeme .*', 'It must be as in -p NAME:=VALUE', text)
     if 'ros__parameters' in text:
         text += " (parameters of a file go below '/**:' and 'ros__parameters:')"
     return text

@@ -159,9 +159,7 @@ class InputStatistics:
     ) -> tuple[Level, str]:
         silence = now - self._last_arrival
         if silence > limits.stale_after:
-            source = (
-                f'from {facts.n_publishers} publishers' if facts.n_publishers else 'nobody sends'
-            )
+            source = f'publishers: {facts.n_publishers}' if facts.n_publishers else 'nobody sends'
             return Level.STALE, f'no cloud on {facts.topic} for {silence:.1f} s ({source})'
         n_received, n_refused = self._recent
         if n_received == 0:
