@@ -63,7 +63,7 @@ setup(
     entry_points={
         'console_scripts': [
             'gp-ground-seg = gp_ground_seg.cli.main:main',
-            'ground_segmentation_node = gp_ground_seg.ros.node:main',
+            'ground_segmentation_node = gp_ground_seg.cli.node:main',
         ],
     },
 )

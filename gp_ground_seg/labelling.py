@@ -36,7 +36,7 @@ def label_points(
     allowance = label.slope_allowance * surface.rise(grid)
     below = label.ground_tolerance + allowance
     above = np.where(stands_in_bin(height, grid, label), label.obstacle_tolerance, below)
-    is_ground = (height <= above) & (height >= -below)
+    is_ground = (height <= above) & (height >= -below) & (grid.bin != OUTSIDE)
     result = np.where(is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[np.isnan(grid.r)] = Label.UNKNOWN
     return result

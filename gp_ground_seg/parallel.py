@@ -7,8 +7,9 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-CHUNK = 15
-"""Rows per chunk: fixed, so that results do not depend on the number of threads."""
+# Rows per chunk: fixed, so that results do not depend on the number of threads.
+SEGMENT_CHUNK = 15
+POINT_CHUNK = 16384
 
 
 class RowPool:
@@ -27,14 +28,22 @@ class RowPool:
         )
 
     def run(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
-        """Call `function` for each chunk of rows; it must release the GIL to gain anything."""
-        if self._executor is None:
+        """Call `function` for chunks of segments; it must release the GIL to gain anything."""
+        self._run(SEGMENT_CHUNK, function, n_rows, arguments)
+
+    def run_points(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
+        """Call `function` for chunks of points."""
+        self._run(POINT_CHUNK, function, n_rows, arguments)
+
+    def _run(
+        self, chunk: int, function: Callable[..., None], n_rows: int, arguments: tuple[Any, ...]
+    ) -> None:
+        if self._executor is None or n_rows <= chunk:
             function(0, n_rows, *arguments)
             return
-        starts = range(0, n_rows, CHUNK)
         futures = [
-            self._executor.submit(function, start, min(start + CHUNK, n_rows), *arguments)
-            for start in starts
+            self._executor.submit(function, start, min(start + chunk, n_rows), *arguments)
+            for start in range(0, n_rows, chunk)
         ]
         for future in futures:
             future.result()

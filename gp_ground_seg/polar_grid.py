@@ -102,12 +102,29 @@ def build_polar_grid(
     return PolarGrid(segment, index, np.where(finite, r, np.nan), edges, grid.n_segments)
 
 
-def lowest_points(grid: PolarGrid, z: FloatArray, min_extent: float) -> Candidates:
-    """Lowest point and vertical density of each occupied bin (paper, section II).
+@dataclass(frozen=True)
+class CellTables:
+    """Extremes of the points of every bin, each (M, n_bins).
 
-    The paper cuts a bin into j slices and averages their densities: points over
-    area. The slices are equally high, so whatever j is, that mean is the number
-    of points over the area of the whole bin, width by height.
+    Attributes
+    ----------
+    lowest_z, lowest_r : float64
+        Height of the lowest point and its range, the nearest of equally low ones
+        [m]; infinite in empty bins.
+    highest_z : float64
+        Height of the highest point [m]; minus infinity in empty bins.
+    count : int64
+        Number of points.
+    """
+
+    lowest_z: FloatArray
+    lowest_r: FloatArray
+    highest_z: FloatArray
+    count: IntArray
+
+
+def reduce_cells(grid: PolarGrid, z: FloatArray) -> CellTables:
+    """Lowest and highest point of each bin, and their number.
 
     Equal heights are settled by the smaller range, so that the order of the
     points does not matter.
@@ -118,30 +135,53 @@ def lowest_points(grid: PolarGrid, z: FloatArray, min_extent: float) -> Candidat
         Bins of the points.
     z : (N,) float64
         Heights [m].
+    """
+    shape = grid.n_segments, len(grid.edges) - 1
+    size = shape[0] * shape[1]
+    inside = grid.bin != OUTSIDE
+    cell = grid.segment[inside] * shape[1] + grid.bin[inside]
+    z_inside, r_inside = z[inside], grid.r[inside]
+    lowest_z = np.full(size, np.inf)
+    np.minimum.at(lowest_z, cell, z_inside)
+    is_lowest = z_inside == lowest_z[cell]
+    lowest_r = np.full(size, np.inf)
+    np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest])
+    highest_z = np.full(size, -np.inf)
+    np.maximum.at(highest_z, cell, z_inside)
+    count = np.bincount(cell, minlength=size)
+    return CellTables(
+        lowest_z.reshape(shape),
+        lowest_r.reshape(shape),
+        highest_z.reshape(shape),
+        count.reshape(shape),
+    )
+
+
+def ground_candidates(cells: CellTables, edges: FloatArray, min_extent: float) -> Candidates:
+    """Lowest point and vertical density of each occupied bin (paper, section II).
+
+    The paper cuts a bin into j slices and averages their densities: points over
+    area. The slices are equally high, so whatever j is, that mean is the number
+    of points over the area of the whole bin, width by height.
+
+    Parameters
+    ----------
+    cells : CellTables
+        Extremes of every bin.
+    edges : (n_bins + 1,) float64
+        Ranges of the bin edges [m].
     min_extent : float
         Least height of a bin in the density [m]: the points of a flat bin are no
         closer together than the sensor's noise.
     """
-    n_bins = len(grid.edges) - 1
-    inside = grid.bin != OUTSIDE
-    cell = grid.segment[inside] * n_bins + grid.bin[inside]
-    z_inside, r_inside = z[inside], grid.r[inside]
-    lowest_z = np.full(grid.n_segments * n_bins, np.inf)
-    np.minimum.at(lowest_z, cell, z_inside)
-    is_lowest = z_inside == lowest_z[cell]
-    lowest_r = np.full(grid.n_segments * n_bins, np.inf)
-    np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest])
-    highest_z = np.full(grid.n_segments * n_bins, -np.inf)
-    np.maximum.at(highest_z, cell, z_inside)
-    count = np.bincount(cell, minlength=grid.n_segments * n_bins)
-    occupied = np.isfinite(lowest_z)
-    own_bin = np.flatnonzero(occupied) % n_bins
-    extent = np.maximum(highest_z[occupied] - lowest_z[occupied], min_extent)
-    per_segment = occupied.reshape(grid.n_segments, n_bins).sum(axis=1)
+    occupied = cells.count > 0
+    own_bin = np.nonzero(occupied)[1]
+    lowest_z = cells.lowest_z[occupied]
+    extent = np.maximum(cells.highest_z[occupied] - lowest_z, min_extent)
     return Candidates(
-        r=lowest_r[occupied],
-        z=lowest_z[occupied],
+        r=cells.lowest_r[occupied],
+        z=lowest_z,
         bin=own_bin,
-        density=count[occupied] / (np.diff(grid.edges)[own_bin] * extent),
-        offsets=np.concatenate([[0], np.cumsum(per_segment)]),
+        density=cells.count[occupied] / (np.diff(edges)[own_bin] * extent),
+        offsets=np.concatenate([[0], np.cumsum(occupied.sum(axis=1))]),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 
@@ -12,10 +13,9 @@ from gp_ground_seg.config import Config
 from gp_ground_seg.gp.backend import make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
-from gp_ground_seg.labelling import label_points
 from gp_ground_seg.line_extraction import extract_lines
 from gp_ground_seg.points import check_points
-from gp_ground_seg.polar_grid import FloatArray, build_polar_grid, lowest_points
+from gp_ground_seg.polar_grid import FloatArray, ground_candidates
 from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
 from gp_ground_seg.segmentation import FitReport, Segmentation
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
@@ -53,12 +53,13 @@ class GroundSegmenter:
         return self._config
 
     def configure(self, config: Config) -> None:
-        """Use `config` from the next scan on; what was learned is forgotten."""
+        """Use `config` from the next scan on; what was learned under another is forgotten."""
         if config.runtime != self._config.runtime:
             self._backend.close()
             self._backend = make_backend(config.runtime)
+        if dataclasses.replace(config, diagnostics=self._config.diagnostics) != self._config:
+            self.reset()
         self._config = config
-        self.reset()
 
     def reset(self) -> None:
         """Forget what earlier scans taught, as after a jump in time."""
@@ -85,10 +86,11 @@ class GroundSegmenter:
         timer = StageTimer(self._clock)
         xyz, finite = check_points(points)
         z = xyz[:, 2]
-        grid = build_polar_grid(xyz, finite, config.grid)
+        grid = self._backend.polar_grid(xyz, finite, config.grid)
         timer.mark('grid')
 
-        candidates = lowest_points(grid, z, config.lines.min_density_extent)
+        cells = self._backend.reduce_cells(grid, z)
+        candidates = ground_candidates(cells, grid.edges, config.lines.min_density_extent)
         timer.mark('candidates')
 
         lines = extract_lines(candidates, config.lines)
@@ -109,14 +111,15 @@ class GroundSegmenter:
         surface = GroundSurface(grid.edges, mean + expected_ground, std, inlier)
         timer.mark('surface')
 
-        ground_z, ground_std = surface.at(grid)
-        label = label_points(z - ground_z, grid, surface, config.label)
+        ground_z, ground_std = self._backend.surface_under_points(surface, grid)
+        height_over_ground = z - ground_z
+        label = self._backend.label_points(height_over_ground, grid, surface, config.label)
         timer.mark('label')
 
         fit = FitReport.of(model, theta, learned, inlier, mean)
         return Segmentation(
             label,
-            z - ground_z,
+            height_over_ground,
             ground_z,
             ground_std,
             timer.seconds,

@@ -3,16 +3,27 @@ import math
 import numpy as np
 import pytest
 from conftest import hilly_scan
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.config import Config, GridConfig
-from gp_ground_seg.polar_grid import OUTSIDE, bin_edges, build_polar_grid, lowest_points
+from gp_ground_seg.gp.backend import CompiledBackend
+from gp_ground_seg.polar_grid import (
+    OUTSIDE,
+    bin_edges,
+    build_polar_grid,
+    ground_candidates,
+    reduce_cells,
+)
 
 
 def build(points, grid=None):
     xyz = np.asarray(points, dtype=np.float64)
     return build_polar_grid(xyz, np.isfinite(xyz).all(axis=1), grid or GridConfig())
+
+
+def lowest_points(grid, z, min_extent):
+    return ground_candidates(reduce_cells(grid, z), grid.edges, min_extent)
 
 
 def slow_cell(x, y, grid):
@@ -123,3 +134,22 @@ def test_vertical_density_is_the_mean_over_the_slices_however_many(n_slices):
         counts, _ = np.histogram(z, bins=n_slices, range=(z.min(), top))
         area = widths[n] * (top - z.min()) / n_slices
         assert density == pytest.approx(np.mean(counts / area))
+
+
+@settings(deadline=None)
+@given(st.integers(0, 10_000), st.floats(1.0, 3.0), st.integers(4, 60))
+def test_compiled_passes_are_the_reference(seed, growth, n_bins):
+    xyz = hilly_scan(400, seed=seed)
+    xyz[::7] = np.round(xyz[::7])  # equal heights, points on edges and axes
+    xyz[::50, seed % 3] = np.nan
+    grid = GridConfig(n_bins=n_bins, bin_growth=growth, r_min=4.0, r_max=30.0)
+    expected = build(xyz, grid)
+    finite = np.isfinite(xyz).all(axis=1)
+    backend = CompiledBackend(1)
+    found = backend.polar_grid(xyz, finite, grid)
+    np.testing.assert_array_equal(found.bin, expected.bin)
+    np.testing.assert_array_equal(found.segment[finite], expected.segment[finite])
+    np.testing.assert_array_equal(found.r, expected.r)
+    expected_cells = reduce_cells(expected, xyz[:, 2])
+    for name, table in vars(backend.reduce_cells(found, xyz[:, 2])).items():
+        np.testing.assert_array_equal(table, getattr(expected_cells, name))

@@ -1,7 +1,10 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gp_ground_seg.config import GridConfig, LabelConfig
+from gp_ground_seg.gp.backend import CompiledBackend
 from gp_ground_seg.labelling import label_points, stands_in_bin
 from gp_ground_seg.labels import Label
 from gp_ground_seg.polar_grid import build_polar_grid
@@ -102,3 +105,27 @@ def test_tolerance_widens_where_the_surface_rises():
     assert list(label_points(heights, grid, level, LabelConfig())) == [Label.OBSTACLE] * 2
     config = LabelConfig(obstacle_min_height=1.0)
     assert list(label_points(heights, grid, steep, config)) == [Label.GROUND] * 2
+
+
+@settings(deadline=None)
+@given(st.integers(0, 10_000))
+def test_compiled_surface_and_labels_are_the_reference(seed):
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(-12, 12, (200, 3))
+    xyz[::20] = np.nan
+    grid = build_polar_grid(xyz, np.isfinite(xyz).all(axis=1), GRID)
+    surface = GroundSurface(
+        KNOTS, rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5)), np.ones(0, dtype=bool)
+    )
+    surface.mean[seed % 4] = surface.std[seed % 4] = np.nan
+    backend = CompiledBackend(1)
+    for found, expected in zip(
+        backend.surface_under_points(surface, grid), surface.at(grid), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+    height = rng.normal(0, 0.5, 200)
+    height[::9] = np.nan
+    np.testing.assert_array_equal(
+        backend.label_points(height, grid, surface, LabelConfig()),
+        label_points(height, grid, surface, LabelConfig()),
+    )

@@ -6,9 +6,11 @@ import logging
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
+from gp_ground_seg import point_passes
 from gp_ground_seg.compiled import HAVE_NUMBA
-from gp_ground_seg.config import GrowthConfig, RuntimeConfig
+from gp_ground_seg.config import GridConfig, GrowthConfig, LabelConfig, RuntimeConfig
 from gp_ground_seg.errors import MissingDependencyError
 from gp_ground_seg.gp.growth import (
     BoolArray,
@@ -18,9 +20,19 @@ from gp_ground_seg.gp.growth import (
 from gp_ground_seg.gp.latent import latent_rows_compiled, latent_rows_reference
 from gp_ground_seg.gp.objective import TrainingFrame, objective_reference
 from gp_ground_seg.gp.objective_compiled import objective_rows
+from gp_ground_seg.labelling import label_points
 from gp_ground_seg.parallel import RowPool
-from gp_ground_seg.polar_grid import Candidates, FloatArray
+from gp_ground_seg.polar_grid import (
+    Candidates,
+    CellTables,
+    FloatArray,
+    PolarGrid,
+    bin_edges,
+    build_polar_grid,
+    reduce_cells,
+)
 from gp_ground_seg.pseudo_inputs import PseudoInputs
+from gp_ground_seg.surface import GroundSurface
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 _said_slow = False
@@ -31,6 +43,22 @@ class Backend(Protocol):
 
     name: str
     n_threads: int
+
+    def polar_grid(self, xyz: FloatArray, finite: BoolArray, grid: GridConfig) -> PolarGrid:
+        """See `gp_ground_seg.polar_grid.build_polar_grid`."""
+
+    def reduce_cells(self, grid: PolarGrid, z: FloatArray) -> CellTables:
+        """See `gp_ground_seg.polar_grid.reduce_cells`."""
+
+    def surface_under_points(
+        self, surface: GroundSurface, grid: PolarGrid
+    ) -> tuple[FloatArray, FloatArray]:
+        """See `gp_ground_seg.surface.GroundSurface.at`."""
+
+    def label_points(
+        self, height: FloatArray, grid: PolarGrid, surface: GroundSurface, label: LabelConfig
+    ) -> npt.NDArray[np.uint8]:
+        """See `gp_ground_seg.labelling.label_points`."""
 
     def log_length_scales(
         self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
@@ -94,6 +122,26 @@ class ReferenceBackend:
 
     name = 'numpy'
     n_threads = 1
+
+    def polar_grid(self, xyz: FloatArray, finite: BoolArray, grid: GridConfig) -> PolarGrid:
+        """Segment and bin of each point."""
+        return build_polar_grid(xyz, finite, grid)
+
+    def reduce_cells(self, grid: PolarGrid, z: FloatArray) -> CellTables:
+        """Extremes of every bin."""
+        return reduce_cells(grid, z)
+
+    def surface_under_points(
+        self, surface: GroundSurface, grid: PolarGrid
+    ) -> tuple[FloatArray, FloatArray]:
+        """Height and standard deviation of the surface under each point."""
+        return surface.at(grid)
+
+    def label_points(
+        self, height: FloatArray, grid: PolarGrid, surface: GroundSurface, label: LabelConfig
+    ) -> npt.NDArray[np.uint8]:
+        """Label of each point."""
+        return label_points(height, grid, surface, label)
 
     def log_length_scales(
         self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
@@ -160,6 +208,101 @@ class CompiledBackend:
     def __init__(self, n_threads: int) -> None:
         self._pool = RowPool(n_threads)
         self.n_threads = self._pool.n_threads
+
+    def polar_grid(self, xyz: FloatArray, finite: BoolArray, grid: GridConfig) -> PolarGrid:
+        """Segment and bin of each point."""
+        n_points = len(xyz)
+        edges = bin_edges(grid)
+        table, scale = point_passes.first_bins(edges)
+        segment = np.empty(n_points, dtype=np.int64)
+        index = np.empty(n_points, dtype=np.int64)
+        r = np.empty(n_points)
+        self._pool.run_points(
+            point_passes.assign_cells,
+            n_points,
+            xyz,
+            finite,
+            edges,
+            table,
+            scale,
+            grid.n_segments,
+            segment,
+            index,
+            r,
+        )
+        return PolarGrid(segment, index, r, edges, grid.n_segments)
+
+    def reduce_cells(self, grid: PolarGrid, z: FloatArray) -> CellTables:
+        """Extremes of every bin."""
+        shape = grid.n_segments, len(grid.edges) - 1
+        cells = CellTables(
+            np.full(shape, np.inf),
+            np.full(shape, np.inf),
+            np.full(shape, -np.inf),
+            np.zeros(shape, dtype=np.int64),
+        )
+        point_passes.fill_cells(
+            grid.segment,
+            grid.bin,
+            grid.r,
+            z,
+            cells.lowest_z,
+            cells.lowest_r,
+            cells.highest_z,
+            cells.count,
+        )
+        return cells
+
+    def surface_under_points(
+        self, surface: GroundSurface, grid: PolarGrid
+    ) -> tuple[FloatArray, FloatArray]:
+        """Height and standard deviation of the surface under each point."""
+        ground_z, ground_std = np.empty(len(grid.r)), np.empty(len(grid.r))
+        self._pool.run_points(
+            point_passes.surface_under_points,
+            len(grid.r),
+            grid.segment,
+            grid.bin,
+            grid.r,
+            surface.knots,
+            surface.mean,
+            surface.std,
+            ground_z,
+            ground_std,
+        )
+        return ground_z, ground_std
+
+    def label_points(
+        self, height: FloatArray, grid: PolarGrid, surface: GroundSurface, label: LabelConfig
+    ) -> npt.NDArray[np.uint8]:
+        """Label of each point."""
+        standing = np.zeros((grid.n_segments, len(grid.edges) - 1), dtype=np.bool_)
+        self._pool.run_points(
+            point_passes.mark_standing,
+            len(height),
+            grid.segment,
+            grid.bin,
+            height,
+            label.obstacle_min_height,
+            label.obstacle_max_height,
+            standing,
+        )
+        result = np.empty(len(height), dtype=np.uint8)
+        self._pool.run_points(
+            point_passes.label_by_height,
+            len(height),
+            grid.segment,
+            grid.bin,
+            grid.r,
+            height,
+            standing,
+            surface.mean,
+            label.ground_tolerance,
+            label.slope_allowance,
+            label.obstacle_tolerance,
+            result,
+        )
+        return result
 
     def log_length_scales(
         self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
