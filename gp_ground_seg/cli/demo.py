@@ -201,7 +201,7 @@ def _sustainable_rate(bag: BagReader, receiver: OutputReceiver) -> float:
     # Of the next lower numbers of one digit.
     rate = COMFORTABLE_LOAD / seconds
     unit = 10.0 ** math.floor(math.log10(rate))
-    rate = min(RATE, math.floor(rate / unit) * unit)
+    rate = min(RATE, math.floor(round(rate / unit, 6)) * unit)
     _detail(
         f'a scan takes {1e3 * seconds:.0f} ms here and now: playing {rate:g} per second '
         f'instead of {RATE:g}'

@@ -7,8 +7,9 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-DEPTH = 10
-"""Clouds kept until they are acknowledged: a second of a LiDAR at 10 Hz."""
+DEPTH = 100
+"""Clouds kept until they are acknowledged. Small ones are so a few at a time, and lost pieces
+of large ones can take 3 s with stock Fast DDS; acknowledged ones need no memory."""
 _NOW = Duration(seconds=0)
 
 

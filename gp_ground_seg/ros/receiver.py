@@ -16,7 +16,6 @@ from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.datasets.bags import CloudMessage, decode_cloud, encode_cloud
 from gp_ground_seg.errors import GroundSegError
-from gp_ground_seg.ros.qos import cloud_profile
 from gp_ground_seg.ros.session import Session
 
 DEPTH = 50
@@ -48,7 +47,7 @@ class OutputReceiver:
         topics: Sequence[str],
         on_cloud: Callable[[str, CloudMessage, int], None],
     ) -> None:
-        profile = QoSProfile(
+        self._profile = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
             depth=DEPTH,
             reliability=ReliabilityPolicy.RELIABLE,
@@ -61,7 +60,7 @@ class OutputReceiver:
         self._probe_stamp = (0, 0)
         for topic in topics:
             session.node.create_subscription(
-                PointCloud2, topic, partial(self._receive, topic), profile, raw=True
+                PointCloud2, topic, partial(self._receive, topic), self._profile, raw=True
             )
 
     def connect(
@@ -120,7 +119,7 @@ class OutputReceiver:
 
     @contextmanager
     def _publisher(self, topic: str) -> Iterator[Any]:
-        publisher = self._session.node.create_publisher(PointCloud2, topic, cloud_profile())
+        publisher = self._session.node.create_publisher(PointCloud2, topic, self._profile)
         try:
             yield publisher
         finally:
