@@ -64,7 +64,7 @@ class Session:
 
 @contextmanager
 def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
-    """Yield a `Session`; SIGINT, SIGTERM and SIGHUP within the block interrupt it.
+    """Yield a `Session`; SIGINT, SIGTERM and SIGHUP, unless ignored, interrupt the block.
 
     Parameters
     ----------
@@ -105,7 +105,9 @@ def _signals_to(session: Session) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = {number: signal.signal(number, session.interrupt) for number in INTERRUPTS}
+    # What is ignored on purpose, as by nohup, stays so.
+    heeded = [number for number in INTERRUPTS if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, session.interrupt) for number in heeded}
     try:
         yield
     finally:
