@@ -21,8 +21,8 @@ def frames_title(results: Sequence[MethodResult]) -> str:
     frames = results[0].frames
     n_sequences = len({frame.sequence for frame in frames})
     return (
-        f'{count(len(frames), "labelled frame")} of {count(n_sequences, "sequence")}; IoU in the GroundGrid '
-        'convention [%]; heights under points labelled ground [cm]'
+        f'{count(len(frames), "labelled frame")} of {count(n_sequences, "sequence")}; '
+        'IoU in the GroundGrid convention [%]; heights under points labelled ground [cm]'
     )
 
 
@@ -51,8 +51,8 @@ def synthetic_title(results: Sequence[SyntheticResult]) -> str:
     scans = results[0].scans
     n_scenes = len({scan.seed for scan in scans})
     return (
-        f'{count(len(scans), "simulated scan")} of {count(n_scenes, "scene")}, road then rubble, HDL-64E; '
-        'RMSE and bias against the exact ground [cm]'
+        f'{count(len(scans), "simulated scan")} of {count(n_scenes, "scene")}, road then rubble, '
+        'HDL-64E; RMSE and bias against the exact ground [cm]'
     )
 
 
