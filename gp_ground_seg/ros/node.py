@@ -30,6 +30,7 @@ from gp_ground_seg.ros.statistics import (
     ProcessingStatistics,
     Status,
 )
+from gp_ground_seg.ros.transport import large_cloud_transport
 from gp_ground_seg.ros.warm_up import warm_up
 from gp_ground_seg.segmenter import GroundSegmenter
 
@@ -171,8 +172,10 @@ def main(args: Sequence[str] | None = None) -> int:
     node = None
     with stop_on_signals() as stop:
         try:
-            initialize(words)
-            node = GroundSegmentationNode()
+            # Both outputs at once are more than stock Fast DDS sends without loss.
+            with large_cloud_transport():
+                initialize(words)
+                node = GroundSegmentationNode()
             executor = SingleThreadedExecutor()
             executor.add_node(node)
             while rclpy.ok() and not stop.made:
