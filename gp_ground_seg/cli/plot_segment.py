@@ -49,7 +49,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument('-o', '--output', metavar='OUT', required=True, help='.png or .pdf file')
     parser.add_argument('--labels', metavar='FILE', help='colour the points by these labels')
     parser.add_argument(
-        '--max-range', metavar='R', type=float, help='range shown [m] (default: all inliers)'
+        '--max-range', metavar='R', type=float, help='range shown [m] (default: all candidates)'
     )
     parser.add_argument('--force', action='store_true', help='overwrite the file')
     add_config_options(parser)

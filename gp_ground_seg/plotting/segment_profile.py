@@ -59,7 +59,7 @@ def plot_segment(
     title : str
         Line above the panels, before the segment's number.
     max_range : float, optional
-        Range shown [m]; by default a little more than that of the last inlier.
+        Range shown [m]; by default a little more than that of the last candidate.
 
     Raises
     ------

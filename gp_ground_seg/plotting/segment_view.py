@@ -25,7 +25,7 @@ PSEUDO_INPUT_COLOUR = '#7A4FA3'
 
 # Metres kept free below and above the ground, and beyond the last candidate; and how far
 # from the ground a candidate may be to be in the picture for certain.
-BELOW, ABOVE, BEYOND, NEAR_GROUND = 0.25, 0.9, 2.0, 0.7
+BELOW, ABOVE, BEYOND, NEAR_GROUND = 0.25, 0.9, 2.0, 1.0
 
 
 class SegmentView:
@@ -68,11 +68,10 @@ class SegmentView:
         return f'{title}{", " if title else ""}{place}{model}'
 
     def reach(self) -> float:
-        """Range that holds all inliers, and all points where there are none [m]."""
+        """Range that holds all candidates, and all points where there are none [m]."""
         r = self._result.candidates.r[self._candidates]
-        inlier_r = r[self._result.surface.inlier[self._candidates]]
-        if len(inlier_r):
-            return float(inlier_r[-1]) + BEYOND
+        if len(r):
+            return float(r[-1]) + BEYOND
         return float(self._r.max()) + BEYOND if len(self._r) else self._result.grid.edges[-1]
 
     def draw_heights(self, axes: Any, reach: float) -> None:
@@ -114,7 +113,10 @@ class SegmentView:
         )  # fmt: skip
 
     def _heights_shown(self, reach: float) -> tuple[float, float]:
-        """Limits around the ground as far as it rests on inliers, and the candidates near it."""
+        """Limits around the ground as far as it rests on inliers, and candidates near it.
+
+        Ground that is known to be elsewhere, but for a few points, is in them too.
+        """
         candidates, surface = self._result.candidates, self._result.surface
         r, z = candidates.r[self._candidates], candidates.z[self._candidates]
         inlier_r = r[surface.inlier[self._candidates] & (r <= reach)]
@@ -125,6 +127,10 @@ class SegmentView:
         height = np.abs(z - np.interp(r, surface.knots, self._mean))
         near = z[(height <= NEAR_GROUND) & (r <= reach)]
         ground = np.concatenate([near, self._mean[known]])
+        if self._truth is not None:
+            true_ground = self._z[(self._truth == Label.GROUND) & (self._r <= reach)]
+            if len(true_ground):
+                ground = np.concatenate([ground, np.quantile(true_ground, (0.01, 0.99))])
         return float(ground.min()) - BELOW, float(ground.max()) + ABOVE
 
     def _draw_points(self, axes: Any) -> None:
