@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-KITTI ?= $(wildcard ../shared/kitti)
+KITTI ?= $(abspath $(wildcard ../shared/kitti))
 
 .PHONY: help demo test lint format generate clean
 

@@ -129,7 +129,8 @@ def test_error_inside_the_library_does_not_end_the_node(monkeypatch):
 
 def test_diagnostics_of_a_stream():
     message = to_message(street(3000), stamp=(1317383000, 0), frame='velo_link')
-    with bench(*OFTEN, '-p', 'diagnostics.stale_after:=0.3') as b:
+    limits = '-p', 'diagnostics.stale_after:=0.3', '-p', 'diagnostics.max_latency:=10.0'
+    with bench(*OFTEN, *limits) as b:
         stale = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.STALE)
         assert f'{NAMESPACE}/points' in stale.message
         for _ in range(3):

@@ -82,7 +82,8 @@ class GroundSegmentationNode(ConfiguredNode):
         logger.info(f'effective configuration:\n{describe(self.config)}')
         with start_errors():
             self._outputs = OutputPublishers(self)
-        logger.info('compiling; this takes some seconds if it was not done before')
+        if choose_backend(self.config.runtime.backend) == 'numba':
+            logger.info('compiling; this takes some seconds if it was not done before')
         logger.info(f'ready to segment after {warm_up(self._segmenter):.1f} s')
         # Only now: a cloud that came earlier would have waited for the compiler.
         self._input_statistics = InputStatistics(time.monotonic())
