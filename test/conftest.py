@@ -5,6 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
+
+# How long an example takes says more of the machine than of the code.
+settings.register_profile('default', deadline=None)
+settings.load_profile('default')
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from gp_ground_seg.compiled import compiled
+from gp_ground_seg.gp import dense
 from gp_ground_seg.gp.kernels import squared_exponential
 from gp_ground_seg.gp.linalg import factorise, solve
 from gp_ground_seg.polar_grid import FloatArray, IntArray
@@ -45,7 +45,7 @@ def log_length_scale(
     mean = log_length_scale_bar.mean()
     covariance = squared_exponential(r_bar, r_bar, sigma_f_bar, sigma_l_bar)
     covariance[np.diag_indices_from(covariance)] += sigma_n_bar**2
-    weight = cho_solve(cho_factor(covariance, lower=True), log_length_scale_bar - mean)
+    weight = dense.solve(dense.factorise(covariance), log_length_scale_bar - mean)
     value: FloatArray = (
         mean + squared_exponential(r_star, r_bar, sigma_f_bar, sigma_l_bar) @ weight
     )

@@ -8,8 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import LinAlgError
 
+from gp_ground_seg.gp import dense
 from gp_ground_seg.gp.kernels import paciorek, squared_exponential
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
@@ -116,22 +117,20 @@ def _segment(
     if latent:
         l_bar = theta[N_SCALARS + surface_class]
         k_bar = squared_exponential(r_bar, r_bar, sigma_f_bar, sigma_l_bar)
-        b_factor = cho_factor(k_bar + sigma_n_bar**2 * np.eye(len(r_bar)), lower=True)
-        beta = cho_solve(b_factor, l_bar - l_bar.mean())
+        b_factor = dense.factorise(k_bar + sigma_n_bar**2 * np.eye(len(r_bar)))
+        beta = dense.solve(b_factor, l_bar - l_bar.mean())
         k_star = squared_exponential(r, r_bar, sigma_f_bar, sigma_l_bar)
         u = l_bar.mean() + k_star @ beta
 
     length_scale = np.exp(u)
     k = paciorek(r, length_scale, r, length_scale, sigma_f)
-    a_factor = cho_factor(
-        k + slope_std**2 * np.outer(r, r) + sigma_n**2 * np.eye(len(r)), lower=True
-    )
-    alpha = cho_solve(a_factor, z)
+    a_factor = dense.factorise(k + slope_std**2 * np.outer(r, r) + sigma_n**2 * np.eye(len(r)))
+    alpha = dense.solve(a_factor, z)
     value = -0.5 * float(
-        z @ alpha + 2.0 * np.log(np.diag(a_factor[0])).sum() + len(r) * np.log(2.0 * np.pi)
+        z @ alpha + dense.log_determinant(a_factor) + len(r) * np.log(2.0 * np.pi)
     )
 
-    g = 0.5 * (np.outer(alpha, alpha) - cho_solve(a_factor, np.eye(len(r))))
+    g = 0.5 * (np.outer(alpha, alpha) - dense.inverse(a_factor))
     gradient[0] += np.sum(g * 2.0 * k)
     gradient[1] += 2.0 * sigma_n**2 * np.trace(g)
     if not latent:
@@ -143,7 +142,7 @@ def _segment(
     dlog_k = 0.5 - square[:, None] / spread + 2.0 * square[:, None] * distance2 / spread**2
     g_u = 2.0 * np.sum(g * k * dlog_k, axis=1)
 
-    weight = cho_solve(b_factor, k_star.T @ g_u)
+    weight = dense.solve(b_factor, k_star.T @ g_u)
     g_l_bar = weight + (g_u.sum() - weight.sum()) / len(r_bar)
     np.add.at(gradient, N_SCALARS + surface_class, g_l_bar)
 
@@ -157,8 +156,7 @@ def _segment(
     for q, (dk_star, db) in enumerate(derivatives):
         gradient[2 + q] += g_u @ dk_star @ beta - weight @ db @ beta
         if latent_terms:
-            gradient[2 + q] -= 0.5 * np.trace(cho_solve(b_factor, db))
+            gradient[2 + q] -= 0.5 * np.trace(dense.solve(b_factor, db))
     if latent_terms:
-        log_determinant = 2.0 * np.log(np.diag(b_factor[0])).sum()
-        value -= 0.5 * float(log_determinant + len(r_bar) * np.log(2.0 * np.pi))
+        value -= 0.5 * (dense.log_determinant(b_factor) + len(r_bar) * np.log(2.0 * np.pi))
     return value

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
+from gp_ground_seg.gp import dense
 from gp_ground_seg.gp.kernels import paciorek
 from gp_ground_seg.polar_grid import FloatArray
 
@@ -47,8 +47,8 @@ def posterior(
     cross = paciorek(r, length_scale, r_star, length_scale_star, sigma_f)
     cross += slope_std**2 * np.outer(r, r_star)
     prior = sigma_f**2 + slope_std**2 * r_star**2
-    factor = cho_factor(covariance, lower=True)
-    mean = cross.T @ cho_solve(factor, z)
-    whitened = solve_triangular(factor[0], cross, lower=True)
+    factor = dense.factorise(covariance)
+    mean = cross.T @ dense.solve(factor, z)
+    whitened = dense.whiten(factor, cross)
     variance = np.maximum(prior - np.sum(whitened**2, axis=0), 0.0)
     return mean, variance
