@@ -129,7 +129,7 @@ def test_error_inside_the_library_does_not_end_the_node(monkeypatch):
 
 def test_diagnostics_of_a_stream():
     message = to_message(street(3000), stamp=(1317383000, 0), frame='velo_link')
-    limits = '-p', 'diagnostics.stale_after:=0.3', '-p', 'diagnostics.max_latency:=10.0'
+    limits = '-p', 'diagnostics.stale_after:=3.0', '-p', 'diagnostics.max_latency:=10.0'
     with bench(*OFTEN, *limits) as b:
         stale = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.STALE)
         assert f'{NAMESPACE}/points' in stale.message

@@ -5,9 +5,13 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 from conftest import hilly_scan
 
 from gp_ground_seg import GroundSegmenter
+from gp_ground_seg.compiled import HAVE_NUMBA
+
+needs_numba = pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
 
 SCRIPT = """
 import sys
@@ -59,12 +63,14 @@ def test_numba_asked_for_by_name_but_missing_is_an_error():
     assert 'pip install numba' in done.stdout
 
 
+@needs_numba
 def test_the_compiled_code_is_right_as_plain_python_too(tmp_path):
     points, result, done = run(tmp_path, 'open', NUMBA_DISABLE_JIT='1')
     assert done.stdout.strip() == 'numba'
     np.testing.assert_array_equal(result['label'], GroundSegmenter().segment(points).label)
 
 
+@needs_numba
 def test_a_cache_that_cannot_be_written_costs_time_only(tmp_path):
     (tmp_path / 'file').touch()
     _, _, done = run(tmp_path, 'open', NUMBA_CACHE_DIR=str(tmp_path / 'file' / 'below'))
