@@ -1,19 +1,22 @@
-"""Rows of work in fixed chunks over threads."""
+"""Rows of work shared out over threads."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
-# Rows per chunk: fixed, so that results do not depend on the number of threads.
-SEGMENT_CHUNK = 15
-POINT_CHUNK = 16384
+FEWEST_POINTS = 4096
+"""Points below which sharing out costs more than it saves."""
 
 
 class RowPool:
-    """Runs ``function(start, stop, ...)`` over ranges of rows.
+    """Runs compiled functions on shares of rows, one share in each thread.
+
+    Every row is computed by itself, so the results do not depend on the number of
+    threads. There are as many shares as threads, no more: waking a thread costs as
+    much as dozens of rows.
 
     Parameters
     ----------
@@ -23,28 +26,36 @@ class RowPool:
 
     def __init__(self, n_threads: int) -> None:
         self.n_threads = n_threads or len(os.sched_getaffinity(0))
+        # The caller's thread takes a share too.
         self._executor = (
-            ThreadPoolExecutor(self.n_threads, 'gp_ground_seg') if self.n_threads > 1 else None
+            ThreadPoolExecutor(self.n_threads - 1, 'gp_ground_seg') if self.n_threads > 1 else None
         )
 
     def run(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
-        """Call `function` for chunks of segments; it must release the GIL to gain anything."""
-        self._run(SEGMENT_CHUNK, function, n_rows, arguments)
+        """Call ``function(start, stop, step, *arguments)`` for every n-th segment each.
+
+        The function must release the GIL to gain anything. Neighbouring segments
+        cost alike, so interleaved shares are even ones.
+        """
+        shares = [(k, n_rows, self.n_threads) for k in range(self.n_threads)]
+        self._run(function, shares, arguments)
 
     def run_points(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
-        """Call `function` for chunks of points."""
-        self._run(POINT_CHUNK, function, n_rows, arguments)
+        """Call ``function(start, stop, *arguments)`` for contiguous blocks of points."""
+        n_shares = self.n_threads if n_rows >= FEWEST_POINTS else 1
+        bounds = [n_rows * k // n_shares for k in range(n_shares + 1)]
+        self._run(function, list(zip(bounds[:-1], bounds[1:], strict=True)), arguments)
 
     def _run(
-        self, chunk: int, function: Callable[..., None], n_rows: int, arguments: tuple[Any, ...]
+        self,
+        function: Callable[..., None],
+        shares: Sequence[tuple[int, ...]],
+        arguments: tuple[Any, ...],
     ) -> None:
-        if self._executor is None or n_rows <= chunk:
-            function(0, n_rows, *arguments)
-            return
-        futures = [
-            self._executor.submit(function, start, min(start + chunk, n_rows), *arguments)
-            for start in range(0, n_rows, chunk)
-        ]
+        futures: list[Future[None]] = []
+        if self._executor is not None:
+            futures = [self._executor.submit(function, *s, *arguments) for s in shares[1:]]
+        function(*shares[0], *arguments)
         for future in futures:
             future.result()
 

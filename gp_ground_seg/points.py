@@ -39,5 +39,6 @@ def check_points(points: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool
             f'points of shape {array.shape} and type {array.dtype}: must be floating point'
         )
     xyz = array[:, :3].astype(np.float64)
-    finite: npt.NDArray[np.bool_] = np.all(np.isfinite(xyz), axis=1)
+    # Column by column: a reduction along rows of three takes ten times as long.
+    finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
     return xyz, finite

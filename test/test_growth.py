@@ -40,6 +40,7 @@ def compiled(frame, growth, chunks=1, sigma_f=None, sigma_n=None, slope_std=0.05
         grow_surface_compiled(
             start,
             stop,
+            1,
             *frame,
             sigma_f,
             sigma_n,

@@ -215,6 +215,6 @@ def test_compiled_latent_rows_are_the_reference(seed):
     )
     expected = latent_rows_reference(*arguments)
     found = np.empty(counts.sum()), np.full((5, 7), np.nan)
-    latent_rows_compiled(0, 5, *arguments, *found)
+    latent_rows_compiled(0, 5, 1, *arguments, *found)
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)

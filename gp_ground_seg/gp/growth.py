@@ -114,6 +114,7 @@ def grow_surface_reference(
 def grow_surface_compiled(
     start: int,
     stop: int,
+    step: int,
     offsets: IntArray,
     r: FloatArray,
     z: FloatArray,
@@ -130,14 +131,14 @@ def grow_surface_compiled(
     mean: FloatArray,
     std: FloatArray,
 ) -> None:
-    """Do what `grow_surface_reference` does for segments `start` to `stop`, in place.
+    """Do what `grow_surface_reference` does for segments ``start:stop:step``, in place.
 
     ``whitened[k]`` is row k of ``L^-1 K(inliers, candidates and knots)``. Adding
     an inlier appends one row, after which means and variances everywhere follow
     by one multiplication: a whole segment costs one factorisation.
     """
     n_knots = len(knots)
-    for m in range(start, stop):
+    for m in range(start, stop, step):
         first = offsets[m]
         n = offsets[m + 1] - first
         joining = seed[first : first + n].copy()

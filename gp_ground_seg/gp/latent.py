@@ -106,6 +106,7 @@ def latent_rows_reference(
 def latent_rows_compiled(
     start: int,
     stop: int,
+    step: int,
     theta: FloatArray,
     bar_offsets: IntArray,
     r_bar: FloatArray,
@@ -116,8 +117,8 @@ def latent_rows_compiled(
     at_candidates: FloatArray,
     at_knots: FloatArray,
 ) -> None:
-    """Do what `latent_rows_reference` does for segments `start` to `stop`, in place."""
-    for m in range(start, stop):
+    """Do what `latent_rows_reference` does for segments ``start:stop:step``, in place."""
+    for m in range(start, stop, step):
         first, last = bar_offsets[m], bar_offsets[m + 1]
         p = last - first
         if p == 0:

@@ -17,6 +17,7 @@ _LOG_2PI = math.log(2.0 * math.pi)
 def objective_rows(
     start: int,
     stop: int,
+    step: int,
     theta: FloatArray,
     offsets: IntArray,
     r: FloatArray,
@@ -32,12 +33,12 @@ def objective_rows(
 ) -> None:
     """Do what `gp_ground_seg.gp.objective.objective_reference` does, segment by segment.
 
-    ``values[m]`` and ``gradients[m]`` are set for segments `start` to `stop`.
+    ``values[m]`` and ``gradients[m]`` are set for segments ``start:stop:step``.
     """
     sigma_f, sigma_n = math.exp(theta[0]), math.exp(theta[1])
     sigma_f_bar, sigma_l_bar = math.exp(theta[2]), math.exp(theta[3])
     sigma_n_bar = math.exp(theta[4])
-    for m in range(start, stop):
+    for m in range(start, stop, step):
         first, bar_first = offsets[m], bar_offsets[m]
         n, p = offsets[m + 1] - first, bar_offsets[m + 1] - bar_first
         gradients[m] = 0.0
