@@ -128,7 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
                 f'machine: {machine}\n'
             )
             targets['markdown'].write_text(text, encoding='utf-8')
-    print(f'{title}\n{format_table(header, rows)}\n\n{wrapped(f"machine: {machine}")}')
+    print(f'{wrapped(title)}\n{format_table(header, rows)}\n\n{wrapped(f"machine: {machine}")}')
     for name in targets:
         print(f'written: {getattr(arguments, name)}')
     return 0
