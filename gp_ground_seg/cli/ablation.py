@@ -20,7 +20,12 @@ from gp_ground_seg.cli.ablation_report import (
     synthetic_table,
     synthetic_title,
 )
-from gp_ground_seg.cli.experiment_text import config_words, machine_text, markdown_table
+from gp_ground_seg.cli.experiment_text import (
+    config_words,
+    machine_text,
+    markdown_table,
+    wrapped,
+)
 from gp_ground_seg.cli.options import add_config_options, config_from_options
 from gp_ground_seg.cli.tables import format_table
 from gp_ground_seg.config import Config
@@ -123,7 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
                 f'machine: {machine}\n'
             )
             targets['markdown'].write_text(text, encoding='utf-8')
-    print(f'{title}\n{format_table(header, rows)}\n\nmachine: {machine}')
+    print(f'{wrapped(title)}\n{format_table(header, rows)}\n\n{wrapped(f"machine: {machine}")}')
     for name in targets:
         print(f'written: {getattr(arguments, name)}')
     return 0

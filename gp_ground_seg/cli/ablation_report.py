@@ -52,23 +52,26 @@ def synthetic_title(results: Sequence[SyntheticResult]) -> str:
     n_scenes = len({scan.seed for scan in scans})
     return (
         f'{count(len(scans), "simulated scan")} of {count(n_scenes, "scene")}, road then rubble, '
-        'HDL-64E; RMSE and bias against the exact ground [cm]'
+        'HDL-64E; errors against the exact ground [cm]'
     )
 
 
 def synthetic_table(results: Sequence[SyntheticResult]) -> Table:
     """Table of simulated scans."""
     header = ['length-scale']
-    for stretch in STRETCHES:
-        header += [f'RMSE, {stretch}', 'bias']
+    header += [f'{measure}, {stretch}' for measure in ('RMSE', 'median') for stretch in STRETCHES]
     header.append('ms per scan')
     rows = []
     for result in results:
-        row = [result.title]
-        for stretch in STRETCHES:
-            height = result.height(stretch)
-            row += [_centimetres(height.rmse), _centimetres(height.bias)]
-        rows.append([*row, milliseconds(result.median_seconds)])
+        heights = [result.height(stretch) for stretch in STRETCHES]
+        rows.append(
+            [
+                result.title,
+                *(_centimetres(height.rmse) for height in heights),
+                *(_centimetres(height.median_absolute) for height in heights),
+                milliseconds(result.median_seconds),
+            ]
+        )
     return header, rows
 
 

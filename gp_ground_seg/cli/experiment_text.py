@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import textwrap
 from collections.abc import Sequence
 
 from gp_ground_seg.evaluation.environment import Environment
+
+WIDTH = 100
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]], n_left: int = 1) -> str:
@@ -29,6 +32,11 @@ def machine_text(environment: Environment, n_threads: int, backend: str) -> str:
         f'{environment.cpu}, {threads} on {cores}, {backend}; '
         f'Python {environment.python}, {versions}{commit}'
     )
+
+
+def wrapped(line: str) -> str:
+    """Fold a line for the terminal."""
+    return textwrap.fill(line, WIDTH, subsequent_indent='  ', break_on_hyphens=False)
 
 
 def config_words(arguments: argparse.Namespace) -> list[str]:

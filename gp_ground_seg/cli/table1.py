@@ -12,7 +12,12 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from gp_ground_seg.cli.experiment_text import config_words, machine_text, markdown_table
+from gp_ground_seg.cli.experiment_text import (
+    config_words,
+    machine_text,
+    markdown_table,
+    wrapped,
+)
 from gp_ground_seg.cli.options import add_config_options, config_from_options
 from gp_ground_seg.cli.tables import format_table
 from gp_ground_seg.config import Config
@@ -174,7 +179,7 @@ def _text(table: Table1, arguments: argparse.Namespace) -> str:
             + format_table(['segment', 'n_PG/n_L', *_VARIANCES], variances),
             'SMSE at the inliers, and at held-out points labelled ground; seconds per frame\n'
             + format_table([*error_header, 't Z-L [s]', 't Z [s]'], errors),
-            f'{_timing_note(arguments)}\n{_machine(table)}',
+            f'{_timing_note(arguments)}\n{wrapped(_machine(table))}',
         )
     )
 

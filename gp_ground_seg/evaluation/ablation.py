@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gp_ground_seg.config import Config, ParameterValue
+from gp_ground_seg.config import Config, ParameterValue, find_spec
 from gp_ground_seg.datasets.semantic_kitti import Frame, read_labels, read_points
+from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.evaluation.conventions import GROUNDGRID
 from gp_ground_seg.evaluation.height_error import HeightError, height_error, pool_height_errors
 from gp_ground_seg.evaluation.scores import Confusion, count_confusion
@@ -101,7 +102,18 @@ class MethodResult:
 def open_segmenters(
     methods: Mapping[str, Mapping[str, ParameterValue]], config: Config
 ) -> Iterator[dict[str, GroundSegmenter]]:
-    """Yield a segmenter for each method's changes of `config`; their threads end afterwards."""
+    """Yield a segmenter for each method's changes of `config`; their threads end afterwards.
+
+    Raises
+    ------
+    ConfigError
+        If `config` itself changes what the methods set, or a change is not accepted.
+    """
+    for name in sorted({name for changes in methods.values() for name in changes}):
+        if config[name] != find_spec(name).default:
+            raise ConfigError(
+                f'{name} = {config[name]}: the methods compared set it, leave it out'
+            )
     configs = {title: config.replace(**changes) for title, changes in methods.items()}
     with ExitStack() as stack:
         yield {
@@ -135,7 +147,7 @@ def ablate(
     Raises
     ------
     ConfigError
-        If a change is not accepted.
+        As `open_segmenters`.
     DataError
         If a file cannot be read or does not fit its frame.
     """

@@ -112,7 +112,7 @@ def ablate_synthetic(
     Raises
     ------
     ConfigError
-        If a change is not accepted.
+        As `open_segmenters`.
     """
     results: dict[str, list[ScanResult]] = {title: [] for title in methods}
     fits: dict[str, FitReport] = {}

@@ -150,7 +150,8 @@ def table1(
     Raises
     ------
     ConfigError
-        If ``length_scale.model`` is not the default, or a segment is out of range.
+        If ``length_scale.model`` is not the default, nothing is learned, or a segment is out
+        of range.
     DataError
         If a frame is missing or unlabelled.
     """
@@ -159,6 +160,8 @@ def table1(
             f'length_scale.model = {config.length_scale.model}: the table compares latent with '
             'line_gradient, leave it out'
         )
+    if config.learning.mode == 'fixed':
+        raise ConfigError('learning.mode = fixed: the table is of what is learned, leave it out')
     last = config.grid.n_segments - 1
     for choice in choices:
         for segment in choice.segments:

@@ -190,13 +190,13 @@ class SegmentView:
                 label=f'pseudo-inputs ({last - first})',
             )  # fmt: skip
             shown = np.concatenate([shown, l_bar[r_bar <= reach]])
+        # At least a decade: ripples of a constant must not look like mountains. Set before the
+        # scale, since on a log axis matplotlib warns of limits that a constant makes equal.
+        low, high = (shown.min(), shown.max()) if len(shown) else (1.0, 10.0)
+        factor = max(1.2 * math.sqrt(high / low), math.sqrt(10.0))
+        axes.set_ylim(math.sqrt(low * high) / factor, math.sqrt(low * high) * factor)
         axes.set_yscale('log')
         axes.set_ylabel('length-scale l [m]')
-        if len(shown):
-            # At least a decade: ripples of a constant must not look like mountains.
-            middle = math.sqrt(shown.min() * shown.max())
-            factor = max(1.2 * math.sqrt(shown.max() / shown.min()), math.sqrt(10.0))
-            axes.set_ylim(middle / factor, middle * factor)
 
 
 def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, FloatArray]:
