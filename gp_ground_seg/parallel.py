@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 FEWEST_POINTS = 4096
@@ -44,7 +45,7 @@ class RowPool:
         """Call ``function(start, stop, *arguments)`` for contiguous blocks of points."""
         n_shares = self.n_threads if n_rows >= FEWEST_POINTS else 1
         bounds = [n_rows * k // n_shares for k in range(n_shares + 1)]
-        self._run(function, list(zip(bounds[:-1], bounds[1:], strict=True)), arguments)
+        self._run(function, list(pairwise(bounds)), arguments)
 
     def _run(
         self,
