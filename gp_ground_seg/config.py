@@ -8,120 +8,21 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import numbers
-import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from gp_ground_seg.errors import ConfigError
-
-ParameterValue = bool | int | float | str
-
-ROS_NODE_KEY = '/**'
-ROS_PARAMETERS_KEY = 'ros__parameters'
-
-
-@dataclass(frozen=True)
-class ParameterSpec:
-    """What is declared of one parameter.
-
-    Attributes
-    ----------
-    name : str
-        Dotted name, ``group.field``.
-    type : type
-        ``bool``, ``int``, ``float`` or ``str``.
-    default : bool, int, float or str
-        Value used when nothing else is given.
-    description : str
-        One line on what it does.
-    unit : str
-        SI unit; empty for a pure number.
-    symbol : str
-        The paper's symbol, empty if it has none.
-    minimum, maximum : float or None
-        Inclusive bounds of a number; ``None`` for other types.
-    choices : tuple of str
-        Accepted values of a string; empty for other types.
-    """
-
-    name: str
-    type: type
-    default: ParameterValue
-    description: str
-    unit: str
-    symbol: str
-    minimum: float | None
-    maximum: float | None
-    choices: tuple[str, ...]
-
-    @property
-    def accepted(self) -> str:
-        """Accepted values in words."""
-        if self.choices:
-            return 'one of ' + ', '.join(self.choices)
-        if self.type is bool:
-            return 'true or false'
-        unit = f' {self.unit}' if self.unit else ''
-        kind = 'an integer' if self.type is int else 'a number'
-        return f'{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
-
-    def check(self, value: object) -> ParameterValue:
-        """Return `value` in the declared type.
-
-        Raises
-        ------
-        ConfigError
-            If the type is wrong or the value is out of range.
-        """
-        if self.type is bool:
-            if isinstance(value, bool):
-                return value
-        elif self.type is str:
-            if isinstance(value, str) and value in self.choices:
-                return value
-        elif isinstance(value, numbers.Real) and not isinstance(value, bool):
-            assert self.minimum is not None
-            assert self.maximum is not None
-            # The bounds are finite: NaN and the infinities are never within.
-            if value <= self.maximum and not value < self.minimum:
-                if self.type is float:
-                    return float(value)
-                if isinstance(value, numbers.Integral):
-                    return int(value)
-        raise ConfigError(f'{self.name} = {value!r}: must be {self.accepted}')
-
-
-def _parameter(
-    default: ParameterValue,
-    description: str,
-    *,
-    unit: str = '',
-    symbol: str = '',
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-) -> Any:
-    metadata = {
-        'description': description,
-        'unit': unit,
-        'symbol': symbol,
-        'minimum': low,
-        'maximum': high,
-        'choices': choices,
-    }
-    return field(default=default, metadata=metadata)
+from gp_ground_seg.parameter_files import read_parameters
+from gp_ground_seg.parameter_spec import ParameterSpec, ParameterValue, parameter
 
 
 @dataclass(frozen=True)
 class SensorConfig:
     """Where the sensor is."""
 
-    height: float = _parameter(
+    height: float = parameter(
         1.73,
         'height of the sensor above the ground it stands on',
         unit='m',
@@ -134,25 +35,25 @@ class SensorConfig:
 class GridConfig:
     """Radial grid map."""
 
-    n_segments: int = _parameter(
+    n_segments: int = parameter(
         180, 'angular segments of the radial grid', symbol='M', low=4, high=2048
     )
-    n_bins: int = _parameter(80, 'radial bins of each segment', symbol='N', low=4, high=1024)
-    r_min: float = _parameter(
+    n_bins: int = parameter(80, 'radial bins of each segment', symbol='N', low=4, high=1024)
+    r_min: float = parameter(
         2.0,
         'horizontal range where the first bin starts; nearer points belong to that bin',
         unit='m',
         low=0.0,
         high=50.0,
     )
-    r_max: float = _parameter(
+    r_max: float = parameter(
         90.0,
         'horizontal range where the last bin ends; beyond it there is no model',
         unit='m',
         low=1.0,
         high=500.0,
     )
-    bin_growth: float = _parameter(
+    bin_growth: float = parameter(
         1.5,
         'exponent of the bin edges over range: 1 = equal bins, more = finer bins near the sensor',
         low=1.0,
@@ -164,7 +65,7 @@ class GridConfig:
 class LinesConfig:
     """Line extraction over the ground candidates of a segment."""
 
-    slope_tolerance: float = _parameter(
+    slope_tolerance: float = parameter(
         0.1,
         'change of slope that ends a line',
         unit='rad',
@@ -172,7 +73,7 @@ class LinesConfig:
         low=0.001,
         high=1.0,
     )
-    offset_tolerance: float = _parameter(
+    offset_tolerance: float = parameter(
         0.15,
         "change of the line's height at the new point that ends a line",
         unit='m',
@@ -180,7 +81,7 @@ class LinesConfig:
         low=0.005,
         high=5.0,
     )
-    max_line_distance: float = _parameter(
+    max_line_distance: float = parameter(
         0.10,
         'distance of a point to the line that ends it',
         unit='m',
@@ -188,34 +89,34 @@ class LinesConfig:
         low=0.005,
         high=5.0,
     )
-    max_gap: float = _parameter(
+    max_gap: float = parameter(
         1.5,
         'horizontal gap to the next candidate that ends a line, next to the sensor',
         unit='m',
         low=0.05,
         high=50.0,
     )
-    max_gap_growth: float = _parameter(
+    max_gap_growth: float = parameter(
         0.15,
         'growth of the largest gap with range',
         unit='m/m',
         low=0.0,
         high=2.0,
     )
-    max_density_ratio: float = _parameter(
+    max_density_ratio: float = parameter(
         8.0,
         'ratio of the vertical densities of two successive bins that ends a line',
         low=1.0,
         high=1e6,
     )
-    min_density_extent: float = _parameter(
+    min_density_extent: float = parameter(
         0.05,
         'least height of a bin in its vertical density',
         unit='m',
         low=0.001,
         high=1.0,
     )
-    error_ratio: float = _parameter(
+    error_ratio: float = parameter(
         1.0,
         'variance of the height error over that of the range error in the line regression',
         symbol='lambda',
@@ -228,16 +129,16 @@ class LinesConfig:
 class LengthScaleConfig:
     """Length-scale of the observation process along a segment."""
 
-    model: str = _parameter(
+    model: str = parameter(
         'latent',
         'where the length-scales come from: the latent process, the slopes of the extracted '
         'lines, or one constant',
         choices=('latent', 'line_gradient', 'constant'),
     )
-    constant: float = _parameter(
+    constant: float = parameter(
         10.0, 'length-scale of the constant model', unit='m', low=0.05, high=200.0
     )
-    gradient_gain: float = _parameter(
+    gradient_gain: float = parameter(
         2.0,
         'a in l = a log(1/|slope|)',
         unit='m',
@@ -245,22 +146,22 @@ class LengthScaleConfig:
         low=0.05,
         high=100.0,
     )
-    flat_gradient: float = _parameter(
+    flat_gradient: float = parameter(
         0.1,
         'slope below which a line counts as flat',
         symbol='g_def',
         low=0.0001,
         high=0.9,
     )
-    min: float = _parameter(1.0, 'smallest length-scale', unit='m', low=0.05, high=200.0)
-    max: float = _parameter(50.0, 'largest length-scale', unit='m', low=0.05, high=500.0)
+    min: float = parameter(1.0, 'smallest length-scale', unit='m', low=0.05, high=200.0)
+    max: float = parameter(50.0, 'largest length-scale', unit='m', low=0.05, high=500.0)
 
 
 @dataclass(frozen=True)
 class ObservationConfig:
     """Hyper-parameters of the observation process GP_z."""
 
-    sigma_f: float = _parameter(
+    sigma_f: float = parameter(
         0.3,
         'prior standard deviation of the ground height about its mean line',
         unit='m',
@@ -268,7 +169,7 @@ class ObservationConfig:
         low=0.001,
         high=10.0,
     )
-    sigma_n: float = _parameter(
+    sigma_n: float = parameter(
         0.04,
         'standard deviation of the height noise of a ground candidate',
         unit='m',
@@ -276,7 +177,7 @@ class ObservationConfig:
         low=0.001,
         high=5.0,
     )
-    slope_std: float = _parameter(
+    slope_std: float = parameter(
         0.05,
         "prior standard deviation of the mean line's slope; 0 = a level mean",
         low=0.0,
@@ -288,14 +189,14 @@ class ObservationConfig:
 class LatentConfig:
     """Latent process GP_l over log length-scale, and its pseudo-inputs."""
 
-    sigma_f_bar: float = _parameter(
+    sigma_f_bar: float = parameter(
         0.9,
         'prior standard deviation of the log length-scale about its mean',
         symbol='sigma_f_bar',
         low=0.01,
         high=100.0,
     )
-    sigma_l_bar: float = _parameter(
+    sigma_l_bar: float = parameter(
         2.0,
         'length-scale of the latent process',
         unit='m',
@@ -303,29 +204,29 @@ class LatentConfig:
         low=0.1,
         high=500.0,
     )
-    sigma_n_bar: float = _parameter(
+    sigma_n_bar: float = parameter(
         0.25,
         'standard deviation of the noise of the log length-scale',
         symbol='sigma_n_bar',
         low=0.01,
         high=100.0,
     )
-    candidates_per_pseudo_input: float = _parameter(
+    candidates_per_pseudo_input: float = parameter(
         3.0,
         'ground candidates of a line for each pseudo-input: more = faster, less precise',
         low=1.0,
         high=100.0,
     )
-    sloped_gradient: float = _parameter(
+    sloped_gradient: float = parameter(
         0.1, 'slope from which a line counts as sloped', low=0.001, high=10.0
     )
-    steep_gradient: float = _parameter(
+    steep_gradient: float = parameter(
         0.4, 'slope from which a line counts as steep', low=0.001, high=100.0
     )
-    medium_extent: float = _parameter(
+    medium_extent: float = parameter(
         1.5, 'extent from which a line counts as medium', unit='m', low=0.01, high=200.0
     )
-    long_extent: float = _parameter(
+    long_extent: float = parameter(
         5.0, 'extent from which a line counts as long', unit='m', low=0.01, high=200.0
     )
 
@@ -334,28 +235,28 @@ class LatentConfig:
 class GrowthConfig:
     """Iterative growth of the inlier set (outlier rejection)."""
 
-    seed_range: float = _parameter(
+    seed_range: float = parameter(
         20.0,
         'horizontal range within which low candidates start the inlier set',
         unit='m',
         low=0.5,
         high=200.0,
     )
-    seed_height_tolerance: float = _parameter(
+    seed_height_tolerance: float = parameter(
         0.45,
         'largest height of a seed above or below the expected ground',
         unit='m',
         low=0.01,
         high=5.0,
     )
-    max_std: float = _parameter(
+    max_std: float = parameter(
         0.4,
         'predictive standard deviation above which a candidate has to wait',
         unit='m',
         low=0.001,
         high=10.0,
     )
-    max_standardised_residual: float = _parameter(
+    max_standardised_residual: float = parameter(
         2.2,
         'residual over predictive standard deviation above which a candidate is an outlier',
         low=0.1,
@@ -367,7 +268,7 @@ class GrowthConfig:
 class SurfaceConfig:
     """From the segments' surfaces to the surface of the frame."""
 
-    n_neighbours: int = _parameter(
+    n_neighbours: int = parameter(
         2,
         "segments on either side whose surfaces are fused with a segment's own; 0 = none",
         low=0,
@@ -379,7 +280,7 @@ class SurfaceConfig:
 class LabelConfig:
     """Labels from the distance to the surface."""
 
-    ground_tolerance: float = _parameter(
+    ground_tolerance: float = parameter(
         0.2,
         'largest distance of a ground point from the surface, above or below',
         unit='m',
@@ -387,27 +288,27 @@ class LabelConfig:
         low=0.001,
         high=5.0,
     )
-    slope_allowance: float = _parameter(
+    slope_allowance: float = parameter(
         1.0,
         'widening of the tolerance in multiples of the rise of the surface across the bin',
         low=0.0,
         high=10.0,
     )
-    obstacle_tolerance: float = _parameter(
+    obstacle_tolerance: float = parameter(
         0.1,
         'largest height of a ground point above the surface in a bin that an obstacle stands in',
         unit='m',
         low=0.001,
         high=5.0,
     )
-    obstacle_min_height: float = _parameter(
+    obstacle_min_height: float = parameter(
         0.5,
         'height above the surface from which a return shows that an obstacle stands in its bin',
         unit='m',
         low=0.01,
         high=10.0,
     )
-    obstacle_max_height: float = _parameter(
+    obstacle_max_height: float = parameter(
         2.0,
         'height above the surface up to which a return shows that; higher ones overhang',
         unit='m',
@@ -420,33 +321,33 @@ class LabelConfig:
 class LearningConfig:
     """Learning of the hyper-parameters."""
 
-    mode: str = _parameter(
+    mode: str = parameter(
         'every_frame',
         'when the hyper-parameters are learned; fixed = never, the values given here are used',
         choices=('every_frame', 'every_k', 'first_frame', 'fixed'),
     )
-    period: int = _parameter(
+    period: int = parameter(
         10, 'frames from one learning to the next in the mode every_k', low=1, high=10000
     )
-    scope: str = _parameter(
+    scope: str = parameter(
         'frame',
         'frame = one set of hyper-parameters for the whole frame; segment = one for each '
         'segment (slow, for comparison)',
         choices=('frame', 'segment'),
     )
-    objective: str = _parameter(
+    objective: str = parameter(
         'map',
         'map = likelihood of the heights and priors; paper = as printed, which has no upper bound',
         choices=('map', 'paper'),
     )
-    warm_start: bool = _parameter(
+    warm_start: bool = parameter(
         False,
         'start from the frame before: fewer evaluations, but the labels depend on the past',
     )
-    max_evaluations: int = _parameter(
+    max_evaluations: int = parameter(
         5, 'evaluations of the objective per frame; the best so far is used', low=1, high=1000
     )
-    max_time: float = _parameter(
+    max_time: float = parameter(
         0.0,
         'time for the learning of a frame, after which the best so far is used; 0 = no limit; '
         'the labels then depend on the speed of the machine',
@@ -454,19 +355,19 @@ class LearningConfig:
         low=0.0,
         high=60.0,
     )
-    prior_std: float = _parameter(
+    prior_std: float = parameter(
         1.0,
         'standard deviation of the log-normal priors about the values given here',
         low=0.01,
         high=10.0,
     )
-    bound_factor: float = _parameter(
+    bound_factor: float = parameter(
         20.0,
         'largest factor by which a hyper-parameter may leave the value given here',
         low=1.01,
         high=1e6,
     )
-    fixed: str = _parameter(
+    fixed: str = parameter(
         'none',
         'hyper-parameters that are not learned',
         choices=('none', 'sigma_f_bar', 'latent', 'length_scales'),
@@ -477,8 +378,8 @@ class LearningConfig:
 class RuntimeConfig:
     """How the work is done; nothing here changes a label."""
 
-    n_threads: int = _parameter(0, 'threads of the compiled code; 0 = all cores', low=0, high=256)
-    backend: str = _parameter(
+    n_threads: int = parameter(0, 'threads of the compiled code; 0 = all cores', low=0, high=256)
+    backend: str = parameter(
         'auto',
         'auto = compiled code where numba is installed, numpy otherwise; or either by name',
         choices=('auto', 'numba', 'numpy'),
@@ -489,17 +390,17 @@ class RuntimeConfig:
 class DiagnosticsConfig:
     """What the node says of itself on /diagnostics."""
 
-    period: float = _parameter(
+    period: float = parameter(
         1.0, 'time between two diagnostics messages', unit='s', low=0.1, high=60.0
     )
-    stale_after: float = _parameter(
+    stale_after: float = parameter(
         2.0,
         'time without any cloud after which the input is reported STALE',
         unit='s',
         low=0.1,
         high=600.0,
     )
-    max_latency: float = _parameter(
+    max_latency: float = parameter(
         0.1,
         'median time from arrival to publication above which processing is reported WARN',
         unit='s',
@@ -603,56 +504,9 @@ class Config:
             is not accepted. The message starts with the path.
         """
         try:
-            document = load_yaml(Path(path).read_text(encoding='utf-8'))
-            values: dict[str, object] = {}
-            for name, value in _flatten(_unwrap_ros(document)):
-                if name in values:
-                    raise ConfigError(f'{name}: given twice')
-                values[name] = value
-            return cls.from_flat(values)
-        except OSError as error:
-            raise ConfigError(f'{path}: {error.strerror or error}') from error
-        except UnicodeDecodeError as error:
-            raise ConfigError(f'{path}: not a text file') from error
+            return cls.from_flat(read_parameters(path))
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
-        except (yaml.YAMLError, ValueError, RecursionError) as error:
-            # ValueError: what looks like a date or a number and is none, as in 2011-99-99.
-            problem = ' '.join(str(error).split())
-            raise ConfigError(f'{path}: not valid YAML: {problem}') from error
-
-
-class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, without two of its surprises (see `load_yaml`)."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Refuse a key that is there twice; the last would win silently."""
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        for key in keys:
-            if key != '<<' and keys.count(key) > 1:
-                raise ConfigError(f'{key}: given twice, from line {node.start_mark.line + 1} on')
-        return super().construct_mapping(node, deep)
-
-
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:float',
-    re.compile(r'^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
-    list('-+.0123456789'),
-)
-
-
-def load_yaml(text: str) -> object:
-    """Read YAML, keys given twice refused and 1e-3 a number as it is to ROS.
-
-    Raises
-    ------
-    ConfigError
-        If a key is given twice.
-    yaml.YAMLError
-        If it is not YAML.
-    """
-    document: object = yaml.load(text, Loader=_Loader)
-    return document
 
 
 def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterValue]]:
@@ -670,41 +524,6 @@ def _require_order(config: Config, lower: str, upper: str) -> None:
     assert isinstance(high, float)
     if not low < high:
         raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
-
-
-def _unwrap_ros(document: object) -> Mapping[str, object]:
-    """Parameters of a ROS parameter file, or of a file of bare groups."""
-    if document is None:
-        return {}
-    if not isinstance(document, Mapping):
-        raise ConfigError('must be a mapping of parameter groups')
-    if not any(str(key).startswith('/') or _is_ros_node(document[key]) for key in document):
-        return document
-    if len(document) != 1:
-        raise ConfigError(f'parameters of {len(document)} nodes; keep one, keyed {ROS_NODE_KEY}')
-    (node,) = document.values()
-    if not isinstance(node, Mapping) or not isinstance(node.get(ROS_PARAMETERS_KEY), Mapping):
-        raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
-    parameters: Mapping[str, object] = node[ROS_PARAMETERS_KEY]
-    # Names that every ROS node has; they say nothing of the segmentation.
-    return {
-        key: value
-        for key, value in parameters.items()
-        if key != 'use_sim_time' and not str(key).startswith('qos_overrides')
-    }
-
-
-def _is_ros_node(value: object) -> bool:
-    return isinstance(value, Mapping) and ROS_PARAMETERS_KEY in value
-
-
-def _flatten(tree: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:
-    for key, value in tree.items():
-        name = f'{prefix}{key}'
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f'{name}.')
-        else:
-            yield name, value
 
 
 def _build_specs() -> tuple[ParameterSpec, ...]:

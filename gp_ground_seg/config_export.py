@@ -6,16 +6,10 @@ import textwrap
 
 import yaml
 
-from gp_ground_seg.config import (
-    ROS_NODE_KEY,
-    ROS_PARAMETERS_KEY,
-    Config,
-    ParameterSpec,
-    ParameterValue,
-    find_spec,
-    parameter_specs,
-)
+from gp_ground_seg.config import Config, find_spec, parameter_specs
 from gp_ground_seg.errors import DataError
+from gp_ground_seg.parameter_files import ROS_NODE_KEY, ROS_PARAMETERS_KEY
+from gp_ground_seg.parameter_spec import ParameterSpec, ParameterValue
 
 README_BEGIN = '<!-- parameters:begin -->'
 README_END = '<!-- parameters:end -->'

@@ -6,8 +6,9 @@ import argparse
 
 import yaml
 
-from gp_ground_seg.config import Config, load_yaml
+from gp_ground_seg.config import Config
 from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.parameter_files import load_yaml
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:

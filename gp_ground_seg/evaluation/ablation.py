@@ -10,13 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gp_ground_seg.config import Config, ParameterValue, find_spec
+from gp_ground_seg.config import Config, find_spec
 from gp_ground_seg.datasets.semantic_kitti import Frame, read_labels, read_points
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.evaluation.conventions import GROUNDGRID
 from gp_ground_seg.evaluation.height_error import HeightError, height_error, pool_height_errors
 from gp_ground_seg.evaluation.scores import Confusion, count_confusion
 from gp_ground_seg.labels import Label
+from gp_ground_seg.parameter_spec import ParameterValue
 from gp_ground_seg.segmentation import FitReport
 from gp_ground_seg.segmenter import GroundSegmenter
 

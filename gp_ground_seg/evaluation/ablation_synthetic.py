@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.config import Config, ParameterValue
+from gp_ground_seg.config import Config
 from gp_ground_seg.datasets.simulator import HDL_64E, SCENES, Scene, simulate_scan
 from gp_ground_seg.evaluation.ablation import open_segmenters
 from gp_ground_seg.evaluation.height_error import HeightError, height_error, pool_height_errors
 from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.parameter_spec import ParameterValue
 from gp_ground_seg.segmentation import FitReport
 
 SCENE = 'road_then_rubble'

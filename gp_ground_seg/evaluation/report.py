@@ -8,11 +8,12 @@ import math
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.config import Config, ParameterValue, parameter_specs
+from gp_ground_seg.config import Config, parameter_specs
 from gp_ground_seg.evaluation.conventions import CONVENTIONS
 from gp_ground_seg.evaluation.environment import Environment
 from gp_ground_seg.evaluation.scores import RATIOS, Confusion, MethodScore
 from gp_ground_seg.evaluation.semantic_classes import class_name
+from gp_ground_seg.parameter_spec import ParameterValue
 
 
 def changed_parameters(config: Config) -> dict[str, ParameterValue]:

@@ -14,8 +14,9 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from gp_ground_seg.config import Config, ParameterSpec, find_spec, parameter_specs
+from gp_ground_seg.config import Config, find_spec, parameter_specs
 from gp_ground_seg.errors import ConfigError, GroundSegError
+from gp_ground_seg.parameter_spec import ParameterSpec
 from gp_ground_seg.ros.startup import start_errors
 
 QOS_OVERRIDES = 'qos_overrides.'
