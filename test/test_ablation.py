@@ -3,6 +3,9 @@
 import argparse
 import json
 import math
+import re
+import shlex
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ from hypothesis.extra import numpy as npst
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.cli import ablation as command
+from gp_ground_seg.cli.main import build_parser
+from gp_ground_seg.cli.options import config_from_options
 from gp_ground_seg.datasets.semantic_kitti import read_labels, read_points
 from gp_ground_seg.datasets.simulator import HDL_64E, SCENES, simulate_scan
 from gp_ground_seg.errors import ConfigError, DataError
@@ -44,6 +49,16 @@ def table(output):
         first, *cells = (cell.strip() for cell in line.split('  ') if cell.strip())
         rows[first] = cells
     return rows
+
+
+def test_commands_of_the_docs_are_accepted():
+    """Those above the tables of docs/experiments.md, and those in its text."""
+    text = (Path(__file__).parents[1] / 'docs' / 'experiments.md').read_text(encoding='utf-8')
+    commands = re.findall(r'`gp-ground-seg (.*?)`', text)
+    assert {words.split()[0] for words in commands} == {'table1', 'plot-segment', 'ablation'}
+    for words in commands:
+        arguments = build_parser().parse_args(shlex.split(words))
+        config_from_options(arguments)
 
 
 def test_height_error_by_hand():
