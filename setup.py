@@ -52,7 +52,14 @@ setup(
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/config', sorted(glob('config/*'))),
     ],
-    install_requires=['numpy>=1.26', 'scipy>=1.11', 'numba>=0.60', 'PyYAML>=6.0', 'tqdm>=4.60'],
+    install_requires=[
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'numba>=0.60',
+        'PyYAML>=6.0',
+        'threadpoolctl>=3.1',
+        'tqdm>=4.60',
+    ],
     extras_require={
         'bags': BAGS,
         'plot': PLOT,

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import Config
 from gp_ground_seg.gp.backend import make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
@@ -149,6 +150,7 @@ class GroundSegmenter:
             return 0.0 < learning.max_time <= self._clock() - started
 
         start = self._theta if self._theta is not None and learning.warm_start else given
-        self._theta, learned = model.learn(start, out_of_time)
+        with single_threaded_blas():
+            self._theta, learned = model.learn(start, out_of_time)
         self._frames_since_learning = 0
         return self._theta, learned

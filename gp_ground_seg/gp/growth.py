@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.config import GrowthConfig
+from gp_ground_seg.gp.kernels import NEGLIGIBLE_EXPONENT
 from gp_ground_seg.gp.observation import posterior
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
@@ -164,12 +165,11 @@ def grow_surface_compiled(
                 for j in range(n + n_knots):
                     spread = all_l[i] ** 2 + all_l[j] ** 2
                     distance = all_r[i] - all_r[j]
-                    row[j] = (
-                        sigma_f[m] ** 2
-                        * math.sqrt(2.0 * all_l[i] * all_l[j] / spread)
-                        * math.exp(-distance * distance / spread)
-                        + slope_std**2 * all_r[i] * all_r[j]
-                    )
+                    row[j] = slope_std**2 * all_r[i] * all_r[j]
+                    exponent = distance * distance / spread
+                    if exponent < NEGLIGIBLE_EXPONENT:
+                        root = math.sqrt(2.0 * all_l[i] * all_l[j] / spread)
+                        row[j] += sigma_f[m] ** 2 * root * math.exp(-exponent)
                 for k in range(n_inliers):
                     weight = whitened[k, i]
                     for j in range(n + n_knots):

@@ -8,7 +8,7 @@ import numpy as np
 
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.gp import dense
-from gp_ground_seg.gp.kernels import squared_exponential
+from gp_ground_seg.gp.kernels import NEGLIGIBLE_EXPONENT, squared_exponential
 from gp_ground_seg.gp.linalg import factorise, solve
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
@@ -145,11 +145,13 @@ def latent_rows_compiled(
             value = mean
             for j in range(p):
                 d = r[i] - r_bar[first + j]
-                value += weight[j] * variance * math.exp(-decay * d * d)
+                if decay * d * d < NEGLIGIBLE_EXPONENT:
+                    value += weight[j] * variance * math.exp(-decay * d * d)
             at_candidates[i] = value
         for i in range(len(knots)):
             value = mean
             for j in range(p):
                 d = knots[i] - r_bar[first + j]
-                value += weight[j] * variance * math.exp(-decay * d * d)
+                if decay * d * d < NEGLIGIBLE_EXPONENT:
+                    value += weight[j] * variance * math.exp(-decay * d * d)
             at_knots[m, i] = value

@@ -7,10 +7,17 @@ import math
 import numpy as np
 
 from gp_ground_seg.compiled import compiled
+from gp_ground_seg.gp.kernels import NEGLIGIBLE_EXPONENT
 from gp_ground_seg.gp.linalg import factorise, invert
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 _LOG_2PI = math.log(2.0 * math.pi)
+
+
+@compiled
+def _decay(exponent: float) -> float:
+    """``exp(-exponent)``, zero where it is below the rounding of one."""
+    return math.exp(-exponent) if exponent < NEGLIGIBLE_EXPONENT else 0.0
 
 
 @compiled
@@ -57,10 +64,11 @@ def objective_rows(
             for i in range(p):
                 l_bar[i] = theta[5 + surface_class[bar_first + i]]
                 mean += l_bar[i] / p
-                for j in range(p):
+                for j in range(i + 1):
                     d = r_bar[bar_first + i] - r_bar[bar_first + j]
-                    k_bar[i, j] = sigma_f_bar**2 * math.exp(-d * d / (2.0 * sigma_l_bar**2))
-                    b_factor[i, j] = k_bar[i, j]
+                    value = sigma_f_bar**2 * _decay(0.5 * d * d / sigma_l_bar**2)
+                    k_bar[i, j] = k_bar[j, i] = value
+                    b_factor[i, j] = b_factor[j, i] = value
                 b_factor[i, i] += sigma_n_bar**2
             if not factorise(b_factor, p):
                 values[m] = -np.inf
@@ -73,7 +81,7 @@ def objective_rows(
                 u[i] = mean
                 for j in range(p):
                     d = r[first + i] - r_bar[bar_first + j]
-                    k_star[i, j] = sigma_f_bar**2 * math.exp(-d * d / (2.0 * sigma_l_bar**2))
+                    k_star[i, j] = sigma_f_bar**2 * _decay(0.5 * d * d / sigma_l_bar**2)
                     u[i] += k_star[i, j] * beta[j]
         else:
             for i in range(n):
@@ -87,11 +95,10 @@ def objective_rows(
             for j in range(i + 1):
                 spread = square[i] + square[j]
                 d = r[first + i] - r[first + j]
-                value = (
-                    sigma_f**2
-                    * math.sqrt(2.0 * length_scale[i] * length_scale[j] / spread)
-                    * math.exp(-d * d / spread)
-                )
+                value = _decay(d * d / spread)
+                if value > 0.0:
+                    root = math.sqrt(2.0 * length_scale[i] * length_scale[j] / spread)
+                    value *= sigma_f**2 * root
                 k[i, j] = value
                 factor[j, i] = value + slope_std**2 * r[first + i] * r[first + j]
             factor[i, i] += sigma_n**2
@@ -115,6 +122,8 @@ def objective_rows(
             g_trace += g_ii
             g_sigma_f += 2.0 * g_ii * k[i, i]
             for j in range(i):
+                if k[i, j] == 0.0:
+                    continue
                 g_k = 0.5 * (alpha[i] * alpha[j] - inverse[i, j]) * k[i, j]
                 g_sigma_f += 4.0 * g_k
                 spread = square[i] + square[j]
@@ -148,6 +157,8 @@ def objective_rows(
             gradients[m, slot] += weight[i] + (g_sum - weight_sum) / p
         for j in range(p):
             for i in range(n):
+                if k_star[i, j] == 0.0:
+                    continue
                 d = r[first + i] - r_bar[bar_first + j]
                 term = g_u[i] * k_star[i, j] * beta[j]
                 gradients[m, 2] += 2.0 * term
