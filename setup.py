@@ -29,6 +29,7 @@ DEV = [
     'pypatchworkpp>=1.4',
     'pytest>=7.4',
     'ruff>=0.6,<0.18',
+    'scikit-learn>=1.4',
     'setuptools<80',  # colcon's ament_python build needs `setup.py develop` and `install`
     'types-PyYAML',
     'types-tqdm',

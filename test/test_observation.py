@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.gp.kernels import paciorek
+from gp_ground_seg.gp.objective import TrainingFrame, objective_reference
 from gp_ground_seg.gp.observation import posterior
 
 
@@ -78,3 +79,42 @@ def test_noise_free_data_are_interpolated_with_no_uncertainty():
     mean, variance = posterior(r, z, flat, r, flat, 0.5, 1e-6)
     np.testing.assert_allclose(mean, z, atol=1e-6)
     np.testing.assert_allclose(variance, 0.0, atol=1e-9)
+
+
+def test_with_one_length_scale_it_is_scikit_learns_regression():
+    """Posterior and log marginal likelihood of the stationary case, by another's code."""
+    gaussian_process = pytest.importorskip('sklearn.gaussian_process')
+    kernels = gaussian_process.kernels
+    rng = np.random.default_rng(4)
+    r, r_star = np.sort(rng.uniform(2, 40, 25)), np.linspace(0, 50, 30)
+    z = 0.2 * np.sin(0.3 * r) + rng.normal(0, 0.05, 25)
+    sigma_f, sigma_n, length = 0.4, 0.05, 3.0
+    kernel = kernels.ConstantKernel(sigma_f**2) * kernels.RBF(length)
+    theirs = gaussian_process.GaussianProcessRegressor(kernel, alpha=sigma_n**2, optimizer=None)
+    theirs.fit(r[:, None], z)
+    their_mean, their_std = theirs.predict(r_star[:, None], return_std=True)
+    mean, variance = posterior(
+        r, z, np.full(25, length), r_star, np.full(30, length), sigma_f, sigma_n
+    )
+    np.testing.assert_allclose(mean, their_mean, atol=1e-10)
+    np.testing.assert_allclose(np.sqrt(variance), their_std, atol=1e-7)
+
+    # The whole-frame objective of that one segment, its latent process constant.
+    theta = np.log([sigma_f, sigma_n, 0.9, 2.0, 0.3, length])
+    frame = TrainingFrame(
+        np.array([0, 25]),
+        r,
+        z,
+        np.zeros(25),
+        np.array([0, 3]),
+        np.array([5.0, 15.0, 30.0]),
+        np.zeros(3, dtype=np.int64),
+    )
+    value, gradient = objective_reference(theta, frame, 0.0, False)
+    their_value, their_gradient = theirs.log_marginal_likelihood(
+        theirs.kernel_.theta, eval_gradient=True
+    )
+    assert value == pytest.approx(their_value, rel=1e-12)
+    # Theirs is in log sigma_f^2 and log length-scale.
+    assert gradient[0] == pytest.approx(2.0 * their_gradient[0], rel=1e-9)
+    assert gradient[5] == pytest.approx(their_gradient[1], rel=1e-9)
