@@ -8,12 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
-from gp_ground_seg.polar_grid import FloatArray, IntArray
+from gp_ground_seg.labels import Label
+from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, IntArray
 
 BoolArray = npt.NDArray[np.bool_]
 
-UNKNOWN, GROUND, OBSTACLE = 0, 1, 2  # gp_ground_seg.labels.Label, as compiled code knows it
-_OUTSIDE = -1
+# Plain integers: compiled code knows no enumerations.
+_UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
 
 
 def first_bins(edges: FloatArray) -> tuple[IntArray, float]:
@@ -52,7 +53,7 @@ def assign_cells(
     last = len(edges) - 1
     for i in range(start, stop):
         if not finite[i]:
-            segment[i], index[i], r[i] = 0, _OUTSIDE, np.nan
+            segment[i], index[i], r[i] = 0, OUTSIDE, np.nan
             continue
         x, y = xyz[i, 0], xyz[i, 1]
         own_r = math.hypot(x, y)
@@ -60,7 +61,7 @@ def assign_cells(
         turn = math.atan2(y, x) / (2.0 * math.pi) + 0.5
         segment[i] = int(turn * n_segments) % n_segments
         if own_r >= edges[last]:
-            index[i] = _OUTSIDE
+            index[i] = OUTSIDE
         elif own_r < edges[1]:
             index[i] = 0
         else:
@@ -87,7 +88,7 @@ def fill_cells(
     """Do what `gp_ground_seg.polar_grid.reduce_cells` does, into tables that start empty."""
     for i in range(len(r)):
         n = index[i]
-        if n == _OUTSIDE:
+        if n == OUTSIDE:
             continue
         m = segment[i]
         count[m, n] += 1
@@ -112,7 +113,7 @@ def surface_under_points(
     """Do what `gp_ground_seg.surface.GroundSurface.at` does for points `start` to `stop`."""
     for i in range(start, stop):
         n = index[i]
-        if n == _OUTSIDE:
+        if n == OUTSIDE:
             ground_z[i] = ground_std[i] = np.nan
             continue
         m = segment[i]
@@ -134,7 +135,7 @@ def mark_standing(
 ) -> None:
     """Mark the cells that an obstacle stands in; threads only ever write True."""
     for i in range(start, stop):
-        if index[i] != _OUTSIDE and min_height <= height[i] <= max_height:
+        if index[i] != OUTSIDE and min_height <= height[i] <= max_height:
             standing[segment[i], index[i]] = True
 
 
@@ -156,14 +157,14 @@ def label_by_height(
     """Do what `gp_ground_seg.labelling.label_points` does for points `start` to `stop`."""
     for i in range(start, stop):
         if math.isnan(r[i]):
-            label[i] = UNKNOWN
+            label[i] = _UNKNOWN
             continue
-        label[i] = OBSTACLE
+        label[i] = _OBSTACLE
         n = index[i]
-        if n == _OUTSIDE:
+        if n == OUTSIDE:
             continue
         m = segment[i]
         below = ground_tolerance + slope_allowance * abs(mean[m, n + 1] - mean[m, n])
         above = obstacle_tolerance if standing[m, n] else below
         if -below <= height[i] <= above:
-            label[i] = GROUND
+            label[i] = _GROUND

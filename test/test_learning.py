@@ -82,15 +82,31 @@ def test_noise_and_length_scales_of_a_drawn_frame_are_recovered(seed):
     assert np.corrcoef(profile, true_profile)[0, 1] >= 0.9
 
 
-def test_the_end_is_level_or_at_a_bound():
+def gradient_per_datum(frame, space, theta):
+    _, gradient = CompiledBackend(1).objective(theta, frame, 0.0, False)
+    return np.abs(gradient - (theta - space.centre)) / len(frame.r)
+
+
+def test_the_end_is_level():
     frame, truth = draw_frame(3, n_segments=30)
-    space = space_about(truth, factor=1.5)
-    learned = learn_frame(frame, space, truth)
-    _, gradient = CompiledBackend(1).objective(learned.theta, frame, 0.0, False)
-    gradient -= learned.theta - space.centre
-    small = np.abs(gradient) < 1e-2 * len(frame.r)
+    space, start = space_about(truth, factor=1.5), truth + 0.3
+    learned = learn_frame(frame, space, start)
     assert learned.status == 'converged'
-    assert (small | learned.at_bound).all()
+    assert not learned.at_bound.any()
+    assert gradient_per_datum(frame, space, start).max() > 0.1
+    assert gradient_per_datum(frame, space, learned.theta).max() < 1e-3
+
+
+def test_an_end_that_is_not_level_is_at_a_bound_and_said_to_be():
+    frame, truth = draw_frame(3, n_segments=30)
+    # The box leaves the true noise out.
+    space = space_about(truth + np.log([1, 3, 1, 1, 1, 1, 1]), factor=1.5)
+    learned = learn_frame(frame, space, space.centre)
+    level = gradient_per_datum(frame, space, learned.theta) < 1e-3
+    assert learned.at_bound[1]
+    assert learned.theta[1] == space.lower[1]
+    assert not level[1]
+    assert (level | learned.at_bound).all()
     assert (space.lower - 1e-12 <= learned.theta).all()
     assert (learned.theta <= space.upper + 1e-12).all()
 
