@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from gp_ground_seg.gp.backend import CompiledBackend
+from gp_ground_seg.gp.compiled_backend import CompiledBackend
 from gp_ground_seg.gp.kernels import paciorek, squared_exponential
 from gp_ground_seg.gp.latent import (
     latent_rows_compiled,

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.config import Config, GridConfig
-from gp_ground_seg.gp.backend import CompiledBackend
+from gp_ground_seg.gp.compiled_backend import CompiledBackend
 from gp_ground_seg.polar_grid import (
     OUTSIDE,
     bin_edges,

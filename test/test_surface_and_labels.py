@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.config import GridConfig, LabelConfig
-from gp_ground_seg.gp.backend import CompiledBackend
+from gp_ground_seg.gp.compiled_backend import CompiledBackend
 from gp_ground_seg.labelling import label_points, stands_in_bin
 from gp_ground_seg.labels import Label
 from gp_ground_seg.polar_grid import build_polar_grid

@@ -1,0 +1,219 @@
+"""The numerics of a frame in compiled code, in threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg import point_passes
+from gp_ground_seg.config import GridConfig, GrowthConfig, LabelConfig
+from gp_ground_seg.gp.growth import BoolArray, grow_surface_compiled
+from gp_ground_seg.gp.latent import latent_rows_compiled
+from gp_ground_seg.gp.objective import TrainingFrame
+from gp_ground_seg.gp.objective_compiled import objective_rows
+from gp_ground_seg.parallel import RowPool
+from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid, bin_edges
+from gp_ground_seg.pseudo_inputs import PseudoInputs
+from gp_ground_seg.surface import GroundSurface
+
+
+class CompiledBackend:
+    """See `gp_ground_seg.gp.backend.Backend`; rows of segments are shared out over threads.
+
+    Parameters
+    ----------
+    n_threads : int
+        Number of threads; 0 = all cores.
+    """
+
+    name = 'numba'
+
+    def __init__(self, n_threads: int) -> None:
+        self._pool = RowPool(n_threads)
+        self.n_threads = self._pool.n_threads
+
+    def polar_grid(self, xyz: FloatArray, finite: BoolArray, grid: GridConfig) -> PolarGrid:
+        """Segment and bin of each point."""
+        n_points = len(xyz)
+        edges = bin_edges(grid)
+        table, scale = point_passes.first_bins(edges)
+        segment = np.empty(n_points, dtype=np.int64)
+        index = np.empty(n_points, dtype=np.int64)
+        r = np.empty(n_points)
+        self._pool.run_points(
+            point_passes.assign_cells,
+            n_points,
+            xyz,
+            finite,
+            edges,
+            table,
+            scale,
+            grid.n_segments,
+            segment,
+            index,
+            r,
+        )
+        return PolarGrid(segment, index, r, edges, grid.n_segments)
+
+    def reduce_cells(self, grid: PolarGrid, z: FloatArray) -> CellTables:
+        """Extremes of every bin."""
+        shape = grid.n_segments, len(grid.edges) - 1
+        cells = CellTables(
+            np.full(shape, np.inf),
+            np.full(shape, np.inf),
+            np.full(shape, -np.inf),
+            np.zeros(shape, dtype=np.int64),
+        )
+        point_passes.fill_cells(
+            grid.segment,
+            grid.bin,
+            grid.r,
+            z,
+            cells.lowest_z,
+            cells.lowest_r,
+            cells.highest_z,
+            cells.count,
+        )
+        return cells
+
+    def surface_under_points(
+        self, surface: GroundSurface, grid: PolarGrid
+    ) -> tuple[FloatArray, FloatArray]:
+        """Height and standard deviation of the surface under each point."""
+        ground_z, ground_std = np.empty(len(grid.r)), np.empty(len(grid.r))
+        self._pool.run_points(
+            point_passes.surface_under_points,
+            len(grid.r),
+            grid.segment,
+            grid.bin,
+            grid.r,
+            surface.knots,
+            surface.mean,
+            surface.std,
+            ground_z,
+            ground_std,
+        )
+        return ground_z, ground_std
+
+    def label_points(
+        self, height: FloatArray, grid: PolarGrid, surface: GroundSurface, label: LabelConfig
+    ) -> npt.NDArray[np.uint8]:
+        """Label of each point."""
+        standing = np.zeros((grid.n_segments, len(grid.edges) - 1), dtype=np.bool_)
+        self._pool.run_points(
+            point_passes.mark_standing,
+            len(height),
+            grid.segment,
+            grid.bin,
+            height,
+            label.obstacle_min_height,
+            label.obstacle_max_height,
+            standing,
+        )
+        result = np.empty(len(height), dtype=np.uint8)
+        self._pool.run_points(
+            point_passes.label_by_height,
+            len(height),
+            grid.segment,
+            grid.bin,
+            grid.r,
+            height,
+            standing,
+            surface.mean,
+            label.ground_tolerance,
+            label.slope_allowance,
+            label.obstacle_tolerance,
+            result,
+        )
+        return result
+
+    def log_length_scales(
+        self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Log length-scales at candidates and knots."""
+        n_segments = len(candidates.offsets) - 1
+        at_candidates = np.empty(len(candidates.r))
+        at_knots = np.full((n_segments, len(knots)), np.nan)
+        self._pool.run(
+            latent_rows_compiled,
+            n_segments,
+            theta,
+            pseudo.offsets,
+            pseudo.r_bar,
+            pseudo.surface_class,
+            candidates.offsets,
+            candidates.r,
+            knots,
+            at_candidates,
+            at_knots,
+        )
+        return at_candidates, at_knots
+
+    def grow(
+        self,
+        candidates: Candidates,
+        height: FloatArray,
+        length_scale: FloatArray,
+        seed: BoolArray,
+        knots: FloatArray,
+        knot_length_scale: FloatArray,
+        theta: FloatArray,
+        slope_std: float,
+        growth: GrowthConfig,
+    ) -> tuple[BoolArray, FloatArray, FloatArray]:
+        """Inliers, mean and standard deviation of the surface."""
+        n_segments = len(candidates.offsets) - 1
+        inlier = np.zeros(len(candidates.r), dtype=np.bool_)
+        mean = np.full((n_segments, len(knots)), np.nan)
+        std = np.full((n_segments, len(knots)), np.nan)
+        self._pool.run(
+            grow_surface_compiled,
+            n_segments,
+            candidates.offsets,
+            candidates.r,
+            height,
+            length_scale,
+            seed,
+            knots,
+            knot_length_scale,
+            np.exp(theta[:, 0]),
+            np.exp(theta[:, 1]),
+            slope_std,
+            growth.max_std,
+            growth.max_standardised_residual,
+            inlier,
+            mean,
+            std,
+        )
+        return inlier, mean, std
+
+    def objective(
+        self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
+    ) -> tuple[float, FloatArray]:
+        """Whole-frame objective and gradient."""
+        values = np.empty(frame.n_segments)
+        gradients = np.empty((frame.n_segments, len(theta)))
+        self._pool.run(
+            objective_rows,
+            frame.n_segments,
+            theta,
+            frame.offsets,
+            frame.r,
+            frame.z,
+            frame.log_length_scale,
+            frame.bar_offsets,
+            frame.r_bar,
+            frame.surface_class,
+            slope_std,
+            latent_terms,
+            values,
+            gradients,
+        )
+        value = float(values.sum())
+        if not np.isfinite(value):
+            return -np.inf, np.zeros(len(theta))
+        return value, gradients.sum(axis=0)
+
+    def close(self) -> None:
+        """End the threads."""
+        self._pool.close()

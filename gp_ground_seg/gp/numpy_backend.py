@@ -1,0 +1,99 @@
+"""The numerics of a frame in plain numpy, one thread."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.config import GridConfig, GrowthConfig, LabelConfig
+from gp_ground_seg.gp.growth import BoolArray, grow_surface_reference
+from gp_ground_seg.gp.latent import latent_rows_reference
+from gp_ground_seg.gp.objective import TrainingFrame, objective_reference
+from gp_ground_seg.labelling import label_points
+from gp_ground_seg.polar_grid import (
+    Candidates,
+    CellTables,
+    FloatArray,
+    PolarGrid,
+    build_polar_grid,
+    reduce_cells,
+)
+from gp_ground_seg.pseudo_inputs import PseudoInputs
+from gp_ground_seg.surface import GroundSurface
+
+
+class NumpyBackend:
+    """See `gp_ground_seg.gp.backend.Backend`."""
+
+    name = 'numpy'
+    n_threads = 1
+
+    def polar_grid(self, xyz: FloatArray, finite: BoolArray, grid: GridConfig) -> PolarGrid:
+        """Segment and bin of each point."""
+        return build_polar_grid(xyz, finite, grid)
+
+    def reduce_cells(self, grid: PolarGrid, z: FloatArray) -> CellTables:
+        """Extremes of every bin."""
+        return reduce_cells(grid, z)
+
+    def surface_under_points(
+        self, surface: GroundSurface, grid: PolarGrid
+    ) -> tuple[FloatArray, FloatArray]:
+        """Height and standard deviation of the surface under each point."""
+        return surface.at(grid)
+
+    def label_points(
+        self, height: FloatArray, grid: PolarGrid, surface: GroundSurface, label: LabelConfig
+    ) -> npt.NDArray[np.uint8]:
+        """Label of each point."""
+        return label_points(height, grid, surface, label)
+
+    def log_length_scales(
+        self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Log length-scales at candidates and knots."""
+        return latent_rows_reference(
+            theta,
+            pseudo.offsets,
+            pseudo.r_bar,
+            pseudo.surface_class,
+            candidates.offsets,
+            candidates.r,
+            knots,
+        )
+
+    def grow(
+        self,
+        candidates: Candidates,
+        height: FloatArray,
+        length_scale: FloatArray,
+        seed: BoolArray,
+        knots: FloatArray,
+        knot_length_scale: FloatArray,
+        theta: FloatArray,
+        slope_std: float,
+        growth: GrowthConfig,
+    ) -> tuple[BoolArray, FloatArray, FloatArray]:
+        """Inliers, mean and standard deviation of the surface."""
+        return grow_surface_reference(
+            candidates.offsets,
+            candidates.r,
+            height,
+            length_scale,
+            seed,
+            knots,
+            knot_length_scale,
+            np.exp(theta[:, 0]),
+            np.exp(theta[:, 1]),
+            slope_std,
+            growth,
+        )
+
+    def objective(
+        self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
+    ) -> tuple[float, FloatArray]:
+        """Whole-frame objective and gradient."""
+        return objective_reference(theta, frame, slope_std, latent_terms)
+
+    def close(self) -> None:
+        """Nothing to end."""
