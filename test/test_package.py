@@ -15,6 +15,7 @@ SOURCES = sorted((REPOSITORY / 'gp_ground_seg').rglob('*.py'))
 ROS_MODULES = {
     'rclpy',
     'sensor_msgs',
+    'geometry_msgs',
     'std_msgs',
     'diagnostic_msgs',
     'rcl_interfaces',

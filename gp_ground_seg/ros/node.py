@@ -118,7 +118,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._processing_statistics.dropped(arrival.n_lost)
         try:
             segmentation = self._segmenter.segment(read_xyz(cloud))
-            self._outputs.publish(cloud, segmentation)
+            self._outputs.publish(cloud, segmentation, self.config)
         except PointCloudError as error:
             self._refuse(cloud, str(error))
         except Exception as error:

@@ -1,0 +1,49 @@
+"""Colours of length-scales: dark blue where the ground is rough, pale yellow where smooth."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+# Lightness rises evenly from one to the next, and hue only goes from blue to yellow: that
+# is told apart with any of the common colour vision deficiencies, and in print.
+_RAMP = np.array(
+    [
+        [0.02, 0.12, 0.40],
+        [0.16, 0.30, 0.56],
+        [0.36, 0.47, 0.60],
+        [0.58, 0.63, 0.56],
+        [0.82, 0.79, 0.42],
+        [1.00, 0.95, 0.50],
+    ]
+)
+UNKNOWN = (0.5, 0.5, 0.5)
+"""Colour where there is no length-scale."""
+
+
+def length_scale_colours(length_scale: FloatArray, low: float, high: float) -> FloatArray:
+    """Colours of length-scales on a logarithmic scale.
+
+    Parameters
+    ----------
+    length_scale : array of float
+        [m]; NaN gives `UNKNOWN`.
+    low, high : float
+        Length-scales at the ends of the ramp [m], 0 < low < high; what lies beyond gets
+        the colour of the end.
+
+    Returns
+    -------
+    (..., 3) float64
+        Red, green and blue in [0, 1].
+    """
+    known = np.isfinite(length_scale) & (length_scale > 0.0)
+    value = np.log(np.where(known, length_scale, low) / low) / math.log(high / low)
+    stops = np.linspace(0.0, 1.0, len(_RAMP))
+    colours = np.stack([np.interp(value, stops, channel) for channel in _RAMP.T], axis=-1)
+    colours[~known] = UNKNOWN
+    return colours

@@ -1,0 +1,157 @@
+"""The ground model by itself against the segmentation it came from."""
+
+import numpy as np
+import pytest
+from conftest import hilly_scan
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.errors import PointCloudError
+from gp_ground_seg.ground_model import GroundModel
+from gp_ground_seg.length_scale_colours import UNKNOWN, length_scale_colours
+
+# No neighbours, so that segments without a model stay without one; r_min of 0 is the hard case.
+CONFIGS = [
+    Config().replace(**{'learning.mode': 'fixed', **changes})
+    for changes in (
+        {},
+        {'surface.n_neighbours': 0, 'grid.r_min': 0.0, 'grid.n_segments': 17},
+        {'grid.n_bins': 5, 'grid.r_max': 30.0, 'grid.bin_growth': 1.0},
+    )
+]
+
+
+def half_scan(seed=0):
+    """A scan with nothing in a quarter of the directions, and points that are not finite."""
+    points = hilly_scan(3000, seed)
+    points[np.abs(np.arctan2(points[:, 1], points[:, 0]) - 1.0) < 0.8] = [120.0, 0.0, 0.0]
+    points[::97, 1] = np.nan
+    return points
+
+
+@pytest.fixture(scope='module', params=range(len(CONFIGS)))
+def segmented(request):
+    points = half_scan(request.param)
+    segmenter = GroundSegmenter(CONFIGS[request.param])
+    return points, segmenter.segment(points)
+
+
+def rounded(model):
+    """The model as it arrives over the network: knots in single precision."""
+    return GroundModel.from_knot_points(
+        model.knot_points().astype(np.float32),
+        model.std.astype(np.float32),
+        model.length_scale.astype(np.float32),
+    )
+
+
+def test_height_under_every_point_is_that_of_the_segmentation(segmented):
+    points, found = segmented
+    model = GroundModel.of(found)
+    height, std = model.at(points[:, 0], points[:, 1])
+    np.testing.assert_array_equal(np.isnan(height), np.isnan(found.ground_z))
+    assert np.isnan(height).any()
+    assert np.isfinite(height).sum() > 1000
+    np.testing.assert_allclose(height, found.ground_z, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(std, found.ground_std, rtol=0, atol=1e-12)
+
+
+def test_rounding_to_single_precision_costs_less_than_a_tenth_of_a_millimetre(segmented):
+    points, found = segmented
+    height, std = rounded(GroundModel.of(found)).at(points[:, 0], points[:, 1])
+    np.testing.assert_allclose(height, found.ground_z, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(std, found.ground_std, rtol=0, atol=1e-4)
+
+
+def test_knots_are_exact(segmented):
+    _, found = segmented
+    model = rounded(GroundModel.of(found))
+    # All directions meet at a range of 0, and beyond the last knot there is nothing.
+    inner = slice(int(model.knots[0] == 0.0), -1)
+    places = model.knot_points()[:, inner]
+    height, std = model.at(places[..., 0], places[..., 1])
+    np.testing.assert_allclose(height, places[..., 2], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(std, model.std[:, inner], rtol=0, atol=1e-9)
+    # The values themselves are those of the surface, to single precision.
+    np.testing.assert_array_equal(
+        np.float32(found.surface.mean[:, inner]), np.float32(places[..., 2])
+    )
+    np.testing.assert_array_equal(np.isnan(model.length_scale), np.isnan(found.log_length_scale))
+
+
+@settings(max_examples=50)
+@given(
+    st.floats(-200.0, 200.0) | st.sampled_from([np.nan, np.inf, 0.0, -0.0, 1e300]),
+    st.floats(-200.0, 200.0) | st.sampled_from([np.nan, -np.inf, 0.0, -0.0]),
+)
+def test_any_place_has_a_height_or_none(x, y):
+    model = GroundModel(
+        np.array([1.0, 2.0, 4.0]), np.full((8, 3), -1.0), np.full((8, 3), 0.1), np.ones((8, 3))
+    )
+    height, std = model.at(x, y)
+    assert height.shape == std.shape == ()
+    with np.errstate(over='ignore'):
+        inside = np.hypot(x, y) < 4.0
+    assert (height == -1.0) == inside
+    assert np.isnan(std) != inside
+
+
+def test_places_broadcast():
+    model = GroundModel(
+        np.array([0.0, 1.0]), np.array([[0.0, 1.0]] * 4), np.ones((4, 2)), np.ones((4, 2))
+    )
+    height, _ = model.at(np.linspace(-1, 1, 5)[:, None], np.zeros(3))
+    np.testing.assert_allclose(height, np.tile([[np.nan], [0.5], [0], [0.5], [np.nan]], 3))
+
+
+def test_what_is_no_polar_grid_is_refused():
+    model = GroundModel(
+        np.array([1.0, 2.0, 4.0]), np.full((8, 3), -1.0), np.full((8, 3), 0.1), np.ones((8, 3))
+    )
+    points = model.knot_points()
+    for broken in (points + 0.01, points[:, ::-1], np.full_like(points, np.nan), points[:4]):
+        with pytest.raises(PointCloudError, match='transformed or filtered'):
+            GroundModel.from_knot_points(broken, model.std[:4], model.length_scale[:4])
+    for small in (points[:0], points[:, :1]):
+        with pytest.raises(PointCloudError, match='at least 1 segment and 2 knots'):
+            GroundModel.from_knot_points(small, small[..., 0], small[..., 0])
+
+
+# Brettel-style full loss of one cone, as linear maps in linear RGB (Machado et al. 2009).
+DEFICIENCIES = {
+    'none': np.eye(3),
+    'protanopia': [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    'deuteranopia': [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    'tritanopia': [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
+}
+
+
+@pytest.mark.parametrize('name', DEFICIENCIES)
+def test_lightness_of_the_colours_rises_for_every_eye(name):
+    colours = length_scale_colours(np.geomspace(1.0, 50.0, 30), 1.0, 50.0)
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ np.transpose(DEFICIENCIES[name]), 0.0, 1.0)
+    lightness = 116.0 * np.cbrt(seen @ [0.2126, 0.7152, 0.0722]) - 16.0
+    assert np.diff(lightness).min() > 1.0
+    assert np.ptp(lightness) > 60.0
+
+
+def test_colours_end_at_the_limits_and_nan_is_grey():
+    ends = length_scale_colours(np.array([1.0, 50.0, 0.01, 500.0, np.inf, np.nan]), 1.0, 50.0)
+    np.testing.assert_array_equal(ends[2], ends[0])
+    np.testing.assert_array_equal(ends[3], ends[1])
+    assert not np.array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[5], UNKNOWN)
