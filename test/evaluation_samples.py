@@ -79,3 +79,6 @@ class HeightRule:
 
     def stages(self) -> dict[str, float]:
         return {}
+
+    def facts(self) -> dict[str, float | str]:
+        return {}

@@ -36,7 +36,8 @@ def table(output, title):
     lines = output.splitlines()
     start = next(k for k, line in enumerate(lines) if line.startswith(title))
     rows = {}
-    for line in lines[start + 3 :]:
+    rule = next(k for k in range(start, len(lines)) if lines[k].startswith('---'))
+    for line in lines[rule + 1 :]:
         if not line:
             break
         cells = [cell.strip() for cell in line.split('  ') if cell.strip()]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from typing import Any
 
 from gp_ground_seg.cli.tables import format_table, milliseconds, percent
+from gp_ground_seg.evaluation.class_errors import class_errors
 from gp_ground_seg.evaluation.conventions import CONVENTIONS, GROUNDGRID, Convention
 from gp_ground_seg.evaluation.methods import PATCHWORKPP
+from gp_ground_seg.evaluation.rings import ring_titles
 from gp_ground_seg.evaluation.scores import RATIOS, MethodScore
 from gp_ground_seg.evaluation.semantic_classes import class_name
 from gp_ground_seg.labels import Label
@@ -42,7 +45,8 @@ def evaluation_text(scores: Sequence[MethodScore], document: dict[str, Any]) -> 
     """
     parts = [_headline(scores)]
     parts += [_convention_table(scores, convention) for convention in CONVENTIONS]
-    parts += [_class_table(scores[0]), _time_table(scores), _footer(document)]
+    parts += [_ring_table(scores), _class_table(scores[0])]
+    parts += [_time_table(scores), _footer(document)]
     return '\n\n'.join(parts)
 
 
@@ -52,6 +56,10 @@ def _title(score: MethodScore) -> str:
 
 def _count(number: int, noun: str) -> str:
     return f'{number} {noun}' if number == 1 else f'{number} {noun}s'
+
+
+def _thousands(number: int) -> str:
+    return f'{number:,}'.replace(',', ' ')
 
 
 def _headline(scores: Sequence[MethodScore]) -> str:
@@ -85,31 +93,49 @@ def _convention_table(scores: Sequence[MethodScore], convention: Convention) -> 
     return f'{convention.title} convention: {convention.rule}  [%]\n{table}'
 
 
+def _ring_table(scores: Sequence[MethodScore]) -> str:
+    """Where over range the score is lost."""
+    ours, *peers = scores
+    header = ['range', 'points', 'errors', 'of errors', 'precision', 'recall', 'IoU']
+    for peer in peers:
+        header += [f'{_title(peer)} IoU', 'difference']
+    errors = ours.pooled(GROUNDGRID.key).errors
+    rows = []
+    for title, ring, *theirs in zip(ring_titles(), *(s.rings() for s in scores), strict=False):
+        row = [title, _thousands(ring.points), _thousands(ring.errors)]
+        row.append(percent(ring.errors / errors if errors else math.nan))
+        row += [percent(ring.precision), percent(ring.recall), percent(ring.iou)]
+        for its in theirs:
+            row += [percent(its.iou), percent(ring.iou - its.iou, sign=True)]
+        rows.append(row)
+    return f'Horizontal range (GroundGrid convention)  [%]\n{format_table(header, rows)}'
+
+
 def _class_table(score: MethodScore) -> str:
     """Classes by what they count as, and in that by how much they cost."""
+    found = class_errors(score.classes())
     errors = score.pooled(GROUNDGRID.key).errors
-    rows = []
-    for number, count in score.classes().items():
-        truth = GROUNDGRID.truth_of_class(number)
-        wrong = {
-            Label.GROUND: count.points - count.labelled_ground,
-            Label.OBSTACLE: count.labelled_ground,
-            Label.UNKNOWN: 0,
-        }[truth]
-        cells = [
-            class_name(number),
-            TRUTH_TITLES[truth],
-            f'{count.points:,}'.replace(',', ' '),
-            percent(count.share_ground),
-            '-' if truth is Label.UNKNOWN or not errors else percent(wrong / errors),
+    n_points = sum(one.points for one in found)
+    rows = [
+        [
+            class_name(one.number),
+            TRUTH_TITLES[one.truth],
+            _thousands(one.points),
+            percent(one.points / n_points),
+            percent(one.labelled_ground / one.points),
+            percent(one.missed / one.points) if one.truth is Label.GROUND else '-',
+            percent(one.false / one.points) if one.truth is Label.OBSTACLE else '-',
+            '-' if one.truth is Label.UNKNOWN or not errors else percent(one.errors / errors),
         ]
-        rows.append((list(TRUTH_TITLES).index(truth), -wrong, -count.points, cells))
-    table = format_table(
-        ['class', 'counts as', 'points', 'labelled ground [%]', 'of all errors [%]'],
-        [cells for *_, cells in sorted(rows)],
-        n_left=2,
+        for one in sorted(found, key=lambda one: list(TRUTH_TITLES).index(one.truth))
+    ]
+    header = ['class', 'counts as', 'points', 'of points', 'as ground', 'missed', 'false']
+    table = format_table([*header, 'of errors'], rows, n_left=2)
+    return (
+        'Classes (GroundGrid convention): share of all points; of the class, what was labelled '
+        'ground,\nwhat is missed ground and what is false ground; share of all errors  [%]\n'
+        f'{table}'
     )
-    return f'Classes (GroundGrid convention)\n{table}'
 
 
 def _time_table(scores: Sequence[MethodScore]) -> str:

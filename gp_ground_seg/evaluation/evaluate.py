@@ -17,14 +17,18 @@ from gp_ground_seg.datasets.semantic_kitti import (
     read_points,
 )
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.conventions import CONVENTIONS
+from gp_ground_seg.evaluation.conventions import CONVENTIONS, GROUNDGRID
 from gp_ground_seg.evaluation.methods import Method
+from gp_ground_seg.evaluation.rings import count_rings
 from gp_ground_seg.evaluation.scores import (
     FrameScore,
     MethodScore,
     count_classes,
     count_confusion,
 )
+
+Observer = Callable[[str, Frame, FrameScore, npt.NDArray[np.uint8]], None]
+"""Looks at a frame as it is scored: method, frame, score, labels."""
 
 
 def labelled_frames(root: str | Path, sequences: Sequence[str] | None = None) -> list[Frame]:
@@ -61,6 +65,7 @@ def evaluate(
     methods: Sequence[Method],
     clock: Callable[[], float] = time.perf_counter,
     progress: Callable[[Sequence[Frame]], Iterable[Frame]] = iter,
+    observe: Observer | None = None,
 ) -> list[MethodScore]:
     """Score methods on the same frames, run alternately.
 
@@ -77,6 +82,9 @@ def evaluate(
         Source of seconds.
     progress : callable
         Wraps the frames to show how far it is, as tqdm does.
+    observe : callable, optional
+        Called with the name of the method, the frame, its score and its labels (N,)
+        as soon as a frame is scored: scores alone are kept.
 
     Returns
     -------
@@ -107,7 +115,11 @@ def evaluate(
             start = clock()
             method.run(points)
             seconds = clock() - start
-            scores[method.name].append(_score_frame(frame, method, seconds, points, semantic))
+            label = method.label()
+            score = _score_frame(frame, method, seconds, points, semantic, label)
+            scores[method.name].append(score)
+            if observe is not None:
+                observe(method.name, frame, score, label)
     return [MethodScore(name, tuple(found)) for name, found in scores.items()]
 
 
@@ -117,16 +129,18 @@ def _score_frame(
     seconds: float,
     points: npt.NDArray[np.float32],
     semantic: npt.NDArray[np.uint16],
+    label: npt.NDArray[np.uint8],
 ) -> FrameScore:
-    label = method.label()
+    truth = {
+        convention.key: convention.truth(semantic, points[:, 2]) for convention in CONVENTIONS
+    }
     return FrameScore(
         sequence=frame.sequence,
         index=frame.index,
         seconds=seconds,
         stages=method.stages(),
-        confusions={
-            convention.key: count_confusion(label, convention.truth(semantic, points[:, 2]))
-            for convention in CONVENTIONS
-        },
+        confusions={key: count_confusion(label, true_label) for key, true_label in truth.items()},
         classes=count_classes(label, semantic),
+        rings=count_rings(label, truth[GROUNDGRID.key], points),
+        facts=method.facts(),
     )

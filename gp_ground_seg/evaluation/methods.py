@@ -39,6 +39,9 @@ class Method(Protocol):
     def stages(self) -> dict[str, float]:
         """Seconds by stage of the scan last run; empty if it does not tell."""
 
+    def facts(self) -> dict[str, float | str]:
+        """Tell what else is known of the scan last run, by name; empty if nothing."""
+
 
 class OurMethod:
     """`GroundSegmenter` as a method.
@@ -72,6 +75,10 @@ class OurMethod:
     def stages(self) -> dict[str, float]:
         """Seconds by stage of the scan last run."""
         return {stage: s for stage, s in self._result.timings.items() if stage != 'total'}
+
+    def facts(self) -> dict[str, float | str]:
+        """How the learning ended, and how many segments have a ground model."""
+        return {'status': self.fit.status, 'n_segments': float(self.fit.n_segments)}
 
     @property
     def fit(self) -> FitReport:
@@ -127,6 +134,10 @@ class PatchworkppMethod:
 
     def stages(self) -> dict[str, float]:
         """Nothing: it tells only its total."""
+        return {}
+
+    def facts(self) -> dict[str, float | str]:
+        """Nothing."""
         return {}
 
 

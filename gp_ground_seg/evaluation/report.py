@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.config import Config, parameter_specs
-from gp_ground_seg.evaluation.conventions import CONVENTIONS
+from gp_ground_seg.evaluation.class_errors import class_errors
+from gp_ground_seg.evaluation.conventions import CONVENTIONS, GROUNDGRID
 from gp_ground_seg.evaluation.environment import Environment
+from gp_ground_seg.evaluation.rings import ring_titles
 from gp_ground_seg.evaluation.scores import RATIOS, Confusion, MethodScore
 from gp_ground_seg.evaluation.semantic_classes import class_name
 from gp_ground_seg.parameter_spec import ParameterValue
@@ -81,15 +83,8 @@ def _method(score: MethodScore) -> dict[str, Any]:
             sequence: {c.key: _confusion(score.pooled(c.key, sequence)) for c in CONVENTIONS}
             for sequence in score.sequences
         },
-        'classes': {
-            str(number): {
-                'name': class_name(number),
-                'points': count.points,
-                'labelled_ground': count.labelled_ground,
-                'share_ground': count.share_ground,
-            }
-            for number, count in score.classes().items()
-        },
+        'rings': dict(zip(ring_titles(), map(_confusion, score.rings()), strict=False)),
+        'classes': _classes(score),
         'ms_per_frame': {
             'median': 1e3 * score.median_seconds,
             'mean': 1e3 * score.mean_seconds,
@@ -102,10 +97,31 @@ def _method(score: MethodScore) -> dict[str, Any]:
                 'sequence': frame.sequence,
                 'index': frame.index,
                 'ms': 1e3 * frame.seconds,
+                **frame.facts,
                 **{c.key: _confusion(frame.confusions[c.key]) for c in CONVENTIONS},
             }
             for frame in score.frames
         ],
+    }
+
+
+def _classes(score: MethodScore) -> dict[str, Any]:
+    errors = score.pooled(GROUNDGRID.key).errors
+    found = sorted(class_errors(score.classes()), key=lambda one: one.number)
+    n_points = sum(one.points for one in found)
+    return {
+        str(one.number): {
+            'name': class_name(one.number),
+            'counts_as': one.truth.name.lower(),
+            'points': one.points,
+            'share_points': one.points / n_points,
+            'labelled_ground': one.labelled_ground,
+            'share_ground': one.labelled_ground / one.points,
+            'missed_ground': one.missed,
+            'false_ground': one.false,
+            'share_errors': one.errors / errors if errors else math.nan,
+        }
+        for one in found
     }
 
 

@@ -69,6 +69,11 @@ class Confusion:
         return _ratio(self.tp, self.tp + self.errors)
 
     @property
+    def points(self) -> int:
+        """TP + FP + FN + TN."""
+        return self.tp + self.fp + self.fn + self.tn
+
+    @property
     def errors(self) -> int:
         """FP + FN."""
         return self.fp + self.fn
@@ -152,6 +157,10 @@ class FrameScore:
         By key of the convention.
     classes : dict of int to ClassCount
         By number of the semantic class.
+    rings : tuple of Confusion
+        By ring of `gp_ground_seg.evaluation.rings`, GroundGrid convention.
+    facts : dict of str to float or str
+        What else the method tells of the frame, as the sensor's height it found [m].
     """
 
     sequence: str
@@ -160,6 +169,8 @@ class FrameScore:
     stages: dict[str, float] = field(default_factory=dict)
     confusions: dict[str, Confusion] = field(default_factory=dict)
     classes: dict[int, ClassCount] = field(default_factory=dict)
+    rings: tuple[Confusion, ...] = ()
+    facts: dict[str, float | str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -186,6 +197,11 @@ class MethodScore:
             for number, count in frame.classes.items():
                 total[number] = total.get(number, ClassCount()) + count
         return dict(sorted(total.items()))
+
+    def rings(self) -> tuple[Confusion, ...]:
+        """Sum of the counts by ring over all frames."""
+        by_ring = zip(*(frame.rings for frame in self.frames), strict=True)
+        return tuple(sum(ring, Confusion()) for ring in by_ring)
 
     @property
     def median_seconds(self) -> float:

@@ -11,9 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.datasets.staging import staged_file
-from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
+from gp_ground_seg.errors import ConfigError, PointCloudError
 from gp_ground_seg.evaluation.scores import count_confusion
 from gp_ground_seg.labels import Label
+from gp_ground_seg.plotting.canvas import DPI as DPI
+from gp_ground_seg.plotting.canvas import new_figure
 from gp_ground_seg.points import check_points
 
 # After Okabe and Ito's palette, told apart with any colour vision and in grey print.
@@ -27,7 +29,6 @@ MISSED_GROUND_COLOUR = '#0072B2'
 
 # Inches: the square of a panel, what is around it, and the line above all panels.
 SQUARE, LEFT, RIGHT, BOTTOM, TOP, TITLE = 6.2, 0.8, 0.2, 0.95, 0.4, 0.4
-DPI = 120
 
 
 @dataclass(frozen=True)
@@ -85,14 +86,6 @@ def plot_birds_eye(
             )
     if not (extent > 0.0 and math.isfinite(extent)):
         raise ConfigError(f'extent = {extent}: must be a positive number of metres')
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError(
-            "drawing needs matplotlib: pip install 'gp_ground_seg[plot]'"
-        ) from error
-
     shown = finite & (np.abs(xyz[:, :2]) <= extent).all(axis=1)
     panels = [(_label_title(label), _label_layers(label))]
     if truth is not None:
@@ -100,8 +93,7 @@ def plot_birds_eye(
     # Placed by hand: matplotlib's own layouts leave no room for a legend below equal axes.
     width = (LEFT + SQUARE + RIGHT) * len(panels)
     height = BOTTOM + SQUARE + TOP + (TITLE if title else 0.0)
-    figure = Figure((width, height), dpi=DPI)
-    canvas = FigureCanvasAgg(figure)
+    figure, canvas = new_figure(width, height)
     if title:
         figure.text(
             0.5, 1.0 - 0.6 * TITLE / height, title, fontsize=15, fontweight='bold',
@@ -178,7 +170,7 @@ def _draw_panel(
             dot = Line2D([], [], marker='o', markersize=7, color=layer.colour, linestyle='none')
             dot.set_label(layer.title)
             legend.append(dot)
-    _draw_rings(axes, extent, len(layers) + 1)
+    draw_rings(axes, extent, len(layers) + 1)
     sensor = {'marker': '^', 'color': 'white', 'markeredgecolor': 'black', 'linestyle': 'none'}
     legend += axes.plot(0, 0, label='sensor', markersize=8, zorder=len(layers) + 2, **sensor)
     axes.set_aspect('equal')
@@ -192,8 +184,8 @@ def _draw_panel(
     )  # fmt: skip
 
 
-def _draw_rings(axes: Any, extent: float, depth: int) -> None:
-    """Circles of equal range, at most five, a round number of metres apart."""
+def draw_rings(axes: Any, extent: float, depth: int) -> None:
+    """Draw circles of equal range, at most five, a round number of metres apart."""
     step = _round_step(extent / 5.0)
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
     for radius in np.arange(step, extent * math.sqrt(2.0), step):
