@@ -47,8 +47,8 @@ class GroundModel:
     def azimuth(self) -> FloatArray:
         """Middle of each segment, (M,) [rad], from -pi on."""
         n_segments = len(self.height)
-        middle: FloatArray = (np.arange(n_segments) + 0.5) * (2.0 * np.pi / n_segments) - np.pi
-        return middle
+        middle = (np.arange(n_segments) + 0.5) / n_segments
+        return np.asarray(2.0 * np.pi * middle - np.pi, dtype=np.float64)
 
     def knot_points(self) -> FloatArray:
         """Place of every knot in the middle of its segment, (M, K, 3) [m].
