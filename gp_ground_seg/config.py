@@ -407,6 +407,40 @@ class DiagnosticsConfig:
         low=0.001,
         high=10.0,
     )
+    max_load: float = parameter(
+        0.95,
+        'median time per cloud, over the time between two clouds sent, above which processing '
+        'is reported WARN',
+        low=0.01,
+        high=100.0,
+    )
+    max_drop_ratio: float = parameter(
+        0.0,
+        'share of the clouds sent since the last report that may be dropped before processing is '
+        'reported WARN',
+        low=0.0,
+        high=1.0,
+    )
+    max_refused_ratio: float = parameter(
+        0.0,
+        'share of the clouds since the last report that may be refused with a WARN; above it, and '
+        'always when all are, the input is reported ERROR',
+        low=0.0,
+        high=1.0,
+    )
+    min_quality: float = parameter(
+        0.2,
+        'frame_quality of the newest cloud below which the model is reported WARN',
+        low=0.0,
+        high=1.0,
+    )
+    recover_after: float = parameter(
+        3.0,
+        'time that a level stays reported after its cause has gone',
+        unit='s',
+        low=0.0,
+        high=600.0,
+    )
 
 
 @dataclass(frozen=True)

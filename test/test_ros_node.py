@@ -6,6 +6,8 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.clock_type import ClockType
+from rclpy.time import Time
 from ros_helpers import (
     BEST_EFFORT,
     NAMESPACE,
@@ -22,13 +24,14 @@ from ros_helpers import (
     wait_for,
     xyz_of,
 )
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.ros.node import GroundSegmentationNode
 from gp_ground_seg.ros.warm_up import warm_up
 
-OFTEN = ('-p', 'diagnostics.period:=0.1')
+OFTEN = ('-p', 'diagnostics.period:=0.1', '-p', 'diagnostics.recover_after:=0.3')
 
 
 def assert_partition(message, points, ground, obstacles):
@@ -151,6 +154,16 @@ def test_diagnostics_of_a_stream():
         assert values['Fields'] == ' '.join(POINT.names)
         assert values['QoS'] == 'reliable, keep_last 5, volatile'
         assert values['Publishers'] == '1'
+        assert values['Clock'] == 'system time'
+        status = b.wait_for_status('model', lambda v, _: 'frame_quality' in v)
+        assert status.level == DiagnosticStatus.OK
+        values = {entry.key: entry.value for entry in status.values}
+        assert 0.2 < float(values['frame_quality']) <= 1.0
+        assert 0.3 < float(values['Ground fraction']) < 1.0
+        status = b.wait_for_status('output', lambda *_: True)
+        values = {entry.key: entry.value for entry in status.values}
+        assert values[f'{NAMESPACE}/ground subscribers'] == '1'
+        assert values[f'{NAMESPACE}/obstacles since startup'] == '4'
         assert b.set('diagnostics.max_latency', 0.001).successful
         b.wait_for_status('processing', lambda _, s: s.level == DiagnosticStatus.WARN)
 
@@ -160,6 +173,60 @@ def test_diagnostics_come_without_a_clock_under_sim_time():
         assert b.node.get_clock().ros_time_is_active
         b.segment(to_message(street(3000)))
         b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
+
+
+def test_error_in_a_report_does_not_end_the_node(monkeypatch):
+    with bench(*OFTEN) as b:
+        monkeypatch.setattr(b.node, '_outputs', None)
+        status = b.wait_for_status('diagnostics', lambda *_: True)
+        assert status.level == DiagnosticStatus.ERROR
+        assert 'NoneType' in status.message
+        monkeypatch.undo()
+        b.wait_for_status('output', lambda *_: True)
+
+
+def test_stamps_that_jump_back_reset_what_was_learned(monkeypatch):
+    points = street(3000)
+    resets = []
+    reset = GroundSegmenter.reset
+    with bench(*OFTEN) as b:
+        monkeypatch.setattr(GroundSegmenter, 'reset', lambda s: [resets.append(1), reset(s)])
+        for seconds in (100, 101, 102):
+            b.segment(to_message(points, stamp=(seconds, 0)))
+        assert resets == []
+        for seconds in (100, 101, 100):
+            b.segment(to_message(points, stamp=(seconds, 0)))
+        status = b.wait_for_status('input', lambda v, _: v['Time jumps since startup'] == '2')
+        assert status.level == DiagnosticStatus.OK
+        assert resets == [1, 1]
+
+
+def test_simulated_time_that_jumps_back_resets_what_was_learned():
+    with bench(*OFTEN, '-p', 'use_sim_time:=true') as b:
+        publisher = b.probe.create_publisher(Clock, '/clock', RELIABLE)
+        wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of /clock')
+
+        def tell(seconds):
+            message = Clock()
+            message.clock.sec = seconds
+            publisher.publish(message)
+            now = Time(seconds=seconds, clock_type=ClockType.ROS_TIME)
+            wait_for(lambda: b.node.get_clock().now() == now, f'time {seconds}')
+
+        tell(1317383000)
+        b.segment(to_message(street(3000), stamp=(1317382999, 500000000)))
+        # A stamp of 2011 is half a second old: ages are on the node's clock.
+        status = b.wait_for_status('input', lambda v, _: v['Events since startup'] == '1')
+        values = {entry.key: entry.value for entry in status.values}
+        assert values['Age of last stamp (s)'] == '0.500'
+        assert values['Clock'] == 'simulated, from /clock'
+        tell(1317382000)
+        b.wait_for_status('input', lambda v, _: v['Time jumps since startup'] == '1')
+        # The first cloud of the next round: the same jump.
+        b.segment(to_message(street(3000), stamp=(1317382000, 0)))
+        status = b.wait_for_status('input', lambda v, _: v['Events since startup'] == '2')
+        values = {entry.key: entry.value for entry in status.values}
+        assert values['Time jumps since startup'] == '1'
 
 
 def test_drops_are_counted_exactly():

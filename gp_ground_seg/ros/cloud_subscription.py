@@ -17,8 +17,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 
+from gp_ground_seg.ros.health.rate import SequenceGaps
 from gp_ground_seg.ros.qos import INPUT_DEPTH, cloud_profile, in_words, matching_reliability
-from gp_ground_seg.ros.statistics import SequenceGaps
 
 REVIEW_PERIOD = 1.0
 """Time between two looks at the publishers [s]."""

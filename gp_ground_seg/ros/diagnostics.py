@@ -9,7 +9,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from gp_ground_seg.ros.statistics import Status
+from gp_ground_seg.ros.health.status import Level, Status
 
 TOPIC = '/diagnostics'
 NANOSECONDS = 1_000_000_000
@@ -49,7 +49,12 @@ class DiagnosticsPublisher:
         array = DiagnosticArray()
         array.header.stamp = self._node.get_clock().now().to_msg()
         node_name = self._node.get_fully_qualified_name().lstrip('/')
-        array.status = [to_message(status, node_name) for status in self._report()]
+        try:
+            statuses = list(self._report())
+        except Exception as error:
+            # Out of here it would end the node, for the sake of a report.
+            statuses = [Status('diagnostics', Level.ERROR, f'{type(error).__name__}: {error}', {})]
+        array.status = [to_message(status, node_name) for status in statuses]
         self._publisher.publish(array)
 
 

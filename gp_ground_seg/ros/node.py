@@ -18,18 +18,16 @@ from gp_ground_seg.errors import GroundSegError, PointCloudError
 from gp_ground_seg.gp.backend import choose_backend
 from gp_ground_seg.ros.cloud_subscription import Arrival, CloudSubscription
 from gp_ground_seg.ros.diagnostics import DiagnosticsPublisher
+from gp_ground_seg.ros.health.health import Health
+from gp_ground_seg.ros.health.input import InputFacts
+from gp_ground_seg.ros.health.status import Status
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.point_cloud2 import read_xyz
 from gp_ground_seg.ros.qos import in_words
 from gp_ground_seg.ros.signals import stop_on_signals
 from gp_ground_seg.ros.startup import initialize, start_errors
-from gp_ground_seg.ros.statistics import (
-    InputFacts,
-    InputStatistics,
-    ProcessingStatistics,
-    Status,
-)
+from gp_ground_seg.ros.time_jumps import TimeJumps
 from gp_ground_seg.ros.transport import large_cloud_transport
 from gp_ground_seg.ros.warm_up import warm_up
 from gp_ground_seg.segmenter import GroundSegmenter
@@ -70,7 +68,6 @@ class GroundSegmentationNode(ConfiguredNode):
         self._segmenter = GroundSegmenter(self.config)
         # For throttled messages; the default system clock may jump.
         self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self._processing_statistics = ProcessingStatistics()
         try:
             self._start()
         except BaseException:
@@ -86,7 +83,8 @@ class GroundSegmentationNode(ConfiguredNode):
             logger.info('compiling; this takes some seconds if it was not done before')
         logger.info(f'ready to segment after {warm_up(self._segmenter):.1f} s')
         # Only now: a cloud that came earlier would have waited for the compiler.
-        self._input_statistics = InputStatistics(time.monotonic())
+        self._health = Health(time.monotonic())
+        self._time_jumps = TimeJumps(self, self._on_time_jump)
         with start_errors():
             self._input = CloudSubscription(self, INPUT_TOPIC, self.is_given, self._on_cloud)
         self._diagnostics = DiagnosticsPublisher(
@@ -114,27 +112,43 @@ class GroundSegmentationNode(ConfiguredNode):
         start = time.monotonic()
         stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
         fields = [field.name for field in cloud.fields]
-        self._input_statistics.arrived(start, stamp, cloud.header.frame_id, fields)
-        self._processing_statistics.dropped(arrival.n_lost)
+        self._time_jumps.note(stamp)
+        self._health.input.arrived(start, stamp, cloud.header.frame_id, fields)
+        self._health.processing.arrived(start, arrival.n_lost)
         try:
             segmentation = self._segmenter.segment(read_xyz(cloud))
-            self._outputs.publish(cloud, segmentation, self.config)
+            segmented = time.monotonic()
+            topics = self._outputs.publish(cloud, segmentation, self.config)
         except PointCloudError as error:
             self._refuse(cloud, str(error))
         except Exception as error:
             # Whatever one cloud brings about, the next one may be good.
             self._refuse(cloud, f'{type(error).__name__}: {error}')
         else:
-            latency = arrival.wait + time.monotonic() - start
+            end = time.monotonic()
             fit = segmentation.fit
-            self._processing_statistics.processed(
-                latency, segmentation.timings, fit.backend, fit.n_threads
+            self._health.processing.processed(
+                latency=arrival.wait + end - start,
+                duration=end - start,
+                stages={
+                    'queue': arrival.wait,
+                    **segmentation.timings,
+                    'publish': end - segmented,
+                },
+                backend=fit.backend,
+                n_threads=fit.n_threads,
             )
+            self._health.model.segmented(segmentation)
+            self._health.output.published(end, topics)
+
+    def _on_time_jump(self) -> None:
+        self._segmenter.reset()
+        self._health.input.time_jumped()
 
     def _refuse(self, cloud: PointCloud2, reason: str) -> None:
         if not self.context.ok():
             return  # publishing failed because the process ends
-        self._input_statistics.refused(reason)
+        self._health.input.refused(reason)
         self.get_logger().error(
             f'cloud on {self._input.topic} in frame {cloud.header.frame_id!r} refused: {reason}',
             throttle_duration_sec=LOG_PERIOD,
@@ -142,17 +156,17 @@ class GroundSegmentationNode(ConfiguredNode):
         )
 
     def _report(self) -> list[Status]:
+        clock = self.get_clock()
         facts = InputFacts(
             topic=self._input.topic,
             qos=in_words(self._input.qos),
             n_publishers=self._input.n_publishers,
-            ros_time=1e-9 * self.get_clock().now().nanoseconds,
+            ros_time=1e-9 * clock.now().nanoseconds,
+            is_simulated=clock.ros_time_is_active,
         )
-        limits = self.config.diagnostics
-        return [
-            self._input_statistics.report(time.monotonic(), facts, limits),
-            self._processing_statistics.report(limits),
-        ]
+        return self._health.report(
+            time.monotonic(), facts, self._outputs.n_subscribers(), self.config.diagnostics
+        )
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -114,8 +114,21 @@ class OutputPublishers:
             for output in outputs
         ]
 
-    def publish(self, cloud: PointCloud2, segmentation: Segmentation, config: Config) -> None:
-        """Publish all outputs of one cloud; nothing, if one of them cannot be built."""
+    def n_subscribers(self) -> dict[str, int]:
+        """Return how many subscribe to each topic."""
+        return {
+            publisher.topic_name: publisher.get_subscription_count()
+            for _, publisher in self._publishers
+        }
+
+    def publish(self, cloud: PointCloud2, segmentation: Segmentation, config: Config) -> list[str]:
+        """Publish all outputs of one cloud; nothing, if one of them cannot be built.
+
+        Returns
+        -------
+        list of str
+            Topics published to.
+        """
         wanted = [
             (output, publisher)
             for output, publisher in self._publishers
@@ -128,6 +141,7 @@ class OutputPublishers:
             self._say_what_is_renamed(cloud)
         for publisher, message in messages:
             publisher.publish(message)
+        return [publisher.topic_name for publisher, _ in messages]
 
     def _say_what_is_renamed(self, cloud: PointCloud2) -> None:
         names = free_names(field.name for field in cloud.fields)
