@@ -77,6 +77,9 @@ class HeightRule:
     def label(self) -> np.ndarray:
         return self._label.astype(np.uint8)
 
+    def p_ground(self) -> None:
+        return None
+
     def stages(self) -> dict[str, float]:
         return {}
 

@@ -40,6 +40,8 @@ def table(output, title):
     for line in lines[rule + 1 :]:
         if not line:
             break
+        if line.startswith('---'):
+            continue
         cells = [cell.strip() for cell in line.split('  ') if cell.strip()]
         rows[cells[0]] = cells[1:]
     return rows

@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -30,6 +31,7 @@ from gp_ground_seg.evaluation.methods import (
 from gp_ground_seg.evaluation.report import report, write_json
 from gp_ground_seg.evaluation.scores import MethodScore
 from gp_ground_seg.evaluation.worst import WorstFrames
+from gp_ground_seg.plotting.reliability import plot_reliability
 
 EXAMPLES = """\
 examples:
@@ -38,6 +40,7 @@ examples:
   gp-ground-seg evaluate KITTI_ROOT --set label.ground_tolerance=0.15
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
   gp-ground-seg evaluate KITTI_ROOT --frames-csv frames.csv --sheet worst.png --worst 9
+  gp-ground-seg evaluate KITTI_ROOT --reliability reliability.png
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI).
 """
@@ -47,6 +50,7 @@ FILES = {
     'json': 'every number',
     'frames_csv': 'one line per frame',
     'sheet': 'worst frames',
+    'reliability': 'reliability diagram',
 }
 """What is in the file that each option asks for."""
 
@@ -69,6 +73,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument('--frames-csv', metavar='FILE', help='write one line per frame (CSV)')
     parser.add_argument(
         '--sheet', metavar='FILE', help='draw the worst frames from above, errors coloured (PNG)'
+    )
+    parser.add_argument(
+        '--reliability', metavar='FILE', help='draw share of ground over p_ground (PNG)'
     )
     parser.add_argument(
         '--worst',
@@ -105,12 +112,23 @@ def run(arguments: argparse.Namespace) -> int:
             write_frames_csv(scores, parts[FILES['frames_csv']])
         if worst is not None:
             write_worst_sheet(worst.found(), len(scores[0].frames), parts[FILES['sheet']])
+        if FILES['reliability'] in parts:
+            _write_reliability(scores[0], parts[FILES['reliability']])
     print(evaluation_text(scores, document))
     if targets:
         print()
     for title, (path, _) in targets.items():
         print(f'{title}: {path}')
     return 0
+
+
+def _write_reliability(score: MethodScore, path: Path) -> None:
+    found = {name: score.calibration(name) for name in score.sequences}
+    pooled = score.calibration()
+    if pooled is None:
+        raise DataError('--reliability: this segmentation has no probabilities')
+    sequences = {name: one for name, one in found.items() if one is not None}
+    plot_reliability(pooled, sequences, path, f'Reliability, {len(score.frames)} frames')
 
 
 def _positive(word: str) -> int:

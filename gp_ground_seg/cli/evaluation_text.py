@@ -7,6 +7,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
+from gp_ground_seg.cli.calibration_text import calibration_table
 from gp_ground_seg.cli.tables import format_table, milliseconds, percent
 from gp_ground_seg.evaluation.class_errors import class_errors
 from gp_ground_seg.evaluation.conventions import CONVENTIONS, GROUNDGRID, Convention
@@ -46,6 +47,8 @@ def evaluation_text(scores: Sequence[MethodScore], document: dict[str, Any]) -> 
     parts = [_headline(scores)]
     parts += [_convention_table(scores, convention) for convention in CONVENTIONS]
     parts += [_ring_table(scores), _class_table(scores[0])]
+    if (probabilities := calibration_table(scores[0], POOLED)) is not None:
+        parts.append(probabilities)
     parts += [_time_table(scores), _footer(document)]
     return '\n\n'.join(parts)
 

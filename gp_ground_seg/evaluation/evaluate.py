@@ -17,6 +17,7 @@ from gp_ground_seg.datasets.semantic_kitti import (
     read_points,
 )
 from gp_ground_seg.errors import DataError
+from gp_ground_seg.evaluation.calibration import count_calibration
 from gp_ground_seg.evaluation.conventions import CONVENTIONS, GROUNDGRID
 from gp_ground_seg.evaluation.methods import Method
 from gp_ground_seg.evaluation.rings import count_rings
@@ -131,6 +132,7 @@ def _score_frame(
     semantic: npt.NDArray[np.uint16],
     label: npt.NDArray[np.uint8],
 ) -> FrameScore:
+    p_ground = method.p_ground()
     truth = {
         convention.key: convention.truth(semantic, points[:, 2]) for convention in CONVENTIONS
     }
@@ -142,5 +144,8 @@ def _score_frame(
         confusions={key: count_confusion(label, true_label) for key, true_label in truth.items()},
         classes=count_classes(label, semantic),
         rings=count_rings(label, truth[GROUNDGRID.key], points),
+        calibration=(
+            None if p_ground is None else count_calibration(p_ground, truth[GROUNDGRID.key])
+        ),
         facts=method.facts(),
     )

@@ -36,6 +36,9 @@ class Method(Protocol):
     def label(self) -> npt.NDArray[np.uint8]:
         """Labels of the scan last run, (N,)."""
 
+    def p_ground(self) -> npt.NDArray[np.floating] | None:
+        """Probability of ground of each point of the scan last run, (N,); None if it has none."""
+
     def stages(self) -> dict[str, float]:
         """Seconds by stage of the scan last run; empty if it does not tell."""
 
@@ -71,6 +74,11 @@ class OurMethod:
     def label(self) -> npt.NDArray[np.uint8]:
         """Labels of the scan last run."""
         return self._result.label
+
+    def p_ground(self) -> npt.NDArray[np.floating] | None:
+        """Probability of ground of each point of the scan last run."""
+        p_ground: npt.NDArray[np.floating] | None = getattr(self._result, 'p_ground', None)
+        return p_ground
 
     def stages(self) -> dict[str, float]:
         """Seconds by stage of the scan last run."""
@@ -131,6 +139,10 @@ class PatchworkppMethod:
         label = np.full(self._n_points, Label.OBSTACLE, dtype=np.uint8)
         label[self._estimator.getGroundIndices()] = Label.GROUND
         return label
+
+    def p_ground(self) -> None:
+        """Nothing: it decides without."""
+        return None
 
     def stages(self) -> dict[str, float]:
         """Nothing: it tells only its total."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.config import Config, parameter_specs
+from gp_ground_seg.evaluation.calibration import BIN_EDGES, THRESHOLDS, Calibration
 from gp_ground_seg.evaluation.class_errors import class_errors
 from gp_ground_seg.evaluation.conventions import CONVENTIONS, GROUNDGRID
 from gp_ground_seg.evaluation.environment import Environment
@@ -85,6 +86,7 @@ def _method(score: MethodScore) -> dict[str, Any]:
         },
         'rings': dict(zip(ring_titles(), map(_confusion, score.rings()), strict=False)),
         'classes': _classes(score),
+        'calibration': _calibrations(score),
         'ms_per_frame': {
             'median': 1e3 * score.median_seconds,
             'mean': 1e3 * score.mean_seconds,
@@ -122,6 +124,35 @@ def _classes(score: MethodScore) -> dict[str, Any]:
             'share_errors': one.errors / errors if errors else math.nan,
         }
         for one in found
+    }
+
+
+def _calibrations(score: MethodScore) -> dict[str, Any] | None:
+    pooled = score.calibration()
+    if pooled is None:
+        return None
+    found = {name: score.calibration(name) for name in score.sequences}
+    return {
+        'pooled': _calibration(pooled),
+        'sequences': {name: _calibration(one) for name, one in found.items() if one is not None},
+    }
+
+
+def _calibration(one: Calibration) -> dict[str, Any]:
+    step = one.best_step
+    return {
+        'points': one.n_total,
+        'points_without': one.ground_without + one.obstacles_without,
+        'ece': one.ece,
+        'brier': one.brier,
+        'best_threshold': float(THRESHOLDS[step]),
+        'iou_at_best_threshold': one.confusion_at(step).iou,
+        'bins': {
+            'edges': BIN_EDGES.tolist(),
+            'points': one.n_points.tolist(),
+            'mean_p': one.mean_p.tolist(),
+            'share_ground': one.share_ground.tolist(),
+        },
     }
 
 

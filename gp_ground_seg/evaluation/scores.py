@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.labels import Label
+
+if TYPE_CHECKING:
+    from gp_ground_seg.evaluation.calibration import Calibration
 
 RATIOS = ('precision', 'recall', 'f1', 'accuracy', 'iou')
 """Ratios of a `Confusion`, by name of its property."""
@@ -159,6 +165,8 @@ class FrameScore:
         By number of the semantic class.
     rings : tuple of Confusion
         By ring of `gp_ground_seg.evaluation.rings`, GroundGrid convention.
+    calibration : Calibration or None
+        Of the method's probabilities, if it has any, GroundGrid convention.
     facts : dict of str to float or str
         What else the method tells of the frame, as the sensor's height it found [m].
     """
@@ -170,6 +178,7 @@ class FrameScore:
     confusions: dict[str, Confusion] = field(default_factory=dict)
     classes: dict[int, ClassCount] = field(default_factory=dict)
     rings: tuple[Confusion, ...] = ()
+    calibration: Calibration | None = None
     facts: dict[str, float | str] = field(default_factory=dict)
 
 
@@ -202,6 +211,14 @@ class MethodScore:
         """Sum of the counts by ring over all frames."""
         by_ring = zip(*(frame.rings for frame in self.frames), strict=True)
         return tuple(sum(ring, Confusion()) for ring in by_ring)
+
+    def calibration(self, sequence: str | None = None) -> Calibration | None:
+        """Sum over one sequence, or over all; None unless every frame has one."""
+        chosen = [f.calibration for f in self.frames if sequence in (None, f.sequence)]
+        found = [one for one in chosen if one is not None]
+        if not found or len(found) < len(chosen):
+            return None
+        return functools.reduce(operator.add, found)
 
     @property
     def median_seconds(self) -> float:
