@@ -526,10 +526,10 @@ class Config:
         return cls().replace(**values)
 
     @classmethod
-    def from_yaml(cls, path: str | Path) -> Config:
+    def from_yaml(cls, path: str | Path, base: Config | None = None) -> Config:
         """Read a YAML file: ROS form (``/**: ros__parameters:``) or bare groups.
 
-        Parameters not in the file keep their defaults.
+        Parameters not in the file are as in `base`, by default the defaults.
 
         Raises
         ------
@@ -538,7 +538,7 @@ class Config:
             is not accepted. The message starts with the path.
         """
         try:
-            return cls.from_flat(read_parameters(path))
+            return (base or cls()).replace(**read_parameters(path).values)
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Mapping
 
 import yaml
 
@@ -19,12 +20,23 @@ _INDENT = '  '
 _NBSP = '\xa0'  # textwrap does not break here
 
 
-def to_yaml(config: Config) -> str:
+def to_yaml(config: Config, purpose: str = '', reasons: Mapping[str, str] | None = None) -> str:
     """Write a ROS parameter file with a comment on each parameter.
 
     ``Config.from_yaml`` of it gives `config` again, and so does a ROS node.
+
+    Parameters
+    ----------
+    config : Config
+        Values to write.
+    purpose : str
+        What the file is for, written at its top.
+    reasons : mapping of str to str, optional
+        Why a parameter has its value, by name, written above it.
     """
+    reasons = reasons or {}
     lines = [
+        *(_comment(purpose, 0) if purpose else ()),
         '# Parameters of gp_ground_seg, as written by `gp-ground-seg config dump`. To use a copy:',
         '#   ros2 run gp_ground_seg ground_segmentation_node --ros-args --params-file my.yaml',
         '#   gp-ground-seg segment --config my.yaml ...',
@@ -32,12 +44,16 @@ def to_yaml(config: Config) -> str:
         f'{_INDENT}{ROS_PARAMETERS_KEY}:',
     ]
     for group_name, values in config.nested().items():
-        purpose = (type(getattr(config, group_name)).__doc__ or '').strip()
+        about = (type(getattr(config, group_name)).__doc__ or '').strip()
         blank = [] if lines[-1].endswith(f'{ROS_PARAMETERS_KEY}:') else ['']
-        lines += [*blank, *_comment(purpose, 2), f'{2 * _INDENT}{group_name}:']
+        lines += [*blank, *_comment(about, 2), f'{2 * _INDENT}{group_name}:']
         for field_name, value in values.items():
             spec = find_spec(f'{group_name}.{field_name}')
-            lines += [*_comment(_explain(spec), 3), f'{3 * _INDENT}{_entry(field_name, value)}']
+            lines += _comment(_explain(spec), 3)
+            if spec.name in reasons:
+                default = f'(default {yaml_scalar(spec.default)})'.replace(' ', _NBSP)
+                lines += _comment(f'Here: {reasons[spec.name]} {default}', 3)
+            lines.append(f'{3 * _INDENT}{_entry(field_name, value)}')
     return '\n'.join(lines) + '\n'
 
 

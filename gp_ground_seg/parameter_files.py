@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +49,24 @@ def load_yaml(text: str) -> object:
     return document
 
 
-def read_parameters(path: str | Path) -> dict[str, object]:
-    """Read the values of a parameter file by their dotted names, unchecked.
+@dataclass(frozen=True)
+class ParameterFile:
+    """What a parameter file says, unchecked.
+
+    Attributes
+    ----------
+    values : dict of str to object
+        Values by their dotted names.
+    is_ros : bool
+        Whether it is in the form of ROS, where types are strict.
+    """
+
+    values: dict[str, object]
+    is_ros: bool
+
+
+def read_parameters(path: str | Path) -> ParameterFile:
+    """Read a parameter file.
 
     Raises
     ------
@@ -63,7 +80,7 @@ def read_parameters(path: str | Path) -> dict[str, object]:
             if name in values:
                 raise ConfigError(f'{name}: given twice')
             values[name] = value
-        return values
+        return ParameterFile(values, isinstance(document, Mapping) and _is_ros(document))
     except OSError as error:
         raise ConfigError(error.strerror or str(error)) from error
     except UnicodeDecodeError as error:
@@ -87,7 +104,7 @@ def _unwrap_ros(document: object) -> Mapping[str, object]:
         return {}
     if not isinstance(document, Mapping):
         raise ConfigError('must be a mapping of parameter groups')
-    if not any(str(key).startswith('/') or _is_ros_node(document[key]) for key in document):
+    if not _is_ros(document):
         return document
     if len(document) != 1:
         raise ConfigError(f'parameters of {len(document)} nodes; keep one, keyed {ROS_NODE_KEY}')
@@ -101,6 +118,10 @@ def _unwrap_ros(document: object) -> Mapping[str, object]:
         for key, value in parameters.items()
         if key != 'use_sim_time' and not str(key).startswith('qos_overrides')
     }
+
+
+def _is_ros(document: Mapping[str, object]) -> bool:
+    return any(str(key).startswith('/') or _is_ros_node(document[key]) for key in document)
 
 
 def _is_ros_node(value: object) -> bool:

@@ -20,6 +20,7 @@ from gp_ground_seg.config_export import (
     to_yaml,
 )
 from gp_ground_seg.errors import ConfigError, DataError
+from gp_ground_seg.presets import PRESETS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -81,10 +82,15 @@ def test_every_parameter_is_explained_above_it():
     assert seen == [spec.name for spec in parameter_specs()]
 
 
-def test_the_shipped_yaml_is_the_dump(capsys):
-    assert run('dump') == 0
-    shipped = (REPOSITORY / 'config' / 'ground_segmentation.yaml').read_text(encoding='utf-8')
+@pytest.mark.parametrize('name', PRESETS)
+def test_the_shipped_yaml_is_the_dump(capsys, name):
+    assert run('dump', '--preset', name) == 0
+    shipped = (REPOSITORY / 'config' / f'{name}.yaml').read_text(encoding='utf-8')
     assert capsys.readouterr().out == shipped, 'run: python -m gp_ground_seg config generate'
+
+
+def test_every_shipped_yaml_is_of_a_preset():
+    assert {path.stem for path in (REPOSITORY / 'config').glob('*.yaml')} == set(PRESETS)
 
 
 def test_the_table_in_the_readme_is_the_table():
@@ -132,19 +138,21 @@ def test_generate_rewrites_what_is_generated_and_nothing_else(tmp_path, capsys):
     head, tail = '# Title — ünïcode\r\n\r\ntext\n', '\n\nmore\n'
     readme.write_bytes(f'{head}{README_BEGIN}\nold\n{README_END}{tail}'.encode())
     assert run('generate', tmp_path) == 0
-    assert capsys.readouterr().out.count('rewritten') == 2
+    assert capsys.readouterr().out.count('rewritten') == 1 + len(PRESETS)
     text = readme.read_bytes().decode()
     assert text.startswith(f'{head}{README_BEGIN}\n')
     assert text.endswith(f'\n{README_END}{tail}')
     assert to_markdown_table() in text
     assert 'old' not in text.partition(README_BEGIN)[2]
-    generated = tmp_path / 'config' / 'ground_segmentation.yaml'
-    assert generated.read_text(encoding='utf-8') == to_yaml(Config())
+    generated = sorted((tmp_path / 'config').iterdir())
+    assert [path.stem for path in generated] == sorted(PRESETS)
+    for path in generated:
+        assert Config.from_yaml(path) == PRESETS[path.stem].config
 
-    before = [os.stat(path).st_mtime_ns for path in (readme, generated)]
+    before = [os.stat(path).st_mtime_ns for path in (readme, *generated)]
     assert run('generate', tmp_path) == 0
-    assert capsys.readouterr().out.count('unchanged') == 2
-    assert [os.stat(path).st_mtime_ns for path in (readme, generated)] == before
+    assert capsys.readouterr().out.count('unchanged') == 1 + len(PRESETS)
+    assert [os.stat(path).st_mtime_ns for path in (readme, *generated)] == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ['README.md', 'config']
 
 

@@ -11,6 +11,7 @@ import pytest
 from gp_ground_seg.datasets.simulator import (
     HDL_32E,
     HDL_64E,
+    MID_360,
     OS1_128,
     SCENES,
     SENSORS,
@@ -58,6 +59,32 @@ def test_fields_of_view(sensor, n_beams, top, bottom):
     assert elevation.max() == pytest.approx(top)
     assert elevation.min() == pytest.approx(bottom)
     assert SENSORS[sensor.name] is sensor
+
+
+def test_mid_360_fills_its_field_of_view_and_never_repeats():
+    assert SENSORS['mid-360'] is MID_360
+    first, second = MID_360.directions(0.1), MID_360.directions(0.2)
+    assert first.shape == (MID_360.n_rays, 3) == (20_000, 3)
+    np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1.0)
+    elevation = np.degrees(np.arcsin(first[:, 2]))
+    assert -7.0 <= elevation.min() < -6.9
+    assert 51.9 < elevation.max() <= 52.0
+    # Evenly over the sphere: every cell of 10 degrees by a tenth of the height has its share.
+    azimuth = np.arctan2(first[:, 1], first[:, 0])
+    cells, *_ = np.histogram2d(azimuth, first[:, 2], bins=(36, 10))
+    assert cells.min() > 0.7 * cells.mean()
+    nearest = np.min(np.linalg.norm(first[:500, None] - second[None], axis=-1), axis=1)
+    assert np.median(nearest) > 1e-3
+    result = scan(FLAT, MID_360)
+    assert not result.ring.any()
+    assert len(result.points) > 1000
+    assert result.is_ground.all()
+
+
+@pytest.mark.parametrize('change', [{'elevations': (0.1,)}, {'n_columns': 2}, {'n_points': 0}])
+def test_scatter_model_checks_its_values(change):
+    with pytest.raises(ConfigError, match=next(iter(change))):
+        dataclasses.replace(MID_360, **change)
 
 
 def test_hdl64e_has_two_blocks():

@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gp_ground_seg.cli import config_files
 from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.config import Config
 from gp_ground_seg.config_export import replace_readme_table, to_markdown_table, to_yaml
 from gp_ground_seg.datasets.staging import staged_file
 from gp_ground_seg.errors import DataError
+from gp_ground_seg.presets import PRESETS, find_preset
 
-YAML_PATH = 'config/ground_segmentation.yaml'
-"""Generated file, below the root of a checkout."""
+YAML_FOLDER = 'config'
+"""Folder of the generated files, below the root of a checkout: one for each preset."""
 
 README_PATH = 'README.md'
 """File with a generated section, below the root of a checkout."""
@@ -21,6 +22,9 @@ EXAMPLES = """\
 examples:
   gp-ground-seg config dump > my.yaml            every parameter, explained, with its default
   gp-ground-seg config dump --config my.yaml --set label.ground_tolerance=0.15
+  gp-ground-seg config dump --preset vlp16       those for a sensor, with the reasons
+  gp-ground-seg config check my.yaml             unknown names, types, ranges
+  gp-ground-seg config diff default my.yaml      what a file, or a preset, changes
   gp-ground-seg config table                     every parameter as a Markdown table
 """
 
@@ -44,6 +48,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     add_config_options(dump)
     dump.set_defaults(run=run_dump)
 
+    config_files.add_parsers(commands)
+
     table = commands.add_parser(
         'table',
         help='print every parameter as a Markdown table',
@@ -54,8 +60,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     generate = commands.add_parser(
         'generate',
         help='for developers: rewrite what is generated in a checkout',
-        description='Rewrite config/ground_segmentation.yaml and the parameter table of README.md '
-        'from the declaration in gp_ground_seg/config.py.',
+        description='Rewrite the files of the presets in config/ and the parameter table of '
+        'README.md from gp_ground_seg/config.py and gp_ground_seg/presets.py.',
     )
     generate.add_argument(
         'root', metavar='REPO_ROOT', nargs='?', default='.', help='the checkout (default: here)'
@@ -64,8 +70,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run_dump(arguments: argparse.Namespace) -> int:
-    """Print the YAML."""
-    print(to_yaml(config_from_options(arguments)), end='')
+    """Print the YAML, with the reasons of a preset for what it says."""
+    config = config_from_options(arguments)
+    preset = find_preset(arguments.preset)
+    is_preset = config == preset.config
+    reasons = {
+        name: reason
+        for name, reason in preset.reasons.items()
+        if config[name] == preset.config[name]
+    }
+    print(to_yaml(config, preset.title if is_preset else '', reasons), end='')
     return 0
 
 
@@ -81,7 +95,9 @@ def run_generate(arguments: argparse.Namespace) -> int:
     readme = root / README_PATH
     if not readme.is_file():
         raise DataError(f'{readme}: no such file; name the root of a checkout')
-    _rewrite(root / YAML_PATH, to_yaml(Config()))
+    for preset in PRESETS.values():
+        text = to_yaml(preset.config, preset.title, preset.reasons)
+        _rewrite(root / YAML_FOLDER / f'{preset.name}.yaml', text)
     try:
         _rewrite(readme, replace_readme_table(readme.read_bytes().decode('utf-8')))
     except DataError as error:

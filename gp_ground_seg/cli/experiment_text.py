@@ -6,6 +6,7 @@ import argparse
 import textwrap
 from collections.abc import Sequence
 
+from gp_ground_seg.cli.options import DEFAULT_PRESET
 from gp_ground_seg.evaluation.environment import Environment
 
 WIDTH = 100
@@ -41,7 +42,8 @@ def wrapped(line: str) -> str:
 
 def config_words(arguments: argparse.Namespace) -> list[str]:
     """Words of the command line that changed the parameters."""
-    words = ['--config', arguments.config] if arguments.config else []
+    words = ['--preset', arguments.preset] if arguments.preset != DEFAULT_PRESET else []
+    words += ['--config', arguments.config] if arguments.config else []
     for setting in arguments.settings:
         words += ['--set', setting]
     return words

@@ -9,11 +9,20 @@ import yaml
 from gp_ground_seg.config import Config
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.parameter_files import load_yaml
+from gp_ground_seg.presets import PRESETS, find_preset
+
+DEFAULT_PRESET = 'default'
 
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--config FILE`` and ``--set NAME=VALUE``."""
-    parser.add_argument('--config', metavar='FILE', help='parameter file (YAML)')
+    """Add ``--preset NAME``, ``--config FILE`` and ``--set NAME=VALUE``."""
+    parser.add_argument(
+        '--preset',
+        metavar='NAME',
+        default=DEFAULT_PRESET,
+        help=f'parameters of a sensor: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})',
+    )
+    parser.add_argument('--config', metavar='FILE', help='parameter file (YAML), over the preset')
     parser.add_argument(
         '--set',
         metavar='NAME=VALUE',
@@ -25,14 +34,18 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
 
 
 def config_from_options(arguments: argparse.Namespace) -> Config:
-    """Build the configuration that ``--config`` and ``--set`` ask for.
+    """Build the configuration that ``--preset``, ``--config`` and ``--set`` ask for.
+
+    The file changes what the preset gives, the settings what the file gives.
 
     Raises
     ------
     ConfigError
-        If the file or a setting is not accepted.
+        If the preset, the file or a setting is not accepted.
     """
-    config = Config.from_yaml(arguments.config) if arguments.config else Config()
+    config = find_preset(arguments.preset).config
+    if arguments.config:
+        config = Config.from_yaml(arguments.config, config)
     changes = {}
     for setting in arguments.settings:
         name, separator, text = setting.partition('=')

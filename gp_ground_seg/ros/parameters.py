@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from gp_ground_seg.config import Config, find_spec, parameter_specs
+from gp_ground_seg.config_check import check_typed
 from gp_ground_seg.errors import ConfigError, GroundSegError
 from gp_ground_seg.parameter_spec import ParameterSpec
 from gp_ground_seg.ros.startup import start_errors
@@ -55,20 +56,11 @@ def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
     """
     return config.replace(
         **{
-            parameter.name: _typed(find_spec(parameter.name), parameter.value)
+            parameter.name: check_typed(find_spec(parameter.name), parameter.value)
             for parameter in parameters
             if parameter.name in _OWN_NAMES
         }
     )
-
-
-def _typed(spec: ParameterSpec, value: object) -> object:
-    # A ROS parameter keeps its type: an integer is no double, as everywhere in ROS.
-    if spec.type is float and isinstance(value, int) and not isinstance(value, bool):
-        raise ConfigError(
-            f'{spec.name} = {value}: must be {spec.accepted}, with a decimal point as in {value}.0'
-        )
-    return spec.check(value)
 
 
 def describe(config: Config) -> str:

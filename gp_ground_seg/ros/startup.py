@@ -18,7 +18,7 @@ USAGE = """\
 examples:
   %(prog)s --ros-args -r points:=/kitti/velo/pointcloud
   %(prog)s --ros-args -p label.ground_tolerance:=0.15
-  %(prog)s --ros-args --params-file ground_segmentation.yaml
+  %(prog)s --ros-args --params-file config/vlp16.yaml
 """
 
 

@@ -9,25 +9,32 @@ from gp_ground_seg.datasets.simulator.scan import (
     simulate_drive,
     simulate_scan,
 )
+from gp_ground_seg.datasets.simulator.scatter import MID_360, ScatterModel
 from gp_ground_seg.datasets.simulator.scenes import SCENES
 from gp_ground_seg.datasets.simulator.sensor import (
     HDL_32E,
     HDL_64E,
     OS1_128,
-    SENSORS,
     VLP_16,
     SensorModel,
 )
 
+SENSORS: dict[str, SensorModel] = {
+    sensor.name: sensor for sensor in (HDL_64E, HDL_32E, VLP_16, OS1_128, MID_360)
+}
+"""The preset sensors by name."""
+
 __all__ = [
     'HDL_32E',
     'HDL_64E',
+    'MID_360',
     'OS1_128',
     'SCENES',
     'SEMANTIC_KITTI_CLASS',
     'SENSORS',
     'VLP_16',
     'Kind',
+    'ScatterModel',
     'Scene',
     'SensorModel',
     'SimulatedScan',

@@ -172,8 +172,3 @@ OS1_128 = SensorModel(
     dropout=0.02,
     height=1.8,
 )
-
-SENSORS: dict[str, SensorModel] = {
-    sensor.name: sensor for sensor in (HDL_64E, HDL_32E, VLP_16, OS1_128)
-}
-"""The presets by name."""

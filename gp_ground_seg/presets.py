@@ -1,0 +1,124 @@
+"""Parameters by sensor, each value with its reason; ``config/`` is generated from here."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+
+from gp_ground_seg.config import Config
+from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.parameter_spec import ParameterValue
+
+
+@dataclass(frozen=True)
+class Override:
+    """A value that differs from the default, and why."""
+
+    name: str
+    value: ParameterValue
+    reason: str
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A named set of parameters.
+
+    Attributes
+    ----------
+    name : str
+        Name on the command line, and of the file in ``config/``.
+    purpose : str
+        What it is for.
+    overrides : tuple of Override
+        Where it departs from the defaults.
+    """
+
+    name: str
+    purpose: str
+    overrides: tuple[Override, ...] = ()
+
+    @property
+    def config(self) -> Config:
+        """The defaults with the overrides."""
+        return Config().replace(**{one.name: one.value for one in self.overrides})
+
+    @property
+    def title(self) -> str:
+        """First line of its file."""
+        return f'Preset {self.name}: {self.purpose}'
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Reason of each override by the name of its parameter."""
+        return {one.name: one.reason for one in self.overrides}
+
+
+_PRESETS = (
+    Preset('default', 'Chosen on labelled KITTI frames: HDL-64E on the roof of a car.'),
+    Preset(
+        'paper',
+        'What arXiv 2112.05847 prints, and none of our departures from it '
+        '(docs/deviations.md); what it leaves open is as in the defaults.',
+        (
+            Override('grid.n_segments', 180, 'M in section IV'),
+            Override('grid.n_bins', 120, 'N in section IV'),
+            Override('grid.bin_growth', 1.0, 'bins of equal width'),
+            Override('lines.slope_tolerance', 0.02, 'zeta_m in section IV'),
+            Override('lines.offset_tolerance', 0.15, 'zeta_b in section IV'),
+            Override('length_scale.model', 'latent', 'section III-B'),
+            Override('observation.slope_std', 0.0, 'the equations have a level mean'),
+            Override('surface.n_neighbours', 0, 'each segment has a surface of its own'),
+            Override('label.slope_allowance', 0.0, 'one zeta_g for all (Algorithm 2)'),
+            Override('label.obstacle_tolerance', 0.2, 'as label.ground_tolerance: one zeta_g'),
+            Override('learning.objective', 'paper', 'section III-E as printed'),
+            Override('learning.scope', 'frame', 'one theta for the whole frame, section III-E'),
+        ),
+    ),
+    Preset(
+        'hdl64',
+        'Velodyne HDL-64E on the roof of a car.',
+        (
+            Override(
+                'sensor.height', 1.73, "mount of KITTI's car; the defaults are for this sensor"
+            ),
+        ),
+    ),
+    Preset(
+        'hdl32',
+        'Velodyne HDL-32E on the roof of a car.',
+        (Override('sensor.height', 1.84, "mount of nuScenes' car; set yours"),),
+    ),
+    Preset(
+        'vlp16',
+        'Velodyne VLP-16 on a field robot.',
+        (Override('sensor.height', 0.8, 'a field robot; set yours'),),
+    ),
+    Preset(
+        'os1_128',
+        'Ouster OS1-128 on the roof of a car.',
+        (Override('sensor.height', 1.8, 'the roof of a car; set yours'),),
+    ),
+    Preset(
+        'mid360',
+        'Livox Mid-360 on a small robot.',
+        (Override('sensor.height', 0.5, 'a small robot; set yours'),),
+    ),
+)
+PRESETS = {preset.name: preset for preset in _PRESETS}
+"""Every preset by its name."""
+
+
+def find_preset(name: str) -> Preset:
+    """Return the preset `name`.
+
+    Raises
+    ------
+    ConfigError
+        If there is none; the message names the nearest one and all others.
+    """
+    preset = PRESETS.get(name)
+    if preset is None:
+        near = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.5)
+        hint = f'; did you mean {near[0]}?' if near else ''
+        raise ConfigError(f'unknown preset {name!r}{hint} (there are {", ".join(PRESETS)})')
+    return preset
