@@ -1,14 +1,16 @@
-# make demo | make test | make lint: each creates the environment it needs.
+# make demo | make test | make bench | make lint: each creates the environment it needs.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 KITTI ?= $(abspath $(wildcard ../shared/kitti))
 
-.PHONY: help demo test lint format generate clean
+.PHONY: help demo test bench bench-docs lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
 	@echo 'make test      the whole test suite (KITTI=PATH adds labelled frames)'
+	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
+	@echo 'make bench-docs  the same, into docs/performance.md'
 	@echo 'make lint      ruff and mypy'
 	@echo 'make format    format the code'
 	@echo 'make generate  rewrite what is derived from gp_ground_seg/config.py'
@@ -33,6 +35,13 @@ demo: $(VENV)/.ros
 
 test: $(VENV)/.dev
 	GP_GROUND_SEG_KITTI=$(KITTI) $(BIN)/python -m pytest
+
+bench: $(VENV)/.dev
+	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy
+
+bench-docs: $(VENV)/.dev
+	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy --force \
+		--json docs/performance.json --docs docs/performance.md --plot docs/images/performance.png
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

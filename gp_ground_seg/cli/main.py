@@ -23,6 +23,7 @@ ROS_ARGS = '--ros-args'
 COMMAND_MODULES = (
     'gp_ground_seg.cli.segment',
     'gp_ground_seg.cli.evaluate',
+    'gp_ground_seg.cli.bench',
     'gp_ground_seg.cli.table1',
     'gp_ground_seg.cli.plot_segment',
     'gp_ground_seg.cli.ablation',
@@ -39,6 +40,7 @@ examples:
   gp-ground-seg segment scan.bin                 label one KITTI scan
   gp-ground-seg segment drive.mcap -o out.mcap   ground and obstacle clouds of a bag
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
+  gp-ground-seg bench KITTI_ROOT                 time per frame by stage, beside Patchwork++
   gp-ground-seg plot-segment scan.bin --azimuth 0 -o ahead.png
   gp-ground-seg table1 --kitti KITTI_ROOT        the paper's Table I
   gp-ground-seg ablation KITTI_ROOT              what the model and the learning are worth
