@@ -53,7 +53,8 @@ def test_record_holds_machine_cases_stages_and_series(record, scans):
     for case in document['cases']:
         assert len(case['frames']) == 5
         assert all(frame['ms'] > 0 and frame['yardstick_ms'] > 0 for frame in case['frames'])
-        assert sum(case['stages_ms'].values()) == pytest.approx(case['ms']['median'], rel=0.5)
+        assert {'grid', 'learning', 'label', 'rest'} <= set(case['stages_ms'])
+        assert all(case['stages_ms'][stage] > 0 for stage in ('grid', 'label'))
         assert case['ratio']['median'] > 0
     assert document['merged']['n_clouds'] == 1
     assert set(document['scaling']) == {'points', 'segments', 'bins', 'pseudo_inputs'}

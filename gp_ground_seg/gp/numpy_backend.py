@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import GridConfig, GrowthConfig, LabelConfig
 from gp_ground_seg.gp.growth import BoolArray, grow_surface_reference
 from gp_ground_seg.gp.latent import latent_rows_reference
@@ -48,6 +49,7 @@ class NumpyBackend:
         """Label of each point."""
         return label_points(height, grid, surface, label)
 
+    @single_threaded_blas()
     def log_length_scales(
         self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -62,6 +64,7 @@ class NumpyBackend:
             knots,
         )
 
+    @single_threaded_blas()
     def grow(
         self,
         candidates: Candidates,
@@ -89,6 +92,7 @@ class NumpyBackend:
             growth,
         )
 
+    @single_threaded_blas()
     def objective(
         self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
     ) -> tuple[float, FloatArray]:
