@@ -1,10 +1,16 @@
 """Ground segmentation of LiDAR scans with Gaussian processes."""
 
-from gp_ground_seg.config import Config
-from gp_ground_seg.errors import ConfigError, GroundSegError, PointCloudError
-from gp_ground_seg.labels import Label
-from gp_ground_seg.segmentation import Segmentation
-from gp_ground_seg.segmenter import GroundSegmenter
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gp_ground_seg.config import Config
+    from gp_ground_seg.errors import ConfigError, GroundSegError, PointCloudError
+    from gp_ground_seg.labels import Label
+    from gp_ground_seg.segmentation import Segmentation
+    from gp_ground_seg.segmenter import GroundSegmenter
 
 __version__ = '0.1.0'
 
@@ -18,3 +24,29 @@ __all__ = [
     'Segmentation',
     '__version__',
 ]
+
+_MODULES = {
+    'Config': 'config',
+    'ConfigError': 'errors',
+    'GroundSegError': 'errors',
+    'GroundSegmenter': 'segmenter',
+    'Label': 'labels',
+    'PointCloudError': 'errors',
+    'Segmentation': 'segmentation',
+}
+
+
+# numba and scipy take most of a second to import: a program that is told to end
+# meanwhile, or to print its usage, does not wait for them.
+def __getattr__(name: str) -> object:
+    """Import the module that defines `name`."""
+    if name not in _MODULES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    value = getattr(importlib.import_module(f'{__name__}.{_MODULES[name]}'), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names."""
+    return sorted(__all__)

@@ -256,6 +256,21 @@ class Process:
                 self.popen.wait()
 
 
+class Link:
+    """What this process sends to the node of another process, and gets back from it."""
+
+    def __init__(self, context: Context, qos: QoSProfile = RELIABLE) -> None:
+        self.probe = Node('probe', context=context, namespace=NAMESPACE)
+        self.publisher = self.probe.create_publisher(PointCloud2, 'points', qos)
+        self.ground = Collector(self.probe, PointCloud2, 'ground')
+        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles')
+
+    def wait_until_connected(self) -> None:
+        wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription')
+        for collector in (self.ground, self.obstacles):
+            wait_for(lambda c=collector: c.n_publishers == 1, f'publisher of {collector.topic}')
+
+
 class Bench:
     """The node under test in this process, and a probe that talks to it.
 

@@ -65,13 +65,30 @@ def test_only_ros_imports_ros(path):
             assert name.split('.')[:2] not in [['gp_ground_seg', layer] for layer in UPPER_LAYERS]
 
 
-def test_importing_the_library_imports_neither_ros_nor_tools():
-    script = 'import sys, gp_ground_seg; print(*sys.modules)'
+def loaded_by(statement):
+    script = f'import sys; {statement}; print(*sys.modules)'
     done = subprocess.run(
         [sys.executable, '-c', script], capture_output=True, text=True, check=True
     )
-    loaded = {name.split('.')[0] for name in done.stdout.split()}
+    return {name.split('.')[0] for name in done.stdout.split()}
+
+
+def test_importing_the_library_imports_neither_ros_nor_tools():
+    loaded = loaded_by('from gp_ground_seg import *')
+    assert 'numpy' in loaded
     assert not loaded & {'rclpy', 'sensor_msgs', 'matplotlib', 'rosbags', 'tqdm'}
+
+
+def test_importing_the_package_alone_takes_no_time():
+    assert not loaded_by('import gp_ground_seg') & {'numpy', 'scipy', 'numba'}
+
+
+def test_every_public_name_is_there():
+    for name in gp_ground_seg.__all__:
+        assert getattr(gp_ground_seg, name) is not None
+    assert dir(gp_ground_seg) == sorted(gp_ground_seg.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
+        gp_ground_seg.Nothing  # noqa: B018
 
 
 def test_no_path_of_one_machine_and_no_data_is_tracked():

@@ -17,8 +17,8 @@ from ros_helpers import (
     ISOLATION,
     MODULE,
     NAMESPACE,
-    RELIABLE,
     Collector,
+    Link,
     Process,
     isolated_context,
     rows_of,
@@ -37,21 +37,6 @@ CHEAP = Config().replace(**{'learning.mode': 'fixed'})
 IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}', '-p', 'learning.mode:=fixed')
 REPOSITORY = Path(__file__).parents[1]
 PROFILE = REPOSITORY / 'config' / 'fastdds_large_clouds.xml'
-
-
-class Link:
-    """What this process sends to the node, and gets back from it."""
-
-    def __init__(self, context, qos=RELIABLE):
-        self.probe = Node('probe', context=context, namespace=NAMESPACE)
-        self.publisher = self.probe.create_publisher(PointCloud2, 'points', qos)
-        self.ground = Collector(self.probe, PointCloud2, 'ground')
-        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles')
-
-    def wait_until_connected(self):
-        wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription')
-        for collector in (self.ground, self.obstacles):
-            wait_for(lambda c=collector: c.n_publishers == 1, f'publisher of {collector.topic}')
 
 
 def test_clouds_of_two_megabytes_at_10_hz_all_come_back(tmp_path):
@@ -144,50 +129,6 @@ def test_best_effort_driver_with_small_clouds(tmp_path):
 
         with spinning(context, link.probe):
             wait_for(publish_until_answered, 'answer to a best-effort driver')
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_signals_end_it_under_load_with_code_0(tmp_path, number):
-    message = to_message(street(20_000))
-    with Process(*IN_NAMESPACE, folder=tmp_path) as node, isolated_context() as context:
-        node.wait_until_ready()
-        link = Link(context)
-        with spinning(context, link.probe):
-            link.wait_until_connected()
-
-            def publish_until_busy():
-                link.publisher.publish(message)
-                return len(link.ground.messages) >= 3
-
-            wait_for(publish_until_busy, 'cloud')
-            for _ in range(10):
-                link.publisher.publish(message)
-            code, duration = node.stop(number)
-    assert code == 0, node.log
-    # A second where nothing else runs; other tests may run beside this one.
-    assert duration < 5.0
-    assert 'Traceback' not in node.log
-    assert 'ERROR' not in node.log
-
-
-def test_second_signal_does_not_break_the_end(tmp_path):
-    with Process(*IN_NAMESPACE, folder=tmp_path) as node:
-        node.wait_until_ready()
-        node.popen.send_signal(signal.SIGINT)
-        node.popen.send_signal(signal.SIGINT)
-        assert node.stop(signal.SIGTERM)[0] == 0
-        assert 'Traceback' not in node.log
-
-
-def test_signal_while_compiling(tmp_path):
-    cache = tmp_path / 'cache'
-    cache.mkdir()
-    with Process(*IN_NAMESPACE, folder=tmp_path, NUMBA_CACHE_DIR=str(cache)) as node:
-        wait_for(lambda: 'compiling' in node.log, 'start')
-        code, duration = node.stop(signal.SIGTERM)
-    assert code == 0, node.log
-    assert duration < 5.0
-    assert 'Traceback' not in node.log
 
 
 def test_bad_parameter_file_is_exit_code_2(tmp_path):

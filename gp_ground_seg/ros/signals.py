@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import threading
@@ -10,7 +11,8 @@ from contextlib import contextmanager
 from types import FrameType
 
 GRACE = 0.5
-"""Time that clean-up may take after a signal [s]."""
+"""Time from the signal to the end of the process, if the work does not end before [s]."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopRequest:
@@ -18,8 +20,6 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.made = False
-        self._deadline = threading.Timer(GRACE, os._exit, [0])
-        self._deadline.daemon = True
 
     def handle(self, _number: int, _frame: FrameType | None) -> None:
         """Interrupt the main thread at the first signal; ignore the later ones.
@@ -28,13 +28,41 @@ class StopRequest:
         """
         if not self.made:
             self.made = True
-            # numba swallows interrupts, and its compiler runs for seconds.
-            self._deadline.start()
             raise KeyboardInterrupt
 
-    def finish(self) -> None:
-        """Say that the clean-up is done."""
-        self._deadline.cancel()
+
+class Watchdog:
+    """Ends the process with code 0 if a signal does not, within `GRACE`.
+
+    Python calls its handlers between two steps of the main thread. That may be inside
+    the compiler or a long computation, for seconds; and numba swallows interrupts. The
+    number of a signal, though, is written to a pipe at once, where a thread waits for it.
+    """
+
+    def __init__(self) -> None:
+        self._done = threading.Event()
+        self._read_end, self._write_end = os.pipe()
+        os.set_blocking(self._write_end, False)
+        self._before = signal.set_wakeup_fd(self._write_end, warn_on_full_buffer=False)
+        self._thread = threading.Thread(target=self._watch, name='signals', daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Let the process live."""
+        self._done.set()
+        signal.set_wakeup_fd(self._before)
+        os.close(self._write_end)
+        self._thread.join()
+        os.close(self._read_end)
+
+    def _watch(self) -> None:
+        with contextlib.suppress(OSError):
+            while number := os.read(self._read_end, 1):
+                if number[0] in SIGNALS:
+                    break
+        # At the end of the pipe too: then it is done.
+        if not self._done.wait(GRACE):
+            os._exit(0)
 
 
 @contextmanager
@@ -50,12 +78,12 @@ def stop_on_signals() -> Iterator[StopRequest]:
     if threading.current_thread() is not threading.main_thread():
         yield request
         return
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, request.handle) for number in signals}
+    watchdog = Watchdog()
+    before = {number: signal.signal(number, request.handle) for number in SIGNALS}
     try:
         yield request
     finally:
-        request.finish()
         if not request.made:
             for number, handler in before.items():
                 signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        watchdog.close()
