@@ -57,7 +57,7 @@ def test_commands_of_the_docs_are_accepted():
     commands = re.findall(r'`gp-ground-seg (.*?)`', text)
     assert {words.split()[0] for words in commands} == {'table1', 'plot-segment', 'ablation'}
     for words in commands:
-        arguments = build_parser().parse_args(shlex.split(words))
+        arguments = build_parser(words.split()[0]).parse_args(shlex.split(words))
         config_from_options(arguments)
 
 

@@ -23,8 +23,8 @@ TIMES = [0.0, 0.1036219, 0.2072, 0.311, 0.415]
 
 
 @pytest.fixture
-def convert(monkeypatch):
-    return lambda *words: cli_runner.run(monkeypatch, 'kitti-to-bag', *words)
+def convert():
+    return lambda *words: cli_runner.run('kitti-to-bag', *words)
 
 
 def write_sequence(root, n_scans=5, n_labelled=5, times=TIMES):

@@ -36,8 +36,8 @@ SUMMARY = re.compile(
 
 
 @pytest.fixture
-def segment(monkeypatch):
-    return lambda *words: cli_runner.run(monkeypatch, 'segment', *words)
+def segment():
+    return lambda *words: cli_runner.run('segment', *words)
 
 
 @pytest.fixture(scope='module')
@@ -541,14 +541,14 @@ def test_a_full_disk_is_one_line(tmp_path, long_inputs, source, out):
 
 
 @needs_kitti
-def test_kitti_frames_as_scans_and_as_bag_get_the_same_labels(segment, monkeypatch, tmp_path):
+def test_kitti_frames_as_scans_and_as_bag_get_the_same_labels(segment, tmp_path):
     sequence = KITTI / 'sequences' / '00'
     (tmp_path / 'velodyne').mkdir()
     for name in ('000000.bin', '000001.bin'):
         shutil.copy(sequence / 'velodyne' / name, tmp_path / 'velodyne')
     bag = tmp_path / 'kitti.mcap'
     words = [KITTI, '--sequence', '00', bag, '--count', '2']
-    assert cli_runner.run(monkeypatch, 'kitti-to-bag', *words) == 0
+    assert cli_runner.run('kitti-to-bag', *words) == 0
     assert segment(tmp_path / 'velodyne', '--raw') == 0
     assert segment(bag) == 0
     parts = {'/ground': [], '/obstacles': []}

@@ -33,7 +33,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Declare the command and its own commands."""
     parser = subparsers.add_parser(
         'config',
-        help='write parameter files',
         description='Show the parameters, their units and ranges.',
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -59,7 +59,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Declare the command."""
     parser = subparsers.add_parser(
         'evaluate',
-        help='score against SemanticKITTI labels',
         description='Segment labelled frames and score the labels in both conventions '
         'of the field: precision, recall, F1, accuracy, IoU, time per frame.',
         epilog=EXAMPLES,

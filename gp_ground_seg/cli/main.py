@@ -17,22 +17,23 @@ EXIT_INTERRUPTED = 130
 
 ROS_ARGS = '--ros-args'
 
-# Module of each command: `add_parser(subparsers)` declares its options and
-# sets the default `run`, a function of the parsed arguments that returns an exit code.
-# A command that sets the default `accepts_ros_args` finds `ros_args` in them.
-COMMAND_MODULES = (
-    'gp_ground_seg.cli.segment',
-    'gp_ground_seg.cli.evaluate',
-    'gp_ground_seg.cli.bench',
-    'gp_ground_seg.cli.table1',
-    'gp_ground_seg.cli.plot_segment',
-    'gp_ground_seg.cli.ablation',
-    'gp_ground_seg.cli.kitti_to_bag',
-    'gp_ground_seg.cli.play',
-    'gp_ground_seg.cli.demo',
-    'gp_ground_seg.cli.config',
-    'gp_ground_seg.cli.node',
-)
+# Name of each command and what it is for. Its module is named alike: `add_parser(subparsers)`
+# declares the options and sets the default `run`, a function of the parsed arguments that
+# returns an exit code. A command that sets the default `accepts_ros_args` finds `ros_args` in
+# them. Only the module of the command at hand is imported: all of them take a second.
+COMMANDS = {
+    'segment': 'label scans, or split the clouds of a bag',
+    'evaluate': 'score against SemanticKITTI labels',
+    'bench': 'time the segmentation by stage, beside Patchwork++',
+    'table1': "the paper's Table I on real frames",
+    'plot-segment': 'draw one segment from the side',
+    'ablation': 'compare length-scale models and ways to learn',
+    'kitti-to-bag': 'write a KITTI sequence as a rosbag2',
+    'play': "publish a bag's clouds as they were recorded",
+    'demo': 'see it work, no data needed',
+    'config': 'write, check and compare parameter files',
+    'node': 'run the ROS 2 node',
+}
 
 EXAMPLES = """\
 examples:
@@ -50,8 +51,8 @@ examples:
 """
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands."""
+def build_parser(command: str | None = None) -> argparse.ArgumentParser:
+    """Return the parser of one of `COMMANDS`; without one, of all their names."""
     parser = argparse.ArgumentParser(
         prog='gp-ground-seg',
         description='Split LiDAR scans into ground and obstacles with Gaussian processes.',
@@ -60,15 +61,20 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--version', action='version', version=__version__)
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
-    for module in COMMAND_MODULES:
-        importlib.import_module(module).add_parser(subparsers)
+    if command is not None:
+        name = command.replace('-', '_')
+        importlib.import_module(f'gp_ground_seg.cli.{name}').add_parser(subparsers)
+    else:
+        for name, purpose in COMMANDS.items():
+            subparsers.add_parser(name, help=purpose)
     return parser
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
     n_own = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
-    parser = build_parser()
+    command = next((word for word in words[:n_own] if not word.startswith('-')), None)
+    parser = build_parser(command if command in COMMANDS else None)
     arguments = parser.parse_args(words[:n_own])
     arguments.ros_args = words[n_own:]
     if arguments.ros_args and not getattr(arguments, 'accepts_ros_args', False):
@@ -90,8 +96,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit code: 0, 2 for an error said in one line, 130 when interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    arguments = _parse(words)
     try:
+        arguments = _parse(words)
         code: int = arguments.run(arguments)
         sys.stdout.flush()
         return code

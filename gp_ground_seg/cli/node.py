@@ -22,7 +22,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Declare the command; what follows ``--ros-args`` is left to ROS."""
     parser = subparsers.add_parser(
         'node',
-        help='run the ROS 2 node',
         usage='gp-ground-seg node [--ros-args ...]',
         description='Run the ROS 2 node: points in, ground and obstacles out.',
         epilog=EXAMPLES,

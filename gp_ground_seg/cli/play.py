@@ -53,7 +53,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Declare the command; what follows ``--ros-args`` is left to ROS."""
     parser = subparsers.add_parser(
         'play',
-        help="publish a bag's clouds as they were recorded",
         description=DESCRIPTION,
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -1,0 +1,71 @@
+"""The entry point: every command is there, and none costs what another imports."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+import gp_ground_seg
+from gp_ground_seg.cli import main as cli
+
+HEAVY = {'numba', 'scipy', 'matplotlib', 'rosbags', 'rclpy'}
+
+
+@pytest.mark.parametrize('name', cli.COMMANDS)
+def test_every_command_has_a_parser_and_explains_itself(name, capsys):
+    with pytest.raises(SystemExit, match='0'):
+        cli.main([name, '--help'])
+    text = capsys.readouterr().out
+    assert text.startswith(f'usage: gp-ground-seg {name}')
+    assert 'examples:' in text
+    assert f'gp-ground-seg {name}' in text.split('examples:')[1]
+
+
+def test_help_names_every_command_and_an_unknown_one_is_refused(capsys):
+    with pytest.raises(SystemExit, match='0'):
+        cli.main(['--help'])
+    text = capsys.readouterr().out
+    for name, purpose in cli.COMMANDS.items():
+        assert re.search(rf'^    {name}\s+{re.escape(purpose)}$', text, re.MULTILINE)
+    with pytest.raises(SystemExit, match='2'):
+        cli.main(['segmnet', 'scan.bin'])
+    assert "invalid choice: 'segmnet'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'words', [['--help'], ['--version'], ['config', 'dump'], ['config', 'table'], ['node', '-h']]
+)
+def test_what_computes_nothing_imports_nothing_heavy(words):
+    script = (
+        'import atexit, sys\n'
+        'from gp_ground_seg.cli.main import main\n'
+        'atexit.register(lambda: print(*sys.modules, file=sys.stderr))\n'
+        f'sys.exit(main({words!r}))'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', script], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+    loaded = {name.split('.')[0] for name in done.stderr.split()}
+    assert 'gp_ground_seg' in loaded
+    assert not loaded & HEAVY
+
+
+def test_public_names_are_there_when_asked_for():
+    script = (
+        'import sys, gp_ground_seg\n'
+        'assert set(gp_ground_seg.__all__) <= set(dir(gp_ground_seg))\n'
+        "assert 'numpy' not in sys.modules\n"
+        'from gp_ground_seg import *\n'
+        "print(GroundSegmenter.__module__, 'numpy' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ['gp_ground_seg.segmenter', 'True']
+    for name in gp_ground_seg.__all__:
+        assert getattr(gp_ground_seg, name) is not None
+    with pytest.raises(AttributeError, match='no attribute'):
+        gp_ground_seg.GroundSegmentor  # noqa: B018
