@@ -53,6 +53,10 @@ class Preset:
         return {one.name: one.reason for one in self.overrides}
 
 
+_FIRST_RING = (
+    'the lowest beam meets level ground at {} m, and {} downhill {} m below the foot of the '
+    'sensor: near the default, and ground beyond the tolerance is not believed'
+)
 _PRESETS = (
     Preset('default', 'Chosen on labelled KITTI frames: HDL-64E on the roof of a car.'),
     Preset(
@@ -86,22 +90,57 @@ _PRESETS = (
     Preset(
         'hdl32',
         'Velodyne HDL-32E on the roof of a car.',
-        (Override('sensor.height', 1.84, "mount of nuScenes' car; set yours"),),
+        (
+            Override('sensor.height', 1.84, "mount of nuScenes' car; set yours"),
+            Override('grid.r_max', 100.0, "the maker's range"),
+            Override(
+                'growth.seed_height_tolerance', 0.6, _FIRST_RING.format('3.1', '10 %', '0.38')
+            ),
+        ),
     ),
     Preset(
         'vlp16',
         'Velodyne VLP-16 on a field robot.',
-        (Override('sensor.height', 0.8, 'a field robot; set yours'),),
+        (
+            Override('sensor.height', 0.8, 'a field robot; set yours'),
+            Override(
+                'grid.n_segments',
+                120,
+                '16 rings leave few points in a segment: 15 firings of each',
+            ),
+            Override(
+                'grid.n_bins', 50, 'level ground has 8 rings, at 3 m to 46 m: finer bins are empty'
+            ),
+            Override('lines.max_gap', 6.0, 'beams 2 degrees apart: 2 m from ring to ring at 7 m'),
+            Override('lines.max_gap_growth', 0.6, 'and 6 m at 9 m, 30 m at 15 m, on level ground'),
+        ),
     ),
     Preset(
         'os1_128',
         'Ouster OS1-128 on the roof of a car.',
-        (Override('sensor.height', 1.8, 'the roof of a car; set yours'),),
+        (
+            Override('sensor.height', 1.8, 'the roof of a car; set yours'),
+            Override('grid.r_max', 120.0, "the maker's range; 128 beams hit the ground that far"),
+            Override(
+                'growth.seed_height_tolerance', 0.6, _FIRST_RING.format('4.3', '8 %', '0.43')
+            ),
+        ),
     ),
     Preset(
         'mid360',
         'Livox Mid-360 on a small robot.',
-        (Override('sensor.height', 0.5, 'a small robot; set yours'),),
+        (
+            Override('sensor.height', 0.5, 'a small robot; set yours'),
+            Override(
+                'grid.n_segments', 120, '20 000 points a scan, most of them above the ground'
+            ),
+            Override('grid.n_bins', 40, 'as grid.n_segments'),
+            Override('grid.r_max', 60.0, 'beyond it hardly a return meets the ground at 0.5 m'),
+            Override('surface.n_neighbours', 3, 'what one segment lacks, those beside it have'),
+            Override(
+                'growth.seed_height_tolerance', 0.6, _FIRST_RING.format('4.1', '6 %', '0.48')
+            ),
+        ),
     ),
 )
 PRESETS = {preset.name: preset for preset in _PRESETS}

@@ -4,17 +4,21 @@ import re
 import subprocess
 import sys
 import tarfile
+from collections import Counter
+from contextlib import closing
 
+import numpy as np
 import pytest
 from config_samples import configs
 from conftest import REPOSITORY
 from hypothesis import given, settings
 
-from gp_ground_seg import Config, ConfigError
+from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.config import parameter_specs
 from gp_ground_seg.config_check import differences, file_problems
 from gp_ground_seg.config_export import to_yaml
+from gp_ground_seg.datasets.simulator import SCENES, SENSORS, simulate_scan
 from gp_ground_seg.presets import PRESETS, find_preset
 
 
@@ -155,6 +159,34 @@ def test_differences_are_in_order_of_declaration():
     changed = Config().replace(**{'sensor.height': 2.0, 'grid.n_bins': 99, 'runtime.n_threads': 3})
     names = [spec.name for spec, _, _ in differences(Config(), changed)]
     assert names == ['sensor.height', 'grid.n_bins', 'runtime.n_threads']
+
+
+SENSOR_OF = {
+    'hdl64': 'hdl-64e',
+    'hdl32': 'hdl-32e',
+    'vlp16': 'vlp-16',
+    'os1_128': 'os1-128',
+    'mid360': 'mid-360',
+}
+
+
+@pytest.mark.parametrize('name', SENSOR_OF)
+def test_presets_fit_their_sensors(name):
+    """Ground IoU on two simulated scenes each, level and sloped."""
+    sensor, config = SENSORS[SENSOR_OF[name]], PRESETS[name].config
+    assert config.sensor.height == sensor.height
+    # A Mid-360 at 0.5 m sees the ground downhill of it 12 m away at the nearest.
+    least = {'flat': 95.0, 'slope': 90.0 if name == 'mid360' else 95.0}
+    with closing(GroundSegmenter(config)) as segmenter:
+        for scene, limit in least.items():
+            both = Counter()
+            for seed in (0, 1):
+                rng = np.random.default_rng(seed)
+                scan = simulate_scan(SCENES[scene](seed), sensor, rng)
+                found = segmenter.segment(scan.points).label == Label.GROUND
+                both['common'] += int((found & scan.is_ground).sum())
+                both['either'] += int((found | scan.is_ground).sum())
+            assert 100.0 * both['common'] / both['either'] >= limit, scene
 
 
 def test_presets_are_installed_where_ros_looks(tmp_path):
