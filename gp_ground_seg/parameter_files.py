@@ -14,6 +14,8 @@ from gp_ground_seg.errors import ConfigError
 
 ROS_NODE_KEY = '/**'
 ROS_PARAMETERS_KEY = 'ros__parameters'
+OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
+"""Parameters that every ROS node has, whatever it does."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -116,7 +118,7 @@ def _unwrap_ros(document: object) -> Mapping[str, object]:
     return {
         key: value
         for key, value in parameters.items()
-        if key != 'use_sim_time' and not str(key).startswith('qos_overrides')
+        if key not in OF_EVERY_NODE and not str(key).startswith('qos_overrides')
     }
 
 

@@ -17,11 +17,12 @@ from rclpy.parameter import Parameter
 from gp_ground_seg.config import Config, find_spec, parameter_specs
 from gp_ground_seg.config_check import check_typed
 from gp_ground_seg.errors import ConfigError, GroundSegError
+from gp_ground_seg.parameter_files import OF_EVERY_NODE
 from gp_ground_seg.parameter_spec import ParameterSpec
+from gp_ground_seg.ros.parameter_service import OrderFreeParameterService
 from gp_ground_seg.ros.startup import start_errors
 
 QOS_OVERRIDES = 'qos_overrides.'
-OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
 _OWN_NAMES = frozenset(spec.name for spec in parameter_specs())
 
 
@@ -93,10 +94,17 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         If a parameter file or ``-p`` gives a value that is not accepted.
     """
 
-    def __init__(self, name: str, **options: Any) -> None:
+    def __init__(
+        self, name: str, *, start_parameter_services: bool = True, **options: Any
+    ) -> None:
         # Declared from the overrides to learn which names were given; then again, typed.
         with start_errors():
-            super().__init__(name, automatically_declare_parameters_from_overrides=True, **options)
+            super().__init__(
+                name,
+                automatically_declare_parameters_from_overrides=True,
+                start_parameter_services=False,
+                **options,
+            )
         given = {
             parameter_name: parameter
             for parameter_name, parameter in self.get_parameters_by_prefix('').items()
@@ -115,6 +123,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         self._given_names = frozenset(given)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
+        if start_parameter_services:
+            self._parameter_service = OrderFreeParameterService(self)
 
     @property
     def config(self) -> Config:
