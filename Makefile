@@ -1,16 +1,17 @@
-# make demo | make test | make bench | make lint: each creates the environment it needs.
+# make demo | make test | make bench | make node-bench | make lint: each creates the environment it needs.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 KITTI ?= $(abspath $(wildcard ../shared/kitti))
 
-.PHONY: help demo test bench bench-docs lint format generate clean
+.PHONY: help demo test bench bench-docs node-bench lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
 	@echo 'make test      the whole test suite (KITTI=PATH adds labelled frames)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.md'
+	@echo 'make node-bench  latency, losses and memory of the node over DDS'
 	@echo 'make lint      ruff and mypy'
 	@echo 'make format    format the code'
 	@echo 'make generate  rewrite what is derived from gp_ground_seg/config.py'
@@ -42,6 +43,9 @@ bench: $(VENV)/.dev
 bench-docs: $(VENV)/.dev
 	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy --force \
 		--json docs/performance.json --docs docs/performance.md --plot docs/images/performance.png
+
+node-bench: $(VENV)/.ros
+	$(BIN)/gp-ground-seg node-bench $(KITTI)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .
