@@ -33,24 +33,8 @@ COMMANDS = {
     'demo': 'see it work, no data needed',
     'config': 'write, check and compare parameter files',
     'node': 'run the ROS 2 node',
+    'node-bench': 'measure latency, losses and memory of the node',
 }
-# Module of each command: `add_parser(subparsers)` declares its options and
-# sets the default `run`, a function of the parsed arguments that returns an exit code.
-# A command that sets the default `accepts_ros_args` finds `ros_args` in them.
-COMMAND_MODULES = (
-    'gp_ground_seg.cli.segment',
-    'gp_ground_seg.cli.evaluate',
-    'gp_ground_seg.cli.bench',
-    'gp_ground_seg.cli.table1',
-    'gp_ground_seg.cli.plot_segment',
-    'gp_ground_seg.cli.ablation',
-    'gp_ground_seg.cli.kitti_to_bag',
-    'gp_ground_seg.cli.play',
-    'gp_ground_seg.cli.demo',
-    'gp_ground_seg.cli.config',
-    'gp_ground_seg.cli.node',
-    'gp_ground_seg.cli.node_bench',
-)
 
 EXAMPLES = """\
 examples:
