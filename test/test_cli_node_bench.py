@@ -31,17 +31,17 @@ def scans(tmp_path):
 def test_losses_are_reported_and_memory_is_seen(scans, tmp_path, capsys):
     file = tmp_path / 'node.json'
     words = [
-        'node-bench', str(scans), '--rates', '10,1000', '--frames', '24',
+        'node-bench', str(scans), '--rates', '5,1000', '--frames', '30',
         '--memory-frames', '20', '--json', str(file), '--quiet',
-        '--ros-args', '-p', 'learning.max_evaluations:=30',
+        '--ros-args', '-p', 'learning.mode:=fixed',
     ]  # fmt: skip
     code = cli.main(words)
     document = json.loads(file.read_text())
     said = capsys.readouterr().out
     assert code == (cli_missed(document) and 1)
     slow, fast = document['rates']
-    assert (slow['n_sent'], fast['n_sent']) == (24, 24)
-    # Clouds that take some 10 ms, 1 ms apart: the oldest have to go.
+    assert (slow['n_sent'], fast['n_sent']) == (30, 30)
+    # Clouds that take some milliseconds, 1 ms apart: the oldest have to go.
     assert fast['n_lost'] > 0
     for rate in (slow, fast):
         assert rate['n_lost'] == rate['n_dropped'] == rate['n_sent'] - rate['n_back']
@@ -52,7 +52,7 @@ def test_losses_are_reported_and_memory_is_seen(scans, tmp_path, capsys):
     assert memory['n_clouds'] == 20
     assert 50e6 < memory['start'] <= memory['peak']
     assert document['source']['n_clouds'] == 3
-    assert document['source']['node_arguments'] == ['-p', 'learning.max_evaluations:=30']
+    assert document['source']['node_arguments'] == ['-p', 'learning.mode:=fixed']
     assert document['environment']['n_cores'] == len(os.sched_getaffinity(0))
     assert 'Rate [Hz]' in said
     assert '1000' in said
