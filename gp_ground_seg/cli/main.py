@@ -27,6 +27,7 @@ COMMANDS = {
     'bench': 'time the segmentation by stage, beside Patchwork++',
     'table1': "the paper's Table I on real frames",
     'plot-segment': 'draw one segment from the side',
+    'plot-scan': 'draw a scan in perspective, with the ground model on it',
     'ablation': 'compare length-scale models and ways to learn',
     'kitti-to-bag': 'write a KITTI sequence as a rosbag2',
     'play': "publish a bag's clouds as they were recorded",
@@ -44,6 +45,7 @@ examples:
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
   gp-ground-seg bench KITTI_ROOT                 time per frame by stage, beside Patchwork++
   gp-ground-seg plot-segment scan.bin --azimuth 0 -o ahead.png
+  gp-ground-seg plot-scan --simulate urban -o scan.png
   gp-ground-seg table1 --kitti KITTI_ROOT        the paper's Table I
   gp-ground-seg ablation KITTI_ROOT              what the model and the learning are worth
   gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 00 drive.mcap
