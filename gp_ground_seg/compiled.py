@@ -16,21 +16,33 @@ try:
 except ImportError:  # Ubuntu 24.04 has no package of it
     numba = None
 
-_LOGGER = logging.getLogger(__name__)
+_LOGGER = logging.getLogger('gp_ground_seg')
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 
 HAVE_NUMBA = numba is not None
 
+_dispatchers: list[Any] = []
+
 
 def compiled(function: _Function) -> _Function:
-    """Compile `function` where numba is installed, with a cache on disk if one is writable."""
-    if numba is None:
+    """Compile `function` where numba is installed; the code is kept on disk if possible."""
+    if numba is None or numba.config.DISABLE_JIT:
         return function
-    options = {'nogil': True, 'error_model': 'numpy'}
+    result = numba.njit(nogil=True, error_model='numpy')(function)
     try:
-        result: _Function = numba.njit(cache=True, **options)(function)
-    except RuntimeError:
-        # numba found no writable place for its cache: compile anew in each process.
-        _LOGGER.info('no writable cache for compiled code; it is compiled at every start')
-        result = numba.njit(**options)(function)
-    return result
+        from gp_ground_seg.compile_cache import KeptCode
+
+        result._cache = KeptCode(function)
+    except Exception as error:
+        # Parts of numba that it may change at will; without them it compiles at every start.
+        _LOGGER.warning('compiled code is not kept on disk: %r', error)
+    _dispatchers.append(result)
+    kept: _Function = result
+    return kept
+
+
+def compiled_signatures() -> dict[str, int]:
+    """Count the signatures that each compiled function was compiled or loaded for so far."""
+    return {
+        f'{d.py_func.__module__}.{d.py_func.__qualname__}': len(d.signatures) for d in _dispatchers
+    }

@@ -40,7 +40,8 @@ def check_points(points: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool
         )
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
-        xyz = array[:, :3].astype(np.float64)
+        # In one order: compiled code is compiled for each.
+        xyz = array[:, :3].astype(np.float64, order='C')
     # Column by column: a reduction along rows of three takes ten times as long.
     finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
     return xyz, finite

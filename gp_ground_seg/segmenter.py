@@ -86,7 +86,7 @@ class GroundSegmenter:
         config = self._config
         timer = StageTimer(self._clock)
         xyz, finite = check_points(points)
-        z = xyz[:, 2]
+        z = np.ascontiguousarray(xyz[:, 2])
         grid = self._backend.polar_grid(xyz, finite, config.grid)
         timer.mark('grid')
 

@@ -35,6 +35,12 @@ SUMMARY = re.compile(
 )
 
 
+@pytest.fixture(scope='module', autouse=True)
+def _compiled():
+    """Compile, or the first command would say that it does."""
+    GroundSegmenter().segment(samples.scan())
+
+
 @pytest.fixture
 def segment():
     return lambda *words: cli_runner.run('segment', *words)

@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 from gp_ground_seg.cli.bench_input import load_frames
 from gp_ground_seg.cli.bench_text import bench_text, replace_section
+from gp_ground_seg.cli.notes import note
 from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.cli.output import note
 from gp_ground_seg.compiled import HAVE_NUMBA
 from gp_ground_seg.config import Config
 from gp_ground_seg.datasets.staging import staged_file

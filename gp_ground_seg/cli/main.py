@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import logging
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 from gp_ground_seg import __version__
+from gp_ground_seg.cli.notes import library_notes
 from gp_ground_seg.errors import GroundSegError
 
 EXIT_OK = 0
@@ -85,6 +88,14 @@ def _parse(words: list[str]) -> argparse.Namespace:
     return arguments
 
 
+def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
+    """Say what the library logs as notes, but not where it has a log of its own."""
+    if getattr(arguments, 'accepts_ros_args', False):
+        return nullcontext()
+    quiet = getattr(arguments, 'quiet', False)
+    return library_notes(logging.WARNING if quiet else logging.INFO)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -101,7 +112,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         arguments = _parse(words)
-        code: int = arguments.run(arguments)
+        with _notes(arguments):
+            code: int = arguments.run(arguments)
         sys.stdout.flush()
         return code
     except GroundSegError as error:

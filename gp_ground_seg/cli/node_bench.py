@@ -16,7 +16,8 @@ from gp_ground_seg.cli.demo_frames import FRAME_ID, TOPIC, simulated_drive
 from gp_ground_seg.cli.demo_node import NodeProcess, private_network
 from gp_ground_seg.cli.demo_tally import OUTPUTS
 from gp_ground_seg.cli.node_bench_text import document_of, goals_missed, node_bench_text
-from gp_ground_seg.cli.output import count, note, progress_bar
+from gp_ground_seg.cli.notes import note
+from gp_ground_seg.cli.output import count, progress_bar
 from gp_ground_seg.cli.play import needing_ros
 from gp_ground_seg.cli.process_memory import peak_memory, resident_memory
 from gp_ground_seg.datasets.bags import CloudMessage, cloud_from_columns

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from gp_ground_seg.cli.notes import note
 from gp_ground_seg.datasets.staging import leftovers
 from gp_ground_seg.labels import Label
 from gp_ground_seg.segmentation import Segmentation
@@ -57,11 +58,6 @@ def progress_bar(total: int, *, quiet: bool, title: str) -> tqdm[Any]:
         disable=True if quiet else None,
         leave=False,
     )
-
-
-def note(message: str) -> None:
-    """Say something that is neither result nor error."""
-    print(f'gp-ground-seg: note: {message}', file=sys.stderr)
 
 
 def note_leftovers(target: Path) -> None:

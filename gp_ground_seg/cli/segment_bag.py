@@ -7,7 +7,8 @@ import re
 from contextlib import closing
 from pathlib import Path
 
-from gp_ground_seg.cli.output import SegmentationTally, note, note_leftovers, progress_bar
+from gp_ground_seg.cli.notes import note
+from gp_ground_seg.cli.output import SegmentationTally, note_leftovers, progress_bar
 from gp_ground_seg.config import Config
 from gp_ground_seg.datasets.bags import (
     BAG_SUFFIXES,

@@ -21,6 +21,7 @@ from gp_ground_seg.ros.diagnostics import DiagnosticsPublisher
 from gp_ground_seg.ros.health.health import Health
 from gp_ground_seg.ros.health.input import InputFacts
 from gp_ground_seg.ros.health.status import Status
+from gp_ground_seg.ros.library_log import LibraryLog
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.point_cloud2 import read_xyz
@@ -65,6 +66,7 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
+        self._library_log = LibraryLog(self.get_logger())
         self._segmenter = GroundSegmenter(self.config)
         # For throttled messages; the default system clock may jump.
         self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
@@ -79,8 +81,6 @@ class GroundSegmentationNode(ConfiguredNode):
         logger.info(f'effective configuration:\n{describe(self.config)}')
         with start_errors():
             self._outputs = OutputPublishers(self)
-        if choose_backend(self.config.runtime.backend) == 'numba':
-            logger.info('compiling; this takes some seconds if it was not done before')
         logger.info(f'ready to segment after {warm_up(self._segmenter):.1f} s')
         # Only now: a cloud that came earlier would have waited for the compiler.
         self._health = Health(time.monotonic())
@@ -107,6 +107,7 @@ class GroundSegmentationNode(ConfiguredNode):
         # The network first: worker threads may be compiling, and then end late.
         super().destroy_node()
         self._segmenter.close()
+        self._library_log.close()
 
     def _on_cloud(self, cloud: PointCloud2, arrival: Arrival) -> None:
         start = time.monotonic()
