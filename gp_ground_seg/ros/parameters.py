@@ -20,9 +20,9 @@ from gp_ground_seg.errors import ConfigError, GroundSegError
 from gp_ground_seg.parameter_files import OF_EVERY_NODE
 from gp_ground_seg.parameter_spec import ParameterSpec
 from gp_ground_seg.ros.parameter_service import OrderFreeParameterService
+from gp_ground_seg.ros.qos import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.startup import start_errors
 
-QOS_OVERRIDES = 'qos_overrides.'
 _OWN_NAMES = frozenset(spec.name for spec in parameter_specs())
 
 
@@ -113,6 +113,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         use_sim_time = self.get_parameter('use_sim_time').value
         if not isinstance(use_sim_time, bool):
             raise ConfigError(f'use_sim_time = {use_sim_time!r}: must be true or false')
+        check_overrides({name: parameter.value for name, parameter in given.items()})
         self._config = changed(Config(), given.values())
         self.check_config(self._config)
         for parameter_name in given:

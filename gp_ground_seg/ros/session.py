@@ -15,6 +15,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from gp_ground_seg.ros.arguments import check_ros_arguments
 from gp_ground_seg.ros.startup import start_errors
 
 INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -78,6 +79,7 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
     ConfigError
         If the ROS arguments cannot be read.
     """
+    check_ros_arguments(ros_args)
     context = Context()
     with start_errors():
         rclpy.init(

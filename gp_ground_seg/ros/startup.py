@@ -13,6 +13,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.ros.arguments import check_ros_arguments
 
 USAGE = """\
 examples:
@@ -32,6 +33,7 @@ def initialize(words: Sequence[str]) -> None:
     ConfigError
         If the ROS arguments or a parameter file cannot be read.
     """
+    check_ros_arguments(words)
     with start_errors():
         other_words = remove_ros_args(list(words))[1:]
     parser = argparse.ArgumentParser(

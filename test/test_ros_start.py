@@ -1,0 +1,164 @@
+"""What is wrong at the start is one line with a hint and exit code 2, never a traceback."""
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS is not installed')
+
+from hypothesis import given
+from hypothesis import strategies as st
+from ros_helpers import ISOLATION, MODULE, NAMESPACE, Process, isolated_context
+
+from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.ros.arguments import check_ros_arguments
+from gp_ground_seg.ros.node import main
+
+HEAD = '/**:\n  ros__parameters:\n'
+FILES = {
+    'range': (HEAD + '    label: {ground_tolerance: 9.0}\n', 'must be a number in [0.001, 5] m'),
+    'type': (HEAD + '    label: {ground_tolerance: high}\n', "ground_tolerance = 'high': must be"),
+    'integer': (HEAD + '    label: {ground_tolerance: 1}\n', 'with a decimal point as in 1.0'),
+    'list': (HEAD + '    grid: {n_segments: [1, 2]}\n', 'must be an integer in [4, 2048]'),
+    'nan': (HEAD + '    grid: {r_min: .nan}\n', 'grid.r_min = nan: must be'),
+    'rule': (HEAD + '    grid: {r_min: 50.0, r_max: 20.0}\n', 'must be below grid.r_max = 20'),
+    'choice': (HEAD + '    runtime: {backend: cuda}\n', 'must be one of auto, numba, numpy'),
+    'huge': (HEAD + '    grid: {n_segments: 999999999999999999999}\n', 'must be an integer'),
+    'sim_time': (HEAD + '    use_sim_time: "yes"\n', 'must be true or false'),
+    'null': (HEAD + '    grid:\n', 'No value at line 3'),
+    'mixed': (HEAD + '    grid: {n_bins: [1, 2.5]}\n', 'should be of same type'),
+    'bare': ('label: {ground_tolerance: 0.1}\n', 'no ros__parameters; in a parameter file of ROS'),
+    'not_nested': ('/**:\n  label: {ground_tolerance: 0.1}\n', 'no ros__parameters'),
+    'text': ('just words\n', 'no ros__parameters'),
+    'syntax': (HEAD + '  label: [ {a\n', 'not valid YAML: while parsing a flow'),
+    'tab': ('/**:\n\tros__parameters:\n', 'not valid YAML: while scanning'),
+    'twice': (HEAD + '    grid: {n_bins: 40}\n    grid: {n_bins: 50}\n', 'grid: given twice'),
+    'binary': (b'\xff\xfe\x00\x80', 'not a text file'),
+}
+QOS = 'qos_overrides./points.subscription'
+WORDS = {
+    'no such file': ('--params-file nowhere.yaml', 'nowhere.yaml: no such file'),
+    'folder': ('--params-file .', '.: is a folder'),
+    'no file': ('--params-file', 'No file path provided'),
+    'no value': ('-p label.ground_tolerance', 'must be -p NAME:=VALUE'),
+    'empty value': ('-p label.ground_tolerance:=', 'must be -p NAME:=VALUE'),
+    'type': ('-p label.ground_tolerance:=low', "ground_tolerance = 'low': must be a number"),
+    'range': ('-p grid.n_segments:=3', 'grid.n_segments = 3: must be an integer in [4, 2048]'),
+    'sim time': ('-p use_sim_time:=maybe', "use_sim_time = 'maybe': must be true or false"),
+    'remap': ('-r points', '-r points: must be -r FROM:=TO, as in -r points:=/kitti'),
+    'topic': ('-r points:=/1;2', '-r points:=/1;2'),
+    'name': ('-r __node:=1st', "'1st'"),
+    'namespace': ('-r __ns:=front', "'front'"),
+    'argument': ('--nonsense', "unknown ROS arguments ['--nonsense']"),
+    'log level': ('--log-level loud', 'does not use a valid severity level'),
+    'reliability': (
+        f'-p {QOS}.reliability:=maybe',
+        "reliability = 'maybe': must be one of reliable",
+    ),
+    'depth': (f'-p {QOS}.depth:=-3', 'depth = -3: must be an integer in [1, 10000]'),
+    'depth 0': (f'-p {QOS}.depth:=0', 'depth = 0: must be'),
+    'depth type': (f'-p {QOS}.depth:=many', "depth = 'many': must be"),
+}
+
+
+def assert_one_line(capfd, code, hint):
+    said = capfd.readouterr()
+    assert code == 2, said.err
+    assert said.out == ''
+    (line,) = said.err.splitlines()
+    assert line.startswith('ground_segmentation_node: error: ')
+    assert hint in line
+    assert 'lexeme' not in line
+    assert '.c:' not in line
+
+
+@pytest.fixture
+def alone(monkeypatch):
+    for name, value in ISOLATION.items():
+        monkeypatch.setenv(name, value)
+
+
+@pytest.mark.parametrize('name', FILES)
+def test_bad_file(alone, tmp_path, capfd, name):
+    text, hint = FILES[name]
+    path = tmp_path / 'bad.yaml'
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    assert_one_line(capfd, main(['--ros-args', '--params-file', str(path)]), hint)
+
+
+@pytest.mark.parametrize('name', WORDS)
+def test_bad_words(alone, capfd, name):
+    words, hint = WORDS[name]
+    assert_one_line(capfd, main(['--ros-args', *words.split()]), hint)
+
+
+def test_bad_domain(alone, monkeypatch, capfd):
+    for domain, hint in (('999', 'must be an integer in [0, 232]'), ('a', 'not an integral')):
+        monkeypatch.setenv('ROS_DOMAIN_ID', domain)
+        assert_one_line(capfd, main([]), hint)
+
+
+texts = st.text(st.characters(codec='utf-8', exclude_categories=['C', 'Z']))
+
+
+@given(st.lists(st.sampled_from(['-p', '-r', '--ros-args', '--', '--params-file']) | texts))
+def test_any_words_are_accepted_or_refused_in_one_line(words):
+    error = ''
+    try:
+        check_ros_arguments(['--ros-args', *words])
+    except ConfigError as refusal:
+        error = str(refusal)
+    assert len(error.splitlines()) <= 1
+
+
+def test_what_is_not_for_us_is_left_alone(tmp_path):
+    path = tmp_path / 'fleet.yaml'
+    path.write_text(
+        'front:\n  lidar_driver:\n    ros__parameters: {rate: 10, use_sim_time: 3}\n'
+        '/**:\n  ros__parameters: {use_sim_time: true}\n'
+    )
+    words = ['-r', 'a', '--ros-args', '--params-file', str(path), '-r', 'a:=b', '-p', 'a.b:=[1]']
+    check_ros_arguments([*words, '-r', 'driver:__node:=front', '--', '-p', 'nonsense'])
+
+
+def test_log_level_and_parameter_file_of_one_node(tmp_path):
+    """Two nodes side by side read one file, each its own part; the second is told to be quiet."""
+    path = tmp_path / 'both.yaml'
+    path.write_text(
+        f'/**:\n  ros__parameters:\n    learning: {{mode: fixed}}\n'
+        f'{NAMESPACE}/front:\n  ros__parameters:\n    label: {{ground_tolerance: 0.3}}\n'
+        f'{NAMESPACE}/rear:\n  ros__parameters:\n    label: {{ground_tolerance: 0.4}}\n'
+    )
+    common = ('--ros-args', '-r', f'__ns:={NAMESPACE}', '--params-file', str(path))
+    front = (*common, '-r', '__node:=front', '-r', 'points:=front/points')
+    rear = (*common, '-r', '__node:=rear', '--log-level', 'warn', '-p', 'grid.nbins:=5')
+    with (
+        Process(*front, folder=tmp_path) as one,
+        Process(*rear, folder=tmp_path, start=MODULE) as other,
+        isolated_context() as context,
+    ):
+        one.wait_until_ready()
+        assert 'label.ground_tolerance: 0.3 m' in one.log
+        assert f'listening to {NAMESPACE}/front/points' in one.log
+        assert_parameters(context, {'front': 0.3, 'rear': 0.4})
+        # Quiet but for what is wrong, and that names what was meant.
+        (line,) = other.log.splitlines()
+        assert 'grid.nbins' in line
+        assert 'did you mean grid.n_bins?' in line
+
+
+def assert_parameters(context, tolerances):
+    from rcl_interfaces.srv import GetParameters
+    from rclpy.node import Node
+    from ros_helpers import spinning, wait_for
+
+    probe = Node('probe', context=context, namespace=NAMESPACE)
+    with spinning(context, probe):
+        for name, tolerance in tolerances.items():
+            client = probe.create_client(GetParameters, f'{name}/get_parameters')
+            wait_for(client.service_is_ready, f'service of {name}')
+            future = client.call_async(
+                GetParameters.Request(names=['label.ground_tolerance', 'learning.mode'])
+            )
+            wait_for(future.done, f'answer of {name}')
+            values = future.result().values
+            assert values[0].double_value == tolerance
+            assert values[1].string_value == 'fixed'
