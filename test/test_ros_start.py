@@ -51,7 +51,7 @@ WORDS = {
     'log level': ('--log-level loud', 'does not use a valid severity level'),
     'reliability': (
         f'-p {QOS}.reliability:=maybe',
-        "reliability = 'maybe': must be one of reliable",
+        "= 'maybe': must be one of reliable",
     ),
     'depth': (f'-p {QOS}.depth:=-3', 'depth = -3: must be an integer in [1, 10000]'),
     'depth 0': (f'-p {QOS}.depth:=0', 'depth = 0: must be'),
