@@ -7,9 +7,10 @@ import numpy.typing as npt
 
 from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import GridConfig, GrowthConfig, LabelConfig
-from gp_ground_seg.gp.growth import BoolArray, grow_surface_reference
-from gp_ground_seg.gp.latent import latent_rows_reference
-from gp_ground_seg.gp.objective import TrainingFrame, objective_reference
+from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
+from gp_ground_seg.gp.batched_objective import objective_batched
+from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import label_points
 from gp_ground_seg.polar_grid import (
     Candidates,
@@ -54,7 +55,7 @@ class NumpyBackend:
         self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Log length-scales at candidates and knots."""
-        return latent_rows_reference(
+        return latent_rows_batched(
             theta,
             pseudo.offsets,
             pseudo.r_bar,
@@ -78,7 +79,7 @@ class NumpyBackend:
         growth: GrowthConfig,
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
         """Inliers, mean and standard deviation of the surface."""
-        return grow_surface_reference(
+        return grow_surface_batched(
             candidates.offsets,
             candidates.r,
             height,
@@ -97,7 +98,7 @@ class NumpyBackend:
         self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
     ) -> tuple[float, FloatArray]:
         """Whole-frame objective and gradient."""
-        return objective_reference(theta, frame, slope_std, latent_terms)
+        return objective_batched(theta, frame, slope_std, latent_terms)
 
     def close(self) -> None:
         """Nothing to end."""
