@@ -208,6 +208,7 @@ def rows_of(message: PointCloud2) -> list[bytes]:
 ENTRY_POINT = ('-c', 'import sys; from gp_ground_seg.cli.node import main; sys.exit(main())')
 """What the installed executable does."""
 MODULE = ('-m', 'gp_ground_seg', 'node')
+PLAY = ('-m', 'gp_ground_seg', 'play')
 
 
 class Process:
@@ -254,6 +255,35 @@ class Process:
             except subprocess.TimeoutExpired:
                 self.popen.kill()
                 self.popen.wait()
+
+
+IsWanted = Callable[[dict[str, str], DiagnosticStatus], bool]
+"""Of the values of a status, and the status."""
+
+
+def wait_for_status(
+    diagnostics: Collector, node_name: str, task: str, is_wanted: IsWanted
+) -> DiagnosticStatus:
+    """Return the first status of a node's `task`, from now on, that is wanted."""
+    start = len(diagnostics.messages)
+    found: list[DiagnosticStatus] = []
+    name = f'{node_name[1:]}: {task}'
+
+    def look() -> bool:
+        for array_message in diagnostics.messages[start:]:
+            for status in array_message.status:
+                if status.name == name and is_wanted(values_of(status), status):
+                    found.append(status)
+                    return True
+        return False
+
+    wait_for(look, f'wanted status of {name}')
+    return found[0]
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    """The numbers of a status."""
+    return {entry.key: entry.value for entry in status.values}
 
 
 class Link:
@@ -329,23 +359,11 @@ class Bench:
         wait_for(future.done, f'answer of {name}')
         return future.result()
 
-    def wait_for_status(self, task: str, is_wanted: Callable[[dict, DiagnosticStatus], bool]):
+    def wait_for_status(self, task: str, is_wanted: IsWanted) -> DiagnosticStatus:
         """Return the first status of `task`, from now on, that is wanted."""
-        start = len(self.diagnostics.messages)
-        found: list[DiagnosticStatus] = []
-        name = f'{self.node.get_fully_qualified_name()[1:]}: {task}'
-
-        def look() -> bool:
-            for array_message in self.diagnostics.messages[start:]:
-                for status in array_message.status:
-                    values = {entry.key: entry.value for entry in status.values}
-                    if status.name == name and is_wanted(values, status):
-                        found.append(status)
-                        return True
-            return False
-
-        wait_for(look, f'wanted status of {name}')
-        return found[0]
+        return wait_for_status(
+            self.diagnostics, self.node.get_fully_qualified_name(), task, is_wanted
+        )
 
 
 @contextlib.contextmanager

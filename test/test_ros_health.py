@@ -277,6 +277,7 @@ def test_model_reports_the_newest_scan():
     assert 0.3 < float(values['Ground fraction']) < 0.9
     assert float(values['Noise (m)']) == pytest.approx(fit.theta['sigma_n'], rel=1e-3)
     assert values['Optimiser status'] == fit.status
+    assert values['Learned since startup'] == '1'
     assert values['Evaluations'] == str(fit.n_evaluations)
     assert float(values['Objective per candidate']) == pytest.approx(
         fit.objective * fit.n_inliers / fit.n_candidates, abs=1e-4

@@ -83,10 +83,12 @@ class ModelStatistics:
 
     def __init__(self) -> None:
         self._newest: Segmentation | None = None
+        self._n_learned = 0
 
     def segmented(self, segmentation: Segmentation) -> None:
         """Take note of a scan."""
         self._newest = segmentation
+        self._n_learned += segmentation.fit.n_evaluations > 0
 
     def report(self, limits: DiagnosticsConfig) -> Status:
         """Judge the newest scan."""
@@ -108,6 +110,7 @@ class ModelStatistics:
             'Inliers': str(fit.n_inliers),
             'Noise (m)': in_digits(fit.theta.get('sigma_n'), '.4g'),
             'Learning mode': fit.mode,
+            'Learned since startup': str(self._n_learned),
             'Optimiser status': fit.status,
             'Evaluations': str(fit.n_evaluations),
             'At bound': ' '.join(fit.at_bound) or 'none',
