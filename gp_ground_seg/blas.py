@@ -15,6 +15,8 @@ except ImportError:  # then BLAS keeps its threads, and takes time from ours
 
 @functools.cache
 def _controller() -> Any:
+    import scipy.linalg  # noqa: F401 - a BLAS that is loaded later would not be found
+
     return ThreadpoolController()
 
 
