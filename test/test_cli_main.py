@@ -1,5 +1,6 @@
 """The entry point: every command is there, and none costs what another imports."""
 
+import logging
 import re
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import pytest
 
 import gp_ground_seg
 from gp_ground_seg.cli import main as cli
+from gp_ground_seg.cli.notes import library_notes
 
 HEAVY = {'numba', 'scipy', 'matplotlib', 'rosbags', 'rclpy'}
 
@@ -69,3 +71,18 @@ def test_public_names_are_there_when_asked_for():
         assert getattr(gp_ground_seg, name) is not None
     with pytest.raises(AttributeError, match='no attribute'):
         gp_ground_seg.GroundSegmentor  # noqa: B018
+
+
+def test_what_the_library_logs_is_said_within_a_command_only(capsys):
+    logger = logging.getLogger('gp_ground_seg')
+    before = logger.level, list(logger.handlers)
+    with library_notes():
+        logger.info('compiling %s', 'this')
+        logger.debug('not worth saying')
+    with library_notes(logging.WARNING):
+        logger.info('not worth saying')
+        logger.warning('cannot be kept')
+    assert (logger.level, list(logger.handlers)) == before
+    assert capsys.readouterr().err == (
+        'gp-ground-seg: note: compiling this\ngp-ground-seg: note: cannot be kept\n'
+    )
