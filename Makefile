@@ -1,10 +1,10 @@
-# make demo | make test | make bench | make node-bench | make lint: each creates the environment it needs.
+# make demo | make test | make bench | make node-bench | make colcon | make lint: each creates the environment it needs.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 KITTI ?= $(abspath $(wildcard ../shared/kitti))
 
-.PHONY: help demo test bench bench-docs node-bench lint format generate clean
+.PHONY: help demo test bench bench-docs node-bench colcon lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
@@ -12,6 +12,7 @@ help:
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.md'
 	@echo 'make node-bench  latency, losses and memory of the node over DDS'
+	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make lint      ruff and mypy'
 	@echo 'make format    format the code'
 	@echo 'make generate  rewrite what is derived from gp_ground_seg/config.py'
@@ -46,6 +47,15 @@ bench-docs: $(VENV)/.dev
 
 node-bench: $(VENV)/.ros
 	$(BIN)/gp-ground-seg node-bench $(KITTI)
+
+# The interpreter of colcon is that of the node; ROS wheels lie below its prefix.
+colcon: export AMENT_PREFIX_PATH := $(abspath $(VENV))
+colcon: export GP_GROUND_SEG_KITTI := $(KITTI)
+colcon: $(VENV)/.dev
+	$(BIN)/colcon build --packages-select gp_ground_seg
+	$(BIN)/colcon test --packages-select gp_ground_seg --return-code-on-test-failure \
+		--event-handlers console_direct+ $(if $(PYTEST_ARGS),--pytest-args $(PYTEST_ARGS))
+	$(BIN)/colcon test-result --all
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

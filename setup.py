@@ -22,12 +22,13 @@ ROS = [
     'ros-jazzy-common-interfaces>=5.3,<6',
     'ros-jazzy-rmw-fastrtps-cpp>=8.4,<9',
 ]
+# `colcon test` runs pytest because it finds it in an extra of the name `test`.
+TEST = ['hypothesis>=6.100', 'pytest>=7.4']
 DEV = [
+    *TEST,
     'colcon-common-extensions',
-    'hypothesis>=6.100',
     'mypy>=1.10,<2.5',
     'pypatchworkpp>=1.4',
-    'pytest>=7.4',
     'ruff>=0.6,<0.18',
     'scikit-learn>=1.4',
     'setuptools<80',  # colcon's ament_python build needs `setup.py develop` and `install`
@@ -65,6 +66,7 @@ setup(
         'bags': BAGS,
         'plot': PLOT,
         'ros': ROS + BAGS + PLOT,
+        'test': TEST,
         'dev': DEV,
     },
     zip_safe=False,

@@ -215,12 +215,17 @@ class Process:
     """The node in a process of its own, as a user starts it."""
 
     def __init__(
-        self, *words: str, folder: Path, start: tuple[str, ...] = ENTRY_POINT, **environment: str
+        self,
+        *words: str,
+        folder: Path,
+        start: tuple[str, ...] = ENTRY_POINT,
+        command: list[str] | None = None,
+        **environment: str,
     ) -> None:
         self._log = folder / f'node_{time.monotonic_ns()}.log'
         with self._log.open('wb') as log:
             self.popen = subprocess.Popen(
-                [sys.executable, *start, *words],
+                command or [sys.executable, *start, *words],
                 stdout=subprocess.DEVNULL,
                 stderr=log,
                 env={**os.environ, **ISOLATION, **environment},

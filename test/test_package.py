@@ -54,6 +54,41 @@ def test_package_xml_is_an_ament_python_package():
     assert imported & ROS_MODULES <= depends
 
 
+# The order that the schema of format 3 (REP 149) asks for.
+DEPENDENCIES = '(?:(?:build|build_export|buildtool|buildtool_export|exec|doc|test)_depend|depend)'
+IN_ORDER = re.compile(
+    'name version description (?:maintainer )+(?:license )+(?:url )*(?:author )*'
+    f'(?:{DEPENDENCIES} )*(?:group_depend )*(?:member_of_group )*(?:export )?'
+)
+
+
+def test_package_xml_follows_its_schema():
+    text = (REPOSITORY / 'package.xml').read_text(encoding='utf-8')
+    package = ElementTree.fromstring(text)
+    assert IN_ORDER.fullmatch(''.join(f'{element.tag} ' for element in package))
+    assert re.fullmatch(r'[a-z](_?[a-z0-9]+)*', package.findtext('name'))
+    assert re.fullmatch(r'\d+\.\d+\.\d+', package.findtext('version'))
+    for element in package.iter('maintainer'):
+        assert re.fullmatch(r'[^@\s]+@[^@\s]+\.[a-z]+', element.get('email'))
+    for element in package:
+        # A token: no space around it, none doubled, no line break.
+        if not len(element):
+            assert element.text == ' '.join(element.text.split())
+    names = [element.text for element in package if 'depend' in element.tag]
+    assert len(set(names)) == len(names)
+
+
+def test_package_xml_is_accepted_by_the_tools_of_ros():
+    catkin_pkg = pytest.importorskip('catkin_pkg.package', reason='catkin_pkg is not installed')
+    warnings = []
+    path = REPOSITORY / 'package.xml'
+    package = catkin_pkg.parse_package_string(path.read_text(), str(path), warnings=warnings)
+    assert warnings == []
+    assert package.get_build_type() == 'ament_python'
+    package.validate(warnings=warnings)
+    assert warnings == []
+
+
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: path.stem)
 def test_only_ros_imports_ros(path):
     parts = path.relative_to(REPOSITORY / 'gp_ground_seg').parts
