@@ -27,6 +27,11 @@ TEST = ['hypothesis>=6.100', 'pytest>=7.4']
 DEV = [
     *TEST,
     'colcon-common-extensions',
+    'flake8>=6',
+    'flake8-builtins',
+    'flake8-comprehensions',
+    'flake8-docstrings',  # and pydocstyle, which ament_pep257 runs
+    'flake8-quotes',
     'mypy>=1.10,<2.5',
     'pypatchworkpp>=1.4',
     'ruff>=0.6,<0.18',

@@ -45,7 +45,10 @@ class _UnwritableLocator(_IN_TREE):  # type: ignore[misc, valid-type]
 
 
 class _CacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = [*CompileResultCacheImpl._locator_classes, _UnwritableLocator]  # noqa: RUF012
+    _locator_classes = [  # noqa: RUF012
+        *CompileResultCacheImpl._locator_classes,
+        _UnwritableLocator,
+    ]
 
 
 class KeptCode(FunctionCache):  # type: ignore[misc]

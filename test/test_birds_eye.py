@@ -15,11 +15,11 @@ from gp_ground_seg.errors import (
     MissingDependencyError,
     PointCloudError,
 )
-from gp_ground_seg.plotting import birds_eye
+from gp_ground_seg.plotting import birds_eye, canvas
 from gp_ground_seg.plotting.birds_eye import plot_birds_eye
 
 # In pixels: panels of 7.2 inches, the square 0.8 from the left and 0.4 from the top.
-LEFT, TOP, SQUARE, PANEL = (round(inches * birds_eye.DPI) for inches in (0.8, 0.4, 6.2, 7.2))
+LEFT, TOP, SQUARE, PANEL = (round(inches * canvas.DPI) for inches in (0.8, 0.4, 6.2, 7.2))
 
 
 def patch(x, y, half=2.0, n=4000, seed=0):

@@ -24,7 +24,7 @@ class LabelledFrame:
 
     @property
     def iou(self) -> float:
-        """IoU in the GroundGrid convention; NaN where there is nothing to score."""
+        """Score in the GroundGrid convention; NaN where there is nothing to score."""
         return self.score.confusions[GROUNDGRID.key].iou
 
 

@@ -14,7 +14,6 @@ from gp_ground_seg.datasets.staging import staged_file
 from gp_ground_seg.errors import ConfigError, PointCloudError
 from gp_ground_seg.evaluation.scores import count_confusion
 from gp_ground_seg.labels import Label
-from gp_ground_seg.plotting.canvas import DPI as DPI
 from gp_ground_seg.plotting.canvas import new_figure
 from gp_ground_seg.points import check_points
 

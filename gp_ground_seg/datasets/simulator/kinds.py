@@ -43,7 +43,7 @@ REFLECTANCE: dict[Kind, float] = {
 
 
 def semantic_kitti_labels(kind: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:
-    """SemanticKITTI class of each `Kind` code, (N,) uint32, as ``.label`` files hold them."""
+    """Class in SemanticKITTI of each `Kind` code, (N,) uint32, as ``.label`` files hold them."""
     table = np.array([SEMANTIC_KITTI_CLASS[entry] for entry in Kind], dtype=np.uint32)
     return table[kind]
 

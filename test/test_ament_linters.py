@@ -1,0 +1,83 @@
+"""The linters of ROS, with our settings where theirs and our formatter's differ.
+
+The ament linters come with ROS only. What they run, flake8 and pydocstyle, is in the
+``dev`` extra, and run here with the same settings everywhere.
+"""
+
+import importlib.util
+import re
+import subprocess
+import sys
+
+import pytest
+from conftest import REPOSITORY
+
+PLUGINS = ('builtins', 'comprehensions', 'docstrings', 'quotes')
+FLAKE8 = ('flake8', *(f'flake8_{name}' for name in PLUGINS))
+CONFIG = 'test/ament_flake8.ini'
+SOURCES = ('gp_ground_seg', 'test', 'setup.py')
+# The numpy convention leaves out what it contradicts; ament asks for no docstrings either.
+CONVENTION = 'numpy'
+NOT_ASKED_FOR = ('D100', 'D101', 'D102', 'D103', 'D104', 'D105', 'D106', 'D107', 'D404')
+
+
+def run(*words):
+    return subprocess.run(
+        [sys.executable, *words], cwd=REPOSITORY, capture_output=True, text=True, timeout=300
+    )
+
+
+def need(*modules):
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    if missing:
+        pytest.skip(f'not installed: {", ".join(missing)}')
+
+
+def test_flake8_with_the_settings_of_ament():
+    need(*FLAKE8)
+    done = run('-m', 'flake8', f'--config={CONFIG}', *SOURCES)
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+
+
+def test_flake8_would_find_something(tmp_path):
+    need(*FLAKE8)
+    bad = tmp_path / 'bad.py'
+    bad.write_text(
+        'import os\nx = "a" ; y = list([i for i in x])\ndef list(): """no"""\n' + 'z' * 120
+    )
+    done = run('-m', 'flake8', f'--config={CONFIG}', str(bad))
+    codes = set(re.findall(r'[A-Z]\d{3}', done.stdout))
+    assert {'F401', 'Q000', 'E501', 'C411', 'A001', 'D400'} <= codes
+
+
+def test_pydocstyle_with_the_settings_of_ament():
+    need('pydocstyle')
+    words = (f'--convention={CONVENTION}', f'--add-ignore={",".join(NOT_ASKED_FOR)}')
+    done = run('-m', 'pydocstyle', *words, '--match=.*\\.py', 'gp_ground_seg', 'setup.py')
+    assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+
+
+def test_ament_flake8(monkeypatch, capfd):
+    need('ament_flake8')
+    from ament_flake8.main import main_with_errors
+
+    monkeypatch.chdir(REPOSITORY)
+    code, errors = main_with_errors(argv=['--config', CONFIG, *SOURCES])
+    assert (code, errors) == (0, [])
+
+
+def test_ament_pep257(monkeypatch):
+    need('ament_pep257')
+    from ament_pep257.main import main
+
+    monkeypatch.chdir(REPOSITORY)
+    words = ['gp_ground_seg', 'setup.py', '--convention', CONVENTION]
+    assert main(argv=[*words, '--add-ignore', *NOT_ASKED_FOR]) == 0
+
+
+def test_ament_xmllint(monkeypatch):
+    need('ament_xmllint')
+    from ament_xmllint.main import main
+
+    monkeypatch.chdir(REPOSITORY)
+    assert main(argv=['package.xml']) == 0
