@@ -11,23 +11,40 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.parameter_files import read_parameters
-from gp_ground_seg.parameter_spec import ParameterSpec, ParameterValue, parameter
+from gp_ground_seg.parameter_spec import AUTO, ParameterSpec, ParameterValue, parameter
 
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """Where the sensor is."""
+    """Where the sensor is; auto = found out from every scan (docs/pose.md)."""
 
-    height: float = parameter(
-        1.73,
+    height: float | Literal['auto'] = parameter(
+        AUTO,
         'height of the sensor above the ground it stands on',
         unit='m',
         low=0.05,
         high=20.0,
+        auto=True,
+    )
+    roll: float | Literal['auto'] = parameter(
+        AUTO,
+        'roll of the sensor, positive with its left side up; auto = none unless it is clear',
+        unit='rad',
+        low=-3.1416,
+        high=3.1416,
+        auto=True,
+    )
+    pitch: float | Literal['auto'] = parameter(
+        AUTO,
+        'pitch of the sensor, positive with its nose down; auto = none unless it is clear',
+        unit='rad',
+        low=-1.5708,
+        high=1.5708,
+        auto=True,
     )
 
 
@@ -570,7 +587,7 @@ def _build_specs() -> tuple[ParameterSpec, ...]:
             specs.append(
                 ParameterSpec(
                     name=f'{group.name}.{entry.name}',
-                    type=type(default),
+                    type=float if entry.metadata['auto'] else type(default),
                     default=default,
                     **entry.metadata,
                 )

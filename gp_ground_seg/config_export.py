@@ -10,7 +10,7 @@ import yaml
 from gp_ground_seg.config import Config, find_spec, parameter_specs
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.parameter_files import ROS_NODE_KEY, ROS_PARAMETERS_KEY
-from gp_ground_seg.parameter_spec import ParameterSpec, ParameterValue
+from gp_ground_seg.parameter_spec import AUTO, ParameterSpec, ParameterValue
 
 README_BEGIN = '<!-- parameters:begin -->'
 README_END = '<!-- parameters:end -->'
@@ -110,7 +110,8 @@ def _accepted(spec: ParameterSpec) -> str:
         return ' or '.join(spec.choices)
     if spec.type is bool:
         return 'true or false'
-    return f'{spec.minimum:.10g} to {spec.maximum:.10g}'
+    auto = f'{AUTO} or ' if spec.auto else ''
+    return f'{auto}{spec.minimum:.10g} to {spec.maximum:.10g}'
 
 
 def replace_readme_table(readme: str) -> str:

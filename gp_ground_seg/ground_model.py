@@ -10,6 +10,11 @@ import numpy.typing as npt
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.polar_grid import FloatArray
 from gp_ground_seg.segmentation import Segmentation
+from gp_ground_seg.sensor_pose import LEAST_COSINE, SensorPose
+
+SLOPE_STEPS = 4
+"""Steps from the plane of the pose to the surface along a tilted axis: each leaves the slope's
+share of the distance, a tenth or so."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +27,8 @@ class GroundModel:
         Horizontal ranges, near to far [m].
     height : (M, K) float64
         Ground height at the knots of each segment, in the frame of the scan [m]; NaN
-        where there is no model. Segments go counter-clockwise from -x.
+        where there is no model. Segments go counter-clockwise from -x, those of a
+        tilted sensor (``Segmentation.pose``) about its own z axis.
     std : (M, K) float64
         Its standard deviation [m]; NaN where there is no model.
     length_scale : (M, K) float64
@@ -41,7 +47,24 @@ class GroundModel:
         surface = segmentation.surface
         with np.errstate(over='ignore'):
             length_scale = np.exp(segmentation.log_length_scale)
-        return cls(surface.knots, surface.mean, surface.std, length_scale)
+        model = cls(surface.knots, surface.mean, surface.std, length_scale)
+        pose = segmentation.pose
+        return model if pose.is_level else model._in_sensor_frame(pose)
+
+    def _in_sensor_frame(self, pose: SensorPose) -> GroundModel:
+        """Turn a model in the level frame into one over the sensor's own x and y."""
+        points = self.knot_points()
+        # Start on the plane that the level frame is level with: a few steps are enough.
+        up = pose.rotation[2]
+        z = np.full(self.height.shape, np.nan)
+        if abs(up[2]) >= LEAST_COSINE:
+            z = -(pose.height + points[..., 0] * up[0] + points[..., 1] * up[1]) / up[2]
+        for _ in range(SLOPE_STEPS):
+            points[..., 2] = z
+            level = pose.level(points.reshape(-1, 3)).reshape(points.shape)
+            height, std = self.at(level[..., 0], level[..., 1])
+            z = pose.ground_z(z, level[..., 2] - height)
+        return GroundModel(self.knots, z, std, self.length_scale)
 
     @property
     def azimuth(self) -> FloatArray:

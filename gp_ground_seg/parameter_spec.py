@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numbers
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from gp_ground_seg.errors import ConfigError
 
 ParameterValue = bool | int | float | str
+
+AUTO: Literal['auto'] = 'auto'
+"""What a number may be instead where its declaration says so: found out from the scan."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +23,7 @@ class ParameterSpec:
     name : str
         Dotted name, ``group.field``.
     type : type
-        ``bool``, ``int``, ``float`` or ``str``.
+        ``bool``, ``int``, ``float`` or ``str``; that of the number where it may be ``auto``.
     default : bool, int, float or str
         Value used when nothing else is given.
     description : str
@@ -33,6 +36,8 @@ class ParameterSpec:
         Inclusive bounds of a number; ``None`` for other types.
     choices : tuple of str
         Accepted values of a string; empty for other types.
+    auto : bool
+        Whether a number may also be `AUTO`.
     """
 
     name: str
@@ -44,6 +49,7 @@ class ParameterSpec:
     minimum: float | None
     maximum: float | None
     choices: tuple[str, ...]
+    auto: bool = False
 
     @property
     def accepted(self) -> str:
@@ -54,7 +60,8 @@ class ParameterSpec:
             return 'true or false'
         unit = f' {self.unit}' if self.unit else ''
         kind = 'an integer' if self.type is int else 'a number'
-        return f'{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
+        auto = f'{AUTO} or ' if self.auto else ''
+        return f'{auto}{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
 
     def check(self, value: object) -> ParameterValue:
         """Return `value` in the declared type.
@@ -64,6 +71,8 @@ class ParameterSpec:
         ConfigError
             If the type is wrong or the value is out of range.
         """
+        if self.auto and isinstance(value, str) and value == AUTO:
+            return AUTO
         if self.type is bool:
             if isinstance(value, bool):
                 return value
@@ -91,6 +100,7 @@ def parameter(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
+    auto: bool = False,
 ) -> Any:
     """Declare a parameter as a dataclass field; the words are those of `ParameterSpec`."""
     metadata = {
@@ -100,5 +110,6 @@ def parameter(
         'minimum': low,
         'maximum': high,
         'choices': choices,
+        'auto': auto,
     }
     return field(default=default, metadata=metadata)

@@ -14,6 +14,7 @@ from gp_ground_seg.gp.theta import theta_names
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
+from gp_ground_seg.sensor_pose import SensorPose
 from gp_ground_seg.surface import GroundSurface
 
 
@@ -106,22 +107,29 @@ class Segmentation:
         OBSTACLE; where there is no model nothing speaks for ground, and they
         are OBSTACLE. Points that are not finite are UNKNOWN.
     height : (N,) float64
-        Height of each point over the surface [m], negative below it; NaN where there is no model.
+        Height of each point over the surface [m], negative below it; NaN where there is no
+        model. Vertical in the level frame, like `ground_std`: where `pose` has no tilt, that
+        is the sensor's own.
     ground_z : (N,) float64
-        Surface height under each point, sensor frame [m]; NaN where there is no model.
+        Surface height under each point along the sensor's z axis, sensor frame [m]; NaN where
+        there is no model. Without tilt ``z - height``; with it ``z - height / cos(tilt)``,
+        exact where the ground is level (see `gp_ground_seg.sensor_pose.SensorPose.ground_z`).
     ground_std : (N,) float64
-        Its standard deviation [m]; NaN where there is no model.
+        Standard deviation of the surface's height [m]; NaN where there is no model.
     timings : dict of str to float
         Seconds per stage, and ``total``.
     fit : FitReport
         What the learning did.
     grid, candidates, lines, pseudo, surface
-        Intermediate results, for plots and diagnostics.
+        Intermediate results, for plots and diagnostics; in the level frame.
     theta : (M, 5 + K) float64
         Logarithms of the hyper-parameters of each segment, named by `theta_names`.
     log_length_scale : (M, knots) float64
         Log length-scale at the knots of the surface [log m]; NaN in segments
         without candidates.
+    pose : SensorPose
+        Height and tilt of the sensor that were used, and what the scan says of them;
+        ``pose.level(xyz)`` gives points in the level frame.
     """
 
     label: npt.NDArray[np.uint8]
@@ -137,3 +145,4 @@ class Segmentation:
     surface: GroundSurface
     theta: FloatArray
     log_length_scale: FloatArray
+    pose: SensorPose

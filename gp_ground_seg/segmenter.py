@@ -13,13 +13,16 @@ from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import Config
 from gp_ground_seg.gp.backend import make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
+from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.line_extraction import extract_lines
 from gp_ground_seg.points import check_points
-from gp_ground_seg.polar_grid import FloatArray, ground_candidates
+from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid, ground_candidates
 from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
 from gp_ground_seg.segmentation import FitReport, Segmentation
+from gp_ground_seg.sensor_pose import estimate_pose, given_pose
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
+from gp_ground_seg.tilt import turned_sample
 from gp_ground_seg.timing import StageTimer
 
 
@@ -81,25 +84,34 @@ class GroundSegmenter:
         Raises
         ------
         PointCloudError
-            If the array has another shape or type.
+            If the array has another shape or type, or z clearly does not point up.
         """
         config = self._config
         timer = StageTimer(self._clock)
-        xyz, finite = check_points(points)
-        z = np.ascontiguousarray(xyz[:, 2])
-        grid = self._backend.polar_grid(xyz, finite, config.grid)
+        own_xyz, finite = check_points(points)
+        given = given_pose(config.sensor)
+        xyz = given.level(own_xyz)
+        grid, candidates = self._candidates(xyz, finite)
         timer.mark('grid')
 
-        cells = self._backend.reduce_cells(grid, z)
-        candidates = ground_candidates(cells, grid.edges, config.lines.min_density_extent)
-        timer.mark('candidates')
+        pose = estimate_pose(
+            candidates,
+            config.sensor,
+            self._backend.name == 'numba',
+            lambda turn: self._candidates(*turned_sample(xyz, finite, turn))[1],
+        )
+        if (pose.roll, pose.pitch) != (given.roll, given.pitch):
+            xyz = pose.level(own_xyz)
+            grid, candidates = self._candidates(xyz, finite)
+        z = np.ascontiguousarray(xyz[:, 2])
+        timer.mark('pose')
 
         lines = extract_lines(candidates, config.lines)
         pseudo = select_pseudo_inputs(candidates, lines, config)
         timer.mark('lines')
 
         # Heights are centred on the expected ground: a zero mean would pull it to the sensor.
-        expected_ground = -config.sensor.height
+        expected_ground = -pose.height
         height = candidates.z - expected_ground
         model = FrameModel(config, self._backend, candidates, height, lines, pseudo, grid.edges)
         theta, learned = self._learn(model)
@@ -115,6 +127,8 @@ class GroundSegmenter:
         ground_z, ground_std = self._backend.surface_under_points(surface, grid)
         height_over_ground = z - ground_z
         label = self._backend.label_points(height_over_ground, grid, surface, config.label)
+        if not pose.is_level:
+            ground_z = pose.ground_z(own_xyz[:, 2], height_over_ground)
         timer.mark('label')
 
         fit = FitReport.of(model, theta, learned, inlier, mean)
@@ -132,7 +146,15 @@ class GroundSegmenter:
             surface,
             theta,
             log_length_scale,
+            pose,
         )
+
+    def _candidates(self, xyz: FloatArray, finite: BoolArray) -> tuple[PolarGrid, Candidates]:
+        """Grid of points (N, 3) in a level frame, and the lowest point of each of its bins."""
+        grid = self._backend.polar_grid(xyz, finite, self._config.grid)
+        cells = self._backend.reduce_cells(grid, np.ascontiguousarray(xyz[:, 2]))
+        min_extent = self._config.lines.min_density_extent
+        return grid, ground_candidates(cells, grid.edges, min_extent)
 
     def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:
         """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""

@@ -16,7 +16,8 @@ def accepted_values(spec):
         return st.booleans()
     if spec.type is int:
         return st.integers(int(spec.minimum), int(spec.maximum))
-    return st.floats(spec.minimum, spec.maximum)
+    numbers = st.floats(spec.minimum, spec.maximum)
+    return st.one_of(st.just('auto'), numbers) if spec.auto else numbers
 
 
 @st.composite

@@ -27,6 +27,10 @@ def by_name(spec):
     return spec.name
 
 
+def is_of_declared_type(spec, value):
+    return type(value) is spec.type or (spec.auto and value == 'auto')
+
+
 @pytest.fixture
 def from_text(tmp_path):
     """Configuration read from a file of this text."""
@@ -57,7 +61,7 @@ def test_declarations_are_complete(spec):
         assert spec.choices
     default = spec.check(spec.default)
     assert default == spec.default
-    assert type(default) is spec.type
+    assert type(default) is spec.type or (spec.auto and default == 'auto')
 
 
 def test_names_that_other_tools_rely_on():
@@ -96,6 +100,16 @@ def test_ranges_include_their_ends_only(spec):
         spec.check(10**400)  # beyond what a float can hold
 
 
+@pytest.mark.parametrize('spec', NUMBERS, ids=by_name)
+def test_only_numbers_declared_so_may_be_auto(spec):
+    if spec.auto:
+        assert spec.check('auto') == 'auto'
+        assert spec.accepted.startswith('auto or a number in [')
+    for word in ['Auto', 'AUTO', 'auto ', 'none', *([] if spec.auto else ['auto'])]:
+        with pytest.raises(ConfigError, match=re.escape(f'{spec.name} = {word!r}: must be ')):
+            spec.check(word)
+
+
 @pytest.mark.parametrize('spec', INTEGERS, ids=by_name)
 def test_integers_refuse_fractions(spec):
     with pytest.raises(ConfigError, match='an integer'):
@@ -107,7 +121,7 @@ def test_whole_numbers_become_floats(spec):
     whole = math.ceil(spec.minimum)
     if whole <= spec.maximum:
         assert type(spec.check(whole)) is float
-    assert type(spec.check(np.float64(spec.default))) is float
+    assert type(spec.check(np.float64(spec.minimum))) is float
 
 
 def test_groups_given_whole_are_checked_and_converted():
@@ -227,7 +241,7 @@ def test_forms_agree(config):
     assert Config.from_flat(flat) == config
     assert {f'{g}.{f}': v for g, vs in config.nested().items() for f, v in vs.items()} == flat
     assert all(config[name] == value for name, value in flat.items())
-    assert all(type(value) is find_spec(name).type for name, value in flat.items())
+    assert all(is_of_declared_type(find_spec(name), value) for name, value in flat.items())
     assert pickle.loads(pickle.dumps(config)) == config
     assert copy.deepcopy(config) == config
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
@@ -21,7 +22,7 @@ from ros_helpers import (
 )
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
-from gp_ground_seg.config import parameter_specs
+from gp_ground_seg.config import find_spec, parameter_specs
 from gp_ground_seg.ros.node import GroundSegmentationNode, main
 
 TYPES = {
@@ -53,9 +54,9 @@ def test_every_parameter_is_described_with_type_range_unit_and_symbol():
         assert values_of(b) == Config().flat()
     for spec, descriptor in zip(specs, descriptors, strict=True):
         assert descriptor.name == spec.name
-        assert descriptor.type == TYPES[spec.type]
+        assert descriptor.type == TYPES[type(spec.default)]
         assert not descriptor.read_only
-        assert not descriptor.dynamic_typing
+        assert descriptor.dynamic_typing == spec.auto
         assert spec.description in descriptor.description
         assert spec.unit in descriptor.description
         assert spec.symbol in descriptor.description
@@ -89,17 +90,21 @@ def test_a_change_takes_effect_with_the_next_cloud():
 @pytest.mark.parametrize(
     ('name', 'value', 'reason'),
     [
-        ('sensor.height', 30.0, 'sensor.height = 30.0: must be a number in [0.05, 20] m'),
-        ('sensor.height', float('nan'), 'sensor.height = nan: must be a number in [0.05, 20] m'),
+        ('sensor.height', 30.0, 'sensor.height = 30.0: must be auto or a number in [0.05, 20] m'),
+        (
+            'sensor.height',
+            float('nan'),
+            'sensor.height = nan: must be auto or a number in [0.05, 20] m',
+        ),
         (
             'sensor.height',
             2,
-            'sensor.height = 2: must be a number in [0.05, 20] m, with a decimal ',
+            'sensor.height = 2: must be auto or a number in [0.05, 20] m, with a decimal ',
         ),
-        ('sensor.height', '2', "sensor.height = '2': must be a number in [0.05, 20] m"),
-        ('sensor.height', True, 'sensor.height = True: must be a number in [0.05, 20] m'),
+        ('sensor.height', '2', "sensor.height = '2': must be auto or a number in [0.05, 20] m"),
+        ('sensor.height', True, 'sensor.height = True: must be auto or a number in [0.05, 20] m'),
         ('sensor.height', [1.0], 'sensor.height = '),
-        ('sensor.height', None, 'sensor.height = None: must be a number in [0.05, 20] m'),
+        ('sensor.height', None, 'sensor.height = None: must be auto or a number in [0.05, 20] m'),
         ('grid.n_segments', 3, 'grid.n_segments = 3: must be an integer in [4, 2048]'),
         ('grid.n_segments', 90.0, 'grid.n_segments = 90.0: must be an integer in [4, 2048]'),
         ('runtime.backend', 'gpu', "runtime.backend = 'gpu': must be one of auto, numba, numpy"),
@@ -158,6 +163,38 @@ def test_a_fault_in_the_check_is_answered_and_the_node_lives(shared_bench, monke
         assert not result.successful
         assert 'ZeroDivisionError' in result.reason
     assert b.set('sensor.height', 1.73).successful
+    assert b.set('sensor.height', 'auto').successful
+
+
+@pytest.mark.parametrize('name', ['sensor.height', 'sensor.roll', 'sensor.pitch'])
+def test_a_number_or_auto_is_taken_and_nothing_else(shared_bench, name):
+    b = shared_bench
+    for value in (0.5, 'auto', 0.7, 0.6, 'auto'):
+        assert b.set(name, value).successful
+        assert values_of(b)[name] == value == b.node.config[name]
+        request = DescribeParameters.Request(names=[name])
+        (found,) = b.call(DescribeParameters, 'describe_parameters', request).descriptors
+        assert found.type == TYPES[type(value)]
+        assert found.floating_point_range[0].to_value == find_spec(name).maximum
+    for value in ('Auto', 'automatic', '', '0.5', 1, True, 99.0, -99.0, float('inf'), [0.5], None):
+        result = b.set(name, value)
+        assert not result.successful
+        assert f'{name} = ' in result.reason
+        assert 'must be auto or a number in [' in result.reason
+        assert values_of(b)[name] == 'auto'
+
+
+def test_auto_survives_dump_and_load(shared_bench, tmp_path):
+    """`ros2 param dump` writes what `get` returns; `load` sets it again, value by value."""
+    b = shared_bench
+    for height in (1.2, 'auto'):
+        assert b.set('sensor.height', height).successful
+        path = tmp_path / 'dump.yaml'
+        path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values_of(b)}}))
+        assert Config.from_yaml(path) == b.node.config
+        for name, value in yaml.safe_load(path.read_text())['/**']['ros__parameters'].items():
+            assert b.set(name, value).successful, name
+        assert b.node.config == Config().replace(**{'sensor.height': height})
 
 
 def test_local_calls_are_checked_too(shared_bench):
@@ -202,7 +239,11 @@ START_CASES = [
         'label: {ground_tolerance: abc}',
         "label.ground_tolerance = 'abc': must be a number in",
     ),
-    ('sensor: {height: 2}', 'sensor.height = 2: must be a number in [0.05, 20] m, with a decimal'),
+    ('sensor: {roll: sideways}', "sensor.roll = 'sideways': must be auto or a number in"),
+    (
+        'sensor: {height: 2}',
+        'sensor.height = 2: must be auto or a number in [0.05, 20] m, with a decimal',
+    ),
     ('grid: {n_segments: 1.5}', 'grid.n_segments = 1.5: must be an integer in [4, 2048]'),
     ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
     ('runtime: {backend: [a, b]}', 'runtime.backend = '),
@@ -289,7 +330,8 @@ def test_unknown_names_are_reported_and_not_declared(capfd):
 
             wait_for(said_both, 'warnings')
     assert log.count('is not used') == 2
-    assert '  sensor.height: 2.5 m  (default 1.73)' in log
+    assert '  sensor.height: 2.5 m  (default auto)' in log
+    assert '  sensor.roll: auto\n' in log
 
 
 def test_constructor_raises_config_error():

@@ -171,7 +171,7 @@ def _text(table: Table1, arguments: argparse.Namespace) -> str:
         ]
         for row in table.rows
     ]
-    error_header = ['segment', 'inliers Z-L', 'Z', 'SMSE Z-L', 'Z', 'held out', 'SMSE Z-L', 'Z']
+    error_header = ['segment', 'inlier Z-L', 'Z', 'SMSE Z-L', 'Z', 'held out', 'SMSE Z-L', 'Z']
     return '\n\n'.join(
         (
             'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]\n'

@@ -198,7 +198,8 @@ def _rows(
                 seconds[name].append(results[name].timings['total'])
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
     common = results['Z-L']
-    held_out = is_ground & (common.grid.bin != OUTSIDE) & ~is_candidate(common, z)
+    level_z = common.pose.level(points[:, :3].astype(np.float64))[:, 2]
+    held_out = is_ground & (common.grid.bin != OUTSIDE) & ~is_candidate(common, level_z)
     rows = []
     for segment in choice.segments or _most_varied_pair(frame, common.grid, z, is_ground):
         own = held_out & (common.grid.segment == segment)
@@ -219,7 +220,7 @@ def _rows(
 
 
 def is_candidate(result: Segmentation, z: FloatArray) -> npt.NDArray[np.bool_]:
-    """Tell which points are ground candidates, (N,) bool; `z` are their heights (N,) [m]."""
+    """Tell which points are ground candidates, (N,) bool; `z` (N,) in the level frame [m]."""
     grid, candidates = result.grid, result.candidates
     n_bins = len(grid.edges) - 1
     lowest = np.full((2, grid.n_segments * n_bins), np.nan)

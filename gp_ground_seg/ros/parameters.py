@@ -33,6 +33,8 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     result = ParameterDescriptor(
         description=' '.join([spec.description, *notes]),
         additional_constraints=f'must be {spec.accepted}',
+        # ROS has no type for a number or a word; `changed` holds the value to the declaration.
+        dynamic_typing=spec.auto,
     )
     # No step: rclpy would refuse every value off the grid.
     if spec.type is float:
@@ -69,7 +71,7 @@ def describe(config: Config) -> str:
     lines = []
     for spec in parameter_specs():
         value = config[spec.name]
-        unit = f' {spec.unit}' if spec.unit else ''
+        unit = f' {spec.unit}' if spec.unit and not isinstance(value, str) else ''
         note = '' if value == spec.default else f'  (default {spec.default})'
         lines.append(f'  {spec.name}: {value}{unit}{note}')
     return '\n'.join(lines)

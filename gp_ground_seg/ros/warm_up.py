@@ -8,6 +8,7 @@ import numpy as np
 
 from gp_ground_seg.config import Config
 from gp_ground_seg.segmenter import GroundSegmenter
+from gp_ground_seg.sensor_pose import given_pose
 
 _RINGS = 24
 _DIRECTIONS = 64
@@ -35,7 +36,7 @@ def _flat_ground(config: Config) -> np.ndarray[tuple[int, int], np.dtype[np.floa
         np.linspace(nearest, min(nearest + 30.0, config.grid.r_max), _RINGS),
         np.linspace(-math.pi, math.pi, _DIRECTIONS, endpoint=False),
     )
-    height = np.full(radius.shape, -config.sensor.height)
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=-1).reshape(
-        -1, 3
-    )
+    pose = given_pose(config.sensor)
+    height = np.full(radius.shape, -pose.height)
+    level = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=-1)
+    return level.reshape(-1, 3) @ pose.rotation

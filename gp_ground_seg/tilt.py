@@ -1,0 +1,57 @@
+"""Roll and pitch: between angles, rotations and the direction that is up."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.polar_grid import FloatArray
+
+BoolArray = npt.NDArray[np.bool_]
+
+ENOUGH_POINTS = 20000
+"""Points that show well enough which way is up."""
+LARGEST = 1e300
+"""Coordinates beyond this are taken to be this [m]: sums of three still are numbers."""
+
+
+def rotation(roll: float, pitch: float) -> FloatArray:
+    """Matrix (3, 3) that turns vectors of a sensor with these angles [rad] into the level frame.
+
+    Sines and cosines of quarter turns are exact: axes swapped stay points swapped.
+    """
+    (sr, cr), (sp, cp) = (_sine_cosine(angle) for angle in (roll, pitch))
+    return np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
+
+
+def _sine_cosine(angle: float) -> tuple[float, float]:
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return (0.0 if abs(sine) < 1e-12 else sine), (0.0 if abs(cosine) < 1e-12 else cosine)
+
+
+def turned(xyz: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Points (N, 3) turned by a rotation (3, 3); finite ones stay finite."""
+    with np.errstate(invalid='ignore'):
+        result: FloatArray = np.clip(xyz, -LARGEST, LARGEST) @ matrix.T
+    return result
+
+
+def turned_sample(
+    xyz: FloatArray, finite: BoolArray, matrix: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Every n-th point turned, about `ENOUGH_POINTS` of them, and which of them are finite."""
+    step = len(xyz) // ENOUGH_POINTS + 1
+    return turned(xyz[::step], matrix), np.ascontiguousarray(finite[::step])
+
+
+def angles_of(up: FloatArray) -> tuple[float, float]:
+    """Roll and pitch [rad] of a sensor in whose frame the unit vector `up` (3,) points up."""
+    roll = math.atan2(up[1], up[2])
+    return rounded(roll), rounded(math.atan2(-up[0], math.hypot(up[1], up[2])))
+
+
+def rounded(value: float) -> float:
+    """Round to 5 digits: below what a scan tells, above how backends and orders of sums differ."""
+    return round(value, 5) + 0.0
