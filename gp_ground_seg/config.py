@@ -187,7 +187,7 @@ class ObservationConfig:
         high=10.0,
     )
     sigma_n: float = parameter(
-        0.04,
+        0.05,
         'standard deviation of the height noise of a ground candidate',
         unit='m',
         symbol='sigma_n',
@@ -274,10 +274,16 @@ class GrowthConfig:
         high=10.0,
     )
     max_standardised_residual: float = parameter(
-        2.2,
+        2.0,
         'residual over predictive standard deviation above which a candidate is an outlier',
         low=0.1,
         high=50.0,
+    )
+    max_standardised_depth: float = parameter(
+        7.0,
+        'the same for a candidate below the prediction; obstacles lie only above',
+        low=0.1,
+        high=200.0,
     )
 
 
@@ -294,40 +300,86 @@ class SurfaceConfig:
 
 
 @dataclass(frozen=True)
+class FacesConfig:
+    """Upright faces, whose feet lie within the tolerance of ground."""
+
+    cell_size: float = parameter(
+        0.5,
+        'side of the square tiles whose returns are judged together',
+        unit='m',
+        low=0.05,
+        high=10.0,
+    )
+    min_height: float = parameter(
+        0.4,
+        'height of the returns of a tile above its lowest from which it may be a face',
+        unit='m',
+        low=0.05,
+        high=100.0,
+    )
+    max_normal_z: float = parameter(
+        0.45,
+        'vertical part of the unit normal up to which the returns of a tile are an upright face',
+        low=0.0,
+        high=1.0,
+    )
+    tolerance: float = parameter(
+        0.1,
+        'largest height of a ground point above the foot of a face',
+        unit='m',
+        low=0.001,
+        high=100.0,
+    )
+
+
+@dataclass(frozen=True)
 class LabelConfig:
     """Labels from the distance to the surface."""
 
     ground_tolerance: float = parameter(
-        0.2,
-        'largest distance of a ground point from the surface, above or below',
+        0.1,
+        'largest height of a ground point above a smooth surface',
         unit='m',
         symbol='zeta_g',
         low=0.001,
         high=5.0,
     )
-    slope_allowance: float = parameter(
-        1.0,
-        'widening of the tolerance in multiples of the rise of the surface across the bin',
+    roughness_gain: float = parameter(
+        3.0,
+        'growth of that height in multiples of the local roughness',
         low=0.0,
-        high=10.0,
+        high=20.0,
+    )
+    below_tolerance: float = parameter(
+        1.0,
+        'largest depth of a ground point below the surface; obstacles lie only above',
+        unit='m',
+        low=0.001,
+        high=50.0,
     )
     obstacle_tolerance: float = parameter(
-        0.1,
-        'largest height of a ground point above the surface in a bin that an obstacle stands in',
+        0.05,
+        'largest height of a ground point above a smooth surface beside an obstacle (in its bin)',
         unit='m',
         low=0.001,
         high=5.0,
     )
+    obstacle_roughness_gain: float = parameter(
+        1.0,
+        'growth of that height in multiples of the local roughness',
+        low=0.0,
+        high=20.0,
+    )
     obstacle_min_height: float = parameter(
         0.5,
-        'height above the surface from which a return shows that an obstacle stands in its bin',
+        'height above the surface from which a return is an obstacle however rough the ground',
         unit='m',
         low=0.01,
         high=10.0,
     )
     obstacle_max_height: float = parameter(
         2.0,
-        'height above the surface up to which a return shows that; higher ones overhang',
+        'height above the surface up to which a return shows an obstacle; higher ones overhang',
         unit='m',
         low=0.02,
         high=50.0,
@@ -478,6 +530,7 @@ class Config:
     latent: LatentConfig = LatentConfig()
     growth: GrowthConfig = GrowthConfig()
     surface: SurfaceConfig = SurfaceConfig()
+    faces: FacesConfig = FacesConfig()
     label: LabelConfig = LabelConfig()
     learning: LearningConfig = LearningConfig()
     runtime: RuntimeConfig = RuntimeConfig()

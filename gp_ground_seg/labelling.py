@@ -1,4 +1,4 @@
-"""Labels from the distance of each point to the surface."""
+"""Labels from the distance of each point to the surface, and what stands about it."""
 
 from __future__ import annotations
 
@@ -6,58 +6,166 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.config import LabelConfig
+from gp_ground_seg.faces import Faces
 from gp_ground_seg.labels import Label
 from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, PolarGrid
-from gp_ground_seg.surface import GroundSurface
+
+BoolArray = npt.NDArray[np.bool_]
 
 
 def label_points(
-    height: FloatArray, grid: PolarGrid, surface: GroundSurface, label: LabelConfig
-) -> npt.NDArray[np.uint8]:
+    z: FloatArray,
+    height: FloatArray,
+    grid: PolarGrid,
+    faces: Faces,
+    roughness: FloatArray,
+    label: LabelConfig,
+    face_tolerance: float,
+) -> tuple[npt.NDArray[np.uint8], FloatArray]:
     """Label points by their height over the surface (paper, Algorithm 2, line 14).
+
+    The paper's one tolerance is a band here that follows the local roughness, is
+    narrower in a bin that an obstacle stands in, and is open downwards: obstacles
+    stand on the ground, not below it. Of an upright face only the foot is ground.
 
     Parameters
     ----------
+    z : (N,) float64
+        Heights in the sensor frame [m].
     height : (N,) float64
-        Height over the surface [m]; NaN where there is none.
+        Heights over the surface [m]; NaN where there is none.
     grid : PolarGrid
         Bins of the points.
-    surface : GroundSurface
-        The surface; a bin across which it rises has a wider tolerance, since the
-        bin's lowest point stands for its lower end.
+    faces : Faces
+        Upright faces.
+    roughness : (M, n_bins) float64
+        See `local_roughness` [m].
     label : LabelConfig
         Tolerances.
+    face_tolerance : float
+        Largest height of a ground point above the foot of a face [m].
 
     Returns
     -------
-    (N,) uint8
+    label : (N,) uint8
         `Label` of each point; UNKNOWN for points that are not finite.
+    margin : (N,) float64
+        By how much the point is ground: its distance to the nearer edge of the
+        band [m], negative for obstacles, NaN where there is no surface.
     """
-    allowance = label.slope_allowance * surface.rise(grid)
-    below = label.ground_tolerance + allowance
-    above = np.where(stands_in_bin(height, grid, label), label.obstacle_tolerance, below)
-    is_ground = (height <= above) & (height >= -below) & (grid.bin != OUTSIDE)
-    result = np.where(is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
+    inside = grid.bin != OUTSIDE
+    index = np.maximum(grid.bin, 0)
+    rough = roughness[grid.segment, index]
+    above = label.ground_tolerance + label.roughness_gain * rough
+    beside = label.obstacle_tolerance + label.obstacle_roughness_gain * rough
+    stands = stands_in_bin(height, grid, label)[grid.segment, index]
+    above = np.where(stands, np.minimum(above, beside), above)
+    above = np.minimum(above, label.obstacle_min_height)
+    margin = np.minimum(above - height, height + label.below_tolerance)
+    tile = np.maximum(faces.tile, 0)
+    in_face = faces.is_face[tile] & inside
+    over_foot = np.maximum(height, z - np.where(in_face, faces.foot_z[tile], 0.0))
+    margin = np.where(in_face, np.minimum(margin, face_tolerance - over_foot), margin)
+    margin[~inside] = np.nan
+    result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[np.isnan(grid.r)] = Label.UNKNOWN
-    return result
+    return result, margin
 
 
-def stands_in_bin(
-    height: FloatArray, grid: PolarGrid, label: LabelConfig
-) -> npt.NDArray[np.bool_]:
-    """Tell which points share their bin with an obstacle, (N,) bool.
+def stands_in_bin(height: FloatArray, grid: PolarGrid, label: LabelConfig) -> BoolArray:
+    """Tell which bins an obstacle stands in, (M, n_bins) bool.
 
     The foot of a wall lies within any tolerance that ground needs; the returns
     above it give it away. Higher returns say nothing of the foot: they overhang.
     """
-    n_bins = len(grid.edges) - 1
-    cell = grid.segment * n_bins + grid.bin
+    result = np.zeros((grid.n_segments, len(grid.edges) - 1), dtype=np.bool_)
     shows = (
         (height >= label.obstacle_min_height)
         & (height <= label.obstacle_max_height)
         & (grid.bin != OUTSIDE)
     )
-    occupied = np.zeros(grid.n_segments * n_bins, dtype=np.bool_)
-    occupied[cell[shows]] = True
-    result: npt.NDArray[np.bool_] = occupied[cell] & (grid.bin != OUTSIDE)
+    result[grid.segment[shows], grid.bin[shows]] = True
+    return result
+
+
+def local_roughness(
+    height: FloatArray, grid: PolarGrid, faces: Faces, max_height: float
+) -> FloatArray:
+    """Root mean square height over the surface, in bins and their neighbours.
+
+    Each bin with the eight around it: the segments are a ring, the bins are not.
+
+    Parameters
+    ----------
+    height : (N,) float64
+        Heights over the surface [m]; NaN where there is none.
+    grid : PolarGrid
+        Bins of the points.
+    faces : Faces
+        Upright faces; their points are no roughness of the ground.
+    max_height : float
+        Largest distance from the surface that counts [m].
+
+    Returns
+    -------
+    (M, n_bins) float64
+        Roughness [m]; 0 where there are no points.
+    """
+    shape = grid.n_segments, len(grid.edges) - 1
+    counts = (
+        (np.abs(height) <= max_height)
+        & (grid.bin != OUTSIDE)
+        & ~faces.is_face[np.maximum(faces.tile, 0)]
+    )
+    cell = grid.segment[counts] * shape[1] + grid.bin[counts]
+    size = shape[0] * shape[1]
+    number = np.bincount(cell, minlength=size).reshape(shape)
+    squares = np.bincount(cell, weights=height[counts] ** 2, minlength=size).reshape(shape)
+    return root_mean_square(number, squares.astype(np.float64))
+
+
+def root_mean_square(number: npt.NDArray[np.int64], squares: FloatArray) -> FloatArray:
+    """Root of the mean square over each bin and the eight around it, (M, n_bins)."""
+    all_squares = _with_neighbours(squares)
+    all_number = _with_neighbours(number.astype(np.float64))
+    result: FloatArray = np.sqrt(all_squares / np.maximum(all_number, 1.0))
+    return result
+
+
+def _with_neighbours(table: FloatArray) -> FloatArray:
+    """Sum over each bin and the eight around it."""
+    ring = np.roll(table, 1, axis=0) + table + np.roll(table, -1, axis=0)
+    result: FloatArray = ring.copy()
+    result[:, 1:] += ring[:, :-1]
+    result[:, :-1] += ring[:, 1:]
+    return result
+
+
+def ground_probability(
+    margin: FloatArray, ground_std: FloatArray, roughness: FloatArray, noise: float
+) -> npt.NDArray[np.float32]:
+    """Probability that each point is ground.
+
+    The surface under the point is uncertain by its predictive standard deviation,
+    the point itself by the noise and by the roughness about it; all together tell
+    how likely it is that the point lies on its side of the band's edge.
+
+    Parameters
+    ----------
+    margin : (N,) float64
+        See `label_points` [m].
+    ground_std, roughness : (N,) float64
+        Standard deviation of the surface and roughness at the point [m].
+    noise : float
+        Standard deviation of the noise [m].
+
+    Returns
+    -------
+    (N,) float32
+        At least 0.5 where the margin is not negative; 0 where it is NaN.
+    """
+    from scipy.special import ndtr
+
+    spread = np.sqrt(ground_std**2 + roughness**2 + noise**2)
+    result: npt.NDArray[np.float32] = np.nan_to_num(ndtr(margin / spread)).astype(np.float32)
     return result

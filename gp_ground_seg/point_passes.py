@@ -8,13 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
-from gp_ground_seg.labels import Label
 from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, IntArray
 
 BoolArray = npt.NDArray[np.bool_]
-
-# Plain integers: compiled code knows no enumerations.
-_UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
 
 
 def first_bins(edges: FloatArray) -> tuple[IntArray, float]:
@@ -120,51 +116,3 @@ def surface_under_points(
         weight = max((r[i] - knots[n]) / (knots[n + 1] - knots[n]), 0.0)
         ground_z[i] = mean[m, n] * (1.0 - weight) + mean[m, n + 1] * weight
         ground_std[i] = std[m, n] * (1.0 - weight) + std[m, n + 1] * weight
-
-
-@compiled
-def mark_standing(
-    start: int,
-    stop: int,
-    segment: IntArray,
-    index: IntArray,
-    height: FloatArray,
-    min_height: float,
-    max_height: float,
-    standing: BoolArray,
-) -> None:
-    """Mark the cells that an obstacle stands in; threads only ever write True."""
-    for i in range(start, stop):
-        if index[i] != OUTSIDE and min_height <= height[i] <= max_height:
-            standing[segment[i], index[i]] = True
-
-
-@compiled
-def label_by_height(
-    start: int,
-    stop: int,
-    segment: IntArray,
-    index: IntArray,
-    r: FloatArray,
-    height: FloatArray,
-    standing: BoolArray,
-    mean: FloatArray,
-    ground_tolerance: float,
-    slope_allowance: float,
-    obstacle_tolerance: float,
-    label: npt.NDArray[np.uint8],
-) -> None:
-    """Do what `gp_ground_seg.labelling.label_points` does for points `start` to `stop`."""
-    for i in range(start, stop):
-        if math.isnan(r[i]):
-            label[i] = _UNKNOWN
-            continue
-        label[i] = _OBSTACLE
-        n = index[i]
-        if n == OUTSIDE:
-            continue
-        m = segment[i]
-        below = ground_tolerance + slope_allowance * abs(mean[m, n + 1] - mean[m, n])
-        above = obstacle_tolerance if standing[m, n] else below
-        if -below <= height[i] <= above:
-            label[i] = _GROUND

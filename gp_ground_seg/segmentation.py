@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,8 @@ from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.gp.theta import theta_names
+from gp_ground_seg.labelling import ground_probability
+from gp_ground_seg.labels import Label
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
@@ -130,6 +133,11 @@ class Segmentation:
     pose : SensorPose
         Height and tilt of the sensor that were used, and what the scan says of them;
         ``pose.level(xyz)`` gives points in the level frame.
+    margin : (N,) float64
+        Distance of each point to the nearer edge of the band that is ground [m], not
+        negative for ground; NaN where there is no model.
+    roughness : (M, n_bins) float64
+        Root mean square height of the returns over the surface about each bin [m].
     """
 
     label: npt.NDArray[np.uint8]
@@ -146,3 +154,18 @@ class Segmentation:
     theta: FloatArray
     log_length_scale: FloatArray
     pose: SensorPose
+    margin: FloatArray
+    roughness: FloatArray
+
+    @cached_property
+    def p_ground(self) -> npt.NDArray[np.float32]:
+        """Probability that each point is ground, (N,) float32, computed when asked for.
+
+        At least 0.5 for points labelled ground; 0 where there is no model, NaN for
+        points that are not finite.
+        """
+        rough = self.roughness[self.grid.segment, np.maximum(self.grid.bin, 0)]
+        noise = float(np.exp(self.theta[:, 1].mean()))
+        result = ground_probability(self.margin, self.ground_std, rough, noise)
+        result[self.label == Label.UNKNOWN] = np.nan
+        return result

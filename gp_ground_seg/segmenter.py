@@ -126,7 +126,10 @@ class GroundSegmenter:
 
         ground_z, ground_std = self._backend.surface_under_points(surface, grid)
         height_over_ground = z - ground_z
-        label = self._backend.label_points(height_over_ground, grid, surface, config.label)
+        faces = self._backend.find_faces(xyz, grid, config.faces, config.label.obstacle_max_height)
+        label, margin, roughness = self._backend.label_points(
+            xyz, height_over_ground, grid, faces, config.label, config.faces.tolerance
+        )
         if not pose.is_level:
             ground_z = pose.ground_z(own_xyz[:, 2], height_over_ground)
         timer.mark('label')
@@ -147,6 +150,8 @@ class GroundSegmenter:
             theta,
             log_length_scale,
             pose,
+            margin,
+            roughness,
         )
 
     def _candidates(self, xyz: FloatArray, finite: BoolArray) -> tuple[PolarGrid, Candidates]:

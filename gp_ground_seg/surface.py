@@ -48,12 +48,6 @@ class GroundSurface:
             values.append(value)
         return values[0], values[1]
 
-    def rise(self, grid: PolarGrid) -> FloatArray:
-        """Rise of the surface across the bin of each point, (N,) float64 [m]; unsigned."""
-        rise = np.abs(np.diff(self.mean, axis=1))
-        value: FloatArray = rise[grid.segment, np.maximum(grid.bin, 0)]
-        return value
-
 
 def fuse_neighbours(
     mean: FloatArray, std: FloatArray, knots: FloatArray, n_neighbours: int, slope_std: float

@@ -51,7 +51,8 @@ def test_growth(seed, n_segments, slope_std, with_knots):
     if not with_knots:
         frame = (*frame[:5], np.empty(0), np.empty((n_segments, 0)))
     # Every segment may have its own.
-    noise = np.linspace(0.1, 0.5, n_segments), np.linspace(0.1, 0.03, n_segments)
+    ends = (0.1, 0.5), (0.1, 0.03), (0.02, 0.2)
+    noise = [np.linspace(*both, n_segments) for both in ends]
     expected = grow_surface_reference(*frame, *noise, slope_std, GrowthConfig())
     found = grow_surface_batched(*frame, *noise, slope_std, GrowthConfig())
     np.testing.assert_array_equal(found[0], expected[0])

@@ -24,11 +24,12 @@ def random_frame(seed, n_segments=5):
     return offsets, r, z, length_scale, seed_mask, KNOTS, knot_length_scale
 
 
-def compiled(frame, growth, chunks=1, sigma_f=None, sigma_n=None, slope_std=0.05):
+def compiled(frame, growth, chunks=1, sigma_f=None, sigma_n=None, gate_noise=None, slope_std=0.05):
     offsets, r = frame[0], frame[1]
     n_segments = len(offsets) - 1
     sigma_f = np.full(n_segments, 0.2) if sigma_f is None else sigma_f
     sigma_n = np.full(n_segments, 0.07) if sigma_n is None else sigma_n
+    gate_noise = sigma_n if gate_noise is None else gate_noise
     inlier = np.zeros(len(r), dtype=bool)
     mean = np.full((n_segments, len(KNOTS)), np.nan)
     std = np.full((n_segments, len(KNOTS)), np.nan)
@@ -44,9 +45,11 @@ def compiled(frame, growth, chunks=1, sigma_f=None, sigma_n=None, slope_std=0.05
             *frame,
             sigma_f,
             sigma_n,
+            gate_noise,
             slope_std,
             growth.max_std,
             growth.max_standardised_residual,
+            growth.max_standardised_depth,
             inlier,
             mean,
             std,
@@ -60,9 +63,10 @@ def test_appending_rows_gives_what_refitting_gives(seed, slope_std):
     frame = random_frame(seed)
     # Every segment may have its own.
     sigma_f, sigma_n = np.linspace(0.1, 0.5, 5), np.linspace(0.1, 0.03, 5)
+    noise = {'sigma_f': sigma_f, 'sigma_n': sigma_n, 'gate_noise': np.linspace(0.02, 0.2, 5)}
     growth = GrowthConfig()
-    expected = grow_surface_reference(*frame, sigma_f, sigma_n, slope_std, growth)
-    found = compiled(frame, growth, sigma_f=sigma_f, sigma_n=sigma_n, slope_std=slope_std)
+    expected = grow_surface_reference(*frame, *noise.values(), slope_std, growth)
+    found = compiled(frame, growth, **noise, slope_std=slope_std)
     np.testing.assert_array_equal(found[0], expected[0])
     np.testing.assert_allclose(found[1], expected[1], atol=1e-8)
     np.testing.assert_allclose(found[2], expected[2], atol=1e-6)
@@ -89,6 +93,7 @@ def grow_line(z, r=None, seed=None, **bounds):
         KNOTS,
         np.full((1, len(KNOTS)), 8.0),
         np.array([0.2]),
+        np.array([0.07]),
         np.array([0.07]),
         0.05,
         GrowthConfig(**bounds),
@@ -122,3 +127,12 @@ def test_looser_bounds_take_more():
     strict = grow_line(z, max_standardised_residual=1.0)[0].sum()
     loose = grow_line(z, max_standardised_residual=8.0)[0].sum()
     assert strict < loose == pytest.approx(20)
+
+
+def test_what_lies_below_is_believed_sooner_than_what_lies_above():
+    z = np.zeros(12)
+    # Beside the seeds, where the surface is certain.
+    z[3] = 0.3
+    assert list(np.flatnonzero(~grow_line(z)[0])) == [3]
+    assert grow_line(-z)[0].all()
+    assert list(np.flatnonzero(~grow_line(-z, max_standardised_depth=2.0)[0])) == [3]

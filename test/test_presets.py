@@ -65,7 +65,11 @@ def test_the_paper_preset_has_none_of_our_departures():
     paper = PRESETS['paper'].config
     for name, value in switches:
         assert str(paper[name]) in (value, f'{value}.0'), f'{name} of the preset paper'
-    assert paper['label.obstacle_tolerance'] == paper['label.ground_tolerance']
+    label = paper.label
+    assert label.ground_tolerance == label.obstacle_tolerance == label.below_tolerance
+    assert paper['faces.min_height'] > paper['label.obstacle_max_height']
+    growth = paper.growth
+    assert growth.max_standardised_depth == growth.max_standardised_residual
 
 
 @settings(max_examples=30)

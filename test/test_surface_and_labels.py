@@ -1,11 +1,19 @@
 import numpy as np
 import pytest
+import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg.config import GridConfig, LabelConfig
+from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
+from gp_ground_seg.faces import Faces
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
-from gp_ground_seg.labelling import label_points, stands_in_bin
+from gp_ground_seg.gp.numpy_backend import NumpyBackend
+from gp_ground_seg.labelling import (
+    ground_probability,
+    label_points,
+    local_roughness,
+    stands_in_bin,
+)
 from gp_ground_seg.labels import Label
 from gp_ground_seg.polar_grid import build_polar_grid
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
@@ -66,66 +74,143 @@ def test_a_segment_without_a_model_gets_its_neighbours():
     np.testing.assert_array_equal(same[0], mean)
 
 
+def nothing_stands(n):
+    return Faces(np.zeros(n, dtype=np.int64), np.zeros(1), np.zeros(1, dtype=bool))
+
+
+def labels_of(heights, grid, roughness=0.0, config=None, faces=None, z=None):
+    heights = np.asarray(heights, dtype=float)
+    return label_points(
+        heights if z is None else np.asarray(z, dtype=float),
+        heights,
+        grid,
+        nothing_stands(len(heights)) if faces is None else faces,
+        np.full((4, 4), roughness),
+        LabelConfig() if config is None else config,
+        0.1,
+    )
+
+
 def test_labels_by_height():
-    heights = np.array([0.0, 0.19, 0.21, -0.19, -0.21, np.nan])
-    grid = grid_of(3.0, 3.0, 3.0, 3.0, 3.0, 3.0)
-    labels = label_points(heights, grid, surface_of([0.0] * 5), LabelConfig())
+    heights = [0.0, 0.09, 0.11, -0.99, -1.01, np.nan]
+    labels, margin = labels_of(heights, grid_of(*[3.0] * 6))
     assert [Label(value).name[0] for value in labels] == list('GGOGOO')
     assert labels.dtype == np.uint8
+    np.testing.assert_allclose(margin[:5], [0.1, 0.01, -0.01, 0.01, -0.01], atol=1e-12)
+    assert np.isnan(margin[5])
 
 
 def test_points_that_are_not_finite_are_unknown():
-    labels = label_points(
-        np.array([np.nan, 0.0]), grid_of(np.nan, 3.0), surface_of([0.0] * 5), LabelConfig()
-    )
-    assert list(labels) == [Label.UNKNOWN, Label.GROUND]
+    assert list(labels_of([np.nan, 0.0], grid_of(np.nan, 3.0))[0]) == [
+        Label.UNKNOWN,
+        Label.GROUND,
+    ]
 
 
 @pytest.mark.parametrize(
     ('other', 'is_ground'), [(1.0, False), (0.3, True), (2.5, True), (np.nan, True)]
 )
 def test_the_foot_of_an_obstacle_is_judged_more_strictly(other, is_ground):
-    heights = np.array([0.15, other, 0.05, -0.15])
-    grid = grid_of(3.0, 3.5, 3.2, 3.9)
-    labels = label_points(heights, grid, surface_of([0.0] * 5), LabelConfig())
+    labels, _ = labels_of([0.08, other, 0.04, -0.15], grid_of(3.0, 3.5, 3.2, 3.9))
     assert (labels[0] == Label.GROUND) == is_ground
     assert list(labels[2:]) == [Label.GROUND, Label.GROUND]
 
 
 def test_an_obstacle_speaks_only_for_its_own_bin_and_not_from_outside():
-    heights = np.array([0.15, 1.0, 1.0])
-    found = stands_in_bin(heights, grid_of(3.0, 5.0, 1e3), LabelConfig())
-    assert list(found) == [False, True, False]
+    heights, grid = np.array([0.15, 1.0, 1.0]), grid_of(3.0, 5.0, 1e3)
+    found = stands_in_bin(heights, grid, LabelConfig())
+    assert found.sum() == 1
+    assert found[grid.segment[1], grid.bin[1]]
 
 
-def test_tolerance_widens_where_the_surface_rises():
-    heights = np.array([0.5, -0.5])
-    grid = grid_of(5.0, 5.0)
-    level, steep = surface_of([0.0] * 5), surface_of([0.0, 0.0, 0.4, 0.4, 0.4])
-    assert list(label_points(heights, grid, level, LabelConfig())) == [Label.OBSTACLE] * 2
-    config = LabelConfig(obstacle_min_height=1.0)
-    assert list(label_points(heights, grid, steep, config)) == [Label.GROUND] * 2
+def test_the_band_follows_the_roughness_up_to_the_height_of_an_obstacle():
+    heights = [0.3, 0.45, 0.51]
+    grid = grid_of(3.0, 5.0, 7.0)
+    assert list(labels_of(heights, grid)[0]) == [Label.OBSTACLE] * 3
+    assert list(labels_of(heights, grid, roughness=0.08)[0]) == [
+        Label.GROUND,
+        Label.OBSTACLE,
+        Label.OBSTACLE,
+    ]
+    assert list(labels_of(heights, grid, roughness=0.4)[0]) == [
+        Label.GROUND,
+        Label.GROUND,
+        Label.OBSTACLE,
+    ]
+
+
+def test_of_a_face_only_the_foot_is_ground():
+    # The surface climbs a step: its riser lies on it.
+    z = np.array([0.05, 0.15, 0.4])
+    grid = grid_of(5.0, 5.0, 5.0)
+    step = Faces(np.array([0, 0, 0]), np.array([0.0]), np.array([True]))
+    assert list(labels_of(z * 0.0, grid, faces=step, z=z)[0]) == [
+        Label.GROUND,
+        Label.OBSTACLE,
+        Label.OBSTACLE,
+    ]
+    assert list(labels_of(z * 0.0, grid, z=z)[0]) == [Label.GROUND] * 3
+
+
+def test_roughness_is_the_root_mean_square_of_a_bin_and_its_neighbours():
+    # Bins 0, 0, 2 of one segment; the last is no roughness but an obstacle.
+    grid = grid_of(3.0, 3.5, 7.0, 3.0)
+    found = local_roughness(np.array([0.1, -0.2, 0.3, 0.6]), grid, nothing_stands(4), 0.5)
+    own = grid.segment[0]
+    np.testing.assert_allclose(found[own, 0], np.sqrt((0.1**2 + 0.2**2) / 2))
+    np.testing.assert_allclose(found[own, 1], np.sqrt((0.1**2 + 0.2**2 + 0.3**2) / 3))
+    np.testing.assert_allclose(found[own, 3], 0.3)
+    # The segments are a ring of four: the opposite one is not touched.
+    assert found[(own + 1) % 4, 0] == found[(own - 1) % 4, 0] == found[own, 0]
+    assert (found[(own + 2) % 4] == 0.0).all()
+
+
+def test_points_of_faces_are_no_roughness():
+    grid = grid_of(3.0, 3.0)
+    one = Faces(np.array([0, 1]), np.zeros(2), np.array([False, True]))
+    found = local_roughness(np.array([0.1, 0.4]), grid, one, 0.5)
+    np.testing.assert_allclose(found[grid.segment[0], grid.bin[0]], 0.1)
+
+
+def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():
+    margin = np.array([0.0, 0.1, 0.1, -0.1, np.nan])
+    std = np.array([0.1, 0.01, 0.3, 0.01, np.nan])
+    found = ground_probability(margin, std, np.full(5, 0.02), 0.03)
+    expected = scipy.stats.norm.cdf(margin / np.sqrt(std**2 + 0.02**2 + 0.03**2))
+    np.testing.assert_allclose(found[:4], expected[:4], rtol=1e-6)
+    assert found[0] == 0.5
+    assert found[1] > found[2] > 0.5
+    assert found[4] == 0.0
 
 
 @settings(deadline=None)
 @given(st.integers(0, 10_000))
 def test_compiled_surface_and_labels_are_the_reference(seed):
     rng = np.random.default_rng(seed)
-    xyz = rng.uniform(-12, 12, (200, 3))
+    xyz = rng.uniform(-12, 12, (300, 3))
+    xyz[:, 2] *= 0.1
+    # Posts, so that there are faces.
+    xyz[100:200, :2] = np.repeat(xyz[100:120, :2], 5, axis=0) + rng.normal(0, 0.02, (100, 2))
     xyz[::20] = np.nan
     grid = build_polar_grid(xyz, np.isfinite(xyz).all(axis=1), GRID)
     surface = GroundSurface(
         KNOTS, rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5)), np.ones(0, dtype=bool)
     )
     surface.mean[seed % 4] = surface.std[seed % 4] = np.nan
-    backend = CompiledBackend(1)
+    backend, plain = CompiledBackend(1), NumpyBackend()
     for found, expected in zip(
         backend.surface_under_points(surface, grid), surface.at(grid), strict=True
     ):
         np.testing.assert_allclose(found, expected, atol=1e-12)
-    height = rng.normal(0, 0.5, 200)
-    height[::9] = np.nan
-    np.testing.assert_array_equal(
-        backend.label_points(height, grid, surface, LabelConfig()),
-        label_points(height, grid, surface, LabelConfig()),
-    )
+    faces = backend.find_faces(xyz, grid, FacesConfig(), 2.0)
+    same = plain.find_faces(xyz, grid, FacesConfig(), 2.0)
+    np.testing.assert_array_equal(faces.tile, same.tile)
+    np.testing.assert_array_equal(faces.foot_z, same.foot_z)
+    np.testing.assert_array_equal(faces.is_face, same.is_face)
+    assert faces.is_face.any()
+    height = xyz[:, 2] - surface.at(grid)[0]
+    labels = backend.label_points(xyz, height, grid, faces, LabelConfig(), 0.1)
+    expected = plain.label_points(xyz, height, grid, faces, LabelConfig(), 0.1)
+    np.testing.assert_array_equal(labels[0], expected[0])
+    np.testing.assert_allclose(labels[1], expected[1], atol=1e-12)
+    np.testing.assert_allclose(labels[2], expected[2], atol=1e-12)

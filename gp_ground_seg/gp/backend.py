@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.compiled import HAVE_NUMBA
-from gp_ground_seg.config import GridConfig, GrowthConfig, LabelConfig, RuntimeConfig
+from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig, RuntimeConfig
 from gp_ground_seg.errors import MissingDependencyError
+from gp_ground_seg.faces import Faces
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
@@ -38,10 +39,21 @@ class Backend(Protocol):
     ) -> tuple[FloatArray, FloatArray]:
         """See `gp_ground_seg.surface.GroundSurface.at`."""
 
+    def find_faces(
+        self, xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float
+    ) -> Faces:
+        """See `gp_ground_seg.faces.find_faces`."""
+
     def label_points(
-        self, height: FloatArray, grid: PolarGrid, surface: GroundSurface, label: LabelConfig
-    ) -> npt.NDArray[np.uint8]:
-        """See `gp_ground_seg.labelling.label_points`."""
+        self,
+        xyz: FloatArray,
+        height: FloatArray,
+        grid: PolarGrid,
+        faces: Faces,
+        label: LabelConfig,
+        face_tolerance: float,
+    ) -> tuple[npt.NDArray[np.uint8], FloatArray, FloatArray]:
+        """See `gp_ground_seg.labelling`: label and margin of each point, roughness of each bin."""
 
     def log_length_scales(
         self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
@@ -57,6 +69,7 @@ class Backend(Protocol):
         knots: FloatArray,
         knot_length_scale: FloatArray,
         theta: FloatArray,
+        gate_noise: FloatArray,
         slope_std: float,
         growth: GrowthConfig,
     ) -> tuple[BoolArray, FloatArray, FloatArray]:

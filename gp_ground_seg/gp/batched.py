@@ -86,6 +86,7 @@ def grow_surface_batched(
     knot_length_scale: FloatArray,
     sigma_f: FloatArray,
     sigma_n: FloatArray,
+    gate_noise: FloatArray,
     slope_std: float,
     growth: GrowthConfig,
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
@@ -104,7 +105,9 @@ def grow_surface_batched(
         covariance = paciorek_batched(own_r, own_l, own_r, own_l, sigma_f[segments])
         covariance += slope_std**2 * own_r[:, :, None] * own_r[:, None, :]
         noise = np.broadcast_to(sigma_n[segments, None] ** 2, own_r.shape)
-        chosen = _grow(covariance, own_z, noise, own.mask, seed[own.index] & own.mask, growth)
+        gate = np.broadcast_to(gate_noise[segments, None] ** 2, own_r.shape)
+        own_seed = seed[own.index] & own.mask
+        chosen = _grow(covariance, own_z, noise, gate, own.mask, own_seed, growth)
         inlier[own.index[own.mask]] = chosen[own.mask]
         grown = chosen.any(axis=1)
         if len(knots) and grown.any():
@@ -137,6 +140,7 @@ def _grow(
     prior: FloatArray,
     z: FloatArray,
     noise: FloatArray,
+    gate: FloatArray,
     mask: BoolArray,
     seed: BoolArray,
     growth: GrowthConfig,
@@ -151,12 +155,14 @@ def _grow(
         chosen[active] |= joining
         height, covariance = _condition(covariance, height, z[active], noise[active], joining)
         variance = np.diagonal(covariance, axis1=1, axis2=2)
-        spread = np.sqrt(np.maximum(variance, 0.0) + noise[active])
+        spread = np.sqrt(np.maximum(variance, 0.0) + gate[active])
+        residual = (z[active] - height) / spread
         joining = (
             ~chosen[active]
             & mask[active]
             & (variance <= growth.max_std**2)
-            & (np.abs(z[active] - height) <= growth.max_standardised_residual * spread)
+            & (residual <= growth.max_standardised_residual)
+            & (residual >= -growth.max_standardised_depth)
         )
         grows = joining.any(axis=1)
         active, joining = active[grows], joining[grows]

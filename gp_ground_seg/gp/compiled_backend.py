@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg import point_passes
-from gp_ground_seg.config import GridConfig, GrowthConfig, LabelConfig
+from gp_ground_seg import label_passes, point_passes
+from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig
+from gp_ground_seg.faces import FEWEST_RETURNS, Faces, tiles_per_side
 from gp_ground_seg.gp.growth import BoolArray, grow_surface_compiled
 from gp_ground_seg.gp.latent import latent_rows_compiled
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
+from gp_ground_seg.labelling import root_mean_square
 from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid, bin_edges
 from gp_ground_seg.pseudo_inputs import PseudoInputs
@@ -95,37 +97,94 @@ class CompiledBackend:
         )
         return ground_z, ground_std
 
-    def label_points(
-        self, height: FloatArray, grid: PolarGrid, surface: GroundSurface, label: LabelConfig
-    ) -> npt.NDArray[np.uint8]:
-        """Label of each point."""
-        standing = np.zeros((grid.n_segments, len(grid.edges) - 1), dtype=np.bool_)
+    def find_faces(
+        self, xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float
+    ) -> Faces:
+        """Upright faces."""
+        n_points = len(xyz)
+        half = float(grid.edges[-1])
+        side = tiles_per_side(half, faces)
+        tile = np.empty(n_points, dtype=np.int64)
         self._pool.run_points(
-            point_passes.mark_standing,
-            len(height),
+            label_passes.assign_tiles,
+            n_points,
+            xyz,
+            grid.bin,
+            half,
+            1.0 / faces.cell_size,
+            side,
+            tile,
+        )
+        foot_z = np.full(side * side, np.inf)
+        tall, is_face = np.zeros((2, side * side), dtype=np.bool_)
+        label_passes.find_feet(xyz, tile, foot_z)
+        self._pool.run_points(
+            label_passes.mark_tall,
+            n_points,
+            xyz,
+            tile,
+            foot_z,
+            faces.min_height,
+            max_height,
+            tall,
+        )
+        label_passes.judge_faces(
+            xyz, tile, foot_z, tall, max_height, faces.max_normal_z, FEWEST_RETURNS, is_face
+        )
+        return Faces(tile, foot_z, is_face)
+
+    def label_points(
+        self,
+        xyz: FloatArray,
+        height: FloatArray,
+        grid: PolarGrid,
+        faces: Faces,
+        label: LabelConfig,
+        face_tolerance: float,
+    ) -> tuple[npt.NDArray[np.uint8], FloatArray, FloatArray]:
+        """Label and margin of each point; roughness of each bin."""
+        shape = grid.n_segments, len(grid.edges) - 1
+        number = np.zeros(shape, dtype=np.int64)
+        squares = np.zeros(shape)
+        stands = np.zeros(shape, dtype=np.bool_)
+        label_passes.survey_bins(
             grid.segment,
             grid.bin,
+            faces.tile,
             height,
+            faces.is_face,
             label.obstacle_min_height,
             label.obstacle_max_height,
-            standing,
+            number,
+            squares,
+            stands,
         )
-        result = np.empty(len(height), dtype=np.uint8)
+        roughness = root_mean_square(number, squares)
+        labels, margin = np.empty(len(height), dtype=np.uint8), np.empty(len(height))
         self._pool.run_points(
-            point_passes.label_by_height,
+            label_passes.label_by_height,
             len(height),
+            xyz,
             grid.segment,
             grid.bin,
             grid.r,
+            faces.tile,
             height,
-            standing,
-            surface.mean,
+            faces.is_face,
+            faces.foot_z,
+            stands,
+            roughness,
             label.ground_tolerance,
-            label.slope_allowance,
+            label.roughness_gain,
             label.obstacle_tolerance,
-            result,
+            label.obstacle_roughness_gain,
+            label.obstacle_min_height,
+            label.below_tolerance,
+            face_tolerance,
+            labels,
+            margin,
         )
-        return result
+        return labels, margin, roughness
 
     def log_length_scales(
         self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
@@ -158,6 +217,7 @@ class CompiledBackend:
         knots: FloatArray,
         knot_length_scale: FloatArray,
         theta: FloatArray,
+        gate_noise: FloatArray,
         slope_std: float,
         growth: GrowthConfig,
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
@@ -178,9 +238,11 @@ class CompiledBackend:
             knot_length_scale,
             np.exp(theta[:, 0]),
             np.exp(theta[:, 1]),
+            gate_noise,
             slope_std,
             growth.max_std,
             growth.max_standardised_residual,
+            growth.max_standardised_depth,
             inlier,
             mean,
             std,

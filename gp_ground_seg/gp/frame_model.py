@@ -87,6 +87,8 @@ class FrameModel:
             knots,
             np.exp(knot_u),
             theta,
+            # Learned on inliers the noise comes out small, and the gate must not shut for that.
+            np.maximum(np.exp(theta[:, 1]), self.config.observation.sigma_n),
             self.config.observation.slope_std,
             growth,
         )

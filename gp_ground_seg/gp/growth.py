@@ -31,6 +31,7 @@ def grow_surface_reference(
     knot_length_scale: FloatArray,
     sigma_f: FloatArray,
     sigma_n: FloatArray,
+    gate_noise: FloatArray,
     slope_std: float,
     growth: GrowthConfig,
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
@@ -38,8 +39,10 @@ def grow_surface_reference(
 
     A candidate joins when the predictive standard deviation is at most
     ``growth.max_std`` and its standardised residual is at most
-    ``growth.max_standardised_residual``; repeated until none joins (GP-INSAC of
-    Chen et al. 2014; the paper's outlier rejection).
+    ``growth.max_standardised_residual`` above the prediction, or
+    ``growth.max_standardised_depth`` below; repeated until none joins (GP-INSAC of
+    Chen et al. 2014; the paper's outlier rejection). The gate is lopsided because
+    obstacles lie only above the ground.
 
     Parameters
     ----------
@@ -55,6 +58,8 @@ def grow_surface_reference(
         Length-scale there [m].
     sigma_f, sigma_n : (M,) float64
         Standard deviations of process and noise in each segment [m].
+    gate_noise : (M,) float64
+        Standard deviation of the noise that the residuals are standardised with [m].
     slope_std : float
         Prior standard deviation of the mean line's slope.
     growth : GrowthConfig
@@ -88,11 +93,12 @@ def grow_surface_reference(
                 sigma_n[m],
                 slope_std,
             )
-            residual = np.abs(z_own - height) / np.sqrt(variance + sigma_n[m] ** 2)
+            residual = (z_own - height) / np.sqrt(variance + gate_noise[m] ** 2)
             joining = (
                 ~chosen
                 & (variance <= growth.max_std**2)
                 & (residual <= growth.max_standardised_residual)
+                & (residual >= -growth.max_standardised_depth)
             )
             if not joining.any():
                 break
@@ -125,9 +131,11 @@ def grow_surface_compiled(
     knot_length_scale: FloatArray,
     sigma_f: FloatArray,
     sigma_n: FloatArray,
+    gate_noise: FloatArray,
     slope_std: float,
     max_std: float,
     max_standardised_residual: float,
+    max_standardised_depth: float,
     inlier: BoolArray,
     mean: FloatArray,
     std: FloatArray,
@@ -183,11 +191,12 @@ def grow_surface_compiled(
                 n_inliers += 1
             grown = False
             for i in range(n):
-                spread = math.sqrt(max(variance[i], 0.0) + sigma_n[m] ** 2)
+                spread = math.sqrt(max(variance[i], 0.0) + gate_noise[m] ** 2)
+                residual = (z[first + i] - height[i]) / spread
                 joining[i] = (
                     not inlier[first + i]
                     and variance[i] <= max_std**2
-                    and abs(z[first + i] - height[i]) <= max_standardised_residual * spread
+                    and -max_standardised_depth <= residual <= max_standardised_residual
                 )
                 grown = grown or joining[i]
         for j in range(n_knots):

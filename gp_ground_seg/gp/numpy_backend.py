@@ -6,12 +6,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.blas import single_threaded_blas
-from gp_ground_seg.config import GridConfig, GrowthConfig, LabelConfig
+from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig
+from gp_ground_seg.faces import Faces, find_faces
 from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
-from gp_ground_seg.labelling import label_points
+from gp_ground_seg.labelling import label_points, local_roughness
 from gp_ground_seg.polar_grid import (
     Candidates,
     CellTables,
@@ -44,11 +45,27 @@ class NumpyBackend:
         """Height and standard deviation of the surface under each point."""
         return surface.at(grid)
 
+    def find_faces(
+        self, xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float
+    ) -> Faces:
+        """Upright faces."""
+        return find_faces(xyz, grid, faces, max_height)
+
     def label_points(
-        self, height: FloatArray, grid: PolarGrid, surface: GroundSurface, label: LabelConfig
-    ) -> npt.NDArray[np.uint8]:
-        """Label of each point."""
-        return label_points(height, grid, surface, label)
+        self,
+        xyz: FloatArray,
+        height: FloatArray,
+        grid: PolarGrid,
+        faces: Faces,
+        label: LabelConfig,
+        face_tolerance: float,
+    ) -> tuple[npt.NDArray[np.uint8], FloatArray, FloatArray]:
+        """Label and margin of each point; roughness of each bin."""
+        roughness = local_roughness(height, grid, faces, label.obstacle_min_height)
+        labels, margin = label_points(
+            xyz[:, 2], height, grid, faces, roughness, label, face_tolerance
+        )
+        return labels, margin, roughness
 
     @single_threaded_blas()
     def log_length_scales(
@@ -75,6 +92,7 @@ class NumpyBackend:
         knots: FloatArray,
         knot_length_scale: FloatArray,
         theta: FloatArray,
+        gate_noise: FloatArray,
         slope_std: float,
         growth: GrowthConfig,
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
@@ -89,6 +107,7 @@ class NumpyBackend:
             knot_length_scale,
             np.exp(theta[:, 0]),
             np.exp(theta[:, 1]),
+            gate_noise,
             slope_std,
             growth,
         )
