@@ -19,6 +19,7 @@ from gp_ground_seg.ros.health.processing import WINDOW, ProcessingStatistics
 from gp_ground_seg.ros.health.rate import WINDOW as RATE_WINDOW
 from gp_ground_seg.ros.health.rate import Rate, SequenceGaps
 from gp_ground_seg.ros.health.status import Level, Status
+from gp_ground_seg.sensor_pose import SensorPose
 
 LIMITS = DiagnosticsConfig(stale_after=2.0, max_latency=0.1)
 FACTS = InputFacts('/points', 'reliable, keep_last 5, volatile', n_publishers=1, ros_time=1000.5)
@@ -290,6 +291,26 @@ def test_model_reports_the_newest_scan():
     assert statistics.report(strict).level == (Level.WARN if quality < 1.0 else Level.OK)
 
 
+@pytest.mark.parametrize('given', ['auto', 1.73, 3.5])
+def test_model_reports_where_the_sensor_is(given):
+    """Estimated or given; given wrongly is a warning that says so, not a repair."""
+    statistics = ModelStatistics()
+    config = Config().replace(**{'sensor.height': given})
+    segmentation = GroundSegmenter(config).segment(hilly_scan(20_000))
+    statistics.segmented(segmentation)
+    status = statistics.report(LIMITS)
+    values = status.values
+    assert values['Sensor height (m)'] == f'{segmentation.pose.height:.4f}'
+    assert ('height' in values['Taken from the scan']) == (given == 'auto')
+    assert float(values['Estimated height (m)']) == pytest.approx(1.73, abs=0.2)
+    assert abs(float(values['Estimated pitch (rad)'])) < 0.1
+    if given == 3.5:
+        assert status.level == Level.WARN
+        assert 'sensor.height' in status.message
+    else:
+        assert status.level == Level.OK
+
+
 @pytest.mark.parametrize('points', [np.zeros((0, 3)), np.full((9, 3), np.nan)])
 def test_a_scan_without_ground_is_a_warning(points):
     statistics = ModelStatistics()
@@ -312,7 +333,7 @@ def test_quality_is_a_share(n_segments, n_occupied, n_inliers, n_more, certainty
         n_candidates=n_inliers + n_more,
         status=status,
     )
-    facts = ModelFacts(fit, 180, n_occupied, 0.5, 0.0, 0.0, certainty)
+    facts = ModelFacts(fit, SensorPose(1.7, 0.0, 0.0), 180, n_occupied, 0.5, 0.0, 0.0, certainty)
     assert 0.0 <= facts.quality <= 1.0
     unsure = dataclasses.replace(facts, certainty=0.5 * certainty)
     assert unsure.quality <= facts.quality

@@ -11,6 +11,7 @@ from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.labels import Label
 from gp_ground_seg.ros.health.status import Level, Status, in_digits
 from gp_ground_seg.segmentation import FitReport, Segmentation
+from gp_ground_seg.sensor_pose import SensorPose
 
 TASK = 'model'
 
@@ -23,6 +24,8 @@ class ModelFacts:
     ----------
     fit : FitReport
         What the learning did.
+    pose : SensorPose
+        Where the sensor was taken to be.
     n_segments : int
         Segments of the grid.
     n_occupied : int
@@ -35,6 +38,7 @@ class ModelFacts:
     """
 
     fit: FitReport
+    pose: SensorPose
     n_segments: int
     n_occupied: int
     ground: float
@@ -54,6 +58,7 @@ class ModelFacts:
         candidates = segmentation.candidates
         return cls(
             fit=segmentation.fit,
+            pose=segmentation.pose,
             n_segments=len(segmentation.surface.mean),
             n_occupied=int(np.count_nonzero(np.diff(candidates.offsets))),
             ground=n_ground / n_points if n_points else np.nan,
@@ -108,6 +113,7 @@ class ModelStatistics:
             'Label certainty': in_digits(facts.certainty, '.3f'),
             'Candidates': str(fit.n_candidates),
             'Inliers': str(fit.n_inliers),
+            **_pose_values(facts.pose),
             'Noise (m)': in_digits(fit.theta.get('sigma_n'), '.4g'),
             'Learning mode': fit.mode,
             'Learned since startup': str(self._n_learned),
@@ -121,6 +127,8 @@ class ModelStatistics:
 
 
 def _judge(facts: ModelFacts, limits: DiagnosticsConfig) -> tuple[Level, str]:
+    if facts.pose.contradictions:
+        return Level.WARN, '; '.join(facts.pose.contradictions)
     if not facts.fit.n_segments:
         return Level.WARN, 'no ground found in the newest cloud'
     if facts.fit.status == 'failed':
@@ -128,6 +136,26 @@ def _judge(facts: ModelFacts, limits: DiagnosticsConfig) -> tuple[Level, str]:
     if facts.quality < limits.min_quality:
         return Level.WARN, f'frame quality {facts.quality:.2f}, below {limits.min_quality:g}'
     return Level.OK, f'frame quality {facts.quality:.2f}'
+
+
+def _pose_values(pose: SensorPose) -> dict[str, str]:
+    is_estimated = {
+        'height': pose.height_estimated,
+        'roll': pose.roll_estimated,
+        'pitch': pose.pitch_estimated,
+    }
+    values = {
+        'Sensor height (m)': f'{pose.height:.4f}',
+        'Sensor roll (rad)': f'{pose.roll:.4f}',
+        'Sensor pitch (rad)': f'{pose.pitch:.4f}',
+        'Taken from the scan': ' '.join(n for n, yes in is_estimated.items() if yes) or 'nothing',
+    }
+    seen = pose.measured
+    height = seen.height if seen and seen.tells_height else None
+    roll, pitch = (seen.roll, seen.pitch) if seen and seen.tells_tilt else (None, None)
+    for name, value in (('height (m)', height), ('roll (rad)', roll), ('pitch (rad)', pitch)):
+        values[f'Estimated {name}'] = in_digits(value, '.4f')
+    return values
 
 
 def _certainty(segmentation: Segmentation, has_model: BoolArray) -> float:
