@@ -322,4 +322,4 @@ def test_two_nodes_side_by_side():
             b.ground.wait(1)
             assert len(floor.messages) == 1
         assert b.node.config.label.ground_tolerance == 0.5
-        assert rear.config.label.ground_tolerance == 0.2
+        assert rear.config.label == Config().label

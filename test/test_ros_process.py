@@ -146,7 +146,8 @@ def test_command_line_hands_ros_arguments_on(tmp_path):
     words = ('--ros-args', '-p', 'label.ground_tolerance:=0.3', '-r', f'__ns:={NAMESPACE}')
     with Process(*words, folder=tmp_path, start=MODULE) as node:
         node.wait_until_ready()
-        assert 'label.ground_tolerance: 0.3 m  (default 0.2)' in node.log
+        default = Config().label.ground_tolerance
+        assert f'label.ground_tolerance: 0.3 m  (default {default})' in node.log
         assert f'listening to {NAMESPACE}/points' in node.log
         assert node.stop(signal.SIGTERM)[0] == 0
 
