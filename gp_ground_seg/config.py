@@ -49,6 +49,18 @@ class SensorConfig:
 
 
 @dataclass(frozen=True)
+class FrameConfig:
+    """Where the tilt of the sensor is taken from; the node only."""
+
+    level: str = parameter(
+        'sensor',
+        'where the tilt of the sensor is taken from: sensor.roll and sensor.pitch, or TF',
+        choices=('sensor', 'tf'),
+    )
+    base: str = parameter('base_link', 'frame that is level to TF, with frame.level = tf')
+
+
+@dataclass(frozen=True)
 class GridConfig:
     """Radial grid map."""
 
@@ -523,6 +535,7 @@ class Config:
     """
 
     sensor: SensorConfig = SensorConfig()
+    frame: FrameConfig = FrameConfig()
     grid: GridConfig = GridConfig()
     lines: LinesConfig = LinesConfig()
     length_scale: LengthScaleConfig = LengthScaleConfig()

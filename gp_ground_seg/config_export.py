@@ -110,6 +110,8 @@ def _accepted(spec: ParameterSpec) -> str:
         return ' or '.join(spec.choices)
     if spec.type is bool:
         return 'true or false'
+    if spec.type is str:
+        return 'a name'
     auto = f'{AUTO} or ' if spec.auto else ''
     return f'{auto}{spec.minimum:.10g} to {spec.maximum:.10g}'
 

@@ -10,61 +10,49 @@ import numpy.typing as npt
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.polar_grid import FloatArray
 from gp_ground_seg.segmentation import Segmentation
-from gp_ground_seg.sensor_pose import LEAST_COSINE, SensorPose
+from gp_ground_seg.tilt import rotation
 
-SLOPE_STEPS = 4
-"""Steps from the plane of the pose to the surface along a tilted axis: each leaves the slope's
-share of the distance, a tenth or so."""
+N_ITERATIONS = 12
+"""Steps along the z axis of a tilted frame to the ground; each leaves slope times tangent of
+the tilt of the error before."""
+STEEPEST = 0.1
+"""Cosine of the tilt from which on the z axis is taken to meet the ground."""
 
 
 @dataclass(frozen=True)
 class GroundModel:
-    """Ground height over range in each angular segment.
+    """Ground height over range in each angular segment, about the sensor's vertical.
 
     Attributes
     ----------
     knots : (K,) float64
         Horizontal ranges, near to far [m].
     height : (M, K) float64
-        Ground height at the knots of each segment, in the frame of the scan [m]; NaN
-        where there is no model. Segments go counter-clockwise from -x, those of a
-        tilted sensor (``Segmentation.pose``) about its own z axis.
+        Height of the ground over the sensor at the knots of each segment [m], so mostly
+        negative; NaN where there is no model. Segments go counter-clockwise from -x.
     std : (M, K) float64
         Its standard deviation [m]; NaN where there is no model.
     length_scale : (M, K) float64
         Over how far the ground is smooth there [m]; NaN in segments without a ground
         candidate of their own.
+    roll, pitch : float
+        Tilt of the frame of the scan: angles that make it level [rad].
     """
 
     knots: FloatArray
     height: FloatArray
     std: FloatArray
     length_scale: FloatArray
+    roll: float = 0.0
+    pitch: float = 0.0
 
     @classmethod
     def of(cls, segmentation: Segmentation) -> GroundModel:
         """Take the model out of a segmented scan."""
-        surface = segmentation.surface
+        surface, pose = segmentation.surface, segmentation.pose
         with np.errstate(over='ignore'):
             length_scale = np.exp(segmentation.log_length_scale)
-        model = cls(surface.knots, surface.mean, surface.std, length_scale)
-        pose = segmentation.pose
-        return model if pose.is_level else model._in_sensor_frame(pose)
-
-    def _in_sensor_frame(self, pose: SensorPose) -> GroundModel:
-        """Turn a model in the level frame into one over the sensor's own x and y."""
-        points = self.knot_points()
-        # Start on the plane that the level frame is level with: a few steps are enough.
-        up = pose.rotation[2]
-        z = np.full(self.height.shape, np.nan)
-        if abs(up[2]) >= LEAST_COSINE:
-            z = -(pose.height + points[..., 0] * up[0] + points[..., 1] * up[1]) / up[2]
-        for _ in range(SLOPE_STEPS):
-            points[..., 2] = z
-            level = pose.level(points.reshape(-1, 3)).reshape(points.shape)
-            height, std = self.at(level[..., 0], level[..., 1])
-            z = pose.ground_z(z, level[..., 2] - height)
-        return GroundModel(self.knots, z, std, self.length_scale)
+        return cls(surface.knots, surface.mean, surface.std, length_scale, pose.roll, pose.pitch)
 
     @property
     def azimuth(self) -> FloatArray:
@@ -73,19 +61,46 @@ class GroundModel:
         middle = (np.arange(n_segments) + 0.5) / n_segments
         return np.asarray(2.0 * np.pi * middle - np.pi, dtype=np.float64)
 
-    def knot_points(self) -> FloatArray:
-        """Place of every knot in the middle of its segment, (M, K, 3) [m].
+    @property
+    def is_level(self) -> bool:
+        """Whether z of the scan's frame is up."""
+        return self.roll == 0.0 and self.pitch == 0.0
 
-        x and y are always finite; z is NaN where there is no model.
+    def knot_points(self, n_std: float = 0.0) -> FloatArray:
+        """Place of every knot in the middle of its segment, frame of the scan, (M, K, 3) [m].
+
+        NaN where there is no model.
+
+        Parameters
+        ----------
+        n_std : float
+            Standard deviations above the ground, upright.
         """
         azimuth = self.azimuth[:, None]
-        return np.stack(
-            [self.knots * np.cos(azimuth), self.knots * np.sin(azimuth), self.height], axis=-1
+        height = self.height + n_std * self.std
+        known = np.isfinite(height)
+        level = np.stack(
+            [
+                np.where(known, self.knots * np.cos(azimuth), np.nan),
+                np.where(known, self.knots * np.sin(azimuth), np.nan),
+                height,
+            ],
+            axis=-1,
         )
+        if self.is_level:
+            return level
+        points: FloatArray = level @ rotation(self.roll, self.pitch)
+        return points
 
     @classmethod
     def from_knot_points(
-        cls, points: FloatArray, std: FloatArray, length_scale: FloatArray
+        cls,
+        points: FloatArray,
+        knots: FloatArray,
+        std: FloatArray,
+        length_scale: FloatArray,
+        roll: float,
+        pitch: float,
     ) -> GroundModel:
         """Model from what `knot_points` gave, rounded or not.
 
@@ -93,14 +108,14 @@ class GroundModel:
         ----------
         points : (M, K, 3) float array
             Knots of all segments [m].
-        std, length_scale : (M, K) float array
+        knots, std, length_scale, roll, pitch
             As in the attributes.
 
         Raises
         ------
         PointCloudError
-            If the knots of the segments do not lie on common circles, near to far,
-            in the middle of equal segments.
+            If the knots of the segments do not lie at their ranges in the middle of
+            equal segments.
         """
         n_segments, n_knots = points.shape[:2]
         if n_segments < 1 or n_knots < 2:
@@ -108,18 +123,21 @@ class GroundModel:
                 f'ground model of {n_segments} segments and {n_knots} knots: '
                 'must have at least 1 segment and 2 knots'
             )
-        points = points.astype(np.float64)
-        ranges = np.hypot(points[..., 0], points[..., 1])
-        knots: FloatArray = np.median(ranges, axis=0)
+        with np.errstate(invalid='ignore'):
+            level = points.astype(np.float64) @ rotation(roll, pitch).T
         model = cls(
-            knots,
-            points[..., 2],
+            knots.astype(np.float64),
+            level[..., 2],
             np.asarray(std, dtype=np.float64),
             np.asarray(length_scale, dtype=np.float64),
+            roll,
+            pitch,
         )
-        strays = np.abs(points[..., :2] - model.knot_points()[..., :2])
-        # Not below: NaN is no circle either.
-        if not (np.all(np.diff(knots) > 0.0) and np.all(strays <= 1e-6 * (1.0 + knots[:, None]))):
+        with np.errstate(invalid='ignore'):
+            strays = np.abs(points - model.knot_points()).max(axis=-1)
+        # Not above: where x and y are NaN and z is not, so is the distance.
+        near = (strays <= 1e-5 * (1.0 + model.knots)) | np.isnan(level[..., 2])
+        if not (np.all(np.diff(model.knots) > 0.0) and near.all()):
             raise PointCloudError(
                 'ground model: points are no grid of segments and ranges about the sensor; '
                 'was the cloud transformed or filtered?'
@@ -127,11 +145,12 @@ class GroundModel:
         return model
 
     def at(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Ground height and its standard deviation at any place.
+        """Height of the ground along the z axis, and its standard deviation, at any place.
 
         Linear in range between the knots of the segment that the place lies in; nearer
         than the first knot it is the first knot's. The same rule gives
-        ``Segmentation.ground_z`` and ``ground_std``.
+        ``Segmentation.ground_z`` and ``ground_std``. In a tilted frame this is where the
+        line through the place along z meets the ground, on any slope.
 
         Parameters
         ----------
@@ -141,10 +160,30 @@ class GroundModel:
         Returns
         -------
         height, std : float64 arrays of the broadcast shape
-            [m]; NaN beyond the last knot, where there is no model, and for places that
-            are not finite.
+            z in the frame of the scan, and the (upright) standard deviation [m]; NaN beyond
+            the last knot, where there is no model, and for places that are not finite.
         """
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+        if self.is_level:
+            return self._over_level(x, y)
+        matrix = rotation(self.roll, self.pitch)
+        if abs(matrix[2, 2]) < STEEPEST:
+            nothing = np.full(x.shape, np.nan)
+            return nothing, nothing.copy()
+        finite = np.isfinite(x) & np.isfinite(y)
+        x, y = np.where(finite, x, np.nan), np.where(finite, y, np.nan)
+        known = self.height[np.isfinite(self.height)]
+        start = float(np.median(known)) if len(known) else 0.0
+        z = (start - matrix[2, 0] * x - matrix[2, 1] * y) / matrix[2, 2]
+        std = np.full(x.shape, np.nan)
+        for _ in range(N_ITERATIONS):
+            level = np.stack([x, y, z], axis=-1) @ matrix.T
+            height, std = self._over_level(level[..., 0], level[..., 1])
+            z = z + (height - level[..., 2]) / matrix[2, 2]
+        return z, std
+
+    def _over_level(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Height and standard deviation at places of the level frame."""
         finite = np.isfinite(x) & np.isfinite(y)
         x, y = np.where(finite, x, 0.0), np.where(finite, y, 0.0)
         n_segments, n_knots = self.height.shape
@@ -157,9 +196,10 @@ class GroundModel:
         known = finite & (r < self.knots[-1])
         height, std = (
             np.where(
-                known, table[segment, left] * (1.0 - weight) + table[segment, left + 1] * weight,
+                known,
+                table[segment, left] * (1.0 - weight) + table[segment, left + 1] * weight,
                 np.nan,
             )
             for table in (self.height, self.std)
-        )  # fmt: skip
+        )
         return height, std

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numbers
+import re
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -35,7 +36,7 @@ class ParameterSpec:
     minimum, maximum : float or None
         Inclusive bounds of a number; ``None`` for other types.
     choices : tuple of str
-        Accepted values of a string; empty for other types.
+        Accepted values of a string; empty for other types, and for names of the user's.
     auto : bool
         Whether a number may also be `AUTO`.
     """
@@ -58,10 +59,16 @@ class ParameterSpec:
             return 'one of ' + ', '.join(self.choices)
         if self.type is bool:
             return 'true or false'
+        if self.type is str:
+            return 'a name'
         unit = f' {self.unit}' if self.unit else ''
         kind = 'an integer' if self.type is int else 'a number'
         auto = f'{AUTO} or ' if self.auto else ''
         return f'{auto}{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
+
+    def _is_name(self, value: str) -> bool:
+        """Whether any name is accepted, and `value` is one: letters, digits and ``_-./``."""
+        return not self.choices and re.fullmatch(r'[\w\-./]+', value, re.ASCII) is not None
 
     def check(self, value: object) -> ParameterValue:
         """Return `value` in the declared type.
@@ -77,7 +84,7 @@ class ParameterSpec:
             if isinstance(value, bool):
                 return value
         elif self.type is str:
-            if isinstance(value, str) and value in self.choices:
+            if isinstance(value, str) and (value in self.choices or self._is_name(value)):
                 return value
         elif isinstance(value, numbers.Real) and not isinstance(value, bool):
             assert self.minimum is not None

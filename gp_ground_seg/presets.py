@@ -87,20 +87,11 @@ _PRESETS = (
             Override('learning.scope', 'frame', 'one theta for the whole frame, section III-E'),
         ),
     ),
-    Preset(
-        'hdl64',
-        'Velodyne HDL-64E on the roof of a car.',
-        (
-            Override(
-                'sensor.height', 1.73, "mount of KITTI's car; the defaults are for this sensor"
-            ),
-        ),
-    ),
+    Preset('hdl64', 'Velodyne HDL-64E on the roof of a car; the defaults are for this sensor.'),
     Preset(
         'hdl32',
         'Velodyne HDL-32E on the roof of a car.',
         (
-            Override('sensor.height', 1.84, "mount of nuScenes' car; set yours"),
             Override('grid.r_max', 100.0, "the maker's range"),
             Override(
                 'growth.seed_height_tolerance', 0.6, _FIRST_RING.format('3.1', '10 %', '0.38')
@@ -111,7 +102,6 @@ _PRESETS = (
         'vlp16',
         'Velodyne VLP-16 on a field robot.',
         (
-            Override('sensor.height', 0.8, 'a field robot; set yours'),
             Override(
                 'grid.n_segments',
                 120,
@@ -128,7 +118,6 @@ _PRESETS = (
         'os1_128',
         'Ouster OS1-128 on the roof of a car.',
         (
-            Override('sensor.height', 1.8, 'the roof of a car; set yours'),
             Override('grid.r_max', 120.0, "the maker's range; 128 beams hit the ground that far"),
             Override(
                 'growth.seed_height_tolerance', 0.6, _FIRST_RING.format('4.3', '8 %', '0.43')
@@ -139,7 +128,6 @@ _PRESETS = (
         'mid360',
         'Livox Mid-360 on a small robot.',
         (
-            Override('sensor.height', 0.5, 'a small robot; set yours'),
             Override(
                 'grid.n_segments', 120, '20 000 points a scan, most of them above the ground'
             ),

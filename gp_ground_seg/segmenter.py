@@ -73,13 +73,18 @@ class GroundSegmenter:
         """End the worker threads; the segmenter is of no use afterwards."""
         self._backend.close()
 
-    def segment(self, points: npt.ArrayLike) -> Segmentation:
+    def segment(
+        self, points: npt.ArrayLike, tilt: tuple[float, float] | None = None
+    ) -> Segmentation:
         """Label every point of a scan.
 
         Parameters
         ----------
         points : (N, >=3) float array
             x forward, y left, z up in the sensor frame [m]; never written to.
+        tilt : tuple of float, optional
+            Roll and pitch of the sensor in this scan [rad], instead of ``sensor.roll``
+            and ``sensor.pitch``.
 
         Raises
         ------
@@ -87,16 +92,19 @@ class GroundSegmenter:
             If the array has another shape or type, or z clearly does not point up.
         """
         config = self._config
+        sensor = config.sensor
+        if tilt is not None:
+            sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
         timer = StageTimer(self._clock)
         own_xyz, finite = check_points(points)
-        given = given_pose(config.sensor)
+        given = given_pose(sensor)
         xyz = given.level(own_xyz)
         grid, candidates = self._candidates(xyz, finite)
         timer.mark('grid')
 
         pose = estimate_pose(
             candidates,
-            config.sensor,
+            sensor,
             self._backend.name == 'numba',
             lambda turn: self._candidates(*turned_sample(xyz, finite, turn))[1],
         )

@@ -12,6 +12,8 @@ def accepted_values(spec):
     """Strategy of all values a parameter accepts on its own."""
     if spec.choices:
         return st.sampled_from(spec.choices)
+    if spec.type is str:
+        return st.from_regex(r'[A-Za-z0-9_./-]{1,20}', fullmatch=True)
     if spec.type is bool:
         return st.booleans()
     if spec.type is int:

@@ -58,7 +58,7 @@ def test_declarations_are_complete(spec):
         assert spec.minimum < spec.maximum
         assert spec.choices == ()
     elif spec.type is str:
-        assert spec.choices
+        assert spec.choices or spec.name == 'frame.base'
     default = spec.check(spec.default)
     assert default == spec.default
     assert type(default) is spec.type or (spec.auto and default == 'auto')
@@ -133,7 +133,16 @@ def test_groups_given_whole_are_checked_and_converted():
         Config(label=dataclasses.replace(groups['label'], ground_tolerance='wide'))
 
 
-@pytest.mark.parametrize('spec', STRINGS, ids=by_name)
+@pytest.mark.parametrize('value', ['', 'two words', 'ümlaut', 'a\n', 1, True, None])
+def test_a_name_is_letters_and_digits(value):
+    spec = find_spec('frame.base')
+    with pytest.raises(ConfigError, match='must be a name'):
+        spec.check(value)
+    for name in ('base_link', 'robot_1/base.link-2', '7'):
+        assert spec.check(name) == name
+
+
+@pytest.mark.parametrize('spec', [s for s in STRINGS if s.choices], ids=by_name)
 @pytest.mark.parametrize('value', ['', 'nonsense', 1, True, None])
 def test_strings_accept_their_choices_only(spec, value):
     with pytest.raises(ConfigError, match='one of ' + ', '.join(spec.choices)):

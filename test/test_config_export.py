@@ -77,6 +77,8 @@ def test_every_parameter_is_explained_above_it():
             assert spec.symbol in words
             if spec.type is bool:
                 expected = ('true or false',)
+            elif spec.type is str and not spec.choices:
+                expected = ('[a name]',)
             else:
                 expected = spec.choices or (f'{spec.minimum:.10g} to {spec.maximum:.10g}',)
             assert all(choice in words for choice in expected)

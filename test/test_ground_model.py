@@ -1,5 +1,8 @@
 """The ground model by itself against the segmentation it came from."""
 
+import dataclasses
+from contextlib import closing
+
 import numpy as np
 import pytest
 from conftest import hilly_scan
@@ -10,6 +13,7 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.length_scale_colours import UNKNOWN, length_scale_colours
+from gp_ground_seg.tilt import rotation
 
 # No neighbours, so that segments without a model stay without one; r_min of 0 is the hard case.
 CONFIGS = [
@@ -41,8 +45,11 @@ def rounded(model):
     """The model as it arrives over the network: knots in single precision."""
     return GroundModel.from_knot_points(
         model.knot_points().astype(np.float32),
+        model.knots.astype(np.float32),
         model.std.astype(np.float32),
         model.length_scale.astype(np.float32),
+        float(np.float32(model.roll)),
+        float(np.float32(model.pitch)),
     )
 
 
@@ -69,15 +76,59 @@ def test_knots_are_exact(segmented):
     model = rounded(GroundModel.of(found))
     # All directions meet at a range of 0, and beyond the last knot there is nothing.
     inner = slice(int(model.knots[0] == 0.0), -1)
-    places = model.knot_points()[:, inner]
-    height, std = model.at(places[..., 0], places[..., 1])
-    np.testing.assert_allclose(height, places[..., 2], rtol=0, atol=1e-9)
+    azimuth = model.azimuth[:, None]
+    x, y = model.knots[inner] * np.cos(azimuth), model.knots[inner] * np.sin(azimuth)
+    height, std = model.at(x, y)
+    np.testing.assert_allclose(height, model.height[:, inner], rtol=0, atol=1e-9)
     np.testing.assert_allclose(std, model.std[:, inner], rtol=0, atol=1e-9)
     # The values themselves are those of the surface, to single precision.
-    np.testing.assert_array_equal(
-        np.float32(found.surface.mean[:, inner]), np.float32(places[..., 2])
-    )
+    np.testing.assert_array_equal(np.float32(found.surface.mean), np.float32(model.height))
     np.testing.assert_array_equal(np.isnan(model.length_scale), np.isnan(found.log_length_scale))
+
+
+@pytest.mark.parametrize('tilt', [(0.3, -0.2), (-0.05, 0.5), (3.0, 0.1)])
+def test_in_a_tilted_frame_heights_are_on_the_surface(tilt):
+    points = half_scan()
+    turn = rotation(*tilt)
+    with closing(GroundSegmenter(CONFIGS[0])) as segmenter:
+        level = GroundModel.of(segmenter.segment(points, (0.0, 0.0)))
+        found = segmenter.segment(points @ turn, tilt)
+    model = GroundModel.of(found)
+    assert (model.roll, model.pitch) == tilt
+    places = (points @ turn)[:, :2]
+    height, std = model.at(*places.T)
+    known = np.isfinite(height)
+    assert known.sum() > 1000
+    assert np.isfinite(std[known]).all()
+    back = np.column_stack([places, height]) @ turn.T
+    expected, _ = model._over_level(back[:, 0], back[:, 1])
+    # A place beside the edge of a segment may go back and forth between two surfaces.
+    off = np.abs(back[:, 2] - expected)[known]
+    assert np.quantile(off, 0.99) < 1e-6
+    assert np.nanmax(off) < 0.5
+    # It is the surface that the same scan gives when it comes level.
+    np.testing.assert_allclose(model.height, level.height, atol=0.02)
+    # Over the network nothing is lost.
+    again, _ = rounded(model).at(*places.T)
+    close = np.abs(again - height)[known]
+    assert np.quantile(close[np.isfinite(close)], 0.99) < 1e-4
+
+
+def test_along_a_level_axis_there_is_no_height():
+    model = dataclasses.replace(
+        GroundModel(
+            np.array([1.0, 2.0]), np.full((8, 2), -1.0), np.full((8, 2), 0.1), np.ones((8, 2))
+        ),
+        roll=np.pi / 2,
+    )
+    assert np.isnan(model.at([1.0, 2.0], 0.0)).all()
+    # The knots are where they are all the same.
+    points = model.knot_points()
+    np.testing.assert_allclose(points[..., 1], -1.0, atol=1e-12)
+    again = GroundModel.from_knot_points(
+        points, model.knots, model.std, model.length_scale, model.roll, model.pitch
+    )
+    np.testing.assert_allclose(again.height, model.height)
 
 
 @settings(max_examples=50)
@@ -110,12 +161,16 @@ def test_what_is_no_polar_grid_is_refused():
         np.array([1.0, 2.0, 4.0]), np.full((8, 3), -1.0), np.full((8, 3), 0.1), np.ones((8, 3))
     )
     points = model.knot_points()
-    for broken in (points + 0.01, points[:, ::-1], np.full_like(points, np.nan), points[:4]):
+    rest = model.std, model.length_scale, 0.0, 0.0
+    for broken in (points + 0.01, points[:, ::-1], points[::-1], points * [1.0, 1.0, np.inf]):
         with pytest.raises(PointCloudError, match='transformed or filtered'):
-            GroundModel.from_knot_points(broken, model.std[:4], model.length_scale[:4])
+            GroundModel.from_knot_points(broken, model.knots, *rest)
+    for knots in (model.knots[::-1], model.knots * np.nan, model.knots * 1.01):
+        with pytest.raises(PointCloudError, match='transformed or filtered'):
+            GroundModel.from_knot_points(points, knots, *rest)
     for small in (points[:0], points[:, :1]):
         with pytest.raises(PointCloudError, match='at least 1 segment and 2 knots'):
-            GroundModel.from_knot_points(small, small[..., 0], small[..., 0])
+            GroundModel.from_knot_points(small, model.knots[:1], *rest)
 
 
 # Brettel-style full loss of one cone, as linear maps in linear RGB (Machado et al. 2009).

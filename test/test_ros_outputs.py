@@ -166,13 +166,16 @@ def test_ground_model_gives_the_height_anywhere(shared_bench):
     assert found.header == message.header
     assert (found.height, found.width) == (CONFIG.grid.n_segments, CONFIG.grid.n_bins + 1)
     assert [(f.name, f.datatype, f.count) for f in found.fields] == [
-        (name, PointField.FLOAT32, 1) for name in ('x', 'y', 'z', 'std', 'length_scale')
+        (name, PointField.FLOAT32, 1)
+        for name in ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
     ]
     expected = GroundSegmenter(CONFIG).segment(xyz_of(points))
     height, std = read_ground_model(found).at(points['x'], points['y'])
     np.testing.assert_allclose(height, expected.ground_z, rtol=0, atol=1e-4)
     np.testing.assert_allclose(std, expected.ground_std, rtol=0, atol=1e-4)
-    assert np.isfinite(columns_of(found, 'x')['x']).all()
+    columns = columns_of(found, 'range', 'roll', 'pitch')
+    assert np.isfinite(columns['range']).all()
+    assert not columns['roll'].any()
 
 
 def test_markers_draw_profiles_and_band(shared_bench):

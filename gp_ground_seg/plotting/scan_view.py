@@ -148,11 +148,9 @@ def _draw_profiles(axes: Any, model: GroundModel, config: Config, camera: Camera
     rows = np.unique(np.linspace(0, n_segments - 1, min(n_segments, N_PROFILES)).round()).astype(
         int
     )
-    points, std = model.knot_points()[rows], model.std[rows]
-    spread = np.zeros_like(points)
-    spread[..., 2] = N_STD * std
+    std = model.std[rows]
     middle, lower, upper = (
-        camera.project(knots)[0] for knots in (points, points - spread, points + spread)
+        camera.project(model.knot_points(n_std)[rows])[0] for n_std in (0.0, -N_STD, N_STD)
     )
     seen = (std <= config.label.ground_tolerance) & np.isfinite(upper + lower + middle).all(
         axis=-1

@@ -16,18 +16,21 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.datasets.cloud_columns import read_columns
+from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.segmentation import Segmentation
 
-FIELDS = ('x', 'y', 'z', 'std', 'length_scale')
-"""Fields of the cloud, all float32 [m]."""
+FIELDS = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
+"""Fields of the cloud, all float32 [m, rad]. The last three are what it takes to find a place in
+the grid: the horizontal range of the knot in the level frame, and the same angles in each
+point, which turn the cloud's frame into the level one."""
 
 
 def ground_model_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud2:
     """Surface of a segmented `cloud` as an organised cloud with the header of `cloud`.
 
-    Row m is segment m, counter-clockwise from -x; column k is the k-th range. x and y
-    are always finite; z and std are NaN where there is no model, length_scale in
+    Row m is segment m, counter-clockwise from -x of the level frame; column k is the k-th
+    range. The coordinates and std are NaN where there is no model, length_scale in
     segments without a ground candidate of their own.
     """
     model = GroundModel.of(segmentation)
@@ -37,6 +40,8 @@ def ground_model_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointC
         points[..., :3] = model.knot_points()
         points[..., 3] = model.std
         points[..., 4] = model.length_scale
+        points[..., 5] = model.knots
+        points[..., 6:] = model.roll, model.pitch
     data = array('B')
     data.frombytes(points.tobytes())
     message = PointCloud2(
@@ -79,5 +84,13 @@ def read_ground_model(cloud: PointCloud2) -> GroundModel:
         cloud.data,
         FIELDS,
     )
-    points = np.stack([columns[axis] for axis in 'xyz'], axis=-1)
-    return GroundModel.from_knot_points(points, columns['std'], columns['length_scale'])
+    if columns['x'].size == 0:
+        raise PointCloudError('ground model of no points: must have at least 1 segment')
+    return GroundModel.from_knot_points(
+        np.stack([columns[axis] for axis in 'xyz'], axis=-1),
+        columns['range'][0],
+        columns['std'],
+        columns['length_scale'],
+        float(columns['roll'][0, 0]),
+        float(columns['pitch'][0, 0]),
+    )

@@ -41,8 +41,6 @@ def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> M
     grid = np.ix_(rows, columns)
     points, std = model.knot_points()[grid], model.std[grid]
     known = np.isfinite(points).all(axis=-1) & (std <= config.label.ground_tolerance)
-    spread = np.zeros_like(points)
-    spread[..., 2] = N_STD * np.where(known, std, 0.0)
     colours = length_scale_colours(
         model.length_scale[grid], config.length_scale.min, config.length_scale.max
     )
@@ -61,7 +59,8 @@ def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> M
     band.color = ColorRGBA(**dict(zip('rgba', BAND_COLOUR, strict=True)))
     upper = points.size // 3
     corners = [left, left + 1, left + upper, left + 1, left + 1 + upper, left + upper]
-    both = np.concatenate([(points - spread).reshape(-1, 3), (points + spread).reshape(-1, 3)])
+    edges = [model.knot_points(sign * N_STD)[grid].reshape(-1, 3) for sign in (-1.0, 1.0)]
+    both = np.concatenate(edges)
     _fill(band, both, np.stack(corners, axis=-1).ravel())
     return MarkerArray(markers=[profiles, band])
 

@@ -28,6 +28,7 @@ from gp_ground_seg.ros.point_cloud2 import read_xyz
 from gp_ground_seg.ros.qos import in_words
 from gp_ground_seg.ros.signals import stop_on_signals
 from gp_ground_seg.ros.startup import initialize, start_errors
+from gp_ground_seg.ros.tf_tilt import TfTilt, require_tf2
 from gp_ground_seg.ros.time_jumps import TimeJumps
 from gp_ground_seg.ros.transport import large_cloud_transport
 from gp_ground_seg.ros.warm_up import warm_up
@@ -68,6 +69,7 @@ class GroundSegmentationNode(ConfiguredNode):
         super().__init__(NODE_NAME, **options)
         self._library_log = LibraryLog(self.get_logger())
         self._segmenter = GroundSegmenter(self.config)
+        self._tf: TfTilt | None = None
         # For throttled messages; the default system clock may jump.
         self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         try:
@@ -84,6 +86,7 @@ class GroundSegmentationNode(ConfiguredNode):
         logger.info(f'ready to segment after {warm_up(self._segmenter):.1f} s')
         # Only now: a cloud that came earlier would have waited for the compiler.
         self._health = Health(time.monotonic())
+        self._follow_tf(self.config)
         self._time_jumps = TimeJumps(self, self._on_time_jump)
         with start_errors():
             self._input = CloudSubscription(self, INPUT_TOPIC, self.is_given, self._on_cloud)
@@ -94,13 +97,30 @@ class GroundSegmentationNode(ConfiguredNode):
         logger.info(f'listening to {self._input.topic} ({in_words(self._input.qos)})')
 
     def check_config(self, config: Config) -> None:
-        """Raise a GroundSegError if the backend asked for is not installed."""
+        """Raise a GroundSegError if the backend or TF is asked for and not installed."""
         choose_backend(config.runtime.backend)
+        if config.frame.level == 'tf':
+            require_tf2()
 
     def apply_config(self, config: Config) -> None:
         """Use `config` from the next cloud on."""
         self._segmenter.configure(config)
+        self._follow_tf(config)
         self._diagnostics.set_period(config.diagnostics.period)
+
+    def _follow_tf(self, config: Config) -> None:
+        """Listen to TF while the parameters ask for it."""
+        if config.frame.level == 'tf' and self._tf is None:
+            self._tf = TfTilt(self)
+        elif config.frame.level != 'tf' and self._tf is not None:
+            self._tf.close()
+            self._tf = None
+
+    def _tilt(self, cloud: PointCloud2) -> tuple[float, float] | None:
+        """Roll and pitch of the frame of `cloud` by TF; None where they are parameters."""
+        if self._tf is None:
+            return None
+        return self._tf.tilt(cloud.header.frame_id, cloud.header.stamp, self.config.frame.base)
 
     def destroy_node(self) -> None:
         """Free what the node holds, the worker threads too."""
@@ -117,7 +137,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._health.input.arrived(start, stamp, cloud.header.frame_id, fields)
         self._health.processing.arrived(start, arrival.n_lost)
         try:
-            segmentation = self._segmenter.segment(read_xyz(cloud))
+            segmentation = self._segmenter.segment(read_xyz(cloud), self._tilt(cloud))
             segmented = time.monotonic()
             topics = self._outputs.publish(cloud, segmentation, self.config)
         except PointCloudError as error:
@@ -144,6 +164,8 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _on_time_jump(self) -> None:
         self._segmenter.reset()
+        if self._tf is not None:
+            self._tf.reset()
         self._health.input.time_jumped()
 
     def _refuse(self, cloud: PointCloud2, reason: str) -> None:
