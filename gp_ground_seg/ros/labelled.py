@@ -13,8 +13,8 @@ from gp_ground_seg.datasets.cloud_columns import append_columns
 from gp_ground_seg.ros.point_cloud2 import read_xyz
 from gp_ground_seg.segmentation import Segmentation
 
-FIELDS = ('label', 'height', 'ground_z', 'ground_std')
-"""Fields that are added: uint8 `Label`, then float32 [m]."""
+FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'p_ground')
+"""Fields that are added: uint8 `Label`, then float32, [m] but for the probability."""
 PREFIX = 'gp_'
 
 
