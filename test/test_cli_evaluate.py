@@ -101,7 +101,7 @@ def test_without_a_peer_nothing_of_it_is_shown(root, capsys):
 
 def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
     settings = ['label.ground_tolerance=0.011', 'sensor.height=1.7', 'growth.seed_range=19.5']
-    settings += ['runtime.n_threads=1', 'lines.max_gap=1.25', 'observation.sigma_n=0.03']
+    settings += ['runtime.n_threads=1', 'lines.max_gap=1.25', 'grid.r_max=15.0']
     run(root, '--json', tmp_path / 'a.json')
     run(root, '--json', tmp_path / 'b.json', *(f'--set={setting}' for setting in settings))
     a, b = (json.loads((tmp_path / f'{name}.json').read_text()) for name in 'ab')

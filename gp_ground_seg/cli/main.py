@@ -32,6 +32,7 @@ COMMANDS = {
     'plot-segment': 'draw one segment from the side',
     'plot-scan': 'draw a scan in perspective, with the ground model on it',
     'ablation': 'compare length-scale models and ways to learn',
+    'scenes': 'score on simulated scenes, flat and rough, beside Patchwork++',
     'kitti-to-bag': 'write a KITTI sequence as a rosbag2',
     'play': "publish a bag's clouds as they were recorded",
     'demo': 'see it work, no data needed',
@@ -51,6 +52,7 @@ examples:
   gp-ground-seg plot-scan --simulate urban -o scan.png
   gp-ground-seg table1 --kitti KITTI_ROOT        the paper's Table I
   gp-ground-seg ablation KITTI_ROOT              what the model and the learning are worth
+  gp-ground-seg scenes                           simulated scenes, beside Patchwork++
   gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 00 drive.mcap
   gp-ground-seg play drive.mcap --clock
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud

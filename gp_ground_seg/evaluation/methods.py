@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import KDTree
 
 from gp_ground_seg.config import Config
 from gp_ground_seg.errors import MissingDependencyError
@@ -75,18 +76,25 @@ class OurMethod:
         """Labels of the scan last run."""
         return self._result.label
 
-    def p_ground(self) -> npt.NDArray[np.floating] | None:
+    def p_ground(self) -> npt.NDArray[np.float32]:
         """Probability of ground of each point of the scan last run."""
-        p_ground: npt.NDArray[np.floating] | None = getattr(self._result, 'p_ground', None)
-        return p_ground
+        return self._result.p_ground
 
     def stages(self) -> dict[str, float]:
         """Seconds by stage of the scan last run."""
         return {stage: s for stage, s in self._result.timings.items() if stage != 'total'}
 
     def facts(self) -> dict[str, float | str]:
-        """How the learning ended, and how many segments have a ground model."""
-        return {'status': self.fit.status, 'n_segments': float(self.fit.n_segments)}
+        """How the learning ended, segments with a ground model, the sensor's pose [m, rad]."""
+        pose = self._result.pose
+        return {
+            'status': self.fit.status,
+            'n_segments': float(self.fit.n_segments),
+            'sensor_height': pose.height,
+            'sensor_height_estimated': 'yes' if pose.height_estimated else 'no',
+            'sensor_roll': pose.roll,
+            'sensor_pitch': pose.pitch,
+        }
 
     @property
     def fit(self) -> FitReport:
@@ -106,6 +114,11 @@ class PatchworkppMethod:
     Only its estimation is timed, not the fetching of the indices. Its adaptive
     thresholds are learnt over a sequence, so each sequence gets a new one.
 
+    Parameters
+    ----------
+    sensor_height : float, optional
+        Height of the sensor [m]; its published one, that of KITTI, by default.
+
     Raises
     ------
     MissingDependencyError
@@ -114,7 +127,7 @@ class PatchworkppMethod:
 
     name = PATCHWORKPP
 
-    def __init__(self) -> None:
+    def __init__(self, sensor_height: float | None = None) -> None:
         try:
             import pypatchworkpp
         except ImportError as error:
@@ -122,12 +135,17 @@ class PatchworkppMethod:
                 'the peer patchworkpp needs pypatchworkpp: pip install pypatchworkpp'
             ) from error
         self._module = pypatchworkpp
+        self._sensor_height = sensor_height
         self.version = importlib.metadata.version('pypatchworkpp')
 
     def start_sequence(self) -> None:
         """Start with its default thresholds."""
         with _c_stdout_silenced():  # it greets on standard output, where our tables go
-            self._estimator = self._module.patchworkpp(self._module.Parameters())
+            parameters = self._module.Parameters()
+            if self._sensor_height is not None:
+                parameters.sensor_height = self._sensor_height
+            self._uprightness = float(parameters.uprightness_thr)
+            self._estimator = self._module.patchworkpp(parameters)
 
     def run(self, points: npt.NDArray[np.float32]) -> None:
         """Segment a scan."""
@@ -139,6 +157,35 @@ class PatchworkppMethod:
         label = np.full(self._n_points, Label.OBSTACLE, dtype=np.uint8)
         label[self._estimator.getGroundIndices()] = Label.GROUND
         return label
+
+    def ground_z(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """Height of its ground under points of the scan last run, as good as can be had.
+
+        It has no surface of its own, but a plane for each patch that it looks at: here
+        the plane of the nearest patch counts, of those it takes for upright.
+
+        Parameters
+        ----------
+        points : (n, >=2) float
+            Where to ask [m].
+
+        Returns
+        -------
+        (n,) float64
+            z in the sensor frame [m]; NaN if it found no plane.
+        """
+        centre = np.asarray(self._estimator.getCenters(), dtype=np.float64).reshape(-1, 3)
+        normal = np.asarray(self._estimator.getNormals(), dtype=np.float64).reshape(-1, 3)
+        upright = np.abs(normal[:, 2]) > self._uprightness
+        centre, normal = centre[upright], normal[upright]
+        if not len(centre):
+            return np.full(len(points), np.nan)
+        xy = points[:, :2].astype(np.float64)
+        _, nearest = KDTree(centre[:, :2]).query(xy)
+        centre, normal = centre[nearest], normal[nearest]
+        fall = np.sum((xy - centre[:, :2]) * normal[:, :2], axis=1) / normal[:, 2]
+        ground_z: npt.NDArray[np.float64] = centre[:, 2] - fall
+        return ground_z
 
     def p_ground(self) -> None:
         """Nothing: it decides without."""
