@@ -12,6 +12,9 @@ from gp_ground_seg.compiled import compiled
 from gp_ground_seg.low_cells import N_SECTORS, LowCells
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
+NEAR, ENOUGH_NEAR = 8.0, 12
+"""Range within which the ground tells the height, if it has so many cells [m]: kerbs and verges
+lift or lower the plane as a whole."""
 FAR = 10.0
 """Range that the ground reaches outdoors, and walls and ceilings of rooms seldom [m]."""
 MIN_HEIGHT, MAX_HEIGHT = 0.05, 20.0
@@ -39,6 +42,8 @@ class GroundPlane:
         How far below the sensor it is, along z [m].
     slope_x, slope_y : float
         Rise per metre.
+    near_height : float
+        The same as `height` for the parallel plane through the middle of the near cells [m].
     support : float
         Share of the cells that lie on it, in [0, 1].
     coverage : float
@@ -59,6 +64,7 @@ class GroundPlane:
     height: float
     slope_x: float
     slope_y: float
+    near_height: float
     support: float
     coverage: float
     far_coverage: float
@@ -121,11 +127,13 @@ def _describe(
     r = np.hypot(cells.x[on_it], cells.y[on_it])
     sector = cells.sector[on_it]
     depression = np.sort(np.arctan2(-cells.z[on_it], r))
+    near = np.sort(distance[on_it][r < NEAR])
     few, most = n_on_it // 10, (9 * n_on_it) // 10
     return GroundPlane(
         height=height,
         slope_x=slope_x,
         slope_y=slope_y,
+        near_height=height - (float(near[len(near) // 2]) if len(near) >= ENOUGH_NEAR else 0.0),
         support=n_on_it / len(distance),
         coverage=_n_different(sector) / N_SECTORS,
         far_coverage=_n_different(sector[r >= FAR]) / _n_different(cells.sector),

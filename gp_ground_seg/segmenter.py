@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.blas import single_threaded_blas
-from gp_ground_seg.config import Config
+from gp_ground_seg.config import Config, SensorConfig
 from gp_ground_seg.gp.backend import make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.growth import BoolArray
@@ -20,10 +21,21 @@ from gp_ground_seg.points import check_points
 from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid, ground_candidates
 from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
 from gp_ground_seg.segmentation import FitReport, Segmentation
-from gp_ground_seg.sensor_pose import estimate_pose, given_pose
+from gp_ground_seg.sensor_pose import SensorPose, estimate_pose, given_pose
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
 from gp_ground_seg.tilt import turned_sample
 from gp_ground_seg.timing import StageTimer
+
+
+@dataclass(frozen=True)
+class _PlacedScan:
+    """Points (N, 3) in the sensor frame and in the level frame, and what follows from them."""
+
+    own_xyz: FloatArray
+    level_xyz: FloatArray
+    grid: PolarGrid
+    candidates: Candidates
+    pose: SensorPose
 
 
 class GroundSegmenter:
@@ -96,23 +108,10 @@ class GroundSegmenter:
         if tilt is not None:
             sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
         timer = StageTimer(self._clock)
-        own_xyz, finite = check_points(points)
-        given = given_pose(sensor)
-        xyz = given.level(own_xyz)
-        grid, candidates = self._candidates(xyz, finite)
-        timer.mark('grid')
-
-        pose = estimate_pose(
-            candidates,
-            sensor,
-            self._backend.name == 'numba',
-            lambda turn: self._candidates(*turned_sample(xyz, finite, turn))[1],
-        )
-        if (pose.roll, pose.pitch) != (given.roll, given.pitch):
-            xyz = pose.level(own_xyz)
-            grid, candidates = self._candidates(xyz, finite)
+        placed = self._place(points, sensor, timer)
+        xyz, pose = placed.level_xyz, placed.pose
+        grid, candidates = placed.grid, placed.candidates
         z = np.ascontiguousarray(xyz[:, 2])
-        timer.mark('pose')
 
         lines = extract_lines(candidates, config.lines)
         pseudo = select_pseudo_inputs(candidates, lines, config)
@@ -139,7 +138,7 @@ class GroundSegmenter:
             xyz, height_over_ground, grid, faces, config.label, config.faces.tolerance
         )
         if not pose.is_level:
-            ground_z = pose.ground_z(own_xyz[:, 2], height_over_ground)
+            ground_z = pose.ground_z(placed.own_xyz[:, 2], height_over_ground)
         timer.mark('label')
 
         fit = FitReport.of(model, theta, learned, inlier, mean)
@@ -161,6 +160,35 @@ class GroundSegmenter:
             margin,
             roughness,
         )
+
+    def estimate_pose(self, points: npt.ArrayLike) -> SensorPose:
+        """Find out height and tilt of the sensor as `segment` does, and no more.
+
+        Parameters and errors are those of `segment`.
+        """
+        timer = StageTimer(self._clock)
+        return self._place(points, self._config.sensor, timer).pose
+
+    def _place(
+        self, points: npt.ArrayLike, sensor: SensorConfig, timer: StageTimer
+    ) -> _PlacedScan:
+        """Scan in the level frame, as given or as it seems to be."""
+        xyz, finite = check_points(points)
+        given = given_pose(sensor)
+        level_xyz = given.level(xyz)
+        grid, candidates = self._candidates(level_xyz, finite)
+        timer.mark('grid')
+        pose = estimate_pose(
+            candidates,
+            sensor,
+            self._backend.name == 'numba',
+            lambda turn: self._candidates(*turned_sample(level_xyz, finite, turn))[1],
+        )
+        if (pose.roll, pose.pitch) != (given.roll, given.pitch):
+            level_xyz = pose.level(xyz)
+            grid, candidates = self._candidates(level_xyz, finite)
+        timer.mark('pose')
+        return _PlacedScan(xyz, level_xyz, grid, candidates, pose)
 
     def _candidates(self, xyz: FloatArray, finite: BoolArray) -> tuple[PolarGrid, Candidates]:
         """Grid of points (N, 3) in a level frame, and the lowest point of each of its bins."""

@@ -190,7 +190,9 @@ def estimate_pose(
     if not corrects:
         roll, pitch = given.roll, given.pitch
     # Along the vertical of the pose used, not across the plane.
-    height = rounded(plane.height * float(plane.up[2]) / float((rotation(roll, pitch) @ up)[2]))
+    height = rounded(
+        plane.near_height * float(plane.up[2]) / float((rotation(roll, pitch) @ up)[2])
+    )
     own_roll, own_pitch = angles_of(up)
     measured = MeasuredPose(height, own_roll, own_pitch, tells_height, tells_tilt, plane)
     estimates_height = sensor.height == AUTO and tells_height

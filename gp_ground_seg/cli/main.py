@@ -27,6 +27,8 @@ ROS_ARGS = '--ros-args'
 COMMANDS = {
     'segment': 'label scans, or split the clouds of a bag',
     'evaluate': 'score against SemanticKITTI labels',
+    'pose': 'find out height and tilt of the sensor from scans',
+    'pose-check': 'measure what not knowing height and tilt of the sensor costs',
     'bench': 'time the segmentation by stage, beside Patchwork++',
     'table1': "the paper's Table I on real frames",
     'plot-segment': 'draw one segment from the side',
@@ -47,6 +49,7 @@ examples:
   gp-ground-seg segment scan.bin                 label one KITTI scan
   gp-ground-seg segment drive.mcap -o out.mcap   ground and obstacle clouds of a bag
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
+  gp-ground-seg pose scan.bin                    how high and how tilted is the sensor?
   gp-ground-seg bench KITTI_ROOT                 time per frame by stage, beside Patchwork++
   gp-ground-seg plot-segment scan.bin --azimuth 0 -o ahead.png
   gp-ground-seg plot-scan --simulate urban -o scan.png
