@@ -77,9 +77,8 @@ class GroundPlane:
     @property
     def up(self) -> FloatArray:
         """Unit normal that points to the sensor's side, (3,)."""
-        normal = np.array([-self.slope_x, -self.slope_y, 1.0])
-        unit: FloatArray = normal / np.linalg.norm(normal)
-        return unit
+        length = math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
+        return np.array([-self.slope_x / length, -self.slope_y / length, 1.0 / length])
 
 
 def find_plane(cells: LowCells, max_slope: float, use_compiled: bool) -> GroundPlane | None:

@@ -184,15 +184,15 @@ def estimate_pose(
         and plane.coverage >= MIN_COVERAGE
         and plane.reach >= MIN_REACH
     )
-    up = given.rotation.T @ plane.up
+    own_up = plane.up
+    up = own_up if given.is_level else given.rotation.T @ own_up
     roll, pitch = _levelled(up, sensor)
     corrects = tells_tilt and _angle(rotation(roll, pitch)[2], given.rotation[2]) >= CLEAR_TILT
+    # Along the vertical of the pose used, not across the plane.
+    along = float((rotation(roll, pitch) @ up)[2]) if corrects else float(own_up[2])
     if not corrects:
         roll, pitch = given.roll, given.pitch
-    # Along the vertical of the pose used, not across the plane.
-    height = rounded(
-        plane.near_height * float(plane.up[2]) / float((rotation(roll, pitch) @ up)[2])
-    )
+    height = rounded(plane.near_height * float(own_up[2]) / along)
     own_roll, own_pitch = angles_of(up)
     measured = MeasuredPose(height, own_roll, own_pitch, tells_height, tells_tilt, plane)
     estimates_height = sensor.height == AUTO and tells_height
@@ -218,7 +218,7 @@ def _levelled(up: FloatArray, sensor: SensorConfig) -> tuple[float, float]:
 
 
 def _angle(a: FloatArray, b: FloatArray) -> float:
-    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
+    return math.acos(min(max(float(a @ b), -1.0), 1.0))
 
 
 def _contradictions(sensor: SensorConfig, measured: MeasuredPose) -> tuple[str, ...]:

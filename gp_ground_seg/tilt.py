@@ -33,8 +33,12 @@ def _sine_cosine(angle: float) -> tuple[float, float]:
 
 def turned(xyz: FloatArray, matrix: FloatArray) -> FloatArray:
     """Points (N, 3) turned by a rotation (3, 3); finite ones stay finite."""
+    x, y, z = np.clip(xyz, -LARGEST, LARGEST).T
+    result = np.empty((len(xyz), 3))
     with np.errstate(invalid='ignore'):
-        result: FloatArray = np.clip(xyz, -LARGEST, LARGEST) @ matrix.T
+        # Not a matrix product: BLAS would wake its threads, which spin long after.
+        for i, (a, b, c) in enumerate(matrix.tolist()):
+            result[:, i] = a * x + b * y + c * z
     return result
 
 
