@@ -34,16 +34,16 @@ class SensorConfig:
         AUTO,
         'roll of the sensor, positive with its left side up; auto = none unless it is clear',
         unit='rad',
-        low=-3.1416,
-        high=3.1416,
+        low=-3.15,
+        high=3.15,
         auto=True,
     )
     pitch: float | Literal['auto'] = parameter(
         AUTO,
         'pitch of the sensor, positive with its nose down; auto = none unless it is clear',
         unit='rad',
-        low=-1.5708,
-        high=1.5708,
+        low=-1.58,
+        high=1.58,
         auto=True,
     )
 

@@ -118,7 +118,7 @@ def other_way_up(
         return None
     _, up, height = best
     up = given.T @ up
-    roll, pitch = angles_of(up)
+    roll, pitch = (round(angle, 3) + 0.0 for angle in angles_of(up))
     largest = int(np.argmax(np.abs(up)))
     axis = f'{"-" if up[largest] < 0.0 else ""}{"xyz"[largest]}'
     return (

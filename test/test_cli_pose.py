@@ -94,6 +94,18 @@ def test_a_scan_that_does_not_tell(tmp_path, capsys):
     assert 'set sensor.height' in capsys.readouterr().out
 
 
+def test_segment_names_the_scan_that_it_refuses(tmp_path, capsys):
+    write_scan(tmp_path / 'a.bin', 1.2, turn=(math.pi, 0.0))
+    words = ['segment', tmp_path / 'a.bin', '-o', tmp_path / 'a.label', '--quiet']
+    assert run(*words) == 2
+    said = error_line(capsys)
+    assert said.startswith(f'{tmp_path / "a.bin"}: z does not point up: ')
+    assert not (tmp_path / 'a.label').exists()
+    roll, pitch = (re.search(rf'sensor\.{n} to (\S+)', said)[1] for n in ('roll', 'pitch'))
+    assert run(*words, '--set', f'sensor.roll={roll}', '--set', f'sensor.pitch={pitch}') == 0
+    assert (tmp_path / 'a.label').exists()
+
+
 def test_input_that_is_not_there(tmp_path, capsys):
     assert run('pose', tmp_path / 'none.bin') == 2
     assert 'no such file' in error_line(capsys)

@@ -242,7 +242,7 @@ def test_second_run_needs_force(segment, tmp_path, capsys, name):
     assert segment(source, '-o', out, '--quiet') == 2
     assert 'out: exists already; --force replaces it' in cli_runner.error_line(capsys)
     assert {path: path.read_bytes() for path in out.iterdir()} == before
-    assert segment(source, '-o', out, '--force', '--set', 'label.ground_tolerance=0.01') == 0
+    assert segment(source, '-o', out, '--force', '--set', 'sensor.height=0.9') == 0
     after = {path: path.read_bytes() for path in out.iterdir()}
     assert after.keys() == before.keys()
     assert after != before

@@ -14,7 +14,7 @@ from gp_ground_seg.cli.output import SegmentationTally, note_leftovers, progress
 from gp_ground_seg.config import Config
 from gp_ground_seg.datasets.semantic_kitti import read_points
 from gp_ground_seg.datasets.staging import staged_file, staged_files
-from gp_ground_seg.errors import DataError
+from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.labels import Label
 from gp_ground_seg.segmenter import GroundSegmenter
 
@@ -73,7 +73,10 @@ def segment_scans(
         progress_bar(len(scans), quiet=arguments.quiet, title='segment') as bar,
     ):
         for scan, label_path in zip(scans, label_paths, strict=True):
-            result = segmenter.segment(read_points(scan))
+            try:
+                result = segmenter.segment(read_points(scan))
+            except PointCloudError as error:
+                raise PointCloudError(f'{scan}: {error}') from error
             _write_labels(label_path, code[result.label])
             tally.add(result)
             bar.update()
