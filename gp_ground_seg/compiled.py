@@ -26,9 +26,22 @@ _dispatchers: list[Any] = []
 
 def compiled(function: _Function) -> _Function:
     """Compile `function` where numba is installed; the code is kept on disk if possible."""
+    return _compile(function, frozenset())
+
+
+def compiled_vectors(function: _Function) -> _Function:
+    """Compile like `compiled`, and let sums be taken in any order.
+
+    Sums then use vector instructions. The order is fixed by the compiler, not by the
+    number of threads; NaN and infinity keep their meaning.
+    """
+    return _compile(function, frozenset({'reassoc', 'contract', 'nsz'}))
+
+
+def _compile(function: _Function, fastmath: frozenset[str]) -> _Function:
     if numba is None or numba.config.DISABLE_JIT:
         return function
-    result = numba.njit(nogil=True, error_model='numpy')(function)
+    result = numba.njit(nogil=True, error_model='numpy', fastmath=set(fastmath))(function)
     try:
         from gp_ground_seg.compile_cache import KeptCode
 

@@ -12,9 +12,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.compiled import compiled
+from gp_ground_seg.compiled import compiled_vectors
 from gp_ground_seg.config import GrowthConfig
-from gp_ground_seg.gp.kernels import NEGLIGIBLE_EXPONENT
+from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.observation import posterior
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
@@ -117,7 +117,7 @@ def grow_surface_reference(
     return inlier, mean, std
 
 
-@compiled
+@compiled_vectors
 def grow_surface_compiled(
     start: int,
     stop: int,
@@ -159,6 +159,7 @@ def grow_surface_compiled(
         all_r[n:] = knots
         all_l[:n] = length_scale[first : first + n]
         all_l[n:] = knot_length_scale[m]
+        square = all_l * all_l
         whitened = np.empty((n, n + n_knots))
         height = np.zeros(n + n_knots)
         variance = sigma_f[m] ** 2 + slope_std**2 * all_r**2
@@ -170,24 +171,37 @@ def grow_surface_compiled(
                     continue
                 inlier[first + i] = True
                 row = whitened[n_inliers]
+                own_r, own_l, own_square = all_r[i], all_l[i], square[i]
+                tilt = slope_std**2 * own_r
                 for j in range(n + n_knots):
-                    spread = all_l[i] ** 2 + all_l[j] ** 2
-                    distance = all_r[i] - all_r[j]
-                    row[j] = slope_std**2 * all_r[i] * all_r[j]
-                    exponent = distance * distance / spread
-                    if exponent < NEGLIGIBLE_EXPONENT:
-                        root = math.sqrt(2.0 * all_l[i] * all_l[j] / spread)
-                        row[j] += sigma_f[m] ** 2 * root * math.exp(-exponent)
-                for k in range(n_inliers):
-                    weight = whitened[k, i]
+                    inverse = 1.0 / (own_square + square[j])
+                    distance = own_r - all_r[j]
+                    root = math.sqrt(2.0 * own_l * all_l[j] * inverse)
+                    kernel = sigma_f[m] ** 2 * root * decay(distance * distance * inverse)
+                    row[j] = kernel + tilt * all_r[j]
+                # Four rows at a time: the new row is read and written once for all of them.
+                k = 0
+                while k + 4 <= n_inliers:
+                    row_0, row_1 = whitened[k], whitened[k + 1]
+                    row_2, row_3 = whitened[k + 2], whitened[k + 3]
+                    w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
                     for j in range(n + n_knots):
-                        row[j] -= weight * whitened[k, j]
-                pivot = math.sqrt(variance[i] + sigma_n[m] ** 2)
-                innovation = (z[first + i] - height[i]) / pivot
+                        taken = w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
+                        row[j] -= taken
+                    k += 4
+                while k < n_inliers:
+                    row_0 = whitened[k]
+                    w_0 = row_0[i]
+                    for j in range(n + n_knots):
+                        row[j] -= w_0 * row_0[j]
+                    k += 1
+                scale = 1.0 / math.sqrt(variance[i] + sigma_n[m] ** 2)
+                innovation = (z[first + i] - height[i]) * scale
                 for j in range(n + n_knots):
-                    row[j] /= pivot
-                    height[j] += row[j] * innovation
-                    variance[j] -= row[j] * row[j]
+                    value = row[j] * scale
+                    row[j] = value
+                    height[j] += value * innovation
+                    variance[j] -= value * value
                 n_inliers += 1
             grown = False
             for i in range(n):

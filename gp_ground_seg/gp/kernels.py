@@ -6,9 +6,6 @@ import numpy as np
 
 from gp_ground_seg.polar_grid import FloatArray
 
-NEGLIGIBLE_EXPONENT = 40.0
-"""Compiled code takes exp(-x) for zero beyond this x: it is below the rounding of one."""
-
 
 def paciorek(
     r_a: FloatArray, l_a: FloatArray, r_b: FloatArray, l_b: FloatArray, sigma_f: float

@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled import compiled
+from gp_ground_seg.compiled import compiled_vectors
 from gp_ground_seg.gp import dense
-from gp_ground_seg.gp.kernels import NEGLIGIBLE_EXPONENT, squared_exponential
+from gp_ground_seg.gp.decay import decay
+from gp_ground_seg.gp.kernels import squared_exponential
 from gp_ground_seg.gp.linalg import factorise, solve
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
@@ -102,7 +103,7 @@ def latent_rows_reference(
     return at_candidates, at_knots
 
 
-@compiled
+@compiled_vectors
 def latent_rows_compiled(
     start: int,
     stop: int,
@@ -124,7 +125,7 @@ def latent_rows_compiled(
         if p == 0:
             continue
         variance = math.exp(2.0 * theta[m, 2])
-        decay = 0.5 * math.exp(-2.0 * theta[m, 3])
+        sharpness = 0.5 * math.exp(-2.0 * theta[m, 3])
         factor = np.empty((p, p))
         weight = np.empty(p)
         mean = 0.0
@@ -134,24 +135,24 @@ def latent_rows_compiled(
             weight[i] = theta[m, 5 + surface_class[first + i]] - mean
             for j in range(i + 1):
                 d = r_bar[first + i] - r_bar[first + j]
-                factor[j, i] = variance * math.exp(-decay * d * d)
+                factor[j, i] = variance * decay(sharpness * d * d)
             factor[i, i] += math.exp(2.0 * theta[m, 4])
         if not factorise(factor, p):
             # Rounding beat the noise term: the mean is what is left to say.
             weight[:] = 0.0
         else:
             solve(factor, p, weight)
-        for i in range(offsets[m], offsets[m + 1]):
-            value = mean
-            for j in range(p):
-                d = r[i] - r_bar[first + j]
-                if decay * d * d < NEGLIGIBLE_EXPONENT:
-                    value += weight[j] * variance * math.exp(-decay * d * d)
-            at_candidates[i] = value
-        for i in range(len(knots)):
-            value = mean
-            for j in range(p):
-                d = knots[i] - r_bar[first + j]
-                if decay * d * d < NEGLIGIBLE_EXPONENT:
-                    value += weight[j] * variance * math.exp(-decay * d * d)
-            at_knots[m, i] = value
+        # From pseudo-input to pseudo-input: the inner loops run along rows.
+        own = at_candidates[offsets[m] : offsets[m + 1]]
+        own_r = r[offsets[m] : offsets[m + 1]]
+        own[:] = mean
+        at_knots[m] = mean
+        for j in range(p):
+            scaled = weight[j] * variance
+            centre = r_bar[first + j]
+            for i in range(len(own)):
+                d = own_r[i] - centre
+                own[i] += scaled * decay(sharpness * d * d)
+            for i in range(len(knots)):
+                d = knots[i] - centre
+                at_knots[m, i] += scaled * decay(sharpness * d * d)

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 
-from gp_ground_seg.compiled import compiled
+from gp_ground_seg.compiled import compiled_vectors
 from gp_ground_seg.polar_grid import FloatArray
 
 
-@compiled
+@compiled_vectors
 def factorise(a: FloatArray, n: int) -> bool:
     """Replace the upper triangle of ``a[:n, :n]`` by U; False if not positive definite."""
     for k in range(n):
@@ -22,8 +22,9 @@ def factorise(a: FloatArray, n: int) -> bool:
             return False
         pivot = math.sqrt(row[k])
         row[k] = pivot
+        scale = 1.0 / pivot
         for j in range(k + 1, n):
-            row[j] /= pivot
+            row[j] *= scale
         for i in range(k + 1, n):
             weight = row[i]
             below = a[i]
@@ -32,7 +33,7 @@ def factorise(a: FloatArray, n: int) -> bool:
     return True
 
 
-@compiled
+@compiled_vectors
 def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray) -> None:
     """Inverse of ``U^T U``, both triangles, in `inverse`.
 
@@ -64,7 +65,7 @@ def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray
             inverse[j, i] = inverse[i, j]
 
 
-@compiled
+@compiled_vectors
 def solve(factor: FloatArray, n: int, vector: FloatArray) -> None:
     """Replace `vector` by the solution of ``U^T U x = vector``."""
     for i in range(n):

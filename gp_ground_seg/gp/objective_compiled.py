@@ -6,21 +6,15 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled import compiled
-from gp_ground_seg.gp.kernels import NEGLIGIBLE_EXPONENT
+from gp_ground_seg.compiled import compiled_vectors
+from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.linalg import factorise, invert
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-@compiled
-def _decay(exponent: float) -> float:
-    """``exp(-exponent)``, zero where it is below the rounding of one."""
-    return math.exp(-exponent) if exponent < NEGLIGIBLE_EXPONENT else 0.0
-
-
-@compiled
+@compiled_vectors
 def objective_rows(
     start: int,
     stop: int,
@@ -60,15 +54,20 @@ def objective_rows(
         k_star = np.empty((n, p))
         beta = np.zeros(p)
         mean = 0.0
+        own_r = r[first : first + n]
+        own_z = z[first : first + n]
+        own_r_bar = r_bar[bar_first : bar_first + p]
+        sharpness = 0.5 / sigma_l_bar**2
         if p > 0:
             for i in range(p):
                 l_bar[i] = theta[5 + surface_class[bar_first + i]]
                 mean += l_bar[i] / p
-                for j in range(i + 1):
-                    d = r_bar[bar_first + i] - r_bar[bar_first + j]
-                    value = sigma_f_bar**2 * _decay(0.5 * d * d / sigma_l_bar**2)
-                    k_bar[i, j] = k_bar[j, i] = value
-                    b_factor[i, j] = b_factor[j, i] = value
+                centre = own_r_bar[i]
+                for j in range(p):
+                    d = centre - own_r_bar[j]
+                    value = sigma_f_bar**2 * decay(sharpness * d * d)
+                    k_bar[i, j] = value
+                    b_factor[i, j] = value
                 b_factor[i, i] += sigma_n_bar**2
             if not factorise(b_factor, p):
                 values[m] = -np.inf
@@ -78,11 +77,14 @@ def objective_rows(
                 for j in range(p):
                     beta[i] += b_inverse[i, j] * (l_bar[j] - mean)
             for i in range(n):
-                u[i] = mean
+                value = mean
+                centre = own_r[i]
                 for j in range(p):
-                    d = r[first + i] - r_bar[bar_first + j]
-                    k_star[i, j] = sigma_f_bar**2 * _decay(0.5 * d * d / sigma_l_bar**2)
-                    u[i] += k_star[i, j] * beta[j]
+                    d = centre - own_r_bar[j]
+                    covariance = sigma_f_bar**2 * decay(sharpness * d * d)
+                    k_star[i, j] = covariance
+                    value += covariance * beta[j]
+                u[i] = value
         else:
             for i in range(n):
                 u[i] = fixed_u[first + i]
@@ -91,17 +93,22 @@ def objective_rows(
         square = length_scale * length_scale
         k = np.empty((n, n))
         factor = np.empty((n, n))
+        # How the kernel bends with either length-scale.
+        bend = np.empty((n, n))
         for i in range(n):
-            for j in range(i + 1):
-                spread = square[i] + square[j]
-                d = r[first + i] - r[first + j]
-                value = _decay(d * d / spread)
-                if value > 0.0:
-                    root = math.sqrt(2.0 * length_scale[i] * length_scale[j] / spread)
-                    value *= sigma_f**2 * root
-                k[i, j] = value
-                factor[j, i] = value + slope_std**2 * r[first + i] * r[first + j]
-            factor[i, i] += sigma_n**2
+            centre, own_l, own_square = own_r[i], length_scale[i], square[i]
+            tilt = slope_std**2 * centre
+            row, bend_row, factor_row = k[i], bend[i], factor[i]
+            for j in range(i, n):
+                inverse_spread = 1.0 / (own_square + square[j])
+                d = centre - own_r[j]
+                exponent = d * d * inverse_spread
+                root = math.sqrt(2.0 * own_l * length_scale[j] * inverse_spread)
+                value = sigma_f**2 * root * decay(exponent)
+                row[j] = value
+                factor_row[j] = value + tilt * own_r[j]
+                bend_row[j] = own_square * inverse_spread
+            factor_row[i] += sigma_n**2
         if not factorise(factor, n):
             values[m] = -np.inf
             continue
@@ -109,11 +116,14 @@ def objective_rows(
         invert(factor, n, np.empty((n, n)), inverse)
         alpha = np.zeros(n)
         for i in range(n):
+            value = 0.0
+            row = inverse[i]
             for j in range(n):
-                alpha[i] += inverse[i, j] * z[first + j]
+                value += row[j] * own_z[j]
+            alpha[i] = value
         value = -0.5 * n * _LOG_2PI
         for i in range(n):
-            value -= 0.5 * z[first + i] * alpha[i] + math.log(factor[i, i])
+            value -= 0.5 * own_z[i] * alpha[i] + math.log(factor[i, i])
 
         g_sigma_f = g_trace = 0.0
         g_u = np.zeros(n)
@@ -121,17 +131,19 @@ def objective_rows(
             g_ii = 0.5 * (alpha[i] * alpha[i] - inverse[i, i])
             g_trace += g_ii
             g_sigma_f += 2.0 * g_ii * k[i, i]
-            for j in range(i):
-                if k[i, j] == 0.0:
-                    continue
-                g_k = 0.5 * (alpha[i] * alpha[j] - inverse[i, j]) * k[i, j]
-                g_sigma_f += 4.0 * g_k
-                spread = square[i] + square[j]
-                d = r[first + i] - r[first + j]
-                ratio = square[i] / spread
-                twist = 2.0 * d * d / spread
-                g_u[i] += 2.0 * g_k * (0.5 - ratio + ratio * twist)
-                g_u[j] += 2.0 * g_k * (ratio - 0.5 + (1.0 - ratio) * twist)
+            own_alpha, centre, own_square = alpha[i], own_r[i], square[i]
+            row, bend_row, inverse_row = k[i], bend[i], inverse[i]
+            total = own = 0.0
+            for j in range(i + 1, n):
+                g_k = (own_alpha * alpha[j] - inverse_row[j]) * row[j]
+                total += g_k
+                d = centre - own_r[j]
+                ratio = bend_row[j]
+                twist = 2.0 * d * d * ratio / own_square
+                own += g_k * (0.5 - ratio + ratio * twist)
+                g_u[j] += g_k * (ratio - 0.5 + (1.0 - ratio) * twist)
+            g_sigma_f += 2.0 * total
+            g_u[i] += own
         gradients[m, 0] = g_sigma_f
         gradients[m, 1] = 2.0 * sigma_n**2 * g_trace
         values[m] = value
@@ -155,22 +167,25 @@ def objective_rows(
         for i in range(p):
             slot = 5 + surface_class[bar_first + i]
             gradients[m, slot] += weight[i] + (g_sum - weight_sum) / p
-        for j in range(p):
-            for i in range(n):
-                if k_star[i, j] == 0.0:
-                    continue
-                d = r[first + i] - r_bar[bar_first + j]
-                term = g_u[i] * k_star[i, j] * beta[j]
-                gradients[m, 2] += 2.0 * term
-                gradients[m, 3] += term * d * d / sigma_l_bar**2
-            for i in range(p):
-                d = r_bar[bar_first + i] - r_bar[bar_first + j]
+        g_sigma_f_bar = g_sigma_l_bar = g_noise_bar = 0.0
+        share = 0.5 if latent_terms else 0.0
+        for i in range(n):
+            own, centre, row = g_u[i], own_r[i], k_star[i]
+            for j in range(p):
+                d = centre - own_r_bar[j]
+                term = own * row[j] * beta[j]
+                g_sigma_f_bar += term
+                g_sigma_l_bar += term * d * d
+        for i in range(p):
+            own, centre, row, inverse_row = weight[i], own_r_bar[i], k_bar[i], b_inverse[i]
+            for j in range(p):
+                d = centre - own_r_bar[j]
                 # Adjoint of B: every derivative of B is contracted with it.
-                adjoint = -weight[i] * beta[j]
-                if latent_terms:
-                    adjoint -= 0.5 * b_inverse[i, j]
-                gradients[m, 2] += 2.0 * adjoint * k_bar[i, j]
-                gradients[m, 3] += adjoint * k_bar[i, j] * d * d / sigma_l_bar**2
-                if i == j:
-                    gradients[m, 4] += 2.0 * adjoint * sigma_n_bar**2
+                adjoint = -own * beta[j] - share * inverse_row[j]
+                g_sigma_f_bar += adjoint * row[j]
+                g_sigma_l_bar += adjoint * row[j] * d * d
+            g_noise_bar -= own * beta[i] + share * inverse_row[i]
+        gradients[m, 2] = 2.0 * g_sigma_f_bar
+        gradients[m, 3] = g_sigma_l_bar / sigma_l_bar**2
+        gradients[m, 4] = 2.0 * sigma_n_bar**2 * g_noise_bar
         values[m] = value
