@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.config import FacesConfig
-from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, IntArray, PolarGrid
+from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, PolarGrid
 
 FEWEST_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
@@ -24,7 +24,7 @@ class Faces:
 
     Attributes
     ----------
-    tile : (N,) int64
+    tile : (N,) int32
         Tile of each point, or `OUTSIDE`.
     foot_z : (T,) float64
         Height of the lowest point of each tile [m]; infinite in empty ones.
@@ -32,7 +32,7 @@ class Faces:
         Whether the returns of the tile are an upright face.
     """
 
-    tile: IntArray
+    tile: npt.NDArray[np.int32]
     foot_z: FloatArray
     is_face: npt.NDArray[np.bool_]
 
@@ -62,8 +62,8 @@ def find_faces(xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height:
     """
     half = float(grid.edges[-1])
     side = tiles_per_side(half, faces)
-    inside = grid.bin != OUTSIDE
-    tile = np.full(len(xyz), OUTSIDE, dtype=np.int64)
+    inside = grid.inside
+    tile = np.full(len(xyz), OUTSIDE, dtype=np.int32)
     column, row = ((xyz[inside, :2] + half) * (1.0 / faces.cell_size)).astype(np.int64).T
     tile[inside] = np.minimum(column, side - 1) * side + np.minimum(row, side - 1)
 

@@ -8,8 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
+from gp_ground_seg.labelling import SQUARE_UNITS
 from gp_ground_seg.labels import Label
-from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, IntArray
+from gp_ground_seg.point_passes import CellArray
+from gp_ground_seg.polar_grid import NOT_FINITE, OUTSIDE, FloatArray, IntArray
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -21,31 +23,24 @@ N_SUMS = 10
 
 @compiled
 def assign_tiles(
-    start: int,
-    stop: int,
     xyz: FloatArray,
-    index: IntArray,
+    cell: CellArray,
     half: float,
     per_metre: float,
     side: int,
-    tile: IntArray,
+    tile: CellArray,
+    foot_z: FloatArray,
 ) -> None:
-    """Tile of points `start` to `stop`."""
-    for i in range(start, stop):
-        if index[i] == OUTSIDE:
+    """Tile of each point, and the lowest height of each tile into a table of infinities."""
+    for i in range(len(cell)):
+        if cell[i] < 0:
             tile[i] = OUTSIDE
             continue
         column = min(int((xyz[i, 0] + half) * per_metre), side - 1)
         row = min(int((xyz[i, 1] + half) * per_metre), side - 1)
-        tile[i] = column * side + row
-
-
-@compiled
-def find_feet(xyz: FloatArray, tile: IntArray, foot_z: FloatArray) -> None:
-    """Lowest height of each tile, into a table of infinities."""
-    for i in range(len(tile)):
-        own = tile[i]
-        if own != OUTSIDE and xyz[i, 2] < foot_z[own]:
+        own = column * side + row
+        tile[i] = own
+        if xyz[i, 2] < foot_z[own]:
             foot_z[own] = xyz[i, 2]
 
 
@@ -54,7 +49,7 @@ def mark_tall(
     start: int,
     stop: int,
     xyz: FloatArray,
-    tile: IntArray,
+    tile: CellArray,
     foot_z: FloatArray,
     min_height: float,
     max_height: float,
@@ -72,7 +67,7 @@ def mark_tall(
 @compiled
 def judge_faces(
     xyz: FloatArray,
-    tile: IntArray,
+    tile: CellArray,
     foot_z: FloatArray,
     tall: BoolArray,
     max_height: float,
@@ -123,29 +118,46 @@ def judge_faces(
 
 
 @compiled
-def survey_bins(
-    segment: IntArray,
-    index: IntArray,
-    tile: IntArray,
-    height: FloatArray,
+def survey_heights(
+    share: int,
+    start: int,
+    stop: int,
+    xyz: FloatArray,
+    cell: CellArray,
+    r: FloatArray,
+    tile: CellArray,
     is_face: BoolArray,
+    knots: FloatArray,
+    mean: FloatArray,
     min_height: float,
     max_height: float,
+    height: FloatArray,
     number: IntArray,
-    squares: FloatArray,
+    squares: IntArray,
     stands: BoolArray,
 ) -> None:
-    """Sum up the roughness of each bin, and mark those that an obstacle stands in."""
-    for i in range(len(height)):
-        if index[i] == OUTSIDE:
+    """Heights of some points over the surface; sums for the roughness; what stands in a bin.
+
+    Points `start` to `stop`, summed up in tables ``[share]``. Squares are summed in
+    whole numbers: the sum does not depend on its order, nor on the number of threads.
+    """
+    n_bins = len(knots) - 1
+    number, squares, stands = number[share], squares[share], stands[share]
+    for i in range(start, stop):
+        own = cell[i]
+        if own < 0:
+            height[i] = np.nan
             continue
-        h = height[i]
-        m, n = segment[i], index[i]
+        m = own // n_bins
+        n = own - m * n_bins
+        weight = max((r[i] - knots[n]) / (knots[n + 1] - knots[n]), 0.0)
+        h = xyz[i, 2] - (mean[m, n] * (1.0 - weight) + mean[m, n + 1] * weight)
+        height[i] = h
         if min_height <= h <= max_height:
-            stands[m, n] = True
+            stands[own] = True
         if -min_height <= h <= min_height and not is_face[tile[i]]:
-            number[m, n] += 1
-            squares[m, n] += h * h
+            number[own] += 1
+            squares[own] += int(h * h * SQUARE_UNITS + 0.5)
 
 
 @compiled
@@ -153,20 +165,12 @@ def label_by_height(
     start: int,
     stop: int,
     xyz: FloatArray,
-    segment: IntArray,
-    index: IntArray,
-    r: FloatArray,
-    tile: IntArray,
+    cell: CellArray,
+    tile: CellArray,
     height: FloatArray,
     is_face: BoolArray,
     foot_z: FloatArray,
-    stands: BoolArray,
-    roughness: FloatArray,
-    ground_tolerance: float,
-    roughness_gain: float,
-    obstacle_tolerance: float,
-    obstacle_roughness_gain: float,
-    obstacle_min_height: float,
+    band: FloatArray,
     below_tolerance: float,
     face_tolerance: float,
     label: npt.NDArray[np.uint8],
@@ -174,18 +178,12 @@ def label_by_height(
 ) -> None:
     """Do what `gp_ground_seg.labelling.label_points` does for points `start` to `stop`."""
     for i in range(start, stop):
-        margin[i] = np.nan
-        n = index[i]
-        if n == OUTSIDE:
-            label[i] = _UNKNOWN if math.isnan(r[i]) else _OBSTACLE
+        n = cell[i]
+        if n < 0:
+            margin[i] = np.nan
+            label[i] = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
             continue
-        m = segment[i]
-        rough = roughness[m, n]
-        above = ground_tolerance + roughness_gain * rough
-        if stands[m, n]:
-            above = min(above, obstacle_tolerance + obstacle_roughness_gain * rough)
-        above = min(above, obstacle_min_height)
-        own = min(above - height[i], height[i] + below_tolerance)
+        own = min(band[n] - height[i], height[i] + below_tolerance)
         if is_face[tile[i]]:
             over_foot = max(height[i], xyz[i, 2] - foot_z[tile[i]])
             own = min(own, face_tolerance - over_foot)

@@ -2,15 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.config import LabelConfig
 from gp_ground_seg.faces import Faces
 from gp_ground_seg.labels import Label
-from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, PolarGrid
+from gp_ground_seg.polar_grid import NOT_FINITE, FloatArray, PolarGrid
 
 BoolArray = npt.NDArray[np.bool_]
+
+SQUARE_UNITS = 2.0**40
+"""Squared heights are summed in whole multiples of 1 / this [1/m^2]."""
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """Labels of a scan and what they follow from.
+
+    Attributes
+    ----------
+    label : (N,) uint8
+        See `label_points`.
+    height : (N,) float64
+        Height of each point over the surface [m]; NaN where there is none.
+    margin : (N,) float64
+        See `label_points` [m].
+    roughness : (M, n_bins) float64
+        See `local_roughness` [m].
+    """
+
+    label: npt.NDArray[np.uint8]
+    height: FloatArray
+    margin: FloatArray
+    roughness: FloatArray
 
 
 def label_points(
@@ -53,23 +80,37 @@ def label_points(
         By how much the point is ground: its distance to the nearer edge of the
         band [m], negative for obstacles, NaN where there is no surface.
     """
-    inside = grid.bin != OUTSIDE
-    index = np.maximum(grid.bin, 0)
-    rough = roughness[grid.segment, index]
-    above = label.ground_tolerance + label.roughness_gain * rough
-    beside = label.obstacle_tolerance + label.obstacle_roughness_gain * rough
-    stands = stands_in_bin(height, grid, label)[grid.segment, index]
-    above = np.where(stands, np.minimum(above, beside), above)
-    above = np.minimum(above, label.obstacle_min_height)
-    margin = np.minimum(above - height, height + label.below_tolerance)
+    inside = grid.inside
+    own_band = band(roughness, stands_in_bin(height, grid, label), label).ravel()
+    margin = np.minimum(
+        own_band[np.maximum(grid.cell, 0)] - height, height + label.below_tolerance
+    )
     tile = np.maximum(faces.tile, 0)
     in_face = faces.is_face[tile] & inside
     over_foot = np.maximum(height, z - np.where(in_face, faces.foot_z[tile], 0.0))
     margin = np.where(in_face, np.minimum(margin, face_tolerance - over_foot), margin)
     margin[~inside] = np.nan
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
-    result[np.isnan(grid.r)] = Label.UNKNOWN
+    result[grid.cell == NOT_FINITE] = Label.UNKNOWN
     return result, margin
+
+
+def band(roughness: FloatArray, stands: BoolArray, label: LabelConfig) -> FloatArray:
+    """Largest height of ground over the surface in each bin, (M, n_bins) [m].
+
+    Parameters
+    ----------
+    roughness : (M, n_bins) float64
+        See `local_roughness` [m].
+    stands : (M, n_bins) bool
+        See `stands_in_bin`.
+    label : LabelConfig
+        Tolerances.
+    """
+    free = label.ground_tolerance + label.roughness_gain * roughness
+    beside = label.obstacle_tolerance + label.obstacle_roughness_gain * roughness
+    result = np.where(stands, np.minimum(free, beside), free)
+    return np.minimum(result, label.obstacle_min_height)
 
 
 def stands_in_bin(height: FloatArray, grid: PolarGrid, label: LabelConfig) -> BoolArray:
@@ -78,14 +119,12 @@ def stands_in_bin(height: FloatArray, grid: PolarGrid, label: LabelConfig) -> Bo
     The foot of a wall lies within any tolerance that ground needs; the returns
     above it give it away. Higher returns say nothing of the foot: they overhang.
     """
-    result = np.zeros((grid.n_segments, len(grid.edges) - 1), dtype=np.bool_)
+    result = np.zeros(grid.n_segments * grid.n_bins, dtype=np.bool_)
     shows = (
-        (height >= label.obstacle_min_height)
-        & (height <= label.obstacle_max_height)
-        & (grid.bin != OUTSIDE)
+        (height >= label.obstacle_min_height) & (height <= label.obstacle_max_height) & grid.inside
     )
-    result[grid.segment[shows], grid.bin[shows]] = True
-    return result
+    result[grid.cell[shows]] = True
+    return result.reshape(grid.n_segments, grid.n_bins)
 
 
 def local_roughness(
@@ -111,24 +150,36 @@ def local_roughness(
     (M, n_bins) float64
         Roughness [m]; 0 where there are no points.
     """
-    shape = grid.n_segments, len(grid.edges) - 1
     counts = (
-        (np.abs(height) <= max_height)
-        & (grid.bin != OUTSIDE)
-        & ~faces.is_face[np.maximum(faces.tile, 0)]
+        (np.abs(height) <= max_height) & grid.inside & ~faces.is_face[np.maximum(faces.tile, 0)]
     )
-    cell = grid.segment[counts] * shape[1] + grid.bin[counts]
-    size = shape[0] * shape[1]
-    number = np.bincount(cell, minlength=size).reshape(shape)
-    squares = np.bincount(cell, weights=height[counts] ** 2, minlength=size).reshape(shape)
-    return root_mean_square(number, squares.astype(np.float64))
+    cell = grid.cell[counts]
+    size = grid.n_segments * grid.n_bins
+    number = np.bincount(cell, minlength=size)
+    whole = np.floor(height[counts] ** 2 * SQUARE_UNITS + 0.5)
+    squares = np.bincount(cell, weights=whole, minlength=size)
+    return root_mean_square(number, squares, grid.n_segments)
 
 
-def root_mean_square(number: npt.NDArray[np.int64], squares: FloatArray) -> FloatArray:
-    """Root of the mean square over each bin and the eight around it, (M, n_bins)."""
-    all_squares = _with_neighbours(squares)
-    all_number = _with_neighbours(number.astype(np.float64))
-    result: FloatArray = np.sqrt(all_squares / np.maximum(all_number, 1.0))
+def root_mean_square(
+    number: npt.NDArray[np.int64], squares: npt.NDArray[np.generic], n_segments: int
+) -> FloatArray:
+    """Root of the mean square over each bin and the eight around it, (M, n_bins).
+
+    Parameters
+    ----------
+    number : (M * n_bins,) int64
+        Number of heights in each bin.
+    squares : (M * n_bins,) float64 or int64
+        Sum of their squares in units of ``1 / SQUARE_UNITS`` square metres.
+    n_segments : int
+        Number of segments M.
+    """
+    shape = n_segments, -1
+    all_number = _with_neighbours(number.astype(np.float64).reshape(shape))
+    all_squares = _with_neighbours(squares.astype(np.float64).reshape(shape))
+    mean = all_squares / (SQUARE_UNITS * np.maximum(all_number, 1.0))
+    result: FloatArray = np.sqrt(mean)
     return result
 
 

@@ -43,9 +43,20 @@ class RowPool:
 
     def run_points(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
         """Call ``function(start, stop, *arguments)`` for contiguous blocks of points."""
-        n_shares = self.n_threads if n_rows >= FEWEST_POINTS else 1
-        bounds = [n_rows * k // n_shares for k in range(n_shares + 1)]
-        self._run(function, list(pairwise(bounds)), arguments)
+        self._run(function, self._blocks(n_rows), arguments)
+
+    def n_shares(self, n_rows: int) -> int:
+        """Into how many blocks `run_points` and `run_shares` cut that many points."""
+        return self.n_threads if n_rows >= FEWEST_POINTS else 1
+
+    def run_shares(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
+        """Call ``function(share, start, stop, *arguments)`` for contiguous blocks of points."""
+        shares = [(k, *block) for k, block in enumerate(self._blocks(n_rows))]
+        self._run(function, shares, arguments)
+
+    def _blocks(self, n_rows: int) -> list[tuple[int, int]]:
+        n_shares = self.n_shares(n_rows)
+        return list(pairwise(n_rows * k // n_shares for k in range(n_shares + 1)))
 
     def _run(
         self,

@@ -9,8 +9,8 @@ from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.polar_grid import FloatArray
 
 
-def check_points(points: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Return x, y, z in double precision and which points are finite.
+def check_points(points: npt.ArrayLike) -> FloatArray:
+    """Return x, y, z in double precision.
 
     Parameters
     ----------
@@ -21,8 +21,6 @@ def check_points(points: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool
     -------
     xyz : (N, 3) float64
         A copy.
-    finite : (N,) bool
-        Whether x, y and z are all finite.
 
     Raises
     ------
@@ -41,7 +39,4 @@ def check_points(points: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
         # In one order: compiled code is compiled for each.
-        xyz = array[:, :3].astype(np.float64, order='C')
-    # Column by column: a reduction along rows of three takes ten times as long.
-    finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
-    return xyz, finite
+        return array[:, :3].astype(np.float64, order='C')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,9 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 OUTSIDE = -1
-"""Bin of a point that is beyond the grid or not finite."""
+"""Bin and cell of a point that is beyond the grid."""
+NOT_FINITE = -2
+"""Cell of a point that is not finite."""
 
 
 @dataclass(frozen=True)
@@ -22,10 +25,8 @@ class PolarGrid:
 
     Attributes
     ----------
-    segment : (N,) int64
-        Angular segment, 0 to M - 1, counter-clockwise from -x.
-    bin : (N,) int64
-        Radial bin, 0 to n_bins - 1, or `OUTSIDE`.
+    cell : (N,) int32
+        Cell ``segment * n_bins + bin``, or `OUTSIDE`, or `NOT_FINITE`.
     r : (N,) float64
         Horizontal range [m]; NaN for points that are not finite.
     edges : (n_bins + 1,) float64
@@ -34,11 +35,31 @@ class PolarGrid:
         Number of segments M.
     """
 
-    segment: IntArray
-    bin: IntArray
+    cell: npt.NDArray[np.int32]
     r: FloatArray
     edges: FloatArray
     n_segments: int
+
+    @property
+    def n_bins(self) -> int:
+        """Bins of each segment."""
+        return len(self.edges) - 1
+
+    @property
+    def inside(self) -> npt.NDArray[np.bool_]:
+        """Which points lie in a cell, (N,) bool."""
+        return self.cell >= 0
+
+    @cached_property
+    def segment(self) -> IntArray:
+        """Angular segment of each point, counter-clockwise from -x, (N,) int64; 0 outside."""
+        return np.maximum(self.cell, 0).astype(np.int64) // self.n_bins
+
+    @cached_property
+    def bin(self) -> IntArray:
+        """Radial bin of each point, (N,) int64, or `OUTSIDE`."""
+        own = self.cell.astype(np.int64) % self.n_bins
+        return np.where(self.inside, own, OUTSIDE)
 
 
 @dataclass(frozen=True)
@@ -75,31 +96,56 @@ def bin_edges(grid: GridConfig) -> FloatArray:
     return grid.r_min + (grid.r_max - grid.r_min) * fraction**grid.bin_growth
 
 
-def build_polar_grid(
-    xyz: FloatArray, finite: npt.NDArray[np.bool_], grid: GridConfig
-) -> PolarGrid:
+def pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Turn from -x, counter-clockwise, on the unit diamond: 0 to 4.
+
+    It grows with the angle and needs one division: points are sorted into segments
+    by comparing it with that of the segments' edges.
+
+    Parameters
+    ----------
+    x, y : (N,) float64
+        Coordinates; the origin counts as lying on +x.
+    """
+    size = np.abs(x) + np.abs(y)
+    share = np.divide(y, size, out=np.zeros_like(size), where=size > 0.0)
+    left = np.where(y < 0.0, -share, 4.0 - share)
+    result: FloatArray = np.where(x >= 0.0, 2.0 + share, left)
+    return result
+
+
+def segment_edges(n_segments: int) -> FloatArray:
+    """Pseudo-angles of the edges of the segments, (M + 1,)."""
+    angle = -np.pi + 2.0 * np.pi * np.arange(n_segments + 1) / n_segments
+    edges = pseudo_angle(np.cos(angle), np.sin(angle))
+    edges[0], edges[-1] = 0.0, 4.0
+    return edges
+
+
+def build_polar_grid(xyz: FloatArray, grid: GridConfig) -> PolarGrid:
     """Sort points into segments and bins (paper, section II).
 
     Parameters
     ----------
     xyz : (N, 3) float64
         Points [m].
-    finite : (N,) bool
-        Points to use; the others get the bin `OUTSIDE`.
     grid : GridConfig
         Size of the grid.
     """
     edges = bin_edges(grid)
+    finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
     x = np.where(finite, xyz[:, 0], 0.0)
     y = np.where(finite, xyz[:, 1], 0.0)
-    r = np.hypot(x, y)
-    turn = np.arctan2(y, x) / (2.0 * np.pi) + 0.5
-    # arctan2 reaches +pi, and rounding may reach M: that is segment 0 again.
-    segment = (turn * grid.n_segments).astype(np.int64) % grid.n_segments
+    with np.errstate(over='ignore'):  # infinitely far is outside
+        r = np.sqrt(x * x + y * y)
+    # Exactly -x is the edge that ends the last segment: that is segment 0 again.
+    turn = np.searchsorted(segment_edges(grid.n_segments), pseudo_angle(x, y), side='right') - 1
+    segment = turn % grid.n_segments
     # Points nearer than the first edge belong to the first bin.
     index = np.maximum(np.searchsorted(edges, r, side='right') - 1, 0)
-    index[(index >= grid.n_bins) | ~finite] = OUTSIDE
-    return PolarGrid(segment, index, np.where(finite, r, np.nan), edges, grid.n_segments)
+    cell = np.where(index < grid.n_bins, segment * grid.n_bins + index, OUTSIDE)
+    cell = np.where(finite, cell, NOT_FINITE).astype(np.int32)
+    return PolarGrid(cell, np.where(finite, r, np.nan), edges, grid.n_segments)
 
 
 @dataclass(frozen=True)
@@ -136,10 +182,10 @@ def reduce_cells(grid: PolarGrid, z: FloatArray) -> CellTables:
     z : (N,) float64
         Heights [m].
     """
-    shape = grid.n_segments, len(grid.edges) - 1
+    shape = grid.n_segments, grid.n_bins
     size = shape[0] * shape[1]
-    inside = grid.bin != OUTSIDE
-    cell = grid.segment[inside] * shape[1] + grid.bin[inside]
+    inside = grid.inside
+    cell = grid.cell[inside]
     z_inside, r_inside = z[inside], grid.r[inside]
     lowest_z = np.full(size, np.inf)
     np.minimum.at(lowest_z, cell, z_inside)

@@ -12,7 +12,7 @@ from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.gp.theta import theta_names
-from gp_ground_seg.labelling import ground_probability
+from gp_ground_seg.labelling import Labelled, ground_probability
 from gp_ground_seg.labels import Label
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid
@@ -105,20 +105,9 @@ class Segmentation:
 
     Attributes
     ----------
-    label : (N,) uint8
-        `gp_ground_seg.Label` of each point. Finite points are GROUND or
-        OBSTACLE; where there is no model nothing speaks for ground, and they
-        are OBSTACLE. Points that are not finite are UNKNOWN.
-    height : (N,) float64
-        Height of each point over the surface [m], negative below it; NaN where there is no
-        model. Vertical in the level frame, like `ground_std`: where `pose` has no tilt, that
-        is the sensor's own.
-    ground_z : (N,) float64
-        Surface height under each point along the sensor's z axis, sensor frame [m]; NaN where
-        there is no model. Without tilt ``z - height``; with it ``z - height / cos(tilt)``,
-        exact where the ground is level (see `gp_ground_seg.sensor_pose.SensorPose.ground_z`).
-    ground_std : (N,) float64
-        Standard deviation of the surface's height [m]; NaN where there is no model.
+    labelled : Labelled
+        Labels, heights and what they follow from; `label`, `height`, `margin` and
+        `roughness` are taken from it.
     timings : dict of str to float
         Seconds per stage, and ``total``.
     fit : FitReport
@@ -133,17 +122,11 @@ class Segmentation:
     pose : SensorPose
         Height and tilt of the sensor that were used, and what the scan says of them;
         ``pose.level(xyz)`` gives points in the level frame.
-    margin : (N,) float64
-        Distance of each point to the nearer edge of the band that is ground [m], not
-        negative for ground; NaN where there is no model.
-    roughness : (M, n_bins) float64
-        Root mean square height of the returns over the surface about each bin [m].
+    tilted_ground_z : (N,) float64 or None
+        `ground_z` where `pose` has a tilt.
     """
 
-    label: npt.NDArray[np.uint8]
-    height: FloatArray
-    ground_z: FloatArray
-    ground_std: FloatArray
+    labelled: Labelled
     timings: dict[str, float]
     fit: FitReport
     grid: PolarGrid
@@ -154,17 +137,70 @@ class Segmentation:
     theta: FloatArray
     log_length_scale: FloatArray
     pose: SensorPose
-    margin: FloatArray
-    roughness: FloatArray
+    tilted_ground_z: FloatArray | None
+
+    @property
+    def label(self) -> npt.NDArray[np.uint8]:
+        """`gp_ground_seg.Label` of each point, (N,) uint8.
+
+        Finite points are GROUND or OBSTACLE; where there is no model nothing speaks
+        for ground, and they are OBSTACLE. Points that are not finite are UNKNOWN.
+        """
+        return self.labelled.label
+
+    @property
+    def height(self) -> FloatArray:
+        """Height of each point over the surface, (N,) float64 [m]; negative below it.
+
+        NaN where there is no model. Vertical in the level frame, like `ground_std`:
+        where `pose` has no tilt, that is the sensor's own.
+        """
+        return self.labelled.height
+
+    @property
+    def margin(self) -> FloatArray:
+        """Distance of each point to the nearer edge of the band that is ground, (N,) float64 [m].
+
+        Not negative for ground; NaN where there is no model.
+        """
+        return self.labelled.margin
+
+    @property
+    def roughness(self) -> FloatArray:
+        """Root mean square height of the returns over the surface about each bin, (M, n_bins)."""
+        return self.labelled.roughness
+
+    # What follows is computed when it is first asked for: not every user asks.
+
+    @cached_property
+    def ground_z(self) -> FloatArray:
+        """Surface height under each point along the sensor's z axis, (N,) float64 [m].
+
+        In the sensor frame; NaN where there is no model. Without tilt ``z - height``;
+        with it ``z - height / cos(tilt)``, exact where the ground is level (see
+        `gp_ground_seg.sensor_pose.SensorPose.ground_z`).
+        """
+        if self.tilted_ground_z is not None:
+            return self.tilted_ground_z
+        return self._surface_at_points[0]
+
+    @cached_property
+    def ground_std(self) -> FloatArray:
+        """Standard deviation of the surface's height, (N,) float64 [m]; NaN without a model."""
+        return self._surface_at_points[1]
+
+    @cached_property
+    def _surface_at_points(self) -> tuple[FloatArray, FloatArray]:
+        return self.surface.at(self.grid)
 
     @cached_property
     def p_ground(self) -> npt.NDArray[np.float32]:
-        """Probability that each point is ground, (N,) float32, computed when asked for.
+        """Probability that each point is ground, (N,) float32.
 
         At least 0.5 for points labelled ground; 0 where there is no model, NaN for
         points that are not finite.
         """
-        rough = self.roughness[self.grid.segment, np.maximum(self.grid.bin, 0)]
+        rough = self.roughness.ravel()[np.maximum(self.grid.cell, 0)]
         noise = float(np.exp(self.theta[:, 1].mean()))
         result = ground_probability(self.margin, self.ground_std, rough, noise)
         result[self.label == Label.UNKNOWN] = np.nan

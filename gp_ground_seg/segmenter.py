@@ -14,7 +14,6 @@ from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import Config, SensorConfig
 from gp_ground_seg.gp.backend import make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
-from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.line_extraction import extract_lines
 from gp_ground_seg.points import check_points
@@ -111,7 +110,6 @@ class GroundSegmenter:
         placed = self._place(points, sensor, timer)
         xyz, pose = placed.level_xyz, placed.pose
         grid, candidates = placed.grid, placed.candidates
-        z = np.ascontiguousarray(xyz[:, 2])
 
         lines = extract_lines(candidates, config.lines)
         pseudo = select_pseudo_inputs(candidates, lines, config)
@@ -131,22 +129,18 @@ class GroundSegmenter:
         surface = GroundSurface(grid.edges, mean + expected_ground, std, inlier)
         timer.mark('surface')
 
-        ground_z, ground_std = self._backend.surface_under_points(surface, grid)
-        height_over_ground = z - ground_z
         faces = self._backend.find_faces(xyz, grid, config.faces, config.label.obstacle_max_height)
-        label, margin, roughness = self._backend.label_points(
-            xyz, height_over_ground, grid, faces, config.label, config.faces.tolerance
+        labelled = self._backend.label_points(
+            xyz, grid, surface, faces, config.label, config.faces.tolerance
         )
-        if not pose.is_level:
-            ground_z = pose.ground_z(placed.own_xyz[:, 2], height_over_ground)
+        tilted_ground_z = (
+            None if pose.is_level else pose.ground_z(placed.own_xyz[:, 2], labelled.height)
+        )
         timer.mark('label')
 
         fit = FitReport.of(model, theta, learned, inlier, mean)
         return Segmentation(
-            label,
-            height_over_ground,
-            ground_z,
-            ground_std,
+            labelled,
             timer.seconds,
             fit,
             grid,
@@ -157,8 +151,7 @@ class GroundSegmenter:
             theta,
             log_length_scale,
             pose,
-            margin,
-            roughness,
+            tilted_ground_z,
         )
 
     def estimate_pose(self, points: npt.ArrayLike) -> SensorPose:
@@ -173,27 +166,26 @@ class GroundSegmenter:
         self, points: npt.ArrayLike, sensor: SensorConfig, timer: StageTimer
     ) -> _PlacedScan:
         """Scan in the level frame, as given or as it seems to be."""
-        xyz, finite = check_points(points)
+        xyz = check_points(points)
         given = given_pose(sensor)
         level_xyz = given.level(xyz)
-        grid, candidates = self._candidates(level_xyz, finite)
+        grid, candidates = self._candidates(level_xyz)
         timer.mark('grid')
         pose = estimate_pose(
             candidates,
             sensor,
             self._backend.name == 'numba',
-            lambda turn: self._candidates(*turned_sample(level_xyz, finite, turn))[1],
+            lambda turn: self._candidates(turned_sample(level_xyz, turn))[1],
         )
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
             level_xyz = pose.level(xyz)
-            grid, candidates = self._candidates(level_xyz, finite)
+            grid, candidates = self._candidates(level_xyz)
         timer.mark('pose')
         return _PlacedScan(xyz, level_xyz, grid, candidates, pose)
 
-    def _candidates(self, xyz: FloatArray, finite: BoolArray) -> tuple[PolarGrid, Candidates]:
+    def _candidates(self, xyz: FloatArray) -> tuple[PolarGrid, Candidates]:
         """Grid of points (N, 3) in a level frame, and the lowest point of each of its bins."""
-        grid = self._backend.polar_grid(xyz, finite, self._config.grid)
-        cells = self._backend.reduce_cells(grid, np.ascontiguousarray(xyz[:, 2]))
+        grid, cells = self._backend.sort_points(xyz, self._config.grid)
         min_extent = self._config.lines.min_density_extent
         return grid, ground_candidates(cells, grid.edges, min_extent)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gp_ground_seg.gp.growth import BoolArray
-from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, PolarGrid
+from gp_ground_seg.polar_grid import FloatArray, PolarGrid
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,13 @@ class GroundSurface:
         Linear between the knots; nearer than the first knot it is the first
         knot's. NaN beyond the last knot and in segments without a model.
         """
-        index = np.maximum(grid.bin, 0)
+        inside = np.maximum(grid.cell, 0)
+        segment = inside // grid.n_bins
+        index = inside - segment * grid.n_bins
         left, right = self.knots[index], self.knots[index + 1]
         weight = np.clip((grid.r - left) / (right - left), 0.0, 1.0)
-        flat = grid.segment * len(self.knots) + index
-        outside = grid.bin == OUTSIDE
+        flat = segment * len(self.knots) + index
+        outside = ~grid.inside
         values = []
         for table in (self.mean.ravel(), self.std.ravel()):
             value = table[flat] * (1.0 - weight) + table[flat + 1] * weight

@@ -42,12 +42,9 @@ def turned(xyz: FloatArray, matrix: FloatArray) -> FloatArray:
     return result
 
 
-def turned_sample(
-    xyz: FloatArray, finite: BoolArray, matrix: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """Every n-th point turned, about `ENOUGH_POINTS` of them, and which of them are finite."""
-    step = len(xyz) // ENOUGH_POINTS + 1
-    return turned(xyz[::step], matrix), np.ascontiguousarray(finite[::step])
+def turned_sample(xyz: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Every n-th point turned, about `ENOUGH_POINTS` of them."""
+    return turned(xyz[:: len(xyz) // ENOUGH_POINTS + 1], matrix)
 
 
 def angles_of(up: FloatArray) -> tuple[float, float]:

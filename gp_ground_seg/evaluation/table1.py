@@ -225,9 +225,9 @@ def is_candidate(result: Segmentation, z: FloatArray) -> npt.NDArray[np.bool_]:
     n_bins = len(grid.edges) - 1
     lowest = np.full((2, grid.n_segments * n_bins), np.nan)
     lowest[:, candidates.segment * n_bins + candidates.bin] = candidates.r, candidates.z
-    cell = grid.segment * n_bins + np.maximum(grid.bin, 0)
+    cell = np.maximum(grid.cell, 0)
     found: npt.NDArray[np.bool_] = (
-        (grid.bin != OUTSIDE) & (grid.r == lowest[0, cell]) & (z == lowest[1, cell])
+        grid.inside & (grid.r == lowest[0, cell]) & (z == lowest[1, cell])
     )
     return found
 
@@ -242,8 +242,7 @@ def _columns(
     candidates = result.candidates
     own = result.surface.inlier & (candidates.segment == segment)
     at_inliers = PolarGrid(
-        candidates.segment[own],
-        candidates.bin[own],
+        (candidates.segment[own] * result.grid.n_bins + candidates.bin[own]).astype(np.int32),
         candidates.r[own],
         result.grid.edges,
         result.grid.n_segments,

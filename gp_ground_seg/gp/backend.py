@@ -5,15 +5,13 @@ from __future__ import annotations
 import logging
 from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
-
 from gp_ground_seg.compiled import HAVE_NUMBA
 from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig, RuntimeConfig
 from gp_ground_seg.errors import MissingDependencyError
 from gp_ground_seg.faces import Faces
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
+from gp_ground_seg.labelling import Labelled
 from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface
@@ -28,16 +26,8 @@ class Backend(Protocol):
     name: str
     n_threads: int
 
-    def polar_grid(self, xyz: FloatArray, finite: BoolArray, grid: GridConfig) -> PolarGrid:
-        """See `gp_ground_seg.polar_grid.build_polar_grid`."""
-
-    def reduce_cells(self, grid: PolarGrid, z: FloatArray) -> CellTables:
-        """See `gp_ground_seg.polar_grid.reduce_cells`."""
-
-    def surface_under_points(
-        self, surface: GroundSurface, grid: PolarGrid
-    ) -> tuple[FloatArray, FloatArray]:
-        """See `gp_ground_seg.surface.GroundSurface.at`."""
+    def sort_points(self, xyz: FloatArray, grid: GridConfig) -> tuple[PolarGrid, CellTables]:
+        """See `gp_ground_seg.polar_grid.build_polar_grid` and `reduce_cells`."""
 
     def find_faces(
         self, xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float
@@ -47,13 +37,13 @@ class Backend(Protocol):
     def label_points(
         self,
         xyz: FloatArray,
-        height: FloatArray,
         grid: PolarGrid,
+        surface: GroundSurface,
         faces: Faces,
         label: LabelConfig,
         face_tolerance: float,
-    ) -> tuple[npt.NDArray[np.uint8], FloatArray, FloatArray]:
-        """See `gp_ground_seg.labelling`: label and margin of each point, roughness of each bin."""
+    ) -> Labelled:
+        """See `gp_ground_seg.labelling`."""
 
     def log_length_scales(
         self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray

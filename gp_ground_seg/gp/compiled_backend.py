@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg import label_passes, point_passes
 from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig
@@ -12,9 +11,10 @@ from gp_ground_seg.gp.growth import BoolArray, grow_surface_compiled
 from gp_ground_seg.gp.latent import latent_rows_compiled
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
-from gp_ground_seg.labelling import root_mean_square
+from gp_ground_seg.labelling import Labelled, band, root_mean_square
 from gp_ground_seg.parallel import RowPool
-from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid, bin_edges
+from gp_ground_seg.point_passes import grid_ruler
+from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface
 
@@ -34,68 +34,32 @@ class CompiledBackend:
         self._pool = RowPool(n_threads)
         self.n_threads = self._pool.n_threads
 
-    def polar_grid(self, xyz: FloatArray, finite: BoolArray, grid: GridConfig) -> PolarGrid:
-        """Segment and bin of each point."""
+    def sort_points(self, xyz: FloatArray, grid: GridConfig) -> tuple[PolarGrid, CellTables]:
+        """Cell of each point, extremes of each cell."""
         n_points = len(xyz)
-        edges = bin_edges(grid)
-        table, scale = point_passes.first_bins(edges)
-        segment = np.empty(n_points, dtype=np.int64)
-        index = np.empty(n_points, dtype=np.int64)
-        r = np.empty(n_points)
-        self._pool.run_points(
-            point_passes.assign_cells,
+        ruler = grid_ruler(grid)
+        cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points)
+        shape = self._pool.n_shares(n_points), grid.n_segments * grid.n_bins
+        lowest_z, lowest_r = np.full(shape, np.inf), np.full(shape, np.inf)
+        highest_z = np.full(shape, -np.inf)
+        count = np.zeros(shape, dtype=np.int64)
+        self._pool.run_shares(
+            point_passes.sort_points,
             n_points,
             xyz,
-            finite,
-            edges,
-            table,
-            scale,
-            grid.n_segments,
-            segment,
-            index,
+            *ruler,
+            cell,
             r,
+            lowest_z,
+            lowest_r,
+            highest_z,
+            count,
         )
-        return PolarGrid(segment, index, r, edges, grid.n_segments)
-
-    def reduce_cells(self, grid: PolarGrid, z: FloatArray) -> CellTables:
-        """Extremes of every bin."""
-        shape = grid.n_segments, len(grid.edges) - 1
-        cells = CellTables(
-            np.full(shape, np.inf),
-            np.full(shape, np.inf),
-            np.full(shape, -np.inf),
-            np.zeros(shape, dtype=np.int64),
-        )
-        point_passes.fill_cells(
-            grid.segment,
-            grid.bin,
-            grid.r,
-            z,
-            cells.lowest_z,
-            cells.lowest_r,
-            cells.highest_z,
-            cells.count,
-        )
-        return cells
-
-    def surface_under_points(
-        self, surface: GroundSurface, grid: PolarGrid
-    ) -> tuple[FloatArray, FloatArray]:
-        """Height and standard deviation of the surface under each point."""
-        ground_z, ground_std = np.empty(len(grid.r)), np.empty(len(grid.r))
-        self._pool.run_points(
-            point_passes.surface_under_points,
-            len(grid.r),
-            grid.segment,
-            grid.bin,
-            grid.r,
-            surface.knots,
-            surface.mean,
-            surface.std,
-            ground_z,
-            ground_std,
-        )
-        return ground_z, ground_std
+        tables = lowest_z, lowest_r, highest_z, count
+        point_passes.merge_cells(*tables)
+        shape = grid.n_segments, grid.n_bins
+        cells = CellTables(*(table[0].reshape(shape) for table in tables))
+        return PolarGrid(cell, r, ruler[0], grid.n_segments), cells
 
     def find_faces(
         self, xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float
@@ -104,20 +68,10 @@ class CompiledBackend:
         n_points = len(xyz)
         half = float(grid.edges[-1])
         side = tiles_per_side(half, faces)
-        tile = np.empty(n_points, dtype=np.int64)
-        self._pool.run_points(
-            label_passes.assign_tiles,
-            n_points,
-            xyz,
-            grid.bin,
-            half,
-            1.0 / faces.cell_size,
-            side,
-            tile,
-        )
+        tile = np.empty(n_points, dtype=np.int32)
         foot_z = np.full(side * side, np.inf)
         tall, is_face = np.zeros((2, side * side), dtype=np.bool_)
-        label_passes.find_feet(xyz, tile, foot_z)
+        label_passes.assign_tiles(xyz, grid.cell, half, 1.0 / faces.cell_size, side, tile, foot_z)
         self._pool.run_points(
             label_passes.mark_tall,
             n_points,
@@ -136,55 +90,53 @@ class CompiledBackend:
     def label_points(
         self,
         xyz: FloatArray,
-        height: FloatArray,
         grid: PolarGrid,
+        surface: GroundSurface,
         faces: Faces,
         label: LabelConfig,
         face_tolerance: float,
-    ) -> tuple[npt.NDArray[np.uint8], FloatArray, FloatArray]:
-        """Label and margin of each point; roughness of each bin."""
-        shape = grid.n_segments, len(grid.edges) - 1
-        number = np.zeros(shape, dtype=np.int64)
-        squares = np.zeros(shape)
+    ) -> Labelled:
+        """Height, label and margin of each point; roughness of each bin."""
+        n_points = len(xyz)
+        shape = self._pool.n_shares(n_points), grid.n_segments * grid.n_bins
+        height = np.empty(n_points)
+        number, squares = np.zeros((2, *shape), dtype=np.int64)
         stands = np.zeros(shape, dtype=np.bool_)
-        label_passes.survey_bins(
-            grid.segment,
-            grid.bin,
+        self._pool.run_shares(
+            label_passes.survey_heights,
+            n_points,
+            xyz,
+            grid.cell,
+            grid.r,
             faces.tile,
-            height,
             faces.is_face,
+            surface.knots,
+            surface.mean,
             label.obstacle_min_height,
             label.obstacle_max_height,
+            height,
             number,
             squares,
             stands,
         )
-        roughness = root_mean_square(number, squares)
-        labels, margin = np.empty(len(height), dtype=np.uint8), np.empty(len(height))
+        roughness = root_mean_square(number.sum(axis=0), squares.sum(axis=0), grid.n_segments)
+        labels, margin = np.empty(n_points, dtype=np.uint8), np.empty(n_points)
         self._pool.run_points(
             label_passes.label_by_height,
-            len(height),
+            n_points,
             xyz,
-            grid.segment,
-            grid.bin,
-            grid.r,
+            grid.cell,
             faces.tile,
             height,
             faces.is_face,
             faces.foot_z,
-            stands,
-            roughness,
-            label.ground_tolerance,
-            label.roughness_gain,
-            label.obstacle_tolerance,
-            label.obstacle_roughness_gain,
-            label.obstacle_min_height,
+            band(roughness, stands.any(axis=0).reshape(roughness.shape), label).ravel(),
             label.below_tolerance,
             face_tolerance,
             labels,
             margin,
         )
-        return labels, margin, roughness
+        return Labelled(labels, height, margin, roughness)
 
     def log_length_scales(
         self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray

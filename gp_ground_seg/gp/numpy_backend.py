@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig
@@ -12,7 +11,7 @@ from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
-from gp_ground_seg.labelling import label_points, local_roughness
+from gp_ground_seg.labelling import Labelled, label_points, local_roughness
 from gp_ground_seg.polar_grid import (
     Candidates,
     CellTables,
@@ -31,19 +30,10 @@ class NumpyBackend:
     name = 'numpy'
     n_threads = 1
 
-    def polar_grid(self, xyz: FloatArray, finite: BoolArray, grid: GridConfig) -> PolarGrid:
-        """Segment and bin of each point."""
-        return build_polar_grid(xyz, finite, grid)
-
-    def reduce_cells(self, grid: PolarGrid, z: FloatArray) -> CellTables:
-        """Extremes of every bin."""
-        return reduce_cells(grid, z)
-
-    def surface_under_points(
-        self, surface: GroundSurface, grid: PolarGrid
-    ) -> tuple[FloatArray, FloatArray]:
-        """Height and standard deviation of the surface under each point."""
-        return surface.at(grid)
+    def sort_points(self, xyz: FloatArray, grid: GridConfig) -> tuple[PolarGrid, CellTables]:
+        """Cell of each point, extremes of each cell."""
+        sorted_points = build_polar_grid(xyz, grid)
+        return sorted_points, reduce_cells(sorted_points, xyz[:, 2])
 
     def find_faces(
         self, xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float
@@ -54,18 +44,19 @@ class NumpyBackend:
     def label_points(
         self,
         xyz: FloatArray,
-        height: FloatArray,
         grid: PolarGrid,
+        surface: GroundSurface,
         faces: Faces,
         label: LabelConfig,
         face_tolerance: float,
-    ) -> tuple[npt.NDArray[np.uint8], FloatArray, FloatArray]:
-        """Label and margin of each point; roughness of each bin."""
+    ) -> Labelled:
+        """Height, label and margin of each point; roughness of each bin."""
+        height = xyz[:, 2] - surface.at(grid)[0]
         roughness = local_roughness(height, grid, faces, label.obstacle_min_height)
         labels, margin = label_points(
             xyz[:, 2], height, grid, faces, roughness, label, face_tolerance
         )
-        return labels, margin, roughness
+        return Labelled(labels, height, margin, roughness)
 
     @single_threaded_blas()
     def log_length_scales(
