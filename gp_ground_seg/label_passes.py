@@ -32,16 +32,22 @@ def assign_tiles(
     foot_z: FloatArray,
 ) -> None:
     """Tile of each point, and the lowest height of each tile into a table of infinities."""
+    held = np.uintp(0)
+    low = foot_z[0]
     for i in range(len(cell)):
         if cell[i] < 0:
             tile[i] = OUTSIDE
             continue
         column = min(int((xyz[i, 0] + half) * per_metre), side - 1)
         row = min(int((xyz[i, 1] + half) * per_metre), side - 1)
-        own = column * side + row
+        own = np.uintp(column * side + row)
         tile[i] = own
-        if xyz[i, 2] < foot_z[own]:
-            foot_z[own] = xyz[i, 2]
+        if own != held:
+            foot_z[held] = low
+            held = own
+            low = foot_z[held]
+        low = min(low, xyz[i, 2])
+    foot_z[held] = low
 
 
 @compiled
@@ -57,8 +63,8 @@ def mark_tall(
 ) -> None:
     """Mark the tiles with returns well above the lowest; threads only ever write True."""
     for i in range(start, stop):
-        own = tile[i]
-        if own != OUTSIDE:
+        if tile[i] != OUTSIDE:
+            own = np.uintp(tile[i])
             above_foot = xyz[i, 2] - foot_z[own]
             if min_height < above_foot <= max_height:
                 tall[own] = True
@@ -127,8 +133,9 @@ def survey_heights(
     r: FloatArray,
     tile: CellArray,
     is_face: BoolArray,
-    knots: FloatArray,
-    mean: FloatArray,
+    near: FloatArray,
+    level: FloatArray,
+    slope: FloatArray,
     min_height: float,
     max_height: float,
     height: FloatArray,
@@ -140,24 +147,21 @@ def survey_heights(
 
     Points `start` to `stop`, summed up in tables ``[share]``. Squares are summed in
     whole numbers: the sum does not depend on its order, nor on the number of threads.
+    `near`, `level` and `slope` are the cells' near ends and the surface's pieces there.
     """
-    n_bins = len(knots) - 1
-    number, squares, stands = number[share], squares[share], stands[share]
     for i in range(start, stop):
-        own = cell[i]
-        if own < 0:
+        if cell[i] < 0:
             height[i] = np.nan
             continue
-        m = own // n_bins
-        n = own - m * n_bins
-        weight = max((r[i] - knots[n]) / (knots[n + 1] - knots[n]), 0.0)
-        h = xyz[i, 2] - (mean[m, n] * (1.0 - weight) + mean[m, n + 1] * weight)
+        own = np.uintp(cell[i])
+        h = xyz[i, 2] - (level[own] + slope[own] * max(r[i] - near[own], 0.0))
         height[i] = h
-        if min_height <= h <= max_height:
-            stands[own] = True
-        if -min_height <= h <= min_height and not is_face[tile[i]]:
-            number[own] += 1
-            squares[own] += int(h * h * SQUARE_UNITS + 0.5)
+        if h >= min_height:
+            if h <= max_height:
+                stands[share, own] = True
+        elif h >= -min_height and not is_face[np.uintp(tile[i])]:
+            number[share, own] += 1
+            squares[share, own] += int(h * h * SQUARE_UNITS + 0.5)
 
 
 @compiled
@@ -183,9 +187,9 @@ def label_by_height(
             margin[i] = np.nan
             label[i] = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
             continue
-        own = min(band[n] - height[i], height[i] + below_tolerance)
-        if is_face[tile[i]]:
-            over_foot = max(height[i], xyz[i, 2] - foot_z[tile[i]])
+        own = min(band[np.uintp(n)] - height[i], height[i] + below_tolerance)
+        if is_face[np.uintp(tile[i])]:
+            over_foot = max(height[i], xyz[i, 2] - foot_z[np.uintp(tile[i])])
             own = min(own, face_tolerance - over_foot)
         margin[i] = own
         label[i] = _GROUND if own >= 0.0 else _OBSTACLE

@@ -151,7 +151,10 @@ def local_roughness(
         Roughness [m]; 0 where there are no points.
     """
     counts = (
-        (np.abs(height) <= max_height) & grid.inside & ~faces.is_face[np.maximum(faces.tile, 0)]
+        (height < max_height)
+        & (height >= -max_height)
+        & grid.inside
+        & ~faces.is_face[np.maximum(faces.tile, 0)]
     )
     cell = grid.cell[counts]
     size = grid.n_segments * grid.n_bins

@@ -36,19 +36,30 @@ class GroundSurface:
         Linear between the knots; nearer than the first knot it is the first
         knot's. NaN beyond the last knot and in segments without a model.
         """
-        inside = np.maximum(grid.cell, 0)
-        segment = inside // grid.n_bins
-        index = inside - segment * grid.n_bins
-        left, right = self.knots[index], self.knots[index + 1]
-        weight = np.clip((grid.r - left) / (right - left), 0.0, 1.0)
-        flat = segment * len(self.knots) + index
+        cell = np.maximum(grid.cell, 0)
         outside = ~grid.inside
+        beyond = np.maximum(grid.r - np.tile(self.knots[:-1], len(self.mean))[cell], 0.0)
         values = []
-        for table in (self.mean.ravel(), self.std.ravel()):
-            value = table[flat] * (1.0 - weight) + table[flat + 1] * weight
+        for table in (self.mean, self.std):
+            start, slope = pieces(self.knots, table)
+            value = start[cell] + slope[cell] * beyond
             value[outside] = np.nan
             values.append(value)
         return values[0], values[1]
+
+
+def pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Value at the near end of each cell and slope across it, two (M * n_bins,) float64.
+
+    Parameters
+    ----------
+    knots : (K,) float64
+        Ranges of the knots [m].
+    table : (M, K) float64
+        Values at the knots, linear between them.
+    """
+    slope = np.diff(table, axis=1) / np.diff(knots)
+    return table[:, :-1].ravel(), slope.ravel()
 
 
 def fuse_neighbours(

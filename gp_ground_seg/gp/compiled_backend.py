@@ -16,7 +16,7 @@ from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.point_passes import grid_ruler
 from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
-from gp_ground_seg.surface import GroundSurface
+from gp_ground_seg.surface import GroundSurface, pieces
 
 
 class CompiledBackend:
@@ -110,8 +110,8 @@ class CompiledBackend:
             grid.r,
             faces.tile,
             faces.is_face,
-            surface.knots,
-            surface.mean,
+            np.tile(surface.knots[:-1], grid.n_segments),
+            *pieces(surface.knots, surface.mean),
             label.obstacle_min_height,
             label.obstacle_max_height,
             height,
