@@ -139,7 +139,9 @@ def build_polar_grid(xyz: FloatArray, grid: GridConfig) -> PolarGrid:
     with np.errstate(over='ignore'):  # infinitely far is outside
         r = np.sqrt(x * x + y * y)
     # Exactly -x is the edge that ends the last segment: that is segment 0 again.
-    turn = np.searchsorted(segment_edges(grid.n_segments), pseudo_angle(x, y), side='right') - 1
+    near = r < edges[-1]
+    angle = pseudo_angle(np.where(near, x, 0.0), np.where(near, y, 0.0))
+    turn = np.searchsorted(segment_edges(grid.n_segments), angle, side='right') - 1
     segment = turn % grid.n_segments
     # Points nearer than the first edge belong to the first bin.
     index = np.maximum(np.searchsorted(edges, r, side='right') - 1, 0)

@@ -12,7 +12,7 @@ GRID = GridConfig(r_max=30.0)
 
 def faces_of(xyz, **changes):
     xyz = np.asarray(xyz, dtype=float)
-    grid = build_polar_grid(xyz, np.isfinite(xyz).all(axis=1), GRID)
+    grid = build_polar_grid(xyz, GRID)
     found = find_faces(xyz, grid, FacesConfig(**changes), 2.0)
     return found.is_face[np.maximum(found.tile, 0)] & (found.tile != OUTSIDE), found
 

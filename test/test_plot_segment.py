@@ -82,7 +82,7 @@ def count(pixels, colour):
 )
 def test_segment_at_is_that_of_the_grid(azimuth, n_segments):
     xyz = np.array([[10.0 * math.cos(azimuth), 10.0 * math.sin(azimuth), 0.0]])
-    grid = build_polar_grid(xyz, np.ones(1, dtype=bool), GridConfig(n_segments=n_segments))
+    grid = build_polar_grid(xyz, GridConfig(n_segments=n_segments))
     # On the edge between two segments rounding decides.
     position = (azimuth / math.tau + 0.5) * n_segments
     if abs(position - round(position)) > 1e-9:

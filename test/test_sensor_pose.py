@@ -41,19 +41,19 @@ def segmenter(**sensor):
 
 def candidates_of(points):
     """Slow and obvious: no compiled code, no backend."""
-    xyz, finite = check_points(points)
-    grid = build_polar_grid(xyz, finite, Config().grid)
+    xyz = check_points(points)
+    grid = build_polar_grid(xyz, Config().grid)
     return ground_candidates(reduce_cells(grid, xyz[:, 2]), grid.edges, 0.05)
 
 
 def pose_of(points, use_compiled=True, **sensor):
-    xyz, finite = check_points(points)
+    xyz = check_points(points)
     values = {f'sensor.{name}': value for name, value in sensor.items()}
     return estimate_pose(
         candidates_of(xyz),
         Config().replace(**values).sensor,
         use_compiled,
-        lambda turn: candidates_of(turned_sample(xyz, finite, turn)[0]),
+        lambda turn: candidates_of(turned_sample(xyz, turn)),
     )
 
 

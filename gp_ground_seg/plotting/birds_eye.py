@@ -15,7 +15,7 @@ from gp_ground_seg.errors import ConfigError, PointCloudError
 from gp_ground_seg.evaluation.scores import count_confusion
 from gp_ground_seg.labels import Label
 from gp_ground_seg.plotting.canvas import new_figure
-from gp_ground_seg.points import check_points
+from gp_ground_seg.points import check_points, finite_points
 
 # After Okabe and Ito's palette, told apart with any colour vision and in grey print.
 GROUND_COLOUR = '#E3B968'
@@ -77,7 +77,8 @@ def plot_birds_eye(
     DataError
         If the file cannot be written.
     """
-    xyz, finite = check_points(points)
+    xyz = check_points(points)
+    finite = finite_points(xyz)
     for name, values in (('label', label), ('truth', truth)):
         if values is not None and values.shape != (len(xyz),):
             raise PointCloudError(

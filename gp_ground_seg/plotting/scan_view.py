@@ -15,7 +15,7 @@ from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.labels import Label
 from gp_ground_seg.length_scale_colours import length_scale_colours
 from gp_ground_seg.plotting.canvas import new_figure
-from gp_ground_seg.points import check_points
+from gp_ground_seg.points import check_points, finite_points
 from gp_ground_seg.segmentation import Segmentation
 
 FloatArray = npt.NDArray[np.float64]
@@ -102,7 +102,8 @@ def plot_scan_view(
     DataError
         If the file cannot be written.
     """
-    xyz, finite = check_points(points)
+    xyz = check_points(points)
+    finite = finite_points(xyz)
     if len(xyz) != len(segmentation.label):
         raise PointCloudError(
             f'{len(xyz)} points for {len(segmentation.label)} labels: must be the same scan'
