@@ -416,6 +416,13 @@ class LearningConfig:
         'segment (slow, for comparison)',
         choices=('frame', 'segment'),
     )
+    segment_step: int = parameter(
+        3,
+        'for the scope frame: every how many segments one speaks for the frame; neighbouring '
+        'segments see much the same ground',
+        low=1,
+        high=60,
+    )
     objective: str = parameter(
         'map',
         'map = likelihood of the heights and priors; paper = as printed, which has no upper bound',

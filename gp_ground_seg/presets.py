@@ -85,6 +85,7 @@ _PRESETS = (
             Override('label.obstacle_roughness_gain', 0.0, 'one zeta_g for all (Algorithm 2)'),
             Override('learning.objective', 'paper', 'section III-E as printed'),
             Override('learning.scope', 'frame', 'one theta for the whole frame, section III-E'),
+            Override('learning.segment_step', 1, 'every segment speaks, section III-E'),
         ),
     ),
     Preset('hdl64', 'Velodyne HDL-64E on the roof of a car; the defaults are for this sensor.'),

@@ -71,13 +71,15 @@ class FrameModel:
         return u, interpolate_along_segments(self.candidates, u, knots)
 
     def grow(
-        self, theta: FloatArray, knots: FloatArray
+        self, theta: FloatArray, knots: FloatArray, segment_step: int = 1
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Inliers (C,) that grow from low, near seeds; see `surface` for what else."""
         growth = self.config.growth
         seed = (self.candidates.r <= growth.seed_range) & (
             np.abs(self.height) <= growth.seed_height_tolerance
         )
+        if segment_step > 1:
+            seed &= self.candidates.segment % segment_step == 0
         u, knot_u = self.log_length_scales(theta, knots)
         inlier, mean, std = self.backend.grow(
             self.candidates,
@@ -102,9 +104,11 @@ class FrameModel:
         self, theta: FloatArray, out_of_time: Callable[[], bool]
     ) -> tuple[FloatArray, list[Learned]]:
         """Learn theta on the inliers that grow under it (paper, section III-E)."""
-        inlier, *_ = self.grow(theta, _NO_KNOTS)
+        by_frame = self.config.learning.scope == 'frame'
+        step = self.config.learning.segment_step if by_frame else 1
+        inlier, *_ = self.grow(theta, _NO_KNOTS, step)
         frame = self._training_frame(theta, inlier)
-        if self.config.learning.scope == 'frame':
+        if by_frame:
             learned = [self._learn_one(theta[0], frame, out_of_time)]
             return np.tile(learned[0].theta, (len(theta), 1)), learned
         learned = [
