@@ -104,7 +104,9 @@ def test_turning_by_a_segment_turns_the_surface(scan):
     angle = 2 * np.pi / Config().grid.n_segments
     c, s = np.cos(angle), np.sin(angle)
     turned = scan @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
-    given = GroundSegmenter(Config().replace(**{'sensor.height': 1.73}))
+    # Which segments teach is fixed; all of them do not change when the scan is turned.
+    settings = {'sensor.height': 1.73, 'learning.segment_step': 1}
+    given = GroundSegmenter(Config().replace(**settings))
     a, b = given.segment(scan), given.segment(turned)
     np.testing.assert_allclose(b.surface.mean, np.roll(a.surface.mean, 1, axis=0), atol=1e-6)
 
@@ -115,7 +117,7 @@ def test_input_is_never_written_to_nor_kept(scan):
     result = SEGMENTER.segment(points)
     assert not any(
         np.shares_memory(points, value)
-        for value in vars(result).values()
+        for value in [*vars(result).values(), *vars(result.labelled).values()]
         if isinstance(value, np.ndarray)
     )
 
@@ -151,7 +153,7 @@ def test_backends_agree(scan):
 
 def test_a_wider_tolerance_takes_more_ground(scan):
     counts = []
-    for tolerance in (0.02, 0.1, 0.3):
+    for tolerance in (0.01, 0.03, 0.3):
         config = Config().replace(
             **{'label.ground_tolerance': tolerance, 'label.roughness_gain': 0.0}
         )
