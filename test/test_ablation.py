@@ -16,6 +16,7 @@ from hypothesis.extra import numpy as npst
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.cli import ablation as command
+from gp_ground_seg.cli.leave_out import split_settings
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import config_from_options
 from gp_ground_seg.datasets.semantic_kitti import read_labels, read_points
@@ -55,9 +56,17 @@ def test_commands_of_the_docs_are_accepted():
     """Those above the tables of docs/experiments.md, and those in its text."""
     text = (Path(__file__).parents[1] / 'docs' / 'experiments.md').read_text(encoding='utf-8')
     commands = re.findall(r'`gp-ground-seg (.*?)`', text)
-    assert {words.split()[0] for words in commands} == {'table1', 'plot-segment', 'ablation'}
+    names = {'table1', 'plot-segment', 'ablation', 'evaluate', 'ideas', 'leave-out', 'scenes'}
+    assert {words.split()[0] for words in commands} == names
     for words in commands:
         arguments = build_parser(words.split()[0]).parse_args(shlex.split(words))
+        if words.startswith('leave-out'):
+            grid, arguments.settings = split_settings(arguments.settings)
+            for name, values in grid.items():
+                for value in values:
+                    Config().replace(**{name: value})
+        if words.startswith('scenes'):  # each sensor has a preset of its own
+            arguments.preset = arguments.preset or 'default'
         config_from_options(arguments)
 
 

@@ -34,6 +34,8 @@ COMMANDS = {
     'plot-segment': 'draw one segment from the side',
     'plot-scan': 'draw a scan in perspective, with the ground model on it',
     'ablation': 'compare length-scale models and ways to learn',
+    'ideas': 'what each idea is worth: switched off one at a time',
+    'leave-out': 'choose parameters, score them on the sequence left out',
     'scenes': 'score on simulated scenes, flat and rough, beside Patchwork++',
     'kitti-to-bag': 'write a KITTI sequence as a rosbag2',
     'play': "publish a bag's clouds as they were recorded",

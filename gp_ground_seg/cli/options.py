@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 import yaml
 
@@ -46,13 +47,21 @@ def config_from_options(arguments: argparse.Namespace) -> Config:
     config = find_preset(arguments.preset).config
     if arguments.config:
         config = Config.from_yaml(arguments.config, config)
-    changes = {}
-    for setting in arguments.settings:
-        name, separator, text = setting.partition('=')
-        if not separator:
-            raise ConfigError(f'--set {setting}: must be NAME=VALUE')
-        try:
-            changes[name.strip()] = load_yaml(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f'--set {setting}: {text!r} is not a value') from error
-    return config.replace(**changes)
+    return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
+
+
+def parse_setting(setting: str) -> tuple[str, Any]:
+    """Read ``NAME=VALUE``; whether the parameter takes the value is not looked at.
+
+    Raises
+    ------
+    ConfigError
+        If it is not of that form.
+    """
+    name, separator, text = setting.partition('=')
+    if not separator:
+        raise ConfigError(f'--set {setting}: must be NAME=VALUE')
+    try:
+        return name.strip(), load_yaml(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f'--set {setting}: {text!r} is not a value') from error

@@ -101,16 +101,20 @@ class MethodResult:
 
 @contextmanager
 def open_segmenters(
-    methods: Mapping[str, Mapping[str, ParameterValue]], config: Config
+    methods: Mapping[str, Mapping[str, ParameterValue]],
+    config: Config,
+    over_defaults: bool = True,
 ) -> Iterator[dict[str, GroundSegmenter]]:
     """Yield a segmenter for each method's changes of `config`; their threads end afterwards.
 
     Raises
     ------
     ConfigError
-        If `config` itself changes what the methods set, or a change is not accepted.
+        If a change is not accepted, or with `over_defaults` if `config` itself
+        changes what the methods set.
     """
-    for name in sorted({name for changes in methods.values() for name in changes}):
+    names = {name for changes in methods.values() for name in changes}
+    for name in sorted(names) if over_defaults else ():
         if config[name] != find_spec(name).default:
             raise ConfigError(
                 f'{name} = {config[name]}: the methods compared set it, leave it out'
@@ -129,6 +133,7 @@ def ablate(
     config: Config,
     clock: Callable[[], float] = time.perf_counter,
     progress: Callable[[Sequence[Frame]], Iterable[Frame]] = iter,
+    over_defaults: bool = True,
 ) -> list[MethodResult]:
     """Run methods on the same frames, alternately.
 
@@ -144,6 +149,8 @@ def ablate(
         Source of seconds.
     progress : callable
         Wraps the frames to show how far it is, as tqdm does.
+    over_defaults : bool
+        As `open_segmenters`.
 
     Raises
     ------
@@ -154,7 +161,7 @@ def ablate(
     """
     results: dict[str, list[FrameResult]] = {title: [] for title in methods}
     fits: dict[str, FitReport] = {}
-    with open_segmenters(methods, config) as segmenters:
+    with open_segmenters(methods, config, over_defaults) as segmenters:
         points = read_points(frames[0].points_path)
         for segmenter in segmenters.values():  # compiling is not their speed
             segmenter.segment(points)
