@@ -297,6 +297,15 @@ class GrowthConfig:
         low=0.1,
         high=200.0,
     )
+    max_line_slope: float = parameter(
+        1.0,
+        'slope of a line of candidates up to which those that continue it from inliers join',
+        low=0.0,
+        high=10.0,
+    )
+    min_line_size: int = parameter(
+        4, 'candidates that such a line needs at least', low=2, high=10000
+    )
 
 
 @dataclass(frozen=True)

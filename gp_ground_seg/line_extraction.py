@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.config import LinesConfig
@@ -34,6 +35,17 @@ class Lines:
         """Horizontal extent of each line, (Q,) float64 [m]."""
         value: FloatArray = candidates.r[self.start[1:] - 1] - candidates.r[self.start[:-1]]
         return value
+
+    def continued(self, max_slope: float, min_size: int) -> npt.NDArray[np.bool_]:
+        """Candidates that continue the line of the one before them, (C,) bool.
+
+        Of lines that are no steeper than `max_slope` and have at least `min_size`
+        candidates: what is longer and flatter than an obstacle, and hangs together.
+        """
+        counts = (np.abs(self.slope) <= max_slope) & (np.diff(self.start) >= min_size)
+        result: npt.NDArray[np.bool_] = counts[self.line]
+        result[self.start[:-1]] = False
+        return result
 
 
 def extract_lines(candidates: Candidates, lines: LinesConfig) -> Lines:

@@ -77,6 +77,7 @@ _PRESETS = (
             Override('surface.n_neighbours', 0, 'each segment has a surface of its own'),
             Override('growth.max_standardised_residual', 2.0, 'a gate alike above and below'),
             Override('growth.max_standardised_depth', 2.0, 'a gate alike above and below'),
+            Override('growth.max_line_slope', 0.0, 'the gate alone decides'),
             Override('faces.min_height', 100.0, 'no faces'),
             Override('label.ground_tolerance', 0.2, 'zeta_g, not printed: one for all'),
             Override('label.roughness_gain', 0.0, 'one zeta_g for all (Algorithm 2)'),

@@ -49,7 +49,7 @@ def test_batches_hold_every_segment_once_and_like_sizes_together(counts):
 def test_growth(seed, n_segments, slope_std, with_knots):
     frame = random_candidates(seed, n_segments)
     if not with_knots:
-        frame = (*frame[:5], np.empty(0), np.empty((n_segments, 0)))
+        frame = (*frame[:6], np.empty(0), np.empty((n_segments, 0)))
     # Every segment may have its own.
     ends = (0.1, 0.5), (0.1, 0.03), (0.02, 0.2)
     noise = [np.linspace(*both, n_segments) for both in ends]

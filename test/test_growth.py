@@ -21,7 +21,9 @@ def random_frame(seed, n_segments=5):
     length_scale = rng.uniform(1.0, 12.0, len(r))
     knot_length_scale = rng.uniform(1.0, 12.0, (n_segments, len(KNOTS)))
     seed_mask = (r < 15.0) & (np.abs(z) < 0.2)
-    return offsets, r, z, length_scale, seed_mask, KNOTS, knot_length_scale
+    follows = rng.random(len(r)) < 0.3
+    follows[offsets[:-1][counts > 0]] = False
+    return offsets, r, z, length_scale, seed_mask, follows, KNOTS, knot_length_scale
 
 
 def compiled(frame, growth, chunks=1, sigma_f=None, sigma_n=None, gate_noise=None, slope_std=0.05):
@@ -80,7 +82,7 @@ def test_chunks_do_not_matter():
         np.testing.assert_array_equal(a, b)
 
 
-def grow_line(z, r=None, seed=None, **bounds):
+def grow_line(z, r=None, seed=None, follows=None, **bounds):
     r = np.arange(3.0, 3.0 + len(z)) if r is None else r
     seed = np.arange(len(z)) < 3 if seed is None else seed
     flat = np.full(len(z), 8.0)
@@ -90,6 +92,7 @@ def grow_line(z, r=None, seed=None, **bounds):
         np.asarray(z, dtype=float),
         flat,
         seed,
+        np.zeros(len(z), dtype=bool) if follows is None else follows,
         KNOTS,
         np.full((1, len(KNOTS)), 8.0),
         np.array([0.2]),
@@ -136,3 +139,15 @@ def test_what_lies_below_is_believed_sooner_than_what_lies_above():
     assert list(np.flatnonzero(~grow_line(z)[0])) == [3]
     assert grow_line(-z)[0].all()
     assert list(np.flatnonzero(~grow_line(-z, max_standardised_depth=2.0)[0])) == [3]
+
+
+def test_a_line_is_followed_from_inliers_on_wherever_it_leads():
+    z = np.concatenate([np.zeros(6), 0.8 * np.arange(1.0, 9.0)])
+    follows = np.arange(14) > 6
+    assert list(np.flatnonzero(grow_line(z)[0])) == list(range(6))
+    # The line begins at 6, which is no inlier: nothing to follow.
+    assert list(np.flatnonzero(grow_line(z, follows=follows)[0])) == list(range(6))
+    follows[5:] = True
+    inlier, mean, _ = grow_line(z, follows=follows)
+    assert inlier.all()
+    assert mean[0, np.searchsorted(KNOTS, 14.0)] > 1.0

@@ -158,3 +158,16 @@ def test_lines_do_not_cross_segments_and_lone_points_have_no_slope():
 def test_no_candidates():
     lines = extract_lines(one_segment([], []), LinesConfig())
     assert len(lines.line) == len(lines.slope) == 0
+
+
+def test_what_continues_a_line_long_and_flat_enough():
+    # A road, a ramp of 0.3, a wall of three candidates.
+    r = np.concatenate([np.arange(2.0, 8.0), np.arange(8.0, 14.0), [14.0, 14.1, 14.2]])
+    z = np.concatenate([np.zeros(6), 0.3 * np.arange(1.0, 7.0), [2.5, 3.5, 4.5]])
+    lines = extract_lines(one_segment(r, z), LinesConfig())
+    assert list(lines.start) == [0, 6, 12, 15]
+    ramp_and_road = [*range(1, 6), *range(7, 12)]
+    assert list(np.flatnonzero(lines.continued(1.0, 4))) == ramp_and_road
+    assert list(np.flatnonzero(lines.continued(0.2, 4))) == list(range(1, 6))
+    assert list(np.flatnonzero(lines.continued(20.0, 3))) == [*ramp_and_road, 13, 14]
+    assert not lines.continued(1.0, 7).any()

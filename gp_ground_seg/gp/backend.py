@@ -56,6 +56,7 @@ class Backend(Protocol):
         height: FloatArray,
         length_scale: FloatArray,
         seed: BoolArray,
+        follows: BoolArray,
         knots: FloatArray,
         knot_length_scale: FloatArray,
         theta: FloatArray,

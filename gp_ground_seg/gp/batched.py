@@ -82,6 +82,7 @@ def grow_surface_batched(
     z: FloatArray,
     length_scale: FloatArray,
     seed: BoolArray,
+    follows: BoolArray,
     knots: FloatArray,
     knot_length_scale: FloatArray,
     sigma_f: FloatArray,
@@ -107,7 +108,8 @@ def grow_surface_batched(
         noise = np.broadcast_to(sigma_n[segments, None] ** 2, own_r.shape)
         gate = np.broadcast_to(gate_noise[segments, None] ** 2, own_r.shape)
         own_seed = seed[own.index] & own.mask
-        chosen = _grow(covariance, own_z, noise, gate, own.mask, own_seed, growth)
+        own_follows = follows[own.index] & own.mask
+        chosen = _grow(covariance, own_z, noise, gate, own.mask, own_seed, own_follows, growth)
         inlier[own.index[own.mask]] = chosen[own.mask]
         grown = chosen.any(axis=1)
         if len(knots) and grown.any():
@@ -143,6 +145,7 @@ def _grow(
     gate: FloatArray,
     mask: BoolArray,
     seed: BoolArray,
+    follows: BoolArray,
     growth: GrowthConfig,
 ) -> BoolArray:
     """Inliers of each segment, (S, n), for the prior covariance of its candidates."""
@@ -164,6 +167,9 @@ def _grow(
             & (residual <= growth.max_standardised_residual)
             & (residual >= -growth.max_standardised_depth)
         )
+        following = follows[active] & ~chosen[active]
+        following[:, 1:] &= chosen[active, :-1]
+        joining |= following
         grows = joining.any(axis=1)
         active, joining = active[grows], joining[grows]
         covariance, height = covariance[grows], height[grows]

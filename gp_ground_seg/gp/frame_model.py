@@ -86,6 +86,7 @@ class FrameModel:
             self.height,
             np.exp(u),
             seed,
+            self.lines.continued(growth.max_line_slope, growth.min_line_size),
             knots,
             np.exp(knot_u),
             theta,

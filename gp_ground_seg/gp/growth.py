@@ -27,6 +27,7 @@ def grow_surface_reference(
     z: FloatArray,
     length_scale: FloatArray,
     seed: BoolArray,
+    follows: BoolArray,
     knots: FloatArray,
     knot_length_scale: FloatArray,
     sigma_f: FloatArray,
@@ -52,6 +53,8 @@ def grow_surface_reference(
         Range, height about the prior mean, and length-scale of the candidates [m].
     seed : (C,) bool
         Candidates that start the inlier set.
+    follows : (C,) bool
+        Candidates that join if the one before them has: they continue its line.
     knots : (K,) float64
         Ranges where the surface is wanted [m].
     knot_length_scale : (M, K) float64
@@ -100,6 +103,9 @@ def grow_surface_reference(
                 & (residual <= growth.max_standardised_residual)
                 & (residual >= -growth.max_standardised_depth)
             )
+            following = follows[own].copy()
+            following[1:] &= chosen[:-1]
+            joining |= following & ~chosen
             if not joining.any():
                 break
             chosen |= joining
@@ -127,6 +133,7 @@ def grow_surface_compiled(
     z: FloatArray,
     length_scale: FloatArray,
     seed: BoolArray,
+    follows: BoolArray,
     knots: FloatArray,
     knot_length_scale: FloatArray,
     sigma_f: FloatArray,
@@ -205,6 +212,9 @@ def grow_surface_compiled(
                 n_inliers += 1
             grown = False
             for i in range(n):
+                if follows[first + i] and inlier[first + i - 1] and not inlier[first + i]:
+                    joining[i] = grown = True
+                    continue
                 spread = math.sqrt(max(variance[i], 0.0) + gate_noise[m] ** 2)
                 residual = (z[first + i] - height[i]) / spread
                 joining[i] = (
