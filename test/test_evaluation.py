@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.datasets.semantic_kitti import read_labels, read_points
-from gp_ground_seg.errors import DataError, MissingDependencyError
+from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation.conventions import (
     CONVENTIONS,
     GROUNDGRID,
@@ -231,6 +231,16 @@ def test_labels_that_do_not_fit_are_an_error(tmp_path):
     path.write_bytes(path.read_bytes()[:-4])
     with pytest.raises(DataError, match=r'000000\.label'):
         evaluate(labelled_frames(tmp_path), [HeightRule('rule', -1.5)])
+
+
+def test_a_scan_that_is_refused_is_named(tmp_path):
+    points, semantic = street()
+    points[:, 2] *= -1  # upside down
+    write_frame(tmp_path, '00', 3, points, semantic)
+    ours = OurMethod(Config())
+    with pytest.raises(PointCloudError, match=r'000003\.bin: gp_ground_seg: '):
+        evaluate(labelled_frames(tmp_path), [ours])
+    ours.close()
 
 
 def test_ours_is_the_library(tmp_path):

@@ -16,7 +16,7 @@ from gp_ground_seg.datasets.semantic_kitti import (
     read_labels,
     read_points,
 )
-from gp_ground_seg.errors import DataError
+from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation.calibration import count_calibration
 from gp_ground_seg.evaluation.conventions import CONVENTIONS, GROUNDGRID
 from gp_ground_seg.evaluation.methods import Method
@@ -96,12 +96,14 @@ def evaluate(
     ------
     DataError
         If a file cannot be read or does not fit its frame.
+    PointCloudError
+        If a method refuses a scan.
     """
     if frames:
         points = read_points(frames[0].points_path)
         for method in methods:
             method.start_sequence()
-            method.run(points)
+            _run(method, frames[0], points)
     scores: dict[str, list[FrameScore]] = {method.name: [] for method in methods}
     sequence = None
     for k, frame in enumerate(progress(frames)):
@@ -114,7 +116,7 @@ def evaluate(
         semantic = read_labels(frame.labels_path, len(points))
         for method in methods if k % 2 == 0 else reversed(methods):
             start = clock()
-            method.run(points)
+            _run(method, frame, points)
             seconds = clock() - start
             label = method.label()
             score = _score_frame(frame, method, seconds, points, semantic, label)
@@ -122,6 +124,13 @@ def evaluate(
             if observe is not None:
                 observe(method.name, frame, score, label)
     return [MethodScore(name, tuple(found)) for name, found in scores.items()]
+
+
+def _run(method: Method, frame: Frame, points: npt.NDArray[np.float32]) -> None:
+    try:
+        method.run(points)
+    except PointCloudError as error:
+        raise PointCloudError(f'{frame.points_path}: {method.name}: {error}') from error
 
 
 def _score_frame(

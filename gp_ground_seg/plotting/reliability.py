@@ -70,7 +70,7 @@ def plot_reliability(
     upper.set_axisbelow(True)
     text = f'ECE {pooled.ece:.4f}\nBrier {pooled.brier:.4f}'
     upper.text(0.97, 0.03, text, ha='right', va='bottom', fontsize=11)
-    upper.legend(loc='upper left', frameon=False)
+    upper.legend(loc='lower right', bbox_to_anchor=(1.0, 0.1), frameon=False)
     _draw_counts(lower, pooled)
     with staged_file(path, force=True) as part:
         canvas.print_png(str(part))
