@@ -442,7 +442,7 @@ class LearningConfig:
         'start from the frame before: fewer evaluations, but the labels depend on the past',
     )
     max_evaluations: int = parameter(
-        5, 'evaluations of the objective per frame; the best so far is used', low=1, high=1000
+        4, 'evaluations of the objective per frame; the best so far is used', low=1, high=1000
     )
     max_time: float = parameter(
         0.0,

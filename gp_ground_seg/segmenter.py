@@ -21,7 +21,7 @@ from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid, ground_c
 from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
 from gp_ground_seg.segmentation import FitReport, Segmentation
 from gp_ground_seg.sensor_pose import SensorPose, estimate_pose, given_pose
-from gp_ground_seg.surface import GroundSurface, fuse_neighbours
+from gp_ground_seg.surface import GroundSurface
 from gp_ground_seg.tilt import turned_sample
 from gp_ground_seg.timing import StageTimer
 
@@ -123,7 +123,7 @@ class GroundSegmenter:
         timer.mark('learning')
 
         inlier, mean, std, log_length_scale = model.surface(theta)
-        mean, std = fuse_neighbours(
+        mean, std = self._backend.fuse_neighbours(
             mean, std, grid.edges, config.surface.n_neighbours, config.observation.slope_std
         )
         surface = GroundSurface(grid.edges, mean + expected_ground, std, inlier)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from gp_ground_seg.compiled import compiled_vectors
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.polar_grid import FloatArray, PolarGrid
 
@@ -104,3 +106,40 @@ def fuse_neighbours(
     known = total_weight > 0.0
     safe = np.where(known, total_weight, 1.0)
     return np.where(known, weighted / safe, np.nan), np.where(known, 1.0 / np.sqrt(safe), np.nan)
+
+
+@compiled_vectors
+def fuse_rows(
+    start: int,
+    stop: int,
+    step: int,
+    mean: FloatArray,
+    std: FloatArray,
+    aside: FloatArray,
+    n_neighbours: int,
+    fused_mean: FloatArray,
+    fused_std: FloatArray,
+) -> None:
+    """Do what `fuse_neighbours` does for segments ``start:stop:step``, in place.
+
+    `aside` (K,) is the prior standard deviation of a step to the next segment [m].
+    """
+    n_segments, n_knots = mean.shape
+    total_weight, weighted = np.empty(n_knots), np.empty(n_knots)
+    for m in range(start, stop, step):
+        total_weight[:] = 0.0
+        weighted[:] = 0.0
+        for k in range(-n_neighbours, n_neighbours + 1):
+            # A segment has a model at all knots or at none.
+            other = (m - k) % n_segments
+            if math.isnan(std[other, 0]):
+                continue
+            for j in range(n_knots):
+                away = k * aside[j]
+                weight = 1.0 / max(std[other, j] * std[other, j] + away * away, 1e-8)
+                total_weight[j] += weight
+                weighted[j] += weight * mean[other, j]
+        for j in range(n_knots):
+            if total_weight[j] > 0.0:
+                fused_mean[m, j] = weighted[j] / total_weight[j]
+                fused_std[m, j] = 1.0 / math.sqrt(total_weight[j])

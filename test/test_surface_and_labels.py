@@ -211,3 +211,18 @@ def test_compiled_surface_and_labels_are_the_reference(seed):
         np.testing.assert_allclose(
             getattr(found, name), getattr(expected, name), atol=1e-12, err_msg=name
         )
+
+
+@settings(deadline=None)
+@given(st.integers(0, 10_000), st.integers(0, 3))
+def test_compiled_fusing_is_the_reference(seed, n_neighbours):
+    rng = np.random.default_rng(seed)
+    mean, std = rng.normal(0, 0.3, (9, 5)), rng.uniform(0, 0.5, (9, 5))
+    for m in rng.choice(9, 5, replace=False):
+        mean[m] = std[m] = np.nan
+    std[:, 2] = np.where(np.isnan(std[:, 2]), np.nan, 0.0)
+    given_to = mean, std, KNOTS, n_neighbours, 0.05
+    for found, expected in zip(
+        CompiledBackend(2).fuse_neighbours(*given_to), fuse_neighbours(*given_to), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)

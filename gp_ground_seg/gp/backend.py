@@ -66,6 +66,16 @@ class Backend(Protocol):
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
         """See `gp_ground_seg.gp.growth.grow_surface_reference`."""
 
+    def fuse_neighbours(
+        self,
+        mean: FloatArray,
+        std: FloatArray,
+        knots: FloatArray,
+        n_neighbours: int,
+        slope_std: float,
+    ) -> tuple[FloatArray, FloatArray]:
+        """See `gp_ground_seg.surface.fuse_neighbours`."""
+
     def objective(
         self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
     ) -> tuple[float, FloatArray]:

@@ -16,7 +16,7 @@ from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.point_passes import grid_ruler
 from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
-from gp_ground_seg.surface import GroundSurface, pieces
+from gp_ground_seg.surface import GroundSurface, fuse_rows, pieces
 
 
 class CompiledBackend:
@@ -202,6 +202,22 @@ class CompiledBackend:
             std,
         )
         return inlier, mean, std
+
+    def fuse_neighbours(
+        self,
+        mean: FloatArray,
+        std: FloatArray,
+        knots: FloatArray,
+        n_neighbours: int,
+        slope_std: float,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Surfaces fused with those of the segments beside."""
+        if n_neighbours == 0:
+            return mean, std
+        aside = slope_std * 2.0 * np.pi / len(mean) * knots
+        fused = np.full_like(mean, np.nan), np.full_like(std, np.nan)
+        self._pool.run(fuse_rows, len(mean), mean, std, aside, n_neighbours, *fused)
+        return fused
 
     def objective(
         self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool

@@ -21,7 +21,7 @@ from gp_ground_seg.polar_grid import (
     reduce_cells,
 )
 from gp_ground_seg.pseudo_inputs import PseudoInputs
-from gp_ground_seg.surface import GroundSurface
+from gp_ground_seg.surface import GroundSurface, fuse_neighbours
 
 
 class NumpyBackend:
@@ -104,6 +104,17 @@ class NumpyBackend:
             slope_std,
             growth,
         )
+
+    def fuse_neighbours(
+        self,
+        mean: FloatArray,
+        std: FloatArray,
+        knots: FloatArray,
+        n_neighbours: int,
+        slope_std: float,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Surfaces fused with those of the segments beside."""
+        return fuse_neighbours(mean, std, knots, n_neighbours, slope_std)
 
     @single_threaded_blas()
     def objective(
