@@ -7,15 +7,18 @@ import numpy.typing as npt
 
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.polar_grid import FloatArray
+from gp_ground_seg.workspace import Workspace
 
 
-def check_points(points: npt.ArrayLike) -> FloatArray:
+def check_points(points: npt.ArrayLike, workspace: Workspace | None = None) -> FloatArray:
     """Return x, y, z in double precision.
 
     Parameters
     ----------
     points : (N, >=3) float array
         Points; columns after the third are ignored.
+    workspace : Workspace, optional
+        Where to put the copy; by default in a new array.
 
     Returns
     -------
@@ -39,7 +42,12 @@ def check_points(points: npt.ArrayLike) -> FloatArray:
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
         # In one order: compiled code is compiled for each.
-        return array[:, :3].astype(np.float64, order='C')
+        shape = len(array), 3
+        xyz = np.empty(shape) if workspace is None else workspace.take('xyz', shape, np.float64)
+        # Column by column: rows of three are too short for the loop within numpy.
+        for k in range(3):
+            xyz[:, k] = array[:, k]
+    return xyz
 
 
 def finite_points(xyz: FloatArray) -> npt.NDArray[np.bool_]:

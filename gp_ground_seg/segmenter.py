@@ -24,6 +24,7 @@ from gp_ground_seg.sensor_pose import SensorPose, estimate_pose, given_pose
 from gp_ground_seg.surface import GroundSurface
 from gp_ground_seg.tilt import turned_sample
 from gp_ground_seg.timing import StageTimer
+from gp_ground_seg.workspace import Workspace
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class GroundSegmenter:
         self._clock = clock
         self._config = config if config is not None else Config()
         self._backend = make_backend(self._config.runtime)
+        self._workspace = Workspace()
         self._theta: FloatArray | None = None
         self._frames_since_learning = 0
 
@@ -166,7 +168,7 @@ class GroundSegmenter:
         self, points: npt.ArrayLike, sensor: SensorConfig, timer: StageTimer
     ) -> _PlacedScan:
         """Scan in the level frame, as given or as it seems to be."""
-        xyz = check_points(points)
+        xyz = check_points(points, self._workspace)
         given = given_pose(sensor)
         level_xyz = given.level(xyz)
         grid, candidates = self._candidates(level_xyz)

@@ -195,3 +195,20 @@ def test_fit_report_counts(scan):
     assert 0 < fit.n_inliers <= fit.n_candidates <= len(scan)
     assert 0 < fit.n_segments <= 180
     assert fit.n_lines > 0
+
+
+def test_a_result_is_not_changed_by_the_next_scan(scan):
+    segmenter = GroundSegmenter()
+    result = segmenter.segment(scan)
+    kept = {
+        name: getattr(result, name).copy()
+        for name in ('label', 'height', 'margin', 'ground_z', 'ground_std', 'p_ground')
+    }
+    cell, r = result.grid.cell.copy(), result.grid.r.copy()
+    segmenter.segment(hilly_scan(len(scan) + 100, seed=8))
+    again = segmenter.segment(scan[::2])
+    assert len(again.label) == len(scan[::2])
+    for name, value in kept.items():
+        np.testing.assert_array_equal(getattr(result, name), value)
+    np.testing.assert_array_equal(result.grid.cell, cell)
+    np.testing.assert_array_equal(result.grid.r, r)

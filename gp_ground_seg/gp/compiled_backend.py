@@ -17,6 +17,7 @@ from gp_ground_seg.point_passes import grid_ruler
 from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface, fuse_rows, pieces
+from gp_ground_seg.workspace import Workspace
 
 
 class CompiledBackend:
@@ -33,6 +34,7 @@ class CompiledBackend:
     def __init__(self, n_threads: int) -> None:
         self._pool = RowPool(n_threads)
         self.n_threads = self._pool.n_threads
+        self._workspace = Workspace()
 
     def sort_points(self, xyz: FloatArray, grid: GridConfig) -> tuple[PolarGrid, CellTables]:
         """Cell of each point, extremes of each cell."""
@@ -68,9 +70,11 @@ class CompiledBackend:
         n_points = len(xyz)
         half = float(grid.edges[-1])
         side = tiles_per_side(half, faces)
-        tile = np.empty(n_points, dtype=np.int32)
-        foot_z = np.full(side * side, np.inf)
-        tall, is_face = np.zeros((2, side * side), dtype=np.bool_)
+        tile = self._workspace.take('tile', (n_points,), np.int32)
+        foot_z = self._workspace.take('foot_z', (side * side,), np.float64)
+        foot_z.fill(np.inf)
+        tall, is_face = flags = self._workspace.take('faces', (2, side * side), np.bool_)
+        flags.fill(False)
         label_passes.assign_tiles(xyz, grid.cell, half, 1.0 / faces.cell_size, side, tile, foot_z)
         self._pool.run_points(
             label_passes.mark_tall,
