@@ -53,6 +53,13 @@ IDEAS: tuple[Idea, ...] = (
     Idea('bins that widen, 80 of them', {'grid.n_bins': 120, 'grid.bin_growth': 1.0}),
     Idea('lines end at 0.1 rad', {'lines.slope_tolerance': 0.02}),
     Idea('length-scales of classes learned', {'learning.fixed': 'length_scales'}),
+    Idea('lines followed out of the gate', {'growth.max_line_slope': 0.0}),
+    Idea('every third segment teaches', {'learning.segment_step': 1}),
+    Idea('one theta for the frame', {'learning.scope': 'segment'}),
+    Idea('240 segments', {'grid.n_segments': 240}, kept=False),
+    Idea('twice the neighbours fused', {'surface.n_neighbours': 4}, kept=False),
+    Idea('a wider gate (3)', {'growth.max_standardised_residual': 3.0}, kept=False),
+    Idea('faces from 0.3 m on', {'faces.min_height': 0.3}, kept=False),
 )
 """What is measured by default. A new idea is a new row here; nothing else has to change."""
 
