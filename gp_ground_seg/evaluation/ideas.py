@@ -86,7 +86,7 @@ class IdeaResult:
     given: MethodResult
 
     def worth(self, sequence: str | None = None) -> float:
-        """IoU that having the idea adds, in one sequence or pooled; negative if it costs."""
+        """Tell what having the idea adds to the IoU, pooled or in one sequence."""
         gain = self.given.pooled(sequence).iou - self.switched.pooled(sequence).iou
         return gain if self.idea.kept else -gain
 
