@@ -46,8 +46,11 @@ def start(words: Sequence[str]) -> int:
     # Importing ROS takes most of a second; a signal within it is obeyed as well.
     with stop_on_signals() as stop:
         try:
+            stop.interrupt()
             from gp_ground_seg.ros.node import main as run_node
-        except (ImportError, KeyboardInterrupt) as error:
+
+            stop.only_note()
+        except (Exception, KeyboardInterrupt) as error:
             if stop.made:
                 return 0
             if not isinstance(error, ImportError) or (error.name or '').startswith(OWN_PACKAGE):
@@ -56,7 +59,7 @@ def start(words: Sequence[str]) -> int:
                 f'the node needs ROS 2, which cannot be imported ({error}): source the setup '
                 "file of a ROS 2 installation, or pip install 'gp_ground_seg[ros]'"
             ) from error
-        return run_node(words)
+        return 0 if stop.made else run_node(words)
 
 
 def main() -> int:

@@ -40,12 +40,12 @@ class Session:
     def sleep(self, seconds: float) -> None:
         """Wait without handling messages; as exact as the system's clock is."""
         time.sleep(seconds)
-        self._check()
+        self.check()
 
     def spin(self, seconds: float) -> None:
         """Handle one message, or wait that long for it."""
         self._executor.spin_once(timeout_sec=seconds)
-        self._check()
+        self.check()
 
     def interrupt(self, _number: int, _frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt, now and at the next wait."""
@@ -57,10 +57,11 @@ class Session:
         self._executor.shutdown()
         self.node.destroy_node()
 
-    def _check(self) -> None:
+    def check(self, cause: Exception | None = None) -> None:
+        """Raise KeyboardInterrupt once interrupted; `cause` is what it was taken for."""
         # Python swallows an exception that a signal raises within a destructor.
         if self._is_interrupted:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt from cause
 
 
 @contextmanager
@@ -112,6 +113,10 @@ def _signals_to(session: Session) -> Iterator[None]:
     before = {number: signal.signal(number, session.interrupt) for number in heeded}
     try:
         yield
+    except Exception as error:
+        # An interrupt within rclpy's bindings may come out of them as another exception.
+        session.check(error)
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)

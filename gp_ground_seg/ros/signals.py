@@ -16,10 +16,25 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopRequest:
-    """Whether the process was asked to end."""
+    """Whether the process was asked to end; at first a signal is noted and no more."""
 
     def __init__(self) -> None:
         self.made = False
+        self._interrupts = False
+
+    def interrupt(self) -> None:
+        """From here on raise KeyboardInterrupt at the first signal, now if it has come."""
+        self._interrupts = True
+        if self.made:
+            raise KeyboardInterrupt
+
+    def only_note(self) -> None:
+        """From here on a signal sets `made` and no more: for a loop that looks at it.
+
+        An interrupt within rclpy's bindings comes out of them as whatever they take a
+        failed conversion for, or not at all.
+        """
+        self._interrupts = False
 
     def handle(self, _number: int, _frame: FrameType | None) -> None:
         """Interrupt the main thread at the first signal; ignore the later ones.
@@ -28,7 +43,8 @@ class StopRequest:
         """
         if not self.made:
             self.made = True
-            raise KeyboardInterrupt
+            if self._interrupts:
+                raise KeyboardInterrupt
 
 
 class Watchdog:
@@ -67,7 +83,7 @@ class Watchdog:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Turn the first SIGINT or SIGTERM within the block into a KeyboardInterrupt.
+    """Have the first SIGINT or SIGTERM within the block noted, or interrupt it if it says so.
 
     If the block does not end soon after, the process does, with code 0. An
     interrupt that comes within a destructor is swallowed by Python, therefore
