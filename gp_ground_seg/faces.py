@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.config import FacesConfig
-from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, PolarGrid
+from gp_ground_seg.polar_grid import OUTSIDE, FloatArray
+from gp_ground_seg.tiles import Tiles
 
 FEWEST_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
@@ -24,25 +25,19 @@ class Faces:
 
     Attributes
     ----------
-    tile : (N,) int32
-        Tile of each point, or `OUTSIDE`.
-    foot_z : (T,) float64
-        Height of the lowest point of each tile [m]; infinite in empty ones.
+    tiles : Tiles
+        Tiles of the points.
     is_face : (T,) bool
         Whether the returns of the tile are an upright face.
     """
 
-    tile: npt.NDArray[np.int32]
-    foot_z: FloatArray
+    tiles: Tiles
     is_face: npt.NDArray[np.bool_]
 
 
-def tiles_per_side(r_max: float, faces: FacesConfig) -> int:
-    """Tiles along a side of the square that holds the polar grid."""
-    return int(np.ceil(2.0 * r_max / faces.cell_size))
-
-
-def find_faces(xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float) -> Faces:
+def find_faces(
+    xyz: npt.NDArray[np.floating], tiles: Tiles, faces: FacesConfig, max_height: float
+) -> Faces:
     """Find the tiles that an upright face stands in.
 
     A tile is a candidate if a return lies more than ``faces.min_height`` above the
@@ -50,29 +45,22 @@ def find_faces(xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height:
 
     Parameters
     ----------
-    xyz : (N, 3) float64
+    xyz : (N, 3) float32 or float64
         Points [m].
-    grid : PolarGrid
-        Bins of the points; those outside belong to no tile.
+    tiles : Tiles
+        Tiles of the points.
     faces : FacesConfig
-        Size of the tiles and what counts as a face.
+        What counts as a face.
     max_height : float
         Height above the lowest return up to which returns are looked at [m];
         what is higher overhangs.
     """
-    half = float(grid.edges[-1])
-    side = tiles_per_side(half, faces)
-    inside = grid.inside
-    tile = np.full(len(xyz), OUTSIDE, dtype=np.int32)
-    column, row = ((xyz[inside, :2] + half) * (1.0 / faces.cell_size)).astype(np.int64).T
-    tile[inside] = np.minimum(column, side - 1) * side + np.minimum(row, side - 1)
-
-    own, points = tile[inside], xyz[inside]
-    foot_z = np.full(side * side, np.inf)
-    np.minimum.at(foot_z, own, points[:, 2])
-    above_foot = points[:, 2] - foot_z[own]
+    inside = tiles.tile != OUTSIDE
+    own, points = tiles.tile[inside], xyz[inside].astype(np.float64)
+    n_tiles = len(tiles.foot_z)
+    above_foot = points[:, 2] - tiles.foot_z[own]
     low = above_foot <= max_height
-    is_tall = np.zeros(side * side, dtype=np.bool_)
+    is_tall = np.zeros(n_tiles, dtype=np.bool_)
     is_tall[own[low & (above_foot > faces.min_height)]] = True
 
     tall, counted = np.unique(own[low & is_tall[own]], return_inverse=True)
@@ -87,10 +75,10 @@ def find_faces(xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height:
         for j in range(3):
             product = centred[:, i] * centred[:, j]
             scatter[:, i, j] = np.bincount(counted, product, minlength=len(tall))
-    is_face = np.zeros(side * side, dtype=np.bool_)
+    is_face = np.zeros(n_tiles, dtype=np.bool_)
     is_upright = uprightness(scatter) <= faces.max_normal_z
     is_face[tall] = is_upright & (count >= FEWEST_RETURNS)
-    return Faces(tile, foot_z, is_face)
+    return Faces(tiles, is_face)
 
 
 def uprightness(scatter: FloatArray) -> FloatArray:

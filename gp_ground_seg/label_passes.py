@@ -11,6 +11,7 @@ from gp_ground_seg.compiled import compiled
 from gp_ground_seg.labelling import SQUARE_UNITS
 from gp_ground_seg.labels import Label
 from gp_ground_seg.point_passes import CellArray
+from gp_ground_seg.points import PointArray
 from gp_ground_seg.polar_grid import NOT_FINITE, OUTSIDE, FloatArray, IntArray
 
 BoolArray = npt.NDArray[np.bool_]
@@ -19,108 +20,82 @@ BoolArray = npt.NDArray[np.bool_]
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
 N_SUMS = 10
 """Sums per tile: number, x, y, z and their six products."""
-
-
-@compiled
-def assign_tiles(
-    xyz: FloatArray,
-    cell: CellArray,
-    half: float,
-    per_metre: float,
-    side: int,
-    tile: CellArray,
-    foot_z: FloatArray,
-) -> None:
-    """Tile of each point, and the lowest height of each tile into a table of infinities."""
-    held = np.uintp(0)
-    low = foot_z[0]
-    for i in range(len(cell)):
-        if cell[i] < 0:
-            tile[i] = OUTSIDE
-            continue
-        column = min(int((xyz[i, 0] + half) * per_metre), side - 1)
-        row = min(int((xyz[i, 1] + half) * per_metre), side - 1)
-        own = np.uintp(column * side + row)
-        tile[i] = own
-        if own != held:
-            foot_z[held] = low
-            held = own
-            low = foot_z[held]
-        low = min(low, xyz[i, 2])
-    foot_z[held] = low
-
-
-@compiled
-def mark_tall(
-    start: int,
-    stop: int,
-    xyz: FloatArray,
-    tile: CellArray,
-    foot_z: FloatArray,
-    min_height: float,
-    max_height: float,
-    tall: BoolArray,
-) -> None:
-    """Mark the tiles with returns well above the lowest; threads only ever write True."""
-    for i in range(start, stop):
-        if tile[i] != OUTSIDE:
-            own = np.uintp(tile[i])
-            above_foot = xyz[i, 2] - foot_z[own]
-            if min_height < above_foot <= max_height:
-                tall[own] = True
+SKIPPED = -1
+"""Slot of a tile that has nothing tall, or is another thread's."""
 
 
 @compiled
 def judge_faces(
-    xyz: FloatArray,
+    start: int,
+    _stop: int,
+    step: int,
+    xyz: PointArray,
     tile: CellArray,
-    foot_z: FloatArray,
-    tall: BoolArray,
+    foot_z: PointArray,
+    top_z: PointArray,
+    min_height: float,
     max_height: float,
     max_normal_z: float,
     fewest_returns: int,
     is_face: BoolArray,
 ) -> None:
-    """Do what `gp_ground_seg.faces.find_faces` does with the tall tiles."""
-    slot = np.empty(len(tall), dtype=np.int32)
-    n_tall = 0
-    for k in range(len(tall)):
-        if tall[k]:
-            slot[k] = n_tall
-            n_tall += 1
-    sums = np.zeros((n_tall, N_SUMS))
+    """Do what `gp_ground_seg.faces.find_faces` does with every `step`-th tile.
+
+    A tile's sums are taken by one thread in the order of the points: they do not
+    depend on the number of threads.
+    """
+    n_slots = 0
+    slot_of = np.zeros(len(foot_z), dtype=np.int32)
+    most = min(len(foot_z), len(tile))
+    tile_of, is_tall = np.empty(most, dtype=np.int32), np.empty(most, dtype=np.bool_)
+    sums = np.empty((most, N_SUMS))
     # Sums about a point of the tile: about the sensor, rounding would eat the scatter.
-    origin = np.zeros((n_tall, 3))
+    origin = np.empty((most, 2))
     for i in range(len(tile)):
-        own = tile[i]
-        if own == OUTSIDE or not tall[own] or xyz[i, 2] - foot_z[own] > max_height:
+        if tile[i] == OUTSIDE:
             continue
-        k = slot[own]
-        if sums[k, 0] == 0.0:
-            origin[k, 0], origin[k, 1], origin[k, 2] = xyz[i, 0], xyz[i, 1], foot_z[own]
-        x, y, z = xyz[i, 0] - origin[k, 0], xyz[i, 1] - origin[k, 1], xyz[i, 2] - origin[k, 2]
-        sums[k, 0] += 1.0
-        sums[k, 1] += x
-        sums[k, 2] += y
-        sums[k, 3] += z
-        sums[k, 4] += x * x
-        sums[k, 5] += y * y
-        sums[k, 6] += z * z
-        sums[k, 7] += x * y
-        sums[k, 8] += x * z
-        sums[k, 9] += y * z
-    for t in range(len(tall)):
-        if not tall[t]:
+        own = np.uintp(tile[i])
+        k = slot_of[own]
+        if k == SKIPPED:
             continue
-        s = sums[slot[t]]
+        foot = np.float64(foot_z[own])
+        if k == 0:
+            if tile[i] % step != start or np.float64(top_z[own]) - foot <= min_height:
+                slot_of[own] = SKIPPED
+                continue
+            n_slots += 1
+            slot_of[own] = k = n_slots
+            tile_of[k - 1], is_tall[k - 1] = tile[i], False
+            origin[k - 1, 0], origin[k - 1, 1] = xyz[i, 0], xyz[i, 1]
+            sums[k - 1] = 0.0
+        k -= 1
+        z = np.float64(xyz[i, 2]) - foot
+        if z > max_height:
+            continue
+        if z > min_height:
+            is_tall[k] = True
+        x, y = np.float64(xyz[i, 0]) - origin[k, 0], np.float64(xyz[i, 1]) - origin[k, 1]
+        s = sums[k]
+        s[0] += 1.0
+        s[1] += x
+        s[2] += y
+        s[3] += z
+        s[4] += x * x
+        s[5] += y * y
+        s[6] += z * z
+        s[7] += x * y
+        s[8] += x * z
+        s[9] += y * z
+    for k in range(n_slots):
+        s = sums[k]
         n = s[0]
-        if n < fewest_returns:
+        if not is_tall[k] or n < fewest_returns:
             continue
         xx, yy, zz = s[4] - s[1] * s[1] / n, s[5] - s[2] * s[2] / n, s[6] - s[3] * s[3] / n
         xy, xz, yz = s[7] - s[1] * s[2] / n, s[8] - s[1] * s[3] / n, s[9] - s[2] * s[3] / n
         vertical = max(xx * yy - xy * xy, 0.0)
         trace = vertical + max(yy * zz - yz * yz, 0.0) + max(xx * zz - xz * xz, 0.0)
-        is_face[t] = trace > 0.0 and math.sqrt(vertical / trace) <= max_normal_z
+        is_face[tile_of[k]] = trace > 0.0 and math.sqrt(vertical / trace) <= max_normal_z
 
 
 @compiled
@@ -128,7 +103,7 @@ def survey_heights(
     share: int,
     start: int,
     stop: int,
-    xyz: FloatArray,
+    xyz: PointArray,
     cell: CellArray,
     r: FloatArray,
     tile: CellArray,
@@ -154,7 +129,7 @@ def survey_heights(
             height[i] = np.nan
             continue
         own = np.uintp(cell[i])
-        h = xyz[i, 2] - (level[own] + slope[own] * max(r[i] - near[own], 0.0))
+        h = np.float64(xyz[i, 2]) - (level[own] + slope[own] * max(r[i] - near[own], 0.0))
         height[i] = h
         if h >= min_height:
             if h <= max_height:
@@ -168,12 +143,12 @@ def survey_heights(
 def label_by_height(
     start: int,
     stop: int,
-    xyz: FloatArray,
+    xyz: PointArray,
     cell: CellArray,
     tile: CellArray,
     height: FloatArray,
     is_face: BoolArray,
-    foot_z: FloatArray,
+    foot_z: PointArray,
     band: FloatArray,
     below_tolerance: float,
     face_tolerance: float,
@@ -189,7 +164,9 @@ def label_by_height(
             continue
         own = min(band[np.uintp(n)] - height[i], height[i] + below_tolerance)
         if is_face[np.uintp(tile[i])]:
-            over_foot = max(height[i], xyz[i, 2] - foot_z[np.uintp(tile[i])])
+            over_foot = max(
+                height[i], np.float64(xyz[i, 2]) - np.float64(foot_z[np.uintp(tile[i])])
+            )
             own = min(own, face_tolerance - over_foot)
         margin[i] = own
         label[i] = _GROUND if own >= 0.0 else _OBSTACLE

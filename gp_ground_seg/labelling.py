@@ -85,9 +85,9 @@ def label_points(
     margin = np.minimum(
         own_band[np.maximum(grid.cell, 0)] - height, height + label.below_tolerance
     )
-    tile = np.maximum(faces.tile, 0)
+    tile = np.maximum(faces.tiles.tile, 0)
     in_face = faces.is_face[tile] & inside
-    over_foot = np.maximum(height, z - np.where(in_face, faces.foot_z[tile], 0.0))
+    over_foot = np.maximum(height, z - np.where(in_face, faces.tiles.foot_z[tile], 0.0))
     margin = np.where(in_face, np.minimum(margin, face_tolerance - over_foot), margin)
     margin[~inside] = np.nan
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
@@ -154,7 +154,7 @@ def local_roughness(
         (height < max_height)
         & (height >= -max_height)
         & grid.inside
-        & ~faces.is_face[np.maximum(faces.tile, 0)]
+        & ~faces.is_face[np.maximum(faces.tiles.tile, 0)]
     )
     cell = grid.cell[counts]
     size = grid.n_segments * grid.n_bins

@@ -9,21 +9,30 @@ from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.polar_grid import FloatArray
 from gp_ground_seg.workspace import Workspace
 
+PointArray = npt.NDArray[np.floating]
+"""Coordinates, in single or double precision."""
 
-def check_points(points: npt.ArrayLike, workspace: Workspace | None = None) -> FloatArray:
-    """Return x, y, z in double precision.
+
+def check_points(points: npt.ArrayLike) -> FloatArray:
+    """Return a copy of x, y, z in double precision; parameters and errors of `take_points`."""
+    return take_points(points, Workspace()).astype(np.float64)
+
+
+def take_points(points: npt.ArrayLike, workspace: Workspace) -> PointArray:
+    """Return x, y, z in the one layout that the compiled code is compiled for.
 
     Parameters
     ----------
     points : (N, >=3) float array
         Points; columns after the third are ignored.
-    workspace : Workspace, optional
-        Where to put the copy; by default in a new array.
+    workspace : Workspace
+        Where to put a copy, if one is needed.
 
     Returns
     -------
-    xyz : (N, 3) float64
-        A copy.
+    xyz : (N, 3) float32 or float64
+        C-contiguous and read-only; may share memory with `points`. Single precision
+        for types of up to four bytes.
 
     Raises
     ------
@@ -39,15 +48,28 @@ def check_points(points: npt.ArrayLike, workspace: Workspace | None = None) -> F
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be floating point'
         )
+    dtype = np.dtype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
+    if (
+        array.dtype == dtype
+        and array.shape[1] == 3
+        and array.flags.c_contiguous
+        and array.flags.aligned
+    ):
+        return as_read_only(array)
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
-        # In one order: compiled code is compiled for each.
-        shape = len(array), 3
-        xyz = np.empty(shape) if workspace is None else workspace.take('xyz', shape, np.float64)
+        xyz = workspace.take('xyz', (len(array), 3), dtype)
         # Column by column: rows of three are too short for the loop within numpy.
         for k in range(3):
             xyz[:, k] = array[:, k]
-    return xyz
+    return as_read_only(xyz)
+
+
+def as_read_only(xyz: PointArray) -> PointArray:
+    """View of the same memory; for compiled code what may be written to is another type."""
+    view = xyz.view(np.ndarray)
+    view.flags.writeable = False
+    return view
 
 
 def finite_points(xyz: FloatArray) -> npt.NDArray[np.bool_]:

@@ -122,16 +122,17 @@ def segment_edges(n_segments: int) -> FloatArray:
     return edges
 
 
-def build_polar_grid(xyz: FloatArray, grid: GridConfig) -> PolarGrid:
+def build_polar_grid(xyz: npt.NDArray[np.floating], grid: GridConfig) -> PolarGrid:
     """Sort points into segments and bins (paper, section II).
 
     Parameters
     ----------
-    xyz : (N, 3) float64
-        Points [m].
+    xyz : (N, 3) float32 or float64
+        Points [m]; what follows is computed in double precision.
     grid : GridConfig
         Size of the grid.
     """
+    xyz = xyz.astype(np.float64)
     edges = bin_edges(grid)
     finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
     x = np.where(finite, xyz[:, 0], 0.0)
@@ -171,7 +172,7 @@ class CellTables:
     count: IntArray
 
 
-def reduce_cells(grid: PolarGrid, z: FloatArray) -> CellTables:
+def reduce_cells(grid: PolarGrid, z: npt.NDArray[np.floating]) -> CellTables:
     """Lowest and highest point of each bin, and their number.
 
     Equal heights are settled by the smaller range, so that the order of the
@@ -188,7 +189,7 @@ def reduce_cells(grid: PolarGrid, z: FloatArray) -> CellTables:
     size = shape[0] * shape[1]
     inside = grid.inside
     cell = grid.cell[inside]
-    z_inside, r_inside = z[inside], grid.r[inside]
+    z_inside, r_inside = z[inside].astype(np.float64), grid.r[inside]
     lowest_z = np.full(size, np.inf)
     np.minimum.at(lowest_z, cell, z_inside)
     is_lowest = z_inside == lowest_z[cell]

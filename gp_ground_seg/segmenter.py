@@ -16,12 +16,13 @@ from gp_ground_seg.gp.backend import make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.line_extraction import extract_lines
-from gp_ground_seg.points import check_points
+from gp_ground_seg.points import PointArray, as_read_only, take_points
 from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid, ground_candidates
 from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
 from gp_ground_seg.segmentation import FitReport, Segmentation
 from gp_ground_seg.sensor_pose import SensorPose, estimate_pose, given_pose
 from gp_ground_seg.surface import GroundSurface
+from gp_ground_seg.tiles import Tiles
 from gp_ground_seg.tilt import turned_sample
 from gp_ground_seg.timing import StageTimer
 from gp_ground_seg.workspace import Workspace
@@ -31,10 +32,11 @@ from gp_ground_seg.workspace import Workspace
 class _PlacedScan:
     """Points (N, 3) in the sensor frame and in the level frame, and what follows from them."""
 
-    own_xyz: FloatArray
-    level_xyz: FloatArray
+    own_xyz: PointArray
+    level_xyz: PointArray
     grid: PolarGrid
     candidates: Candidates
+    tiles: Tiles
     pose: SensorPose
 
 
@@ -131,7 +133,9 @@ class GroundSegmenter:
         surface = GroundSurface(grid.edges, mean + expected_ground, std, inlier)
         timer.mark('surface')
 
-        faces = self._backend.find_faces(xyz, grid, config.faces, config.label.obstacle_max_height)
+        faces = self._backend.find_faces(
+            xyz, placed.tiles, config.faces, config.label.obstacle_max_height
+        )
         labelled = self._backend.label_points(
             xyz, grid, surface, faces, config.label, config.faces.tolerance
         )
@@ -168,28 +172,31 @@ class GroundSegmenter:
         self, points: npt.ArrayLike, sensor: SensorConfig, timer: StageTimer
     ) -> _PlacedScan:
         """Scan in the level frame, as given or as it seems to be."""
-        xyz = check_points(points, self._workspace)
+        xyz = take_points(points, self._workspace)
         given = given_pose(sensor)
         level_xyz = given.level(xyz)
-        grid, candidates = self._candidates(level_xyz)
+        grid, candidates, tiles = self._sort(level_xyz, self._workspace)
         timer.mark('grid')
         pose = estimate_pose(
             candidates,
             sensor,
             self._backend.name == 'numba',
-            lambda turn: self._candidates(turned_sample(level_xyz, turn))[1],
+            lambda turn: self._sort(turned_sample(level_xyz, turn), Workspace())[1],
         )
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
             level_xyz = pose.level(xyz)
-            grid, candidates = self._candidates(level_xyz)
+            grid, candidates, tiles = self._sort(level_xyz, self._workspace)
         timer.mark('pose')
-        return _PlacedScan(xyz, level_xyz, grid, candidates, pose)
+        return _PlacedScan(xyz, level_xyz, grid, candidates, tiles, pose)
 
-    def _candidates(self, xyz: FloatArray) -> tuple[PolarGrid, Candidates]:
-        """Grid of points (N, 3) in a level frame, and the lowest point of each of its bins."""
-        grid, cells = self._backend.sort_points(xyz, self._config.grid)
-        min_extent = self._config.lines.min_density_extent
-        return grid, ground_candidates(cells, grid.edges, min_extent)
+    def _sort(self, xyz: PointArray, workspace: Workspace) -> tuple[PolarGrid, Candidates, Tiles]:
+        """Grid of points (N, 3) in a level frame, the lowest point of each bin, tiles."""
+        config = self._config
+        grid, cells, tiles = self._backend.sort_points(
+            as_read_only(xyz), config.grid, config.faces.cell_size, workspace
+        )
+        candidates = ground_candidates(cells, grid.edges, config.lines.min_density_extent)
+        return grid, candidates, tiles
 
     def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:
         """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""

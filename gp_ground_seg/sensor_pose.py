@@ -14,6 +14,7 @@ from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.ground_plane import GroundPlane, find_plane
 from gp_ground_seg.low_cells import low_cells
 from gp_ground_seg.parameter_spec import AUTO
+from gp_ground_seg.points import PointArray
 from gp_ground_seg.polar_grid import Candidates, FloatArray
 from gp_ground_seg.tilt import angles_of, rotation, rounded, turned
 from gp_ground_seg.up_axis import is_suspicious, other_way_up
@@ -106,16 +107,16 @@ class SensorPose:
         """Matrix (3, 3) from the sensor frame to the level frame."""
         return rotation(self.roll, self.pitch)
 
-    def level(self, xyz: FloatArray) -> FloatArray:
+    def level(self, xyz: PointArray) -> PointArray:
         """Points (N, 3) of the sensor frame in the level frame; `xyz` itself without tilt."""
         return xyz if self.is_level else turned(xyz, self.rotation)
 
-    def ground_z(self, z: FloatArray, height: FloatArray) -> FloatArray:
+    def ground_z(self, z: PointArray, height: FloatArray) -> FloatArray:
         """Height of the surface along the sensor's z axis, sensor frame [m].
 
         Parameters
         ----------
-        z : (N,) float64
+        z : (N,) float32 or float64
             Of the points, sensor frame [m].
         height : (N,) float64
             Of the points over the surface, vertical [m].

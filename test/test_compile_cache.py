@@ -150,7 +150,8 @@ def test_what_others_may_not_write_they_may_read(program, tmp_path):
 def warm(request):
     config = Config().replace(**{'learning.mode': request.param, 'runtime.n_threads': 2})
     segmenter = GroundSegmenter(config)
-    segmenter.segment(hilly_scan(500))
+    for dtype in (np.float32, np.float64):
+        segmenter.segment(hilly_scan(500).astype(dtype))
     yield segmenter
     segmenter.close()
 

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from gp_ground_seg.config import FacesConfig, GridConfig
 from gp_ground_seg.faces import find_faces, uprightness
 from gp_ground_seg.polar_grid import OUTSIDE, build_polar_grid
+from gp_ground_seg.tiles import build_tiles
 
 GRID = GridConfig(r_max=30.0)
 
@@ -13,8 +14,10 @@ GRID = GridConfig(r_max=30.0)
 def faces_of(xyz, **changes):
     xyz = np.asarray(xyz, dtype=float)
     grid = build_polar_grid(xyz, GRID)
-    found = find_faces(xyz, grid, FacesConfig(**changes), 2.0)
-    return found.is_face[np.maximum(found.tile, 0)] & (found.tile != OUTSIDE), found
+    config = FacesConfig(**changes)
+    tiles = build_tiles(xyz, grid, config.cell_size)
+    found = find_faces(xyz, tiles, config, 2.0)
+    return found.is_face[np.maximum(tiles.tile, 0)] & (tiles.tile != OUTSIDE), tiles
 
 
 def plane(normal_z, rng, size=0.5, n=200, corner=(10.0, 5.0)):
@@ -37,9 +40,10 @@ def test_a_wall_of_any_direction_is_a_face_and_its_foot_is_known():
         along = rng.uniform(-0.2, 0.2, 100)
         z = rng.uniform(-1.6, 0.0, 100)
         wall = np.column_stack([10.25 + along * np.cos(turn), 5.25 + along * np.sin(turn), z])
-        found, faces = faces_of(wall)
+        found, tiles = faces_of(wall)
         assert found.all()
-        assert faces.foot_z[faces.tile[0]] == z.min()
+        assert tiles.foot_z[tiles.tile[0]] == z.min()
+        assert tiles.top_z[tiles.tile[0]] == z.max()
 
 
 def test_low_flat_and_overhanging_returns_are_no_faces():
@@ -58,8 +62,8 @@ def test_three_returns_have_no_orientation():
 
 
 def test_points_outside_the_grid_belong_to_no_tile():
-    found, faces = faces_of([[50.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [5.0, 5.0, 0.0]])
-    assert list(faces.tile[:2]) == [OUTSIDE, OUTSIDE]
+    found, tiles = faces_of([[50.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [5.0, 5.0, 0.0]])
+    assert list(tiles.tile[:2]) == [OUTSIDE, OUTSIDE]
     assert not found.any()
 
 

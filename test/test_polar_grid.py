@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 
 from gp_ground_seg.config import Config, GridConfig
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
+from gp_ground_seg.point_passes import grid_ruler
+from gp_ground_seg.points import as_read_only
 from gp_ground_seg.polar_grid import (
     OUTSIDE,
     bin_edges,
@@ -16,6 +18,8 @@ from gp_ground_seg.polar_grid import (
     pseudo_angle,
     reduce_cells,
 )
+from gp_ground_seg.tiles import build_tiles
+from gp_ground_seg.workspace import Workspace
 
 
 def build(points, grid=None):
@@ -142,26 +146,51 @@ def test_vertical_density_is_the_mean_over_the_slices_however_many(n_slices):
 
 
 @settings(deadline=None)
-@given(st.integers(0, 10_000), st.floats(1.0, 3.0), st.integers(4, 60))
-def test_compiled_passes_are_the_reference(seed, growth, n_bins):
+@given(
+    st.integers(0, 10_000),
+    st.floats(1.0, 3.0),
+    st.integers(4, 60),
+    st.sampled_from([np.float32, np.float64]),
+)
+def test_compiled_passes_are_the_reference(seed, growth, n_bins, dtype):
     xyz = hilly_scan(400, seed=seed)
     xyz[::7] = np.round(xyz[::7])  # equal heights, points on edges and axes
     xyz[::50, seed % 3] = np.nan
+    xyz[::60, seed % 3] = extreme(seed)
+    xyz = as_read_only(xyz.astype(dtype))
     grid = GridConfig(n_bins=n_bins, bin_growth=growth, r_min=4.0, r_max=30.0)
     expected = build(xyz, grid)
-    found, cells = CompiledBackend(1).sort_points(xyz, grid)
+    found, cells, tiles = CompiledBackend(1).sort_points(xyz, grid, 0.7, Workspace())
     np.testing.assert_array_equal(found.cell, expected.cell)
     np.testing.assert_array_equal(found.r, expected.r)
     expected_cells = reduce_cells(expected, xyz[:, 2])
     for name, table in vars(cells).items():
         np.testing.assert_array_equal(table, getattr(expected_cells, name))
+    expected_tiles = build_tiles(xyz, expected, 0.7)
+    for name, table in vars(tiles).items():
+        np.testing.assert_array_equal(table, getattr(expected_tiles, name))
+
+
+def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
+    grid = GridConfig(n_bins=1024, bin_growth=4.0, n_segments=2048)
+    edges, table, *_ = grid_ruler(grid)
+    assert len(table) < 40_000
+    xyz = as_read_only(hilly_scan(4000, seed=3))
+    found, *_ = CompiledBackend(1).sort_points(xyz, grid, 0.5, Workspace())
+    np.testing.assert_array_equal(found.cell, build(xyz, grid).cell)
+    assert len(edges) == 1025
+
+
+def extreme(seed):
+    """Infinite, or far away on the edge of single precision."""
+    return [np.inf, -np.inf, 3e38, -3e38][seed % 4]
 
 
 def test_shares_of_the_points_are_merged():
-    xyz = hilly_scan(9000, seed=5)
+    xyz = as_read_only(hilly_scan(9000, seed=5))
     for found, expected in zip(
-        CompiledBackend(3).sort_points(xyz, GridConfig()),
-        CompiledBackend(1).sort_points(xyz, GridConfig()),
+        CompiledBackend(3).sort_points(xyz, GridConfig(), 0.5, Workspace()),
+        CompiledBackend(1).sort_points(xyz, GridConfig(), 0.5, Workspace()),
         strict=True,
     ):
         for name, table in vars(found).items():

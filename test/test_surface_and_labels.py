@@ -15,8 +15,10 @@ from gp_ground_seg.labelling import (
     stands_in_bin,
 )
 from gp_ground_seg.labels import Label
+from gp_ground_seg.points import as_read_only
 from gp_ground_seg.polar_grid import build_polar_grid
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
+from gp_ground_seg.tiles import Tiles, build_tiles
 
 GRID = GridConfig(n_segments=4, n_bins=4, r_min=2.0, r_max=10.0, bin_growth=1.0)
 KNOTS = np.array([2.0, 4.0, 6.0, 8.0, 10.0])
@@ -74,8 +76,12 @@ def test_a_segment_without_a_model_gets_its_neighbours():
     np.testing.assert_array_equal(same[0], mean)
 
 
+def faces_in(tile, foot_z, is_face):
+    return Faces(Tiles(tile, foot_z, foot_z + 1.0), is_face)
+
+
 def nothing_stands(n):
-    return Faces(np.zeros(n, dtype=np.int64), np.zeros(1), np.zeros(1, dtype=bool))
+    return faces_in(np.zeros(n, dtype=np.int32), np.zeros(1), np.zeros(1, dtype=bool))
 
 
 def labels_of(heights, grid, roughness=0.0, config=None, faces=None, z=None):
@@ -143,7 +149,7 @@ def test_of_a_face_only_the_foot_is_ground():
     # The surface climbs a step: its riser lies on it.
     z = np.array([0.05, 0.15, 0.4])
     grid = grid_of(5.0, 5.0, 5.0)
-    step = Faces(np.array([0, 0, 0]), np.array([0.0]), np.array([True]))
+    step = faces_in(np.array([0, 0, 0]), np.array([0.0]), np.array([True]))
     assert list(labels_of(z * 0.0, grid, faces=step, z=z)[0]) == [
         Label.GROUND,
         Label.OBSTACLE,
@@ -167,7 +173,7 @@ def test_roughness_is_the_root_mean_square_of_a_bin_and_its_neighbours():
 
 def test_points_of_faces_are_no_roughness():
     grid = grid_of(3.0, 3.0)
-    one = Faces(np.array([0, 1]), np.zeros(2), np.array([False, True]))
+    one = faces_in(np.array([0, 1]), np.zeros(2), np.array([False, True]))
     found = local_roughness(np.array([0.1, 0.4]), grid, one, 0.5)
     np.testing.assert_allclose(found[grid.segment[0], grid.bin[0]], 0.1)
 
@@ -184,10 +190,10 @@ def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():
 
 
 @settings(deadline=None)
-@given(st.integers(0, 10_000))
-def test_compiled_surface_and_labels_are_the_reference(seed):
+@given(st.integers(0, 10_000), st.sampled_from([np.float32, np.float64]), st.integers(1, 3))
+def test_compiled_surface_and_labels_are_the_reference(seed, dtype, n_threads):
     rng = np.random.default_rng(seed)
-    xyz = rng.uniform(-12, 12, (300, 3))
+    xyz = rng.uniform(-12, 12, (300, 3)).astype(dtype)
     xyz[:, 2] *= 0.1
     # Posts, so that there are faces.
     xyz[100:200, :2] = np.repeat(xyz[100:120, :2], 5, axis=0) + rng.normal(0, 0.02, (100, 2))
@@ -197,11 +203,11 @@ def test_compiled_surface_and_labels_are_the_reference(seed):
         KNOTS, rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5)), np.ones(0, dtype=bool)
     )
     surface.mean[seed % 4] = surface.std[seed % 4] = np.nan
-    backend, plain = CompiledBackend(1), NumpyBackend()
-    faces = backend.find_faces(xyz, grid, FacesConfig(), 2.0)
-    same = plain.find_faces(xyz, grid, FacesConfig(), 2.0)
-    np.testing.assert_array_equal(faces.tile, same.tile)
-    np.testing.assert_array_equal(faces.foot_z, same.foot_z)
+    xyz = as_read_only(xyz)
+    backend, plain = CompiledBackend(n_threads), NumpyBackend()
+    tiles = build_tiles(xyz, grid, FacesConfig().cell_size)
+    faces = backend.find_faces(xyz, tiles, FacesConfig(), 2.0)
+    same = plain.find_faces(xyz, tiles, FacesConfig(), 2.0)
     np.testing.assert_array_equal(faces.is_face, same.is_face)
     assert faces.is_face.any()
     found = backend.label_points(xyz, grid, surface, faces, LabelConfig(), 0.1)

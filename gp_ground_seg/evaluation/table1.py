@@ -198,7 +198,7 @@ def _rows(
                 seconds[name].append(results[name].timings['total'])
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
     common = results['Z-L']
-    level_z = common.pose.level(points[:, :3].astype(np.float64))[:, 2]
+    level_z = common.pose.level(points[:, :3])[:, 2].astype(np.float64)
     held_out = is_ground & (common.grid.bin != OUTSIDE) & ~is_candidate(common, level_z)
     rows = []
     for segment in choice.segments or _most_varied_pair(frame, common.grid, z, is_ground):

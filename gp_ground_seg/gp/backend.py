@@ -12,9 +12,12 @@ from gp_ground_seg.faces import Faces
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled
+from gp_ground_seg.points import PointArray
 from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface
+from gp_ground_seg.tiles import Tiles
+from gp_ground_seg.workspace import Workspace
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 _said_slow = False
@@ -26,17 +29,22 @@ class Backend(Protocol):
     name: str
     n_threads: int
 
-    def sort_points(self, xyz: FloatArray, grid: GridConfig) -> tuple[PolarGrid, CellTables]:
-        """See `gp_ground_seg.polar_grid.build_polar_grid` and `reduce_cells`."""
+    def sort_points(
+        self, xyz: PointArray, grid: GridConfig, tile_size: float, workspace: Workspace
+    ) -> tuple[PolarGrid, CellTables, Tiles]:
+        """See `build_polar_grid` and `reduce_cells`; `gp_ground_seg.tiles.build_tiles`.
+
+        The rest than the grid may lie in `workspace`.
+        """
 
     def find_faces(
-        self, xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float
+        self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
     ) -> Faces:
         """See `gp_ground_seg.faces.find_faces`."""
 
     def label_points(
         self,
-        xyz: FloatArray,
+        xyz: PointArray,
         grid: PolarGrid,
         surface: GroundSurface,
         faces: Faces,

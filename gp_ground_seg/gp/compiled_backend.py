@@ -6,7 +6,7 @@ import numpy as np
 
 from gp_ground_seg import label_passes, point_passes
 from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig
-from gp_ground_seg.faces import FEWEST_RETURNS, Faces, tiles_per_side
+from gp_ground_seg.faces import FEWEST_RETURNS, Faces
 from gp_ground_seg.gp.growth import BoolArray, grow_surface_compiled
 from gp_ground_seg.gp.latent import latent_rows_compiled
 from gp_ground_seg.gp.objective import TrainingFrame
@@ -14,9 +14,11 @@ from gp_ground_seg.gp.objective_compiled import objective_rows
 from gp_ground_seg.labelling import Labelled, band, root_mean_square
 from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.point_passes import grid_ruler
+from gp_ground_seg.points import PointArray
 from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface, fuse_rows, pieces
+from gp_ground_seg.tiles import Tiles, tiles_per_side
 from gp_ground_seg.workspace import Workspace
 
 
@@ -36,64 +38,79 @@ class CompiledBackend:
         self.n_threads = self._pool.n_threads
         self._workspace = Workspace()
 
-    def sort_points(self, xyz: FloatArray, grid: GridConfig) -> tuple[PolarGrid, CellTables]:
-        """Cell of each point, extremes of each cell."""
+    def sort_points(
+        self, xyz: PointArray, grid: GridConfig, tile_size: float, workspace: Workspace
+    ) -> tuple[PolarGrid, CellTables, Tiles]:
+        """Cell and tile of each point, extremes of each."""
         n_points = len(xyz)
         ruler = grid_ruler(grid)
+        n_sides = tiles_per_side(grid.r_max, tile_size)
+        take = workspace.take
         cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points)
-        shape = self._pool.n_shares(n_points), grid.n_segments * grid.n_bins
-        lowest_z, lowest_r = np.full(shape, np.inf), np.full(shape, np.inf)
-        highest_z = np.full(shape, -np.inf)
-        count = np.zeros(shape, dtype=np.int64)
+        tile = take('tile', (n_points,), np.int32)
+        n_shares = self._pool.n_shares(n_points)
+        lowest_z, lowest_r, highest_z = take(
+            'cells', (3, n_shares, grid.n_segments * grid.n_bins), np.float64
+        )
+        count = take('count', lowest_z.shape, np.int64)
+        foot_z, top_z = take('tiles', (2, n_shares, n_sides**2), xyz.dtype)
+        for table, empty in (
+            (lowest_z, np.inf),
+            (lowest_r, np.inf),
+            (highest_z, -np.inf),
+            (count, 0),
+            (foot_z, np.inf),
+            (top_z, -np.inf),
+        ):
+            table.fill(empty)
+        cells = lowest_z, lowest_r, highest_z, count
         self._pool.run_shares(
             point_passes.sort_points,
             n_points,
             xyz,
             *ruler,
+            1.0 / tile_size,
+            n_sides,
             cell,
             r,
-            lowest_z,
-            lowest_r,
-            highest_z,
-            count,
-        )
-        tables = lowest_z, lowest_r, highest_z, count
-        point_passes.merge_cells(*tables)
-        shape = grid.n_segments, grid.n_bins
-        cells = CellTables(*(table[0].reshape(shape) for table in tables))
-        return PolarGrid(cell, r, ruler[0], grid.n_segments), cells
-
-    def find_faces(
-        self, xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float
-    ) -> Faces:
-        """Upright faces."""
-        n_points = len(xyz)
-        half = float(grid.edges[-1])
-        side = tiles_per_side(half, faces)
-        tile = self._workspace.take('tile', (n_points,), np.int32)
-        foot_z = self._workspace.take('foot_z', (side * side,), np.float64)
-        foot_z.fill(np.inf)
-        tall, is_face = flags = self._workspace.take('faces', (2, side * side), np.bool_)
-        flags.fill(False)
-        label_passes.assign_tiles(xyz, grid.cell, half, 1.0 / faces.cell_size, side, tile, foot_z)
-        self._pool.run_points(
-            label_passes.mark_tall,
-            n_points,
-            xyz,
+            *cells,
             tile,
             foot_z,
+            top_z,
+        )
+        point_passes.merge_cells(*cells)
+        point_passes.merge_tiles(foot_z, top_z)
+        shape = grid.n_segments, grid.n_bins
+        return (
+            PolarGrid(cell, r, ruler[0], grid.n_segments),
+            CellTables(*(table[0].reshape(shape) for table in cells)),
+            Tiles(tile, foot_z[0], top_z[0]),
+        )
+
+    def find_faces(
+        self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
+    ) -> Faces:
+        """Upright faces."""
+        is_face = self._workspace.take('faces', tiles.foot_z.shape, np.bool_)
+        is_face.fill(False)
+        self._pool.run(
+            label_passes.judge_faces,
+            len(is_face),
+            xyz,
+            tiles.tile,
+            tiles.foot_z,
+            tiles.top_z,
             faces.min_height,
             max_height,
-            tall,
+            faces.max_normal_z,
+            FEWEST_RETURNS,
+            is_face,
         )
-        label_passes.judge_faces(
-            xyz, tile, foot_z, tall, max_height, faces.max_normal_z, FEWEST_RETURNS, is_face
-        )
-        return Faces(tile, foot_z, is_face)
+        return Faces(tiles, is_face)
 
     def label_points(
         self,
-        xyz: FloatArray,
+        xyz: PointArray,
         grid: PolarGrid,
         surface: GroundSurface,
         faces: Faces,
@@ -112,7 +129,7 @@ class CompiledBackend:
             xyz,
             grid.cell,
             grid.r,
-            faces.tile,
+            faces.tiles.tile,
             faces.is_face,
             np.tile(surface.knots[:-1], grid.n_segments),
             *pieces(surface.knots, surface.mean),
@@ -130,10 +147,10 @@ class CompiledBackend:
             n_points,
             xyz,
             grid.cell,
-            faces.tile,
+            faces.tiles.tile,
             height,
             faces.is_face,
-            faces.foot_z,
+            faces.tiles.foot_z,
             band(roughness, stands.any(axis=0).reshape(roughness.shape), label).ravel(),
             label.below_tolerance,
             face_tolerance,

@@ -6,29 +6,28 @@ from gp_ground_seg.compiled import compiled_vectors
 
 NEGLIGIBLE_EXPONENT = 40.0
 """Compiled code takes exp(-x) for exp(-40), 4e-18, beyond this x: below the rounding of one."""
-_HALVINGS = 8
+_HALVINGS = 7
 _SCALE = -1.0 / 2.0**_HALVINGS
+# Factors, not quotients: a division takes as long as ten multiplications.
+_C2, _C3, _C4, _C5, _C6, _C7 = 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 720, 1 / 5040
 
 
 @compiled_vectors
 def decay(x: float) -> float:
-    """``exp(-x)`` for x >= 0, to a relative error of 1e-13.
+    """``exp(-x)`` for x >= 0, to an error of 1e-14 of exp(0).
 
-    The Taylor polynomial of ``exp(-x / 256)``, squared eight times: no branch, no
-    table, no call, four numbers at a time.
+    The Taylor polynomial of ``exp(-x / 128)``, squared seven times: no branch, no
+    table, no call, four numbers at a time. What the polynomial leaves out is at most
+    ``x^8 exp(-x) / (128^7 8!)``, 3e-16.
     """
     y = min(x, NEGLIGIBLE_EXPONENT) * _SCALE
-    value = 1.0 + y / 10.0
-    value = 1.0 + y / 9.0 * value
-    value = 1.0 + y / 8.0 * value
-    value = 1.0 + y / 7.0 * value
-    value = 1.0 + y / 6.0 * value
-    value = 1.0 + y / 5.0 * value
-    value = 1.0 + y / 4.0 * value
-    value = 1.0 + y / 3.0 * value
-    value = 1.0 + y / 2.0 * value
-    value = 1.0 + y * value
-    value *= value
+    value = _C7 * y + _C6
+    value = value * y + _C5
+    value = value * y + _C4
+    value = value * y + _C3
+    value = value * y + _C2
+    value = value * y + 1.0
+    value = value * y + 1.0
     value *= value
     value *= value
     value *= value

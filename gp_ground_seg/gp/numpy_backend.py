@@ -12,6 +12,7 @@ from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled, label_points, local_roughness
+from gp_ground_seg.points import PointArray
 from gp_ground_seg.polar_grid import (
     Candidates,
     CellTables,
@@ -22,6 +23,8 @@ from gp_ground_seg.polar_grid import (
 )
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
+from gp_ground_seg.tiles import Tiles, build_tiles
+from gp_ground_seg.workspace import Workspace
 
 
 class NumpyBackend:
@@ -30,20 +33,22 @@ class NumpyBackend:
     name = 'numpy'
     n_threads = 1
 
-    def sort_points(self, xyz: FloatArray, grid: GridConfig) -> tuple[PolarGrid, CellTables]:
-        """Cell of each point, extremes of each cell."""
-        sorted_points = build_polar_grid(xyz, grid)
-        return sorted_points, reduce_cells(sorted_points, xyz[:, 2])
+    def sort_points(
+        self, xyz: PointArray, grid: GridConfig, tile_size: float, workspace: Workspace
+    ) -> tuple[PolarGrid, CellTables, Tiles]:
+        """Cell and tile of each point, extremes of each."""
+        cells = build_polar_grid(xyz, grid)
+        return cells, reduce_cells(cells, xyz[:, 2]), build_tiles(xyz, cells, tile_size)
 
     def find_faces(
-        self, xyz: FloatArray, grid: PolarGrid, faces: FacesConfig, max_height: float
+        self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
     ) -> Faces:
         """Upright faces."""
-        return find_faces(xyz, grid, faces, max_height)
+        return find_faces(xyz, tiles, faces, max_height)
 
     def label_points(
         self,
-        xyz: FloatArray,
+        xyz: PointArray,
         grid: PolarGrid,
         surface: GroundSurface,
         faces: Faces,
@@ -51,11 +56,10 @@ class NumpyBackend:
         face_tolerance: float,
     ) -> Labelled:
         """Height, label and margin of each point; roughness of each bin."""
-        height = xyz[:, 2] - surface.at(grid)[0]
+        z = xyz[:, 2].astype(np.float64)
+        height = z - surface.at(grid)[0]
         roughness = local_roughness(height, grid, faces, label.obstacle_min_height)
-        labels, margin = label_points(
-            xyz[:, 2], height, grid, faces, roughness, label, face_tolerance
-        )
+        labels, margin = label_points(z, height, grid, faces, roughness, label, face_tolerance)
         return Labelled(labels, height, margin, roughness)
 
     @single_threaded_blas()

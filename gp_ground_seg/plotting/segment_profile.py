@@ -72,7 +72,7 @@ def plot_segment(
     DataError
         If the file cannot be written.
     """
-    z = result.pose.level(check_points(points))[:, 2]
+    z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     for name, label in (('result', result.label), ('truth', truth)):
         if label is not None and label.shape != (len(z),):
             raise PointCloudError(

@@ -1,0 +1,61 @@
+"""Square tiles of the plane: points to tiles, lowest and highest point per tile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.polar_grid import OUTSIDE, PolarGrid
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Where each point lies in a square of square tiles that holds the polar grid.
+
+    Attributes
+    ----------
+    tile : (N,) int32
+        Tile of each point, or `OUTSIDE`.
+    foot_z, top_z : (T,) float32 or float64
+        Height of the lowest and of the highest point of each tile [m], in the
+        precision of the points; infinite, minus infinite in empty ones.
+    """
+
+    tile: npt.NDArray[np.int32]
+    foot_z: npt.NDArray[np.floating]
+    top_z: npt.NDArray[np.floating]
+
+
+def tiles_per_side(r_max: float, tile_size: float) -> int:
+    """Tiles along a side of the square that holds the polar grid."""
+    return int(np.ceil(2.0 * r_max / tile_size))
+
+
+def build_tiles(xyz: npt.NDArray[np.floating], grid: PolarGrid, tile_size: float) -> Tiles:
+    """Sort points into square tiles.
+
+    Parameters
+    ----------
+    xyz : (N, 3) float32 or float64
+        Points [m].
+    grid : PolarGrid
+        Bins of the points; those outside belong to no tile.
+    tile_size : float
+        Side of a tile [m].
+    """
+    half = float(grid.edges[-1])
+    side = tiles_per_side(half, tile_size)
+    inside = grid.inside
+    tile = np.full(len(xyz), OUTSIDE, dtype=np.int32)
+    plane = xyz[inside, :2].astype(np.float64)
+    column, row = ((plane + half) * (1.0 / tile_size)).astype(np.int64).T
+    own = np.minimum(column, side - 1) * side + np.minimum(row, side - 1)
+    tile[inside] = own
+    z = xyz[inside, 2]
+    foot_z = np.full(side * side, np.inf, dtype=xyz.dtype)
+    top_z = np.full(side * side, -np.inf, dtype=xyz.dtype)
+    np.minimum.at(foot_z, own, z)
+    np.maximum.at(top_z, own, z)
+    return Tiles(tile, foot_z, top_z)
