@@ -89,6 +89,12 @@ class Candidates:
         """Segment of each candidate, (C,) int64."""
         return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
 
+    @property
+    def n_edges(self) -> IntArray:
+        """Bin edges up to the far one of the last bin with a candidate, (M,) int64, or 0."""
+        last = self.bin[np.maximum(self.offsets[1:] - 1, 0)] if len(self.bin) else 0
+        return np.where(np.diff(self.offsets) > 0, last + 2, 0)
+
 
 def bin_edges(grid: GridConfig) -> FloatArray:
     """Ranges of the bin edges [m], (n_bins + 1,)."""

@@ -22,7 +22,8 @@ class GroundSurface:
         Ranges [m]: the bin edges.
     mean, std : (M, K) float64
         Ground height in the sensor frame and its standard deviation [m]; NaN in
-        segments without a model.
+        segments without a model, and behind the last bin with a return in a segment
+        and in those that are fused with it.
     inlier : (C,) bool
         Candidates that made the surface.
     """
@@ -78,7 +79,8 @@ def fuse_neighbours(
     Parameters
     ----------
     mean, std : (M, K) float64
-        Height and standard deviation at the knots [m]; NaN where there is no model.
+        Height and standard deviation at the knots [m]; NaN from the first knot on
+        where there is no model.
     knots : (K,) float64
         Ranges of the knots [m].
     n_neighbours : int
@@ -130,11 +132,11 @@ def fuse_rows(
         total_weight[:] = 0.0
         weighted[:] = 0.0
         for k in range(-n_neighbours, n_neighbours + 1):
-            # A segment has a model at all knots or at none.
             other = (m - k) % n_segments
-            if math.isnan(std[other, 0]):
-                continue
             for j in range(n_knots):
+                # A segment has a model up to some knot.
+                if math.isnan(std[other, j]):
+                    break
                 away = k * aside[j]
                 weight = 1.0 / max(std[other, j] * std[other, j] + away * away, 1e-8)
                 total_weight[j] += weight

@@ -74,6 +74,7 @@ def test_latent_rows(seed, n_segments):
         np.concatenate([[0], np.cumsum(counts)]),
         rng.uniform(3, 50, counts.sum()),
         np.linspace(2.0, 60.0, 9),
+        rng.integers(0, 10, n_segments),
     )
     for found, expected in zip(
         latent_rows_batched(*arguments), latent_rows_reference(*arguments), strict=True

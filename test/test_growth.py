@@ -20,6 +20,8 @@ def random_frame(seed, n_segments=5):
     z[lifted] += rng.uniform(0.4, 2.0, lifted.sum())
     length_scale = rng.uniform(1.0, 12.0, len(r))
     knot_length_scale = rng.uniform(1.0, 12.0, (n_segments, len(KNOTS)))
+    n_wanted = rng.integers(0, len(KNOTS) + 1, (n_segments, 1))
+    knot_length_scale[np.arange(len(KNOTS)) >= n_wanted] = np.nan
     seed_mask = (r < 15.0) & (np.abs(z) < 0.2)
     follows = rng.random(len(r)) < 0.3
     follows[offsets[:-1][counts > 0]] = False

@@ -212,6 +212,7 @@ def test_compiled_latent_rows_are_the_reference(seed):
         np.concatenate([[0], np.cumsum(counts)]),
         rng.uniform(3, 40, counts.sum()),
         np.linspace(2, 60, 7),
+        rng.integers(0, 8, 5),
     )
     expected = latent_rows_reference(*arguments)
     found = np.empty(counts.sum()), np.full((5, 7), np.nan)

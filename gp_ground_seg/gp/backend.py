@@ -13,7 +13,7 @@ from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled
 from gp_ground_seg.points import PointArray
-from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
+from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, IntArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface
 from gp_ground_seg.tiles import Tiles
@@ -54,7 +54,12 @@ class Backend(Protocol):
         """See `gp_ground_seg.labelling`."""
 
     def log_length_scales(
-        self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
+        self,
+        theta: FloatArray,
+        pseudo: PseudoInputs,
+        candidates: Candidates,
+        knots: FloatArray,
+        n_knots: IntArray,
     ) -> tuple[FloatArray, FloatArray]:
         """See `gp_ground_seg.gp.latent.latent_rows_reference`."""
 

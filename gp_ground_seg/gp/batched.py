@@ -22,6 +22,7 @@ def latent_rows_batched(
     offsets: IntArray,
     r: FloatArray,
     knots: FloatArray,
+    n_knots: IntArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Do what `latent_rows_reference` does."""
     n_segments = len(offsets) - 1
@@ -43,7 +44,8 @@ def latent_rows_batched(
         at_candidates[own.index[own.mask]] = (value + mean[:, None])[own.mask]
         wanted = np.broadcast_to(knots, (len(segments), len(knots)))
         value = (_gaussian(wanted, own_r_bar, variance, decay) @ weight)[:, :, 0]
-        at_knots[segments] = value + mean[:, None]
+        is_wanted = np.arange(len(knots)) < n_knots[segments, None]
+        at_knots[segments] = np.where(is_wanted, value + mean[:, None], np.nan)
     return at_candidates, at_knots
 
 
@@ -115,9 +117,9 @@ def grow_surface_batched(
         if len(knots) and grown.any():
             kept = segments[grown]
             wanted = np.broadcast_to(knots, (len(kept), len(knots)))
-            cross = paciorek_batched(
-                own_r[grown], own_l[grown], wanted, knot_length_scale[kept], sigma_f[kept]
-            )
+            is_wanted = np.isfinite(knot_length_scale[kept])
+            wanted_l = np.where(is_wanted, knot_length_scale[kept], 1.0)
+            cross = paciorek_batched(own_r[grown], own_l[grown], wanted, wanted_l, sigma_f[kept])
             cross += slope_std**2 * own_r[grown][:, :, None] * knots
             mean[kept], variance = _predict(
                 regularised(covariance[grown], noise[grown], chosen[grown]),
@@ -125,7 +127,8 @@ def grow_surface_batched(
                 own_z[grown] * chosen[grown],
             )
             variance += sigma_f[kept, None] ** 2 + slope_std**2 * knots**2
-            std[kept] = np.sqrt(np.maximum(variance, 0.0))
+            mean[kept] = np.where(is_wanted, mean[kept], np.nan)
+            std[kept] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
     return inlier, mean, std
 
 

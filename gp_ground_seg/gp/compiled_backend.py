@@ -15,7 +15,7 @@ from gp_ground_seg.labelling import Labelled, band, root_mean_square
 from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.point_passes import grid_ruler
 from gp_ground_seg.points import PointArray
-from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, PolarGrid
+from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, IntArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface, fuse_rows, pieces
 from gp_ground_seg.tiles import Tiles, tiles_per_side
@@ -160,7 +160,12 @@ class CompiledBackend:
         return Labelled(labels, height, margin, roughness)
 
     def log_length_scales(
-        self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
+        self,
+        theta: FloatArray,
+        pseudo: PseudoInputs,
+        candidates: Candidates,
+        knots: FloatArray,
+        n_knots: IntArray,
     ) -> tuple[FloatArray, FloatArray]:
         """Log length-scales at candidates and knots."""
         n_segments = len(candidates.offsets) - 1
@@ -176,6 +181,7 @@ class CompiledBackend:
             candidates.offsets,
             candidates.r,
             knots,
+            n_knots,
             at_candidates,
             at_knots,
         )

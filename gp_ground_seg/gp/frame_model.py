@@ -64,11 +64,18 @@ class FrameModel:
     def log_length_scales(
         self, theta: FloatArray, knots: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Log length-scales at the candidates (C,) and knots (M, K) [log m]."""
+        """Log length-scales at the candidates (C,) and knots (M, K) [log m].
+
+        NaN behind the bin of the last candidate: nothing is known of the ground there.
+        """
+        n_knots = np.minimum(self.candidates.n_edges, len(knots))
         if self.config.length_scale.model == 'latent':
-            return self.backend.log_length_scales(theta, self.pseudo, self.candidates, knots)
+            return self.backend.log_length_scales(
+                theta, self.pseudo, self.candidates, knots, n_knots
+            )
         u = candidate_log_length_scale(self.candidates, self.lines, self.config.length_scale)
-        return u, interpolate_along_segments(self.candidates, u, knots)
+        knot_u = interpolate_along_segments(self.candidates, u, knots)
+        return u, np.where(np.arange(len(knots)) < n_knots[:, None], knot_u, np.nan)
 
     def grow(
         self, theta: FloatArray, knots: FloatArray, segment_step: int = 1

@@ -58,7 +58,7 @@ def grow_surface_reference(
     knots : (K,) float64
         Ranges where the surface is wanted [m].
     knot_length_scale : (M, K) float64
-        Length-scale there [m].
+        Length-scale there [m]; NaN from the first knot on that is not wanted.
     sigma_f, sigma_n : (M,) float64
         Standard deviations of process and noise in each segment [m].
     gate_noise : (M,) float64
@@ -73,8 +73,8 @@ def grow_surface_reference(
     inlier : (C,) bool
         Candidates that made the surface.
     mean, std : (M, K) float64
-        Height about the prior mean and its standard deviation [m]; NaN in
-        segments without an inlier.
+        Height about the prior mean and its standard deviation [m]; NaN at knots that
+        are not wanted and in segments without an inlier.
     """
     n_segments = len(offsets) - 1
     inlier = seed.copy()
@@ -109,17 +109,18 @@ def grow_surface_reference(
             if not joining.any():
                 break
             chosen |= joining
-        mean[m], variance = posterior(
+        wanted = np.isfinite(knot_length_scale[m])
+        mean[m, wanted], variance = posterior(
             r_own[chosen],
             z_own[chosen],
             l_own[chosen],
-            knots,
-            knot_length_scale[m],
+            knots[wanted],
+            knot_length_scale[m, wanted],
             sigma_f[m],
             sigma_n[m],
             slope_std,
         )
-        std[m] = np.sqrt(variance)
+        std[m, wanted] = np.sqrt(variance)
     return inlier, mean, std
 
 
@@ -153,19 +154,21 @@ def grow_surface_compiled(
     an inlier appends one row, after which means and variances everywhere follow
     by one multiplication: a whole segment costs one factorisation.
     """
-    n_knots = len(knots)
     for m in range(start, stop, step):
         first = offsets[m]
         n = offsets[m + 1] - first
         joining = seed[first : first + n].copy()
         if not joining.any():
             continue
+        n_knots = 0
+        while n_knots < len(knots) and not math.isnan(knot_length_scale[m, n_knots]):
+            n_knots += 1
         all_r = np.empty(n + n_knots)
         all_l = np.empty(n + n_knots)
         all_r[:n] = r[first : first + n]
-        all_r[n:] = knots
+        all_r[n:] = knots[:n_knots]
         all_l[:n] = length_scale[first : first + n]
-        all_l[n:] = knot_length_scale[m]
+        all_l[n:] = knot_length_scale[m, :n_knots]
         square = all_l * all_l
         whitened = np.empty((n, n + n_knots))
         height = np.zeros(n + n_knots)

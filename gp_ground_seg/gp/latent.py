@@ -61,6 +61,7 @@ def latent_rows_reference(
     offsets: IntArray,
     r: FloatArray,
     knots: FloatArray,
+    n_knots: IntArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Log length-scales at the candidates and knots of every segment.
 
@@ -75,14 +76,16 @@ def latent_rows_reference(
     r : (C,) float64
         Ranges of the candidates [m].
     knots : (K,) float64
-        Ranges wanted in every segment [m].
+        Ranges wanted [m].
+    n_knots : (M,) int64
+        How many of them, from the first on, are wanted in each segment.
 
     Returns
     -------
     at_candidates : (C,) float64
         Log length-scales [log m].
     at_knots : (M, K) float64
-        The same at the knots; NaN in segments without candidates.
+        The same at the knots; NaN at those that are not wanted.
     """
     n_segments = len(offsets) - 1
     at_candidates = np.empty(len(r))
@@ -95,11 +98,11 @@ def latent_rows_reference(
         values = log_length_scale(
             r_bar[bar],
             theta[m, 5 + surface_class[bar]],
-            np.concatenate([r[own], knots]),
+            np.concatenate([r[own], knots[: n_knots[m]]]),
             *np.exp(theta[m, 2:5]),
         )
         at_candidates[own] = values[: own.stop - own.start]
-        at_knots[m] = values[own.stop - own.start :]
+        at_knots[m, : n_knots[m]] = values[own.stop - own.start :]
     return at_candidates, at_knots
 
 
@@ -115,6 +118,7 @@ def latent_rows_compiled(
     offsets: IntArray,
     r: FloatArray,
     knots: FloatArray,
+    n_knots: IntArray,
     at_candidates: FloatArray,
     at_knots: FloatArray,
 ) -> None:
@@ -146,13 +150,14 @@ def latent_rows_compiled(
         own = at_candidates[offsets[m] : offsets[m + 1]]
         own_r = r[offsets[m] : offsets[m + 1]]
         own[:] = mean
-        at_knots[m] = mean
+        own_knots = at_knots[m, : n_knots[m]]
+        own_knots[:] = mean
         for j in range(p):
             scaled = weight[j] * variance
             centre = r_bar[first + j]
             for i in range(len(own)):
                 d = own_r[i] - centre
                 own[i] += scaled * decay(sharpness * d * d)
-            for i in range(len(knots)):
+            for i in range(len(own_knots)):
                 d = knots[i] - centre
-                at_knots[m, i] += scaled * decay(sharpness * d * d)
+                own_knots[i] += scaled * decay(sharpness * d * d)

@@ -17,6 +17,7 @@ from gp_ground_seg.polar_grid import (
     Candidates,
     CellTables,
     FloatArray,
+    IntArray,
     PolarGrid,
     build_polar_grid,
     reduce_cells,
@@ -64,7 +65,12 @@ class NumpyBackend:
 
     @single_threaded_blas()
     def log_length_scales(
-        self, theta: FloatArray, pseudo: PseudoInputs, candidates: Candidates, knots: FloatArray
+        self,
+        theta: FloatArray,
+        pseudo: PseudoInputs,
+        candidates: Candidates,
+        knots: FloatArray,
+        n_knots: IntArray,
     ) -> tuple[FloatArray, FloatArray]:
         """Log length-scales at candidates and knots."""
         return latent_rows_batched(
@@ -75,6 +81,7 @@ class NumpyBackend:
             candidates.offsets,
             candidates.r,
             knots,
+            n_knots,
         )
 
     @single_threaded_blas()
