@@ -11,8 +11,7 @@ from gp_ground_seg.compiled import compiled
 from gp_ground_seg.labelling import SQUARE_UNITS
 from gp_ground_seg.labels import Label
 from gp_ground_seg.point_passes import CellArray
-from gp_ground_seg.points import PointArray
-from gp_ground_seg.polar_grid import NOT_FINITE, OUTSIDE, FloatArray, IntArray
+from gp_ground_seg.polar_grid import NOT_FINITE, OUTSIDE, FloatArray, IntArray, PointArray
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -29,7 +28,7 @@ def judge_faces(
     start: int,
     _stop: int,
     step: int,
-    xyz: PointArray,
+    columns: PointArray,
     tile: CellArray,
     foot_z: PointArray,
     top_z: PointArray,
@@ -66,15 +65,15 @@ def judge_faces(
             n_slots += 1
             slot_of[own] = k = n_slots
             tile_of[k - 1], is_tall[k - 1] = tile[i], False
-            origin[k - 1, 0], origin[k - 1, 1] = xyz[i, 0], xyz[i, 1]
+            origin[k - 1, 0], origin[k - 1, 1] = columns[0, i], columns[1, i]
             sums[k - 1] = 0.0
         k -= 1
-        z = np.float64(xyz[i, 2]) - foot
+        z = np.float64(columns[2, i]) - foot
         if z > max_height:
             continue
         if z > min_height:
             is_tall[k] = True
-        x, y = np.float64(xyz[i, 0]) - origin[k, 0], np.float64(xyz[i, 1]) - origin[k, 1]
+        x, y = np.float64(columns[0, i]) - origin[k, 0], np.float64(columns[1, i]) - origin[k, 1]
         s = sums[k]
         s[0] += 1.0
         s[1] += x
@@ -103,47 +102,46 @@ def survey_heights(
     share: int,
     start: int,
     stop: int,
-    xyz: PointArray,
+    columns: PointArray,
     cell: CellArray,
-    r: FloatArray,
+    r: PointArray,
     tile: CellArray,
     is_face: BoolArray,
-    near: FloatArray,
-    level: FloatArray,
-    slope: FloatArray,
+    pieces: FloatArray,
     min_height: float,
     max_height: float,
     height: FloatArray,
-    number: IntArray,
-    squares: IntArray,
+    sums: IntArray,
     stands: BoolArray,
 ) -> None:
     """Heights of some points over the surface; sums for the roughness; what stands in a bin.
 
     Points `start` to `stop`, summed up in tables ``[share]``. Squares are summed in
     whole numbers: the sum does not depend on its order, nor on the number of threads.
-    `near`, `level` and `slope` are the cells' near ends and the surface's pieces there.
+    `pieces` are the cells' near ends, and level and slope of the surface from there.
     """
     for i in range(start, stop):
         if cell[i] < 0:
             height[i] = np.nan
             continue
         own = np.uintp(cell[i])
-        h = np.float64(xyz[i, 2]) - (level[own] + slope[own] * max(r[i] - near[own], 0.0))
+        h = np.float64(columns[2, i]) - (
+            pieces[own, 1] + pieces[own, 2] * max(np.float64(r[i]) - pieces[own, 0], 0.0)
+        )
         height[i] = h
         if h >= min_height:
             if h <= max_height:
                 stands[share, own] = True
         elif h >= -min_height and not is_face[np.uintp(tile[i])]:
-            number[share, own] += 1
-            squares[share, own] += int(h * h * SQUARE_UNITS + 0.5)
+            sums[share, own, 0] += 1
+            sums[share, own, 1] += int(h * h * SQUARE_UNITS + 0.5)
 
 
 @compiled
 def label_by_height(
     start: int,
     stop: int,
-    xyz: PointArray,
+    columns: PointArray,
     cell: CellArray,
     tile: CellArray,
     height: FloatArray,
@@ -165,7 +163,7 @@ def label_by_height(
         own = min(band[np.uintp(n)] - height[i], height[i] + below_tolerance)
         if is_face[np.uintp(tile[i])]:
             over_foot = max(
-                height[i], np.float64(xyz[i, 2]) - np.float64(foot_z[np.uintp(tile[i])])
+                height[i], np.float64(columns[2, i]) - np.float64(foot_z[np.uintp(tile[i])])
             )
             own = min(own, face_tolerance - over_foot)
         margin[i] = own

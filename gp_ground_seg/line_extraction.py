@@ -63,7 +63,7 @@ def extract_lines(candidates: Candidates, lines: LinesConfig) -> Lines:
     lines : LinesConfig
         Tolerances.
     """
-    line, slope, n_lines = _extract(
+    line, slope, start, n_lines = _extract(
         candidates.offsets,
         candidates.r,
         candidates.z,
@@ -76,8 +76,7 @@ def extract_lines(candidates: Candidates, lines: LinesConfig) -> Lines:
         math.log(lines.max_density_ratio),
         lines.error_ratio,
     )
-    start = np.searchsorted(line, np.arange(n_lines + 1))
-    return Lines(line, slope[:n_lines], start)
+    return Lines(line, slope[:n_lines], start[: n_lines + 1])
 
 
 def _deming_from_moments(s_rr: float, s_zz: float, s_rz: float, error_ratio: float) -> float:
@@ -116,8 +115,9 @@ def _extract(
     max_gap_growth: float,
     max_log_density_change: float,
     error_ratio: float,
-) -> tuple[IntArray, FloatArray, int]:
+) -> tuple[IntArray, FloatArray, IntArray, int]:
     line = np.empty(len(r), np.int64)
+    start = np.empty(len(r) + 1, np.int64)
     slopes = np.full(len(r), np.nan)
     current = -1
     for m in range(len(offsets) - 1):
@@ -127,7 +127,7 @@ def _extract(
             # Sums relative to the first point of the line keep their digits.
             n = 0
             sum_r = sum_z = sum_rr = sum_zz = sum_rz = 0.0
-            slope = np.nan
+            slope = angle = np.nan
             j = i
             while j < offsets[m + 1]:
                 dr, dz = r[j] - r[i], z[j] - z[i]
@@ -137,7 +137,7 @@ def _extract(
                 ):
                     break
                 new_r, new_z = (sum_r + dr) / (n + 1), (sum_z + dz) / (n + 1)
-                new_slope = np.nan
+                new_slope = new_angle = np.nan
                 if n > 0:
                     new_slope = deming_slope(
                         sum_rr + dr * dr - (n + 1) * new_r * new_r,
@@ -145,10 +145,11 @@ def _extract(
                         sum_rz + dr * dz - (n + 1) * new_r * new_z,
                         error_ratio,
                     )
+                    new_angle = math.atan(new_slope)
                 if n > 1:
                     before = sum_z / n + slope * (dr - sum_r / n)
                     after = new_z + new_slope * (dr - new_r)
-                    turn = abs(math.atan(new_slope) - math.atan(slope))
+                    turn = abs(new_angle - angle)
                     distance = abs(dz - before) / math.sqrt(1.0 + slope * slope)
                     if (
                         turn > slope_tolerance
@@ -162,9 +163,11 @@ def _extract(
                 sum_rr += dr * dr
                 sum_zz += dz * dz
                 sum_rz += dr * dz
-                slope = new_slope
+                slope, angle = new_slope, new_angle
                 j += 1
             line[i:j] = current
+            start[current] = i
             slopes[current] = slope
             i = j
-    return line, slopes, current + 1
+    start[current + 1] = len(r)
+    return line, slopes, start, current + 1

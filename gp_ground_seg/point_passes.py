@@ -10,12 +10,12 @@ import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.config import GridConfig
-from gp_ground_seg.points import PointArray
 from gp_ground_seg.polar_grid import (
     NOT_FINITE,
     OUTSIDE,
     FloatArray,
     IntArray,
+    PointArray,
     bin_edges,
     segment_edges,
 )
@@ -24,8 +24,9 @@ CellArray = npt.NDArray[np.int32]
 LARGEST_TABLE = 2**15
 BLOCK = 512
 """Points sorted at a time: what is known of them stays in the nearest cache."""
-EARLY = 1e-6
-"""How much earlier the entries of a table begin, in entries: more than rounding does."""
+EARLY = 0.02
+"""How much earlier the entries of a table begin, in entries: more than single precision
+puts a value off in the largest table."""
 
 
 def first_bins(edges: FloatArray, fineness: int) -> tuple[npt.NDArray[np.int32], float]:
@@ -72,17 +73,18 @@ def sort_points(
     share: int,
     start: int,
     stop: int,
-    xyz: PointArray,
+    columns: PointArray,
     edges: FloatArray,
     table: CellArray,
     scale: float,
     turn_edges: FloatArray,
     turn_table: CellArray,
     turn_scale: float,
+    farthest: float,
     tiles_per_metre: float,
     n_sides: int,
     cell: CellArray,
-    r: FloatArray,
+    r: PointArray,
     lowest_z: FloatArray,
     lowest_r: FloatArray,
     highest_z: FloatArray,
@@ -97,64 +99,72 @@ def sort_points(
     The tables ``[share]`` start empty. Block by block: where the points lie, in loops
     without branches; then the extremes.
     """
-    turn, near = np.empty(BLOCK), np.empty(BLOCK, dtype=np.int32)
+    turn, near = np.empty(BLOCK, dtype=columns.dtype), np.empty(BLOCK, dtype=np.int32)
     for first in range(start, stop, BLOCK):
-        last = min(first + BLOCK, stop)
-        own = slice(first, last)
-        _measure_range(xyz[own], edges[0], edges[-1], scale, r[own], near, cell[own])
-        _measure_turn(xyz[own], edges[-1], tiles_per_metre, n_sides, cell[own], turn, tile[own])
+        own = slice(first, min(first + BLOCK, stop))
+        x, y, z = columns[0, own], columns[1, own], columns[2, own]
+        _measure_range(x, y, z, edges[0], farthest, scale, r[own], near, cell[own])
+        _measure_turn(x, y, farthest, tiles_per_metre, n_sides, cell[own], turn, tile[own])
         _look_up(edges, table, turn_edges, turn_table, turn_scale, r[own], near, turn, cell[own])
-        _reduce_cells(xyz[own], r[own], cell[own], lowest_z[share], lowest_r[share],
+        _reduce_cells(z, r[own], cell[own], lowest_z[share], lowest_r[share],
                       highest_z[share], count[share])  # fmt: skip
-        _reduce_tiles(xyz[own], tile[own], foot_z[share], top_z[share])
+        _reduce_tiles(z, tile[own], foot_z[share], top_z[share])
 
 
 @compiled
 def _measure_range(
-    xyz: PointArray,
+    x: PointArray,
+    y: PointArray,
+    z: PointArray,
     nearest: float,
     farthest: float,
     scale: float,
-    r: FloatArray,
+    r: PointArray,
     near: CellArray,
     cell: CellArray,
 ) -> None:
     """Range of each point and its entry in the table; ``cell`` 0, or why it has none."""
+    number = x.dtype.type
+    zero, infinity, nothing = number(0.0), number(np.inf), number(np.nan)
+    start, end, per_metre = number(nearest), number(farthest), number(scale)
     for i in range(len(r)):
-        x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
-        finite = (abs(x) < np.inf) & (abs(y) < np.inf) & (abs(z) < np.inf)
-        own_r = math.sqrt(x * x + y * y)
-        inside = finite & (own_r < farthest)
-        r[i] = own_r if finite else np.nan
+        finite = (abs(x[i]) < infinity) & (abs(y[i]) < infinity) & (abs(z[i]) < infinity)
+        own_r = math.sqrt(x[i] * x[i] + y[i] * y[i])
+        inside = finite & (own_r < end)
+        r[i] = own_r if finite else nothing
         cell[i] = 0 if inside else (OUTSIDE if finite else NOT_FINITE)
-        beyond = (own_r - nearest) * scale
-        near[i] = np.int32(beyond if inside & (beyond > 0.0) else 0.0)
+        beyond = (own_r - start) * per_metre
+        near[i] = np.int32(beyond if inside & (beyond > zero) else zero)
 
 
 # Apart from the other: of many arrays the compiler does not find out that none overlap.
 @compiled
 def _measure_turn(
-    xyz: PointArray,
+    x: PointArray,
+    y: PointArray,
     farthest: float,
     tiles_per_metre: float,
     n_sides: int,
     cell: CellArray,
-    turn: FloatArray,
+    turn: PointArray,
     tile: CellArray,
 ) -> None:
     """Pseudo-angle and tile of each point that has a cell."""
+    number = x.dtype.type
+    zero, two, four = number(0.0), number(2.0), number(4.0)
+    half, per_metre, last = number(farthest), number(tiles_per_metre), number(n_sides - 1)
     for i in range(len(cell)):
         inside = cell[i] == 0
-        x = np.float64(xyz[i, 0]) if inside else 0.0
-        y = np.float64(xyz[i, 1]) if inside else 0.0
-        size = abs(x) + abs(y)
-        share = y / size if size > 0.0 else 0.0
-        left = -share if y < 0.0 else 4.0 - share
-        own_turn = 2.0 + share if x >= 0.0 else left
+        own_x = x[i] if inside else zero
+        own_y = y[i] if inside else zero
+        size = abs(own_x) + abs(own_y)
+        share = own_y / size if size > zero else zero
+        left = -share if own_y < zero else four - share
+        own_turn = two + share if own_x >= zero else left
         # Exactly 4 is the edge that ends the last segment: that is segment 0 again.
-        turn[i] = own_turn if own_turn < 4.0 else 0.0
-        column = np.int32(min((x + farthest) * tiles_per_metre, n_sides - 1.0))
-        row = np.int32(min((y + farthest) * tiles_per_metre, n_sides - 1.0))
+        turn[i] = own_turn if own_turn < four else zero
+        column = np.int32(min((own_x + half) * per_metre, last))
+        row = np.int32(min((own_y + half) * per_metre, last))
         tile[i] = column * np.int32(n_sides) + row if inside else OUTSIDE
 
 
@@ -165,9 +175,9 @@ def _look_up(
     turn_edges: FloatArray,
     turn_table: CellArray,
     turn_scale: float,
-    r: FloatArray,
+    r: PointArray,
     near: CellArray,
-    turn: FloatArray,
+    turn: PointArray,
     cell: CellArray,
 ) -> None:
     """Cell of the points that have one: the table's bin, or one soon after."""
@@ -189,8 +199,8 @@ def _look_up(
 
 @compiled
 def _reduce_cells(
-    xyz: PointArray,
-    r: FloatArray,
+    z: PointArray,
+    r: PointArray,
     cell: CellArray,
     lowest_z: FloatArray,
     lowest_r: FloatArray,
@@ -214,17 +224,17 @@ def _reduce_cells(
             held = own
             low_z, low_r = lowest_z[held], lowest_r[held]
             high_z, number = highest_z[held], count[held]
-        z = np.float64(xyz[i, 2])
+        own_z, own_r = np.float64(z[i]), np.float64(r[i])
         number += 1
-        high_z = max(high_z, z)
-        if z < low_z or (z == low_z and r[i] < low_r):
-            low_z, low_r = z, r[i]
+        high_z = max(high_z, own_z)
+        if own_z < low_z or (own_z == low_z and own_r < low_r):
+            low_z, low_r = own_z, own_r
     lowest_z[held], lowest_r[held] = low_z, low_r
     highest_z[held], count[held] = high_z, number
 
 
 @compiled
-def _reduce_tiles(xyz: PointArray, tile: CellArray, foot_z: PointArray, top_z: PointArray) -> None:
+def _reduce_tiles(z: PointArray, tile: CellArray, foot_z: PointArray, top_z: PointArray) -> None:
     """Extremes of the tiles, likewise."""
     held = np.uintp(0)
     low, high = foot_z[0], top_z[0]
@@ -236,7 +246,7 @@ def _reduce_tiles(xyz: PointArray, tile: CellArray, foot_z: PointArray, top_z: P
             foot_z[held], top_z[held] = low, high
             held = own
             low, high = foot_z[held], top_z[held]
-        low, high = min(low, xyz[i, 2]), max(high, xyz[i, 2])
+        low, high = min(low, z[i]), max(high, z[i])
     foot_z[held], top_z[held] = low, high
 
 
@@ -263,3 +273,32 @@ def merge_tiles(foot_z: PointArray, top_z: PointArray) -> None:
         for k in range(foot_z.shape[1]):
             foot_z[0, k] = min(foot_z[0, k], foot_z[share, k])
             top_z[0, k] = max(top_z[0, k], top_z[share, k])
+
+
+@compiled
+def collect_candidates(
+    lowest_z: FloatArray,
+    lowest_r: FloatArray,
+    highest_z: FloatArray,
+    count: IntArray,
+    widths: FloatArray,
+    min_extent: float,
+    offsets: IntArray,
+    r: FloatArray,
+    z: FloatArray,
+    own_bin: IntArray,
+    density: FloatArray,
+) -> int:
+    """Do what `polar_grid.ground_candidates` does, into arrays for all bins; their number."""
+    c = 0
+    for m in range(count.shape[0]):
+        offsets[m] = c
+        for n in range(count.shape[1]):
+            if count[m, n] == 0:
+                continue
+            r[c], z[c], own_bin[c] = lowest_r[m, n], lowest_z[m, n], n
+            extent = max(highest_z[m, n] - lowest_z[m, n], min_extent)
+            density[c] = count[m, n] / (widths[n] * extent)
+            c += 1
+    offsets[count.shape[0]] = c
+    return c

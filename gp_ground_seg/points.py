@@ -6,11 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.polar_grid import FloatArray
+from gp_ground_seg.polar_grid import FloatArray, PointArray
 from gp_ground_seg.workspace import Workspace
-
-PointArray = npt.NDArray[np.floating]
-"""Coordinates, in single or double precision."""
 
 
 def check_points(points: npt.ArrayLike) -> FloatArray:
@@ -31,8 +28,8 @@ def take_points(points: npt.ArrayLike, workspace: Workspace) -> PointArray:
     Returns
     -------
     xyz : (N, 3) float32 or float64
-        C-contiguous and read-only; may share memory with `points`. Single precision
-        for types of up to four bytes.
+        Each coordinate by itself in a row (Fortran order) and read-only; may share
+        memory with `points`. Single precision for types of up to four bytes.
 
     Raises
     ------
@@ -58,11 +55,10 @@ def take_points(points: npt.ArrayLike, workspace: Workspace) -> PointArray:
         return as_read_only(array)
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
-        xyz = workspace.take('xyz', (len(array), 3), dtype)
-        # Column by column: rows of three are too short for the loop within numpy.
+        columns = workspace.take('columns', (3, len(array)), dtype)
         for k in range(3):
-            xyz[:, k] = array[:, k]
-    return as_read_only(xyz)
+            columns[k] = array[:, k]
+    return as_read_only(columns.T)
 
 
 def as_read_only(xyz: PointArray) -> PointArray:

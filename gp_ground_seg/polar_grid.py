@@ -11,6 +11,8 @@ import numpy.typing as npt
 from gp_ground_seg.config import GridConfig
 
 FloatArray = npt.NDArray[np.float64]
+PointArray = npt.NDArray[np.floating]
+"""Coordinates, in single or double precision."""
 IntArray = npt.NDArray[np.int64]
 
 OUTSIDE = -1
@@ -27,8 +29,9 @@ class PolarGrid:
     ----------
     cell : (N,) int32
         Cell ``segment * n_bins + bin``, or `OUTSIDE`, or `NOT_FINITE`.
-    r : (N,) float64
-        Horizontal range [m]; NaN for points that are not finite.
+    r : (N,) float32 or float64
+        Horizontal range [m], in the precision of the points; NaN for points that are
+        not finite.
     edges : (n_bins + 1,) float64
         Range of the bin edges [m].
     n_segments : int
@@ -36,7 +39,7 @@ class PolarGrid:
     """
 
     cell: npt.NDArray[np.int32]
-    r: FloatArray
+    r: PointArray
     edges: FloatArray
     n_segments: int
 
@@ -102,7 +105,16 @@ def bin_edges(grid: GridConfig) -> FloatArray:
     return grid.r_min + (grid.r_max - grid.r_min) * fraction**grid.bin_growth
 
 
-def pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
+def reach(edges: FloatArray, dtype: np.dtype[np.floating]) -> np.floating:
+    """Least number of that precision that is no less than the last edge.
+
+    A range in that precision lies below it if, and only if, it lies below the edge.
+    """
+    near: np.floating = edges[-1:].astype(dtype)[0]
+    return near if near >= edges[-1] else np.nextafter(near, dtype.type(np.inf))
+
+
+def pseudo_angle(x: PointArray, y: PointArray) -> PointArray:
     """Turn from -x, counter-clockwise, on the unit diamond: 0 to 4.
 
     It grows with the angle and needs one division: points are sorted into segments
@@ -110,51 +122,53 @@ def pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
 
     Parameters
     ----------
-    x, y : (N,) float64
+    x, y : (N,) float32 or float64
         Coordinates; the origin counts as lying on +x.
     """
     size = np.abs(x) + np.abs(y)
+    two, four = size.dtype.type(2.0), size.dtype.type(4.0)
     share = np.divide(y, size, out=np.zeros_like(size), where=size > 0.0)
-    left = np.where(y < 0.0, -share, 4.0 - share)
-    result: FloatArray = np.where(x >= 0.0, 2.0 + share, left)
+    left = np.where(y < 0.0, -share, four - share)
+    result: PointArray = np.where(x >= 0.0, two + share, left)
     return result
 
 
 def segment_edges(n_segments: int) -> FloatArray:
     """Pseudo-angles of the edges of the segments, (M + 1,)."""
     angle = -np.pi + 2.0 * np.pi * np.arange(n_segments + 1) / n_segments
-    edges = pseudo_angle(np.cos(angle), np.sin(angle))
+    edges: FloatArray = pseudo_angle(np.cos(angle), np.sin(angle)).astype(np.float64)
     edges[0], edges[-1] = 0.0, 4.0
     return edges
 
 
-def build_polar_grid(xyz: npt.NDArray[np.floating], grid: GridConfig) -> PolarGrid:
+def build_polar_grid(xyz: PointArray, grid: GridConfig) -> PolarGrid:
     """Sort points into segments and bins (paper, section II).
 
     Parameters
     ----------
     xyz : (N, 3) float32 or float64
-        Points [m]; what follows is computed in double precision.
+        Points [m]; in their precision ranges and angles are computed.
     grid : GridConfig
         Size of the grid.
     """
-    xyz = xyz.astype(np.float64)
     edges = bin_edges(grid)
     finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
-    x = np.where(finite, xyz[:, 0], 0.0)
-    y = np.where(finite, xyz[:, 1], 0.0)
+    zero, nothing = xyz.dtype.type(0.0), xyz.dtype.type(np.nan)
+    x, y = np.where(finite, xyz[:, 0], zero), np.where(finite, xyz[:, 1], zero)
     with np.errstate(over='ignore'):  # infinitely far is outside
         r = np.sqrt(x * x + y * y)
     # Exactly -x is the edge that ends the last segment: that is segment 0 again.
     near = r < edges[-1]
-    angle = pseudo_angle(np.where(near, x, 0.0), np.where(near, y, 0.0))
-    turn = np.searchsorted(segment_edges(grid.n_segments), angle, side='right') - 1
+    angle = pseudo_angle(np.where(near, x, zero), np.where(near, y, zero))
+    turn = (
+        np.searchsorted(segment_edges(grid.n_segments), angle.astype(np.float64), side='right') - 1
+    )
     segment = turn % grid.n_segments
     # Points nearer than the first edge belong to the first bin.
-    index = np.maximum(np.searchsorted(edges, r, side='right') - 1, 0)
+    index = np.maximum(np.searchsorted(edges, r.astype(np.float64), side='right') - 1, 0)
     cell = np.where(index < grid.n_bins, segment * grid.n_bins + index, OUTSIDE)
     cell = np.where(finite, cell, NOT_FINITE).astype(np.int32)
-    return PolarGrid(cell, np.where(finite, r, np.nan), edges, grid.n_segments)
+    return PolarGrid(cell, np.where(finite, r, nothing), edges, grid.n_segments)
 
 
 @dataclass(frozen=True)
@@ -178,7 +192,7 @@ class CellTables:
     count: IntArray
 
 
-def reduce_cells(grid: PolarGrid, z: npt.NDArray[np.floating]) -> CellTables:
+def reduce_cells(grid: PolarGrid, z: PointArray) -> CellTables:
     """Lowest and highest point of each bin, and their number.
 
     Equal heights are settled by the smaller range, so that the order of the
@@ -200,7 +214,7 @@ def reduce_cells(grid: PolarGrid, z: npt.NDArray[np.floating]) -> CellTables:
     np.minimum.at(lowest_z, cell, z_inside)
     is_lowest = z_inside == lowest_z[cell]
     lowest_r = np.full(size, np.inf)
-    np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest])
+    np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest].astype(np.float64))
     highest_z = np.full(size, -np.inf)
     np.maximum.at(highest_z, cell, z_inside)
     count = np.bincount(cell, minlength=size)

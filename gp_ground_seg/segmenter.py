@@ -16,8 +16,13 @@ from gp_ground_seg.gp.backend import make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.line_extraction import extract_lines
-from gp_ground_seg.points import PointArray, as_read_only, take_points
-from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid, ground_candidates
+from gp_ground_seg.points import as_read_only, take_points
+from gp_ground_seg.polar_grid import (
+    Candidates,
+    FloatArray,
+    PointArray,
+    PolarGrid,
+)
 from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
 from gp_ground_seg.segmentation import FitReport, Segmentation
 from gp_ground_seg.sensor_pose import SensorPose, estimate_pose, given_pose
@@ -195,7 +200,9 @@ class GroundSegmenter:
         grid, cells, tiles = self._backend.sort_points(
             as_read_only(xyz), config.grid, config.faces.cell_size, workspace
         )
-        candidates = ground_candidates(cells, grid.edges, config.lines.min_density_extent)
+        candidates = self._backend.ground_candidates(
+            cells, grid.edges, config.lines.min_density_extent
+        )
         return grid, candidates, tiles
 
     def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:

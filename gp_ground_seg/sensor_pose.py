@@ -14,8 +14,7 @@ from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.ground_plane import GroundPlane, find_plane
 from gp_ground_seg.low_cells import low_cells
 from gp_ground_seg.parameter_spec import AUTO
-from gp_ground_seg.points import PointArray
-from gp_ground_seg.polar_grid import Candidates, FloatArray
+from gp_ground_seg.polar_grid import Candidates, FloatArray, PointArray
 from gp_ground_seg.tilt import angles_of, rotation, rounded, turned
 from gp_ground_seg.up_axis import is_suspicious, other_way_up
 

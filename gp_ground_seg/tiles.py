@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.polar_grid import OUTSIDE, PolarGrid
+from gp_ground_seg.polar_grid import OUTSIDE, PolarGrid, reach
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,12 @@ def build_tiles(xyz: npt.NDArray[np.floating], grid: PolarGrid, tile_size: float
     tile_size : float
         Side of a tile [m].
     """
-    half = float(grid.edges[-1])
-    side = tiles_per_side(half, tile_size)
+    half = reach(grid.edges, xyz.dtype)
+    side = tiles_per_side(float(grid.edges[-1]), tile_size)
     inside = grid.inside
     tile = np.full(len(xyz), OUTSIDE, dtype=np.int32)
-    plane = xyz[inside, :2].astype(np.float64)
-    column, row = ((plane + half) * (1.0 / tile_size)).astype(np.int64).T
+    per_metre = xyz.dtype.type(1.0 / tile_size)
+    column, row = ((xyz[inside, :2] + half) * per_metre).astype(np.int64).T
     own = np.minimum(column, side - 1) * side + np.minimum(row, side - 1)
     tile[inside] = own
     z = xyz[inside, 2]

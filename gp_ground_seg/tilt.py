@@ -40,11 +40,12 @@ def turned(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
     """
     largest = LARGEST[xyz.dtype.itemsize]
     x, y, z = np.clip(xyz, -largest, largest).T.astype(np.float64)
-    result = np.empty((len(xyz), 3), dtype=xyz.dtype)
+    columns = np.empty((3, len(xyz)), dtype=xyz.dtype)
     with np.errstate(invalid='ignore'):
         # Not a matrix product: BLAS would wake its threads, which spin long after.
         for i, (a, b, c) in enumerate(matrix.tolist()):
-            result[:, i] = a * x + b * y + c * z
+            columns[i] = a * x + b * y + c * z
+    result: npt.NDArray[_Float] = columns.T
     return result
 
 

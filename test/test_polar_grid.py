@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gp_ground_seg.config import Config, GridConfig
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
 from gp_ground_seg.point_passes import grid_ruler
-from gp_ground_seg.points import as_read_only
+from gp_ground_seg.points import take_points
 from gp_ground_seg.polar_grid import (
     OUTSIDE,
     bin_edges,
@@ -23,8 +23,12 @@ from gp_ground_seg.workspace import Workspace
 
 
 def build(points, grid=None):
-    xyz = np.asarray(points, dtype=np.float64)
+    xyz = np.asarray(points)
     return build_polar_grid(xyz, grid or GridConfig())
+
+
+def taken(points):
+    return take_points(points, Workspace())
 
 
 def lowest_points(grid, z, min_extent):
@@ -157,7 +161,7 @@ def test_compiled_passes_are_the_reference(seed, growth, n_bins, dtype):
     xyz[::7] = np.round(xyz[::7])  # equal heights, points on edges and axes
     xyz[::50, seed % 3] = np.nan
     xyz[::60, seed % 3] = extreme(seed)
-    xyz = as_read_only(xyz.astype(dtype))
+    xyz = taken(xyz.astype(dtype))
     grid = GridConfig(n_bins=n_bins, bin_growth=growth, r_min=4.0, r_max=30.0)
     expected = build(xyz, grid)
     found, cells, tiles = CompiledBackend(1).sort_points(xyz, grid, 0.7, Workspace())
@@ -175,7 +179,7 @@ def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
     grid = GridConfig(n_bins=1024, bin_growth=4.0, n_segments=2048)
     edges, table, *_ = grid_ruler(grid)
     assert len(table) < 40_000
-    xyz = as_read_only(hilly_scan(4000, seed=3))
+    xyz = taken(hilly_scan(4000, seed=3))
     found, *_ = CompiledBackend(1).sort_points(xyz, grid, 0.5, Workspace())
     np.testing.assert_array_equal(found.cell, build(xyz, grid).cell)
     assert len(edges) == 1025
@@ -187,7 +191,7 @@ def extreme(seed):
 
 
 def test_shares_of_the_points_are_merged():
-    xyz = as_read_only(hilly_scan(9000, seed=5))
+    xyz = taken(hilly_scan(9000, seed=5))
     for found, expected in zip(
         CompiledBackend(3).sort_points(xyz, GridConfig(), 0.5, Workspace()),
         CompiledBackend(1).sort_points(xyz, GridConfig(), 0.5, Workspace()),

@@ -15,10 +15,11 @@ from gp_ground_seg.labelling import (
     stands_in_bin,
 )
 from gp_ground_seg.labels import Label
-from gp_ground_seg.points import as_read_only
+from gp_ground_seg.points import take_points
 from gp_ground_seg.polar_grid import build_polar_grid
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
 from gp_ground_seg.tiles import Tiles, build_tiles
+from gp_ground_seg.workspace import Workspace
 
 GRID = GridConfig(n_segments=4, n_bins=4, r_min=2.0, r_max=10.0, bin_growth=1.0)
 KNOTS = np.array([2.0, 4.0, 6.0, 8.0, 10.0])
@@ -203,7 +204,7 @@ def test_compiled_surface_and_labels_are_the_reference(seed, dtype, n_threads):
         KNOTS, rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5)), np.ones(0, dtype=bool)
     )
     surface.mean[seed % 4] = surface.std[seed % 4] = np.nan
-    xyz = as_read_only(xyz)
+    xyz = take_points(xyz, Workspace())
     backend, plain = CompiledBackend(n_threads), NumpyBackend()
     tiles = build_tiles(xyz, grid, FacesConfig().cell_size)
     faces = backend.find_faces(xyz, tiles, FacesConfig(), 2.0)

@@ -90,14 +90,16 @@ def read_xyz(
     columns = _find_xyz(fields, point_step)
     order = '>' if is_bigendian else '<'
     wide = any(code == 'f8' for _, code in columns)
-    xyz = np.empty((height, width, 3), dtype=np.float64 if wide else np.float32)
+    # One coordinate after the other, as the segmentation takes it.
+    xyz = np.empty((3, height, width), dtype=np.float64 if wide else np.float32)
     # Arbitrary bytes may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
         for axis, (offset, code) in enumerate(columns):
-            xyz[:, :, axis] = np.ndarray(
+            xyz[axis] = np.ndarray(
                 (height, width), order + code, raw, offset, (row_step, point_step)
             )
-    return xyz.reshape(-1, 3)
+    result: npt.NDArray[np.float32] | npt.NDArray[np.float64] = xyz.reshape(3, -1).T
+    return result
 
 
 def select_rows(

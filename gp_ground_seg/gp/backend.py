@@ -12,8 +12,14 @@ from gp_ground_seg.faces import Faces
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled
-from gp_ground_seg.points import PointArray
-from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, IntArray, PolarGrid
+from gp_ground_seg.polar_grid import (
+    Candidates,
+    CellTables,
+    FloatArray,
+    IntArray,
+    PointArray,
+    PolarGrid,
+)
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface
 from gp_ground_seg.tiles import Tiles
@@ -36,6 +42,11 @@ class Backend(Protocol):
 
         The rest than the grid may lie in `workspace`.
         """
+
+    def ground_candidates(
+        self, cells: CellTables, edges: FloatArray, min_extent: float
+    ) -> Candidates:
+        """See `gp_ground_seg.polar_grid.ground_candidates`."""
 
     def find_faces(
         self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float

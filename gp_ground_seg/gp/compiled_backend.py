@@ -11,11 +11,18 @@ from gp_ground_seg.gp.growth import BoolArray, grow_surface_compiled
 from gp_ground_seg.gp.latent import latent_rows_compiled
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
-from gp_ground_seg.labelling import Labelled, band, root_mean_square
+from gp_ground_seg.labelling import Labelled, band, root_mean_square_compiled
 from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.point_passes import grid_ruler
-from gp_ground_seg.points import PointArray
-from gp_ground_seg.polar_grid import Candidates, CellTables, FloatArray, IntArray, PolarGrid
+from gp_ground_seg.polar_grid import (
+    Candidates,
+    CellTables,
+    FloatArray,
+    IntArray,
+    PointArray,
+    PolarGrid,
+    reach,
+)
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface, fuse_rows, pieces
 from gp_ground_seg.tiles import Tiles, tiles_per_side
@@ -46,7 +53,7 @@ class CompiledBackend:
         ruler = grid_ruler(grid)
         n_sides = tiles_per_side(grid.r_max, tile_size)
         take = workspace.take
-        cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points)
+        cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points, dtype=xyz.dtype)
         tile = take('tile', (n_points,), np.int32)
         n_shares = self._pool.n_shares(n_points)
         lowest_z, lowest_r, highest_z = take(
@@ -67,8 +74,9 @@ class CompiledBackend:
         self._pool.run_shares(
             point_passes.sort_points,
             n_points,
-            xyz,
+            xyz.T,
             *ruler,
+            float(reach(ruler[0], xyz.dtype)),
             1.0 / tile_size,
             n_sides,
             cell,
@@ -87,6 +95,29 @@ class CompiledBackend:
             Tiles(tile, foot_z[0], top_z[0]),
         )
 
+    def ground_candidates(
+        self, cells: CellTables, edges: FloatArray, min_extent: float
+    ) -> Candidates:
+        """Lowest point and vertical density of each occupied bin."""
+        n_segments, n_bins = cells.count.shape
+        size = n_segments * n_bins
+        offsets, own_bin = np.empty(n_segments + 1, np.int64), np.empty(size, np.int64)
+        r, z, density = np.empty((3, size))
+        n = point_passes.collect_candidates(
+            cells.lowest_z,
+            cells.lowest_r,
+            cells.highest_z,
+            cells.count,
+            np.diff(edges),
+            min_extent,
+            offsets,
+            r,
+            z,
+            own_bin,
+            density,
+        )
+        return Candidates(r[:n], z[:n], own_bin[:n], density[:n], offsets)
+
     def find_faces(
         self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
     ) -> Faces:
@@ -96,7 +127,7 @@ class CompiledBackend:
         self._pool.run(
             label_passes.judge_faces,
             len(is_face),
-            xyz,
+            xyz.T,
             tiles.tile,
             tiles.foot_z,
             tiles.top_z,
@@ -121,31 +152,34 @@ class CompiledBackend:
         n_points = len(xyz)
         shape = self._pool.n_shares(n_points), grid.n_segments * grid.n_bins
         height = np.empty(n_points)
-        number, squares = np.zeros((2, *shape), dtype=np.int64)
+        sums = np.zeros((*shape, 2), dtype=np.int64)
         stands = np.zeros(shape, dtype=np.bool_)
         self._pool.run_shares(
             label_passes.survey_heights,
             n_points,
-            xyz,
+            xyz.T,
             grid.cell,
             grid.r,
             faces.tiles.tile,
             faces.is_face,
-            np.tile(surface.knots[:-1], grid.n_segments),
-            *pieces(surface.knots, surface.mean),
+            np.column_stack(
+                [
+                    np.tile(surface.knots[:-1], grid.n_segments),
+                    *pieces(surface.knots, surface.mean),
+                ]
+            ),
             label.obstacle_min_height,
             label.obstacle_max_height,
             height,
-            number,
-            squares,
+            sums,
             stands,
         )
-        roughness = root_mean_square(number.sum(axis=0), squares.sum(axis=0), grid.n_segments)
+        roughness = root_mean_square_compiled(sums.sum(axis=0), grid.n_segments)
         labels, margin = np.empty(n_points, dtype=np.uint8), np.empty(n_points)
         self._pool.run_points(
             label_passes.label_by_height,
             n_points,
-            xyz,
+            xyz.T,
             grid.cell,
             faces.tiles.tile,
             height,

@@ -152,7 +152,9 @@ def grow_surface_compiled(
 
     ``whitened[k]`` is row k of ``L^-1 K(inliers, candidates and knots)``. Adding
     an inlier appends one row, after which means and variances everywhere follow
-    by one multiplication: a whole segment costs one factorisation.
+    by one multiplication: a whole segment costs one factorisation. Inliers come
+    from near to far, mostly: what lies nearer than the first candidate that is none
+    needs no more rows.
     """
     for m in range(start, stop, step):
         first = offsets[m]
@@ -174,16 +176,22 @@ def grow_surface_compiled(
         height = np.zeros(n + n_knots)
         variance = sigma_f[m] ** 2 + slope_std**2 * all_r**2
         n_inliers = 0
+        done = 0
+        end = np.uintp(n + n_knots)
         grown = True
         while grown:
             for i in range(n):
                 if not joining[i]:
                     continue
                 inlier[first + i] = True
+                while done < n and inlier[first + done]:
+                    done += 1
+                # Nothing asks for the columns before; unsigned, or they could count from the end.
+                near = np.uintp(min(i, done))
                 row = whitened[n_inliers]
                 own_r, own_l, own_square = all_r[i], all_l[i], square[i]
                 tilt = slope_std**2 * own_r
-                for j in range(n + n_knots):
+                for j in range(near, end):
                     inverse = 1.0 / (own_square + square[j])
                     distance = own_r - all_r[j]
                     root = math.sqrt(2.0 * own_l * all_l[j] * inverse)
@@ -195,19 +203,19 @@ def grow_surface_compiled(
                     row_0, row_1 = whitened[k], whitened[k + 1]
                     row_2, row_3 = whitened[k + 2], whitened[k + 3]
                     w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
-                    for j in range(n + n_knots):
+                    for j in range(near, end):
                         taken = w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
                         row[j] -= taken
                     k += 4
                 while k < n_inliers:
                     row_0 = whitened[k]
                     w_0 = row_0[i]
-                    for j in range(n + n_knots):
+                    for j in range(near, end):
                         row[j] -= w_0 * row_0[j]
                     k += 1
                 scale = 1.0 / math.sqrt(variance[i] + sigma_n[m] ** 2)
                 innovation = (z[first + i] - height[i]) * scale
-                for j in range(n + n_knots):
+                for j in range(near, end):
                     value = row[j] * scale
                     row[j] = value
                     height[j] += value * innovation

@@ -12,14 +12,15 @@ from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled, label_points, local_roughness
-from gp_ground_seg.points import PointArray
 from gp_ground_seg.polar_grid import (
     Candidates,
     CellTables,
     FloatArray,
     IntArray,
+    PointArray,
     PolarGrid,
     build_polar_grid,
+    ground_candidates,
     reduce_cells,
 )
 from gp_ground_seg.pseudo_inputs import PseudoInputs
@@ -40,6 +41,12 @@ class NumpyBackend:
         """Cell and tile of each point, extremes of each."""
         cells = build_polar_grid(xyz, grid)
         return cells, reduce_cells(cells, xyz[:, 2]), build_tiles(xyz, cells, tile_size)
+
+    def ground_candidates(
+        self, cells: CellTables, edges: FloatArray, min_extent: float
+    ) -> Candidates:
+        """Lowest point and vertical density of each occupied bin."""
+        return ground_candidates(cells, edges, min_extent)
 
     def find_faces(
         self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
