@@ -40,7 +40,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.ros.node import GroundSegmentationNode
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 """Time to wait for what has to happen [s]; only a failure takes that long."""
 
 # Other tests run beside this one; nothing of them must be heard here.

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -22,6 +21,8 @@ from ros_helpers import BEST_EFFORT, ISOLATION, PATIENCE, isolated_context, spin
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
+from gp_ground_seg.cli import notes
+from gp_ground_seg.cli import play as cli_play
 from gp_ground_seg.cli.main import main
 from gp_ground_seg.datasets.bags import decode_cloud, open_bag
 from gp_ground_seg.ros import delivery, player, transport
@@ -87,12 +88,19 @@ def recorded(bag, topic):
         return [raw for _, _, raw in reader.messages([topic])]
 
 
-def test_every_byte_at_the_recorded_times(tmp_path, capsys):
+def test_every_byte_at_the_recorded_times(tmp_path, capsys, monkeypatch):
     bag = tmp_path / 'drive.mcap'
     write_ros2_bag(bag, 8)
+    told = []
+    tell = player._BagClock.publish
+    monkeypatch.setattr(
+        player._BagClock, 'publish', lambda clock, now: [told.append(now), tell(clock, now)]
+    )
+    end = START + 7 * PERIOD
     with listening('/points') as listener:
         assert play(bag, '--clock', '--rate', 2) == 0
         wait_for(lambda: len(listener.clouds['/points']) == 8, 'last cloud')
+        wait_for(lambda: listener.clock[-1:] == [end], 'end of /clock')
     assert listener.clouds['/points'] == recorded(bag, '/points')
     captured = capsys.readouterr()
     note, *waiting = captured.err.splitlines()
@@ -100,19 +108,23 @@ def test_every_byte_at_the_recorded_times(tmp_path, capsys):
     assert set(waiting) <= {WAITING}
     numbers = SUMMARY.fullmatch(captured.out).groups()
     assert (numbers[0], numbers[5]) == ('8', '0')
-    assert float(numbers[1]) == pytest.approx(7 * 0.05, abs=0.1)
+    # How late a cloud is the machine decides, not we; the summary tells.
+    delay = 1e-3 * float(numbers[4])
+    assert float(numbers[1]) == pytest.approx(7 * 0.05, abs=0.06 + delay)
 
-    # No cloud before its time; how much after it the machine decides, not we.
+    # No cloud before its time, counted from the first, which may be late itself.
     times = np.array(listener.times['/points'])
     due = np.arange(8) * PERIOD / 2
-    assert (times - times[0] - due > -0.02e9).all()
+    assert (times - times[0] - due > -1e9 * (0.02 + delay)).all()
 
-    clock = np.array(listener.clock)
-    assert (np.diff(clock) >= 0).all()
-    assert (clock[0], clock[-1]) == (START, START + 7 * PERIOD)
+    # A newer time may take the place of one not sent yet.
+    assert set(listener.clock) <= set(told)
+    assert listener.clock == sorted(listener.clock)
+    assert told == sorted(told)
+    assert (told[0], told[-1]) == (START, end)
+    assert set(START + np.arange(8) * PERIOD) <= set(told)
     # 50 times a second, of which each lasts two of the bag's.
-    assert np.median(np.diff(clock)) <= 2 * 0.03e9
-    assert set(START + np.arange(8) * PERIOD) <= set(clock)
+    assert np.median(np.diff(told)) <= 2 * 0.03e9 + 2e9 * delay
 
 
 def test_part_of_a_bag(tmp_path, capsys):
@@ -150,8 +162,8 @@ def test_which_topics(tmp_path, capsys):
         wait_for(lambda: [len(c) for c in listener.clouds.values()] == [2, 4], 'last cloud')
         numbers = summary(capsys)
     assert numbers[0] == 4
-    # Two clouds on each topic, 0.2 s apart.
-    assert numbers[2] == pytest.approx(5.0, rel=0.3)
+    # Two clouds on each topic, 0.2 s apart but for what one of them is late.
+    assert 1.0 / numbers[2] == pytest.approx(0.2, abs=0.01 + 1e-3 * numbers[4])
 
 
 def test_bag_of_ros_1_on_another_topic(tmp_path, capsys):
@@ -180,15 +192,23 @@ def test_nobody_listens(tmp_path, capsys):
     assert (numbers[0], numbers[5]) == (3, 3)
 
 
-def test_waits_and_says_so(tmp_path, capsys):
+def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
     bag = tmp_path / 'drive.mcap'
     write_ros2_bag(bag, 2)
+    is_said = threading.Event()
+
+    def note(text):
+        notes.note(text)
+        if text.startswith('waiting'):
+            is_said.set()
+
+    monkeypatch.setattr(cli_play, 'note', note)
     with isolated_context() as context:
         node = Node('late', context=context)
         clouds = []
 
         def come_late():
-            time.sleep(2.0)
+            is_said.wait(PATIENCE)
             node.create_subscription(PointCloud2, '/points', clouds.append, RELIABLE)
 
         thread = threading.Thread(target=come_late)
@@ -276,7 +296,7 @@ def test_loop_until_interrupted(tmp_path, number):
     assert stamps == list(itertools.islice(itertools.cycle(stamps[:3]), len(stamps)))
     # A period between the last of a round and the first of the next, as between the others.
     steps = np.diff(listener.times['/points'])
-    assert steps.min() > 0.5 * PERIOD / 2
+    assert steps.min() > 0.5 * PERIOD / 2 - 1e6 * float(numbers[4])
 
 
 def test_signals_of_a_session():
@@ -298,11 +318,18 @@ def test_signals_of_a_session():
 
 
 SUBSCRIBER = """
-import rclpy, sys
+import os, rclpy, signal
 from sensor_msgs.msg import PointCloud2
 rclpy.init()
 node = rclpy.create_node('doomed')
-node.create_subscription(PointCloud2, '/points', lambda m: print('cloud', flush=True), 10)
+seen = []
+
+def receive(cloud):
+    seen.append(cloud)
+    if len(seen) == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+node.create_subscription(PointCloud2, '/points', receive, 10)
 rclpy.spin(node)
 """
 
@@ -314,16 +341,8 @@ def test_subscriber_that_is_killed(tmp_path, capsys, monkeypatch):
     n_clouds = delivery.DEPTH + 50
     write_ros2_bag(bag, n_clouds)
     with Program(code=('-c', SUBSCRIBER)) as subscriber, isolated_context():
-
-        def kill():
-            for _ in range(3):
-                subscriber.popen.stdout.readline()
-            subscriber.popen.kill()
-
-        thread = threading.Thread(target=kill)
-        thread.start()
-        assert play(bag, '--quiet', '--rate', 20, '--wait', PATIENCE) == 1
-        thread.join()
+        assert play(bag, '--quiet', '--rate', 10, '--wait', PATIENCE) == 1
+        assert subscriber.popen.wait(PATIENCE) == -signal.SIGKILL
     n_sent, *_, n_undelivered = summary(capsys)
     assert n_sent == n_clouds
     # More than still wait in the queue: those that were pushed out of it count as well.

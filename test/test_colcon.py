@@ -100,6 +100,7 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
     with Process(folder=tmp_path, command=command, **workspace.environment) as node:
         node.wait_until_ready()
         assert f'listening to {NAMESPACE}/points' in node.log
+        assert 'grid.n_segments: 120  (default 180)' in node.log
         code, _ = node.stop(signal.SIGINT)
     assert code == 0, node.log
     assert 'Traceback' not in node.log

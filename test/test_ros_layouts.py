@@ -99,6 +99,17 @@ def clouds(draw):
     return message, xyz, [raw[start : start + step].tobytes() for start in starts]
 
 
+def oracle_reads(fields):
+    """Whether sensor_msgs_py can: it refuses a count of 0 and a name that comes twice."""
+    from sensor_msgs_py.point_cloud2 import dtype_from_fields
+
+    try:
+        dtype_from_fields(fields)
+    except AssertionError:
+        return False
+    return True
+
+
 @pytest.fixture(scope='module')
 def tested():
     words = [word for name, value in CHANGES.items() for word in ('-p', f'{name}:={value}')]
@@ -149,7 +160,7 @@ def test_every_layout_comes_through(tested, case):
         values = np.ascontiguousarray(raw[:, slice(*ends)]).view(order + code).ravel()
         np.testing.assert_array_equal(values, getattr(expected, name).astype(code))
     # A reader that knows nothing of us finds the same in it.
-    if HAS_ORACLE:
+    if HAS_ORACLE and oracle_reads(message.fields):
         from sensor_msgs_py.point_cloud2 import read_points
 
         read = read_points(whole, field_names=['x', 'y', 'z', names[0]])

@@ -86,10 +86,11 @@ def test_a_bag_of_2011_shows_ok(tmp_path, use_sim_time):
                 )  # fmt: skip
                 age = float(values_of(status)['Age of last stamp (s)'])
                 assert player.popen.wait(60.0) == 0, player.log
-            wait_for_status(
-                listener.diagnostics, NODE, 'processing',
-                lambda values, _: values['Clouds since startup'] == '25',
-            )  # fmt: skip
+            listener.ground.wait(25)
+            listener.obstacles.wait(25)
+            status = wait_for_status(listener.diagnostics, NODE, 'processing', lambda *_: True)
+            values = values_of(status)
+            assert (values['Clouds since startup'], values['Dropped since startup']) == ('25', '0')
             stamps = [
                 part.header.stamp.sec * 10**9 + part.header.stamp.nanosec
                 for part in listener.ground.messages
@@ -118,15 +119,29 @@ def test_a_bag_in_a_loop_resets_what_was_learned(tmp_path):
                     listener.diagnostics, NODE, 'input',
                     lambda values, _: int(values['Time jumps since startup']) >= 2,
                 )  # fmt: skip
-                # Once in each round, on its first cloud.
-                status = wait_for_status(
+                wait_for_status(
                     listener.diagnostics, NODE, 'model',
-                    lambda values, _: int(values['Learned since startup']) == 3,
+                    lambda values, _: int(values.get('Learned since startup', 0)) >= 3,
                 )  # fmt: skip
-                assert status.level == DiagnosticStatus.OK
                 assert player.popen.poll() is None, player.log
-    # Rounds of less than a second: said once.
-    assert node.log.count('time jumped back by 1.') == 1
+        reports = [
+            {status.name.rpartition(' ')[2]: status for status in array.status}
+            for array in listener.diagnostics.messages
+        ]
+    for report in reports:
+        assert report['model'].level == DiagnosticStatus.OK
+        n_rounds = 1 + int(values_of(report['input'])['Time jumps since startup'])
+        n_learned = int(values_of(report['model']).get('Learned since startup', 0))
+        # Once in each round, on its first cloud, which may be still to come.
+        assert n_learned in (n_rounds - 1, n_rounds)
+    # Rounds of less than a second: not said each time.
+    times = [
+        float(line.split('[')[2].rstrip('] '))
+        for line in node.log.splitlines()
+        if 'time jumped back by 1.' in line
+    ]
+    assert times
+    assert all(later - earlier > 4.9 for earlier, later in itertools.pairwise(times))
 
 
 def test_a_storm_of_parameters_loses_no_cloud(tmp_path):
@@ -161,6 +176,7 @@ def test_a_storm_of_parameters_loses_no_cloud(tmp_path):
             with Process(*arguments, folder=tmp_path, start=PLAY) as player:
                 listener.ground.wait(3)
                 n_before = len(listener.ground.messages)
+                n_during = []
                 for k in range(100):
                     name, value = next(bad if k % 5 == 4 else good)
                     request = SetParameters.Request(parameters=[parameter_message(name, value)])
@@ -169,8 +185,10 @@ def test_a_storm_of_parameters_loses_no_cloud(tmp_path):
                     (result,) = future.result().results
                     assert result.successful == (k % 5 != 4), result.reason
                     assert result.successful or name in result.reason
-                # They came while clouds did.
-                assert n_before < len(listener.ground.messages) < 30
+                    n_during.append(len(listener.ground.messages))
+                # They came while clouds did; on a busy machine the last ones come later.
+                assert n_before < n_during[-1]
+                assert n_during[20] < 30
                 assert player.popen.wait(60.0) == 0, player.log
             listener.ground.wait(30)
             listener.obstacles.wait(30)
@@ -221,17 +239,18 @@ def test_a_bad_cloud_among_good_ones(tmp_path):
                 listener.ground.wait(2 * k)
             status = wait_for_status(
                 listener.diagnostics, NODE, 'input',
-                lambda _, status: status.level == DiagnosticStatus.ERROR,
+                # Of the last of them: a good one in the same report would not take it back.
+                lambda values, status: status.level == DiagnosticStatus.ERROR
+                and values['Events since startup'] == '9',
             )  # fmt: skip
             assert 'no field named z' in status.message
             publisher.publish(good)
             status = wait_for_status(
                 listener.diagnostics, NODE, 'input',
-                lambda _, status: status.level == DiagnosticStatus.OK,
+                lambda values, status: status.level == DiagnosticStatus.OK
+                and values['Events since startup'] == '10',
             )  # fmt: skip
-            values = values_of(status)
-            assert values['Refused since startup'] == '3'
-            assert values['Events since startup'] == '10'
+            assert values_of(status)['Refused since startup'] == '3'
         # Throttled: three bad clouds, one message with topic, frame and reason.
         (line,) = [line for line in node.log.splitlines() if 'ERROR' in line]
         assert f"cloud on {NAMESPACE}/points in frame 'broken' refused: " in line

@@ -1,6 +1,12 @@
 """What is wrong at the start is one line with a hint and exit code 2, never a traceback."""
 
+import re
+import signal
+import subprocess
+import sys
+
 import pytest
+from conftest import REPOSITORY
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
@@ -143,6 +149,31 @@ def test_log_level_and_parameter_file_of_one_node(tmp_path):
         (line,) = other.log.splitlines()
         assert 'grid.nbins' in line
         assert 'did you mean grid.n_bins?' in line
+
+
+def test_a_preset_as_the_readme_has_it(tmp_path):
+    """The block that makes a copy of a preset, line for line, but for where the files are."""
+    readme = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
+    blocks = re.findall(r'```sh\n(.*?)```', readme, re.DOTALL)
+    (block,) = [block for block in blocks if 'config dump --preset' in block]
+    *commands, node_command = block.splitlines()
+    script = f'gp-ground-seg() {{ {sys.executable} -m gp_ground_seg "$@"; }}; set -e\n'
+    done = subprocess.run(
+        ['bash', '-c', script + '\n'.join(commands)],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert 'my.yaml: good; ' in done.stdout
+    program, *words = node_command.split()
+    assert program == 'gp-ground-seg'
+    words[words.index('my.yaml')] = str(tmp_path / 'my.yaml')
+    words += ['-p', 'grid.n_bins:=55']
+    with Process(*words, folder=tmp_path, start=('-m', 'gp_ground_seg')) as node:
+        node.wait_until_ready()
+        assert 'listening to /velodyne_points' in node.log
+        assert 'grid.n_segments: 120  (default 180)' in node.log
+        assert 'grid.n_bins: 55  (default 80)' in node.log
+        assert node.stop(signal.SIGINT)[0] == 0
 
 
 def assert_parameters(context, tolerances):
