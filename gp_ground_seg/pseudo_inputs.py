@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gp_ground_seg.compiled import compiled
 from gp_ground_seg.config import Config, LatentConfig
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
@@ -52,12 +53,13 @@ def classify_lines(slope: FloatArray, extent: FloatArray, latent: LatentConfig) 
     latent : LatentConfig
         Limits between the classes.
     """
-    steepness = np.digitize(
-        np.where(np.isnan(slope), np.inf, np.abs(slope)),
-        [latent.sloped_gradient, latent.steep_gradient],
-    )
-    length = np.digitize(extent, [latent.medium_extent, latent.long_extent])
-    return (3 * steepness + length).astype(np.int64)
+    steepness = np.where(np.isnan(slope), np.inf, np.abs(slope))
+    # Comparisons, not `np.digitize`: that searches for each of them.
+    result: IntArray = (extent >= latent.medium_extent).astype(np.int64)
+    result += extent >= latent.long_extent
+    result += 3 * (steepness >= latent.sloped_gradient)
+    result += 3 * (steepness >= latent.steep_gradient)
+    return result
 
 
 def select_pseudo_inputs(candidates: Candidates, lines: Lines, config: Config) -> PseudoInputs:
@@ -75,11 +77,6 @@ def select_pseudo_inputs(candidates: Candidates, lines: Lines, config: Config) -
     size = np.diff(lines.start)
     wanted = np.rint(size / config.latent.candidates_per_pseudo_input).astype(np.int64)
     number = np.maximum(wanted, 1)
-    line = np.repeat(np.arange(len(size)), number)
-    first = np.concatenate([[0], np.cumsum(number)])
-    rank = np.arange(len(line)) - first[line]
-    # The middle of each of `number` equal shares of the line's candidates.
-    position = lines.start[line] + (size[line] * (2 * rank + 1)) // (2 * number[line])
     extent = lines.extent(candidates)
     line_class = classify_lines(lines.slope, extent, config.latent)
     limits = config.length_scale
@@ -87,9 +84,26 @@ def select_pseudo_inputs(candidates: Candidates, lines: Lines, config: Config) -
     count = np.bincount(line_class, minlength=N_CLASSES)
     total = np.bincount(line_class, weights=log_extent, minlength=N_CLASSES)
     empty = log_extent.mean() if len(log_extent) else np.log(limits.min)
+    position, line = _spread(lines.start, number, int(number.sum()))
     return PseudoInputs(
         r_bar=candidates.r[position],
         surface_class=line_class[line],
         offsets=np.searchsorted(position, candidates.offsets),
         first_guess=np.where(count > 0, total / np.maximum(count, 1), empty),
     )
+
+
+@compiled
+def _spread(start: IntArray, number: IntArray, n_positions: int) -> tuple[IntArray, IntArray]:
+    """Candidate and line of each pseudo-input."""
+    position = np.empty(n_positions, dtype=np.int64)
+    line = np.empty(n_positions, dtype=np.int64)
+    p = 0
+    for q in range(len(number)):
+        size = start[q + 1] - start[q]
+        for rank in range(number[q]):
+            # The middle of each of `number` equal shares of the line's candidates.
+            position[p] = start[q] + (size * (2 * rank + 1)) // (2 * number[q])
+            line[p] = q
+            p += 1
+    return position, line
