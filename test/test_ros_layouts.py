@@ -71,7 +71,8 @@ def clouds(draw):
 
     n_points = height * width
     source = street(n_points, seed=int(rng.integers(2**32)))
-    xyz = np.empty((n_points, 3))
+    is_wide = any(code.endswith('f8') for code, _ in formats.values())
+    xyz = np.empty((n_points, 3), dtype=np.float64 if is_wide else np.float32)
     for k, axis in enumerate('xyz'):
         values = source[axis].astype(np.float64)
         bad = rng.random(n_points) < draw(st.sampled_from((0.0, 0.1, 1.0)), label=f'bad {axis}')

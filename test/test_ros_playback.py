@@ -78,7 +78,7 @@ def test_a_bag_of_2011_shows_ok(tmp_path, use_sim_time):
         listener = Listener(context)
         with spinning(context, listener.node):
             listener.wait_until_connected()
-            arguments = (str(bag), '--rate', '2', *clock, *TO_NODE)
+            arguments = (str(bag), '--rate', '1', *clock, *TO_NODE)
             with Process(*arguments, folder=tmp_path, start=PLAY) as player:
                 status = wait_for_status(
                     listener.diagnostics, NODE, 'input',

@@ -77,7 +77,7 @@ def test_columns_follow_their_definitions(measured, frame, method, model):
         mu = np.interp(candidates.r[own][inlier], surface.knots, surface.mean[segment])
         assert columns.n_inliers == len(y)
         smse = np.mean((y - mu) ** 2 / np.var(y))
-        assert columns.smse_in_sample == pytest.approx(smse, rel=1e-9)
+        assert columns.smse_in_sample == pytest.approx(smse, rel=1e-6)
 
         r = np.hypot(points[:, 0].astype(float), points[:, 1].astype(float))
         azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
@@ -87,7 +87,8 @@ def test_columns_follow_their_definitions(measured, frame, method, model):
         y = z[held_out]
         mu = np.interp(r[held_out], surface.knots, surface.mean[segment])
         smse = np.mean((y - mu) ** 2 / np.var(y))
-        assert columns.smse_held_out == pytest.approx(smse, rel=1e-9)
+        # The segmenter takes ranges in the precision of the points.
+        assert columns.smse_held_out == pytest.approx(smse, rel=1e-6)
         assert columns.seconds > 0.0
 
 
