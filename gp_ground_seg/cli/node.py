@@ -46,14 +46,9 @@ def start(words: Sequence[str]) -> int:
     # Importing ROS takes most of a second; a signal within it is obeyed as well.
     with stop_on_signals() as stop:
         try:
-            stop.interrupt()
             from gp_ground_seg.ros.node import main as run_node
-
-            stop.only_note()
-        except (Exception, KeyboardInterrupt) as error:
-            if stop.made:
-                return 0
-            if not isinstance(error, ImportError) or (error.name or '').startswith(OWN_PACKAGE):
+        except ImportError as error:
+            if (error.name or '').startswith(OWN_PACKAGE):
                 raise
             raise MissingDependencyError(
                 f'the node needs ROS 2, which cannot be imported ({error}): source the setup '

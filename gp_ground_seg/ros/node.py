@@ -210,26 +210,20 @@ def main(args: Sequence[str] | None = None) -> int:
     node = None
     with stop_on_signals() as stop:
         try:
-            stop.interrupt()
             # Both outputs at once are more than stock Fast DDS sends without loss.
             with large_cloud_transport():
                 initialize(words)
                 node = GroundSegmentationNode()
             executor = SingleThreadedExecutor()
             executor.add_node(node)
-            stop.only_note()
             while rclpy.ok() and not stop.made:
                 # Python handles a signal after the wait, not within it.
                 executor.spin_once(timeout_sec=LONGEST_WAIT)
-        except (KeyboardInterrupt, ExternalShutdownException):
-            pass
-        except Exception as error:
-            if stop.made:
-                return 0  # an interrupt, as the bindings of rclpy took it
-            if not isinstance(error, GroundSegError):
-                raise
+        except GroundSegError as error:
             sys.stderr.write(f'{NODE_NAME}: error: {error}\n')
             return 2
+        except ExternalShutdownException:
+            pass
         finally:
             if node is not None:
                 node.destroy_node()

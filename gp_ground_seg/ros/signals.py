@@ -16,43 +16,26 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopRequest:
-    """Whether the process was asked to end; at first a signal is noted and no more."""
+    """Whether the process was asked to end."""
 
     def __init__(self) -> None:
         self.made = False
-        self._interrupts = False
 
-    def interrupt(self) -> None:
-        """From here on raise KeyboardInterrupt at the first signal, now if it has come."""
-        self._interrupts = True
-        if self.made:
-            raise KeyboardInterrupt
+    def note(self, _number: int, _frame: FrameType | None) -> None:
+        """Set `made`, and no more.
 
-    def only_note(self) -> None:
-        """From here on a signal sets `made` and no more: for a loop that looks at it.
-
-        An interrupt within rclpy's bindings comes out of them as whatever they take a
-        failed conversion for, or not at all.
+        An exception here would come out of whatever runs: rclpy's bindings turn it into
+        another one, the compiler and destructors print and forget it.
         """
-        self._interrupts = False
-
-    def handle(self, _number: int, _frame: FrameType | None) -> None:
-        """Interrupt the main thread at the first signal; ignore the later ones.
-
-        A terminal and ``ros2 launch`` both signal: the second must not break the clean-up.
-        """
-        if not self.made:
-            self.made = True
-            if self._interrupts:
-                raise KeyboardInterrupt
+        self.made = True
 
 
 class Watchdog:
     """Ends the process with code 0 if a signal does not, within `GRACE`.
 
-    Python calls its handlers between two steps of the main thread. That may be inside
-    the compiler or a long computation, for seconds; and numba swallows interrupts. The
-    number of a signal, though, is written to a pipe at once, where a thread waits for it.
+    Python calls its handlers between two steps of the main thread. The next one may be
+    seconds away, behind a long computation. The number of a signal, though, is written
+    to a pipe at once, where a thread waits for it.
     """
 
     def __init__(self) -> None:
@@ -83,19 +66,19 @@ class Watchdog:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Have the first SIGINT or SIGTERM within the block noted, or interrupt it if it says so.
+    """Have SIGINT and SIGTERM within the block noted, which looks at ``made`` now and then.
 
-    If the block does not end soon after, the process does, with code 0. An
-    interrupt that comes within a destructor is swallowed by Python, therefore
-    loops have to look at ``made`` too. Once asked to end, the process goes on
-    ignoring both signals. In other threads than the main one nothing is changed.
+    If it does not end soon after, the process does, with code 0. Once asked to end,
+    the process goes on ignoring both signals: a terminal and ``ros2 launch`` both
+    send one, and the second must not break the clean-up. In other threads than the
+    main one nothing is changed.
     """
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():
         yield request
         return
     watchdog = Watchdog()
-    before = {number: signal.signal(number, request.handle) for number in SIGNALS}
+    before = {number: signal.signal(number, request.note) for number in SIGNALS}
     try:
         yield request
     finally:
