@@ -46,12 +46,8 @@ def take_points(points: npt.ArrayLike, workspace: Workspace) -> PointArray:
             f'points of shape {array.shape} and type {array.dtype}: must be floating point'
         )
     dtype = np.dtype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
-    if (
-        array.dtype == dtype
-        and array.shape[1] == 3
-        and array.flags.c_contiguous
-        and array.flags.aligned
-    ):
+    fits = array.flags.f_contiguous and array.flags.aligned
+    if fits and array.dtype == dtype and array.shape[1] == 3:
         return as_read_only(array)
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ def shifted(x):
 """
 CALLER = """
 import sys
+from pathlib import Path
 from constant import FACTOR
 from callee import shifted
 from gp_ground_seg.compiled import compiled
@@ -188,3 +190,30 @@ def test_no_cloud_is_worth_a_new_compilation(warm, n_points, dtype, layout, widt
         points[7, 2] = np.nan
     warm.segment(LAYOUTS[layout](points))
     assert compiled_signatures() == before
+
+
+FIRST_CLOUDS = """
+import numpy as np
+from conftest import hilly_scan
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.compiled import compiled_signatures
+from gp_ground_seg.ros.warm_up import warm_up
+
+segmenter = GroundSegmenter(Config())
+warm_up(segmenter)
+before = compiled_signatures()
+for dtype in (np.float32, np.float64):
+    points = hilly_scan(9000).astype(dtype)
+    for cloud in (points, np.asfortranarray(points), np.hstack([points, points])[:, :3]):
+        segmenter.segment(cloud)
+        print({k: v for k, v in compiled_signatures().items() if v != before[k]})
+"""
+
+
+def test_the_first_frame_of_the_node_compiles_all_there_is():
+    """In a process of its own: what other tests compiled does not count."""
+    script = [sys.executable, '-c', FIRST_CLOUDS]
+    done = subprocess.run(
+        script, capture_output=True, text=True, cwd=Path(__file__).parent, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, 6 * '{}\n'), done.stderr
