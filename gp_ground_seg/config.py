@@ -306,6 +306,14 @@ class GrowthConfig:
     min_line_size: int = parameter(
         4, 'candidates that such a line needs at least', low=2, high=10000
     )
+    min_bend_extent: float = parameter(
+        10.0,
+        'length of a line from which on it joins where the line before it bends into it: longer '
+        'than what stands on the ground',
+        unit='m',
+        low=0.1,
+        high=1000.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -332,7 +340,7 @@ class FacesConfig:
         high=10.0,
     )
     min_height: float = parameter(
-        0.4,
+        0.5,
         'height of the returns of a tile above its lowest from which it may be a face',
         unit='m',
         low=0.05,
@@ -350,6 +358,21 @@ class FacesConfig:
         unit='m',
         low=0.001,
         high=100.0,
+    )
+    max_foot_distance: float = parameter(
+        0.06,
+        'distance (root mean square) of the lowest returns of a face from its plane up to which '
+        'they are its own and no ground before it is seen; 0 = some is always seen',
+        unit='m',
+        low=0.0,
+        high=10.0,
+    )
+    max_foot_density: float = parameter(
+        3.0,
+        'density over height of those returns, in multiples of that above them, up to which '
+        "they are the face's own: ground would pile up at one height",
+        low=0.0,
+        high=1000.0,
     )
 
 

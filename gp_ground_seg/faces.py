@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.config import FacesConfig
+from gp_ground_seg.hidden_feet import hides_foot
 from gp_ground_seg.polar_grid import OUTSIDE, FloatArray
 from gp_ground_seg.tiles import Tiles
 
@@ -29,10 +30,14 @@ class Faces:
         Tiles of the points.
     is_face : (T,) bool
         Whether the returns of the tile are an upright face.
+    is_footless : (T,) bool
+        Whether they are one down to the lowest: no ground is seen in the tile. See
+        `gp_ground_seg.hidden_feet`.
     """
 
     tiles: Tiles
     is_face: npt.NDArray[np.bool_]
+    is_footless: npt.NDArray[np.bool_]
 
 
 def find_faces(
@@ -78,7 +83,10 @@ def find_faces(
     is_face = np.zeros(n_tiles, dtype=np.bool_)
     is_upright = uprightness(scatter) <= faces.max_normal_z
     is_face[tall] = is_upright & (count >= FEWEST_RETURNS)
-    return Faces(tiles, is_face)
+    above_own = chosen[:, 2] - tiles.foot_z[tall][counted]
+    is_footless = np.zeros(n_tiles, dtype=np.bool_)
+    is_footless[tall] = hides_foot(counted, centred, above_own, len(tall), faces) & is_face[tall]
+    return Faces(tiles, is_face, is_footless)
 
 
 def uprightness(scatter: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
+from gp_ground_seg.hidden_feet import hides_foot_compiled
 from gp_ground_seg.labelling import SQUARE_UNITS
 from gp_ground_seg.labels import Label
 from gp_ground_seg.point_passes import CellArray
@@ -17,8 +18,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 # Plain integers: compiled code knows no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
-N_SUMS = 10
-"""Sums per tile: number, x, y, z and their six products."""
+N_SUMS = 17
+"""Sums per tile: number, x, y, z and their six products; those of `hides_foot_compiled`."""
 SKIPPED = -1
 """Slot of a tile that has nothing tall, or is another thread's."""
 
@@ -36,7 +37,11 @@ def judge_faces(
     max_height: float,
     max_normal_z: float,
     fewest_returns: int,
+    tolerance: float,
+    max_foot_distance: float,
+    max_foot_density: float,
     is_face: BoolArray,
+    is_footless: BoolArray,
 ) -> None:
     """Do what `gp_ground_seg.faces.find_faces` does with every `step`-th tile.
 
@@ -85,6 +90,14 @@ def judge_faces(
         s[7] += x * y
         s[8] += x * z
         s[9] += y * z
+        if z <= tolerance:
+            s[10] += 1.0
+            s[11] += x
+            s[12] += y
+            s[13] += x * x
+            s[14] += y * y
+            s[15] += x * y
+        s[16] = max(s[16], z)
     for k in range(n_slots):
         s = sums[k]
         n = s[0]
@@ -94,7 +107,11 @@ def judge_faces(
         xy, xz, yz = s[7] - s[1] * s[2] / n, s[8] - s[1] * s[3] / n, s[9] - s[2] * s[3] / n
         vertical = max(xx * yy - xy * xy, 0.0)
         trace = vertical + max(yy * zz - yz * yz, 0.0) + max(xx * zz - xz * xz, 0.0)
-        is_face[tile_of[k]] = trace > 0.0 and math.sqrt(vertical / trace) <= max_normal_z
+        if trace > 0.0 and math.sqrt(vertical / trace) <= max_normal_z:
+            is_face[tile_of[k]] = True
+            is_footless[tile_of[k]] = hides_foot_compiled(
+                s, tolerance, max_foot_distance, max_foot_density
+            )
 
 
 @compiled
@@ -146,6 +163,7 @@ def label_by_height(
     tile: CellArray,
     height: FloatArray,
     is_face: BoolArray,
+    is_footless: BoolArray,
     foot_z: PointArray,
     band: FloatArray,
     below_tolerance: float,
@@ -165,6 +183,7 @@ def label_by_height(
             over_foot = max(
                 height[i], np.float64(columns[2, i]) - np.float64(foot_z[np.uintp(tile[i])])
             )
-            own = min(own, face_tolerance - over_foot)
+            reach = -face_tolerance if is_footless[np.uintp(tile[i])] else face_tolerance
+            own = min(own, reach - over_foot)
         margin[i] = own
         label[i] = _GROUND if own >= 0.0 else _OBSTACLE

@@ -55,7 +55,8 @@ def label_points(
 
     The paper's one tolerance is a band here that follows the local roughness, is
     narrower in a bin that an obstacle stands in, and is open downwards: obstacles
-    stand on the ground, not below it. Of an upright face only the foot is ground.
+    stand on the ground, not below it. Of an upright face only the foot is ground, and
+    nothing where the foot is not seen.
 
     Parameters
     ----------
@@ -90,7 +91,9 @@ def label_points(
     tile = np.maximum(faces.tiles.tile, 0)
     in_face = faces.is_face[tile] & inside
     over_foot = np.maximum(height, z - np.where(in_face, faces.tiles.foot_z[tile], 0.0))
-    margin = np.where(in_face, np.minimum(margin, face_tolerance - over_foot), margin)
+    # A foot that is not seen lies lower than the lowest return by more than the tolerance.
+    reach = np.where(faces.is_footless[tile], -face_tolerance, face_tolerance)
+    margin = np.where(in_face, np.minimum(margin, reach - over_foot), margin)
     margin[~inside] = np.nan
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN

@@ -92,6 +92,13 @@ class Candidates:
         """Segment of each candidate, (C,) int64."""
         return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
 
+    def where(self, kept: npt.NDArray[np.bool_]) -> Candidates:
+        """Those of the (C,) bool mask `kept`."""
+        before = np.concatenate([[0], np.cumsum(kept)])
+        return Candidates(
+            self.r[kept], self.z[kept], self.bin[kept], self.density[kept], before[self.offsets]
+        )
+
     @property
     def n_edges(self) -> IntArray:
         """Bin edges up to the far one of the last bin with a candidate, (M,) int64, or 0."""

@@ -118,7 +118,14 @@ class GroundSegmenter:
         timer = StageTimer(self._clock)
         placed = self._place(points, sensor, timer)
         xyz, pose = placed.level_xyz, placed.pose
-        grid, candidates = placed.grid, placed.candidates
+        grid = placed.grid
+
+        faces = self._backend.find_faces(
+            xyz, placed.tiles, config.faces, config.label.obstacle_max_height
+        )
+        on_face = self._backend.on_footless_faces(placed.candidates, grid, xyz, faces)
+        candidates = placed.candidates.where(~on_face)
+        timer.mark('faces')
 
         lines = extract_lines(candidates, config.lines)
         pseudo = select_pseudo_inputs(candidates, lines, config)
@@ -138,9 +145,6 @@ class GroundSegmenter:
         surface = GroundSurface(grid.edges, mean + expected_ground, std, inlier)
         timer.mark('surface')
 
-        faces = self._backend.find_faces(
-            xyz, placed.tiles, config.faces, config.label.obstacle_max_height
-        )
         labelled = self._backend.label_points(
             xyz, grid, surface, faces, config.label, config.faces.tolerance
         )

@@ -49,7 +49,7 @@ def test_a_wall_of_any_direction_is_a_face_and_its_foot_is_known():
 def test_low_flat_and_overhanging_returns_are_no_faces():
     rng = np.random.default_rng(3)
     x, y = rng.uniform(10.0, 10.5, (2, 60))
-    assert not faces_of(np.column_stack([x, y, rng.uniform(0.0, 0.39, 60)]))[0].any()
+    assert not faces_of(np.column_stack([x, y, rng.uniform(0.0, 0.49, 60)]))[0].any()
     assert not faces_of(np.column_stack([x, y, np.zeros(60)]))[0].any()
     # A branch over flat ground.
     assert not faces_of(np.column_stack([x, y, np.where(x > 10.25, 3.0, 0.0)]))[0].any()

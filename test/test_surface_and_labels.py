@@ -78,7 +78,7 @@ def test_a_segment_without_a_model_gets_its_neighbours():
 
 
 def faces_in(tile, foot_z, is_face):
-    return Faces(Tiles(tile, foot_z, foot_z + 1.0), is_face)
+    return Faces(Tiles(tile, foot_z, foot_z + 1.0), is_face, np.zeros_like(is_face))
 
 
 def nothing_stands(n):
@@ -210,6 +210,7 @@ def test_compiled_surface_and_labels_are_the_reference(seed, dtype, n_threads):
     faces = backend.find_faces(xyz, tiles, FacesConfig(), 2.0)
     same = plain.find_faces(xyz, tiles, FacesConfig(), 2.0)
     np.testing.assert_array_equal(faces.is_face, same.is_face)
+    np.testing.assert_array_equal(faces.is_footless, same.is_footless)
     assert faces.is_face.any()
     found = backend.label_points(xyz, grid, surface, faces, LabelConfig(), 0.1)
     expected = plain.label_points(xyz, grid, surface, faces, LabelConfig(), 0.1)

@@ -40,6 +40,7 @@ IDEAS: tuple[Idea, ...] = (
     Idea('neighbouring segments fused', {'surface.n_neighbours': 0}),
     Idea('lopsided gate of the growth', {'growth.max_standardised_depth': 2.0}),
     Idea('upright faces', {'faces.min_height': 100.0}),
+    Idea('faces that hide their foot', {'faces.max_foot_distance': 0.0}),
     Idea(
         'band that follows the roughness',
         {
@@ -54,6 +55,7 @@ IDEAS: tuple[Idea, ...] = (
     Idea('lines end at 0.1 rad', {'lines.slope_tolerance': 0.02}),
     Idea('length-scales of classes learned', {'learning.fixed': 'length_scales'}),
     Idea('lines followed out of the gate', {'growth.max_line_slope': 0.0}),
+    Idea('lines followed round a bend', {'growth.min_bend_extent': 1000.0}),
     Idea('every third segment teaches', {'learning.segment_step': 1}),
     Idea('one theta for the frame', {'learning.scope': 'segment'}),
     Idea('240 segments', {'grid.n_segments': 240}, kept=False),

@@ -11,6 +11,7 @@ from gp_ground_seg.gp.growth import BoolArray, grow_surface_compiled
 from gp_ground_seg.gp.latent import latent_rows_compiled
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
+from gp_ground_seg.hidden_feet import lowest_of_cells, mark_lowest
 from gp_ground_seg.labelling import Labelled, band, root_mean_square_compiled
 from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.point_passes import grid_ruler
@@ -122,8 +123,9 @@ class CompiledBackend:
         self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
     ) -> Faces:
         """Upright faces."""
-        is_face = self._workspace.take('faces', tiles.foot_z.shape, np.bool_)
-        is_face.fill(False)
+        flags = self._workspace.take('faces', (2, len(tiles.foot_z)), np.bool_)
+        flags.fill(False)
+        is_face, is_footless = flags
         self._pool.run(
             label_passes.judge_faces,
             len(is_face),
@@ -135,9 +137,35 @@ class CompiledBackend:
             max_height,
             faces.max_normal_z,
             FEWEST_RETURNS,
+            faces.tolerance,
+            faces.max_foot_distance,
+            faces.max_foot_density,
             is_face,
+            is_footless,
         )
-        return Faces(tiles, is_face)
+        return Faces(tiles, is_face, is_footless)
+
+    def on_footless_faces(
+        self, candidates: Candidates, grid: PolarGrid, xyz: PointArray, faces: Faces
+    ) -> BoolArray:
+        """Candidates that are part of a face."""
+        own = candidates.segment * grid.n_bins + candidates.bin
+        lowest_z, lowest_r = lowest_of_cells(candidates, own, grid)
+        marked = np.zeros(len(lowest_z), dtype=np.bool_)
+        self._pool.run_points(
+            mark_lowest,
+            len(xyz),
+            xyz.T,
+            grid.r,
+            grid.cell,
+            faces.tiles.tile,
+            faces.is_footless,
+            lowest_z,
+            lowest_r,
+            marked,
+        )
+        result: BoolArray = marked[own]
+        return result
 
     def label_points(
         self,
@@ -184,6 +212,7 @@ class CompiledBackend:
             faces.tiles.tile,
             height,
             faces.is_face,
+            faces.is_footless,
             faces.tiles.foot_z,
             band(roughness, stands.any(axis=0).reshape(roughness.shape), label).ravel(),
             label.below_tolerance,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from gp_ground_seg.length_scale import (
     candidate_log_length_scale,
     interpolate_along_segments,
 )
+from gp_ground_seg.line_bends import set_off_at_bend
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
 from gp_ground_seg.pseudo_inputs import PseudoInputs
@@ -57,6 +59,20 @@ class FrameModel:
     pseudo: PseudoInputs
     knots: FloatArray
 
+    @cached_property
+    def follows(self) -> BoolArray:
+        """Candidates that join the inliers if the one before them has, (C,) bool."""
+        growth, lines = self.config.growth, self.lines
+        at_bend = set_off_at_bend(
+            lines,
+            self.candidates,
+            self.config.lines.offset_tolerance,
+            growth.min_bend_extent,
+            growth.max_line_slope,
+        )
+        continued = lines.continued(growth.max_line_slope, growth.min_line_size)
+        return continued | at_bend[lines.line]
+
     def space(self) -> ThetaSpace:
         """Bounds, priors and starting values of theta for this frame."""
         return theta_space(self.config, self.pseudo.first_guess)
@@ -93,7 +109,7 @@ class FrameModel:
             self.height,
             np.exp(u),
             seed,
-            self.lines.continued(growth.max_line_slope, growth.min_line_size),
+            self.follows,
             knots,
             np.exp(knot_u),
             theta,

@@ -11,6 +11,7 @@ from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
+from gp_ground_seg.hidden_feet import on_footless_faces
 from gp_ground_seg.labelling import Labelled, label_points, local_roughness
 from gp_ground_seg.polar_grid import (
     Candidates,
@@ -53,6 +54,12 @@ class NumpyBackend:
     ) -> Faces:
         """Upright faces."""
         return find_faces(xyz, tiles, faces, max_height)
+
+    def on_footless_faces(
+        self, candidates: Candidates, grid: PolarGrid, xyz: PointArray, faces: Faces
+    ) -> BoolArray:
+        """Candidates that are part of a face."""
+        return on_footless_faces(candidates, grid, xyz[:, 2], faces.tiles.tile, faces.is_footless)
 
     def label_points(
         self,

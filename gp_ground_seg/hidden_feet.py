@@ -1,0 +1,175 @@
+"""Faces that hide their foot: whatever lies lowest in their tile is no ground.
+
+What stands before a wall hides its foot, and far away the rings of the sensor miss the
+strip of ground in its tile. The lowest return of the tile is the wall's then.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.compiled import compiled
+from gp_ground_seg.config import FacesConfig
+from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray, PointArray, PolarGrid
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+def hides_foot(
+    tile: npt.NDArray[np.int64],
+    xyz: FloatArray,
+    above_foot: FloatArray,
+    n_tiles: int,
+    faces: FacesConfig,
+) -> npt.NDArray[np.bool_]:
+    """Tell the faces whose lowest returns are no ground before them but their own.
+
+    Ground would lie off the plane that the returns above make, and all at one height;
+    what is in the plane and no denser than above is the face.
+
+    Parameters
+    ----------
+    tile : (P,) int64
+        Tile of each return.
+    xyz : (P, 3) float64
+        Returns, relative to any point of their tile [m].
+    above_foot : (P,) float64
+        Height above the lowest return of the tile [m].
+    n_tiles : int
+        Number of tiles T.
+    faces : FacesConfig
+        What counts as the face's own.
+
+    Returns
+    -------
+    (T,) bool
+        False where fewer than two returns are higher than the tolerance.
+    """
+
+    def total(values: FloatArray, chosen: npt.NDArray[np.bool_]) -> FloatArray:
+        return np.bincount(tile[chosen], values[chosen], minlength=n_tiles).astype(np.float64)
+
+    low = above_foot <= faces.tolerance
+    n_low, n_high = (np.bincount(tile[part], minlength=n_tiles) for part in (low, ~low))
+    number = np.maximum(n_high, 1)
+    x = xyz[:, 0] - (total(xyz[:, 0], ~low) / number)[tile]
+    y = xyz[:, 1] - (total(xyz[:, 1], ~low) / number)[tile]
+    along, across = total(x * x - y * y, ~low), 2.0 * total(x * y, ~low)
+    own_along, own_across = total(x * x - y * y, low), 2.0 * total(x * y, low)
+    # Mean square along the direction in which the returns above scatter least.
+    size = np.hypot(along, across)
+    turned = (own_along * along + own_across * across) / np.where(size > 0.0, size, 1.0)
+    square = 0.5 * (total(x * x + y * y, low) - turned)
+    top = np.zeros(n_tiles)
+    np.maximum.at(top, tile, above_foot)
+    is_in_plane = square <= n_low * faces.max_foot_distance**2
+    usual = n_high * faces.tolerance
+    is_sparse = n_low * (top - faces.tolerance) <= faces.max_foot_density * usual
+    result: npt.NDArray[np.bool_] = is_in_plane & is_sparse & (n_high >= 2)
+    return result & (faces.max_foot_distance > 0.0)
+
+
+@compiled
+def hides_foot_compiled(
+    s: FloatArray,
+    tolerance: float,
+    max_foot_distance: float,
+    max_foot_density: float,
+) -> bool:
+    """Do what `hides_foot` does, from the sums of one tile.
+
+    Number, x, y, z, x^2, y^2, z^2, x y, x z and y z of all its returns; number, x, y,
+    x^2, y^2 and x y of the lowest; height of the highest.
+    """
+    foot, top = s[10:16], s[16]
+    n_low, n_high = foot[0], s[0] - foot[0]
+    if max_foot_distance <= 0.0 or n_high < 2.0:
+        return False
+    if n_low * (top - tolerance) > max_foot_density * n_high * tolerance:
+        return False
+    mean_x, mean_y = (s[1] - foot[1]) / n_high, (s[2] - foot[2]) / n_high
+    xx = s[4] - foot[3] - n_high * mean_x * mean_x
+    yy = s[5] - foot[4] - n_high * mean_y * mean_y
+    xy = s[7] - foot[5] - n_high * mean_x * mean_y
+    own_xx = foot[3] - 2.0 * mean_x * foot[1] + n_low * mean_x * mean_x
+    own_yy = foot[4] - 2.0 * mean_y * foot[2] + n_low * mean_y * mean_y
+    own_xy = foot[5] - mean_x * foot[2] - mean_y * foot[1] + n_low * mean_x * mean_y
+    size = math.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)
+    turned = 0.0
+    if size > 0.0:
+        turned = ((own_xx - own_yy) * (xx - yy) + 4.0 * own_xy * xy) / size
+    square: float = 0.5 * (own_xx + own_yy - turned)
+    in_plane: bool = square <= n_low * max_foot_distance * max_foot_distance
+    return in_plane
+
+
+def on_footless_faces(
+    candidates: Candidates,
+    grid: PolarGrid,
+    z: PointArray,
+    tile: npt.NDArray[np.int32],
+    is_footless: BoolArray,
+) -> BoolArray:
+    """Tell the candidates that lie in the tile of a face that hides its foot, (C,) bool.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        Lowest points of the cells.
+    grid : PolarGrid
+        Cells of the points.
+    z : (N,) float32 or float64
+        Heights of the points [m].
+    tile : (N,) int32
+        Tiles of the points.
+    is_footless : (T,) bool
+        Tiles of faces that hide their foot.
+    """
+    own = candidates.segment * grid.n_bins + candidates.bin
+    lowest_z, lowest_r = lowest_of_cells(candidates, own, grid)
+    shows = grid.inside & is_footless[np.maximum(tile, 0)]
+    cell = grid.cell[shows]
+    is_lowest = (z[shows] == lowest_z[cell]) & (grid.r[shows] == lowest_r[cell])
+    marked = np.zeros(len(lowest_z), dtype=np.bool_)
+    marked[cell[is_lowest]] = True
+    result: BoolArray = marked[own]
+    return result
+
+
+def lowest_of_cells(
+    candidates: Candidates, cell: IntArray, grid: PolarGrid
+) -> tuple[FloatArray, FloatArray]:
+    """Height and range [m] of the candidate of each cell, NaN without, two (M * n_bins,).
+
+    `cell` (C,) are those that the candidates lie in.
+    """
+    lowest_z, lowest_r = np.full((2, grid.n_segments * grid.n_bins), np.nan)
+    lowest_z[cell], lowest_r[cell] = candidates.z, candidates.r
+    return lowest_z, lowest_r
+
+
+@compiled
+def mark_lowest(
+    start: int,
+    stop: int,
+    columns: PointArray,
+    r: PointArray,
+    cell: npt.NDArray[np.int32],
+    tile: npt.NDArray[np.int32],
+    is_footless: BoolArray,
+    lowest_z: FloatArray,
+    lowest_r: FloatArray,
+    marked: BoolArray,
+) -> None:
+    """Do what `on_footless_faces` does for points `start` to `stop`.
+
+    Marks cells; threads only ever write True.
+    """
+    for i in range(start, stop):
+        if cell[i] >= 0 and is_footless[np.uintp(tile[i])]:
+            own = np.uintp(cell[i])
+            if columns[2, i] == lowest_z[own] and r[i] == lowest_r[own]:
+                marked[own] = True
