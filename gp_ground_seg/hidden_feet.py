@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.config import FacesConfig
-from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray, PointArray, PolarGrid
+from gp_ground_seg.polar_grid import FloatArray
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -104,72 +104,3 @@ def hides_foot_compiled(
     square: float = 0.5 * (own_xx + own_yy - turned)
     in_plane: bool = square <= n_low * max_foot_distance * max_foot_distance
     return in_plane
-
-
-def on_footless_faces(
-    candidates: Candidates,
-    grid: PolarGrid,
-    z: PointArray,
-    tile: npt.NDArray[np.int32],
-    is_footless: BoolArray,
-) -> BoolArray:
-    """Tell the candidates that lie in the tile of a face that hides its foot, (C,) bool.
-
-    Parameters
-    ----------
-    candidates : Candidates
-        Lowest points of the cells.
-    grid : PolarGrid
-        Cells of the points.
-    z : (N,) float32 or float64
-        Heights of the points [m].
-    tile : (N,) int32
-        Tiles of the points.
-    is_footless : (T,) bool
-        Tiles of faces that hide their foot.
-    """
-    own = candidates.segment * grid.n_bins + candidates.bin
-    lowest_z, lowest_r = lowest_of_cells(candidates, own, grid)
-    shows = grid.inside & is_footless[np.maximum(tile, 0)]
-    cell = grid.cell[shows]
-    is_lowest = (z[shows] == lowest_z[cell]) & (grid.r[shows] == lowest_r[cell])
-    marked = np.zeros(len(lowest_z), dtype=np.bool_)
-    marked[cell[is_lowest]] = True
-    result: BoolArray = marked[own]
-    return result
-
-
-def lowest_of_cells(
-    candidates: Candidates, cell: IntArray, grid: PolarGrid
-) -> tuple[FloatArray, FloatArray]:
-    """Height and range [m] of the candidate of each cell, NaN without, two (M * n_bins,).
-
-    `cell` (C,) are those that the candidates lie in.
-    """
-    lowest_z, lowest_r = np.full((2, grid.n_segments * grid.n_bins), np.nan)
-    lowest_z[cell], lowest_r[cell] = candidates.z, candidates.r
-    return lowest_z, lowest_r
-
-
-@compiled
-def mark_lowest(
-    start: int,
-    stop: int,
-    columns: PointArray,
-    r: PointArray,
-    cell: npt.NDArray[np.int32],
-    tile: npt.NDArray[np.int32],
-    is_footless: BoolArray,
-    lowest_z: FloatArray,
-    lowest_r: FloatArray,
-    marked: BoolArray,
-) -> None:
-    """Do what `on_footless_faces` does for points `start` to `stop`.
-
-    Marks cells; threads only ever write True.
-    """
-    for i in range(start, stop):
-        if cell[i] >= 0 and is_footless[np.uintp(tile[i])]:
-            own = np.uintp(cell[i])
-            if columns[2, i] == lowest_z[own] and r[i] == lowest_r[own]:
-                marked[own] = True

@@ -89,6 +89,7 @@ def sort_points(
     lowest_r: FloatArray,
     highest_z: FloatArray,
     count: IntArray,
+    lowest_tile: CellArray,
     tile: CellArray,
     foot_z: PointArray,
     top_z: PointArray,
@@ -106,8 +107,8 @@ def sort_points(
         _measure_range(x, y, z, edges[0], farthest, scale, r[own], near, cell[own])
         _measure_turn(x, y, farthest, tiles_per_metre, n_sides, cell[own], turn, tile[own])
         _look_up(edges, table, turn_edges, turn_table, turn_scale, r[own], near, turn, cell[own])
-        _reduce_cells(z, r[own], cell[own], lowest_z[share], lowest_r[share],
-                      highest_z[share], count[share])  # fmt: skip
+        _reduce_cells(z, r[own], cell[own], tile[own], lowest_z[share], lowest_r[share],
+                      highest_z[share], count[share], lowest_tile[share])  # fmt: skip
         _reduce_tiles(z, tile[own], foot_z[share], top_z[share])
 
 
@@ -202,10 +203,12 @@ def _reduce_cells(
     z: PointArray,
     r: PointArray,
     cell: CellArray,
+    tile: CellArray,
     lowest_z: FloatArray,
     lowest_r: FloatArray,
     highest_z: FloatArray,
     count: IntArray,
+    lowest_tile: CellArray,
 ) -> None:
     """Extremes of the cells.
 
@@ -214,22 +217,25 @@ def _reduce_cells(
     """
     held = np.uintp(0)
     low_z, low_r, high_z, number = lowest_z[0], lowest_r[0], highest_z[0], count[0]
+    low_tile = lowest_tile[0]
     for i in range(len(cell)):
         if cell[i] < 0:
             continue
         own = np.uintp(cell[i])
         if own != held:
-            lowest_z[held], lowest_r[held] = low_z, low_r
+            lowest_z[held], lowest_r[held], lowest_tile[held] = low_z, low_r, low_tile
             highest_z[held], count[held] = high_z, number
             held = own
-            low_z, low_r = lowest_z[held], lowest_r[held]
+            low_z, low_r, low_tile = lowest_z[held], lowest_r[held], lowest_tile[held]
             high_z, number = highest_z[held], count[held]
         own_z, own_r = np.float64(z[i]), np.float64(r[i])
         number += 1
         high_z = max(high_z, own_z)
-        if own_z < low_z or (own_z == low_z and own_r < low_r):
-            low_z, low_r = own_z, own_r
-    lowest_z[held], lowest_r[held] = low_z, low_r
+        if own_z > low_z:
+            continue
+        if own_z < low_z or own_r < low_r or (own_r == low_r and tile[i] < low_tile):
+            low_z, low_r, low_tile = own_z, own_r, tile[i]
+    lowest_z[held], lowest_r[held], lowest_tile[held] = low_z, low_r, low_tile
     highest_z[held], count[held] = high_z, number
 
 
@@ -252,16 +258,21 @@ def _reduce_tiles(z: PointArray, tile: CellArray, foot_z: PointArray, top_z: Poi
 
 @compiled
 def merge_cells(
-    lowest_z: FloatArray, lowest_r: FloatArray, highest_z: FloatArray, count: IntArray
+    lowest_z: FloatArray,
+    lowest_r: FloatArray,
+    highest_z: FloatArray,
+    count: IntArray,
+    lowest_tile: CellArray,
 ) -> None:
     """Reduce the tables of all shares into the first."""
     for share in range(1, len(count)):
         for k in range(count.shape[1]):
             if count[share, k] == 0:
                 continue
-            z, r = lowest_z[share, k], lowest_r[share, k]
-            if z < lowest_z[0, k] or (z == lowest_z[0, k] and r < lowest_r[0, k]):
-                lowest_z[0, k], lowest_r[0, k] = z, r
+            z, r, tile = lowest_z[share, k], lowest_r[share, k], lowest_tile[share, k]
+            own = lowest_z[0, k], lowest_r[0, k], lowest_tile[0, k]
+            if (z, r, tile) < own:
+                lowest_z[0, k], lowest_r[0, k], lowest_tile[0, k] = z, r, tile
             highest_z[0, k] = max(highest_z[0, k], highest_z[share, k])
             count[0, k] += count[share, k]
 
@@ -281,6 +292,7 @@ def collect_candidates(
     lowest_r: FloatArray,
     highest_z: FloatArray,
     count: IntArray,
+    lowest_tile: CellArray,
     widths: FloatArray,
     min_extent: float,
     offsets: IntArray,
@@ -288,6 +300,7 @@ def collect_candidates(
     z: FloatArray,
     own_bin: IntArray,
     density: FloatArray,
+    tile: CellArray,
 ) -> int:
     """Do what `polar_grid.ground_candidates` does, into arrays for all bins; their number."""
     c = 0
@@ -297,6 +310,7 @@ def collect_candidates(
             if count[m, n] == 0:
                 continue
             r[c], z[c], own_bin[c] = lowest_r[m, n], lowest_z[m, n], n
+            tile[c] = lowest_tile[m, n]
             extent = max(highest_z[m, n] - lowest_z[m, n], min_extent)
             density[c] = count[m, n] / (widths[n] * extent)
             c += 1

@@ -19,6 +19,8 @@ OUTSIDE = -1
 """Bin and cell of a point that is beyond the grid."""
 NOT_FINITE = -2
 """Cell of a point that is not finite."""
+NO_TILE = 2**31 - 1
+"""Tile of the lowest point of an empty cell."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,8 @@ class Candidates:
         Vertical density of each candidate's bin [points/m^2].
     offsets : (M + 1,) int64
         Candidates of segment m are ``offsets[m]:offsets[m + 1]``.
+    tile : (C,) int32
+        Tile that each of them lies in (see `gp_ground_seg.tiles.Tiles`).
     """
 
     r: FloatArray
@@ -86,6 +90,7 @@ class Candidates:
     bin: IntArray
     density: FloatArray
     offsets: IntArray
+    tile: npt.NDArray[np.int32]
 
     @property
     def segment(self) -> IntArray:
@@ -96,7 +101,12 @@ class Candidates:
         """Those of the (C,) bool mask `kept`."""
         before = np.concatenate([[0], np.cumsum(kept)])
         return Candidates(
-            self.r[kept], self.z[kept], self.bin[kept], self.density[kept], before[self.offsets]
+            self.r[kept],
+            self.z[kept],
+            self.bin[kept],
+            self.density[kept],
+            before[self.offsets],
+            self.tile[kept],
         )
 
     @property
@@ -191,15 +201,18 @@ class CellTables:
         Height of the highest point [m]; minus infinity in empty bins.
     count : int64
         Number of points.
+    lowest_tile : int32
+        Tile of the lowest point, the first of equally low and near ones.
     """
 
     lowest_z: FloatArray
     lowest_r: FloatArray
     highest_z: FloatArray
     count: IntArray
+    lowest_tile: npt.NDArray[np.int32]
 
 
-def reduce_cells(grid: PolarGrid, z: PointArray) -> CellTables:
+def reduce_cells(grid: PolarGrid, z: PointArray, tile: npt.NDArray[np.int32]) -> CellTables:
     """Lowest and highest point of each bin, and their number.
 
     Equal heights are settled by the smaller range, so that the order of the
@@ -209,8 +222,10 @@ def reduce_cells(grid: PolarGrid, z: PointArray) -> CellTables:
     ----------
     grid : PolarGrid
         Bins of the points.
-    z : (N,) float64
+    z : (N,) float32 or float64
         Heights [m].
+    tile : (N,) int32
+        Tiles of the points.
     """
     shape = grid.n_segments, grid.n_bins
     size = shape[0] * shape[1]
@@ -222,6 +237,9 @@ def reduce_cells(grid: PolarGrid, z: PointArray) -> CellTables:
     is_lowest = z_inside == lowest_z[cell]
     lowest_r = np.full(size, np.inf)
     np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest].astype(np.float64))
+    is_lowest &= r_inside == lowest_r[cell]
+    lowest_tile = np.full(size, NO_TILE, dtype=np.int32)
+    np.minimum.at(lowest_tile, cell[is_lowest], tile[inside][is_lowest])
     highest_z = np.full(size, -np.inf)
     np.maximum.at(highest_z, cell, z_inside)
     count = np.bincount(cell, minlength=size)
@@ -230,6 +248,7 @@ def reduce_cells(grid: PolarGrid, z: PointArray) -> CellTables:
         lowest_r.reshape(shape),
         highest_z.reshape(shape),
         count.reshape(shape),
+        lowest_tile.reshape(shape),
     )
 
 
@@ -260,4 +279,5 @@ def ground_candidates(cells: CellTables, edges: FloatArray, min_extent: float) -
         bin=own_bin,
         density=cells.count[occupied] / (np.diff(edges)[own_bin] * extent),
         offsets=np.concatenate([[0], np.cumsum(occupied.sum(axis=1))]),
+        tile=cells.lowest_tile[occupied],
     )

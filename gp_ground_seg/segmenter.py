@@ -123,8 +123,7 @@ class GroundSegmenter:
         faces = self._backend.find_faces(
             xyz, placed.tiles, config.faces, config.label.obstacle_max_height
         )
-        on_face = self._backend.on_footless_faces(placed.candidates, grid, xyz, faces)
-        candidates = placed.candidates.where(~on_face)
+        candidates = placed.candidates.where(~faces.is_footless[placed.candidates.tile])
         timer.mark('faces')
 
         lines = extract_lines(candidates, config.lines)

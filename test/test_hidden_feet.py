@@ -8,7 +8,6 @@ from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
 from gp_ground_seg.faces import Faces, find_faces
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
 from gp_ground_seg.gp.numpy_backend import NumpyBackend
-from gp_ground_seg.hidden_feet import on_footless_faces
 from gp_ground_seg.labelling import label_points
 from gp_ground_seg.labels import Label
 from gp_ground_seg.points import take_points
@@ -82,10 +81,10 @@ def test_lowest_points_on_such_faces_are_no_candidates():
     free = np.array([[10.1, -5.0, -1.0]])
     xyz = np.vstack([wall(), free])
     grid = build_polar_grid(xyz, GRID)
-    candidates = ground_candidates(reduce_cells(grid, xyz[:, 2]), grid.edges, 0.1)
     tiles = build_tiles(xyz, grid, FacesConfig().cell_size)
+    candidates = ground_candidates(reduce_cells(grid, xyz[:, 2], tiles.tile), grid.edges, 0.1)
     faces = find_faces(xyz, tiles, FacesConfig(), 2.0)
-    on_face = on_footless_faces(candidates, grid, xyz[:, 2], tiles.tile, faces.is_footless)
+    on_face = faces.is_footless[candidates.tile]
     assert on_face.any()
     assert not on_face[candidates.segment == grid.segment[-1]].any()
     kept = candidates.where(~on_face)
@@ -126,14 +125,9 @@ def test_compiled_marks_are_the_reference(seed, dtype, n_threads):
     xyz[::20] = np.nan
     xyz = take_points(xyz.astype(dtype), Workspace())
     grid = build_polar_grid(xyz, GRID)
-    candidates = ground_candidates(reduce_cells(grid, xyz[:, 2]), grid.edges, 0.1)
     config = FacesConfig(max_foot_distance=rng.uniform(0.02, 0.2))
     tiles = build_tiles(xyz, grid, config.cell_size)
     backend, plain = CompiledBackend(n_threads), NumpyBackend()
     faces = backend.find_faces(xyz, tiles, config, 2.0)
     same = plain.find_faces(xyz, tiles, config, 2.0)
     np.testing.assert_array_equal(faces.is_footless, same.is_footless)
-    np.testing.assert_array_equal(
-        backend.on_footless_faces(candidates, grid, xyz, faces),
-        plain.on_footless_faces(candidates, grid, xyz, same),
-    )

@@ -16,6 +16,7 @@ CANDIDATES = Candidates(
     bin=np.arange(4),
     density=np.ones(4),
     offsets=np.array([0, 3, 3, 4]),
+    tile=np.zeros(4, dtype=np.int32),
 )
 
 

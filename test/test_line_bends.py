@@ -21,6 +21,7 @@ def bends(r, z, offsets=None, min_extent=8.0, max_slope=1.0):
         np.arange(n),
         np.ones(n),
         np.array([0, n] if offsets is None else offsets),
+        np.zeros(n, dtype=np.int32),
     )
     lines = extract_lines(found, SPARSE)
     return list(lines.start), list(

@@ -15,7 +15,8 @@ from gp_ground_seg.polar_grid import Candidates
 def one_segment(r, z, density=None):
     r, z = np.asarray(r, dtype=float), np.asarray(z, dtype=float)
     density = np.ones(len(r)) if density is None else np.asarray(density, dtype=float)
-    return Candidates(r, z, np.arange(len(r)), density, np.array([0, len(r)]))
+    nowhere = np.zeros(len(r), dtype=np.int32)
+    return Candidates(r, z, np.arange(len(r)), density, np.array([0, len(r)]), nowhere)
 
 
 def moments(r, z):
@@ -147,7 +148,12 @@ def test_extent_of_lines():
 
 def test_lines_do_not_cross_segments_and_lone_points_have_no_slope():
     candidates = Candidates(
-        np.array([3.0, 4.0, 5.0]), np.zeros(3), np.arange(3), np.ones(3), np.array([0, 2, 2, 3])
+        np.array([3.0, 4.0, 5.0]),
+        np.zeros(3),
+        np.arange(3),
+        np.ones(3),
+        np.array([0, 2, 2, 3]),
+        np.zeros(3, dtype=np.int32),
     )
     lines = extract_lines(candidates, LinesConfig())
     assert list(lines.line) == [0, 0, 1]

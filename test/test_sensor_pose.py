@@ -43,7 +43,8 @@ def candidates_of(points):
     """Slow and obvious: no compiled code, no backend."""
     xyz = check_points(points)
     grid = build_polar_grid(xyz, Config().grid)
-    return ground_candidates(reduce_cells(grid, xyz[:, 2]), grid.edges, 0.05)
+    nowhere = np.zeros(len(xyz), dtype=np.int32)
+    return ground_candidates(reduce_cells(grid, xyz[:, 2], nowhere), grid.edges, 0.05)
 
 
 def pose_of(points, use_compiled=True, **sensor):

@@ -53,11 +53,6 @@ class Backend(Protocol):
     ) -> Faces:
         """See `gp_ground_seg.faces.find_faces`."""
 
-    def on_footless_faces(
-        self, candidates: Candidates, grid: PolarGrid, xyz: PointArray, faces: Faces
-    ) -> BoolArray:
-        """See `gp_ground_seg.hidden_feet.on_footless_faces`."""
-
     def label_points(
         self,
         xyz: PointArray,

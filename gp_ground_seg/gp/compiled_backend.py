@@ -11,11 +11,11 @@ from gp_ground_seg.gp.growth import BoolArray, grow_surface_compiled
 from gp_ground_seg.gp.latent import latent_rows_compiled
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
-from gp_ground_seg.hidden_feet import lowest_of_cells, mark_lowest
 from gp_ground_seg.labelling import Labelled, band, root_mean_square_compiled
 from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.point_passes import grid_ruler
 from gp_ground_seg.polar_grid import (
+    NO_TILE,
     Candidates,
     CellTables,
     FloatArray,
@@ -61,17 +61,19 @@ class CompiledBackend:
             'cells', (3, n_shares, grid.n_segments * grid.n_bins), np.float64
         )
         count = take('count', lowest_z.shape, np.int64)
+        lowest_tile = take('lowest_tile', lowest_z.shape, np.int32)
         foot_z, top_z = take('tiles', (2, n_shares, n_sides**2), xyz.dtype)
         for table, empty in (
             (lowest_z, np.inf),
             (lowest_r, np.inf),
             (highest_z, -np.inf),
             (count, 0),
+            (lowest_tile, NO_TILE),
             (foot_z, np.inf),
             (top_z, -np.inf),
         ):
             table.fill(empty)
-        cells = lowest_z, lowest_r, highest_z, count
+        cells = lowest_z, lowest_r, highest_z, count, lowest_tile
         self._pool.run_shares(
             point_passes.sort_points,
             n_points,
@@ -104,11 +106,13 @@ class CompiledBackend:
         size = n_segments * n_bins
         offsets, own_bin = np.empty(n_segments + 1, np.int64), np.empty(size, np.int64)
         r, z, density = np.empty((3, size))
+        tile = np.empty(size, dtype=np.int32)
         n = point_passes.collect_candidates(
             cells.lowest_z,
             cells.lowest_r,
             cells.highest_z,
             cells.count,
+            cells.lowest_tile,
             np.diff(edges),
             min_extent,
             offsets,
@@ -116,8 +120,9 @@ class CompiledBackend:
             z,
             own_bin,
             density,
+            tile,
         )
-        return Candidates(r[:n], z[:n], own_bin[:n], density[:n], offsets)
+        return Candidates(r[:n], z[:n], own_bin[:n], density[:n], offsets, tile[:n])
 
     def find_faces(
         self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
@@ -144,28 +149,6 @@ class CompiledBackend:
             is_footless,
         )
         return Faces(tiles, is_face, is_footless)
-
-    def on_footless_faces(
-        self, candidates: Candidates, grid: PolarGrid, xyz: PointArray, faces: Faces
-    ) -> BoolArray:
-        """Candidates that are part of a face."""
-        own = candidates.segment * grid.n_bins + candidates.bin
-        lowest_z, lowest_r = lowest_of_cells(candidates, own, grid)
-        marked = np.zeros(len(lowest_z), dtype=np.bool_)
-        self._pool.run_points(
-            mark_lowest,
-            len(xyz),
-            xyz.T,
-            grid.r,
-            grid.cell,
-            faces.tiles.tile,
-            faces.is_footless,
-            lowest_z,
-            lowest_r,
-            marked,
-        )
-        result: BoolArray = marked[own]
-        return result
 
     def label_points(
         self,

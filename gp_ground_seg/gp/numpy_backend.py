@@ -11,7 +11,6 @@ from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.objective import TrainingFrame
-from gp_ground_seg.hidden_feet import on_footless_faces
 from gp_ground_seg.labelling import Labelled, label_points, local_roughness
 from gp_ground_seg.polar_grid import (
     Candidates,
@@ -41,7 +40,8 @@ class NumpyBackend:
     ) -> tuple[PolarGrid, CellTables, Tiles]:
         """Cell and tile of each point, extremes of each."""
         cells = build_polar_grid(xyz, grid)
-        return cells, reduce_cells(cells, xyz[:, 2]), build_tiles(xyz, cells, tile_size)
+        tiles = build_tiles(xyz, cells, tile_size)
+        return cells, reduce_cells(cells, xyz[:, 2], tiles.tile), tiles
 
     def ground_candidates(
         self, cells: CellTables, edges: FloatArray, min_extent: float
@@ -54,12 +54,6 @@ class NumpyBackend:
     ) -> Faces:
         """Upright faces."""
         return find_faces(xyz, tiles, faces, max_height)
-
-    def on_footless_faces(
-        self, candidates: Candidates, grid: PolarGrid, xyz: PointArray, faces: Faces
-    ) -> BoolArray:
-        """Candidates that are part of a face."""
-        return on_footless_faces(candidates, grid, xyz[:, 2], faces.tiles.tile, faces.is_footless)
 
     def label_points(
         self,
