@@ -18,8 +18,10 @@ BoolArray = npt.NDArray[np.bool_]
 
 # Plain integers: compiled code knows no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
-N_SUMS = 17
-"""Sums per tile: number, x, y, z and their six products; those of `hides_foot_compiled`."""
+# Columns of what is known of a tile: sums (number, x, y, z and their six products; the six
+# of the lowest returns; the highest), a point of it, its number, whether it is tall.
+_ORIGIN_X, _ORIGIN_Y, _TILE, _IS_TALL = 17, 18, 19, 20
+N_COLUMNS = 21
 SKIPPED = -1
 """Slot of a tile that has nothing tall, or is another thread's."""
 
@@ -40,46 +42,46 @@ def judge_faces(
     tolerance: float,
     max_foot_distance: float,
     max_foot_density: float,
+    slots: CellArray,
+    sums: FloatArray,
     is_face: BoolArray,
     is_footless: BoolArray,
 ) -> None:
     """Do what `gp_ground_seg.faces.find_faces` does with every `step`-th tile.
 
     A tile's sums are taken by one thread in the order of the points: they do not
-    depend on the number of threads.
+    depend on the number of threads. `slots` (step, T) and `sums` (step, T, N_COLUMNS)
+    are room to work in.
     """
     n_slots = 0
-    slot_of = np.zeros(len(foot_z), dtype=np.int32)
-    most = min(len(foot_z), len(tile))
-    tile_of, is_tall = np.empty(most, dtype=np.int32), np.empty(most, dtype=np.bool_)
-    sums = np.empty((most, N_SUMS))
-    # Sums about a point of the tile: about the sensor, rounding would eat the scatter.
-    origin = np.empty((most, 2))
+    own_slots, own_sums = slots[start], sums[start]
+    own_slots[:] = 0
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
             continue
         own = np.uintp(tile[i])
-        k = slot_of[own]
+        k = own_slots[own]
         if k == SKIPPED:
             continue
         foot = np.float64(foot_z[own])
         if k == 0:
             if tile[i] % step != start or np.float64(top_z[own]) - foot <= min_height:
-                slot_of[own] = SKIPPED
+                own_slots[own] = SKIPPED
                 continue
             n_slots += 1
-            slot_of[own] = k = n_slots
-            tile_of[k - 1], is_tall[k - 1] = tile[i], False
-            origin[k - 1, 0], origin[k - 1, 1] = columns[0, i], columns[1, i]
-            sums[k - 1] = 0.0
-        k -= 1
+            own_slots[own] = k = n_slots
+            own_sums[k - 1] = 0.0
+            # Sums about a point of the tile: about the sensor, rounding would eat the scatter.
+            own_sums[k - 1, _ORIGIN_X] = columns[0, i]
+            own_sums[k - 1, _ORIGIN_Y] = columns[1, i]
+            own_sums[k - 1, _TILE] = tile[i]
+        s = own_sums[k - 1]
         z = np.float64(columns[2, i]) - foot
         if z > max_height:
             continue
         if z > min_height:
-            is_tall[k] = True
-        x, y = np.float64(columns[0, i]) - origin[k, 0], np.float64(columns[1, i]) - origin[k, 1]
-        s = sums[k]
+            s[_IS_TALL] = 1.0
+        x, y = np.float64(columns[0, i]) - s[_ORIGIN_X], np.float64(columns[1, i]) - s[_ORIGIN_Y]
         s[0] += 1.0
         s[1] += x
         s[2] += y
@@ -99,17 +101,18 @@ def judge_faces(
             s[15] += x * y
         s[16] = max(s[16], z)
     for k in range(n_slots):
-        s = sums[k]
+        s = own_sums[k]
         n = s[0]
-        if not is_tall[k] or n < fewest_returns:
+        if s[_IS_TALL] == 0.0 or n < fewest_returns:
             continue
         xx, yy, zz = s[4] - s[1] * s[1] / n, s[5] - s[2] * s[2] / n, s[6] - s[3] * s[3] / n
         xy, xz, yz = s[7] - s[1] * s[2] / n, s[8] - s[1] * s[3] / n, s[9] - s[2] * s[3] / n
         vertical = max(xx * yy - xy * xy, 0.0)
         trace = vertical + max(yy * zz - yz * yz, 0.0) + max(xx * zz - xz * xz, 0.0)
         if trace > 0.0 and math.sqrt(vertical / trace) <= max_normal_z:
-            is_face[tile_of[k]] = True
-            is_footless[tile_of[k]] = hides_foot_compiled(
+            own_tile = int(s[_TILE])
+            is_face[own_tile] = True
+            is_footless[own_tile] = hides_foot_compiled(
                 s, tolerance, max_foot_distance, max_foot_density
             )
 

@@ -93,6 +93,7 @@ def sort_points(
     tile: CellArray,
     foot_z: PointArray,
     top_z: PointArray,
+    touched: CellArray,
 ) -> None:
     """Sort points `start` to `stop` into cells and tiles, with the extremes of each.
 
@@ -109,7 +110,7 @@ def sort_points(
         _look_up(edges, table, turn_edges, turn_table, turn_scale, r[own], near, turn, cell[own])
         _reduce_cells(z, r[own], cell[own], tile[own], lowest_z[share], lowest_r[share],
                       highest_z[share], count[share], lowest_tile[share])  # fmt: skip
-        _reduce_tiles(z, tile[own], foot_z[share], top_z[share])
+        _reduce_tiles(z, tile[own], foot_z[share], top_z[share], touched[share])
 
 
 @compiled
@@ -240,10 +241,13 @@ def _reduce_cells(
 
 
 @compiled
-def _reduce_tiles(z: PointArray, tile: CellArray, foot_z: PointArray, top_z: PointArray) -> None:
-    """Extremes of the tiles, likewise."""
+def _reduce_tiles(
+    z: PointArray, tile: CellArray, foot_z: PointArray, top_z: PointArray, touched: CellArray
+) -> None:
+    """Extremes of the tiles, likewise; after their number, those touched first here."""
     held = np.uintp(0)
     low, high = foot_z[0], top_z[0]
+    n_touched = touched[0]
     for i in range(len(tile)):
         if tile[i] < 0:
             continue
@@ -252,8 +256,12 @@ def _reduce_tiles(z: PointArray, tile: CellArray, foot_z: PointArray, top_z: Poi
             foot_z[held], top_z[held] = low, high
             held = own
             low, high = foot_z[held], top_z[held]
+        if low > high:  # so far it was empty
+            n_touched += 1
+            touched[n_touched] = tile[i]
         low, high = min(low, z[i]), max(high, z[i])
     foot_z[held], top_z[held] = low, high
+    touched[0] = n_touched
 
 
 @compiled
@@ -278,10 +286,11 @@ def merge_cells(
 
 
 @compiled
-def merge_tiles(foot_z: PointArray, top_z: PointArray) -> None:
+def merge_tiles(foot_z: PointArray, top_z: PointArray, touched: CellArray) -> None:
     """Reduce the tables of all shares into the first."""
     for share in range(1, len(foot_z)):
-        for k in range(foot_z.shape[1]):
+        for place in range(1, touched[share, 0] + 1):
+            k = np.uintp(touched[share, place])
             foot_z[0, k] = min(foot_z[0, k], foot_z[share, k])
             top_z[0, k] = max(top_z[0, k], top_z[share, k])
 

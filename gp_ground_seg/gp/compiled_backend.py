@@ -63,6 +63,8 @@ class CompiledBackend:
         count = take('count', lowest_z.shape, np.int64)
         lowest_tile = take('lowest_tile', lowest_z.shape, np.int32)
         foot_z, top_z = take('tiles', (2, n_shares, n_sides**2), xyz.dtype)
+        touched = take('touched', (n_shares, 1 + n_sides**2), np.int32)
+        touched[:, 0] = 0
         for table, empty in (
             (lowest_z, np.inf),
             (lowest_r, np.inf),
@@ -88,9 +90,10 @@ class CompiledBackend:
             tile,
             foot_z,
             top_z,
+            touched,
         )
         point_passes.merge_cells(*cells)
-        point_passes.merge_tiles(foot_z, top_z)
+        point_passes.merge_tiles(foot_z, top_z, touched)
         shape = grid.n_segments, grid.n_bins
         return (
             PolarGrid(cell, r, ruler[0], grid.n_segments),
@@ -131,6 +134,10 @@ class CompiledBackend:
         flags = self._workspace.take('faces', (2, len(tiles.foot_z)), np.bool_)
         flags.fill(False)
         is_face, is_footless = flags
+        # As much as could be needed: what is not used takes no memory.
+        room = self.n_threads, len(tiles.foot_z)
+        slots = self._workspace.take('slots', room, np.int32)
+        sums = self._workspace.take('sums', (*room, label_passes.N_COLUMNS), np.float64)
         self._pool.run(
             label_passes.judge_faces,
             len(is_face),
@@ -145,6 +152,8 @@ class CompiledBackend:
             faces.tolerance,
             faces.max_foot_distance,
             faces.max_foot_density,
+            slots,
+            sums,
             is_face,
             is_footless,
         )
@@ -289,7 +298,8 @@ class CompiledBackend:
             return mean, std
         aside = slope_std * 2.0 * np.pi / len(mean) * knots
         fused = np.full_like(mean, np.nan), np.full_like(std, np.nan)
-        self._pool.run(fuse_rows, len(mean), mean, std, aside, n_neighbours, *fused)
+        # Waking another thread would take as long.
+        fuse_rows(0, len(mean), 1, mean, std, aside, n_neighbours, *fused)
         return fused
 
     def objective(
