@@ -129,9 +129,9 @@ def run(arguments: argparse.Namespace) -> int:
         private_network(),
         large_cloud_transport(),
         ros_session('demo') as session,
-        NodeProcess(part / LOG, ('-r', f'points:={TOPIC}')) as node,
+        NodeProcess(part / LOG, ('-r', f'points:={TOPIC}'), session.holding_back) as node,
     ):
-        written = _write(drive, part / BAG)
+        written = _write(drive, part / BAG, session)
         tally = Tally(shown=drive.n_frames // 2)
         receiver = _connect(session, node, tally)
         with open_bag(part / BAG) as bag:
@@ -168,12 +168,17 @@ def _choose_drive(arguments: argparse.Namespace) -> Drive:
     return kitti_drive(arguments.kitti, sequence, arguments.frames)
 
 
-def _write(drive: Drive, path: Path) -> WrittenDrive:
+def _write(drive: Drive, path: Path, session: Session) -> WrittenDrive:
     scans = count(drive.n_frames, 'scan')
     _step(1, f'writing {scans} as a bag: {drive.description}; meanwhile the node starts')
     start = time.monotonic()
     with progress_bar(drive.n_frames, quiet=False, title='scans') as bar:
-        written = write_drive(drive, path, bar.update)
+
+        def progress() -> None:
+            session.check()
+            bar.update()
+
+        written = write_drive(drive, path, progress)
     seconds = time.monotonic() - start
     points, size = thousands(written.n_points), written.n_bytes / 1e6
     _detail(f'{points} points, {size:.0f} MB, took {seconds:.1f} s')

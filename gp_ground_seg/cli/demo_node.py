@@ -6,7 +6,8 @@ import contextlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from gp_ground_seg.errors import GroundSegError
@@ -53,15 +54,24 @@ class NodeProcess:
         File for all it says.
     ros_args : sequence of str
         What follows ``--ros-args``.
+    uninterrupted : callable
+        Returns a context in which a signal does not raise an exception.
     """
 
-    def __init__(self, log: Path, ros_args: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        log: Path,
+        ros_args: Sequence[str] = (),
+        uninterrupted: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> None:
         self._log = log
+        self._uninterrupted = uninterrupted
         self._command = [sys.executable, '-m', 'gp_ground_seg', 'node', '--ros-args', *ros_args]
 
     def __enter__(self) -> NodeProcess:
         """Start it."""
-        with self._log.open('wb') as log:
+        # Between the start of the process and the knowledge of it nothing could end it.
+        with self._log.open('wb') as log, self._uninterrupted():
             self._process = subprocess.Popen(
                 self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
             )

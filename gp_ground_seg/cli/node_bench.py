@@ -162,7 +162,9 @@ def _measure(
             stack.enter_context(block)
         session = stack.enter_context(ros_session('node_bench'))
         words = ('-r', f'points:={TOPIC}', *arguments.ros_args[1:])
-        node = stack.enter_context(NodeProcess(Path(folder, 'node.log'), words))
+        node = stack.enter_context(
+            NodeProcess(Path(folder, 'node.log'), words, session.holding_back)
+        )
         load = LoadTest(session, TOPIC, OUTPUTS, clouds)
         if not arguments.quiet:
             note('waiting for the node; it compiles when it runs the first time')

@@ -36,6 +36,7 @@ class Session:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._is_interrupted = False
+        self._holds_back = False
 
     def sleep(self, seconds: float) -> None:
         """Wait without handling messages; as exact as the system's clock is."""
@@ -50,7 +51,17 @@ class Session:
     def interrupt(self, _number: int, _frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt, now and at the next wait."""
         self._is_interrupted = True
-        raise KeyboardInterrupt
+        if not self._holds_back:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def holding_back(self) -> Iterator[None]:
+        """Let a signal within the block be raised at the next `check` only."""
+        self._holds_back = True
+        try:
+            yield
+        finally:
+            self._holds_back = False
 
     def close(self) -> None:
         """Tell the network that the node goes, so that nobody waits for it."""
@@ -58,8 +69,11 @@ class Session:
         self.node.destroy_node()
 
     def check(self, cause: Exception | None = None) -> None:
-        """Raise KeyboardInterrupt once interrupted; `cause` is what it was taken for."""
-        # Python swallows an exception that a signal raises within a destructor.
+        """Raise KeyboardInterrupt once interrupted; `cause` is what it was taken for.
+
+        Python swallows an exception that a signal raises within a destructor or a
+        callback: whatever takes long has to ask now and then.
+        """
         if self._is_interrupted:
             raise KeyboardInterrupt from cause
 
