@@ -7,9 +7,17 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
+from ros_helpers import ISOLATION
+
 from gp_ground_seg.ros.session import ros_session
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch):
+    for name, value in ISOLATION.items():
+        monkeypatch.setenv(name, value)
 
 
 def interrupted_by(number, said):
