@@ -1,6 +1,7 @@
 """What several test modules use: labelled frames where they are at hand, small scans."""
 
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -44,3 +45,11 @@ def hilly_scan(n_points: int = 4000, seed: int = 0, sensor_height: float = 1.73)
 @pytest.fixture
 def scan() -> np.ndarray:
     return hilly_scan()
+
+
+@pytest.fixture
+def heeded_hangup():
+    """SIGHUP as in a terminal, also where the tests run under nohup."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)

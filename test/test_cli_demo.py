@@ -273,7 +273,7 @@ def test_demo_on_real_scans(rclpy, kitti, tmp_path):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_interrupted_demo_leaves_nothing(rclpy, tmp_path, number):
+def test_interrupted_demo_leaves_nothing(rclpy, tmp_path, heeded_hangup, number):
     command = [*COMMAND, '--frames', '500']
     with subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

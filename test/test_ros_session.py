@@ -54,6 +54,7 @@ def failing(_number, _said):
     ('act', 'expected'),
     [(interrupted_by, ['before']), (held_back, ['held back']), (misunderstood, [])],
 )
+@pytest.mark.usefixtures('heeded_hangup')
 def test_a_signal_interrupts_at_once_or_where_it_may(act, expected, number):
     said = []
     with pytest.raises(KeyboardInterrupt):
