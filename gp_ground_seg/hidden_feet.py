@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.config import FacesConfig
-from gp_ground_seg.polar_grid import FloatArray
+from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -70,6 +70,62 @@ def hides_foot(
     is_sparse = n_low * (top - faces.tolerance) <= faces.max_foot_density * usual
     result: npt.NDArray[np.bool_] = is_in_plane & is_sparse & (n_high >= 2)
     return result & (faces.max_foot_distance > 0.0)
+
+
+def without_hidden_feet(
+    candidates: Candidates, is_footless: BoolArray, use_compiled: bool
+) -> Candidates:
+    """Leave out the candidates whose tile shows no ground.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        Ground candidates.
+    is_footless : (T,) bool
+        Tiles whose face hides its foot.
+    use_compiled : bool
+        Compiled code, or its twin in numpy.
+    """
+    if not use_compiled:
+        return candidates.where(~is_footless[candidates.tile])
+    return Candidates(
+        *keep_compiled(
+            is_footless,
+            candidates.r,
+            candidates.z,
+            candidates.bin,
+            candidates.density,
+            candidates.offsets,
+            candidates.tile,
+        )
+    )
+
+
+@compiled
+def keep_compiled(
+    is_footless: npt.NDArray[np.bool_],
+    r: FloatArray,
+    z: FloatArray,
+    own_bin: IntArray,
+    density: FloatArray,
+    offsets: IntArray,
+    tile: npt.NDArray[np.int32],
+) -> tuple[FloatArray, FloatArray, IntArray, FloatArray, IntArray, npt.NDArray[np.int32]]:
+    """Do what `without_hidden_feet` does, from and to the fields of `Candidates`."""
+    kept_r, kept_z, kept_density = np.empty(len(r)), np.empty(len(r)), np.empty(len(r))
+    kept_bin, kept_tile = np.empty(len(r), np.int64), np.empty(len(r), np.int32)
+    kept_offsets = np.empty(len(offsets), np.int64)
+    n = 0
+    kept_offsets[0] = 0
+    for m in range(len(offsets) - 1):
+        for c in range(offsets[m], offsets[m + 1]):
+            if is_footless[tile[c]]:
+                continue
+            kept_r[n], kept_z[n], kept_density[n] = r[c], z[c], density[c]
+            kept_bin[n], kept_tile[n] = own_bin[c], tile[c]
+            n += 1
+        kept_offsets[m + 1] = n
+    return (kept_r[:n], kept_z[:n], kept_bin[:n], kept_density[:n], kept_offsets, kept_tile[:n])
 
 
 @compiled

@@ -1,15 +1,59 @@
-"""Lines that set off where the ground bends: the foot of a ramp between two rings."""
+"""Candidates that join the ground with the one before them: along a line, and at a bend.
+
+A line may set off where the ground bends: the foot of a ramp between two rings.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.compiled import compiled
+from gp_ground_seg.config import Config
 from gp_ground_seg.line_extraction import Lines
-from gp_ground_seg.polar_grid import Candidates
+from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
 
 FEWEST_CANDIDATES = 3
 """Candidates that a line needs to be one: through two there is always one."""
+
+
+def candidates_that_follow(
+    lines: Lines, candidates: Candidates, config: Config, use_compiled: bool
+) -> npt.NDArray[np.bool_]:
+    """Tell the candidates that join the inliers if the one before them has, (C,) bool.
+
+    They continue a line (see `Lines.continued`), or their line sets off at a bend (see
+    `set_off_at_bend`).
+
+    Parameters
+    ----------
+    lines : Lines
+        Lines through the candidates.
+    candidates : Candidates
+        Ground candidates.
+    config : Config
+        Tolerance of the lines; least size, least extent and steepest slope.
+    use_compiled : bool
+        Compiled code, or its twin in numpy; both give the same but for rounding.
+    """
+    growth, tolerance = config.growth, config.lines.offset_tolerance
+    if use_compiled:
+        return follow_compiled(
+            candidates.offsets,
+            candidates.r,
+            candidates.z,
+            lines.start,
+            lines.slope,
+            tolerance,
+            growth.min_line_size,
+            growth.min_bend_extent,
+            growth.max_line_slope,
+        )
+    at_bend = set_off_at_bend(
+        lines, candidates, tolerance, growth.min_bend_extent, growth.max_line_slope
+    )
+    continued = lines.continued(growth.max_line_slope, growth.min_line_size)
+    return continued | at_bend[lines.line]
 
 
 def set_off_at_bend(
@@ -61,3 +105,45 @@ def set_off_at_bend(
     result = np.zeros(len(size), dtype=np.bool_)
     result[chosen] = upwards | downwards
     return result
+
+
+@compiled
+def follow_compiled(
+    offsets: IntArray,
+    r: FloatArray,
+    z: FloatArray,
+    start: IntArray,
+    slope: FloatArray,
+    offset_tolerance: float,
+    min_size: int,
+    min_extent: float,
+    max_slope: float,
+) -> npt.NDArray[np.bool_]:
+    """Do what `candidates_that_follow` does, in one pass over the lines."""
+    follows = np.empty(len(r), dtype=np.bool_)
+    m = 0
+    for q in range(len(slope)):
+        first, stop = start[q], start[q + 1]
+        size = stop - first
+        while offsets[m] < first:
+            m += 1
+        is_flat = abs(slope[q]) <= max_slope
+        at_bend = False
+        is_long = size >= FEWEST_CANDIDATES and r[stop - 1] - r[first] >= min_extent
+        if is_flat and is_long and offsets[m] != first:
+            mean_r, mean_z = 0.0, 0.0
+            for c in range(first, stop):
+                mean_r += r[c] / size
+                mean_z += z[c] / size
+            last = first - 1
+            before = slope[q - 1]
+            if not abs(before) <= max_slope:
+                before = 0.0
+            over_last = mean_z + slope[q] * (r[last] - mean_r) - z[last]
+            over_line = z[first] - (z[last] + before * (r[first] - r[last]))
+            upwards = over_last <= offset_tolerance and over_line >= -offset_tolerance
+            downwards = over_last >= -offset_tolerance and over_line <= offset_tolerance
+            at_bend = upwards or downwards
+        follows[first] = at_bend
+        follows[first + 1 : stop] = at_bend or (is_flat and size >= min_size)
+    return follows

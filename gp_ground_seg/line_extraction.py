@@ -63,20 +63,20 @@ def extract_lines(candidates: Candidates, lines: LinesConfig) -> Lines:
     lines : LinesConfig
         Tolerances.
     """
-    line, slope, start, n_lines = _extract(
+    line, slope, start = _extract(
         candidates.offsets,
         candidates.r,
         candidates.z,
-        np.log(candidates.density),
+        candidates.density,
         lines.slope_tolerance,
         lines.offset_tolerance,
         lines.max_line_distance,
         lines.max_gap,
         lines.max_gap_growth,
-        math.log(lines.max_density_ratio),
+        lines.max_density_ratio,
         lines.error_ratio,
     )
-    return Lines(line, slope[:n_lines], start[: n_lines + 1])
+    return Lines(line, slope, start)
 
 
 def _deming_from_moments(s_rr: float, s_zz: float, s_rz: float, error_ratio: float) -> float:
@@ -107,67 +107,82 @@ def _extract(
     offsets: IntArray,
     r: FloatArray,
     z: FloatArray,
-    log_density: FloatArray,
+    density: FloatArray,
     slope_tolerance: float,
     offset_tolerance: float,
     max_line_distance: float,
     max_gap: float,
     max_gap_growth: float,
-    max_log_density_change: float,
+    max_density_ratio: float,
     error_ratio: float,
-) -> tuple[IntArray, FloatArray, IntArray, int]:
+) -> tuple[IntArray, FloatArray, IntArray]:
     line = np.empty(len(r), np.int64)
     start = np.empty(len(r) + 1, np.int64)
-    slopes = np.full(len(r), np.nan)
-    current = -1
+    slopes = np.empty(len(r))
+    tangent = math.tan(slope_tolerance)
+    square_distance = max_line_distance * max_line_distance
+    current = 0
     for m in range(len(offsets) - 1):
+        stop = offsets[m + 1]
         i = offsets[m]
-        while i < offsets[m + 1]:
-            current += 1
+        while i < stop:
             # Sums relative to the first point of the line keep their digits.
-            n = 0
-            sum_r = sum_z = sum_rr = sum_zz = sum_rz = 0.0
-            slope = angle = np.nan
-            j = i
-            while j < offsets[m + 1]:
-                dr, dz = r[j] - r[i], z[j] - z[i]
-                if n > 0 and (
+            first_r, first_z = r[i], z[i]
+            sum_r, sum_z, sum_rr, sum_zz, sum_rz = 0.0, 0.0, 0.0, 0.0, 0.0
+            mean_r, mean_z = 0.0, 0.0
+            slope = np.nan
+            start[current] = i
+            line[i] = current
+            n = 1
+            j = i + 1
+            while j < stop:
+                last_density, own_density = density[j - 1], density[j]
+                if (
                     r[j] - r[j - 1] > max_gap + max_gap_growth * r[j]
-                    or abs(log_density[j] - log_density[j - 1]) > max_log_density_change
+                    or own_density > max_density_ratio * last_density
+                    or last_density > max_density_ratio * own_density
                 ):
                     break
-                new_r, new_z = (sum_r + dr) / (n + 1), (sum_z + dz) / (n + 1)
-                new_slope = new_angle = np.nan
-                if n > 0:
-                    new_slope = deming_slope(
-                        sum_rr + dr * dr - (n + 1) * new_r * new_r,
-                        sum_zz + dz * dz - (n + 1) * new_z * new_z,
-                        sum_rz + dr * dz - (n + 1) * new_r * new_z,
-                        error_ratio,
-                    )
-                    new_angle = math.atan(new_slope)
-                if n > 1:
-                    before = sum_z / n + slope * (dr - sum_r / n)
-                    after = new_z + new_slope * (dr - new_r)
-                    turn = abs(new_angle - angle)
-                    distance = abs(dz - before) / math.sqrt(1.0 + slope * slope)
-                    if (
-                        turn > slope_tolerance
-                        or abs(after - before) > offset_tolerance
-                        or distance > max_line_distance
-                    ):
-                        break
+                dr, dz = r[j] - first_r, z[j] - first_z
+                expected = mean_z + slope * (dr - mean_r)
+                missed = dz - expected
+                if n > 1 and missed * missed > square_distance * (1.0 + slope * slope):
+                    break
                 n += 1
                 sum_r += dr
                 sum_z += dz
                 sum_rr += dr * dr
                 sum_zz += dz * dz
                 sum_rz += dr * dz
-                slope, angle = new_slope, new_angle
+                mean_r, mean_z = sum_r / n, sum_z / n
+                new_slope = deming_slope(
+                    sum_rr - n * mean_r * mean_r,
+                    sum_zz - n * mean_z * mean_z,
+                    sum_rz - n * mean_r * mean_z,
+                    error_ratio,
+                )
+                if n > 2:
+                    moved = mean_z + new_slope * (dr - mean_r) - expected
+                    if abs(moved) > offset_tolerance or turns(
+                        slope, new_slope, slope_tolerance, tangent
+                    ):
+                        break
+                slope = new_slope
+                line[j] = current
                 j += 1
-            line[i:j] = current
-            start[current] = i
             slopes[current] = slope
+            current += 1
             i = j
-    start[current + 1] = len(r)
-    return line, slopes, start, current + 1
+    start[current] = len(r)
+    return line, slopes[:current], start[: current + 1]
+
+
+@compiled
+def turns(slope: float, new_slope: float, tolerance: float, tangent: float) -> bool:
+    """Tell whether two lines differ in direction by more than `tolerance`, with its tangent."""
+    # An arctangent costs as much as the rest of a step: the tangent of the difference
+    # of two angles follows from their tangents.
+    along = 1.0 + slope * new_slope
+    if math.isfinite(along):
+        return along <= 0.0 or abs(new_slope - slope) > tangent * along
+    return abs(math.atan(new_slope) - math.atan(slope)) > tolerance

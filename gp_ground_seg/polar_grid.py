@@ -112,8 +112,14 @@ class Candidates:
     @property
     def n_edges(self) -> IntArray:
         """Bin edges up to the far one of the last bin with a candidate, (M,) int64, or 0."""
-        last = self.bin[np.maximum(self.offsets[1:] - 1, 0)] if len(self.bin) else 0
-        return np.where(np.diff(self.offsets) > 0, last + 2, 0)
+        first, stop = self.offsets[:-1], self.offsets[1:]
+        if len(self.bin) == 0:
+            return np.zeros(len(stop), dtype=np.int64)
+        # Of leading segments without a candidate this is the last of all: they get 0 below.
+        result: IntArray = self.bin[stop - 1]
+        result += 2
+        result *= stop > first
+        return result
 
 
 def bin_edges(grid: GridConfig) -> FloatArray:

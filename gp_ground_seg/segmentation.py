@@ -8,8 +8,6 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.gp.frame_model import FrameModel
-from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.gp.theta import theta_names
 from gp_ground_seg.labelling import Labelled, ground_probability
@@ -19,6 +17,29 @@ from gp_ground_seg.polar_grid import Candidates, FloatArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.sensor_pose import SensorPose
 from gp_ground_seg.surface import GroundSurface
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """What `FitReport` cannot learn from the results.
+
+    Attributes
+    ----------
+    mode : str
+        ``learning.mode`` of the frame.
+    learned : list of Learned
+        Outcome of the learning, of each segment where each has its own; empty when
+        nothing was learned on this frame.
+    backend : str
+        ``numba`` or ``numpy``.
+    n_threads : int
+        Threads used.
+    """
+
+    mode: str
+    learned: list[Learned]
+    backend: str
+    n_threads: int
 
 
 @dataclass(frozen=True)
@@ -67,35 +88,29 @@ class FitReport:
     n_threads: int
 
     @classmethod
-    def of(
-        cls,
-        model: FrameModel,
-        theta: FloatArray,
-        learned: list[Learned],
-        inlier: BoolArray,
-        mean: FloatArray,
-    ) -> FitReport:
+    def of(cls, frame: Segmentation) -> FitReport:
         """Sum up one frame."""
-        names = theta_names(theta.shape[1])
-        values = np.exp(theta.mean(axis=0))
+        learned = frame.fitting.learned
+        names = theta_names(frame.theta.shape[1])
+        values = np.exp(frame.theta.mean(axis=0))
         statuses = {one.status for one in learned}
         at_bound = np.any([one.at_bound for one in learned], axis=0) if learned else []
-        n_inliers = int(inlier.sum())
+        n_inliers = int(frame.surface.inlier.sum())
         total = sum(one.objective for one in learned)
         return cls(
-            mode=model.config.learning.mode,
+            mode=frame.fitting.mode,
             status=next((s for s in ('failed', 'budget', 'converged') if s in statuses), 'kept'),
             n_evaluations=sum(one.n_evaluations for one in learned),
             objective=total / n_inliers if learned and n_inliers else float('nan'),
             theta={name: float(value) for name, value in zip(names, values, strict=True)},
             at_bound=tuple(n for n, hit in zip(names, at_bound, strict=False) if hit),
-            n_segments=int(np.isfinite(mean[:, 0]).sum()),
-            n_candidates=len(model.candidates.r),
+            n_segments=int(np.isfinite(frame.surface.mean[:, 0]).sum()),
+            n_candidates=len(frame.candidates.r),
             n_inliers=n_inliers,
-            n_lines=len(model.lines.slope),
-            n_pseudo_inputs=len(model.pseudo.r_bar),
-            backend=model.backend.name,
-            n_threads=model.backend.n_threads,
+            n_lines=len(frame.lines.slope),
+            n_pseudo_inputs=len(frame.pseudo.r_bar),
+            backend=frame.fitting.backend,
+            n_threads=frame.fitting.n_threads,
         )
 
 
@@ -110,8 +125,8 @@ class Segmentation:
         `roughness` are taken from it.
     timings : dict of str to float
         Seconds per stage, and ``total``.
-    fit : FitReport
-        What the learning did.
+    fitting : Fitting
+        How it was fitted; `fit` sums it up.
     grid, candidates, lines, pseudo, surface
         Intermediate results, for plots and diagnostics; in the level frame.
     theta : (M, 5 + K) float64
@@ -128,7 +143,7 @@ class Segmentation:
 
     labelled: Labelled
     timings: dict[str, float]
-    fit: FitReport
+    fitting: Fitting
     grid: PolarGrid
     candidates: Candidates
     lines: Lines
@@ -171,6 +186,11 @@ class Segmentation:
         return self.labelled.roughness
 
     # What follows is computed when it is first asked for: not every user asks.
+
+    @cached_property
+    def fit(self) -> FitReport:
+        """What the learning and the inlier growth did."""
+        return FitReport.of(self)
 
     @cached_property
     def ground_z(self) -> FloatArray:

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.blas import single_threaded_blas
@@ -15,6 +14,7 @@ from gp_ground_seg.config import Config, SensorConfig
 from gp_ground_seg.gp.backend import make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
+from gp_ground_seg.hidden_feet import without_hidden_feet
 from gp_ground_seg.line_extraction import extract_lines
 from gp_ground_seg.points import as_read_only, take_points
 from gp_ground_seg.polar_grid import (
@@ -24,7 +24,7 @@ from gp_ground_seg.polar_grid import (
     PolarGrid,
 )
 from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
-from gp_ground_seg.segmentation import FitReport, Segmentation
+from gp_ground_seg.segmentation import Fitting, Segmentation
 from gp_ground_seg.sensor_pose import SensorPose, estimate_pose, given_pose
 from gp_ground_seg.surface import GroundSurface
 from gp_ground_seg.tiles import Tiles
@@ -123,11 +123,12 @@ class GroundSegmenter:
         faces = self._backend.find_faces(
             xyz, placed.tiles, config.faces, config.label.obstacle_max_height
         )
-        candidates = placed.candidates.where(~faces.is_footless[placed.candidates.tile])
+        use_compiled = self._backend.name == 'numba'
+        candidates = without_hidden_feet(placed.candidates, faces.is_footless, use_compiled)
         timer.mark('faces')
 
         lines = extract_lines(candidates, config.lines)
-        pseudo = select_pseudo_inputs(candidates, lines, config)
+        pseudo = select_pseudo_inputs(candidates, lines, config, use_compiled)
         timer.mark('lines')
 
         # Heights are centred on the expected ground: a zero mean would pull it to the sensor.
@@ -152,11 +153,11 @@ class GroundSegmenter:
         )
         timer.mark('label')
 
-        fit = FitReport.of(model, theta, learned, inlier, mean)
+        backend = self._backend
         return Segmentation(
             labelled,
             timer.seconds,
-            fit,
+            Fitting(config.learning.mode, learned, backend.name, backend.n_threads),
             grid,
             candidates,
             lines,
@@ -211,7 +212,7 @@ class GroundSegmenter:
     def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:
         """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""
         learning = self._config.learning
-        given = np.tile(model.space().centre, (self._config.grid.n_segments, 1))
+        given = model.given_theta()
         if learning.mode == 'fixed':
             return given, []
         keeps = {'every_frame': 1, 'every_k': learning.period, 'first_frame': None}[learning.mode]

@@ -38,10 +38,11 @@ def test_their_number_follows_the_parameter(per):
         np.testing.assert_array_equal(result.pseudo.r_bar, result.candidates.r)
 
 
-def test_first_guess_is_the_mean_log_extent_of_the_class():
+@pytest.mark.parametrize('use_compiled', [True, False])
+def test_first_guess_is_the_mean_log_extent_of_the_class(use_compiled):
     config = Config()
     result = GroundSegmenter(config).segment(hilly_scan(6000))
-    pseudo = select_pseudo_inputs(result.candidates, result.lines, config)
+    pseudo = select_pseudo_inputs(result.candidates, result.lines, config, use_compiled)
     extent = result.lines.extent(result.candidates)
     classes = classify_lines(result.lines.slope, extent, config.latent)
     bounded = np.log(np.clip(extent, config.length_scale.min, config.length_scale.max))

@@ -13,12 +13,12 @@ from gp_ground_seg.gp.backend import Backend
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.learning import Learned, learn
 from gp_ground_seg.gp.objective import TrainingFrame
-from gp_ground_seg.gp.theta import ThetaSpace, theta_space
+from gp_ground_seg.gp.theta import ThetaSpace, theta_centre, theta_space
 from gp_ground_seg.length_scale import (
     candidate_log_length_scale,
     interpolate_along_segments,
 )
-from gp_ground_seg.line_bends import set_off_at_bend
+from gp_ground_seg.line_bends import candidates_that_follow
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
 from gp_ground_seg.pseudo_inputs import PseudoInputs
@@ -62,16 +62,15 @@ class FrameModel:
     @cached_property
     def follows(self) -> BoolArray:
         """Candidates that join the inliers if the one before them has, (C,) bool."""
-        growth, lines = self.config.growth, self.lines
-        at_bend = set_off_at_bend(
-            lines,
-            self.candidates,
-            self.config.lines.offset_tolerance,
-            growth.min_bend_extent,
-            growth.max_line_slope,
-        )
-        continued = lines.continued(growth.max_line_slope, growth.min_line_size)
-        return continued | at_bend[lines.line]
+        use_compiled = self.backend.name == 'numba'
+        return candidates_that_follow(self.lines, self.candidates, self.config, use_compiled)
+
+    def given_theta(self) -> FloatArray:
+        """Theta before anything is learned, the same in every segment, (M, 5 + K)."""
+        centre = theta_centre(self.config, self.pseudo.first_guess)
+        result = np.empty((len(self.candidates.offsets) - 1, len(centre)))
+        result[:] = centre
+        return result
 
     def space(self) -> ThetaSpace:
         """Bounds, priors and starting values of theta for this frame."""

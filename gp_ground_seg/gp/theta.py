@@ -42,32 +42,44 @@ class ThetaSpace:
     prior_std: float
 
 
-def theta_space(config: Config, first_guess: FloatArray) -> ThetaSpace:
-    """Space of theta for a frame.
+def theta_centre(config: Config, first_guess: FloatArray) -> FloatArray:
+    """Values given by the configuration and the first guess, (5 + K,), in log space.
 
     Parameters
     ----------
     config : Config
-        Values, bounds and fixed mask.
+        Values, and bounds of the length-scale.
     first_guess : (K,) float64
         First guess of the surface classes' log length-scales [log m].
     """
-    observation, latent, learning = config.observation, config.latent, config.learning
-    scalars = np.log(
+    observation, latent, limits = config.observation, config.latent, config.length_scale
+    log = np.log(
         [
             observation.sigma_f,
             observation.sigma_n,
             latent.sigma_f_bar,
             latent.sigma_l_bar,
             latent.sigma_n_bar,
+            limits.min,
+            limits.max,
         ]
     )
-    centre = np.concatenate([scalars, first_guess])
+    centre = np.empty(N_SCALARS + len(first_guess))
+    centre[:N_SCALARS] = log[:N_SCALARS]
+    # Every frame begins with this; `np.clip` would take as long as the rest.
+    np.maximum(first_guess, log[N_SCALARS], out=centre[N_SCALARS:])
+    np.minimum(centre[N_SCALARS:], log[N_SCALARS + 1], out=centre[N_SCALARS:])
+    return centre
+
+
+def theta_space(config: Config, first_guess: FloatArray) -> ThetaSpace:
+    """Space of theta for a frame; parameters are those of `theta_centre`."""
+    learning = config.learning
+    centre = theta_centre(config, first_guess)
     width = np.log(learning.bound_factor)
     lower, upper = centre - width, centre + width
     lower[N_SCALARS:] = np.log(config.length_scale.min)
     upper[N_SCALARS:] = np.log(config.length_scale.max)
-    centre[N_SCALARS:] = np.clip(first_guess, lower[N_SCALARS:], upper[N_SCALARS:])
     free = np.ones(len(centre), dtype=np.bool_)
     if config.length_scale.model != 'latent' or learning.fixed == 'length_scales':
         free[2:] = False
