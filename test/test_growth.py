@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.config import GrowthConfig
-from gp_ground_seg.gp.growth import grow_surface_compiled, grow_surface_reference
+from gp_ground_seg.gp.growth import grow_surface_reference
+from gp_ground_seg.gp.growth_compiled import grow_surface_compiled
 
 KNOTS = np.linspace(2.0, 60.0, 30)
 
@@ -34,9 +35,8 @@ def compiled(frame, growth, chunks=1, sigma_f=None, sigma_n=None, gate_noise=Non
     sigma_f = np.full(n_segments, 0.2) if sigma_f is None else sigma_f
     sigma_n = np.full(n_segments, 0.07) if sigma_n is None else sigma_n
     gate_noise = sigma_n if gate_noise is None else gate_noise
-    inlier = np.zeros(len(r), dtype=bool)
-    mean = np.full((n_segments, len(KNOTS)), np.nan)
-    std = np.full((n_segments, len(KNOTS)), np.nan)
+    inlier = np.ones(len(r), dtype=bool)
+    mean, std = np.zeros((2, n_segments, len(KNOTS)))
     for start, stop in zip(
         np.linspace(0, n_segments, chunks + 1)[:-1].astype(int),
         np.linspace(0, n_segments, chunks + 1)[1:].astype(int),
@@ -46,7 +46,10 @@ def compiled(frame, growth, chunks=1, sigma_f=None, sigma_n=None, gate_noise=Non
             start,
             stop,
             1,
-            *frame,
+            *frame[:3],
+            np.log(frame[3]),
+            *frame[4:7],
+            np.log(frame[7]),
             sigma_f,
             sigma_n,
             gate_noise,

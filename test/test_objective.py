@@ -215,7 +215,7 @@ def test_compiled_latent_rows_are_the_reference(seed):
         rng.integers(0, 8, 5),
     )
     expected = latent_rows_reference(*arguments)
-    found = np.empty(counts.sum()), np.full((5, 7), np.nan)
+    found = np.empty(counts.sum()), np.zeros((5, 7))
     latent_rows_compiled(0, 5, 1, *arguments, *found)
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)

@@ -6,10 +6,10 @@ import logging
 from typing import Protocol
 
 from gp_ground_seg.compiled import HAVE_NUMBA
-from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig, RuntimeConfig
+from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig, RuntimeConfig
 from gp_ground_seg.errors import MissingDependencyError
 from gp_ground_seg.faces import Faces
-from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled
 from gp_ground_seg.polar_grid import (
@@ -75,20 +75,17 @@ class Backend(Protocol):
         """See `gp_ground_seg.gp.latent.latent_rows_reference`."""
 
     def grow(
-        self,
-        candidates: Candidates,
-        height: FloatArray,
-        length_scale: FloatArray,
-        seed: BoolArray,
-        follows: BoolArray,
-        knots: FloatArray,
-        knot_length_scale: FloatArray,
-        theta: FloatArray,
-        gate_noise: FloatArray,
-        slope_std: float,
-        growth: GrowthConfig,
+        self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """See `gp_ground_seg.gp.growth.grow_surface_reference`."""
+        """See `gp_ground_seg.gp.growth.grow_surface_reference`; log length-scales (C,), (M, K)."""
+
+    def grow_on_latent(
+        self, task: GrowthTask, pseudo: PseudoInputs, n_knots: IntArray
+    ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
+        """Both processes: `log_length_scales`, then `grow`.
+
+        What `grow` gives, and the log length-scales at the knots (M, K) [log m].
+        """
 
     def fuse_neighbours(
         self,

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from gp_ground_seg import label_passes, point_passes
-from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig
+from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
 from gp_ground_seg.faces import FEWEST_RETURNS, Faces
-from gp_ground_seg.gp.growth import BoolArray, grow_surface_compiled
+from gp_ground_seg.gp.growth import BoolArray, GrowthTask
+from gp_ground_seg.gp.growth_compiled import grow_on_latent_compiled, grow_surface_compiled
 from gp_ground_seg.gp.latent import latent_rows_compiled
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
@@ -225,7 +226,7 @@ class CompiledBackend:
         """Log length-scales at candidates and knots."""
         n_segments = len(candidates.offsets) - 1
         at_candidates = np.empty(len(candidates.r))
-        at_knots = np.full((n_segments, len(knots)), np.nan)
+        at_knots = np.empty((n_segments, len(knots)))
         self._pool.run(
             latent_rows_compiled,
             n_segments,
@@ -243,47 +244,54 @@ class CompiledBackend:
         return at_candidates, at_knots
 
     def grow(
-        self,
-        candidates: Candidates,
-        height: FloatArray,
-        length_scale: FloatArray,
-        seed: BoolArray,
-        follows: BoolArray,
-        knots: FloatArray,
-        knot_length_scale: FloatArray,
-        theta: FloatArray,
-        gate_noise: FloatArray,
-        slope_std: float,
-        growth: GrowthConfig,
+        self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
         """Inliers, mean and standard deviation of the surface."""
-        n_segments = len(candidates.offsets) - 1
-        inlier = np.zeros(len(candidates.r), dtype=np.bool_)
-        mean = np.full((n_segments, len(knots)), np.nan)
-        std = np.full((n_segments, len(knots)), np.nan)
+        candidates, shape = task.candidates, knot_log_length_scale.shape
+        results = np.empty(len(candidates.r), np.bool_), np.empty(shape), np.empty(shape)
         self._pool.run(
             grow_surface_compiled,
-            n_segments,
+            len(candidates.offsets) - 1,
             candidates.offsets,
             candidates.r,
-            height,
-            length_scale,
-            seed,
-            follows,
-            knots,
-            knot_length_scale,
-            np.exp(theta[:, 0]),
-            np.exp(theta[:, 1]),
-            gate_noise,
-            slope_std,
-            growth.max_std,
-            growth.max_standardised_residual,
-            growth.max_standardised_depth,
-            inlier,
-            mean,
-            std,
+            task.height,
+            log_length_scale,
+            task.seed,
+            task.follows,
+            task.knots,
+            knot_log_length_scale,
+            *_limits(task),
+            *results,
         )
-        return inlier, mean, std
+        return results
+
+    def grow_on_latent(
+        self, task: GrowthTask, pseudo: PseudoInputs, n_knots: IntArray
+    ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
+        """Both processes; the log length-scales at the knots as well."""
+        candidates, shape = task.candidates, (len(n_knots), len(task.knots))
+        at_candidates, at_knots = np.empty(len(candidates.r)), np.empty(shape)
+        results = np.empty(len(candidates.r), np.bool_), np.empty(shape), np.empty(shape)
+        self._pool.run(
+            grow_on_latent_compiled,
+            len(n_knots),
+            task.theta,
+            pseudo.offsets,
+            pseudo.r_bar,
+            pseudo.surface_class,
+            candidates.offsets,
+            candidates.r,
+            task.knots,
+            n_knots,
+            at_candidates,
+            at_knots,
+            task.height,
+            task.seed,
+            task.follows,
+            *_limits(task),
+            *results,
+        )
+        return *results, at_knots
 
     def fuse_neighbours(
         self,
@@ -332,3 +340,17 @@ class CompiledBackend:
     def close(self) -> None:
         """End the threads."""
         self._pool.close()
+
+
+def _limits(task: GrowthTask) -> tuple[FloatArray | float, ...]:
+    """Return what the growth holds the candidates against, in the order of its parameters."""
+    growth = task.growth
+    return (
+        np.exp(task.theta[:, 0]),
+        np.exp(task.theta[:, 1]),
+        task.gate_noise,
+        task.slope_std,
+        growth.max_std,
+        growth.max_standardised_residual,
+        growth.max_standardised_depth,
+    )

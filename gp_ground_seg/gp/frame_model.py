@@ -10,7 +10,7 @@ import numpy as np
 
 from gp_ground_seg.config import Config
 from gp_ground_seg.gp.backend import Backend
-from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.learning import Learned, learn
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.theta import ThetaSpace, theta_centre, theta_space
@@ -83,7 +83,7 @@ class FrameModel:
 
         NaN behind the bin of the last candidate: nothing is known of the ground there.
         """
-        n_knots = np.minimum(self.candidates.n_edges, len(knots))
+        n_knots = self._n_knots(knots)
         if self.config.length_scale.model == 'latent':
             return self.backend.log_length_scales(
                 theta, self.pseudo, self.candidates, knots, n_knots
@@ -102,22 +102,25 @@ class FrameModel:
         )
         if segment_step > 1:
             seed &= self.candidates.segment % segment_step == 0
-        u, knot_u = self.log_length_scales(theta, knots)
-        inlier, mean, std = self.backend.grow(
+        task = GrowthTask(
             self.candidates,
             self.height,
-            np.exp(u),
             seed,
             self.follows,
             knots,
-            np.exp(knot_u),
             theta,
             # Learned on inliers the noise comes out small, and the gate must not shut for that.
             np.maximum(np.exp(theta[:, 1]), self.config.observation.sigma_n),
             self.config.observation.slope_std,
             growth,
         )
-        return inlier, mean, std, knot_u
+        if self.config.length_scale.model == 'latent':
+            return self.backend.grow_on_latent(task, self.pseudo, self._n_knots(knots))
+        u, knot_u = self.log_length_scales(theta, knots)
+        return *self.backend.grow(task, u, knot_u), knot_u
+
+    def _n_knots(self, knots: FloatArray) -> IntArray:
+        return np.minimum(self.candidates.n_edges, len(knots))
 
     def surface(self, theta: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Inliers (C,); at the knots (M, K): height about the prior mean, its std [m], log l."""

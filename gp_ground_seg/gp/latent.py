@@ -13,6 +13,10 @@ from gp_ground_seg.gp.kernels import squared_exponential
 from gp_ground_seg.gp.linalg import factorise, solve
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
+LANES = 4
+"""Columns that vector instructions take at once: rows end at multiples of it, as what is left
+over at the end takes longer than all before."""
+
 
 def log_length_scale(
     r_bar: FloatArray,
@@ -123,41 +127,48 @@ def latent_rows_compiled(
     at_knots: FloatArray,
 ) -> None:
     """Do what `latent_rows_reference` does for segments ``start:stop:step``, in place."""
+    most = most_bar = 0
     for m in range(start, stop, step):
-        first, last = bar_offsets[m], bar_offsets[m + 1]
-        p = last - first
+        most = max(most, offsets[m + 1] - offsets[m])
+        most_bar = max(most_bar, bar_offsets[m + 1] - bar_offsets[m])
+    room = (most + len(knots) + LANES - 1) & -LANES
+    wanted, value = np.empty(room), np.empty(room)
+    factor, weight = np.empty((most_bar, most_bar)), np.empty(most_bar)
+    for m in range(start, stop, step):
+        at_knots[m] = np.nan
+        first, own = bar_offsets[m], offsets[m]
+        p, n, n_wanted = bar_offsets[m + 1] - first, offsets[m + 1] - own, n_knots[m]
         if p == 0:
             continue
         variance = math.exp(2.0 * theta[m, 2])
         sharpness = 0.5 * math.exp(-2.0 * theta[m, 3])
-        factor = np.empty((p, p))
-        weight = np.empty(p)
+        noise = math.exp(2.0 * theta[m, 4])
         mean = 0.0
         for i in range(p):
             mean += theta[m, 5 + surface_class[first + i]] / p
         for i in range(p):
             weight[i] = theta[m, 5 + surface_class[first + i]] - mean
-            for j in range(i + 1):
+            row = factor[i]
+            for j in range(i, p):
                 d = r_bar[first + i] - r_bar[first + j]
-                factor[j, i] = variance * decay(sharpness * d * d)
-            factor[i, i] += math.exp(2.0 * theta[m, 4])
+                row[j] = variance * decay(sharpness * d * d)
+            row[i] += noise
         if not factorise(factor, p):
             # Rounding beat the noise term: the mean is what is left to say.
-            weight[:] = 0.0
+            weight[:p] = 0.0
         else:
             solve(factor, p, weight)
-        # From pseudo-input to pseudo-input: the inner loops run along rows.
-        own = at_candidates[offsets[m] : offsets[m + 1]]
-        own_r = r[offsets[m] : offsets[m + 1]]
-        own[:] = mean
-        own_knots = at_knots[m, : n_knots[m]]
-        own_knots[:] = mean
+        # From pseudo-input to pseudo-input: the inner loop runs along a row.
+        size = (n + n_wanted + LANES - 1) & -LANES
+        wanted[:n] = r[own : own + n]
+        wanted[n : n + n_wanted] = knots[:n_wanted]
+        wanted[n + n_wanted : size] = 0.0
+        value[:size] = mean
         for j in range(p):
             scaled = weight[j] * variance
             centre = r_bar[first + j]
-            for i in range(len(own)):
-                d = own_r[i] - centre
-                own[i] += scaled * decay(sharpness * d * d)
-            for i in range(len(own_knots)):
-                d = knots[i] - centre
-                own_knots[i] += scaled * decay(sharpness * d * d)
+            for i in range(size):
+                d = wanted[i] - centre
+                value[i] += scaled * decay(sharpness * d * d)
+        at_candidates[own : own + n] = value[:n]
+        at_knots[m, :n_wanted] = value[n : n + n_wanted]

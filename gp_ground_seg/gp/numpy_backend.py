@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from gp_ground_seg.blas import single_threaded_blas
-from gp_ground_seg.config import FacesConfig, GridConfig, GrowthConfig, LabelConfig
+from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
 from gp_ground_seg.faces import Faces, find_faces
 from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
-from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled, label_points, local_roughness
 from gp_ground_seg.polar_grid import (
@@ -94,35 +94,33 @@ class NumpyBackend:
 
     @single_threaded_blas()
     def grow(
-        self,
-        candidates: Candidates,
-        height: FloatArray,
-        length_scale: FloatArray,
-        seed: BoolArray,
-        follows: BoolArray,
-        knots: FloatArray,
-        knot_length_scale: FloatArray,
-        theta: FloatArray,
-        gate_noise: FloatArray,
-        slope_std: float,
-        growth: GrowthConfig,
+        self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
         """Inliers, mean and standard deviation of the surface."""
         return grow_surface_batched(
-            candidates.offsets,
-            candidates.r,
-            height,
-            length_scale,
-            seed,
-            follows,
-            knots,
-            knot_length_scale,
-            np.exp(theta[:, 0]),
-            np.exp(theta[:, 1]),
-            gate_noise,
-            slope_std,
-            growth,
+            task.candidates.offsets,
+            task.candidates.r,
+            task.height,
+            np.exp(log_length_scale),
+            task.seed,
+            task.follows,
+            task.knots,
+            np.exp(knot_log_length_scale),
+            np.exp(task.theta[:, 0]),
+            np.exp(task.theta[:, 1]),
+            task.gate_noise,
+            task.slope_std,
+            task.growth,
         )
+
+    def grow_on_latent(
+        self, task: GrowthTask, pseudo: PseudoInputs, n_knots: IntArray
+    ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
+        """Both processes; the log length-scales at the knots as well."""
+        u, knot_u = self.log_length_scales(
+            task.theta, pseudo, task.candidates, task.knots, n_knots
+        )
+        return *self.grow(task, u, knot_u), knot_u
 
     def fuse_neighbours(
         self,

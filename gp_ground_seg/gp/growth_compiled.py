@@ -1,0 +1,261 @@
+"""Inlier growth and the surface of every segment, compiled.
+
+Row k of `whitened` is that of ``L^-1 K(inliers, candidates and knots)``. Adding an
+inlier appends one row, after which means and variances everywhere follow by one
+multiplication: a whole segment costs one factorisation. Inliers come from near to far,
+mostly: what lies nearer than the first candidate that is none needs no more rows.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gp_ground_seg.compiled import compiled_vectors
+from gp_ground_seg.gp.decay import decay
+from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.gp.latent import LANES, latent_rows_compiled
+from gp_ground_seg.polar_grid import FloatArray, IntArray
+
+
+@compiled_vectors
+def grow_surface_compiled(
+    start: int,
+    stop: int,
+    step: int,
+    offsets: IntArray,
+    r: FloatArray,
+    z: FloatArray,
+    log_length_scale: FloatArray,
+    seed: BoolArray,
+    follows: BoolArray,
+    knots: FloatArray,
+    knot_log_length_scale: FloatArray,
+    sigma_f: FloatArray,
+    sigma_n: FloatArray,
+    gate_noise: FloatArray,
+    slope_std: float,
+    max_std: float,
+    max_standardised_residual: float,
+    max_standardised_depth: float,
+    inlier: BoolArray,
+    mean: FloatArray,
+    std: FloatArray,
+) -> None:
+    """Do what `grow_surface_reference` does for segments ``start:stop:step``, in place.
+
+    Of the length-scales the logarithms.
+    """
+    most = 0
+    for m in range(start, stop, step):
+        most = max(most, offsets[m + 1] - offsets[m])
+    room = (most + len(knots) + LANES - 1) & -LANES
+    columns, whitened = np.empty((5, room)), np.empty((most, room))
+    # Unpacked at once they would not be known to be contiguous.
+    all_r, all_l, square = columns[0], columns[1], columns[2]
+    height, variance = columns[3], columns[4]
+    new = np.empty(most, np.int64)
+    slope = slope_std**2
+    for m in range(start, stop, step):
+        first = offsets[m]
+        n = offsets[m + 1] - first
+        inlier[first : first + n] = False
+        mean[m] = np.nan
+        std[m] = np.nan
+        n_new = 0
+        for i in range(n):
+            if seed[first + i]:
+                new[n_new] = i
+                n_new += 1
+        if n_new == 0:
+            continue
+        n_knots = 0
+        while n_knots < len(knots) and not math.isnan(knot_log_length_scale[m, n_knots]):
+            n_knots += 1
+        size = (n + n_knots + LANES - 1) & -LANES
+        all_r[:n] = r[first : first + n]
+        all_r[n : n + n_knots] = knots[:n_knots]
+        all_r[n + n_knots : size] = 0.0
+        all_l[:n] = log_length_scale[first : first + n]
+        all_l[n : n + n_knots] = knot_log_length_scale[m, :n_knots]
+        all_l[n + n_knots : size] = 0.0
+        sill = sigma_f[m] ** 2
+        for j in range(size):
+            all_l[j] = decay(-all_l[j])
+            square[j] = all_l[j] * all_l[j]
+            height[j] = 0.0
+            variance[j] = sill + slope * all_r[j] * all_r[j]
+        noise, gate = sigma_n[m] ** 2, gate_noise[m] ** 2
+        n_inliers = done = 0
+        # Unsigned, or columns could count from the end.
+        end = np.uintp(size)
+        while n_new > 0:
+            a = 0
+            while a < n_new:
+                # Two at a time: the rows before are read once for both.
+                i, ii = new[a], new[min(a + 1, n_new - 1)]
+                inlier[first + i] = inlier[first + ii] = True
+                while done < n and inlier[first + done]:
+                    done += 1
+                # Nothing asks for the columns before.
+                near = np.uintp(min(i, done) & -LANES)
+                row = whitened[n_inliers]
+                _covariances(i, near, end, all_r, all_l, square, sill, slope, row)
+                scale = 1.0 / math.sqrt(variance[i] + noise)
+                innovation = (z[first + i] - height[i]) * scale
+                if i == ii:
+                    _project(whitened, n_inliers, i, near, end, row)
+                    for j in range(near, end):
+                        value = row[j] * scale
+                        row[j] = value
+                        height[j] += value * innovation
+                        variance[j] -= value * value
+                    n_inliers += 1
+                    break
+                after = whitened[n_inliers + 1]
+                _covariances(ii, near, end, all_r, all_l, square, sill, slope, after)
+                _project_two(whitened, n_inliers, i, ii, near, end, row, after)
+                between = row[ii] * scale
+                left = variance[ii] - between * between
+                scale_2 = 1.0 / math.sqrt(left + noise)
+                innovation_2 = (z[first + ii] - height[ii] - between * innovation) * scale_2
+                for j in range(near, end):
+                    value = row[j] * scale
+                    value_2 = (after[j] - between * value) * scale_2
+                    row[j] = value
+                    after[j] = value_2
+                    height[j] += value * innovation + value_2 * innovation_2
+                    variance[j] -= value * value + value_2 * value_2
+                n_inliers += 2
+                a += 2
+            n_new = 0
+            for i in range(done, n):
+                if inlier[first + i]:
+                    continue
+                residual = z[first + i] - height[i]
+                limit = max_standardised_residual if residual > 0.0 else max_standardised_depth
+                spread = max(variance[i], 0.0) + gate
+                if (follows[first + i] and inlier[first + i - 1]) or (
+                    variance[i] <= max_std**2 and residual * residual <= limit * limit * spread
+                ):
+                    new[n_new] = i
+                    n_new += 1
+        for j in range(n_knots):
+            mean[m, j] = height[n + j]
+            std[m, j] = math.sqrt(max(variance[n + j], 0.0))
+
+
+@compiled_vectors
+def grow_on_latent_compiled(
+    start: int,
+    stop: int,
+    step: int,
+    theta: FloatArray,
+    bar_offsets: IntArray,
+    r_bar: FloatArray,
+    surface_class: IntArray,
+    offsets: IntArray,
+    r: FloatArray,
+    knots: FloatArray,
+    n_knots: IntArray,
+    log_length_scale: FloatArray,
+    knot_log_length_scale: FloatArray,
+    z: FloatArray,
+    seed: BoolArray,
+    follows: BoolArray,
+    sigma_f: FloatArray,
+    sigma_n: FloatArray,
+    gate_noise: FloatArray,
+    slope_std: float,
+    max_std: float,
+    max_standardised_residual: float,
+    max_standardised_depth: float,
+    inlier: BoolArray,
+    mean: FloatArray,
+    std: FloatArray,
+) -> None:
+    """Both processes of segments ``start:stop:step``, in place: threads meet once less."""
+    latent_rows_compiled(
+        start, stop, step, theta, bar_offsets, r_bar, surface_class, offsets, r, knots,
+        n_knots, log_length_scale, knot_log_length_scale,
+    )  # fmt: skip
+    grow_surface_compiled(
+        start, stop, step, offsets, r, z, log_length_scale, seed, follows, knots,
+        knot_log_length_scale, sigma_f, sigma_n, gate_noise, slope_std, max_std,
+        max_standardised_residual, max_standardised_depth, inlier, mean, std,
+    )  # fmt: skip
+
+
+@compiled_vectors
+def _covariances(
+    i: int,
+    near: int,
+    end: int,
+    all_r: FloatArray,
+    all_l: FloatArray,
+    square: FloatArray,
+    sill: float,
+    slope: float,
+    row: FloatArray,
+) -> None:
+    """Prior covariance of column `i` with the columns from `near` on (paper, eq. 8)."""
+    own_r, own_l, own_square = all_r[i], 2.0 * all_l[i], square[i]
+    tilt = slope * own_r
+    for j in range(near, end):
+        inverse = 1.0 / (own_square + square[j])
+        distance = own_r - all_r[j]
+        root = math.sqrt(own_l * all_l[j] * inverse)
+        row[j] = sill * root * decay(distance * distance * inverse) + tilt * all_r[j]
+
+
+@compiled_vectors
+def _project(
+    whitened: FloatArray, n_rows: int, i: int, near: int, end: int, row: FloatArray
+) -> None:
+    """Take out of a new row what the rows before hold of it."""
+    # Four rows at a time: the new row is read and written once for all of them.
+    k = 0
+    while k + 4 <= n_rows:
+        row_0, row_1, row_2, row_3 = whitened[k], whitened[k + 1], whitened[k + 2], whitened[k + 3]
+        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
+        for j in range(near, end):
+            row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
+        k += 4
+    while k < n_rows:
+        row_0 = whitened[k]
+        w_0 = row_0[i]
+        for j in range(near, end):
+            row[j] -= w_0 * row_0[j]
+        k += 1
+
+
+@compiled_vectors
+def _project_two(
+    whitened: FloatArray,
+    n_rows: int,
+    i: int,
+    ii: int,
+    near: int,
+    end: int,
+    row: FloatArray,
+    after: FloatArray,
+) -> None:
+    """Do what `_project` does with the rows of two columns."""
+    k = 0
+    while k + 4 <= n_rows:
+        row_0, row_1, row_2, row_3 = whitened[k], whitened[k + 1], whitened[k + 2], whitened[k + 3]
+        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
+        v_0, v_1, v_2, v_3 = row_0[ii], row_1[ii], row_2[ii], row_3[ii]
+        for j in range(near, end):
+            x_0, x_1, x_2, x_3 = row_0[j], row_1[j], row_2[j], row_3[j]
+            row[j] -= w_0 * x_0 + w_1 * x_1 + w_2 * x_2 + w_3 * x_3
+            after[j] -= v_0 * x_0 + v_1 * x_1 + v_2 * x_2 + v_3 * x_3
+        k += 4
+    while k < n_rows:
+        row_0 = whitened[k]
+        w_0, v_0 = row_0[i], row_0[ii]
+        for j in range(near, end):
+            row[j] -= w_0 * row_0[j]
+            after[j] -= v_0 * row_0[j]
+        k += 1
