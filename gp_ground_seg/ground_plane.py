@@ -25,11 +25,18 @@ PENALTY = 1.0
 """What a cell clearly below the plane takes from its score: of a street and the roofs of cars,
 or of a floor and tables, the ground is the lower one."""
 
-_N_TRIPLES = 192
-_N_LEVEL = 64
-_RESOLUTION = 4096.0
-_N_REFINEMENTS = 12
-_MIN_CELLS = 3
+N_TRIPLES = 192
+"""Planes tried through three cells each."""
+N_LEVEL = 64
+"""Level planes tried, at most."""
+MIN_AREA = 0.1
+"""Twice the area, seen from above, from which three cells make a plane [m^2]."""
+LOOSER = 1.1
+"""How much steeper than what was looked for a refined plane may be."""
+RESOLUTION = 4096.0
+"""Score of a cell right on a plane; scores of cells are whole numbers."""
+N_REFINEMENTS = 12
+MIN_CELLS = 3
 
 
 @dataclass(frozen=True)
@@ -75,13 +82,18 @@ class GroundPlane:
     n_support: int
 
     @property
-    def up(self) -> FloatArray:
-        """Unit normal that points to the sensor's side, (3,)."""
+    def normal(self) -> tuple[float, float, float]:
+        """Unit normal that points to the sensor's side."""
         length = math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
-        return np.array([-self.slope_x / length, -self.slope_y / length, 1.0 / length])
+        return -self.slope_x / length, -self.slope_y / length, 1.0 / length
+
+    @property
+    def up(self) -> FloatArray:
+        """The same as an array, (3,)."""
+        return np.array(self.normal)
 
 
-def find_plane(cells: LowCells, max_slope: float, use_compiled: bool) -> GroundPlane | None:
+def find_plane(cells: LowCells, max_slope: float) -> GroundPlane | None:
     """Find the plane that most cells lie on and few below; None if there is none.
 
     Consensus (Fischler & Bolles, CACM 1981) over planes through a fixed, evenly spread
@@ -94,20 +106,17 @@ def find_plane(cells: LowCells, max_slope: float, use_compiled: bool) -> GroundP
         Where the ground may be.
     max_slope : float
         Steepest plane to look for, as rise per metre.
-    use_compiled : bool
-        Compiled code, or its twin in numpy; both give the same but for rounding.
     """
-    if len(cells.z) < _MIN_CELLS:
+    if len(cells.z) < MIN_CELLS:
         return None
     hypotheses = _hypotheses(cells, max_slope)
     if len(hypotheses) == 0:
         return None
-    score, refine = (score_compiled, refine_compiled) if use_compiled else (_score, _refine)
-    arguments = cells.x, cells.y, cells.z, cells.tolerance
-    best = hypotheses[int(np.argmax(score(hypotheses, *arguments)))]
-    height, slope_x, slope_y = refine(best, *arguments)
+    best = hypotheses[int(np.argmax(_score(hypotheses, cells)))]
+    height, slope_x, slope_y = _refine(best, cells)
     if not (
-        MIN_HEIGHT <= height <= MAX_HEIGHT and math.hypot(slope_x, slope_y) <= 1.1 * max_slope
+        MIN_HEIGHT <= height <= MAX_HEIGHT
+        and slope_x * slope_x + slope_y * slope_y <= (LOOSER * max_slope) ** 2
     ):
         # Nothing holds the refined plane: what was found is no ground.
         height, slope_x, slope_y = best
@@ -123,9 +132,8 @@ def _describe(
     n_on_it = int(np.count_nonzero(on_it))
     if n_on_it == 0:
         return None
-    r = np.hypot(cells.x[on_it], cells.y[on_it])
-    sector = cells.sector[on_it]
-    depression = np.sort(np.arctan2(-cells.z[on_it], r))
+    r, sector = cells.r[on_it], cells.sector[on_it]
+    drop = np.sort(-cells.z[on_it] / r)
     near = np.sort(distance[on_it][r < NEAR])
     few, most = n_on_it // 10, (9 * n_on_it) // 10
     return GroundPlane(
@@ -137,7 +145,7 @@ def _describe(
         coverage=_n_different(sector) / N_SECTORS,
         far_coverage=_n_different(sector[r >= FAR]) / _n_different(cells.sector),
         reach=float(np.sort(r)[most]),
-        spread=float(depression[most] - depression[few]),
+        spread=math.atan(drop[most]) - math.atan(drop[few]),
         residual=float(np.sqrt(np.mean(distance[on_it] ** 2))),
         n_cells=len(distance),
         n_support=n_on_it,
@@ -159,19 +167,20 @@ def _spread(n: int) -> FloatArray:
     return points
 
 
-_SPREAD = _spread(_N_TRIPLES)
+SPREAD = _spread(N_TRIPLES)
+"""Which three cells, as shares of their number, (N_TRIPLES, 3)."""
 
 
 def _hypotheses(cells: LowCells, max_slope: float) -> FloatArray:
     """Planes that may be the ground, (H, 3): height, slope_x, slope_y."""
     n = len(cells.z)
-    level = np.zeros((min(n, _N_LEVEL), 3))
+    level = np.zeros((min(n, N_LEVEL), 3))
     level[:, 0] = -cells.z[np.arange(len(level)) * n // len(level)]
-    i, j, k = (_SPREAD * n).astype(np.int64).T
+    i, j, k = (SPREAD * n).astype(np.int64).T
     x1, y1, z1 = (v[j] - v[i] for v in (cells.x, cells.y, cells.z))
     x2, y2, z2 = (v[k] - v[i] for v in (cells.x, cells.y, cells.z))
     area = x1 * y2 - x2 * y1
-    wide = np.flatnonzero(np.abs(area) > 0.1)
+    wide = np.flatnonzero(np.abs(area) > MIN_AREA)
     i, area = i[wide], area[wide]
     slope_x = (z1[wide] * y2[wide] - z2[wide] * y1[wide]) / area
     slope_y = (x1[wide] * z2[wide] - x2[wide] * z1[wide]) / area
@@ -180,81 +189,32 @@ def _hypotheses(cells: LowCells, max_slope: float) -> FloatArray:
     possible = (
         (found[:, 0] >= MIN_HEIGHT)
         & (found[:, 0] <= MAX_HEIGHT)
-        & (np.hypot(found[:, 1], found[:, 2]) <= max_slope)
+        & (found[:, 1] * found[:, 1] + found[:, 2] * found[:, 2] <= max_slope * max_slope)
     )
     kept: FloatArray = found[possible]
     return kept
 
 
-def _score(
-    planes: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, tolerance: FloatArray
-) -> npt.NDArray[np.int64]:
+def _score(planes: FloatArray, cells: LowCells) -> npt.NDArray[np.int64]:
     """Support less penalty of each plane, (H,); in whole numbers, which add up in any order."""
     height, slope_x, slope_y = (column[:, None] for column in planes.T)
-    d = (z - (slope_x * x + slope_y * y - height)) / tolerance
-    gain = np.where(np.abs(d) < 1.0, _RESOLUTION * (1.0 - d * d), 0.0).astype(np.int64)
-    loss = np.where(d < -CLEARLY_BELOW, int(PENALTY * _RESOLUTION), 0)
+    # Times the inverse, as the twin does it: even the last bit of a score is the same.
+    d = (cells.z - (slope_x * cells.x + slope_y * cells.y - height)) * (1.0 / cells.tolerance)
+    gain = np.where(np.abs(d) < 1.0, RESOLUTION * (1.0 - d * d), 0.0).astype(np.int64)
+    loss = np.where(d < -CLEARLY_BELOW, int(PENALTY * RESOLUTION), 0)
     total: npt.NDArray[np.int64] = (gain - loss).sum(axis=1)
     return total
 
 
-@compiled
-def score_compiled(
-    planes: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, tolerance: FloatArray
-) -> npt.NDArray[np.int64]:
-    """Do what `_score` does."""
-    total = np.zeros(len(planes), dtype=np.int64)
-    for h in range(len(planes)):
-        height, slope_x, slope_y = planes[h, 0], planes[h, 1], planes[h, 2]
-        own = 0
-        for c in range(len(z)):
-            d = (z[c] - (slope_x * x[c] + slope_y * y[c] - height)) / tolerance[c]
-            if abs(d) < 1.0:
-                own += int(_RESOLUTION * (1.0 - d * d))
-            elif d < -CLEARLY_BELOW:
-                own -= int(PENALTY * _RESOLUTION)
-        total[h] = own
-    return total
-
-
-def _refine(
-    plane: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, tolerance: FloatArray
-) -> tuple[float, float, float]:
+def _refine(plane: FloatArray, cells: LowCells) -> tuple[float, float, float]:
     """Weighted least squares with Tukey's weights of the plane before, again and again."""
     height, slope_x, slope_y = plane
-    for _ in range(_N_REFINEMENTS):
+    x, y, z, tolerance = cells.x, cells.y, cells.z, cells.tolerance
+    for _ in range(N_REFINEMENTS):
         d = (z - (slope_x * x + slope_y * y - height)) / tolerance
         weight = np.maximum(1.0 - 0.5 * d * d, 0.0) ** 2 / tolerance**2
         columns = 1.0, x, y, x * x, x * y, y * y, z, x * z, y * z
         w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = (float(np.sum(weight * v)) for v in columns)
-        height, slope_x, slope_y = solve_plane(
-            w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, height, slope_x, slope_y
-        )
-    return height, slope_x, slope_y
-
-
-@compiled
-def refine_compiled(
-    plane: FloatArray, x: FloatArray, y: FloatArray, z: FloatArray, tolerance: FloatArray
-) -> tuple[float, float, float]:
-    """Do what `_refine` does."""
-    height, slope_x, slope_y = plane[0], plane[1], plane[2]
-    for _ in range(_N_REFINEMENTS):
-        w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for c in range(len(z)):
-            d = (z[c] - (slope_x * x[c] + slope_y * y[c] - height)) / tolerance[c]
-            root = 1.0 - 0.5 * d * d
-            if root > 0.0:
-                weight = root**2 / tolerance[c] ** 2
-                w += weight
-                wx += weight * x[c]
-                wy += weight * y[c]
-                wxx += weight * x[c] * x[c]
-                wxy += weight * x[c] * y[c]
-                wyy += weight * y[c] * y[c]
-                wz += weight * z[c]
-                wxz += weight * x[c] * z[c]
-                wyz += weight * y[c] * z[c]
         height, slope_x, slope_y = solve_plane(
             w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, height, slope_x, slope_y
         )

@@ -6,16 +6,17 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from gp_ground_seg.config import SensorConfig
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.ground_plane import GroundPlane, find_plane
-from gp_ground_seg.low_cells import low_cells
+from gp_ground_seg.ground_plane import GroundPlane
 from gp_ground_seg.parameter_spec import AUTO
+from gp_ground_seg.plane_passes import plane_below
 from gp_ground_seg.polar_grid import Candidates, FloatArray, PointArray
-from gp_ground_seg.tilt import angles_of, rotation, rounded, turned
+from gp_ground_seg.tilt import Direction, angles_of, rotation, rounded, turned, vertical
 from gp_ground_seg.up_axis import is_suspicious, other_way_up
 
 DEFAULT_HEIGHT = 1.73
@@ -133,6 +134,7 @@ class SensorPose:
         return below
 
 
+@lru_cache(maxsize=4)
 def given_pose(sensor: SensorConfig) -> SensorPose:
     """Pose by the parameters alone: angles that are auto 0, a height that is auto the default."""
     return SensorPose(
@@ -168,7 +170,7 @@ def estimate_pose(
         If roll or pitch is auto and z is clearly not up.
     """
     given = given_pose(sensor)
-    plane = find_plane(low_cells(candidates, use_compiled), math.tan(MAX_TILT), use_compiled)
+    plane = plane_below(candidates, math.tan(MAX_TILT), use_compiled)
     not_up = None
     if is_suspicious(plane):
         not_up = other_way_up(given.rotation, plane, use_compiled, candidates_turned)
@@ -184,15 +186,16 @@ def estimate_pose(
         and plane.coverage >= MIN_COVERAGE
         and plane.reach >= MIN_REACH
     )
-    own_up = plane.up
-    up = own_up if given.is_level else given.rotation.T @ own_up
+    own_up = plane.normal
+    up = own_up if given.is_level else _turned_back(own_up, given.rotation)
     roll, pitch = _levelled(up, sensor)
-    corrects = tells_tilt and _angle(rotation(roll, pitch)[2], given.rotation[2]) >= CLEAR_TILT
+    levelled = vertical(roll, pitch)
+    corrects = tells_tilt and _angle(levelled, vertical(given.roll, given.pitch)) >= CLEAR_TILT
     # Along the vertical of the pose used, not across the plane.
-    along = float((rotation(roll, pitch) @ up)[2]) if corrects else float(own_up[2])
+    along = _product(levelled, up) if corrects else own_up[2]
     if not corrects:
         roll, pitch = given.roll, given.pitch
-    height = rounded(plane.near_height * float(own_up[2]) / along)
+    height = rounded(plane.near_height * own_up[2] / along)
     own_roll, own_pitch = angles_of(up)
     measured = MeasuredPose(height, own_roll, own_pitch, tells_height, tells_tilt, plane)
     estimates_height = sensor.height == AUTO and tells_height
@@ -208,8 +211,13 @@ def estimate_pose(
     )
 
 
-def _levelled(up: FloatArray, sensor: SensorConfig) -> tuple[float, float]:
-    """Roll and pitch [rad] that turn `up` (3,) upwards as far as those given allow."""
+def _turned_back(up: Direction, matrix: FloatArray) -> Direction:
+    x, y, z = (matrix.T @ up).tolist()
+    return x, y, z
+
+
+def _levelled(up: Direction, sensor: SensorConfig) -> tuple[float, float]:
+    """Roll and pitch [rad] that turn `up` upwards as far as those given allow."""
     roll = rounded(math.atan2(up[1], up[2])) if sensor.roll == AUTO else sensor.roll
     if sensor.pitch != AUTO:
         return roll, sensor.pitch
@@ -217,8 +225,12 @@ def _levelled(up: FloatArray, sensor: SensorConfig) -> tuple[float, float]:
     return roll, rounded(math.atan2(-up[0], across))
 
 
-def _angle(a: FloatArray, b: FloatArray) -> float:
-    return math.acos(min(max(float(a @ b), -1.0), 1.0))
+def _product(a: Direction, b: Direction) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _angle(a: Direction, b: Direction) -> float:
+    return math.acos(min(max(_product(a, b), -1.0), 1.0))
 
 
 def _contradictions(sensor: SensorConfig, measured: MeasuredPose) -> tuple[str, ...]:
@@ -231,7 +243,7 @@ def _contradictions(sensor: SensorConfig, measured: MeasuredPose) -> tuple[str, 
                 f'sensor.height = {sensor.height:g}: the ground near the sensor is '
                 f'{measured.height:.2f} m below it'
             )
-    if measured.tells_tilt and math.acos(min(float(plane.up[2]), 1.0)) > TILT_CONTRADICTION:
+    if measured.tells_tilt and math.acos(min(plane.normal[2], 1.0)) > TILT_CONTRADICTION:
         names = [n for n in ('roll', 'pitch') if getattr(sensor, n) != AUTO]
         if names:
             words = ', '.join(f'sensor.{name} = {getattr(sensor, name):g}' for name in names)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from gp_ground_seg.polar_grid import FloatArray
 
 BoolArray = npt.NDArray[np.bool_]
+Direction = tuple[float, float, float]
 
 ENOUGH_POINTS = 20000
 """Points that show well enough which way is up."""
@@ -31,6 +32,12 @@ def rotation(roll: float, pitch: float) -> FloatArray:
 def _sine_cosine(angle: float) -> tuple[float, float]:
     sine, cosine = math.sin(angle), math.cos(angle)
     return (0.0 if abs(sine) < 1e-12 else sine), (0.0 if abs(cosine) < 1e-12 else cosine)
+
+
+def vertical(roll: float, pitch: float) -> Direction:
+    """Last row of `rotation`: the direction that is up, in the frame of the sensor."""
+    (sr, cr), (sp, cp) = _sine_cosine(roll), _sine_cosine(pitch)
+    return -sp, cp * sr, cp * cr
 
 
 def turned(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
@@ -54,7 +61,7 @@ def turned_sample(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_
     return turned(xyz[:: len(xyz) // ENOUGH_POINTS + 1], matrix)
 
 
-def angles_of(up: FloatArray) -> tuple[float, float]:
+def angles_of(up: FloatArray | Direction) -> tuple[float, float]:
     """Roll and pitch [rad] of a sensor in whose frame the unit vector `up` (3,) points up."""
     roll = math.atan2(up[1], up[2])
     return rounded(roll), rounded(math.atan2(-up[0], math.hypot(up[1], up[2])))

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from gp_ground_seg.ground_plane import GroundPlane, find_plane
-from gp_ground_seg.low_cells import low_cells
+from gp_ground_seg.ground_plane import GroundPlane
+from gp_ground_seg.plane_passes import plane_below
 from gp_ground_seg.polar_grid import Candidates, FloatArray
 from gp_ground_seg.tilt import angles_of, rotation
 
@@ -97,8 +97,7 @@ def other_way_up(
     farthest = plane.height / NEARER if plane is not None and _is_tall(plane) else math.inf
 
     def look(turn: FloatArray) -> GroundPlane | None:
-        cells = low_cells(candidates_turned(turn), use_compiled)
-        return find_plane(cells, math.tan(MAX_TILT), use_compiled)
+        return plane_below(candidates_turned(turn), math.tan(MAX_TILT), use_compiled)
 
     best: tuple[float, FloatArray, float] | None = None
     for angles in _TURNS:

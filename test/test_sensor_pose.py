@@ -23,10 +23,20 @@ from gp_ground_seg.datasets.simulator import (
 )
 from gp_ground_seg.datasets.simulator.objects import floating_box, wall
 from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.ground_plane import find_plane
-from gp_ground_seg.low_cells import low_cells
+from gp_ground_seg.low_cells import directions, low_cells
+from gp_ground_seg.plane_passes import (
+    ALLOWED,
+    INVERSE,
+    N_LARGEST,
+    RANGE,
+    X,
+    Y,
+    Z,
+    plane_below,
+    tabulate,
+)
 from gp_ground_seg.points import check_points
-from gp_ground_seg.polar_grid import build_polar_grid, ground_candidates, reduce_cells
+from gp_ground_seg.polar_grid import Candidates, build_polar_grid, ground_candidates, reduce_cells
 from gp_ground_seg.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT, SensorPose, estimate_pose
 from gp_ground_seg.tilt import angles_of, rotation, turned_sample
 
@@ -56,6 +66,18 @@ def pose_of(points, use_compiled=True, **sensor):
         use_compiled,
         lambda turn: candidates_of(turned_sample(xyz, turn)),
     )
+
+
+def assert_same_cells(candidates):
+    """What the compiled code makes of the candidates is what its twin does."""
+    slow = low_cells(candidates)
+    cells, sectors = np.empty((6, N_LARGEST)), np.empty(N_LARGEST, dtype=np.int64)
+    offsets = candidates.offsets
+    n = tabulate(offsets, candidates.r, candidates.z, directions(len(offsets) - 1), cells, sectors)
+    rows = {X: slow.x, Y: slow.y, Z: slow.z, RANGE: slow.r, ALLOWED: slow.tolerance}
+    for row, expected in {**rows, INVERSE: 1.0 / slow.tolerance}.items():
+        np.testing.assert_array_equal(cells[row, :n], expected)
+    np.testing.assert_array_equal(sectors[:n], slow.sector)
 
 
 def tilted(points, roll, pitch):
@@ -128,10 +150,9 @@ def test_a_cluttered_plane_is_recovered(seed, height, roll, pitch):
 @given(st.integers(0, 2**32 - 1))
 def test_twins_agree_and_the_order_of_points_does_not_matter(seed):
     points = cluttered_plane(seed, 1.5, 0.1, -0.05)
-    slow, fast = (low_cells(candidates_of(points), compiled) for compiled in (False, True))
-    for name in ('x', 'y', 'z', 'tolerance', 'sector'):
-        np.testing.assert_array_equal(getattr(slow, name), getattr(fast, name))
-    a, b = (find_plane(slow, 0.5, compiled) for compiled in (False, True))
+    candidates = candidates_of(points)
+    assert_same_cells(candidates)
+    a, b = (plane_below(candidates, 0.5, compiled) for compiled in (False, True))
     np.testing.assert_allclose(dataclasses.astuple(a), dataclasses.astuple(b), atol=1e-9)
     order = np.random.default_rng(seed).permutation(len(points))
     assert pose_of(points) == pose_of(points[order])
@@ -140,6 +161,27 @@ def test_twins_agree_and_the_order_of_points_does_not_matter(seed):
         for compiled in (True, False)
     )
     assert same == other
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.integers(0, 40), st.floats(0.0, 1.0))
+def test_twins_agree_on_anything(seed, n_segments, n_bins, share):
+    """Few cells or many, equally low ones, nearer, farther, lower than what counts."""
+    rng = np.random.default_rng(seed)
+    n = rng.binomial(n_bins, share, n_segments)
+    offsets = np.concatenate([[0], np.cumsum(n)])
+    r = [np.sort(rng.choice(np.geomspace(0.4, 50.0, 60), k, replace=False)) for k in n]
+    z = np.round(rng.choice([-1.7, 0.0, 70.0], offsets[-1], p=[0.8, 0.15, 0.05]), 1)
+    z += np.round(rng.normal(0.0, 0.1, offsets[-1]), 1)
+    nothing = np.zeros(offsets[-1])
+    candidates = Candidates(
+        np.concatenate(r), z, nothing.astype(np.int64), nothing, offsets, nothing.astype(np.int32)
+    )
+    assert_same_cells(candidates)
+    a, b = (plane_below(candidates, 0.577, compiled) for compiled in (False, True))
+    assert (a is None) == (b is None)
+    if a is not None and b is not None:
+        np.testing.assert_allclose(dataclasses.astuple(a), dataclasses.astuple(b), atol=1e-9)
 
 
 @settings(max_examples=20)
