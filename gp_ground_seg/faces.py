@@ -62,7 +62,7 @@ def find_faces(
     """
     inside = tiles.tile != OUTSIDE
     own, points = tiles.tile[inside], xyz[inside].astype(np.float64)
-    n_tiles = len(tiles.foot_z)
+    n_tiles = len(tiles.extremes)
     above_foot = points[:, 2] - tiles.foot_z[own]
     low = above_foot <= max_height
     is_tall = np.zeros(n_tiles, dtype=np.bool_)

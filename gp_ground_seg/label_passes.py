@@ -33,8 +33,7 @@ def judge_faces(
     step: int,
     columns: PointArray,
     tile: CellArray,
-    foot_z: PointArray,
-    top_z: PointArray,
+    extremes: PointArray,
     min_height: float,
     max_height: float,
     max_normal_z: float,
@@ -63,9 +62,9 @@ def judge_faces(
         k = own_slots[own]
         if k == SKIPPED:
             continue
-        foot = np.float64(foot_z[own])
+        foot = np.float64(extremes[own, 0])
         if k == 0:
-            if tile[i] % step != start or np.float64(top_z[own]) - foot <= min_height:
+            if tile[i] % step != start or np.float64(extremes[own, 1]) - foot <= min_height:
                 own_slots[own] = SKIPPED
                 continue
             n_slots += 1
@@ -167,7 +166,7 @@ def label_by_height(
     height: FloatArray,
     is_face: BoolArray,
     is_footless: BoolArray,
-    foot_z: PointArray,
+    tile_extremes: PointArray,
     band: FloatArray,
     below_tolerance: float,
     face_tolerance: float,
@@ -184,7 +183,8 @@ def label_by_height(
         own = min(band[np.uintp(n)] - height[i], height[i] + below_tolerance)
         if is_face[np.uintp(tile[i])]:
             over_foot = max(
-                height[i], np.float64(columns[2, i]) - np.float64(foot_z[np.uintp(tile[i])])
+                height[i],
+                np.float64(columns[2, i]) - np.float64(tile_extremes[np.uintp(tile[i]), 0]),
             )
             reach = -face_tolerance if is_footless[np.uintp(tile[i])] else face_tolerance
             own = min(own, reach - over_foot)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,12 +12,14 @@ import numpy.typing as npt
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.config import GridConfig
 from gp_ground_seg.polar_grid import (
+    NO_TILE,
     NOT_FINITE,
     OUTSIDE,
     FloatArray,
     IntArray,
     PointArray,
     bin_edges,
+    reach,
     segment_edges,
 )
 
@@ -29,43 +32,65 @@ EARLY = 0.02
 puts a value off in the largest table."""
 
 
-def first_bins(edges: FloatArray, fineness: int) -> tuple[npt.NDArray[np.int32], float]:
-    """Table that says where to begin to look for the bin of a value.
+class Ruler(NamedTuple):
+    """Edges of bins, and a table that tells the bin of a value without a search.
+
+    Attributes
+    ----------
+    edges : (n + 1,) float32 or float64
+        A value lies at or beyond the exact edge if, and only if, it does beyond this one
+        (see `gp_ground_seg.polar_grid.reach`); in the precision of the values.
+    bins : (T,) int32
+        Bin of the values from ``edges[0] + k / scale`` on, a little early.
+    ends : (T,) float32 or float64
+        Where that bin ends.
+    scale : float
+        Entries per unit.
+    is_coarse : bool
+        Whether more than one edge may lie in an entry.
+    """
+
+    edges: PointArray
+    bins: CellArray
+    ends: PointArray
+    scale: float
+    is_coarse: bool
+
+
+def make_ruler(edges: FloatArray, fineness: int, dtype: np.dtype[np.floating]) -> Ruler:
+    """Ruler of the bins between `edges` (n + 1,) for values of type `dtype`.
 
     Parameters
     ----------
     edges : (n + 1,) float64
         Edges of the bins.
     fineness : int
-        Entries in the narrowest bin: the more, the rarer a second look. Fewer where
-        there would be more than `LARGEST_TABLE` in all.
-
-    Returns
-    -------
-    table : (T,) int32
-        Bin of the values ``edges[0] + k / scale``; the bin of a value in between is
-        that one, or one soon after.
-    scale : float
-        Entries per unit.
+        Entries in the narrowest bin. Fewer where there would be more than
+        `LARGEST_TABLE` in all.
+    dtype : dtype
+        Precision of the values.
     """
-    extent = float(edges[-1] - edges[0])
-    scale = min(fineness / float(np.diff(edges).min()), LARGEST_TABLE / extent)
+    extent, narrowest = float(edges[-1] - edges[0]), float(np.diff(edges).min())
+    scale = min(fineness / narrowest, LARGEST_TABLE / extent)
     size = int(extent * scale) + 2
     # A little early, so that rounding never puts an entry too far.
     starts = edges[0] + (np.arange(size) - EARLY) / scale
-    table = np.searchsorted(edges, starts, side='right') - 1
-    return np.clip(table, 0, len(edges) - 2).astype(np.int32), scale
+    bins = np.clip(np.searchsorted(edges, starts, side='right') - 1, 0, len(edges) - 2)
+    own_edges = np.array([reach(edges[: k + 1], dtype) for k in range(len(edges))], dtype=dtype)
+    is_coarse = narrowest * scale < 1.0 + 2.0 * EARLY
+    arrays = own_edges, bins.astype(np.int32), own_edges[bins + 1]
+    for array in arrays:
+        array.setflags(write=False)
+    return Ruler(*arrays, scale, is_coarse)
 
 
 @lru_cache(maxsize=4)
-def grid_ruler(
-    grid: GridConfig,
-) -> tuple[FloatArray, CellArray, float, FloatArray, CellArray, float]:
-    """Edges of the bins and of the segments, each with its table of where to begin to look."""
-    edges, turns = bin_edges(grid), segment_edges(grid.n_segments)
-    for array in (edges, turns):
-        array.setflags(write=False)
-    return edges, *first_bins(edges, 4), turns, *first_bins(turns, 8)
+def grid_rulers(grid: GridConfig, dtype: np.dtype[np.floating]) -> tuple[FloatArray, Ruler, Ruler]:
+    """Edges of the bins (n_bins + 1,) float64, their ruler, and that of the segments."""
+    edges = bin_edges(grid)
+    edges.setflags(write=False)
+    turns = segment_edges(grid.n_segments)
+    return edges, make_ruler(edges, 4, dtype), make_ruler(turns, 8, dtype)
 
 
 @compiled
@@ -74,43 +99,53 @@ def sort_points(
     start: int,
     stop: int,
     columns: PointArray,
-    edges: FloatArray,
-    table: CellArray,
-    scale: float,
-    turn_edges: FloatArray,
-    turn_table: CellArray,
-    turn_scale: float,
-    farthest: float,
+    ranges: Ruler,
+    turns: Ruler,
     tiles_per_metre: float,
     n_sides: int,
     cell: CellArray,
     r: PointArray,
-    lowest_z: FloatArray,
-    lowest_r: FloatArray,
-    highest_z: FloatArray,
-    count: IntArray,
-    lowest_tile: CellArray,
+    extremes: PointArray,
+    numbers: CellArray,
     tile: CellArray,
-    foot_z: PointArray,
-    top_z: PointArray,
+    tile_extremes: PointArray,
     touched: CellArray,
 ) -> None:
     """Sort points `start` to `stop` into cells and tiles, with the extremes of each.
 
     The twins are `polar_grid.build_polar_grid`, `reduce_cells` and `tiles.build_tiles`.
-    The tables ``[share]`` start empty. Block by block: where the points lie, in loops
-    without branches; then the extremes.
+    The tables ``[share]`` have a last row for the points that are in none. Block by
+    block: where the points lie, in loops without branches; then the extremes.
     """
-    turn, near = np.empty(BLOCK, dtype=columns.dtype), np.empty(BLOCK, dtype=np.int32)
+    own_extremes, own_numbers = extremes[share], numbers[share]
+    own_tile_extremes, own_touched = tile_extremes[share], touched[share]
+    _empty(own_extremes, own_numbers, own_tile_extremes, own_touched)
+    own_r_entry = np.empty(BLOCK, dtype=np.int32)
+    own_turn, own_turn_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
     for first in range(start, stop, BLOCK):
         own = slice(first, min(first + BLOCK, stop))
         x, y, z = columns[0, own], columns[1, own], columns[2, own]
-        _measure_range(x, y, z, edges[0], farthest, scale, r[own], near, cell[own])
-        _measure_turn(x, y, farthest, tiles_per_metre, n_sides, cell[own], turn, tile[own])
-        _look_up(edges, table, turn_edges, turn_table, turn_scale, r[own], near, turn, cell[own])
-        _reduce_cells(z, r[own], cell[own], tile[own], lowest_z[share], lowest_r[share],
-                      highest_z[share], count[share], lowest_tile[share])  # fmt: skip
-        _reduce_tiles(z, tile[own], foot_z[share], top_z[share], touched[share])
+        _measure_range(x, y, z, ranges, r[own], own_r_entry, cell[own])
+        _measure_turn(x, y, ranges.edges[-1], turns.scale, tiles_per_metre, n_sides, cell[own],
+                      own_turn, own_turn_entry, tile[own])  # fmt: skip
+        _look_up(ranges, turns, r[own], own_r_entry, own_turn, own_turn_entry, cell[own])
+        _widen_cells(z, cell[own], own_extremes, own_numbers)
+        _widen_tiles(z, tile[own], own_tile_extremes, own_touched)
+    own = slice(start, stop)
+    _settle_lowest(columns[2, own], r[own], cell[own], tile[own], own_extremes, own_numbers)
+
+
+@compiled
+def _empty(
+    extremes: PointArray, numbers: CellArray, tile_extremes: PointArray, touched: CellArray
+) -> None:
+    for k in range(len(numbers)):
+        extremes[k, 0] = extremes[k, 1] = np.inf
+        extremes[k, 2] = -np.inf
+        numbers[k, 0], numbers[k, 1] = 0, NO_TILE
+    for k in range(len(tile_extremes)):
+        tile_extremes[k, 0], tile_extremes[k, 1] = np.inf, -np.inf
+    touched[0] = 0
 
 
 @compiled
@@ -118,17 +153,15 @@ def _measure_range(
     x: PointArray,
     y: PointArray,
     z: PointArray,
-    nearest: float,
-    farthest: float,
-    scale: float,
+    ranges: Ruler,
     r: PointArray,
-    near: CellArray,
+    entry: CellArray,
     cell: CellArray,
 ) -> None:
     """Range of each point and its entry in the table; ``cell`` 0, or why it has none."""
     number = x.dtype.type
     zero, infinity, nothing = number(0.0), number(np.inf), number(np.nan)
-    start, end, per_metre = number(nearest), number(farthest), number(scale)
+    start, end, per_metre = ranges.edges[0], ranges.edges[-1], number(ranges.scale)
     for i in range(len(r)):
         finite = (abs(x[i]) < infinity) & (abs(y[i]) < infinity) & (abs(z[i]) < infinity)
         own_r = math.sqrt(x[i] * x[i] + y[i] * y[i])
@@ -136,7 +169,7 @@ def _measure_range(
         r[i] = own_r if finite else nothing
         cell[i] = 0 if inside else (OUTSIDE if finite else NOT_FINITE)
         beyond = (own_r - start) * per_metre
-        near[i] = np.int32(beyond if inside & (beyond > zero) else zero)
+        entry[i] = np.int32(beyond if inside & (beyond > zero) else zero)
 
 
 # Apart from the other: of many arrays the compiler does not find out that none overlap.
@@ -145,16 +178,19 @@ def _measure_turn(
     x: PointArray,
     y: PointArray,
     farthest: float,
+    scale: float,
     tiles_per_metre: float,
     n_sides: int,
     cell: CellArray,
     turn: PointArray,
+    entry: CellArray,
     tile: CellArray,
 ) -> None:
-    """Pseudo-angle and tile of each point that has a cell."""
+    """Pseudo-angle of each point that has a cell, its entry in the table, and the tile."""
     number = x.dtype.type
     zero, two, four = number(0.0), number(2.0), number(4.0)
     half, per_metre, last = number(farthest), number(tiles_per_metre), number(n_sides - 1)
+    per_turn = number(scale)
     for i in range(len(cell)):
         inside = cell[i] == 0
         own_x = x[i] if inside else zero
@@ -164,7 +200,9 @@ def _measure_turn(
         left = -share if own_y < zero else four - share
         own_turn = two + share if own_x >= zero else left
         # Exactly 4 is the edge that ends the last segment: that is segment 0 again.
-        turn[i] = own_turn if own_turn < four else zero
+        own_turn = own_turn if own_turn < four else zero
+        turn[i] = own_turn
+        entry[i] = np.int32(own_turn * per_turn)
         column = np.int32(min((own_x + half) * per_metre, last))
         row = np.int32(min((own_y + half) * per_metre, last))
         tile[i] = column * np.int32(n_sides) + row if inside else OUTSIDE
@@ -172,136 +210,102 @@ def _measure_turn(
 
 @compiled
 def _look_up(
-    edges: FloatArray,
-    table: CellArray,
-    turn_edges: FloatArray,
-    turn_table: CellArray,
-    turn_scale: float,
+    ranges: Ruler,
+    turns: Ruler,
     r: PointArray,
-    near: CellArray,
+    r_entry: CellArray,
     turn: PointArray,
+    turn_entry: CellArray,
     cell: CellArray,
 ) -> None:
-    """Cell of the points that have one: the table's bin, or one soon after."""
-    n_bins = len(edges) - 1
+    """Cell of the points that have one: the bin of the table's entry, or the one after."""
+    n_bins = np.int32(len(ranges.edges) - 1)
+    one = np.int32(1)
     for i in range(len(cell)):
-        if cell[i] != 0:
-            continue
-        # One step without a branch, which nobody could predict; more are rare.
-        n = np.intp(table[np.uintp(near[i])])
-        n += np.intp(r[i] >= edges[np.uintp(n + 1)])
-        while r[i] >= edges[np.uintp(n + 1)]:
-            n += 1
-        m = np.intp(turn_table[np.uintp(turn[i] * turn_scale)])
-        m += np.intp(turn[i] >= turn_edges[np.uintp(m + 1)])
-        while turn[i] >= turn_edges[np.uintp(m + 1)]:
-            m += 1
-        cell[i] = m * n_bins + n
+        k, q = np.uintp(r_entry[i]), np.uintp(turn_entry[i])
+        n = ranges.bins[k] + (one if r[i] >= ranges.ends[k] else np.int32(0))
+        m = turns.bins[q] + (one if turn[i] >= turns.ends[q] else np.int32(0))
+        if ranges.is_coarse and cell[i] == 0:
+            while r[i] >= ranges.edges[np.uintp(n + 1)]:
+                n += one
+        if turns.is_coarse:
+            while turn[i] >= turns.edges[np.uintp(m + 1)]:
+                m += one
+        cell[i] = m * n_bins + n if cell[i] == 0 else cell[i]
 
 
 @compiled
-def _reduce_cells(
-    z: PointArray,
-    r: PointArray,
-    cell: CellArray,
-    tile: CellArray,
-    lowest_z: FloatArray,
-    lowest_r: FloatArray,
-    highest_z: FloatArray,
-    count: IntArray,
-    lowest_tile: CellArray,
-) -> None:
-    """Extremes of the cells.
-
-    Sensors send neighbours one after the other: the extremes of the latest cell stay
-    in registers until a point of another one comes.
-    """
-    held = np.uintp(0)
-    low_z, low_r, high_z, number = lowest_z[0], lowest_r[0], highest_z[0], count[0]
-    low_tile = lowest_tile[0]
-    for i in range(len(cell)):
-        if cell[i] < 0:
-            continue
-        own = np.uintp(cell[i])
-        if own != held:
-            lowest_z[held], lowest_r[held], lowest_tile[held] = low_z, low_r, low_tile
-            highest_z[held], count[held] = high_z, number
-            held = own
-            low_z, low_r, low_tile = lowest_z[held], lowest_r[held], lowest_tile[held]
-            high_z, number = highest_z[held], count[held]
-        own_z, own_r = np.float64(z[i]), np.float64(r[i])
-        number += 1
-        high_z = max(high_z, own_z)
-        if own_z > low_z:
-            continue
-        if own_z < low_z or own_r < low_r or (own_r == low_r and tile[i] < low_tile):
-            low_z, low_r, low_tile = own_z, own_r, tile[i]
-    lowest_z[held], lowest_r[held], lowest_tile[held] = low_z, low_r, low_tile
-    highest_z[held], count[held] = high_z, number
+def _widen_cells(z: PointArray, cell: CellArray, extremes: PointArray, numbers: CellArray) -> None:
+    """Heights and number of the points of each cell, without a branch."""
+    for i in range(len(z)):
+        k = np.uintp(cell[i] if cell[i] >= 0 else len(numbers) - 1)
+        low, high = extremes[k, 0], extremes[k, 2]
+        extremes[k, 0] = z[i] if z[i] < low else low
+        extremes[k, 2] = z[i] if z[i] > high else high
+        numbers[k, 0] += np.int32(1)
 
 
 @compiled
-def _reduce_tiles(
-    z: PointArray, tile: CellArray, foot_z: PointArray, top_z: PointArray, touched: CellArray
-) -> None:
-    """Extremes of the tiles, likewise; after their number, those touched first here."""
-    held = np.uintp(0)
-    low, high = foot_z[0], top_z[0]
+def _widen_tiles(z: PointArray, tile: CellArray, extremes: PointArray, touched: CellArray) -> None:
+    """Heights of the points of each tile, likewise; after their number, those touched."""
     n_touched = touched[0]
-    for i in range(len(tile)):
-        if tile[i] < 0:
-            continue
-        own = np.uintp(tile[i])
-        if own != held:
-            foot_z[held], top_z[held] = low, high
-            held = own
-            low, high = foot_z[held], top_z[held]
-        if low > high:  # so far it was empty
-            n_touched += 1
-            touched[n_touched] = tile[i]
-        low, high = min(low, z[i]), max(high, z[i])
-    foot_z[held], top_z[held] = low, high
+    for i in range(len(z)):
+        k = np.uintp(tile[i] if tile[i] >= 0 else len(extremes) - 1)
+        low, high = extremes[k, 0], extremes[k, 1]
+        # Written in any case, counted only where the tile was empty.
+        touched[np.uintp(n_touched + 1)] = tile[i]
+        n_touched += np.int32((low > high) & (tile[i] >= 0))
+        extremes[k, 0] = z[i] if z[i] < low else low
+        extremes[k, 1] = z[i] if z[i] > high else high
     touched[0] = n_touched
 
 
 @compiled
-def merge_cells(
-    lowest_z: FloatArray,
-    lowest_r: FloatArray,
-    highest_z: FloatArray,
-    count: IntArray,
-    lowest_tile: CellArray,
+def _settle_lowest(
+    z: PointArray,
+    r: PointArray,
+    cell: CellArray,
+    tile: CellArray,
+    extremes: PointArray,
+    numbers: CellArray,
 ) -> None:
-    """Reduce the tables of all shares into the first."""
-    for share in range(1, len(count)):
-        for k in range(count.shape[1]):
-            if count[share, k] == 0:
-                continue
-            z, r, tile = lowest_z[share, k], lowest_r[share, k], lowest_tile[share, k]
-            own = lowest_z[0, k], lowest_r[0, k], lowest_tile[0, k]
-            if (z, r, tile) < own:
-                lowest_z[0, k], lowest_r[0, k], lowest_tile[0, k] = z, r, tile
-            highest_z[0, k] = max(highest_z[0, k], highest_z[share, k])
-            count[0, k] += count[share, k]
+    """Range and tile of the lowest point of each cell: of few points, once it is known which."""
+    for i in range(len(z)):
+        k = np.uintp(cell[i] if cell[i] >= 0 else len(numbers) - 1)
+        if z[i] == extremes[k, 0]:
+            own, low = r[i], extremes[k, 1]
+            if own < low or (own == low and tile[i] < numbers[k, 1]):
+                extremes[k, 1], numbers[k, 1] = own, tile[i]
 
 
 @compiled
-def merge_tiles(foot_z: PointArray, top_z: PointArray, touched: CellArray) -> None:
+def merge_cells(extremes: PointArray, numbers: CellArray) -> None:
     """Reduce the tables of all shares into the first."""
-    for share in range(1, len(foot_z)):
+    for share in range(1, len(numbers)):
+        for k in range(numbers.shape[1] - 1):
+            if numbers[share, k, 0] == 0:
+                continue
+            z, r, tile = extremes[share, k, 0], extremes[share, k, 1], numbers[share, k, 1]
+            if (z, r, tile) < (extremes[0, k, 0], extremes[0, k, 1], numbers[0, k, 1]):
+                extremes[0, k, 0], extremes[0, k, 1], numbers[0, k, 1] = z, r, tile
+            extremes[0, k, 2] = max(extremes[0, k, 2], extremes[share, k, 2])
+            numbers[0, k, 0] += numbers[share, k, 0]
+
+
+@compiled
+def merge_tiles(extremes: PointArray, touched: CellArray) -> None:
+    """Reduce the tables of all shares into the first."""
+    for share in range(1, len(extremes)):
         for place in range(1, touched[share, 0] + 1):
             k = np.uintp(touched[share, place])
-            foot_z[0, k] = min(foot_z[0, k], foot_z[share, k])
-            top_z[0, k] = max(top_z[0, k], top_z[share, k])
+            extremes[0, k, 0] = min(extremes[0, k, 0], extremes[share, k, 0])
+            extremes[0, k, 1] = max(extremes[0, k, 1], extremes[share, k, 1])
 
 
 @compiled
 def collect_candidates(
-    lowest_z: FloatArray,
-    lowest_r: FloatArray,
-    highest_z: FloatArray,
-    count: IntArray,
-    lowest_tile: CellArray,
+    extremes: PointArray,
+    numbers: CellArray,
     widths: FloatArray,
     min_extent: float,
     offsets: IntArray,
@@ -313,15 +317,15 @@ def collect_candidates(
 ) -> int:
     """Do what `polar_grid.ground_candidates` does, into arrays for all bins; their number."""
     c = 0
-    for m in range(count.shape[0]):
+    for m in range(numbers.shape[0]):
         offsets[m] = c
-        for n in range(count.shape[1]):
-            if count[m, n] == 0:
+        for n in range(numbers.shape[1]):
+            count = numbers[m, n, 0]
+            if count == 0:
                 continue
-            r[c], z[c], own_bin[c] = lowest_r[m, n], lowest_z[m, n], n
-            tile[c] = lowest_tile[m, n]
-            extent = max(highest_z[m, n] - lowest_z[m, n], min_extent)
-            density[c] = count[m, n] / (widths[n] * extent)
+            low, high = np.float64(extremes[m, n, 0]), np.float64(extremes[m, n, 2])
+            r[c], z[c], own_bin[c], tile[c] = extremes[m, n, 1], low, n, numbers[m, n, 1]
+            density[c] = count / (widths[n] * max(high - low, min_extent))
             c += 1
-    offsets[count.shape[0]] = c
+    offsets[numbers.shape[0]] = c
     return c

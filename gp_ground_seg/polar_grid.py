@@ -196,26 +196,21 @@ def build_polar_grid(xyz: PointArray, grid: GridConfig) -> PolarGrid:
 
 @dataclass(frozen=True)
 class CellTables:
-    """Extremes of the points of every bin, each (M, n_bins).
+    """Extremes of the points of every bin.
 
     Attributes
     ----------
-    lowest_z, lowest_r : float64
-        Height of the lowest point and its range, the nearest of equally low ones
-        [m]; infinite in empty bins.
-    highest_z : float64
-        Height of the highest point [m]; minus infinity in empty bins.
-    count : int64
-        Number of points.
-    lowest_tile : int32
-        Tile of the lowest point, the first of equally low and near ones.
+    extremes : (M, n_bins, 3) float32 or float64
+        Height of the lowest point and its range, the nearest of equally low ones, and
+        height of the highest point [m], in the precision of the points; infinite,
+        infinite and minus infinite in empty bins.
+    numbers : (M, n_bins, 2) int32
+        Number of points; tile of the lowest point, the first of equally low and near
+        ones, or `NO_TILE`.
     """
 
-    lowest_z: FloatArray
-    lowest_r: FloatArray
-    highest_z: FloatArray
-    count: IntArray
-    lowest_tile: npt.NDArray[np.int32]
+    extremes: PointArray
+    numbers: npt.NDArray[np.int32]
 
 
 def reduce_cells(grid: PolarGrid, z: PointArray, tile: npt.NDArray[np.int32]) -> CellTables:
@@ -233,29 +228,24 @@ def reduce_cells(grid: PolarGrid, z: PointArray, tile: npt.NDArray[np.int32]) ->
     tile : (N,) int32
         Tiles of the points.
     """
-    shape = grid.n_segments, grid.n_bins
-    size = shape[0] * shape[1]
+    size = grid.n_segments * grid.n_bins
     inside = grid.inside
     cell = grid.cell[inside]
-    z_inside, r_inside = z[inside].astype(np.float64), grid.r[inside]
-    lowest_z = np.full(size, np.inf)
+    z_inside, r_inside = z[inside], grid.r[inside]
+    extremes = np.full((size, 3), np.inf, dtype=z.dtype)
+    lowest_z, lowest_r, highest_z = extremes.T
     np.minimum.at(lowest_z, cell, z_inside)
     is_lowest = z_inside == lowest_z[cell]
-    lowest_r = np.full(size, np.inf)
-    np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest].astype(np.float64))
+    np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest])
     is_lowest &= r_inside == lowest_r[cell]
-    lowest_tile = np.full(size, NO_TILE, dtype=np.int32)
-    np.minimum.at(lowest_tile, cell[is_lowest], tile[inside][is_lowest])
-    highest_z = np.full(size, -np.inf)
+    numbers = np.empty((size, 2), dtype=np.int32)
+    numbers[:, 0] = np.bincount(cell, minlength=size)
+    numbers[:, 1] = NO_TILE
+    np.minimum.at(numbers[:, 1], cell[is_lowest], tile[inside][is_lowest])
+    highest_z[:] = -np.inf
     np.maximum.at(highest_z, cell, z_inside)
-    count = np.bincount(cell, minlength=size)
-    return CellTables(
-        lowest_z.reshape(shape),
-        lowest_r.reshape(shape),
-        highest_z.reshape(shape),
-        count.reshape(shape),
-        lowest_tile.reshape(shape),
-    )
+    shape = grid.n_segments, grid.n_bins, -1
+    return CellTables(extremes.reshape(shape), numbers.reshape(shape))
 
 
 def ground_candidates(cells: CellTables, edges: FloatArray, min_extent: float) -> Candidates:
@@ -275,15 +265,16 @@ def ground_candidates(cells: CellTables, edges: FloatArray, min_extent: float) -
         Least height of a bin in the density [m]: the points of a flat bin are no
         closer together than the sensor's noise.
     """
-    occupied = cells.count > 0
+    count = cells.numbers[:, :, 0]
+    occupied = count > 0
     own_bin = np.nonzero(occupied)[1]
-    lowest_z = cells.lowest_z[occupied]
-    extent = np.maximum(cells.highest_z[occupied] - lowest_z, min_extent)
+    lowest_z, lowest_r, highest_z = cells.extremes[occupied].astype(np.float64).T
+    extent = np.maximum(highest_z - lowest_z, min_extent)
     return Candidates(
-        r=cells.lowest_r[occupied],
-        z=lowest_z,
+        r=lowest_r.copy(),
+        z=lowest_z.copy(),
         bin=own_bin,
-        density=cells.count[occupied] / (np.diff(edges)[own_bin] * extent),
+        density=count[occupied] / (np.diff(edges)[own_bin] * extent),
         offsets=np.concatenate([[0], np.cumsum(occupied.sum(axis=1))]),
-        tile=cells.lowest_tile[occupied],
+        tile=cells.numbers[occupied, 1],
     )

@@ -18,14 +18,19 @@ class Tiles:
     ----------
     tile : (N,) int32
         Tile of each point, or `OUTSIDE`.
-    foot_z, top_z : (T,) float32 or float64
+    extremes : (T, 2) float32 or float64
         Height of the lowest and of the highest point of each tile [m], in the
         precision of the points; infinite, minus infinite in empty ones.
     """
 
     tile: npt.NDArray[np.int32]
-    foot_z: npt.NDArray[np.floating]
-    top_z: npt.NDArray[np.floating]
+    extremes: npt.NDArray[np.floating]
+
+    @property
+    def foot_z(self) -> npt.NDArray[np.floating]:
+        """Height of the lowest point of each tile, (T,) [m]."""
+        value: npt.NDArray[np.floating] = self.extremes[:, 0]
+        return value
 
 
 def tiles_per_side(r_max: float, tile_size: float) -> int:
@@ -54,8 +59,8 @@ def build_tiles(xyz: npt.NDArray[np.floating], grid: PolarGrid, tile_size: float
     own = np.minimum(column, side - 1) * side + np.minimum(row, side - 1)
     tile[inside] = own
     z = xyz[inside, 2]
-    foot_z = np.full(side * side, np.inf, dtype=xyz.dtype)
-    top_z = np.full(side * side, -np.inf, dtype=xyz.dtype)
-    np.minimum.at(foot_z, own, z)
-    np.maximum.at(top_z, own, z)
-    return Tiles(tile, foot_z, top_z)
+    extremes = np.empty((side * side, 2), dtype=xyz.dtype)
+    extremes[:] = np.inf, -np.inf
+    np.minimum.at(extremes[:, 0], own, z)
+    np.maximum.at(extremes[:, 1], own, z)
+    return Tiles(tile, extremes)

@@ -42,8 +42,8 @@ def test_a_wall_of_any_direction_is_a_face_and_its_foot_is_known():
         wall = np.column_stack([10.25 + along * np.cos(turn), 5.25 + along * np.sin(turn), z])
         found, tiles = faces_of(wall)
         assert found.all()
-        assert tiles.foot_z[tiles.tile[0]] == z.min()
-        assert tiles.top_z[tiles.tile[0]] == z.max()
+        assert tiles.extremes[tiles.tile[0], 0] == z.min()
+        assert tiles.extremes[tiles.tile[0], 1] == z.max()
 
 
 def test_low_flat_and_overhanging_returns_are_no_faces():

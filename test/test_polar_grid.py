@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gp_ground_seg.config import Config, GridConfig
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
-from gp_ground_seg.point_passes import grid_ruler
+from gp_ground_seg.point_passes import grid_rulers
 from gp_ground_seg.points import take_points
 from gp_ground_seg.polar_grid import (
     OUTSIDE,
@@ -178,8 +178,9 @@ def test_compiled_passes_are_the_reference(seed, growth, n_bins, dtype):
 
 def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
     grid = GridConfig(n_bins=1024, bin_growth=4.0, n_segments=2048)
-    edges, table, *_ = grid_ruler(grid)
-    assert len(table) < 40_000
+    edges, ranges, _ = grid_rulers(grid, np.dtype(np.float64))
+    assert len(ranges.bins) < 40_000
+    assert ranges.is_coarse
     xyz = taken(hilly_scan(4000, seed=3))
     found, *_ = CompiledBackend(1).sort_points(xyz, grid, 0.5, Workspace())
     np.testing.assert_array_equal(found.cell, build(xyz, grid).cell)

@@ -14,16 +14,14 @@ from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
 from gp_ground_seg.labelling import Labelled, band, root_mean_square_compiled
 from gp_ground_seg.parallel import RowPool
-from gp_ground_seg.point_passes import grid_ruler
+from gp_ground_seg.point_passes import grid_rulers
 from gp_ground_seg.polar_grid import (
-    NO_TILE,
     Candidates,
     CellTables,
     FloatArray,
     IntArray,
     PointArray,
     PolarGrid,
-    reach,
 )
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.surface import GroundSurface, fuse_rows, pieces
@@ -52,71 +50,55 @@ class CompiledBackend:
     ) -> tuple[PolarGrid, CellTables, Tiles]:
         """Cell and tile of each point, extremes of each."""
         n_points = len(xyz)
-        ruler = grid_ruler(grid)
+        edges, ranges, turns = grid_rulers(grid, xyz.dtype)
         n_sides = tiles_per_side(grid.r_max, tile_size)
+        n_shares = self._pool.n_shares(n_points)
+        n_cells, n_tiles = grid.n_segments * grid.n_bins, n_sides**2
         take = workspace.take
         cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points, dtype=xyz.dtype)
         tile = take('tile', (n_points,), np.int32)
-        n_shares = self._pool.n_shares(n_points)
-        lowest_z, lowest_r, highest_z = take(
-            'cells', (3, n_shares, grid.n_segments * grid.n_bins), np.float64
-        )
-        count = take('count', lowest_z.shape, np.int64)
-        lowest_tile = take('lowest_tile', lowest_z.shape, np.int32)
-        foot_z, top_z = take('tiles', (2, n_shares, n_sides**2), xyz.dtype)
-        touched = take('touched', (n_shares, 1 + n_sides**2), np.int32)
-        touched[:, 0] = 0
-        for table, empty in (
-            (lowest_z, np.inf),
-            (lowest_r, np.inf),
-            (highest_z, -np.inf),
-            (count, 0),
-            (lowest_tile, NO_TILE),
-            (foot_z, np.inf),
-            (top_z, -np.inf),
-        ):
-            table.fill(empty)
-        cells = lowest_z, lowest_r, highest_z, count, lowest_tile
+        # One row more, for the points that are in none.
+        extremes = take('cells', (n_shares, n_cells + 1, 3), xyz.dtype)
+        numbers = take('numbers', (n_shares, n_cells + 1, 2), np.int32)
+        tile_extremes = take('tiles', (n_shares, n_tiles + 1, 2), xyz.dtype)
+        touched = take('touched', (n_shares, n_tiles + 2), np.int32)
         self._pool.run_shares(
             point_passes.sort_points,
             n_points,
             xyz.T,
-            *ruler,
-            float(reach(ruler[0], xyz.dtype)),
+            ranges,
+            turns,
             1.0 / tile_size,
             n_sides,
             cell,
             r,
-            *cells,
+            extremes,
+            numbers,
             tile,
-            foot_z,
-            top_z,
+            tile_extremes,
             touched,
         )
-        point_passes.merge_cells(*cells)
-        point_passes.merge_tiles(foot_z, top_z, touched)
-        shape = grid.n_segments, grid.n_bins
+        point_passes.merge_cells(extremes, numbers)
+        point_passes.merge_tiles(tile_extremes, touched)
+        shape = grid.n_segments, grid.n_bins, -1
         return (
-            PolarGrid(cell, r, ruler[0], grid.n_segments),
-            CellTables(*(table[0].reshape(shape) for table in cells)),
-            Tiles(tile, foot_z[0], top_z[0]),
+            PolarGrid(cell, r, edges, grid.n_segments),
+            CellTables(extremes[0, :-1].reshape(shape), numbers[0, :-1].reshape(shape)),
+            Tiles(tile, tile_extremes[0, :-1]),
         )
 
     def ground_candidates(
         self, cells: CellTables, edges: FloatArray, min_extent: float
     ) -> Candidates:
         """Lowest point and vertical density of each occupied bin."""
-        n_segments, n_bins = cells.count.shape
+        n_segments, n_bins, _ = cells.numbers.shape
         size = n_segments * n_bins
         offsets, own_bin = np.empty(n_segments + 1, np.int64), np.empty(size, np.int64)
         r, z, density = np.empty((3, size))
         tile = np.empty(size, dtype=np.int32)
         n = point_passes.collect_candidates(
-            cells.lowest_z,
-            cells.lowest_r,
-            cells.highest_z,
-            cells.count,
-            cells.lowest_tile,
+            cells.extremes,
+            cells.numbers,
             np.diff(edges),
             min_extent,
             offsets,
@@ -132,11 +114,11 @@ class CompiledBackend:
         self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
     ) -> Faces:
         """Upright faces."""
-        flags = self._workspace.take('faces', (2, len(tiles.foot_z)), np.bool_)
+        flags = self._workspace.take('faces', (2, len(tiles.extremes)), np.bool_)
         flags.fill(False)
         is_face, is_footless = flags
         # As much as could be needed: what is not used takes no memory.
-        room = self.n_threads, len(tiles.foot_z)
+        room = self.n_threads, len(tiles.extremes)
         slots = self._workspace.take('slots', room, np.int32)
         sums = self._workspace.take('sums', (*room, label_passes.N_COLUMNS), np.float64)
         self._pool.run(
@@ -144,8 +126,7 @@ class CompiledBackend:
             len(is_face),
             xyz.T,
             tiles.tile,
-            tiles.foot_z,
-            tiles.top_z,
+            tiles.extremes,
             faces.min_height,
             max_height,
             faces.max_normal_z,
@@ -206,7 +187,7 @@ class CompiledBackend:
             height,
             faces.is_face,
             faces.is_footless,
-            faces.tiles.foot_z,
+            faces.tiles.extremes,
             band(roughness, stands.any(axis=0).reshape(roughness.shape), label).ravel(),
             label.below_tolerance,
             face_tolerance,
