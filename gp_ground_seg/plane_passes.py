@@ -109,22 +109,26 @@ def tabulate(
 ) -> int:
     """Do what `low_cells` does, with a table (6, N_LARGEST); returns how many cells there are."""
     n_segments = len(offsets) - 1
-    lowest = np.full(N_SECTORS * N_RINGS, MAX_Z)
-    index, home = np.full(len(lowest), -1), np.zeros(len(lowest), dtype=np.int64)
+    lowest, cell_of = np.empty(N_SECTORS * N_RINGS), np.empty(len(r), dtype=np.int16)
+    index, home = np.empty(len(lowest), dtype=np.int64), np.empty(len(lowest), dtype=np.int64)
+    for cell in range(len(lowest)):
+        lowest[cell], index[cell], home[cell] = MAX_Z, -1, 0
+    # How low first, without a branch: which of two points is lower is anybody's guess.
     for m in range(n_segments):
         first = (m * N_SECTORS // n_segments) * N_RINGS
         for c in range(offsets[m], offsets[m + 1]):
-            if not (RING_EDGES[0] <= r[c] < RING_EDGES[N_RINGS] and z[c] > -MAX_Z):
-                continue
-            ring = _RING_TABLE[int((r[c] - RING_EDGES[0]) * _RINGS_PER_METRE)]
-            cell = first + ring + (1 if r[c] >= RING_EDGES[ring + 1] else 0)
-            # No branch: which of two points is the lower one is anybody's guess.
-            lower = z[c] < lowest[cell]
-            if z[c] == lowest[cell] and index[cell] >= 0:
-                lower = r[c] < r[index[cell]]
-            lowest[cell] = z[c] if lower else lowest[cell]
-            index[cell] = c if lower else index[cell]
-            home[cell] = m if lower else home[cell]
+            cell_of[c] = -1
+            if RING_EDGES[0] <= r[c] < RING_EDGES[N_RINGS] and abs(z[c]) < MAX_Z:
+                ring = _RING_TABLE[int((r[c] - RING_EDGES[0]) * _RINGS_PER_METRE)]
+                cell = first + ring + (1 if r[c] >= RING_EDGES[ring + 1] else 0)
+                lowest[cell] = z[c] if z[c] < lowest[cell] else lowest[cell]
+                cell_of[c] = cell
+    for m in range(n_segments):
+        for c in range(offsets[m], offsets[m + 1]):
+            cell = cell_of[c]
+            is_lowest = cell >= 0 and z[c] == lowest[cell]
+            if is_lowest and (index[cell] < 0 or r[c] < r[index[cell]]):
+                index[cell], home[cell] = c, m
     n = 0
     for cell in range(len(lowest)):
         if index[cell] >= 0:
@@ -151,8 +155,8 @@ def _best_hypothesis(
         if t < n_level:
             height, slope_x, slope_y = -cells[Z, t * n // n_level], 0.0, 0.0
         else:
-            share = SPREAD[t - n_level]
-            i, j, k = int(share[0] * n), int(share[1] * n), int(share[2] * n)
+            s = t - n_level
+            i, j, k = int(SPREAD[s, 0] * n), int(SPREAD[s, 1] * n), int(SPREAD[s, 2] * n)
             x1, y1, z1 = (
                 cells[X, j] - cells[X, i], cells[Y, j] - cells[Y, i], cells[Z, j] - cells[Z, i]
             )  # fmt: skip
