@@ -36,7 +36,6 @@ from gp_ground_seg.low_cells import (
     directions,
     low_cells,
 )
-from gp_ground_seg.point_passes import first_bins
 from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
 
 X, Y, Z, RANGE, ALLOWED, INVERSE = range(6)
@@ -46,8 +45,11 @@ WIDTH = 32
 N_LARGEST = -(-N_SECTORS * N_RINGS // WIDTH) * WIDTH
 _OUT_OF_REACH = 1e6
 
-# Fine enough that no entry holds more than one edge.
-_RING_TABLE, _RINGS_PER_METRE = first_bins(RING_EDGES, 4)
+# Ring where each stretch begins, a little early for the sake of rounding: a range in it lies
+# in that ring or the next, as the narrowest ring is four stretches wide.
+_PER_METRE = 4.0 / float(RING_EDGES[1] - RING_EDGES[0])
+_STARTS = RING_EDGES[0] + (np.arange(int(RING_EDGES[-1] * _PER_METRE) + 1) - 0.02) / _PER_METRE
+_RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0, N_RINGS - 1)
 
 Values = tuple[float, float, float, float, float, float, float, float, float, float, int, int]
 
@@ -119,7 +121,7 @@ def tabulate(
         for c in range(offsets[m], offsets[m + 1]):
             cell_of[c] = -1
             if RING_EDGES[0] <= r[c] < RING_EDGES[N_RINGS] and abs(z[c]) < MAX_Z:
-                ring = _RING_TABLE[int((r[c] - RING_EDGES[0]) * _RINGS_PER_METRE)]
+                ring = _RING_TABLE[int((r[c] - RING_EDGES[0]) * _PER_METRE)]
                 cell = first + ring + (1 if r[c] >= RING_EDGES[ring + 1] else 0)
                 lowest[cell] = z[c] if z[c] < lowest[cell] else lowest[cell]
                 cell_of[c] = cell
