@@ -130,29 +130,30 @@ def keep_compiled(
 
 @compiled
 def hides_foot_compiled(
-    s: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    top: float,
     tolerance: float,
     max_foot_distance: float,
     max_foot_density: float,
 ) -> bool:
     """Do what `hides_foot` does, from the sums of one tile.
 
-    Number, x, y, z, x^2, y^2, z^2, x y, x z and y z of all its returns; number, x, y,
-    x^2, y^2 and x y of the lowest; height of the highest.
+    Number, x, y, z, x^2, y^2, z^2, x y, x z and y z of its lowest returns, and of those
+    above; height of the highest.
     """
-    foot, top = s[10:16], s[16]
-    n_low, n_high = foot[0], s[0] - foot[0]
+    n_low, n_high = low[0], high[0]
     if max_foot_distance <= 0.0 or n_high < 2.0:
         return False
     if n_low * (top - tolerance) > max_foot_density * n_high * tolerance:
         return False
-    mean_x, mean_y = (s[1] - foot[1]) / n_high, (s[2] - foot[2]) / n_high
-    xx = s[4] - foot[3] - n_high * mean_x * mean_x
-    yy = s[5] - foot[4] - n_high * mean_y * mean_y
-    xy = s[7] - foot[5] - n_high * mean_x * mean_y
-    own_xx = foot[3] - 2.0 * mean_x * foot[1] + n_low * mean_x * mean_x
-    own_yy = foot[4] - 2.0 * mean_y * foot[2] + n_low * mean_y * mean_y
-    own_xy = foot[5] - mean_x * foot[2] - mean_y * foot[1] + n_low * mean_x * mean_y
+    mean_x, mean_y = high[1] / n_high, high[2] / n_high
+    xx = high[4] - n_high * mean_x * mean_x
+    yy = high[5] - n_high * mean_y * mean_y
+    xy = high[7] - n_high * mean_x * mean_y
+    own_xx = low[4] - 2.0 * mean_x * low[1] + n_low * mean_x * mean_x
+    own_yy = low[5] - 2.0 * mean_y * low[2] + n_low * mean_y * mean_y
+    own_xy = low[7] - mean_x * low[2] - mean_y * low[1] + n_low * mean_x * mean_y
     size = math.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)
     turned = 0.0
     if size > 0.0:

@@ -18,10 +18,10 @@ BoolArray = npt.NDArray[np.bool_]
 
 # Plain integers: compiled code knows no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
-# Columns of what is known of a tile: sums (number, x, y, z and their six products; the six
-# of the lowest returns; the highest), a point of it, its number, whether it is tall.
-_ORIGIN_X, _ORIGIN_Y, _TILE, _IS_TALL = 17, 18, 19, 20
-N_COLUMNS = 21
+# Of each tall tile two rows of sums, its lowest returns and those above: number, x, y, z, their
+# squares, x y, x z, y z; the highest. Then, in the first row, where x, y and z are counted from.
+_TOP, _ORIGIN_X, _ORIGIN_Y, _FOOT = 10, 11, 12, 13
+N_COLUMNS = 14
 SKIPPED = -1
 """Slot of a tile that has nothing tall, or is another thread's."""
 
@@ -34,6 +34,8 @@ def judge_faces(
     columns: PointArray,
     tile: CellArray,
     extremes: PointArray,
+    touched: CellArray,
+    tile_size: float,
     min_height: float,
     max_height: float,
     max_normal_z: float,
@@ -49,38 +51,27 @@ def judge_faces(
     """Do what `gp_ground_seg.faces.find_faces` does with every `step`-th tile.
 
     A tile's sums are taken by one thread in the order of the points: they do not
-    depend on the number of threads. `slots` (step, T) and `sums` (step, T, N_COLUMNS)
+    depend on the number of threads. `slots` (step, T) and `sums` (step, 2 T, N_COLUMNS)
     are room to work in.
     """
-    n_slots = 0
     own_slots, own_sums = slots[start], sums[start]
-    own_slots[:] = 0
+    n_slots = _take_tall(
+        start, step, extremes, touched, tile_size, min_height, own_slots, own_sums
+    )
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
             continue
-        own = np.uintp(tile[i])
-        k = own_slots[own]
+        k = own_slots[np.uintp(tile[i])]
         if k == SKIPPED:
             continue
-        foot = np.float64(extremes[own, 0])
-        if k == 0:
-            if tile[i] % step != start or np.float64(extremes[own, 1]) - foot <= min_height:
-                own_slots[own] = SKIPPED
-                continue
-            n_slots += 1
-            own_slots[own] = k = n_slots
-            own_sums[k - 1] = 0.0
-            # Sums about a point of the tile: about the sensor, rounding would eat the scatter.
-            own_sums[k - 1, _ORIGIN_X] = columns[0, i]
-            own_sums[k - 1, _ORIGIN_Y] = columns[1, i]
-            own_sums[k - 1, _TILE] = tile[i]
-        s = own_sums[k - 1]
-        z = np.float64(columns[2, i]) - foot
+        low = own_sums[np.uintp(k)]
+        z = np.float64(columns[2, i]) - low[_FOOT]
         if z > max_height:
             continue
-        if z > min_height:
-            s[_IS_TALL] = 1.0
-        x, y = np.float64(columns[0, i]) - s[_ORIGIN_X], np.float64(columns[1, i]) - s[_ORIGIN_Y]
+        x = np.float64(columns[0, i]) - low[_ORIGIN_X]
+        y = np.float64(columns[1, i]) - low[_ORIGIN_Y]
+        # No branch: whether a return is one of the lowest is anybody's guess.
+        s = own_sums[np.uintp(k + np.int32(z > tolerance))]
         s[0] += 1.0
         s[1] += x
         s[2] += y
@@ -91,29 +82,84 @@ def judge_faces(
         s[7] += x * y
         s[8] += x * z
         s[9] += y * z
-        if z <= tolerance:
-            s[10] += 1.0
-            s[11] += x
-            s[12] += y
-            s[13] += x * x
-            s[14] += y * y
-            s[15] += x * y
-        s[16] = max(s[16], z)
-    for k in range(n_slots):
-        s = own_sums[k]
-        n = s[0]
-        if s[_IS_TALL] == 0.0 or n < fewest_returns:
+        s[_TOP] = max(s[_TOP], z)
+    s = np.empty(N_COLUMNS)
+    for slot in range(n_slots):
+        t = touched[np.uintp(own_slots[len(extremes) + slot])]
+        low, high = own_sums[2 * slot], own_sums[2 * slot + 1]
+        for c in range(_TOP):
+            s[c] = low[c] + high[c]
+        n, top = s[0], max(low[_TOP], high[_TOP])
+        if top <= min_height or n < fewest_returns:
             continue
         xx, yy, zz = s[4] - s[1] * s[1] / n, s[5] - s[2] * s[2] / n, s[6] - s[3] * s[3] / n
         xy, xz, yz = s[7] - s[1] * s[2] / n, s[8] - s[1] * s[3] / n, s[9] - s[2] * s[3] / n
         vertical = max(xx * yy - xy * xy, 0.0)
         trace = vertical + max(yy * zz - yz * yz, 0.0) + max(xx * zz - xz * xz, 0.0)
         if trace > 0.0 and math.sqrt(vertical / trace) <= max_normal_z:
-            own_tile = int(s[_TILE])
-            is_face[own_tile] = True
-            is_footless[own_tile] = hides_foot_compiled(
-                s, tolerance, max_foot_distance, max_foot_density
+            is_face[t] = True
+            is_footless[t] = hides_foot_compiled(
+                low, high, top, tolerance, max_foot_distance, max_foot_density
             )
+
+
+@compiled
+def _take_tall(
+    start: int,
+    step: int,
+    extremes: PointArray,
+    touched: CellArray,
+    tile_size: float,
+    min_height: float,
+    slots: CellArray,
+    sums: FloatArray,
+) -> int:
+    """Make room for the sums of every tall tile that is this thread's; their number.
+
+    Sums are taken about a point of the tile: about the sensor, rounding would eat the
+    scatter.
+    """
+    n_slots = 0
+    n_sides = int(math.sqrt(len(extremes)))
+    half = 0.5 * n_sides * tile_size
+    for place in range(len(touched)):
+        t = np.uintp(touched[place])
+        foot = np.float64(extremes[t, 0])
+        is_tall = np.float64(extremes[t, 1]) - foot > min_height
+        if not is_tall or touched[place] % step != start:
+            slots[t] = SKIPPED
+            continue
+        slots[t] = 2 * n_slots
+        slots[len(extremes) + n_slots] = place
+        for row in (2 * n_slots, 2 * n_slots + 1):
+            sums[row] = 0.0
+        sums[2 * n_slots, _ORIGIN_X] = (touched[place] // n_sides) * tile_size - half
+        sums[2 * n_slots, _ORIGIN_Y] = (touched[place] % n_sides) * tile_size - half
+        sums[2 * n_slots, _FOOT] = foot
+        n_slots += 1
+    return n_slots
+
+
+@compiled
+def level_and_slope(knots: FloatArray, mean: FloatArray, pieces: FloatArray) -> None:
+    """Surface in each cell as ``pieces[k, 0] + pieces[k, 1] * r``; NaN in the last row.
+
+    Parameters
+    ----------
+    knots : (K,) float64
+        Ranges of the knots [m].
+    mean : (M, K) float64
+        Height at the knots, linear between them [m].
+    pieces : (M * (K - 1) + 1, 2) float64
+        Result; the last row is for the points of no cell.
+    """
+    n_bins = len(knots) - 1
+    for m in range(len(mean)):
+        for n in range(n_bins):
+            slope = (mean[m, n + 1] - mean[m, n]) / (knots[n + 1] - knots[n])
+            pieces[m * n_bins + n, 0] = mean[m, n] - slope * knots[n]
+            pieces[m * n_bins + n, 1] = slope
+    pieces[len(pieces) - 1] = np.nan
 
 
 @compiled
@@ -127,33 +173,86 @@ def survey_heights(
     tile: CellArray,
     is_face: BoolArray,
     pieces: FloatArray,
+    nearest: float,
     min_height: float,
     max_height: float,
     height: FloatArray,
     sums: IntArray,
-    stands: BoolArray,
 ) -> None:
     """Heights of some points over the surface; sums for the roughness; what stands in a bin.
 
-    Points `start` to `stop`, summed up in tables ``[share]``. Squares are summed in
-    whole numbers: the sum does not depend on its order, nor on the number of threads.
-    `pieces` are the cells' near ends, and level and slope of the surface from there.
+    Points `start` to `stop`, summed up in tables ``[share]``, which start empty and have a
+    last row for points of no cell: number, squares, whether an obstacle stands there.
+    Squares are summed in whole numbers: the sum does not depend on its order, nor on the
+    number of threads. For `pieces` see `level_and_slope`; nearer than `nearest` the
+    surface is level.
     """
+    own_sums = sums[share]
+    own_sums[:] = 0
     for i in range(start, stop):
-        if cell[i] < 0:
-            height[i] = np.nan
-            continue
-        own = np.uintp(cell[i])
-        h = np.float64(columns[2, i]) - (
-            pieces[own, 1] + pieces[own, 2] * max(np.float64(r[i]) - pieces[own, 0], 0.0)
-        )
+        own = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
+        away = max(np.float64(r[i]), nearest)
+        h = np.float64(columns[2, i]) - (pieces[own, 0] + pieces[own, 1] * away)
         height[i] = h
         if h >= min_height:
             if h <= max_height:
-                stands[share, own] = True
+                own_sums[own, 2] = 1
         elif h >= -min_height and not is_face[np.uintp(tile[i])]:
-            sums[share, own, 0] += 1
-            sums[share, own, 1] += int(h * h * SQUARE_UNITS + 0.5)
+            own_sums[own, 0] += 1
+            own_sums[own, 1] += int(h * h * SQUARE_UNITS + 0.5)
+
+
+@compiled
+def bands(
+    sums: IntArray,
+    ground_tolerance: float,
+    roughness_gain: float,
+    obstacle_tolerance: float,
+    obstacle_roughness_gain: float,
+    obstacle_min_height: float,
+    roughness: FloatArray,
+    band: FloatArray,
+) -> None:
+    """Do what `labelling.root_mean_square` and `labelling.band` do, of the sums of all shares.
+
+    Parameters
+    ----------
+    sums : (shares, M * n_bins + 1, 3) int64
+        What `survey_heights` found; the first share becomes the sum of all.
+    ground_tolerance, roughness_gain, obstacle_tolerance, obstacle_roughness_gain : float
+        Tolerances, see `gp_ground_seg.config.LabelConfig`.
+    obstacle_min_height : float
+        Widest band [m].
+    roughness : (M, n_bins) float64
+        Result [m].
+    band : (M * n_bins + 1,) float64
+        Result [m]; the last is NaN.
+    """
+    n_segments, n_bins = roughness.shape
+    total = sums[0]
+    for share in range(1, len(sums)):
+        for k in range(n_segments * n_bins):
+            for c in range(3):
+                total[k, c] += sums[share, k, c]
+    ring = np.empty((n_bins + 2, 2))
+    ring[0] = ring[n_bins + 1] = 0.0
+    for m in range(n_segments):
+        before = (m - 1 if m > 0 else n_segments - 1) * n_bins
+        after = (m + 1 if m + 1 < n_segments else 0) * n_bins
+        for n in range(n_bins):
+            own = m * n_bins + n
+            for c in range(2):
+                ring[n + 1, c] = total[before + n, c] + total[own, c] + total[after + n, c]
+        for n in range(n_bins):
+            number = ring[n, 0] + ring[n + 1, 0] + ring[n + 2, 0]
+            squares = ring[n, 1] + ring[n + 1, 1] + ring[n + 2, 1]
+            own_roughness = math.sqrt(squares / (SQUARE_UNITS * max(number, 1.0)))
+            free = ground_tolerance + roughness_gain * own_roughness
+            if total[m * n_bins + n, 2] > 0:
+                free = min(free, obstacle_tolerance + obstacle_roughness_gain * own_roughness)
+            roughness[m, n] = own_roughness
+            band[m * n_bins + n] = min(free, obstacle_min_height)
+    band[len(band) - 1] = np.nan
 
 
 @compiled
@@ -175,18 +274,13 @@ def label_by_height(
 ) -> None:
     """Do what `gp_ground_seg.labelling.label_points` does for points `start` to `stop`."""
     for i in range(start, stop):
-        n = cell[i]
-        if n < 0:
-            margin[i] = np.nan
-            label[i] = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
-            continue
-        own = min(band[np.uintp(n)] - height[i], height[i] + below_tolerance)
-        if is_face[np.uintp(tile[i])]:
-            over_foot = max(
-                height[i],
-                np.float64(columns[2, i]) - np.float64(tile_extremes[np.uintp(tile[i]), 0]),
-            )
-            reach = -face_tolerance if is_footless[np.uintp(tile[i])] else face_tolerance
+        n, h = cell[i], height[i]
+        # The last row of the band is NaN, for the points of no cell.
+        own = min(band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + below_tolerance)
+        t = np.uintp(tile[i] if n >= 0 else 0)
+        if is_face[t]:
+            over_foot = max(h, np.float64(columns[2, i]) - np.float64(tile_extremes[t, 0]))
+            reach = -face_tolerance if is_footless[t] else face_tolerance
             own = min(own, reach - over_foot)
         margin[i] = own
-        label[i] = _GROUND if own >= 0.0 else _OBSTACLE
+        label[i] = _GROUND if own >= 0.0 else (_UNKNOWN if n == NOT_FINITE else _OBSTACLE)

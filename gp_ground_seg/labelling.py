@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.compiled import compiled
 from gp_ground_seg.config import LabelConfig
 from gp_ground_seg.faces import Faces
 from gp_ground_seg.labels import Label
-from gp_ground_seg.polar_grid import NOT_FINITE, FloatArray, IntArray, PolarGrid
+from gp_ground_seg.polar_grid import NOT_FINITE, FloatArray, PolarGrid
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -188,27 +186,6 @@ def root_mean_square(
     all_squares = _with_neighbours(squares.astype(np.float64).reshape(shape))
     mean = all_squares / (SQUARE_UNITS * np.maximum(all_number, 1.0))
     result: FloatArray = np.sqrt(mean)
-    return result
-
-
-@compiled
-def root_mean_square_compiled(sums: IntArray, n_segments: int) -> FloatArray:
-    """Do what `root_mean_square` does with (M * n_bins, 2): numbers, squares."""
-    n_bins = len(sums) // n_segments
-    result = np.empty((n_segments, n_bins))
-    ring = np.empty((n_bins + 2, 2))
-    ring[0] = ring[n_bins + 1] = 0.0
-    for m in range(n_segments):
-        before = (m - 1 if m > 0 else n_segments - 1) * n_bins
-        after = (m + 1 if m + 1 < n_segments else 0) * n_bins
-        for n in range(n_bins):
-            own = m * n_bins + n
-            for k in range(2):
-                ring[n + 1, k] = sums[before + n, k] + sums[own, k] + sums[after + n, k]
-        for n in range(n_bins):
-            number = ring[n, 0] + ring[n + 1, 0] + ring[n + 2, 0]
-            squares = ring[n, 1] + ring[n + 1, 1] + ring[n + 2, 1]
-            result[m, n] = math.sqrt(squares / (SQUARE_UNITS * max(number, 1.0)))
     return result
 
 

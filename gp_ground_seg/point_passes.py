@@ -294,12 +294,17 @@ def merge_cells(extremes: PointArray, numbers: CellArray) -> None:
 
 @compiled
 def merge_tiles(extremes: PointArray, touched: CellArray) -> None:
-    """Reduce the tables of all shares into the first."""
+    """Reduce the tables of all shares into the first, and their touched tiles."""
+    n_touched = touched[0, 0]
     for share in range(1, len(extremes)):
         for place in range(1, touched[share, 0] + 1):
             k = np.uintp(touched[share, place])
+            if extremes[0, k, 0] > extremes[0, k, 1]:
+                n_touched += 1
+                touched[0, n_touched] = touched[share, place]
             extremes[0, k, 0] = min(extremes[0, k, 0], extremes[share, k, 0])
             extremes[0, k, 1] = max(extremes[0, k, 1], extremes[share, k, 1])
+    touched[0, 0] = n_touched
 
 
 @compiled

@@ -21,10 +21,13 @@ class Tiles:
     extremes : (T, 2) float32 or float64
         Height of the lowest and of the highest point of each tile [m], in the
         precision of the points; infinite, minus infinite in empty ones.
+    touched : (K,) int32
+        Tiles with a point, in any order.
     """
 
     tile: npt.NDArray[np.int32]
     extremes: npt.NDArray[np.floating]
+    touched: npt.NDArray[np.int32]
 
     @property
     def foot_z(self) -> npt.NDArray[np.floating]:
@@ -63,4 +66,4 @@ def build_tiles(xyz: npt.NDArray[np.floating], grid: PolarGrid, tile_size: float
     extremes[:] = np.inf, -np.inf
     np.minimum.at(extremes[:, 0], own, z)
     np.maximum.at(extremes[:, 1], own, z)
-    return Tiles(tile, extremes)
+    return Tiles(tile, extremes, np.unique(own).astype(np.int32))

@@ -71,7 +71,11 @@ def test_of_a_face_that_hides_its_foot_nothing_is_ground():
     smooth = np.zeros((grid.n_segments, grid.n_bins))
     yes, no = np.array([True]), np.array([False])
     for footless, expected in ((no, Label.GROUND), (yes, Label.OBSTACLE)):
-        faces = Faces(Tiles(np.zeros(3, dtype=np.int32), z[:1], z[2:]), yes, footless)
+        faces = Faces(
+            Tiles(np.zeros(3, dtype=np.int32), z[[[0, 2]]], np.zeros(1, dtype=np.int32)),
+            yes,
+            footless,
+        )
         labels, margin = label_points(z, z, grid, faces, smooth, LabelConfig(), 0.1)
         assert list(labels) == [expected] * 3
         assert ((margin >= 0.0) == (expected == Label.GROUND)).all()

@@ -79,7 +79,9 @@ def test_a_segment_without_a_model_gets_its_neighbours():
 
 def faces_in(tile, foot_z, is_face):
     return Faces(
-        Tiles(tile, np.column_stack([foot_z, foot_z + 1.0])), is_face, np.zeros_like(is_face)
+        Tiles(tile, np.column_stack([foot_z, foot_z + 1.0]), np.unique(tile)),
+        is_face,
+        np.zeros_like(is_face),
     )
 
 

@@ -12,7 +12,7 @@ from gp_ground_seg.gp.growth_compiled import grow_on_latent_compiled, grow_surfa
 from gp_ground_seg.gp.latent import latent_rows_compiled
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
-from gp_ground_seg.labelling import Labelled, band, root_mean_square_compiled
+from gp_ground_seg.labelling import Labelled
 from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.point_passes import grid_rulers
 from gp_ground_seg.polar_grid import (
@@ -24,7 +24,7 @@ from gp_ground_seg.polar_grid import (
     PolarGrid,
 )
 from gp_ground_seg.pseudo_inputs import PseudoInputs
-from gp_ground_seg.surface import GroundSurface, fuse_rows, pieces
+from gp_ground_seg.surface import GroundSurface, fuse_rows
 from gp_ground_seg.tiles import Tiles, tiles_per_side
 from gp_ground_seg.workspace import Workspace
 
@@ -84,7 +84,7 @@ class CompiledBackend:
         return (
             PolarGrid(cell, r, edges, grid.n_segments),
             CellTables(extremes[0, :-1].reshape(shape), numbers[0, :-1].reshape(shape)),
-            Tiles(tile, tile_extremes[0, :-1]),
+            Tiles(tile, tile_extremes[0, :-1], touched[0, 1 : 1 + touched[0, 0]]),
         )
 
     def ground_candidates(
@@ -118,7 +118,7 @@ class CompiledBackend:
         flags.fill(False)
         is_face, is_footless = flags
         # As much as could be needed: what is not used takes no memory.
-        room = self.n_threads, len(tiles.extremes)
+        room = self.n_threads, 2 * len(tiles.extremes)
         slots = self._workspace.take('slots', room, np.int32)
         sums = self._workspace.take('sums', (*room, label_passes.N_COLUMNS), np.float64)
         self._pool.run(
@@ -127,6 +127,8 @@ class CompiledBackend:
             xyz.T,
             tiles.tile,
             tiles.extremes,
+            tiles.touched,
+            faces.cell_size,
             faces.min_height,
             max_height,
             faces.max_normal_z,
@@ -151,11 +153,13 @@ class CompiledBackend:
         face_tolerance: float,
     ) -> Labelled:
         """Height, label and margin of each point; roughness of each bin."""
-        n_points = len(xyz)
-        shape = self._pool.n_shares(n_points), grid.n_segments * grid.n_bins
+        n_points, n_cells = len(xyz), grid.n_segments * grid.n_bins
+        take = self._workspace.take
+        # One row more, for the points of no cell.
+        cell_pieces = take('pieces', (n_cells + 1, 2), np.float64)
+        label_passes.level_and_slope(surface.knots, surface.mean, cell_pieces)
         height = np.empty(n_points)
-        sums = np.zeros((*shape, 2), dtype=np.int64)
-        stands = np.zeros(shape, dtype=np.bool_)
+        sums = take('squares', (self._pool.n_shares(n_points), n_cells + 1, 3), np.int64)
         self._pool.run_shares(
             label_passes.survey_heights,
             n_points,
@@ -164,19 +168,25 @@ class CompiledBackend:
             grid.r,
             faces.tiles.tile,
             faces.is_face,
-            np.column_stack(
-                [
-                    np.tile(surface.knots[:-1], grid.n_segments),
-                    *pieces(surface.knots, surface.mean),
-                ]
-            ),
+            cell_pieces,
+            float(surface.knots[0]),
             label.obstacle_min_height,
             label.obstacle_max_height,
             height,
             sums,
-            stands,
         )
-        roughness = root_mean_square_compiled(sums.sum(axis=0), grid.n_segments)
+        roughness = np.empty((grid.n_segments, grid.n_bins))
+        own_band = take('band', (n_cells + 1,), np.float64)
+        label_passes.bands(
+            sums,
+            label.ground_tolerance,
+            label.roughness_gain,
+            label.obstacle_tolerance,
+            label.obstacle_roughness_gain,
+            label.obstacle_min_height,
+            roughness,
+            own_band,
+        )
         labels, margin = np.empty(n_points, dtype=np.uint8), np.empty(n_points)
         self._pool.run_points(
             label_passes.label_by_height,
@@ -188,7 +198,7 @@ class CompiledBackend:
             faces.is_face,
             faces.is_footless,
             faces.tiles.extremes,
-            band(roughness, stands.any(axis=0).reshape(roughness.shape), label).ravel(),
+            own_band,
             label.below_tolerance,
             face_tolerance,
             labels,
