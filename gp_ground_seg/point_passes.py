@@ -98,6 +98,9 @@ def sort_points(
     share: int,
     start: int,
     stop: int,
+    flat: PointArray,
+    step: int,
+    target: PointArray,
     columns: PointArray,
     ranges: Ruler,
     turns: Ruler,
@@ -114,8 +117,10 @@ def sort_points(
     """Sort points `start` to `stop` into cells and tiles, with the extremes of each.
 
     The twins are `polar_grid.build_polar_grid`, `reduce_cells` and `tiles.build_tiles`.
-    The tables ``[share]`` have a last row for the points that are in none. Block by
-    block: where the points lie, in loops without branches; then the extremes.
+    If `step` is positive, they are first put from `flat` (see `points.flat_rows`) into
+    `target`, which is the memory of `columns`. The tables ``[share]`` have a last row for
+    the points that are in none. Block by block: where the points lie, in loops without
+    branches; then the extremes.
     """
     own_extremes, own_numbers = extremes[share], numbers[share]
     own_tile_extremes, own_touched = tile_extremes[share], touched[share]
@@ -124,6 +129,10 @@ def sort_points(
     own_turn, own_turn_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
     for first in range(start, stop, BLOCK):
         own = slice(first, min(first + BLOCK, stop))
+        if step > 0:
+            for i in range(first, min(first + BLOCK, stop)):
+                for k in range(3):
+                    target[k, i] = flat[i * step + k]
         x, y, z = columns[0, own], columns[1, own], columns[2, own]
         _measure_range(x, y, z, ranges, r[own], own_r_entry, cell[own])
         _measure_turn(x, y, ranges.edges[-1], turns.scale, tiles_per_metre, n_sides, cell[own],

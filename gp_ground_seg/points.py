@@ -4,32 +4,35 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import as_strided
 
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.polar_grid import FloatArray, PointArray
 from gp_ground_seg.workspace import Workspace
 
 
+COMPUTED = (np.dtype(np.float32), np.dtype(np.float64))
+"""Types that are computed with."""
+
+
 def check_points(points: npt.ArrayLike) -> FloatArray:
     """Return a copy of x, y, z in double precision; parameters and errors of `take_points`."""
-    return take_points(points, Workspace()).astype(np.float64)
+    return np.array(take_points(points), dtype=np.float64, order='F')
 
 
-def take_points(points: npt.ArrayLike, workspace: Workspace) -> PointArray:
-    """Return x, y, z in the one layout that the compiled code is compiled for.
+def take_points(points: npt.ArrayLike) -> PointArray:
+    """Return x, y, z, as they lie in memory if their type is one that is computed with.
 
     Parameters
     ----------
     points : (N, >=3) float array
         Points; columns after the third are ignored.
-    workspace : Workspace
-        Where to put a copy, if one is needed.
 
     Returns
     -------
     xyz : (N, 3) float32 or float64
-        Each coordinate by itself in a row (Fortran order) and read-only; may share
-        memory with `points`. Single precision for types of up to four bytes.
+        Shares memory with `points`, if it can. Single precision for types of up to four
+        bytes.
 
     Raises
     ------
@@ -37,6 +40,8 @@ def take_points(points: npt.ArrayLike, workspace: Workspace) -> PointArray:
         If the shape or type is another; the message holds both.
     """
     array = np.asarray(points)
+    if array.dtype in COMPUTED and array.flags.aligned and array.ndim == 2 and array.shape[1] >= 3:
+        return array[:, :3]
     if array.ndim != 2 or array.shape[1] < 3:
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be (N, 3) or wider'
@@ -46,15 +51,53 @@ def take_points(points: npt.ArrayLike, workspace: Workspace) -> PointArray:
             f'points of shape {array.shape} and type {array.dtype}: must be floating point'
         )
     dtype = np.dtype(np.float32 if array.dtype.itemsize <= 4 else np.float64)
-    fits = array.flags.f_contiguous and array.flags.aligned
-    if fits and array.dtype == dtype and array.shape[1] == 3:
-        return as_read_only(array)
     # Bytes from a sensor may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
-        columns = workspace.take('columns', (3, len(array)), dtype)
+        return array[:, :3].astype(dtype, copy=not array.flags.aligned)
+
+
+def in_columns(xyz: PointArray, workspace: Workspace) -> PointArray:
+    """Return points (N, 3) in the one layout that compiled code is compiled for.
+
+    Each coordinate by itself in a row (Fortran order) and read-only; a copy in
+    `workspace` where they lie otherwise.
+    """
+    if is_in_columns(xyz):
+        return as_read_only(xyz)
+    columns: PointArray = workspace.take('columns', (3, len(xyz)), xyz.dtype)
+    with np.errstate(invalid='ignore'):
         for k in range(3):
-            columns[k] = array[:, k]
+            columns[k] = xyz[:, k]
     return as_read_only(columns.T)
+
+
+def is_in_columns(xyz: PointArray) -> bool:
+    """Whether each coordinate lies by itself in a row of memory."""
+    return bool(xyz.flags.f_contiguous and xyz.flags.aligned)
+
+
+def flat_rows(xyz: PointArray) -> tuple[PointArray, int]:
+    """View of the memory from the first x to the last z, and the numbers from row to row.
+
+    Parameters
+    ----------
+    xyz : (N, 3) float32 or float64
+        Points, aligned.
+
+    Returns
+    -------
+    flat : (L,) float32 or float64
+        Read-only; empty where the coordinates of a point do not lie side by side in
+        order, or the points not one behind the other.
+    step : int
+        Coordinate k of point i is ``flat[i * step + k]``.
+    """
+    size = xyz.dtype.itemsize
+    row, column = xyz.strides
+    if len(xyz) == 0 or column != size or row < 3 * size or row % size != 0:
+        return as_read_only(np.empty(0, dtype=xyz.dtype)), 0
+    step = row // size
+    return as_strided(xyz, ((len(xyz) - 1) * step + 3,), (size,), writeable=False), step
 
 
 def as_read_only(xyz: PointArray) -> PointArray:

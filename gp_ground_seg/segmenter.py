@@ -16,7 +16,7 @@ from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.hidden_feet import without_hidden_feet
 from gp_ground_seg.line_extraction import extract_lines
-from gp_ground_seg.points import as_read_only, take_points
+from gp_ground_seg.points import take_points
 from gp_ground_seg.polar_grid import (
     Candidates,
     FloatArray,
@@ -181,33 +181,33 @@ class GroundSegmenter:
         self, points: npt.ArrayLike, sensor: SensorConfig, timer: StageTimer
     ) -> _PlacedScan:
         """Scan in the level frame, as given or as it seems to be."""
-        xyz = take_points(points, self._workspace)
+        own_xyz = take_points(points)
         given = given_pose(sensor)
-        level_xyz = given.level(xyz)
-        grid, candidates, tiles = self._sort(level_xyz, self._workspace)
+        level_xyz, grid, candidates, tiles = self._sort(given.level(own_xyz), self._workspace)
         timer.mark('grid')
         pose = estimate_pose(
             candidates,
             sensor,
             self._backend.name == 'numba',
-            lambda turn: self._sort(turned_sample(level_xyz, turn), Workspace())[1],
+            lambda turn: self._sort(turned_sample(level_xyz, turn), Workspace())[2],
         )
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
-            level_xyz = pose.level(xyz)
-            grid, candidates, tiles = self._sort(level_xyz, self._workspace)
+            level_xyz, grid, candidates, tiles = self._sort(pose.level(own_xyz), self._workspace)
         timer.mark('pose')
-        return _PlacedScan(xyz, level_xyz, grid, candidates, tiles, pose)
+        return _PlacedScan(own_xyz, level_xyz, grid, candidates, tiles, pose)
 
-    def _sort(self, xyz: PointArray, workspace: Workspace) -> tuple[PolarGrid, Candidates, Tiles]:
-        """Grid of points (N, 3) in a level frame, the lowest point of each bin, tiles."""
+    def _sort(
+        self, xyz: PointArray, workspace: Workspace
+    ) -> tuple[PointArray, PolarGrid, Candidates, Tiles]:
+        """Points (N, 3) column by column, their grid, the lowest point of each bin, tiles."""
         config = self._config
-        grid, cells, tiles = self._backend.sort_points(
-            as_read_only(xyz), config.grid, config.faces.cell_size, workspace
+        xyz, grid, cells, tiles = self._backend.sort_points(
+            xyz, config.grid, config.faces.cell_size, workspace
         )
         candidates = self._backend.ground_candidates(
             cells, grid.edges, config.lines.min_density_extent
         )
-        return grid, candidates, tiles
+        return xyz, grid, candidates, tiles
 
     def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:
         """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""

@@ -10,7 +10,7 @@ from gp_ground_seg.gp.compiled_backend import CompiledBackend
 from gp_ground_seg.gp.numpy_backend import NumpyBackend
 from gp_ground_seg.labelling import label_points
 from gp_ground_seg.labels import Label
-from gp_ground_seg.points import take_points
+from gp_ground_seg.points import in_columns
 from gp_ground_seg.polar_grid import build_polar_grid, ground_candidates, reduce_cells
 from gp_ground_seg.tiles import Tiles, build_tiles
 from gp_ground_seg.workspace import Workspace
@@ -127,7 +127,7 @@ def test_compiled_marks_are_the_reference(seed, dtype, n_threads):
     xyz[:, 2] *= 0.1
     xyz[100:250, :2] = np.repeat(xyz[100:115, :2], 10, axis=0) + rng.normal(0, 0.05, (150, 2))
     xyz[::20] = np.nan
-    xyz = take_points(xyz.astype(dtype), Workspace())
+    xyz = in_columns(xyz.astype(dtype), Workspace())
     grid = build_polar_grid(xyz, GRID)
     config = FacesConfig(max_foot_distance=rng.uniform(0.02, 0.2))
     tiles = build_tiles(xyz, grid, config.cell_size)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gp_ground_seg.config import Config, GridConfig
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
 from gp_ground_seg.point_passes import grid_rulers
-from gp_ground_seg.points import take_points
+from gp_ground_seg.points import flat_rows, in_columns, take_points
 from gp_ground_seg.polar_grid import (
     OUTSIDE,
     bin_edges,
@@ -28,7 +28,7 @@ def build(points, grid=None):
 
 
 def taken(points):
-    return take_points(points, Workspace())
+    return in_columns(points, Workspace())
 
 
 def lowest_points(grid, z, min_extent):
@@ -165,7 +165,7 @@ def test_compiled_passes_are_the_reference(seed, growth, n_bins, dtype):
     xyz = taken(xyz.astype(dtype))
     grid = GridConfig(n_bins=n_bins, bin_growth=growth, r_min=4.0, r_max=30.0)
     expected = build(xyz, grid)
-    found, cells, tiles = CompiledBackend(1).sort_points(xyz, grid, 0.7, Workspace())
+    _, found, cells, tiles = CompiledBackend(1).sort_points(xyz, grid, 0.7, Workspace())
     np.testing.assert_array_equal(found.cell, expected.cell)
     np.testing.assert_array_equal(found.r, expected.r)
     expected_tiles = build_tiles(xyz, expected, 0.7)
@@ -181,9 +181,44 @@ def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
     assert len(ranges.bins) < 40_000
     assert ranges.is_coarse
     xyz = taken(hilly_scan(4000, seed=3))
-    found, *_ = CompiledBackend(1).sort_points(xyz, grid, 0.5, Workspace())
+    _, found, *_ = CompiledBackend(1).sort_points(xyz, grid, 0.5, Workspace())
     np.testing.assert_array_equal(found.cell, build(xyz, grid).cell)
     assert len(edges) == 1025
+
+
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+@pytest.mark.parametrize('step', [3, 4, 7])
+def test_rows_are_sorted_as_columns_are_and_left_as_they_were(step, dtype):
+    rows = np.zeros((9000, step), dtype=dtype)
+    rows[:, :3] = hilly_scan(9000, seed=step)
+    before = rows.copy()
+    xyz = take_points(rows)
+    assert flat_rows(xyz)[1] == step
+    assert np.shares_memory(xyz, rows)
+    found = CompiledBackend(2).sort_points(xyz, GridConfig(), 0.5, Workspace())
+    expected = CompiledBackend(1).sort_points(taken(xyz), GridConfig(), 0.5, Workspace())
+    np.testing.assert_array_equal(found[0], rows[:, :3])
+    assert found[0].flags.f_contiguous
+    np.testing.assert_array_equal(found[1].cell, expected[1].cell)
+    np.testing.assert_array_equal(rows, before)
+
+
+@pytest.mark.parametrize(
+    'rows',
+    [
+        np.zeros((5, 3))[::-1],
+        np.zeros((5, 4))[:, ::-1][:, :3],
+        np.zeros((3, 5)).T,
+        np.broadcast_to(np.zeros(3), (5, 3)),
+        np.zeros((5, 6))[:, ::2],
+        np.zeros((0, 3)),
+    ],
+)
+def test_what_does_not_lie_row_behind_row_is_no_flat_memory(rows):
+    assert flat_rows(rows)[1] == 0
+    assert len(CompiledBackend(1).sort_points(rows, GridConfig(), 0.5, Workspace())[0]) == len(
+        rows
+    )
 
 
 def assert_same_tiles(found, expected):
@@ -199,8 +234,8 @@ def extreme(seed):
 
 def test_shares_of_the_points_are_merged():
     xyz = taken(hilly_scan(9000, seed=5))
-    *found, tiles = CompiledBackend(3).sort_points(xyz, GridConfig(), 0.5, Workspace())
-    *expected, all_tiles = CompiledBackend(1).sort_points(xyz, GridConfig(), 0.5, Workspace())
+    _, *found, tiles = CompiledBackend(3).sort_points(xyz, GridConfig(), 0.5, Workspace())
+    _, *expected, all_tiles = CompiledBackend(1).sort_points(xyz, GridConfig(), 0.5, Workspace())
     for one, other in zip(found, expected, strict=True):
         for name, table in vars(one).items():
             np.testing.assert_array_equal(table, getattr(other, name))

@@ -15,7 +15,7 @@ from gp_ground_seg.labelling import (
     stands_in_bin,
 )
 from gp_ground_seg.labels import Label
-from gp_ground_seg.points import take_points
+from gp_ground_seg.points import in_columns
 from gp_ground_seg.polar_grid import build_polar_grid
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
 from gp_ground_seg.tiles import Tiles, build_tiles
@@ -208,7 +208,7 @@ def test_compiled_surface_and_labels_are_the_reference(seed, dtype, n_threads):
         KNOTS, rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5)), np.ones(0, dtype=bool)
     )
     surface.mean[seed % 4] = surface.std[seed % 4] = np.nan
-    xyz = take_points(xyz, Workspace())
+    xyz = in_columns(xyz, Workspace())
     backend, plain = CompiledBackend(n_threads), NumpyBackend()
     tiles = build_tiles(xyz, grid, FacesConfig().cell_size)
     faces = backend.find_faces(xyz, tiles, FacesConfig(), 2.0)

@@ -37,10 +37,11 @@ class Backend(Protocol):
 
     def sort_points(
         self, xyz: PointArray, grid: GridConfig, tile_size: float, workspace: Workspace
-    ) -> tuple[PolarGrid, CellTables, Tiles]:
+    ) -> tuple[PointArray, PolarGrid, CellTables, Tiles]:
         """See `build_polar_grid` and `reduce_cells`; `gp_ground_seg.tiles.build_tiles`.
 
-        The rest than the grid may lie in `workspace`.
+        First the points as `gp_ground_seg.points.in_columns` puts them. All but the grid
+        may lie in `workspace`.
         """
 
     def ground_candidates(

@@ -15,6 +15,7 @@ from gp_ground_seg.gp.objective_compiled import objective_rows
 from gp_ground_seg.labelling import Labelled
 from gp_ground_seg.parallel import RowPool
 from gp_ground_seg.point_passes import grid_rulers
+from gp_ground_seg.points import as_read_only, flat_rows, in_columns
 from gp_ground_seg.polar_grid import (
     Candidates,
     CellTables,
@@ -47,9 +48,17 @@ class CompiledBackend:
 
     def sort_points(
         self, xyz: PointArray, grid: GridConfig, tile_size: float, workspace: Workspace
-    ) -> tuple[PolarGrid, CellTables, Tiles]:
+    ) -> tuple[PointArray, PolarGrid, CellTables, Tiles]:
         """Cell and tile of each point, extremes of each."""
         n_points = len(xyz)
+        flat, step = flat_rows(xyz)
+        if step > 0:
+            # Sorting puts them there, block by block.
+            target = workspace.take('columns', (3, n_points), xyz.dtype)
+            xyz = as_read_only(target.T)
+        else:
+            target = np.empty((3, 0), dtype=xyz.dtype)
+            xyz = in_columns(xyz, workspace)
         edges, ranges, turns = grid_rulers(grid, xyz.dtype)
         n_sides = tiles_per_side(grid.r_max, tile_size)
         n_shares = self._pool.n_shares(n_points)
@@ -65,6 +74,9 @@ class CompiledBackend:
         self._pool.run_shares(
             point_passes.sort_points,
             n_points,
+            flat,
+            step,
+            target,
             xyz.T,
             ranges,
             turns,
@@ -82,6 +94,7 @@ class CompiledBackend:
         point_passes.merge_tiles(tile_extremes, touched)
         shape = grid.n_segments, grid.n_bins, -1
         return (
+            xyz,
             PolarGrid(cell, r, edges, grid.n_segments),
             CellTables(extremes[0, :-1].reshape(shape), numbers[0, :-1].reshape(shape)),
             Tiles(tile, tile_extremes[0, :-1], touched[0, 1 : 1 + touched[0, 0]]),

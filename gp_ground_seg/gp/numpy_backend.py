@@ -12,6 +12,7 @@ from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled, label_points, local_roughness
+from gp_ground_seg.points import in_columns
 from gp_ground_seg.polar_grid import (
     Candidates,
     CellTables,
@@ -37,11 +38,12 @@ class NumpyBackend:
 
     def sort_points(
         self, xyz: PointArray, grid: GridConfig, tile_size: float, workspace: Workspace
-    ) -> tuple[PolarGrid, CellTables, Tiles]:
+    ) -> tuple[PointArray, PolarGrid, CellTables, Tiles]:
         """Cell and tile of each point, extremes of each."""
+        xyz = in_columns(xyz, workspace)
         cells = build_polar_grid(xyz, grid)
         tiles = build_tiles(xyz, cells, tile_size)
-        return cells, reduce_cells(cells, xyz[:, 2], tiles.tile), tiles
+        return xyz, cells, reduce_cells(cells, xyz[:, 2], tiles.tile), tiles
 
     def ground_candidates(
         self, cells: CellTables, edges: FloatArray, min_extent: float
