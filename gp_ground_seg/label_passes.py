@@ -11,8 +11,8 @@ from gp_ground_seg.compiled import compiled
 from gp_ground_seg.hidden_feet import hides_foot_compiled
 from gp_ground_seg.labelling import SQUARE_UNITS
 from gp_ground_seg.labels import Label
-from gp_ground_seg.point_passes import CellArray
 from gp_ground_seg.polar_grid import NOT_FINITE, OUTSIDE, FloatArray, IntArray, PointArray
+from gp_ground_seg.rulers import CellArray
 
 BoolArray = npt.NDArray[np.bool_]
 

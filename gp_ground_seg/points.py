@@ -10,7 +10,6 @@ from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.polar_grid import FloatArray, PointArray
 from gp_ground_seg.workspace import Workspace
 
-
 COMPUTED = (np.dtype(np.float32), np.dtype(np.float64))
 """Types that are computed with."""
 

@@ -41,18 +41,18 @@ class GroundSurface:
         """
         cell = np.maximum(grid.cell, 0)
         outside = ~grid.inside
-        beyond = np.maximum(grid.r - np.tile(self.knots[:-1], len(self.mean))[cell], 0.0)
+        away = np.maximum(grid.r, self.knots[0])
         values = []
         for table in (self.mean, self.std):
-            start, slope = pieces(self.knots, table)
-            value = start[cell] + slope[cell] * beyond
+            level, slope = pieces(self.knots, table)
+            value = level[cell] + slope[cell] * away
             value[outside] = np.nan
             values.append(value)
         return values[0], values[1]
 
 
 def pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Value at the near end of each cell and slope across it, two (M * n_bins,) float64.
+    """Line across each cell: its value at range 0 and its slope, two (M * n_bins,) float64.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray
         Values at the knots, linear between them.
     """
     slope = np.diff(table, axis=1) / np.diff(knots)
-    return table[:, :-1].ravel(), slope.ravel()
+    return (table[:, :-1] - slope * knots[:-1]).ravel(), slope.ravel()
 
 
 def fuse_neighbours(

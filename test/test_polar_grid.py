@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from gp_ground_seg.config import Config, GridConfig
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
-from gp_ground_seg.point_passes import grid_rulers
 from gp_ground_seg.points import flat_rows, in_columns, take_points
 from gp_ground_seg.polar_grid import (
     OUTSIDE,
@@ -18,6 +17,7 @@ from gp_ground_seg.polar_grid import (
     pseudo_angle,
     reduce_cells,
 )
+from gp_ground_seg.rulers import grid_rulers
 from gp_ground_seg.tiles import build_tiles
 from gp_ground_seg.workspace import Workspace
 

@@ -14,7 +14,6 @@ from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
 from gp_ground_seg.labelling import Labelled
 from gp_ground_seg.parallel import RowPool
-from gp_ground_seg.point_passes import grid_rulers
 from gp_ground_seg.points import as_read_only, flat_rows, in_columns
 from gp_ground_seg.polar_grid import (
     Candidates,
@@ -25,6 +24,7 @@ from gp_ground_seg.polar_grid import (
     PolarGrid,
 )
 from gp_ground_seg.pseudo_inputs import PseudoInputs
+from gp_ground_seg.rulers import grid_rulers
 from gp_ground_seg.surface import GroundSurface, fuse_rows
 from gp_ground_seg.tiles import Tiles, tiles_per_side
 from gp_ground_seg.workspace import Workspace
