@@ -58,9 +58,7 @@ def sort_points(
     for first in range(start, stop, BLOCK):
         own = slice(first, min(first + BLOCK, stop))
         if step > 0:
-            for i in range(first, min(first + BLOCK, stop)):
-                for k in range(3):
-                    target[k, i] = flat[i * step + k]
+            _spread(flat[first * step :], step, target[0, own], target[1, own], target[2, own])
         x, y, z = columns[0, own], columns[1, own], columns[2, own]
         _measure_range(x, y, z, ranges, r[own], own_r_entry, cell[own])
         _measure_turn(x, y, ranges.edges[-1], turns.scale, tiles_per_metre, n_sides, cell[own],
@@ -83,6 +81,20 @@ def _empty(
     for k in range(len(tile_extremes)):
         tile_extremes[k, 0], tile_extremes[k, 1] = np.inf, -np.inf
     touched[0] = 0
+
+
+@compiled
+def _spread(flat: PointArray, step: int, x: PointArray, y: PointArray, z: PointArray) -> None:
+    """Rows to columns. Steps that are known beforehand are read in whole vectors."""
+    if step == 4:
+        for i in range(len(x)):
+            x[i], y[i], z[i] = flat[4 * i], flat[4 * i + 1], flat[4 * i + 2]
+    elif step == 3:
+        for i in range(len(x)):
+            x[i], y[i], z[i] = flat[3 * i], flat[3 * i + 1], flat[3 * i + 2]
+    else:
+        for i in range(len(x)):
+            x[i], y[i], z[i] = flat[i * step], flat[i * step + 1], flat[i * step + 2]
 
 
 @compiled
@@ -157,44 +169,74 @@ def _look_up(
 ) -> None:
     """Cell of the points that have one: the bin of the table's entry, or the one after."""
     n_bins = np.int32(len(ranges.edges) - 1)
-    one = np.int32(1)
+    zero, one = np.int32(0), np.int32(1)
     for i in range(len(cell)):
         k, q = np.uintp(r_entry[i]), np.uintp(turn_entry[i])
-        n = ranges.bins[k] + (one if r[i] >= ranges.ends[k] else np.int32(0))
-        m = turns.bins[q] + (one if turn[i] >= turns.ends[q] else np.int32(0))
-        if ranges.is_coarse and cell[i] == 0:
-            while r[i] >= ranges.edges[np.uintp(n + 1)]:
-                n += one
-        if turns.is_coarse:
-            while turn[i] >= turns.edges[np.uintp(m + 1)]:
-                m += one
+        n = ranges.bins[k] + (one if r[i] >= ranges.ends[k] else zero)
+        m = turns.bins[q] + (one if turn[i] >= turns.ends[q] else zero)
         cell[i] = m * n_bins + n if cell[i] == 0 else cell[i]
+    if not ranges.is_coarse and not turns.is_coarse:
+        return
+    for i in range(len(cell)):
+        if cell[i] < 0:
+            continue
+        m, n = cell[i] // n_bins, cell[i] % n_bins
+        while r[i] >= ranges.edges[np.uintp(n + 1)]:
+            n += one
+        while turn[i] >= turns.edges[np.uintp(m + 1)]:
+            m += one
+        cell[i] = m * n_bins + n
 
 
 @compiled
 def _widen_cells(z: PointArray, cell: CellArray, extremes: PointArray, numbers: CellArray) -> None:
-    """Heights and number of the points of each cell, without a branch."""
-    for i in range(len(z)):
-        k = np.uintp(cell[i] if cell[i] >= 0 else len(numbers) - 1)
-        low, high = extremes[k, 0], extremes[k, 2]
-        extremes[k, 0] = z[i] if z[i] < low else low
-        extremes[k, 2] = z[i] if z[i] > high else high
-        numbers[k, 0] += np.int32(1)
+    """Heights and number of the points of each cell, without a branch.
+
+    Neighbours in the scan lie in the same cell, and each waits for the one before to be
+    written: points half a block apart take turns.
+    """
+    half = len(z) // 2
+    for i in range(half):
+        for j in (i, i + half):
+            _widen_cell(z[j], cell[j], extremes, numbers)
+    for i in range(2 * half, len(z)):
+        _widen_cell(z[i], cell[i], extremes, numbers)
+
+
+@compiled
+def _widen_cell(z: float, cell: int, extremes: PointArray, numbers: CellArray) -> None:
+    k = np.uintp(cell if cell >= 0 else len(numbers) - 1)
+    low, high = extremes[k, 0], extremes[k, 2]
+    extremes[k, 0] = z if z < low else low
+    extremes[k, 2] = z if z > high else high
+    numbers[k, 0] += np.int32(1)
 
 
 @compiled
 def _widen_tiles(z: PointArray, tile: CellArray, extremes: PointArray, touched: CellArray) -> None:
     """Heights of the points of each tile, likewise; after their number, those touched."""
+    half = len(z) // 2
     n_touched = touched[0]
-    for i in range(len(z)):
-        k = np.uintp(tile[i] if tile[i] >= 0 else len(extremes) - 1)
-        low, high = extremes[k, 0], extremes[k, 1]
-        # Written in any case, counted only where the tile was empty.
-        touched[np.uintp(n_touched + 1)] = tile[i]
-        n_touched += np.int32((low > high) & (tile[i] >= 0))
-        extremes[k, 0] = z[i] if z[i] < low else low
-        extremes[k, 1] = z[i] if z[i] > high else high
+    for i in range(half):
+        for j in (i, i + half):
+            n_touched = _widen_tile(z[j], tile[j], extremes, touched, n_touched)
+    for i in range(2 * half, len(z)):
+        n_touched = _widen_tile(z[i], tile[i], extremes, touched, n_touched)
     touched[0] = n_touched
+
+
+@compiled
+def _widen_tile(
+    z: float, tile: int, extremes: PointArray, touched: CellArray, n_touched: int
+) -> int:
+    k = np.uintp(tile if tile >= 0 else len(extremes) - 1)
+    low, high = extremes[k, 0], extremes[k, 1]
+    # Written in any case, counted only where the tile was empty.
+    touched[np.uintp(n_touched + 1)] = tile
+    n_touched += np.int32((low > high) & (tile >= 0))
+    extremes[k, 0] = z if z < low else low
+    extremes[k, 1] = z if z > high else high
+    return n_touched
 
 
 @compiled
@@ -207,9 +249,19 @@ def _settle_lowest(
     numbers: CellArray,
 ) -> None:
     """Range and tile of the lowest point of each cell: of few points, once it is known which."""
-    for i in range(len(z)):
-        k = np.uintp(cell[i] if cell[i] >= 0 else len(numbers) - 1)
-        if z[i] == extremes[k, 0]:
+    outside = len(numbers) - 1
+    # Put down in any case, counted only where it is the lowest: no branch to guess.
+    found = np.empty(BLOCK + 1, dtype=np.int64)
+    for first in range(0, len(z), BLOCK):
+        n_found = 0
+        for i in range(first, min(first + BLOCK, len(z))):
+            k = np.uintp(cell[i] if cell[i] >= 0 else outside)
+            found[np.uintp(n_found)] = i
+            n_found += np.int64(z[i] == extremes[k, 0])
+        for i in found[:n_found]:
+            if cell[i] < 0:
+                continue
+            k = np.uintp(cell[i])
             own, low = r[i], extremes[k, 1]
             if own < low or (own == low and tile[i] < numbers[k, 1]):
                 extremes[k, 1], numbers[k, 1] = own, tile[i]
