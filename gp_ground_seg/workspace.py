@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ class Workspace:
 
     def __init__(self) -> None:
         self._arrays: dict[str, npt.NDArray[Any]] = {}
+        self._views: dict[str, npt.NDArray[Any]] = {}
 
     def take(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
         """Array of that shape with whatever was in it, C-contiguous.
@@ -30,8 +32,12 @@ class Workspace:
         dtype : dtype
             Type of the elements.
         """
-        size = int(np.prod(shape))
+        view = self._views.get(name)
+        if view is not None and view.shape == shape and view.dtype == dtype:
+            return view
+        size = math.prod(shape)
         held = self._arrays.get(name)
         if held is None or len(held) < size or held.dtype != np.dtype(dtype):
             held = self._arrays[name] = np.empty(size, dtype=dtype)
-        return held[:size].reshape(shape)
+        view = self._views[name] = held[:size].reshape(shape)
+        return view

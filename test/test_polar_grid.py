@@ -5,6 +5,7 @@ import pytest
 from conftest import hilly_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.lib.stride_tricks import as_strided
 
 from gp_ground_seg.config import Config, GridConfig
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
@@ -189,7 +190,8 @@ def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
 @pytest.mark.parametrize('dtype', [np.float32, np.float64])
 @pytest.mark.parametrize('step', [3, 4, 7])
 def test_rows_are_sorted_as_columns_are_and_left_as_they_were(step, dtype):
-    rows = np.zeros((9000, step), dtype=dtype)
+    room = np.zeros((9010, step), dtype=dtype)
+    rows = room[5:-5]
     rows[:, :3] = hilly_scan(9000, seed=step)
     before = rows.copy()
     xyz = take_points(rows)
@@ -201,6 +203,29 @@ def test_rows_are_sorted_as_columns_are_and_left_as_they_were(step, dtype):
     assert found[0].flags.f_contiguous
     np.testing.assert_array_equal(found[1].cell, expected[1].cell)
     np.testing.assert_array_equal(rows, before)
+
+
+@pytest.mark.parametrize(
+    'rows',
+    [
+        np.arange(28.0).reshape(4, 7)[:, 2:5],
+        np.arange(28.0).reshape(4, 7)[::2, 4:],
+        np.arange(60.0).reshape(3, 4, 5)[1, :, :3],
+        np.frombuffer(np.arange(20, dtype=np.float32).tobytes(), np.float32).reshape(5, 4)[1:, 1:],
+        as_strided(np.arange(30.0), (4, 3), (40, 8)),
+        as_strided(
+            np.arange(30.0, dtype=np.float32).view(np.uint8)[4:].view(np.float32), (4, 3), (16, 4)
+        ),
+    ],
+)
+def test_flat_rows_are_the_same_memory(rows):
+    flat, step = flat_rows(rows)
+    assert np.shares_memory(flat, rows)
+    np.testing.assert_array_equal(
+        as_strided(flat, rows.shape, (step * flat.itemsize, flat.itemsize)), rows
+    )
+    assert len(flat) == (len(rows) - 1) * step + 3
+    assert not flat.flags.writeable
 
 
 @pytest.mark.parametrize(
