@@ -24,6 +24,8 @@ from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 
 _NO_KNOTS = np.empty(0)
+# Like the edges of the bins: for compiled code what may be written to is another type.
+_NO_KNOTS.setflags(write=False)
 
 
 @dataclass(frozen=True)
