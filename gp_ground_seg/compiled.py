@@ -38,6 +38,18 @@ def compiled_vectors(function: _Function) -> _Function:
     return _compile(function, frozenset({'reassoc', 'contract', 'nsz'}))
 
 
+def inlined(function: _Function) -> _Function:
+    """Make `function` a part of the compiled functions that call it.
+
+    It is never compiled by itself, which takes longer than the work it does in them; sums
+    are taken in the order that those say.
+    """
+    if numba is None or numba.config.DISABLE_JIT:
+        return function
+    part: _Function = numba.njit(inline='always', nogil=True, error_model='numpy')(function)
+    return part
+
+
 def _compile(function: _Function, fastmath: frozenset[str]) -> _Function:
     if numba is None or numba.config.DISABLE_JIT:
         return function

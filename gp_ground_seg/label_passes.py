@@ -7,7 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.compiled import compiled
+from gp_ground_seg.compiled import compiled, inlined
 from gp_ground_seg.hidden_feet import hides_foot_compiled
 from gp_ground_seg.labelling import SQUARE_UNITS
 from gp_ground_seg.labels import Label
@@ -103,7 +103,7 @@ def judge_faces(
             )
 
 
-@compiled
+@inlined
 def _take_tall(
     start: int,
     step: int,

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled import compiled
+from gp_ground_seg.compiled import compiled, inlined
 from gp_ground_seg.polar_grid import (
     NO_TILE,
     NOT_FINITE,
@@ -203,7 +203,7 @@ def _widen_cells(z: PointArray, cell: CellArray, extremes: PointArray, numbers: 
         _widen_cell(z[i], cell[i], extremes, numbers)
 
 
-@compiled
+@inlined
 def _widen_cell(z: float, cell: int, extremes: PointArray, numbers: CellArray) -> None:
     k = np.uintp(cell if cell >= 0 else len(numbers) - 1)
     low, high = extremes[k, 0], extremes[k, 2]
@@ -225,7 +225,7 @@ def _widen_tiles(z: PointArray, tile: CellArray, extremes: PointArray, touched: 
     touched[0] = n_touched
 
 
-@compiled
+@inlined
 def _widen_tile(
     z: float, tile: int, extremes: PointArray, touched: CellArray, n_touched: int
 ) -> int:

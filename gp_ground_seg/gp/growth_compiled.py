@@ -12,15 +12,14 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled import compiled_vectors
+from gp_ground_seg.compiled import compiled_vectors, inlined
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.growth import BoolArray
-from gp_ground_seg.gp.latent import LANES, latent_rows_compiled
+from gp_ground_seg.gp.latent import LANES, latent_rows_inlined
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 
-@compiled_vectors
-def grow_surface_compiled(
+def _grow_surface(
     start: int,
     stop: int,
     step: int,
@@ -60,11 +59,11 @@ def grow_surface_compiled(
     for m in range(start, stop, step):
         first = offsets[m]
         n = offsets[m + 1] - first
-        inlier[first : first + n] = False
-        mean[m] = np.nan
-        std[m] = np.nan
+        for j in range(len(knots)):
+            mean[m, j] = std[m, j] = np.nan
         n_new = 0
         for i in range(n):
+            inlier[first + i] = False
             if seed[first + i]:
                 new[n_new] = i
                 n_new += 1
@@ -74,12 +73,13 @@ def grow_surface_compiled(
         while n_knots < len(knots) and not math.isnan(knot_log_length_scale[m, n_knots]):
             n_knots += 1
         size = (n + n_knots + LANES - 1) & -LANES
-        all_r[:n] = r[first : first + n]
-        all_r[n : n + n_knots] = knots[:n_knots]
-        all_r[n + n_knots : size] = 0.0
-        all_l[:n] = log_length_scale[first : first + n]
-        all_l[n : n + n_knots] = knot_log_length_scale[m, :n_knots]
-        all_l[n + n_knots : size] = 0.0
+        # Element by element: to assign slices takes no less time, and two seconds to compile.
+        for i in range(n):
+            all_r[i], all_l[i] = r[first + i], log_length_scale[first + i]
+        for j in range(n_knots):
+            all_r[n + j], all_l[n + j] = knots[j], knot_log_length_scale[m, j]
+        for j in range(n + n_knots, size):
+            all_r[j] = all_l[j] = 0.0
         sill = sigma_f[m] ** 2
         for j in range(size):
             all_l[j] = decay(-all_l[j])
@@ -146,6 +146,84 @@ def grow_surface_compiled(
             std[m, j] = math.sqrt(max(variance[n + j], 0.0))
 
 
+@inlined
+def _covariances(
+    i: int,
+    near: int,
+    end: int,
+    all_r: FloatArray,
+    all_l: FloatArray,
+    square: FloatArray,
+    sill: float,
+    slope: float,
+    row: FloatArray,
+) -> None:
+    """Prior covariance of column `i` with the columns from `near` on (paper, eq. 8)."""
+    own_r, own_l, own_square = all_r[i], 2.0 * all_l[i], square[i]
+    tilt = slope * own_r
+    for j in range(near, end):
+        inverse = 1.0 / (own_square + square[j])
+        distance = own_r - all_r[j]
+        root = math.sqrt(own_l * all_l[j] * inverse)
+        row[j] = sill * root * decay(distance * distance * inverse) + tilt * all_r[j]
+
+
+@inlined
+def _project(
+    whitened: FloatArray, n_rows: int, i: int, near: int, end: int, row: FloatArray
+) -> None:
+    """Take out of a new row what the rows before hold of it."""
+    # Four rows at a time: the new row is read and written once for all of them.
+    k = 0
+    while k + 4 <= n_rows:
+        row_0, row_1, row_2, row_3 = whitened[k], whitened[k + 1], whitened[k + 2], whitened[k + 3]
+        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
+        for j in range(near, end):
+            row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
+        k += 4
+    while k < n_rows:
+        row_0 = whitened[k]
+        w_0 = row_0[i]
+        for j in range(near, end):
+            row[j] -= w_0 * row_0[j]
+        k += 1
+
+
+@inlined
+def _project_two(
+    whitened: FloatArray,
+    n_rows: int,
+    i: int,
+    ii: int,
+    near: int,
+    end: int,
+    row: FloatArray,
+    after: FloatArray,
+) -> None:
+    """Do what `_project` does with the rows of two columns."""
+    k = 0
+    while k + 4 <= n_rows:
+        row_0, row_1, row_2, row_3 = whitened[k], whitened[k + 1], whitened[k + 2], whitened[k + 3]
+        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
+        v_0, v_1, v_2, v_3 = row_0[ii], row_1[ii], row_2[ii], row_3[ii]
+        for j in range(near, end):
+            x_0, x_1, x_2, x_3 = row_0[j], row_1[j], row_2[j], row_3[j]
+            row[j] -= w_0 * x_0 + w_1 * x_1 + w_2 * x_2 + w_3 * x_3
+            after[j] -= v_0 * x_0 + v_1 * x_1 + v_2 * x_2 + v_3 * x_3
+        k += 4
+    while k < n_rows:
+        row_0 = whitened[k]
+        w_0, v_0 = row_0[i], row_0[ii]
+        for j in range(near, end):
+            row[j] -= w_0 * row_0[j]
+            after[j] -= v_0 * row_0[j]
+        k += 1
+
+
+grow_surface_compiled = compiled_vectors(_grow_surface)
+grow_surface_inlined = inlined(_grow_surface)
+
+
 @compiled_vectors
 def grow_on_latent_compiled(
     start: int,
@@ -176,86 +254,12 @@ def grow_on_latent_compiled(
     std: FloatArray,
 ) -> None:
     """Both processes of segments ``start:stop:step``, in place: threads meet once less."""
-    latent_rows_compiled(
+    latent_rows_inlined(
         start, stop, step, theta, bar_offsets, r_bar, surface_class, offsets, r, knots,
         n_knots, log_length_scale, knot_log_length_scale,
     )  # fmt: skip
-    grow_surface_compiled(
+    grow_surface_inlined(
         start, stop, step, offsets, r, z, log_length_scale, seed, follows, knots,
         knot_log_length_scale, sigma_f, sigma_n, gate_noise, slope_std, max_std,
         max_standardised_residual, max_standardised_depth, inlier, mean, std,
     )  # fmt: skip
-
-
-@compiled_vectors
-def _covariances(
-    i: int,
-    near: int,
-    end: int,
-    all_r: FloatArray,
-    all_l: FloatArray,
-    square: FloatArray,
-    sill: float,
-    slope: float,
-    row: FloatArray,
-) -> None:
-    """Prior covariance of column `i` with the columns from `near` on (paper, eq. 8)."""
-    own_r, own_l, own_square = all_r[i], 2.0 * all_l[i], square[i]
-    tilt = slope * own_r
-    for j in range(near, end):
-        inverse = 1.0 / (own_square + square[j])
-        distance = own_r - all_r[j]
-        root = math.sqrt(own_l * all_l[j] * inverse)
-        row[j] = sill * root * decay(distance * distance * inverse) + tilt * all_r[j]
-
-
-@compiled_vectors
-def _project(
-    whitened: FloatArray, n_rows: int, i: int, near: int, end: int, row: FloatArray
-) -> None:
-    """Take out of a new row what the rows before hold of it."""
-    # Four rows at a time: the new row is read and written once for all of them.
-    k = 0
-    while k + 4 <= n_rows:
-        row_0, row_1, row_2, row_3 = whitened[k], whitened[k + 1], whitened[k + 2], whitened[k + 3]
-        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
-        for j in range(near, end):
-            row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
-        k += 4
-    while k < n_rows:
-        row_0 = whitened[k]
-        w_0 = row_0[i]
-        for j in range(near, end):
-            row[j] -= w_0 * row_0[j]
-        k += 1
-
-
-@compiled_vectors
-def _project_two(
-    whitened: FloatArray,
-    n_rows: int,
-    i: int,
-    ii: int,
-    near: int,
-    end: int,
-    row: FloatArray,
-    after: FloatArray,
-) -> None:
-    """Do what `_project` does with the rows of two columns."""
-    k = 0
-    while k + 4 <= n_rows:
-        row_0, row_1, row_2, row_3 = whitened[k], whitened[k + 1], whitened[k + 2], whitened[k + 3]
-        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
-        v_0, v_1, v_2, v_3 = row_0[ii], row_1[ii], row_2[ii], row_3[ii]
-        for j in range(near, end):
-            x_0, x_1, x_2, x_3 = row_0[j], row_1[j], row_2[j], row_3[j]
-            row[j] -= w_0 * x_0 + w_1 * x_1 + w_2 * x_2 + w_3 * x_3
-            after[j] -= v_0 * x_0 + v_1 * x_1 + v_2 * x_2 + v_3 * x_3
-        k += 4
-    while k < n_rows:
-        row_0 = whitened[k]
-        w_0, v_0 = row_0[i], row_0[ii]
-        for j in range(near, end):
-            row[j] -= w_0 * row_0[j]
-            after[j] -= v_0 * row_0[j]
-        k += 1

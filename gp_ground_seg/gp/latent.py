@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled import compiled_vectors
+from gp_ground_seg.compiled import compiled_vectors, inlined
 from gp_ground_seg.gp import dense
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.kernels import squared_exponential
@@ -110,8 +110,7 @@ def latent_rows_reference(
     return at_candidates, at_knots
 
 
-@compiled_vectors
-def latent_rows_compiled(
+def _latent_rows(
     start: int,
     stop: int,
     step: int,
@@ -135,7 +134,8 @@ def latent_rows_compiled(
     wanted, value = np.empty(room), np.empty(room)
     factor, weight = np.empty((most_bar, most_bar)), np.empty(most_bar)
     for m in range(start, stop, step):
-        at_knots[m] = np.nan
+        for j in range(len(knots)):
+            at_knots[m, j] = np.nan
         first, own = bar_offsets[m], offsets[m]
         p, n, n_wanted = bar_offsets[m + 1] - first, offsets[m + 1] - own, n_knots[m]
         if p == 0:
@@ -155,20 +155,32 @@ def latent_rows_compiled(
             row[i] += noise
         if not factorise(factor, p):
             # Rounding beat the noise term: the mean is what is left to say.
-            weight[:p] = 0.0
+            for i in range(p):
+                weight[i] = 0.0
         else:
             solve(factor, p, weight)
         # From pseudo-input to pseudo-input: the inner loop runs along a row.
         size = (n + n_wanted + LANES - 1) & -LANES
-        wanted[:n] = r[own : own + n]
-        wanted[n : n + n_wanted] = knots[:n_wanted]
-        wanted[n + n_wanted : size] = 0.0
-        value[:size] = mean
+        # Element by element: to assign slices takes no less time, and two seconds to compile.
+        for i in range(n):
+            wanted[i] = r[own + i]
+        for i in range(n_wanted):
+            wanted[n + i] = knots[i]
+        for i in range(n + n_wanted, size):
+            wanted[i] = 0.0
+        for i in range(size):
+            value[i] = mean
         for j in range(p):
             scaled = weight[j] * variance
             centre = r_bar[first + j]
             for i in range(size):
                 d = wanted[i] - centre
                 value[i] += scaled * decay(sharpness * d * d)
-        at_candidates[own : own + n] = value[:n]
-        at_knots[m, :n_wanted] = value[n : n + n_wanted]
+        for i in range(n):
+            at_candidates[own + i] = value[i]
+        for i in range(n_wanted):
+            at_knots[m, i] = value[n + i]
+
+
+latent_rows_compiled = compiled_vectors(_latent_rows)
+latent_rows_inlined = inlined(_latent_rows)
