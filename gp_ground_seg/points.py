@@ -75,6 +75,18 @@ def is_in_columns(xyz: PointArray) -> bool:
     return bool(xyz.flags.f_contiguous and xyz.flags.aligned)
 
 
+def single_precision(xyz: PointArray) -> PointArray:
+    """Points (N, 3) as float32; `xyz` itself if it is. What is finite stays finite."""
+    if xyz.dtype == np.float32:
+        return xyz
+    largest = np.finfo(np.float32).max
+    with np.errstate(over='ignore', invalid='ignore'):
+        single = xyz.astype(np.float32)
+        too_large = np.isinf(single) & np.isfinite(xyz)
+        single[too_large] = np.copysign(largest, xyz[too_large])
+    return single
+
+
 def flat_rows(xyz: PointArray) -> tuple[PointArray, int]:
     """View of the memory from the first x to the last z, and the numbers from row to row.
 

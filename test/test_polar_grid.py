@@ -9,7 +9,7 @@ from numpy.lib.stride_tricks import as_strided
 
 from gp_ground_seg.config import Config, GridConfig
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
-from gp_ground_seg.points import flat_rows, in_columns, take_points
+from gp_ground_seg.points import flat_rows, in_columns, single_precision, take_points
 from gp_ground_seg.polar_grid import (
     OUTSIDE,
     bin_edges,
@@ -244,6 +244,18 @@ def test_what_does_not_lie_row_behind_row_is_no_flat_memory(rows):
     assert len(CompiledBackend(1).sort_points(rows, GridConfig(), 0.5, Workspace())[0]) == len(
         rows
     )
+
+
+def test_single_precision_keeps_finite_what_is():
+    xyz = np.array([[1.0, 1e300, -1e300], [np.inf, -np.inf, np.nan], [0.1, 2.0, 3.0]])
+    single = single_precision(xyz)
+    assert single.dtype == np.float32
+    np.testing.assert_array_equal(np.isfinite(single), np.isfinite(xyz))
+    assert single[0, 1] > 3e38
+    assert single[0, 2] < -3e38
+    assert np.isposinf(single[1, 0])
+    np.testing.assert_array_equal(single[2], np.float32([0.1, 2.0, 3.0]))
+    assert single_precision(single) is single
 
 
 def assert_same_tiles(found, expected):

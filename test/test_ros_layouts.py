@@ -15,6 +15,7 @@ from ros_helpers import Collector, bench, street, wait_for
 from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.points import single_precision
 from gp_ground_seg.ros.labelled import FIELDS, free_names
 
 HAS_ORACLE = importlib.util.find_spec('sensor_msgs_py') is not None
@@ -129,7 +130,7 @@ def tested():
 def test_every_layout_comes_through(tested, case):
     b, labelled, segmenter = tested
     message, xyz, rows = case
-    expected = segmenter.segment(xyz)
+    expected = segmenter.segment(single_precision(xyz))
     count = len(labelled.messages)
     parts = b.segment(message)
 
