@@ -11,7 +11,8 @@ import hashlib
 import inspect
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import CodeType, FunctionType
 from typing import Any
 
@@ -22,6 +23,32 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataC
 _LOGGER = logging.getLogger('gp_ground_seg')
 
 _said: set[str] = set()
+_refused: list[str] = []
+
+
+class CodeNotKeptError(Exception):
+    """Code would have to be compiled, or was and cannot be kept, and that is refused."""
+
+
+@contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """Raise `CodeNotKeptError` for what is otherwise put up with.
+
+    Parameters
+    ----------
+    what : str
+        ``compilation``, or the ``loss`` of compiled code that cannot be kept on disk.
+    """
+    _refused.append(what)
+    try:
+        yield
+    finally:
+        _refused.pop()
+
+
+def say_that_it_compiles() -> None:
+    """Log, once in a process, that compiling takes its time."""
+    _say_once(logging.INFO, 'compiling for this processor, which takes 10 to 40 s')
 
 
 def _say_once(level: int, message: str, *facts: str) -> None:
@@ -88,7 +115,9 @@ class KeptCode(FunctionCache):  # type: ignore[misc]
             except Exception as error:
                 # Whatever is wrong with a file, compiling writes it anew.
                 _LOGGER.info('compiled code kept of %s cannot be used: %r', self._name, error)
-        _say_once(logging.INFO, 'compiling for this processor, which takes 10 to 40 s')
+        if 'compilation' in _refused:
+            raise CodeNotKeptError(self._name)
+        say_that_it_compiles()
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -109,6 +138,8 @@ class KeptCode(FunctionCache):  # type: ignore[misc]
             self._say_not_kept(repr(error))
 
     def _say_not_kept(self, reason: str) -> None:
+        if 'loss' in _refused:
+            raise CodeNotKeptError(reason)
         _say_once(
             logging.WARNING,
             'compiled code cannot be kept in %s (%s): every start compiles anew; '

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import Config, SensorConfig
-from gp_ground_seg.gp.backend import make_backend
+from gp_ground_seg.gp.backend import Backend, make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
 from gp_ground_seg.hidden_feet import without_hidden_feet
@@ -54,6 +54,8 @@ class GroundSegmenter:
         Parameters; `configure` changes them between scans.
     clock : callable
         Source of the seconds in ``Segmentation.timings`` and of ``learning.max_time``.
+    backend : Backend, optional
+        Who computes, until the parameters ``runtime`` change; by default as they say.
 
     Raises
     ------
@@ -62,11 +64,14 @@ class GroundSegmenter:
     """
 
     def __init__(
-        self, config: Config | None = None, clock: Callable[[], float] = time.perf_counter
+        self,
+        config: Config | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        backend: Backend | None = None,
     ) -> None:
         self._clock = clock
         self._config = config if config is not None else Config()
-        self._backend = make_backend(self._config.runtime)
+        self._backend = make_backend(self._config.runtime) if backend is None else backend
         self._workspace = Workspace()
         self._theta: FloatArray | None = None
         self._frames_since_learning = 0
@@ -75,6 +80,11 @@ class GroundSegmenter:
     def config(self) -> Config:
         """Parameters of the next scan."""
         return self._config
+
+    @property
+    def backend_name(self) -> str:
+        """Who computes: ``numba`` or ``numpy``."""
+        return self._backend.name
 
     def configure(self, config: Config) -> None:
         """Use `config` from the next scan on; what was learned under another is forgotten."""

@@ -211,6 +211,40 @@ for cloud in (points, np.asfortranarray(points), np.hstack([points, points])[:, 
 """
 
 
+COLD_START = """
+import logging, resource
+import numba.core.event
+from gp_ground_seg import GroundSegmenter
+from gp_ground_seg.ros.warm_up import warm_up
+
+class Listener(numba.core.event.Listener):
+    def on_start(self, event):
+        print('compiled here', event.data['dispatcher'].py_func.__name__)
+
+    def on_end(self, event):
+        pass
+
+logging.basicConfig(level=logging.INFO, format='%(name)s %(levelname)s %(message)s')
+numba.core.event.register('numba:compile', Listener())
+warm_up(GroundSegmenter())
+"""
+
+
+def test_a_first_start_has_others_compile(tmp_path):
+    """All of it: the compiler would leave hundreds of megabytes behind in the node."""
+    environment = {**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path)}
+    for n_said in (1, 0):
+        done = subprocess.run(
+            [sys.executable, '-c', COLD_START],
+            capture_output=True,
+            text=True,
+            env=environment,
+            check=False,
+        )
+        assert (done.returncode, done.stdout) == (0, ''), done.stderr
+        assert done.stderr.count(COMPILES) == n_said, done.stderr
+
+
 def test_the_first_frame_of_the_node_compiles_all_there_is():
     """In a process of its own: what other tests compiled does not count."""
     script = [sys.executable, '-c', FIRST_CLOUDS]

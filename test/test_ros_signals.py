@@ -43,10 +43,26 @@ def heeds_sigterm(process):
     return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
 
 
-def cpu_seconds(process):
-    with open(f'/proc/{process.popen.pid}/stat', encoding='ascii') as stat:
-        words = stat.read().rsplit(')', 1)[1].split()
+def stat_words(pid):
+    with open(f'/proc/{pid}/stat', encoding='ascii') as stat:
+        return stat.read().rsplit(')', 1)[1].split()
+
+
+def cpu_seconds(pid):
+    words = stat_words(pid)
     return (int(words[11]) + int(words[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def is_running(pid):
+    try:
+        return stat_words(pid)[0] != 'Z'
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def children(pid):
+    found = [int(name) for name in os.listdir('/proc') if name.isdigit()]
+    return [one for one in found if is_running(one) and int(stat_words(one)[1]) == pid]
 
 
 def assert_good_end(node, number, words=()):
@@ -72,10 +88,13 @@ def test_while_compiling(tmp_path):
     cache.mkdir()
     with Process(*IN_NAMESPACE, folder=tmp_path, NUMBA_CACHE_DIR=str(cache)) as node:
         wait_for(lambda: 'compiling' in node.log, 'start')
-        before = cpu_seconds(node)
-        wait_for(lambda: cpu_seconds(node) > before + 0.5, 'work')
+        wait_for(lambda: len(children(node.popen.pid)) == 2, 'two compilers')
+        compilers = children(node.popen.pid)
+        wait_for(lambda: all(cpu_seconds(pid) > 2.0 for pid in compilers), 'work')
         assert 'listening' not in node.log
         assert_good_end(node, signal.SIGTERM)
+    # Who compiled for it does not go on without it.
+    wait_for(lambda: not any(is_running(pid) for pid in compilers), 'end of the compilers')
 
 
 @pytest.mark.parametrize(
@@ -107,9 +126,9 @@ def test_within_a_long_segmentation(tmp_path, backend, number):
         link = Link(context)
         with spinning(context, link.probe):
             link.wait_until_connected()
-            before = cpu_seconds(node)
+            before = cpu_seconds(node.popen.pid)
             link.publisher.publish(message)
-            wait_for(lambda: cpu_seconds(node) > before + 1.0, 'work')
+            wait_for(lambda: cpu_seconds(node.popen.pid) > before + 1.0, 'work')
             assert_good_end(node, number)
             assert not link.ground.messages
 
