@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import weakref
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
+from threading import Lock, Thread
 from typing import Any
 
 FEWEST_POINTS = 4096
@@ -13,6 +14,59 @@ FEWEST_POINTS = 4096
 MOST_UNASKED = 4
 """Threads that are taken without being asked for: each of them costs a wake-up in every stage,
 more than its share of what is left is worth."""
+
+
+class _Worker:
+    """Thread that waits for one call at a time.
+
+    Two bare locks: an executor with its queue and futures takes twice as long to pass a
+    call on, as long as some of them are.
+    """
+
+    def __init__(self) -> None:
+        self._call: tuple[Callable[..., None], tuple[Any, ...]] | None = None
+        self._error: BaseException | None = None
+        self._go, self._done = Lock(), Lock()
+        self._go.acquire()
+        self._done.acquire()
+        self._is_busy = False
+        Thread(target=self._work, name='gp_ground_seg', daemon=True).start()
+
+    def start(self, function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+        """Call ``function(*arguments)`` in the thread."""
+        if self._is_busy:  # whoever waited was interrupted
+            self._done.acquire()
+        self._call, self._is_busy, self._error = (function, arguments), True, None
+        self._go.release()
+
+    def wait(self) -> None:
+        """Wait until the call has returned, and raise what it raised."""
+        self._done.acquire()
+        self._is_busy = False
+        if self._error is not None:
+            raise self._error
+
+    def end(self) -> None:
+        """End the thread."""
+        if self._is_busy:
+            self._done.acquire()
+        self._call = None
+        self._go.release()
+
+    def _work(self) -> None:
+        while True:
+            self._go.acquire()
+            if self._call is None:
+                return
+            function, arguments = self._call
+            try:
+                function(*arguments)
+            except BaseException as error:
+                self._error = error
+            # Nothing is held until the next call: frames are large.
+            self._call = None
+            del function, arguments
+            self._done.release()
 
 
 class RowPool:
@@ -31,9 +85,8 @@ class RowPool:
     def __init__(self, n_threads: int) -> None:
         self.n_threads = n_threads or min(len(os.sched_getaffinity(0)), MOST_UNASKED)
         # The caller's thread takes a share too.
-        self._executor = (
-            ThreadPoolExecutor(self.n_threads - 1, 'gp_ground_seg') if self.n_threads > 1 else None
-        )
+        self._workers = [_Worker() for _ in range(self.n_threads - 1)]
+        self._end = weakref.finalize(self, _end_all, self._workers)
 
     def run(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
         """Call ``function(start, stop, step, *arguments)`` for every n-th segment each.
@@ -67,14 +120,21 @@ class RowPool:
         shares: Sequence[tuple[int, ...]],
         arguments: tuple[Any, ...],
     ) -> None:
-        futures: list[Future[None]] = []
-        if self._executor is not None:
-            futures = [self._executor.submit(function, *s, *arguments) for s in shares[1:]]
-        function(*shares[0], *arguments)
-        for future in futures:
-            future.result()
+        # As many as there are shares: small clouds are not shared out.
+        workers = self._workers[: len(shares) - 1]
+        for worker, share in zip(workers, shares[1:], strict=True):
+            worker.start(function, (*share, *arguments))
+        try:
+            function(*shares[0], *arguments)
+        finally:
+            for worker in workers:
+                worker.wait()
 
     def close(self) -> None:
         """End the threads."""
-        if self._executor is not None:
-            self._executor.shutdown()
+        self._end()
+
+
+def _end_all(workers: list[_Worker]) -> None:
+    while workers:
+        workers.pop().end()

@@ -232,18 +232,17 @@ def reduce_cells(grid: PolarGrid, z: PointArray, tile: npt.NDArray[np.int32]) ->
     inside = grid.inside
     cell = grid.cell[inside]
     z_inside, r_inside = z[inside], grid.r[inside]
-    extremes = np.full((size, 3), np.inf, dtype=z.dtype)
-    lowest_z, lowest_r, highest_z = extremes.T
+    lowest_z, lowest_r = np.full((2, size), np.inf, dtype=z.dtype)
+    highest_z = np.full(size, -np.inf, dtype=z.dtype)
     np.minimum.at(lowest_z, cell, z_inside)
     is_lowest = z_inside == lowest_z[cell]
     np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest])
     is_lowest &= r_inside == lowest_r[cell]
-    numbers = np.empty((size, 2), dtype=np.int32)
-    numbers[:, 0] = np.bincount(cell, minlength=size)
-    numbers[:, 1] = NO_TILE
-    np.minimum.at(numbers[:, 1], cell[is_lowest], tile[inside][is_lowest])
-    highest_z[:] = -np.inf
+    lowest_tile = np.full(size, NO_TILE, dtype=np.int32)
+    np.minimum.at(lowest_tile, cell[is_lowest], tile[inside][is_lowest])
     np.maximum.at(highest_z, cell, z_inside)
+    extremes = np.column_stack([lowest_z, lowest_r, highest_z])
+    numbers = np.column_stack([np.bincount(cell, minlength=size).astype(np.int32), lowest_tile])
     shape = grid.n_segments, grid.n_bins, -1
     return CellTables(extremes.reshape(shape), numbers.reshape(shape))
 

@@ -62,8 +62,9 @@ def build_tiles(xyz: npt.NDArray[np.floating], grid: PolarGrid, tile_size: float
     own = np.minimum(column, side - 1) * side + np.minimum(row, side - 1)
     tile[inside] = own
     z = xyz[inside, 2]
-    extremes = np.empty((side * side, 2), dtype=xyz.dtype)
-    extremes[:] = np.inf, -np.inf
-    np.minimum.at(extremes[:, 0], own, z)
-    np.maximum.at(extremes[:, 1], own, z)
-    return Tiles(tile, extremes, np.unique(own).astype(np.int32))
+    foot_z = np.full(side * side, np.inf, dtype=xyz.dtype)
+    top_z = np.full(side * side, -np.inf, dtype=xyz.dtype)
+    np.minimum.at(foot_z, own, z)
+    np.maximum.at(top_z, own, z)
+    touched = np.flatnonzero(top_z > -np.inf).astype(np.int32)
+    return Tiles(tile, np.column_stack([foot_z, top_z]), touched)

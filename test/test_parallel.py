@@ -1,0 +1,102 @@
+"""Shares of work in threads: all done, errors passed on, threads gone in the end."""
+
+import gc
+import threading
+import time
+
+import pytest
+
+from gp_ground_seg.parallel import FEWEST_POINTS, MOST_UNASKED, RowPool
+
+NAME = 'gp_ground_seg'
+
+
+def n_workers():
+    return sum(thread.name == NAME for thread in threading.enumerate())
+
+
+def wait_for_workers(number):
+    end = time.monotonic() + 10.0
+    while n_workers() != number:
+        assert time.monotonic() < end, f'{n_workers()} threads instead of {number}'
+        time.sleep(0.01)
+
+
+@pytest.fixture
+def pool():
+    pool = RowPool(3)
+    yield pool
+    pool.close()
+
+
+def test_every_row_is_done_once_whatever_the_number_of_threads():
+    for n_threads in (1, 2, 3, 7):
+        pool = RowPool(n_threads)
+        for n_rows in (0, 1, 5, FEWEST_POINTS, 3 * FEWEST_POINTS + 1):
+            rows, points, shares = [], [], []
+            pool.run(lambda a, b, step, to: to.extend(range(a, b, step)), n_rows, rows)
+            pool.run_points(lambda a, b, to: to.extend(range(a, b)), n_rows, points)
+            pool.run_shares(lambda k, a, b, to: to.append((k, b - a)), n_rows, shares)
+            assert sorted(rows) == sorted(points) == list(range(n_rows))
+            assert [k for k, _ in sorted(shares)] == list(range(pool.n_shares(n_rows)))
+            assert sum(size for _, size in shares) == n_rows
+        pool.close()
+
+
+def test_shares_are_done_side_by_side(pool):
+    meeting = threading.Barrier(3, timeout=10.0)
+    pool.run(lambda *_: meeting.wait(), 3)
+
+
+@pytest.mark.parametrize('bad', [0, 1, 2])
+def test_an_error_in_any_share_is_raised_and_the_pool_goes_on(pool, bad):
+    def work(k, *_):
+        time.sleep(0.02 * (k != bad))
+        done.append(k)
+        if k == bad:
+            raise ValueError(f'share {k}')
+
+    for _ in range(3):
+        done = []
+        with pytest.raises(ValueError, match=f'share {bad}'):
+            pool.run(work, 3)
+        # No thread is still at work on arrays that the caller takes for its own.
+        assert sorted(done) == [0, 1, 2]
+    pool.run(lambda k, *_: done.append(k), 3)
+    assert sorted(done) == [0, 0, 1, 1, 2, 2]
+
+
+def test_an_interrupted_wait_is_made_up_for(pool):
+    begun = threading.Event()
+
+    def slow(k, *_):
+        if k == 0:
+            begun.wait(10.0)
+            raise KeyboardInterrupt
+        begun.set()
+        time.sleep(0.1)
+        late.append(k)
+
+    late = []
+    with pytest.raises(KeyboardInterrupt):
+        pool.run(slow, 3)
+    pool.run(lambda k, *_: late.append(10 + k), 3)
+    assert sorted(late) == [1, 2, 10, 11, 12]
+
+
+def test_threads_end_when_closed_and_when_forgotten():
+    before = n_workers()
+    pool, other = RowPool(4), RowPool(2)
+    assert n_workers() == before + 4
+    pool.close()
+    pool.close()
+    wait_for_workers(before + 1)
+    del other
+    gc.collect()
+    wait_for_workers(before)
+
+
+def test_unasked_there_are_few():
+    pool = RowPool(0)
+    assert 1 <= pool.n_threads <= MOST_UNASKED
+    pool.close()
