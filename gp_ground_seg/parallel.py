@@ -39,12 +39,11 @@ class _Worker:
         self._call, self._is_busy, self._error = (function, arguments), True, None
         self._go.release()
 
-    def wait(self) -> None:
-        """Wait until the call has returned, and raise what it raised."""
+    def wait(self) -> BaseException | None:
+        """Wait until the call has returned; what it raised."""
         self._done.acquire()
         self._is_busy = False
-        if self._error is not None:
-            raise self._error
+        return self._error
 
     def end(self) -> None:
         """End the thread."""
@@ -127,8 +126,11 @@ class RowPool:
         try:
             function(*shares[0], *arguments)
         finally:
-            for worker in workers:
-                worker.wait()
+            # All of them: they work on arrays that are the caller's again afterwards.
+            errors = [worker.wait() for worker in workers]
+        for error in errors:
+            if error is not None:
+                raise error
 
     def close(self) -> None:
         """End the threads."""
