@@ -8,19 +8,6 @@ import pytest
 
 from gp_ground_seg.parallel import FEWEST_POINTS, MOST_UNASKED, RowPool
 
-NAME = 'gp_ground_seg'
-
-
-def n_workers():
-    return sum(thread.name == NAME for thread in threading.enumerate())
-
-
-def wait_for_workers(number):
-    end = time.monotonic() + 10.0
-    while n_workers() != number:
-        assert time.monotonic() < end, f'{n_workers()} threads instead of {number}'
-        time.sleep(0.01)
-
 
 @pytest.fixture
 def pool():
@@ -84,16 +71,29 @@ def test_an_interrupted_wait_is_made_up_for(pool):
     assert sorted(late) == [1, 2, 10, 11, 12]
 
 
+def threads_of(n_threads):
+    """A pool, and the threads that it has started."""
+    before = set(threading.enumerate())
+    return RowPool(n_threads), set(threading.enumerate()) - before
+
+
+def wait_for_end(threads):
+    for thread in threads:
+        thread.join(timeout=10.0)
+        assert not thread.is_alive()
+
+
 def test_threads_end_when_closed_and_when_forgotten():
-    before = n_workers()
-    pool, other = RowPool(4), RowPool(2)
-    assert n_workers() == before + 4
-    pool.close()
-    pool.close()
-    wait_for_workers(before + 1)
-    del other
+    closed, its_threads = threads_of(4)
+    forgotten, other_threads = threads_of(2)
+    assert (len(its_threads), len(other_threads)) == (3, 1)
+    closed.close()
+    closed.close()
+    wait_for_end(its_threads)
+    assert all(thread.is_alive() for thread in other_threads)
+    del forgotten
     gc.collect()
-    wait_for_workers(before)
+    wait_for_end(other_threads)
 
 
 def test_unasked_there_are_few():
