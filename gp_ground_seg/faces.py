@@ -6,6 +6,7 @@ The returns above the foot can: together they are a surface that stands upright.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,22 @@ class Faces:
     tiles: Tiles
     is_face: npt.NDArray[np.bool_]
     is_footless: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class BegunFaces:
+    """Faces that another thread may be looking for.
+
+    Attributes
+    ----------
+    find : callable
+        Waits for them, and returns them.
+    drop : callable
+        Waits until nobody looks for them, to be called where they are no longer wanted.
+    """
+
+    find: Callable[[], Faces]
+    drop: Callable[[], None]
 
 
 def find_faces(

@@ -23,14 +23,14 @@ _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.
 _TOP, _ORIGIN_X, _ORIGIN_Y, _FOOT = 10, 11, 12, 13
 N_COLUMNS = 14
 SKIPPED = -1
-"""Slot of a tile that has nothing tall, or is another thread's."""
+"""Slot of a tile that has nothing tall."""
 
 
 @compiled
 def judge_faces(
-    start: int,
+    _start: int,
     _stop: int,
-    step: int,
+    _step: int,
     columns: PointArray,
     tile: CellArray,
     extremes: PointArray,
@@ -48,30 +48,25 @@ def judge_faces(
     is_face: BoolArray,
     is_footless: BoolArray,
 ) -> None:
-    """Do what `gp_ground_seg.faces.find_faces` does with every `step`-th tile.
+    """Do what `gp_ground_seg.faces.find_faces` does.
 
-    A tile's sums are taken by one thread in the order of the points: they do not
-    depend on the number of threads. `slots` (step, T) and `sums` (step, 2 T, N_COLUMNS)
-    are room to work in.
+    `slots` (2 T,) and `sums` (2 T, N_COLUMNS) are room to work in.
     """
-    own_slots, own_sums = slots[start], sums[start]
-    n_slots = _take_tall(
-        start, step, extremes, touched, tile_size, min_height, own_slots, own_sums
-    )
+    n_slots = _take_tall(extremes, touched, tile_size, min_height, slots, sums)
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
             continue
-        k = own_slots[np.uintp(tile[i])]
+        k = slots[np.uintp(tile[i])]
         if k == SKIPPED:
             continue
-        low = own_sums[np.uintp(k)]
+        low = sums[np.uintp(k)]
         z = np.float64(columns[2, i]) - low[_FOOT]
         if z > max_height:
             continue
         x = np.float64(columns[0, i]) - low[_ORIGIN_X]
         y = np.float64(columns[1, i]) - low[_ORIGIN_Y]
         # No branch: whether a return is one of the lowest is anybody's guess.
-        s = own_sums[np.uintp(k + np.int32(z > tolerance))]
+        s = sums[np.uintp(k + np.int32(z > tolerance))]
         s[0] += 1.0
         s[1] += x
         s[2] += y
@@ -85,8 +80,8 @@ def judge_faces(
         s[_TOP] = max(s[_TOP], z)
     s = np.empty(N_COLUMNS)
     for slot in range(n_slots):
-        t = touched[np.uintp(own_slots[len(extremes) + slot])]
-        low, high = own_sums[2 * slot], own_sums[2 * slot + 1]
+        t = touched[np.uintp(slots[len(extremes) + slot])]
+        low, high = sums[2 * slot], sums[2 * slot + 1]
         for c in range(_TOP):
             s[c] = low[c] + high[c]
         n, top = s[0], max(low[_TOP], high[_TOP])
@@ -105,8 +100,6 @@ def judge_faces(
 
 @inlined
 def _take_tall(
-    start: int,
-    step: int,
     extremes: PointArray,
     touched: CellArray,
     tile_size: float,
@@ -114,7 +107,7 @@ def _take_tall(
     slots: CellArray,
     sums: FloatArray,
 ) -> int:
-    """Make room for the sums of every tall tile that is this thread's; their number.
+    """Make room for the sums of every tall tile; their number.
 
     Sums are taken about a point of the tile: about the sensor, rounding would eat the
     scatter.
@@ -126,7 +119,7 @@ def _take_tall(
         t = np.uintp(touched[place])
         foot = np.float64(extremes[t, 0])
         is_tall = np.float64(extremes[t, 1]) - foot > min_height
-        if not is_tall or touched[place] % step != start:
+        if not is_tall:
             slots[t] = SKIPPED
             continue
         slots[t] = 2 * n_slots

@@ -68,6 +68,36 @@ class _Worker:
             self._done.release()
 
 
+class Begun:
+    """A call that a worker, if there is one, has begun."""
+
+    def __init__(
+        self,
+        workers: list[_Worker],
+        function: Callable[..., None],
+        arguments: tuple[Any, ...],
+    ) -> None:
+        self._workers = workers
+        self._call = None if workers else lambda: function(*arguments)
+        self._error: BaseException | None = None
+        for worker in workers:
+            worker.start(function, arguments)
+
+    def finish(self) -> None:
+        """Wait until it is done, and raise what it raised."""
+        if self._call is not None:
+            self._call()
+            self._call = None
+        self.drop()
+        if self._error is not None:
+            raise self._error
+
+    def drop(self) -> None:
+        """Make sure that nobody works at it any more; `finish` may be called later."""
+        while self._workers:
+            self._error = self._workers.pop().wait()
+
+
 class RowPool:
     """Runs compiled functions on shares of rows, one share in each thread.
 
@@ -85,6 +115,7 @@ class RowPool:
         self.n_threads = n_threads or min(len(os.sched_getaffinity(0)), MOST_UNASKED)
         # The caller's thread takes a share too.
         self._workers = [_Worker() for _ in range(self.n_threads - 1)]
+        self._begun: Begun | None = None
         self._end = weakref.finalize(self, _end_all, self._workers)
 
     def run(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
@@ -109,6 +140,21 @@ class RowPool:
         shares = [(k, *block) for k, block in enumerate(self._blocks(n_rows))]
         self._run(function, shares, arguments)
 
+    def begin(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> Begun:
+        """Begin ``function(0, n_rows, 1, *arguments)`` beside what the caller goes on to do.
+
+        With one thread, it is done when it is asked for. Before anything else is shared
+        out, it is waited for.
+        """
+        self._settle()
+        self._begun = Begun(self._workers[:1], function, (0, n_rows, 1, *arguments))
+        return self._begun
+
+    def _settle(self) -> None:
+        if self._begun is not None:
+            self._begun.drop()
+            self._begun = None
+
     def _blocks(self, n_rows: int) -> list[tuple[int, int]]:
         n_shares = self.n_shares(n_rows)
         return list(pairwise(n_rows * k // n_shares for k in range(n_shares + 1)))
@@ -119,6 +165,7 @@ class RowPool:
         shares: Sequence[tuple[int, ...]],
         arguments: tuple[Any, ...],
     ) -> None:
+        self._settle()
         # As many as there are shares: small clouds are not shared out.
         workers = self._workers[: len(shares) - 1]
         for worker, share in zip(workers, shares[1:], strict=True):
@@ -134,6 +181,7 @@ class RowPool:
 
     def close(self) -> None:
         """End the threads."""
+        self._settle()
         self._end()
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import Config, SensorConfig
+from gp_ground_seg.faces import BegunFaces
 from gp_ground_seg.gp.backend import Backend, make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
@@ -19,6 +20,7 @@ from gp_ground_seg.line_extraction import extract_lines
 from gp_ground_seg.points import take_points
 from gp_ground_seg.polar_grid import (
     Candidates,
+    CellTables,
     FloatArray,
     PointArray,
     PolarGrid,
@@ -41,7 +43,7 @@ class _PlacedScan:
     level_xyz: PointArray
     grid: PolarGrid
     candidates: Candidates
-    tiles: Tiles
+    faces: BegunFaces
     pose: SensorPose
 
 
@@ -130,9 +132,7 @@ class GroundSegmenter:
         xyz, pose = placed.level_xyz, placed.pose
         grid = placed.grid
 
-        faces = self._backend.find_faces(
-            xyz, placed.tiles, config.faces, config.label.obstacle_max_height
-        )
+        faces = placed.faces.find()
         use_compiled = self._backend.name == 'numba'
         candidates = without_hidden_feet(placed.candidates, faces.is_footless, use_compiled)
         timer.mark('faces')
@@ -185,7 +185,9 @@ class GroundSegmenter:
         Parameters and errors are those of `segment`.
         """
         timer = StageTimer(self._clock)
-        return self._place(points, self._config.sensor, timer).pose
+        placed = self._place(points, self._config.sensor, timer)
+        placed.faces.drop()
+        return placed.pose
 
     def _place(
         self, points: npt.ArrayLike, sensor: SensorConfig, timer: StageTimer
@@ -193,31 +195,52 @@ class GroundSegmenter:
         """Scan in the level frame, as given or as it seems to be."""
         own_xyz = take_points(points)
         given = given_pose(sensor)
-        level_xyz, grid, candidates, tiles = self._sort(given.level(own_xyz), self._workspace)
-        timer.mark('grid')
-        pose = estimate_pose(
-            candidates,
-            sensor,
-            self._backend.name == 'numba',
-            lambda turn: self._sort(turned_sample(level_xyz, turn), Workspace())[2],
-        )
+        level_xyz, grid, cells, tiles = self._sort(given.level(own_xyz), self._workspace)
+        # It needs neither the candidates nor the pose: another thread may have begun.
+        faces = self._begin_faces(level_xyz, tiles)
+        try:
+            candidates = self._candidates(cells, grid)
+            timer.mark('grid')
+            pose = estimate_pose(
+                candidates,
+                sensor,
+                self._backend.name == 'numba',
+                lambda turn: self._turned_candidates(level_xyz, turn),
+            )
+        except BaseException:
+            faces.drop()
+            raise
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
-            level_xyz, grid, candidates, tiles = self._sort(pose.level(own_xyz), self._workspace)
+            faces.drop()
+            level_xyz, grid, cells, tiles = self._sort(pose.level(own_xyz), self._workspace)
+            candidates = self._candidates(cells, grid)
+            faces = self._begin_faces(level_xyz, tiles)
         timer.mark('pose')
-        return _PlacedScan(own_xyz, level_xyz, grid, candidates, tiles, pose)
+        return _PlacedScan(own_xyz, level_xyz, grid, candidates, faces, pose)
 
     def _sort(
         self, xyz: PointArray, workspace: Workspace
-    ) -> tuple[PointArray, PolarGrid, Candidates, Tiles]:
-        """Points (N, 3) column by column, their grid, the lowest point of each bin, tiles."""
+    ) -> tuple[PointArray, PolarGrid, CellTables, Tiles]:
+        """Points (N, 3) column by column, in a level frame, sorted into bins and tiles."""
+        return self._backend.sort_points(
+            xyz, self._config.grid, self._config.faces.cell_size, workspace
+        )
+
+    def _candidates(self, cells: CellTables, grid: PolarGrid) -> Candidates:
+        return self._backend.ground_candidates(
+            cells, grid.edges, self._config.lines.min_density_extent
+        )
+
+    def _turned_candidates(self, xyz: PointArray, turn: FloatArray) -> Candidates:
+        """Candidates of a sample of the points turned by a matrix (3, 3)."""
+        _, grid, cells, _ = self._sort(turned_sample(xyz, turn), Workspace())
+        return self._candidates(cells, grid)
+
+    def _begin_faces(self, xyz: PointArray, tiles: Tiles) -> BegunFaces:
         config = self._config
-        xyz, grid, cells, tiles = self._backend.sort_points(
-            xyz, config.grid, config.faces.cell_size, workspace
+        return self._backend.begin_faces(
+            xyz, tiles, config.faces, config.label.obstacle_max_height
         )
-        candidates = self._backend.ground_candidates(
-            cells, grid.edges, config.lines.min_density_extent
-        )
-        return xyz, grid, candidates, tiles
 
     def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:
         """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""

@@ -132,6 +132,6 @@ def test_compiled_marks_are_the_reference(seed, dtype, n_threads):
     config = FacesConfig(max_foot_distance=rng.uniform(0.02, 0.2))
     tiles = build_tiles(xyz, grid, config.cell_size)
     backend, plain = CompiledBackend(n_threads), NumpyBackend()
-    faces = backend.find_faces(xyz, tiles, config, 2.0)
-    same = plain.find_faces(xyz, tiles, config, 2.0)
+    faces = backend.begin_faces(xyz, tiles, config, 2.0).find()
+    same = plain.begin_faces(xyz, tiles, config, 2.0).find()
     np.testing.assert_array_equal(faces.is_footless, same.is_footless)

@@ -71,6 +71,31 @@ def test_an_interrupted_wait_is_made_up_for(pool):
     assert sorted(late) == [1, 2, 10, 11, 12]
 
 
+@pytest.mark.parametrize('n_threads', [1, 2, 3])
+def test_what_was_begun_is_done_once_and_before_anything_else(n_threads):
+    pool, done = RowPool(n_threads), []
+
+    def work(*_):
+        time.sleep(0.05)
+        done.append('begun')
+
+    begun = pool.begin(work, 1)
+    begun.finish()
+    begun.finish()
+    assert done == ['begun']
+    begun = pool.begin(work, 1)
+    pool.run(lambda *_: done.append('run'), 1)
+    # With one thread nobody has begun yet.
+    expected = ['begun', *n_threads * ['run']] if n_threads > 1 else ['run', 'begun']
+    begun.finish()
+    assert done[1:] == expected
+    pool.begin(work, 1).drop()
+    assert done.count('begun') == (3 if n_threads > 1 else 2)
+    with pytest.raises(ZeroDivisionError):
+        pool.begin(lambda *_: 1 / 0, 1).finish()
+    pool.close()
+
+
 def threads_of(n_threads):
     """A pool, and the threads that it has started."""
     before = set(threading.enumerate())

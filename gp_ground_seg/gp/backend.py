@@ -8,7 +8,7 @@ from typing import Protocol
 from gp_ground_seg.compiled import HAVE_NUMBA
 from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig, RuntimeConfig
 from gp_ground_seg.errors import MissingDependencyError
-from gp_ground_seg.faces import Faces
+from gp_ground_seg.faces import BegunFaces, Faces
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled
@@ -49,10 +49,13 @@ class Backend(Protocol):
     ) -> Candidates:
         """See `gp_ground_seg.polar_grid.ground_candidates`."""
 
-    def find_faces(
+    def begin_faces(
         self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
-    ) -> Faces:
-        """See `gp_ground_seg.faces.find_faces`."""
+    ) -> BegunFaces:
+        """Begin `gp_ground_seg.faces.find_faces`, in another thread if there is one.
+
+        They, or that they are dropped, are to be waited for before the points change.
+        """
 
     def label_points(
         self,

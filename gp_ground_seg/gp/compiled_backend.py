@@ -6,7 +6,7 @@ import numpy as np
 
 from gp_ground_seg import label_passes, point_passes
 from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
-from gp_ground_seg.faces import FEWEST_RETURNS, Faces
+from gp_ground_seg.faces import FEWEST_RETURNS, BegunFaces, Faces
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.growth_compiled import grow_on_latent_compiled, grow_surface_compiled
 from gp_ground_seg.gp.latent import latent_rows_compiled
@@ -123,18 +123,21 @@ class CompiledBackend:
         )
         return Candidates(r[:n], z[:n], own_bin[:n], density[:n], offsets, tile[:n])
 
-    def find_faces(
+    def begin_faces(
         self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
-    ) -> Faces:
-        """Upright faces."""
+    ) -> BegunFaces:
+        """Upright faces, in another thread if there is one.
+
+        Shared out, each thread would look at all points: two need as long as one.
+        """
         flags = self._workspace.take('faces', (2, len(tiles.extremes)), np.bool_)
         flags.fill(False)
         is_face, is_footless = flags
         # As much as could be needed: what is not used takes no memory.
-        room = self.n_threads, 2 * len(tiles.extremes)
-        slots = self._workspace.take('slots', room, np.int32)
-        sums = self._workspace.take('sums', (*room, label_passes.N_COLUMNS), np.float64)
-        self._pool.run(
+        room = 2 * len(tiles.extremes)
+        slots = self._workspace.take('slots', (room,), np.int32)
+        sums = self._workspace.take('sums', (room, label_passes.N_COLUMNS), np.float64)
+        begun = self._pool.begin(
             label_passes.judge_faces,
             len(is_face),
             xyz.T,
@@ -154,7 +157,12 @@ class CompiledBackend:
             is_face,
             is_footless,
         )
-        return Faces(tiles, is_face, is_footless)
+
+        def find() -> Faces:
+            begun.finish()
+            return Faces(tiles, is_face, is_footless)
+
+        return BegunFaces(find, begun.drop)
 
     def label_points(
         self,

@@ -6,7 +6,7 @@ import numpy as np
 
 from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
-from gp_ground_seg.faces import Faces, find_faces
+from gp_ground_seg.faces import BegunFaces, Faces, find_faces
 from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
@@ -51,11 +51,11 @@ class NumpyBackend:
         """Lowest point and vertical density of each occupied bin."""
         return ground_candidates(cells, edges, min_extent)
 
-    def find_faces(
+    def begin_faces(
         self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
-    ) -> Faces:
-        """Upright faces."""
-        return find_faces(xyz, tiles, faces, max_height)
+    ) -> BegunFaces:
+        """Upright faces, when they are asked for."""
+        return BegunFaces(lambda: find_faces(xyz, tiles, faces, max_height), lambda: None)
 
     def label_points(
         self,

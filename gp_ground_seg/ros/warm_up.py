@@ -24,7 +24,7 @@ from gp_ground_seg.sensor_pose import given_pose
 _RINGS = 24
 _DIRECTIONS = 64
 _PARTS = {
-    'points': ('sort_points', 'ground_candidates', 'find_faces', 'label_points'),
+    'points': ('sort_points', 'ground_candidates', 'begin_faces', 'label_points'),
     'processes': ('log_length_scales', 'grow', 'grow_on_latent', 'fuse_neighbours', 'objective'),
 }
 """Methods of the backend whose code is compiled side by side."""
