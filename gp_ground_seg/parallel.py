@@ -19,8 +19,8 @@ more than its share of what is left is worth."""
 class _Worker:
     """Thread that waits for one call at a time.
 
-    Two bare locks: an executor with its queue and futures takes twice as long to pass a
-    call on, as long as some of them are.
+    Two bare locks: an executor with its queue and futures takes longer to pass a call on,
+    and some calls are as short as that.
     """
 
     def __init__(self) -> None:

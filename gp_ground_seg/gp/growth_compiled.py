@@ -73,7 +73,7 @@ def _grow_surface(
         while n_knots < len(knots) and not math.isnan(knot_log_length_scale[m, n_knots]):
             n_knots += 1
         size = (n + n_knots + LANES - 1) & -LANES
-        # Element by element: to assign slices takes no less time, and two seconds to compile.
+        # Element by element: to assign slices takes no less time, and seconds to compile.
         for i in range(n):
             all_r[i], all_l[i] = r[first + i], log_length_scale[first + i]
         for j in range(n_knots):

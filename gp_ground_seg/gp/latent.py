@@ -161,7 +161,7 @@ def _latent_rows(
             solve(factor, p, weight)
         # From pseudo-input to pseudo-input: the inner loop runs along a row.
         size = (n + n_wanted + LANES - 1) & -LANES
-        # Element by element: to assign slices takes no less time, and two seconds to compile.
+        # Element by element: to assign slices takes no less time, and seconds to compile.
         for i in range(n):
             wanted[i] = r[own + i]
         for i in range(n_wanted):

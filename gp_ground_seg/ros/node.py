@@ -138,7 +138,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._health.input.arrived(start, stamp, cloud.header.frame_id, fields)
         self._health.processing.arrived(start, arrival.n_lost)
         try:
-            # The code for the other precision would take the first start half as long again.
+            # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
             segmentation = self._segmenter.segment(points, self._tilt(cloud))
             segmented = time.monotonic()
