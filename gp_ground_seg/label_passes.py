@@ -28,9 +28,6 @@ SKIPPED = -1
 
 @compiled
 def judge_faces(
-    _start: int,
-    _stop: int,
-    _step: int,
     columns: PointArray,
     tile: CellArray,
     extremes: PointArray,
@@ -80,7 +77,7 @@ def judge_faces(
         s[_TOP] = max(s[_TOP], z)
     s = np.empty(N_COLUMNS)
     for slot in range(n_slots):
-        t = touched[np.uintp(slots[len(extremes) + slot])]
+        t = slots[len(extremes) + slot]
         low, high = sums[2 * slot], sums[2 * slot + 1]
         for c in range(_TOP):
             s[c] = low[c] + high[c]
@@ -115,19 +112,19 @@ def _take_tall(
     n_slots = 0
     n_sides = int(math.sqrt(len(extremes)))
     half = 0.5 * n_sides * tile_size
-    for place in range(len(touched)):
-        t = np.uintp(touched[place])
+    for own in touched:
+        t = np.uintp(own)
         foot = np.float64(extremes[t, 0])
         is_tall = np.float64(extremes[t, 1]) - foot > min_height
         if not is_tall:
             slots[t] = SKIPPED
             continue
         slots[t] = 2 * n_slots
-        slots[len(extremes) + n_slots] = place
+        slots[len(extremes) + n_slots] = own
         for row in (2 * n_slots, 2 * n_slots + 1):
             sums[row] = 0.0
-        sums[2 * n_slots, _ORIGIN_X] = (touched[place] // n_sides) * tile_size - half
-        sums[2 * n_slots, _ORIGIN_Y] = (touched[place] % n_sides) * tile_size - half
+        sums[2 * n_slots, _ORIGIN_X] = (own // n_sides) * tile_size - half
+        sums[2 * n_slots, _ORIGIN_Y] = (own % n_sides) * tile_size - half
         sums[2 * n_slots, _FOOT] = foot
         n_slots += 1
     return n_slots

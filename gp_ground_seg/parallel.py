@@ -140,14 +140,14 @@ class RowPool:
         shares = [(k, *block) for k, block in enumerate(self._blocks(n_rows))]
         self._run(function, shares, arguments)
 
-    def begin(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> Begun:
-        """Begin ``function(0, n_rows, 1, *arguments)`` beside what the caller goes on to do.
+    def begin(self, function: Callable[..., None], *arguments: Any) -> Begun:
+        """Begin ``function(*arguments)`` beside what the caller goes on to do.
 
         With one thread, it is done when it is asked for. Before anything else is shared
         out, it is waited for.
         """
         self._settle()
-        self._begun = Begun(self._workers[:1], function, (0, n_rows, 1, *arguments))
+        self._begun = Begun(self._workers[:1], function, arguments)
         return self._begun
 
     def _settle(self) -> None:

@@ -39,12 +39,12 @@ def take_points(points: npt.ArrayLike) -> PointArray:
         If the shape or type is another; the message holds both.
     """
     array = np.asarray(points)
-    if array.dtype in COMPUTED and array.flags.aligned and array.ndim == 2 and array.shape[1] >= 3:
-        return array[:, :3]
     if array.ndim != 2 or array.shape[1] < 3:
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be (N, 3) or wider'
         )
+    if array.dtype in COMPUTED and array.flags.aligned:
+        return array[:, :3]
     if not np.issubdtype(array.dtype, np.floating):
         raise PointCloudError(
             f'points of shape {array.shape} and type {array.dtype}: must be floating point'
@@ -61,18 +61,13 @@ def in_columns(xyz: PointArray, workspace: Workspace) -> PointArray:
     Each coordinate by itself in a row (Fortran order) and read-only; a copy in
     `workspace` where they lie otherwise.
     """
-    if is_in_columns(xyz):
+    if xyz.flags.f_contiguous and xyz.flags.aligned:
         return as_read_only(xyz)
     columns: PointArray = workspace.take('columns', (3, len(xyz)), xyz.dtype)
     with np.errstate(invalid='ignore'):
         for k in range(3):
             columns[k] = xyz[:, k]
     return as_read_only(columns.T)
-
-
-def is_in_columns(xyz: PointArray) -> bool:
-    """Whether each coordinate lies by itself in a row of memory."""
-    return bool(xyz.flags.f_contiguous and xyz.flags.aligned)
 
 
 def single_precision(xyz: PointArray) -> PointArray:

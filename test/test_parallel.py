@@ -79,20 +79,20 @@ def test_what_was_begun_is_done_once_and_before_anything_else(n_threads):
         time.sleep(0.05)
         done.append('begun')
 
-    begun = pool.begin(work, 1)
+    begun = pool.begin(work)
     begun.finish()
     begun.finish()
     assert done == ['begun']
-    begun = pool.begin(work, 1)
+    begun = pool.begin(work)
     pool.run(lambda *_: done.append('run'), 1)
     # With one thread nobody has begun yet.
     expected = ['begun', *n_threads * ['run']] if n_threads > 1 else ['run', 'begun']
     begun.finish()
     assert done[1:] == expected
-    pool.begin(work, 1).drop()
+    pool.begin(work).drop()
     assert done.count('begun') == (3 if n_threads > 1 else 2)
     with pytest.raises(ZeroDivisionError):
-        pool.begin(lambda *_: 1 / 0, 1).finish()
+        pool.begin(lambda: 1 / 0).finish()
     pool.close()
 
 

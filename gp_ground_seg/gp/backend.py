@@ -68,16 +68,6 @@ class Backend(Protocol):
     ) -> Labelled:
         """See `gp_ground_seg.labelling`."""
 
-    def log_length_scales(
-        self,
-        theta: FloatArray,
-        pseudo: PseudoInputs,
-        candidates: Candidates,
-        knots: FloatArray,
-        n_knots: IntArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """See `gp_ground_seg.gp.latent.latent_rows_reference`."""
-
     def grow(
         self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
@@ -86,7 +76,7 @@ class Backend(Protocol):
     def grow_on_latent(
         self, task: GrowthTask, pseudo: PseudoInputs, n_knots: IntArray
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
-        """Both processes: `log_length_scales`, then `grow`.
+        """Both processes: `gp_ground_seg.gp.latent.latent_rows_reference`, then `grow`.
 
         What `grow` gives, and the log length-scales at the knots (M, K) [log m].
         """

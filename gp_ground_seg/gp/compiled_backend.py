@@ -9,7 +9,6 @@ from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
 from gp_ground_seg.faces import FEWEST_RETURNS, BegunFaces, Faces
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.growth_compiled import grow_on_latent_compiled, grow_surface_compiled
-from gp_ground_seg.gp.latent import latent_rows_compiled
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
 from gp_ground_seg.labelling import Labelled
@@ -139,7 +138,6 @@ class CompiledBackend:
         sums = self._workspace.take('sums', (room, label_passes.N_COLUMNS), np.float64)
         begun = self._pool.begin(
             label_passes.judge_faces,
-            len(is_face),
             xyz.T,
             tiles.tile,
             tiles.extremes,
@@ -226,34 +224,6 @@ class CompiledBackend:
             margin,
         )
         return Labelled(labels, height, margin, roughness)
-
-    def log_length_scales(
-        self,
-        theta: FloatArray,
-        pseudo: PseudoInputs,
-        candidates: Candidates,
-        knots: FloatArray,
-        n_knots: IntArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Log length-scales at candidates and knots."""
-        n_segments = len(candidates.offsets) - 1
-        at_candidates = np.empty(len(candidates.r))
-        at_knots = np.empty((n_segments, len(knots)))
-        self._pool.run(
-            latent_rows_compiled,
-            n_segments,
-            theta,
-            pseudo.offsets,
-            pseudo.r_bar,
-            pseudo.surface_class,
-            candidates.offsets,
-            candidates.r,
-            knots,
-            n_knots,
-            at_candidates,
-            at_knots,
-        )
-        return at_candidates, at_knots
 
     def grow(
         self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray

@@ -78,20 +78,14 @@ class FrameModel:
         """Bounds, priors and starting values of theta for this frame."""
         return theta_space(self.config, self.pseudo.first_guess)
 
-    def log_length_scales(
-        self, theta: FloatArray, knots: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Log length-scales at the candidates (C,) and knots (M, K) [log m].
+    def _given_log_length_scales(self, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Log length-scales at the candidates (C,) and knots (M, K) without a latent process.
 
         NaN behind the bin of the last candidate: nothing is known of the ground there.
         """
-        n_knots = self._n_knots(knots)
-        if self.config.length_scale.model == 'latent':
-            return self.backend.log_length_scales(
-                theta, self.pseudo, self.candidates, knots, n_knots
-            )
         u = candidate_log_length_scale(self.candidates, self.lines, self.config.length_scale)
         knot_u = interpolate_along_segments(self.candidates, u, knots)
+        n_knots = self._n_knots(knots)
         return u, np.where(np.arange(len(knots)) < n_knots[:, None], knot_u, np.nan)
 
     def grow(
@@ -118,7 +112,7 @@ class FrameModel:
         )
         if self.config.length_scale.model == 'latent':
             return self.backend.grow_on_latent(task, self.pseudo, self._n_knots(knots))
-        u, knot_u = self.log_length_scales(theta, knots)
+        u, knot_u = self._given_log_length_scales(knots)
         return *self.backend.grow(task, u, knot_u), knot_u
 
     def _n_knots(self, knots: FloatArray) -> IntArray:
@@ -169,7 +163,7 @@ class FrameModel:
         u = (
             np.zeros(int(inlier.sum()))
             if latent
-            else self.log_length_scales(theta, _NO_KNOTS)[0][inlier]
+            else self._given_log_length_scales(_NO_KNOTS)[0][inlier]
         )
         return TrainingFrame(
             offsets=taken[offsets],

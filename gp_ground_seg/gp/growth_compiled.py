@@ -15,7 +15,7 @@ import numpy as np
 from gp_ground_seg.compiled import compiled_vectors, inlined
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.growth import BoolArray
-from gp_ground_seg.gp.latent import LANES, latent_rows_inlined
+from gp_ground_seg.gp.latent import LANES, latent_rows_compiled
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 
@@ -254,7 +254,7 @@ def grow_on_latent_compiled(
     std: FloatArray,
 ) -> None:
     """Both processes of segments ``start:stop:step``, in place: threads meet once less."""
-    latent_rows_inlined(
+    latent_rows_compiled(
         start, stop, step, theta, bar_offsets, r_bar, surface_class, offsets, r, knots,
         n_knots, log_length_scale, knot_log_length_scale,
     )  # fmt: skip

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled import compiled_vectors, inlined
+from gp_ground_seg.compiled import inlined
 from gp_ground_seg.gp import dense
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.kernels import squared_exponential
@@ -110,7 +110,8 @@ def latent_rows_reference(
     return at_candidates, at_knots
 
 
-def _latent_rows(
+@inlined
+def latent_rows_compiled(
     start: int,
     stop: int,
     step: int,
@@ -180,7 +181,3 @@ def _latent_rows(
             at_candidates[own + i] = value[i]
         for i in range(n_wanted):
             at_knots[m, i] = value[n + i]
-
-
-latent_rows_compiled = compiled_vectors(_latent_rows)
-latent_rows_inlined = inlined(_latent_rows)

@@ -74,27 +74,6 @@ class NumpyBackend:
         return Labelled(labels, height, margin, roughness)
 
     @single_threaded_blas()
-    def log_length_scales(
-        self,
-        theta: FloatArray,
-        pseudo: PseudoInputs,
-        candidates: Candidates,
-        knots: FloatArray,
-        n_knots: IntArray,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Log length-scales at candidates and knots."""
-        return latent_rows_batched(
-            theta,
-            pseudo.offsets,
-            pseudo.r_bar,
-            pseudo.surface_class,
-            candidates.offsets,
-            candidates.r,
-            knots,
-            n_knots,
-        )
-
-    @single_threaded_blas()
     def grow(
         self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
@@ -115,12 +94,20 @@ class NumpyBackend:
             task.growth,
         )
 
+    @single_threaded_blas()
     def grow_on_latent(
         self, task: GrowthTask, pseudo: PseudoInputs, n_knots: IntArray
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Both processes; the log length-scales at the knots as well."""
-        u, knot_u = self.log_length_scales(
-            task.theta, pseudo, task.candidates, task.knots, n_knots
+        u, knot_u = latent_rows_batched(
+            task.theta,
+            pseudo.offsets,
+            pseudo.r_bar,
+            pseudo.surface_class,
+            task.candidates.offsets,
+            task.candidates.r,
+            task.knots,
+            n_knots,
         )
         return *self.grow(task, u, knot_u), knot_u
 

@@ -25,7 +25,7 @@ _RINGS = 24
 _DIRECTIONS = 64
 _PARTS = {
     'points': ('sort_points', 'ground_candidates', 'begin_faces', 'label_points'),
-    'processes': ('log_length_scales', 'grow', 'grow_on_latent', 'fuse_neighbours', 'objective'),
+    'processes': ('grow', 'grow_on_latent', 'fuse_neighbours', 'objective'),
 }
 """Methods of the backend whose code is compiled side by side."""
 _LOOK_AROUND = 0.2
