@@ -6,7 +6,7 @@ The returns above the foot can: together they are a surface that stands upright.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,9 @@ from gp_ground_seg.tiles import Tiles
 
 FEWEST_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
+UNITS_PER_METRE = 2.0**16
+"""In whole units of 15 um, squares and products of coordinates within a tile, and sums of two
+hundred thousand of them, are exact: they come out the same in any order."""
 
 
 @dataclass(frozen=True)
@@ -41,22 +44,6 @@ class Faces:
     is_footless: npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class BegunFaces:
-    """Faces that another thread may be looking for.
-
-    Attributes
-    ----------
-    find : callable
-        Waits for them, and returns them.
-    drop : callable
-        Waits until nobody looks for them, to be called where they are no longer wanted.
-    """
-
-    find: Callable[[], Faces]
-    drop: Callable[[], None]
-
-
 def find_faces(
     xyz: npt.NDArray[np.floating], tiles: Tiles, faces: FacesConfig, max_height: float
 ) -> Faces:
@@ -64,6 +51,7 @@ def find_faces(
 
     A tile is a candidate if a return lies more than ``faces.min_height`` above the
     lowest. The covariance of its returns tells their orientation; see `uprightness`.
+    Coordinates are rounded to `UNITS_PER_METRE`.
 
     Parameters
     ----------
@@ -80,7 +68,14 @@ def find_faces(
     inside = tiles.tile != OUTSIDE
     own, points = tiles.tile[inside], xyz[inside].astype(np.float64)
     n_tiles = len(tiles.extremes)
+    n_sides = math.isqrt(n_tiles)
+    # About the sensor, rounding would eat the scatter.
+    for i, place in enumerate(np.divmod(own, n_sides)):
+        origin = place * faces.cell_size - 0.5 * n_sides * faces.cell_size
+        points[:, i] -= np.rint(origin * UNITS_PER_METRE) / UNITS_PER_METRE
     above_foot = points[:, 2] - tiles.foot_z[own]
+    points[:, 2] = above_foot
+    points = np.rint(points * UNITS_PER_METRE) / UNITS_PER_METRE
     low = above_foot <= max_height
     is_tall = np.zeros(n_tiles, dtype=np.bool_)
     is_tall[own[low & (above_foot > faces.min_height)]] = True
@@ -100,7 +95,7 @@ def find_faces(
     is_face = np.zeros(n_tiles, dtype=np.bool_)
     is_upright = uprightness(scatter) <= faces.max_normal_z
     is_face[tall] = is_upright & (count >= FEWEST_RETURNS)
-    above_own = chosen[:, 2] - tiles.foot_z[tall][counted]
+    above_own = above_foot[low & is_tall[own]]
     is_footless = np.zeros(n_tiles, dtype=np.bool_)
     is_footless[tall] = hides_foot(counted, centred, above_own, len(tall), faces) & is_face[tall]
     return Faces(tiles, is_face, is_footless)

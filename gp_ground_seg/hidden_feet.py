@@ -72,9 +72,7 @@ def hides_foot(
     return result & (faces.max_foot_distance > 0.0)
 
 
-def without_hidden_feet(
-    candidates: Candidates, is_footless: BoolArray, use_compiled: bool
-) -> Candidates:
+def without_hidden_feet(candidates: Candidates, is_footless: BoolArray) -> Candidates:
     """Leave out the candidates whose tile shows no ground.
 
     Parameters
@@ -83,22 +81,8 @@ def without_hidden_feet(
         Ground candidates.
     is_footless : (T,) bool
         Tiles whose face hides its foot.
-    use_compiled : bool
-        Compiled code, or its twin in numpy.
     """
-    if not use_compiled:
-        return candidates.where(~is_footless[candidates.tile])
-    return Candidates(
-        *keep_compiled(
-            is_footless,
-            candidates.r,
-            candidates.z,
-            candidates.bin,
-            candidates.density,
-            candidates.offsets,
-            candidates.tile,
-        )
-    )
+    return candidates.where(~is_footless[candidates.tile])
 
 
 @compiled

@@ -18,7 +18,7 @@ FEWEST_CANDIDATES = 3
 
 
 def candidates_that_follow(
-    lines: Lines, candidates: Candidates, config: Config, use_compiled: bool
+    lines: Lines, candidates: Candidates, config: Config
 ) -> npt.NDArray[np.bool_]:
     """Tell the candidates that join the inliers if the one before them has, (C,) bool.
 
@@ -33,22 +33,8 @@ def candidates_that_follow(
         Ground candidates.
     config : Config
         Tolerance of the lines; least size, least extent and steepest slope.
-    use_compiled : bool
-        Compiled code, or its twin in numpy; both give the same but for rounding.
     """
     growth, tolerance = config.growth, config.lines.offset_tolerance
-    if use_compiled:
-        return follow_compiled(
-            candidates.offsets,
-            candidates.r,
-            candidates.z,
-            lines.start,
-            lines.slope,
-            tolerance,
-            growth.min_line_size,
-            growth.min_bend_extent,
-            growth.max_line_slope,
-        )
     at_bend = set_off_at_bend(
         lines, candidates, tolerance, growth.min_bend_extent, growth.max_line_slope
     )

@@ -67,7 +67,7 @@ def extract_lines(candidates: Candidates, lines: LinesConfig) -> Lines:
     columns = candidates.offsets, candidates.r, candidates.z, candidates.density
     # Plain Python reads lists much faster than arrays.
     offsets, r, z, density = columns if HAVE_NUMBA else _lists(*columns)
-    line, slope, start = _extract(
+    line, slope, start = extract(
         offsets,
         r,
         z,
@@ -111,7 +111,7 @@ of the range error. A vertical line has an infinite slope.
 
 
 @compiled
-def _extract(
+def extract(
     offsets: IntArray,
     r: FloatArray,
     z: FloatArray,
@@ -124,6 +124,7 @@ def _extract(
     max_density_ratio: float,
     error_ratio: float,
 ) -> tuple[IntArray, FloatArray, IntArray]:
+    """Do what `extract_lines` does, from the fields of candidates to those of lines."""
     line = np.empty(len(r), np.int64)
     start = np.empty(len(r) + 1, np.int64)
     slopes = np.empty(len(r))

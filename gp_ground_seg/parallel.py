@@ -1,58 +1,70 @@
-"""Rows of work shared out over threads."""
+"""Work shared out over threads."""
 
 from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Callable, Sequence
-from itertools import pairwise
+from collections.abc import Callable
 from threading import Lock, Thread
 from typing import Any
 
+from gp_ground_seg.meeting import BEFORE_LEAVING, RUNG, Board, give_up, linger, make_board
+
+MOST_STAGES = 4
+"""Stages of the longest work that is shared out."""
 FEWEST_POINTS = 4096
 """Points below which sharing out costs more than it saves."""
 MOST_UNASKED = 4
-"""Threads that are taken without being asked for: each of them costs a wake-up in every stage,
+"""Threads that are taken without being asked for: each of them has tables to fill and a wake-up,
 more than its share of what is left is worth."""
 
 
 class _Worker:
     """Thread that waits for one call at a time.
 
-    Two bare locks: an executor with its queue and futures takes longer to pass a call on,
-    and some calls are as short as that.
+    For a while in compiled code, from where it begins at once when it is rung for; then
+    asleep. Two bare locks: an executor with its queue and futures takes longer to pass a
+    call on, and some calls are as short as that.
+
+    Parameters
+    ----------
+    board : Board
+        Where it is rung for.
+    patience : int
+        How long it stays awake, see `gp_ground_seg.meeting.linger`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, board: Board, patience: int) -> None:
         self._call: tuple[Callable[..., None], tuple[Any, ...]] | None = None
         self._error: BaseException | None = None
         self._go, self._done = Lock(), Lock()
         self._go.acquire()
         self._done.acquire()
         self._is_busy = False
-        Thread(target=self._work, name='gp_ground_seg', daemon=True).start()
+        Thread(
+            target=self._work, args=(board, patience), name='gp_ground_seg', daemon=True
+        ).start()
 
     def start(self, function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-        """Call ``function(*arguments)`` in the thread."""
-        if self._is_busy:  # whoever waited was interrupted
-            self._done.acquire()
+        """Call ``function(*arguments)`` in the thread, which is at nothing else."""
         self._call, self._is_busy, self._error = (function, arguments), True, None
         self._go.release()
 
     def wait(self) -> BaseException | None:
         """Wait until the call has returned; what it raised."""
-        self._done.acquire()
+        if self._is_busy:
+            self._done.acquire()
         self._is_busy = False
         return self._error
 
     def end(self) -> None:
         """End the thread."""
-        if self._is_busy:
-            self._done.acquire()
+        self.wait()
         self._call = None
         self._go.release()
 
-    def _work(self) -> None:
+    def _work(self, board: Board, patience: int) -> None:
+        own = make_board(0, 1)
         while True:
             self._go.acquire()
             if self._call is None:
@@ -65,45 +77,69 @@ class _Worker:
             # Nothing is held until the next call: frames are large.
             self._call = None
             del function, arguments
+            n_rung = int(board[RUNG, 0])
             self._done.release()
+            linger(board, n_rung, patience, own)
 
 
-class Begun:
-    """A call that a worker, if there is one, has begun."""
+class Team:
+    """Threads that share out the work of some stages, see `gp_ground_seg.meeting`.
 
-    def __init__(
-        self,
-        workers: list[_Worker],
-        function: Callable[..., None],
-        arguments: tuple[Any, ...],
-    ) -> None:
-        self._workers = workers
-        self._call = None if workers else lambda: function(*arguments)
-        self._error: BaseException | None = None
-        for worker in workers:
-            worker.start(function, arguments)
+    What the workers do is started once; the caller, share 0, takes part when it likes.
 
-    def finish(self) -> None:
-        """Wait until it is done, and raise what it raised."""
-        if self._call is not None:
-            self._call()
-            self._call = None
-        self.drop()
-        if self._error is not None:
-            raise self._error
+    Attributes
+    ----------
+    board : Board
+        Where they meet.
+    """
 
-    def drop(self) -> None:
-        """Make sure that nobody works at it any more; `finish` may be called later."""
-        while self._workers:
-            self._error = self._workers.pop().wait()
+    def __init__(self, workers: list[_Worker], board: Board) -> None:
+        self._idle, self._working = workers, list[_Worker]()
+        self.board = board
+
+    def start(self, *functions: Callable[[int], None]) -> None:
+        """Have every worker call the functions one after the other, with its share."""
+        while self._idle:
+            worker = self._idle.pop(0)
+            self._working.append(worker)
+            worker.start(self._call, (len(self._working), *functions))
+
+    def take_part(self, function: Callable[[int], None]) -> None:
+        """Call ``function(0)``; the workers go on meanwhile and after it."""
+        try:
+            self._call(0, function)
+        except BaseException:
+            # They work on arrays that are the caller's again afterwards.
+            self.settle()
+            raise
+
+    def wait(self) -> None:
+        """Wait until no worker is at it any more, and raise what they raised."""
+        for error in self.settle():
+            raise error
+
+    def settle(self) -> list[BaseException]:
+        """Wait until no worker is at it any more; what they raised."""
+        errors = []
+        while self._working:
+            error = self._working[-1].wait()
+            self._working.pop()
+            errors += [error] if error is not None else []
+        return errors
+
+    def _call(self, share: int, *functions: Callable[[int], None]) -> None:
+        try:
+            for function in functions:
+                function(share)
+        except BaseException:
+            give_up(self.board)
+            raise
 
 
 class RowPool:
-    """Runs compiled functions on shares of rows, one share in each thread.
+    """Threads for compiled functions that share out their work, see `gp_ground_seg.meeting`.
 
-    Every row is computed by itself, so the results do not depend on the number of
-    threads. There are as many shares as threads, no more: waking a thread costs as
-    much as dozens of rows.
+    Whatever thread does a block, its results are the same.
 
     Parameters
     ----------
@@ -112,72 +148,44 @@ class RowPool:
     """
 
     def __init__(self, n_threads: int) -> None:
-        self.n_threads = n_threads or min(len(os.sched_getaffinity(0)), MOST_UNASKED)
+        n_cores = len(os.sched_getaffinity(0))
+        self.n_threads = n_threads or min(n_cores, MOST_UNASKED)
+        self._board = make_board(MOST_STAGES, self.n_threads)
+        # Who stays awake needs a core to be awake on.
+        patience = BEFORE_LEAVING if self.n_threads <= n_cores else 0
         # The caller's thread takes a share too.
-        self._workers = [_Worker() for _ in range(self.n_threads - 1)]
-        self._begun: Begun | None = None
+        self._workers = [_Worker(self._board, patience) for _ in range(self.n_threads - 1)]
+        self._team: Team | None = None
         self._end = weakref.finalize(self, _end_all, self._workers)
 
-    def run(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
-        """Call ``function(start, stop, step, *arguments)`` for every n-th segment each.
-
-        The function must release the GIL to gain anything. Neighbouring segments
-        cost alike, so interleaved shares are even ones.
-        """
-        shares = [(k, n_rows, self.n_threads) for k in range(self.n_threads)]
-        self._run(function, shares, arguments)
-
-    def run_points(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
-        """Call ``function(start, stop, *arguments)`` for contiguous blocks of points."""
-        self._run(function, self._blocks(n_rows), arguments)
-
     def n_shares(self, n_rows: int) -> int:
-        """Into how many blocks `run_points` and `run_shares` cut that many points."""
+        """Into how many threads so many points are worth to be shared out."""
         return self.n_threads if n_rows >= FEWEST_POINTS else 1
 
-    def run_shares(self, function: Callable[..., None], n_rows: int, *arguments: Any) -> None:
-        """Call ``function(share, start, stop, *arguments)`` for contiguous blocks of points."""
-        shares = [(k, *block) for k, block in enumerate(self._blocks(n_rows))]
-        self._run(function, shares, arguments)
-
-    def begin(self, function: Callable[..., None], *arguments: Any) -> Begun:
-        """Begin ``function(*arguments)`` beside what the caller goes on to do.
-
-        With one thread, it is done when it is asked for. Before anything else is shared
-        out, it is waited for.
-        """
+    def team(self, n_shares: int) -> Team:
+        """Team of that many threads, all or one. The one before is waited for."""
         self._settle()
-        self._begun = Begun(self._workers[:1], function, arguments)
-        return self._begun
+        n_rung = self._board[RUNG, 0]
+        self._board.fill(0)
+        self._board[RUNG, 0] = n_rung
+        self._team = Team(self._workers[: n_shares - 1], self._board)
+        return self._team
+
+    def run(self, function: Callable[..., None], n_shares: int, *arguments: Any) -> None:
+        """Call ``function(share, n_shares, board, *arguments)`` in a team."""
+        team = self.team(n_shares)
+
+        def work(share: int) -> None:
+            function(share, n_shares, team.board, *arguments)
+
+        team.start(work)
+        team.take_part(work)
+        team.wait()
 
     def _settle(self) -> None:
-        if self._begun is not None:
-            self._begun.drop()
-            self._begun = None
-
-    def _blocks(self, n_rows: int) -> list[tuple[int, int]]:
-        n_shares = self.n_shares(n_rows)
-        return list(pairwise(n_rows * k // n_shares for k in range(n_shares + 1)))
-
-    def _run(
-        self,
-        function: Callable[..., None],
-        shares: Sequence[tuple[int, ...]],
-        arguments: tuple[Any, ...],
-    ) -> None:
-        self._settle()
-        # As many as there are shares: small clouds are not shared out.
-        workers = self._workers[: len(shares) - 1]
-        for worker, share in zip(workers, shares[1:], strict=True):
-            worker.start(function, (*share, *arguments))
-        try:
-            function(*shares[0], *arguments)
-        finally:
-            # All of them: they work on arrays that are the caller's again afterwards.
-            errors = [worker.wait() for worker in workers]
-        for error in errors:
-            if error is not None:
-                raise error
+        if self._team is not None:
+            self._team.settle()
+            self._team = None
 
     def close(self) -> None:
         """End the threads."""

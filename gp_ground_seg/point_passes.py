@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from gp_ground_seg.compiled import compiled, inlined
+from gp_ground_seg.meeting import Board, all_done, await_settled, claim, n_taken, ring
 from gp_ground_seg.polar_grid import (
     NO_TILE,
     NOT_FINITE,
@@ -17,15 +18,19 @@ from gp_ground_seg.polar_grid import (
 )
 from gp_ground_seg.rulers import CellArray, Ruler
 
+SORTING = 0
+"""Stage of `sort_points`."""
 BLOCK = 512
 """Points sorted at a time: what is known of them stays in the nearest cache."""
+_TAKEN = 4 * BLOCK
+"""Points that a thread takes at a time."""
 
 
 @compiled
 def sort_points(
     share: int,
-    start: int,
-    stop: int,
+    n_shares: int,
+    board: Board,
     flat: PointArray,
     step: int,
     target: PointArray,
@@ -42,44 +47,70 @@ def sort_points(
     tile_extremes: PointArray,
     touched: CellArray,
 ) -> None:
-    """Sort points `start` to `stop` into cells and tiles, with the extremes of each.
+    """Sort points into cells and tiles, with the extremes of each, in the stage `SORTING`.
 
     The twins are `polar_grid.build_polar_grid`, `reduce_cells` and `tiles.build_tiles`.
-    If `step` is positive, they are first put from `flat` (see `points.flat_rows`) into
-    `target`, which is the memory of `columns`. The tables ``[share]`` have a last row for
+    If `step` is positive, points are first put from `flat` (see `points.flat_rows`) into
+    `target`, which is the memory of `columns`. The tables ``[share]`` hold what a thread
+    found in the points that it took, see `gp_ground_seg.meeting`, and have a last row for
     the points that are in none. Block by block: where the points lie, in loops without
     branches; then the extremes.
     """
+    if share == 0:
+        ring(board, n_shares)
+    n_points = len(cell)
+    n_blocks = (n_points + _TAKEN - 1) // _TAKEN
     own_extremes, own_numbers = extremes[share], numbers[share]
     own_tile_extremes, own_touched = tile_extremes[share], touched[share]
-    _empty(own_extremes, own_numbers, own_tile_extremes, own_touched)
     own_r_entry = np.empty(BLOCK, dtype=np.int32)
     own_turn, own_turn_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
-    for first in range(start, stop, BLOCK):
-        own = slice(first, min(first + BLOCK, stop))
-        if step > 0:
-            _spread(flat[first * step :], step, target[0, own], target[1, own], target[2, own])
-        x, y, z = columns[0, own], columns[1, own], columns[2, own]
-        _measure_range(x, y, z, ranges, r[own], own_r_entry, cell[own])
-        _measure_turn(x, y, ranges.edges[-1], turns.scale, tiles_per_metre, n_sides, cell[own],
-                      own_turn, own_turn_entry, tile[own])  # fmt: skip
-        _look_up(ranges, turns, r[own], own_r_entry, own_turn, own_turn_entry, cell[own])
-        _widen_cells(z, cell[own], own_extremes, own_numbers)
-        _widen_tiles(z, tile[own], own_tile_extremes, own_touched)
-    own = slice(start, stop)
-    _settle_lowest(columns[2, own], r[own], cell[own], tile[own], own_extremes, own_numbers)
+    taken = np.empty(n_blocks, dtype=np.int64)
+    # No literal: for each of those numba compiles anew.
+    stage, n_own = np.int64(SORTING), 0
+    block = claim(board, stage, share, n_shares, n_blocks)
+    # Not where others took all: they may have gone on to the next stage.
+    if block >= 0:
+        empty_cells(own_extremes, own_numbers)
+        empty_tiles(own_tile_extremes, own_touched)
+    while block >= 0:
+        taken[n_own] = block
+        n_own += 1
+        stop = min((block + 1) * _TAKEN, n_points)
+        for first in range(block * _TAKEN, stop, BLOCK):
+            own = slice(first, min(first + BLOCK, stop))
+            if step > 0:
+                _spread(flat[first * step :], step, target[0, own], target[1, own],
+                        target[2, own])  # fmt: skip
+            x, y, z = columns[0, own], columns[1, own], columns[2, own]
+            _measure_range(x, y, z, ranges, r[own], own_r_entry, cell[own])
+            _measure_turn(x, y, ranges.edges[-1], turns.scale, tiles_per_metre, n_sides,
+                          cell[own], own_turn, own_turn_entry, tile[own])  # fmt: skip
+            _look_up(ranges, turns, r[own], own_r_entry, own_turn, own_turn_entry, cell[own])
+            _widen_cells(z, cell[own], own_extremes, own_numbers)
+            _widen_tiles(z, tile[own], own_tile_extremes, own_touched)
+        block = claim(board, stage, share, n_shares, n_blocks)
+    for block in taken[:n_own]:
+        own = slice(block * _TAKEN, min((block + 1) * _TAKEN, n_points))
+        _settle_lowest(columns[2, own], r[own], cell[own], tile[own], own_extremes, own_numbers)
+    all_done(board, stage, share, n_shares, n_own, n_blocks)
+    if share == 0:
+        await_settled(board, n_shares - 1)
 
 
 @compiled
-def _empty(
-    extremes: PointArray, numbers: CellArray, tile_extremes: PointArray, touched: CellArray
-) -> None:
+def empty_cells(extremes: PointArray, numbers: CellArray) -> None:
+    """Make the tables of the cells those of no points."""
     for k in range(len(numbers)):
         extremes[k, 0] = extremes[k, 1] = np.inf
         extremes[k, 2] = -np.inf
         numbers[k, 0], numbers[k, 1] = 0, NO_TILE
-    for k in range(len(tile_extremes)):
-        tile_extremes[k, 0], tile_extremes[k, 1] = np.inf, -np.inf
+
+
+@compiled
+def empty_tiles(extremes: PointArray, touched: CellArray) -> None:
+    """Make the tables of the tiles those of no points."""
+    for k in range(len(extremes)):
+        extremes[k, 0], extremes[k, 1] = np.inf, -np.inf
     touched[0] = 0
 
 
@@ -268,36 +299,8 @@ def _settle_lowest(
 
 
 @compiled
-def merge_cells(extremes: PointArray, numbers: CellArray) -> None:
-    """Reduce the tables of all shares into the first."""
-    for share in range(1, len(numbers)):
-        for k in range(numbers.shape[1] - 1):
-            if numbers[share, k, 0] == 0:
-                continue
-            z, r, tile = extremes[share, k, 0], extremes[share, k, 1], numbers[share, k, 1]
-            if (z, r, tile) < (extremes[0, k, 0], extremes[0, k, 1], numbers[0, k, 1]):
-                extremes[0, k, 0], extremes[0, k, 1], numbers[0, k, 1] = z, r, tile
-            extremes[0, k, 2] = max(extremes[0, k, 2], extremes[share, k, 2])
-            numbers[0, k, 0] += numbers[share, k, 0]
-
-
-@compiled
-def merge_tiles(extremes: PointArray, touched: CellArray) -> None:
-    """Reduce the tables of all shares into the first, and their touched tiles."""
-    n_touched = touched[0, 0]
-    for share in range(1, len(extremes)):
-        for place in range(1, touched[share, 0] + 1):
-            k = np.uintp(touched[share, place])
-            if extremes[0, k, 0] > extremes[0, k, 1]:
-                n_touched += 1
-                touched[0, n_touched] = touched[share, place]
-            extremes[0, k, 0] = min(extremes[0, k, 0], extremes[share, k, 0])
-            extremes[0, k, 1] = max(extremes[0, k, 1], extremes[share, k, 1])
-    touched[0, 0] = n_touched
-
-
-@compiled
 def collect_candidates(
+    board: Board,
     extremes: PointArray,
     numbers: CellArray,
     widths: FloatArray,
@@ -309,17 +312,35 @@ def collect_candidates(
     density: FloatArray,
     tile: CellArray,
 ) -> int:
-    """Do what `polar_grid.ground_candidates` does, into arrays for all bins; their number."""
+    """Do what `polar_grid.ground_candidates` does, into arrays for all bins; their number.
+
+    `extremes` and `numbers` are the tables of all shares that `sort_points` left.
+    """
+    n_shares, n_bins = len(numbers), len(widths)
+    low = near = high = extremes.dtype.type(0.0)
+    lowest_tile = NO_TILE
     c = 0
-    for m in range(numbers.shape[0]):
+    for m in range(len(offsets) - 1):
         offsets[m] = c
-        for n in range(numbers.shape[1]):
-            count = numbers[m, n, 0]
+        for n in range(n_bins):
+            k = m * n_bins + n
+            count = 0
+            for share in range(n_shares):
+                # What a thread did not come to is left from before.
+                own = numbers[share, k, 0]
+                if own == 0 or n_taken(board, SORTING, share, n_shares) == 0:
+                    continue
+                own_z, own_r = extremes[share, k, 0], extremes[share, k, 1]
+                own_top, own_tile = extremes[share, k, 2], numbers[share, k, 1]
+                if count == 0 or (own_z, own_r, own_tile) < (low, near, lowest_tile):
+                    low, near, lowest_tile = own_z, own_r, own_tile
+                high = own_top if count == 0 else max(high, own_top)
+                count += own
             if count == 0:
                 continue
-            low, high = np.float64(extremes[m, n, 0]), np.float64(extremes[m, n, 2])
-            r[c], z[c], own_bin[c], tile[c] = extremes[m, n, 1], low, n, numbers[m, n, 1]
-            density[c] = count / (widths[n] * max(high - low, min_extent))
+            z[c], r[c], tile[c], own_bin[c] = low, near, lowest_tile, n
+            extent = np.float64(high) - np.float64(low)
+            density[c] = count / (widths[n] * max(extent, min_extent))
             c += 1
-    offsets[numbers.shape[0]] = c
+    offsets[len(offsets) - 1] = c
     return c

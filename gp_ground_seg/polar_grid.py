@@ -123,9 +123,12 @@ class Candidates:
 
 
 def bin_edges(grid: GridConfig) -> FloatArray:
-    """Ranges of the bin edges [m], (n_bins + 1,)."""
+    """Ranges of the bin edges [m], (n_bins + 1,), read-only."""
     fraction = np.arange(grid.n_bins + 1) / grid.n_bins
-    return grid.r_min + (grid.r_max - grid.r_min) * fraction**grid.bin_growth
+    edges: FloatArray = grid.r_min + (grid.r_max - grid.r_min) * fraction**grid.bin_growth
+    # For compiled code what may be written to is another type.
+    edges.setflags(write=False)
+    return edges
 
 
 def reach(edges: FloatArray, dtype: np.dtype[np.floating]) -> np.floating:

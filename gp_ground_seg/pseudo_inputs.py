@@ -63,9 +63,7 @@ def classify_lines(slope: FloatArray, extent: FloatArray, latent: LatentConfig) 
     return result
 
 
-def select_pseudo_inputs(
-    candidates: Candidates, lines: Lines, config: Config, use_compiled: bool
-) -> PseudoInputs:
+def select_pseudo_inputs(candidates: Candidates, lines: Lines, config: Config) -> PseudoInputs:
     """Spread pseudo-inputs evenly over the candidates of each line (paper, section III-C).
 
     Parameters
@@ -76,26 +74,8 @@ def select_pseudo_inputs(
         Lines through them; every line gets at least one pseudo-input.
     config : Config
         Number of pseudo-inputs, limits of the classes, bounds of the length-scale.
-    use_compiled : bool
-        Compiled code, or its twin in numpy; both give the same but for rounding.
     """
     latent, limits = config.latent, config.length_scale
-    if use_compiled:
-        return PseudoInputs(
-            *select_compiled(
-                candidates.offsets,
-                candidates.r,
-                lines.start,
-                lines.slope,
-                latent.candidates_per_pseudo_input,
-                latent.medium_extent,
-                latent.long_extent,
-                latent.sloped_gradient,
-                latent.steep_gradient,
-                limits.min,
-                limits.max,
-            )
-        )
     size = np.diff(lines.start)
     wanted = np.rint(size / latent.candidates_per_pseudo_input).astype(np.int64)
     number = np.maximum(wanted, 1)

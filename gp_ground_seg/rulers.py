@@ -74,6 +74,5 @@ def make_ruler(edges: FloatArray, fineness: int, dtype: np.dtype[np.floating]) -
 def grid_rulers(grid: GridConfig, dtype: np.dtype[np.floating]) -> tuple[FloatArray, Ruler, Ruler]:
     """Edges of the bins (n_bins + 1,) float64, their ruler, and that of the segments."""
     edges = bin_edges(grid)
-    edges.setflags(write=False)
     turns = segment_edges(grid.n_segments)
     return edges, make_ruler(edges, 4, dtype), make_ruler(turns, 8, dtype)

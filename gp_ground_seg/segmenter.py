@@ -11,25 +11,15 @@ import numpy.typing as npt
 
 from gp_ground_seg.blas import single_threaded_blas
 from gp_ground_seg.config import Config, SensorConfig
-from gp_ground_seg.faces import BegunFaces
 from gp_ground_seg.gp.backend import Backend, make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
-from gp_ground_seg.hidden_feet import without_hidden_feet
-from gp_ground_seg.line_extraction import extract_lines
 from gp_ground_seg.points import take_points
-from gp_ground_seg.polar_grid import (
-    Candidates,
-    CellTables,
-    FloatArray,
-    PointArray,
-    PolarGrid,
-)
-from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
+from gp_ground_seg.polar_grid import Candidates, FloatArray, PointArray
 from gp_ground_seg.segmentation import Fitting, Segmentation
 from gp_ground_seg.sensor_pose import SensorPose, estimate_pose, given_pose
+from gp_ground_seg.sorted_points import SortedPoints
 from gp_ground_seg.surface import GroundSurface
-from gp_ground_seg.tiles import Tiles
 from gp_ground_seg.tilt import turned_sample
 from gp_ground_seg.timing import StageTimer
 from gp_ground_seg.workspace import Workspace
@@ -37,13 +27,10 @@ from gp_ground_seg.workspace import Workspace
 
 @dataclass(frozen=True)
 class _PlacedScan:
-    """Points (N, 3) in the sensor frame and in the level frame, and what follows from them."""
+    """Points (N, 3) in the sensor frame, and in the level frame that the pose leads to."""
 
     own_xyz: PointArray
-    level_xyz: PointArray
-    grid: PolarGrid
-    candidates: Candidates
-    faces: BegunFaces
+    level: SortedPoints
     pose: SensorPose
 
 
@@ -129,34 +116,31 @@ class GroundSegmenter:
             sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
         timer = StageTimer(self._clock)
         placed = self._place(points, sensor, timer)
-        xyz, pose = placed.level_xyz, placed.pose
-        grid = placed.grid
+        scan, pose = placed.level, placed.pose
+        grid = scan.grid
 
-        faces = placed.faces.find()
-        use_compiled = self._backend.name == 'numba'
-        candidates = without_hidden_feet(placed.candidates, faces.is_footless, use_compiled)
+        faces = scan.find_faces()
         timer.mark('faces')
 
-        lines = extract_lines(candidates, config.lines)
-        pseudo = select_pseudo_inputs(candidates, lines, config, use_compiled)
+        candidates, lines, pseudo, follows = self._backend.find_lines(
+            scan.candidates, faces.is_footless, config
+        )
         timer.mark('lines')
 
-        # Heights are centred on the expected ground: a zero mean would pull it to the sensor.
+        # Of mean zero, the process would be pulled to the height of the sensor.
         expected_ground = -pose.height
-        height = candidates.z - expected_ground
-        model = FrameModel(config, self._backend, candidates, height, lines, pseudo, grid.edges)
+        model = FrameModel(
+            config, self._backend, candidates, expected_ground, lines, pseudo, follows, grid.edges
+        )
         theta, learned = self._learn(model)
         timer.mark('learning')
 
         inlier, mean, std, log_length_scale = model.surface(theta)
-        mean, std = self._backend.fuse_neighbours(
-            mean, std, grid.edges, config.surface.n_neighbours, config.observation.slope_std
-        )
-        surface = GroundSurface(grid.edges, mean + expected_ground, std, inlier)
+        surface = GroundSurface(grid.edges, mean, std, inlier)
         timer.mark('surface')
 
         labelled = self._backend.label_points(
-            xyz, grid, surface, faces, config.label, config.faces.tolerance
+            scan.xyz, grid, surface, faces, config.label, config.faces.tolerance
         )
         tilted_ground_z = (
             None if pose.is_level else pose.ground_z(placed.own_xyz[:, 2], labelled.height)
@@ -186,7 +170,7 @@ class GroundSegmenter:
         """
         timer = StageTimer(self._clock)
         placed = self._place(points, self._config.sensor, timer)
-        placed.faces.drop()
+        placed.level.drop_faces()
         return placed.pose
 
     def _place(
@@ -195,52 +179,31 @@ class GroundSegmenter:
         """Scan in the level frame, as given or as it seems to be."""
         own_xyz = take_points(points)
         given = given_pose(sensor)
-        level_xyz, grid, cells, tiles = self._sort(given.level(own_xyz), self._workspace)
-        # It needs neither the candidates nor the pose: another thread may have begun.
-        faces = self._begin_faces(level_xyz, tiles)
+        scan = self._sort(given.level(own_xyz))
         try:
-            candidates = self._candidates(cells, grid)
             timer.mark('grid')
             pose = estimate_pose(
-                candidates,
+                scan.candidates,
                 sensor,
                 self._backend.name == 'numba',
-                lambda turn: self._turned_candidates(level_xyz, turn),
+                lambda turn: self._turned_candidates(scan.xyz, turn),
             )
         except BaseException:
-            faces.drop()
+            scan.drop_faces()
             raise
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
-            faces.drop()
-            level_xyz, grid, cells, tiles = self._sort(pose.level(own_xyz), self._workspace)
-            candidates = self._candidates(cells, grid)
-            faces = self._begin_faces(level_xyz, tiles)
+            scan.drop_faces()
+            scan = self._sort(pose.level(own_xyz))
         timer.mark('pose')
-        return _PlacedScan(own_xyz, level_xyz, grid, candidates, faces, pose)
+        return _PlacedScan(own_xyz, scan, pose)
 
-    def _sort(
-        self, xyz: PointArray, workspace: Workspace
-    ) -> tuple[PointArray, PolarGrid, CellTables, Tiles]:
-        """Points (N, 3) column by column, in a level frame, sorted into bins and tiles."""
-        return self._backend.sort_points(
-            xyz, self._config.grid, self._config.faces.cell_size, workspace
-        )
-
-    def _candidates(self, cells: CellTables, grid: PolarGrid) -> Candidates:
-        return self._backend.ground_candidates(
-            cells, grid.edges, self._config.lines.min_density_extent
-        )
+    def _sort(self, xyz: PointArray) -> SortedPoints:
+        return self._backend.sort_points(xyz, self._config, self._workspace)
 
     def _turned_candidates(self, xyz: PointArray, turn: FloatArray) -> Candidates:
         """Candidates of a sample of the points turned by a matrix (3, 3)."""
-        _, grid, cells, _ = self._sort(turned_sample(xyz, turn), Workspace())
-        return self._candidates(cells, grid)
-
-    def _begin_faces(self, xyz: PointArray, tiles: Tiles) -> BegunFaces:
-        config = self._config
-        return self._backend.begin_faces(
-            xyz, tiles, config.faces, config.label.obstacle_max_height
-        )
+        sample = turned_sample(xyz, turn)
+        return self._backend.sort_points(sample, self._config, Workspace(), False).candidates
 
     def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:
         """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gp_ground_seg.compiled import compiled_vectors
+from gp_ground_seg.compiled import inlined
 from gp_ground_seg.gp.growth import BoolArray
-from gp_ground_seg.polar_grid import FloatArray, PolarGrid
+from gp_ground_seg.polar_grid import FloatArray, IntArray, PolarGrid
 
 
 @dataclass(frozen=True)
@@ -110,38 +110,48 @@ def fuse_neighbours(
     return np.where(known, weighted / safe, np.nan), np.where(known, 1.0 / np.sqrt(safe), np.nan)
 
 
-@compiled_vectors
+@inlined
 def fuse_rows(
     start: int,
     stop: int,
-    step: int,
     mean: FloatArray,
     std: FloatArray,
-    aside: FloatArray,
+    n_known: IntArray,
+    knots: FloatArray,
     n_neighbours: int,
+    slope_std: float,
+    prior_mean: float,
     fused_mean: FloatArray,
     fused_std: FloatArray,
 ) -> None:
-    """Do what `fuse_neighbours` does for segments ``start:stop:step``, in place.
+    """Do what `fuse_neighbours` does for segments `start` to `stop`, in place.
 
-    `aside` (K,) is the prior standard deviation of a step to the next segment [m].
+    `n_known` (M,) are the knots up to which a segment has a model; `mean` is about
+    `prior_mean`, and the result is not.
     """
     n_segments, n_knots = mean.shape
+    aside = slope_std * 2.0 * math.pi / n_segments
     total_weight, weighted = np.empty(n_knots), np.empty(n_knots)
-    for m in range(start, stop, step):
-        total_weight[:] = 0.0
-        weighted[:] = 0.0
+    for m in range(start, stop):
+        if n_neighbours == 0:
+            for j in range(n_knots):
+                fused_mean[m, j], fused_std[m, j] = mean[m, j] + prior_mean, std[m, j]
+            continue
+        for j in range(n_knots):
+            total_weight[j] = weighted[j] = 0.0
+        n_fused = 0
         for k in range(-n_neighbours, n_neighbours + 1):
             other = (m - k) % n_segments
-            for j in range(n_knots):
-                # A segment has a model up to some knot.
-                if math.isnan(std[other, j]):
-                    break
-                away = k * aside[j]
-                weight = 1.0 / max(std[other, j] * std[other, j] + away * away, 1e-8)
+            n_fused = max(n_fused, n_known[other])
+            slope = k * aside
+            their_mean, their_std = mean[other], std[other]
+            for j in range(n_known[other]):
+                away = slope * knots[j]
+                weight = 1.0 / max(their_std[j] * their_std[j] + away * away, 1e-8)
                 total_weight[j] += weight
-                weighted[j] += weight * mean[other, j]
-        for j in range(n_knots):
-            if total_weight[j] > 0.0:
-                fused_mean[m, j] = weighted[j] / total_weight[j]
-                fused_std[m, j] = 1.0 / math.sqrt(total_weight[j])
+                weighted[j] += weight * their_mean[j]
+        for j in range(n_fused):
+            fused_mean[m, j] = weighted[j] / total_weight[j] + prior_mean
+            fused_std[m, j] = 1.0 / math.sqrt(total_weight[j])
+        for j in range(n_fused, n_knots):
+            fused_mean[m, j] = fused_std[m, j] = math.nan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +39,7 @@ class Tiles:
 
 def tiles_per_side(r_max: float, tile_size: float) -> int:
     """Tiles along a side of the square that holds the polar grid."""
-    return int(np.ceil(2.0 * r_max / tile_size))
+    return math.ceil(2.0 * r_max / tile_size)
 
 
 def build_tiles(xyz: npt.NDArray[np.floating], grid: PolarGrid, tile_size: float) -> Tiles:

@@ -2,11 +2,16 @@
 
 import os
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from hypothesis import settings
+
+from gp_ground_seg.gp.compiled_backend import CompiledBackend
 
 # How long an example takes says more of the machine than of the code.
 settings.register_profile('default', deadline=None)
@@ -40,6 +45,15 @@ def hilly_scan(n_points: int = 4000, seed: int = 0, sensor_height: float = 1.73)
     standing = rng.random(n_points) < 0.2
     z[standing] += rng.uniform(0.5, 2.0, standing.sum())
     return np.column_stack([x, y, z])
+
+
+@contextmanager
+def sharing(n_threads: int) -> Iterator[CompiledBackend]:
+    """Backend whose threads share out even the smallest clouds."""
+    backend = CompiledBackend(n_threads)
+    with patch('gp_ground_seg.parallel.FEWEST_POINTS', 1):
+        yield backend
+    backend.close()
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config
-from gp_ground_seg.hidden_feet import without_hidden_feet
+from gp_ground_seg.gp.numpy_backend import NumpyBackend
 from gp_ground_seg.line_bends import candidates_that_follow
 from gp_ground_seg.line_extraction import extract_lines, turns
+from gp_ground_seg.line_passes import find_lines_compiled
 from gp_ground_seg.polar_grid import Candidates
-from gp_ground_seg.pseudo_inputs import select_pseudo_inputs
 
 N_TILES = 50
 CONFIG = Config().replace(**{'lines.max_gap': 6.0, 'growth.min_bend_extent': 3.0})
@@ -40,38 +40,25 @@ def draw_candidates(seed, n_segments=8, most=30):
     )
 
 
-def assert_same(ours, theirs, names):
-    for name in names:
-        own, other = getattr(ours, name), getattr(theirs, name)
+def assert_same(ours, theirs):
+    for name, own in vars(ours).items():
+        other = getattr(theirs, name)
         assert own.dtype == other.dtype
         np.testing.assert_allclose(own, other, rtol=1e-13, atol=1e-15, err_msg=name)
 
 
-@given(st.integers(0, 10_000))
-def test_candidates_without_hidden_feet(seed):
+@given(st.integers(0, 10_000), st.sampled_from([1.0, 2.5, 3.0, 10.0]))
+def test_from_candidates_to_pseudo_inputs(seed, per):
     candidates = draw_candidates(seed)
     is_footless = np.random.default_rng(seed).uniform(size=N_TILES) < 0.2
-    both = [without_hidden_feet(candidates, is_footless, flag) for flag in (True, False)]
-    assert_same(*both, ('r', 'z', 'bin', 'density', 'offsets', 'tile'))
-    assert not is_footless[both[0].tile].any()
-    assert len(both[0].r) == (~is_footless[candidates.tile]).sum()
-
-
-@given(st.integers(0, 10_000), st.sampled_from([1.0, 2.5, 3.0, 10.0]))
-def test_pseudo_inputs(seed, per):
-    candidates = draw_candidates(seed)
     config = CONFIG.replace(**{'latent.candidates_per_pseudo_input': per})
-    lines = extract_lines(candidates, config.lines)
-    both = [select_pseudo_inputs(candidates, lines, config, flag) for flag in (True, False)]
-    assert_same(*both, ('r_bar', 'surface_class', 'offsets', 'first_guess'))
-
-
-@given(st.integers(0, 10_000))
-def test_candidates_that_follow(seed):
-    candidates = draw_candidates(seed)
-    lines = extract_lines(candidates, CONFIG.lines)
-    both = [candidates_that_follow(lines, candidates, CONFIG, flag) for flag in (True, False)]
-    np.testing.assert_array_equal(*both)
+    found = find_lines_compiled(candidates, is_footless, config)
+    expected = NumpyBackend().find_lines(candidates, is_footless, config)
+    for ours, theirs in zip(found[:3], expected[:3], strict=True):
+        assert_same(ours, theirs)
+    np.testing.assert_array_equal(found[3], expected[3])
+    assert not is_footless[found[0].tile].any()
+    assert len(found[0].r) == (~is_footless[candidates.tile]).sum()
 
 
 def test_the_candidates_drawn_try_every_way_to_follow():
@@ -80,7 +67,7 @@ def test_the_candidates_drawn_try_every_way_to_follow():
     for seed in range(40):
         candidates = draw_candidates(seed)
         lines = extract_lines(candidates, CONFIG.lines)
-        follows = candidates_that_follow(lines, candidates, CONFIG, True)
+        follows = candidates_that_follow(lines, candidates, CONFIG)
         at_bend += follows[lines.start[:-1]].sum()
         continued += (follows[1:] & (lines.line[1:] == lines.line[:-1])).sum()
         alone += (~follows).sum()

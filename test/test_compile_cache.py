@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip('numba', reason='there is no compiled code without numba')
 
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import Config, GroundSegmenter, meeting
+from gp_ground_seg.compile_cache import digest
 from gp_ground_seg.compiled import compiled_signatures
 
 CONSTANT = 'FACTOR = {factor}\n'
@@ -195,7 +196,8 @@ def test_no_cloud_is_worth_a_new_compilation(warm, n_points, dtype, layout, widt
 FIRST_CLOUDS = """
 import numpy as np
 from conftest import hilly_scan
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import Config, GroundSegmenter, meeting
+from gp_ground_seg.compile_cache import digest
 from gp_ground_seg.compiled import compiled_signatures
 from gp_ground_seg.points import single_precision
 from gp_ground_seg.ros.warm_up import warm_up
@@ -252,3 +254,10 @@ def test_the_first_frame_of_the_node_compiles_all_there_is():
         script, capture_output=True, text=True, cwd=Path(__file__).parent, check=False
     )
     assert (done.returncode, done.stdout) == (0, 6 * '{}\n'), done.stderr
+
+
+def test_instructions_made_by_hand_are_part_of_the_key(monkeypatch):
+    before = digest(meeting.claim.py_func)
+    assert digest(meeting.claim.py_func) == before
+    monkeypatch.setattr(meeting, '_add', meeting._look)
+    assert digest(meeting.claim.py_func) != before

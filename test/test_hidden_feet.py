@@ -1,12 +1,14 @@
+import dataclasses
+
 import numpy as np
 import pytest
+from conftest import sharing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
 from gp_ground_seg.faces import Faces, find_faces
-from gp_ground_seg.gp.compiled_backend import CompiledBackend
 from gp_ground_seg.gp.numpy_backend import NumpyBackend
 from gp_ground_seg.labelling import label_points
 from gp_ground_seg.labels import Label
@@ -128,10 +130,10 @@ def test_compiled_marks_are_the_reference(seed, dtype, n_threads):
     xyz[100:250, :2] = np.repeat(xyz[100:115, :2], 10, axis=0) + rng.normal(0, 0.05, (150, 2))
     xyz[::20] = np.nan
     xyz = in_columns(xyz.astype(dtype), Workspace())
-    grid = build_polar_grid(xyz, GRID)
-    config = FacesConfig(max_foot_distance=rng.uniform(0.02, 0.2))
-    tiles = build_tiles(xyz, grid, config.cell_size)
-    backend, plain = CompiledBackend(n_threads), NumpyBackend()
-    faces = backend.begin_faces(xyz, tiles, config, 2.0).find()
-    same = plain.begin_faces(xyz, tiles, config, 2.0).find()
+    config = Config().replace(**{'faces.max_foot_distance': rng.uniform(0.02, 0.2)})
+    config = dataclasses.replace(config, grid=GRID)
+    with sharing(n_threads) as backend:
+        faces = backend.sort_points(xyz, config, Workspace()).find_faces()
+    same = NumpyBackend().sort_points(xyz, config, Workspace()).find_faces()
+    np.testing.assert_array_equal(faces.is_face, same.is_face)
     np.testing.assert_array_equal(faces.is_footless, same.is_footless)

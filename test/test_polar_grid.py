@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -7,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.stride_tricks import as_strided
 
-from gp_ground_seg.config import Config, GridConfig
+from gp_ground_seg.config import Config, FacesConfig, GridConfig
 from gp_ground_seg.gp.compiled_backend import CompiledBackend
 from gp_ground_seg.points import flat_rows, in_columns, single_precision, take_points
 from gp_ground_seg.polar_grid import (
@@ -22,6 +23,8 @@ from gp_ground_seg.rulers import grid_rulers
 from gp_ground_seg.tiles import build_tiles
 from gp_ground_seg.workspace import Workspace
 
+MIN_EXTENT = Config().lines.min_density_extent
+
 
 def build(points, grid=None):
     xyz = np.asarray(points)
@@ -35,6 +38,23 @@ def taken(points):
 def lowest_points(grid, z, min_extent):
     nowhere = np.zeros(len(z), dtype=np.int32)
     return ground_candidates(reduce_cells(grid, z, nowhere), grid.edges, min_extent)
+
+
+def sort(xyz, grid=None, n_threads=1, cell_size=0.5):
+    """Sort points with compiled code, in a backend of its own."""
+    config = dataclasses.replace(
+        Config(), grid=grid or GridConfig(), faces=FacesConfig(cell_size=cell_size)
+    )
+    backend = CompiledBackend(n_threads)
+    found = backend.sort_points(xyz, config, Workspace())
+    found.find_faces()
+    backend.close()
+    return found
+
+
+def assert_same_candidates(found, expected):
+    for name, column in vars(found).items():
+        np.testing.assert_array_equal(column, getattr(expected, name), err_msg=name)
 
 
 def slow_bin(r, grid):
@@ -168,14 +188,15 @@ def test_compiled_passes_are_the_reference(seed, growth, n_bins, dtype):
     grid = GridConfig(n_bins=n_bins, bin_growth=growth, r_min=4.0, r_max=30.0)
     expected = build(xyz, grid)
     with np.errstate(over='ignore'):  # infinitely far is outside, where numba is missing too
-        _, found, cells, tiles = CompiledBackend(1).sort_points(xyz, grid, 0.7, Workspace())
-    np.testing.assert_array_equal(found.cell, expected.cell)
-    np.testing.assert_array_equal(found.r, expected.r)
+        found = sort(xyz, grid, 1 + seed % 3, cell_size=0.7)
+    np.testing.assert_array_equal(found.grid.cell, expected.cell)
+    np.testing.assert_array_equal(found.grid.r, expected.r)
     expected_tiles = build_tiles(xyz, expected, 0.7)
     expected_cells = reduce_cells(expected, xyz[:, 2], expected_tiles.tile)
-    for name, table in vars(cells).items():
-        np.testing.assert_array_equal(table, getattr(expected_cells, name))
-    assert_same_tiles(tiles, expected_tiles)
+    assert_same_candidates(
+        found.candidates, ground_candidates(expected_cells, expected.edges, MIN_EXTENT)
+    )
+    assert_same_tiles(found.find_faces().tiles, expected_tiles)
 
 
 def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
@@ -184,8 +205,7 @@ def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
     assert len(ranges.bins) < 40_000
     assert ranges.is_coarse
     xyz = taken(hilly_scan(4000, seed=3))
-    _, found, *_ = CompiledBackend(1).sort_points(xyz, grid, 0.5, Workspace())
-    np.testing.assert_array_equal(found.cell, build(xyz, grid).cell)
+    np.testing.assert_array_equal(sort(xyz, grid).grid.cell, build(xyz, grid).cell)
     assert len(edges) == 1025
 
 
@@ -199,11 +219,11 @@ def test_rows_are_sorted_as_columns_are_and_left_as_they_were(step, dtype):
     xyz = take_points(rows)
     assert flat_rows(xyz)[1] == step
     assert np.shares_memory(xyz, rows)
-    found = CompiledBackend(2).sort_points(xyz, GridConfig(), 0.5, Workspace())
-    expected = CompiledBackend(1).sort_points(taken(xyz), GridConfig(), 0.5, Workspace())
-    np.testing.assert_array_equal(found[0], rows[:, :3])
-    assert found[0].flags.f_contiguous
-    np.testing.assert_array_equal(found[1].cell, expected[1].cell)
+    found, expected = sort(xyz, n_threads=2), sort(taken(xyz))
+    np.testing.assert_array_equal(found.xyz, rows[:, :3])
+    assert found.xyz.flags.f_contiguous
+    np.testing.assert_array_equal(found.grid.cell, expected.grid.cell)
+    assert_same_candidates(found.candidates, expected.candidates)
     np.testing.assert_array_equal(rows, before)
 
 
@@ -243,9 +263,7 @@ def test_flat_rows_are_the_same_memory(rows):
 )
 def test_what_does_not_lie_row_behind_row_is_no_flat_memory(rows):
     assert flat_rows(rows)[1] == 0
-    assert len(CompiledBackend(1).sort_points(rows, GridConfig(), 0.5, Workspace())[0]) == len(
-        rows
-    )
+    assert len(sort(rows).xyz) == len(rows)
 
 
 def test_single_precision_keeps_finite_what_is():
@@ -271,14 +289,22 @@ def extreme(seed):
     return [np.inf, -np.inf, 3e38, -3e38][seed % 4]
 
 
-def test_shares_of_the_points_are_merged():
-    xyz = taken(hilly_scan(9000, seed=5))
-    _, *found, tiles = CompiledBackend(3).sort_points(xyz, GridConfig(), 0.5, Workspace())
-    _, *expected, all_tiles = CompiledBackend(1).sort_points(xyz, GridConfig(), 0.5, Workspace())
-    for one, other in zip(found, expected, strict=True):
-        for name, table in vars(one).items():
-            np.testing.assert_array_equal(table, getattr(other, name))
-    assert_same_tiles(tiles, all_tiles)
+@pytest.mark.parametrize('n_threads', [2, 3, 5])
+def test_shares_of_the_points_are_merged(n_threads):
+    backend, workspace, config = CompiledBackend(n_threads), Workspace(), Config()
+    # Small clouds are not shared out, and leave other tables behind.
+    for n_points in (9000, 300, 50_000, 9000):
+        xyz = hilly_scan(n_points, seed=5)
+        xyz[::3] = np.round(xyz[::3])  # equal heights, in all shares
+        found, expected = backend.sort_points(taken(xyz), config, workspace), sort(taken(xyz))
+        np.testing.assert_array_equal(found.grid.cell, expected.grid.cell)
+        assert_same_candidates(found.candidates, expected.candidates)
+        faces, same = found.find_faces(), expected.find_faces()
+        assert_same_tiles(faces.tiles, same.tiles)
+        np.testing.assert_array_equal(faces.is_face, same.is_face)
+        np.testing.assert_array_equal(faces.is_footless, same.is_footless)
+        assert faces.is_face.any() or n_points == 300
+    backend.close()
 
 
 @given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi), st.floats(0.01, 1e3))

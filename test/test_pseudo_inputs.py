@@ -4,7 +4,7 @@ from conftest import hilly_scan
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.config import LatentConfig
-from gp_ground_seg.pseudo_inputs import N_CLASSES, classify_lines, select_pseudo_inputs
+from gp_ground_seg.pseudo_inputs import N_CLASSES, classify_lines
 
 
 def test_classes_by_slope_and_extent():
@@ -38,11 +38,11 @@ def test_their_number_follows_the_parameter(per):
         np.testing.assert_array_equal(result.pseudo.r_bar, result.candidates.r)
 
 
-@pytest.mark.parametrize('use_compiled', [True, False])
-def test_first_guess_is_the_mean_log_extent_of_the_class(use_compiled):
-    config = Config()
+@pytest.mark.parametrize('backend', ['auto', 'numpy'])
+def test_first_guess_is_the_mean_log_extent_of_the_class(backend):
+    config = Config().replace(**{'runtime.backend': backend})
     result = GroundSegmenter(config).segment(hilly_scan(6000))
-    pseudo = select_pseudo_inputs(result.candidates, result.lines, config, use_compiled)
+    pseudo = result.pseudo
     extent = result.lines.extent(result.candidates)
     classes = classify_lines(result.lines.slope, extent, config.latent)
     bounded = np.log(np.clip(extent, config.length_scale.min, config.length_scale.max))

@@ -6,23 +6,17 @@ import logging
 from typing import Protocol
 
 from gp_ground_seg.compiled import HAVE_NUMBA
-from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig, RuntimeConfig
+from gp_ground_seg.config import Config, LabelConfig, RuntimeConfig
 from gp_ground_seg.errors import MissingDependencyError
-from gp_ground_seg.faces import BegunFaces, Faces
+from gp_ground_seg.faces import Faces
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.labelling import Labelled
-from gp_ground_seg.polar_grid import (
-    Candidates,
-    CellTables,
-    FloatArray,
-    IntArray,
-    PointArray,
-    PolarGrid,
-)
+from gp_ground_seg.line_extraction import Lines
+from gp_ground_seg.polar_grid import Candidates, FloatArray, PointArray, PolarGrid
 from gp_ground_seg.pseudo_inputs import PseudoInputs
+from gp_ground_seg.sorted_points import SortedPoints
 from gp_ground_seg.surface import GroundSurface
-from gp_ground_seg.tiles import Tiles
 from gp_ground_seg.workspace import Workspace
 
 _LOGGER = logging.getLogger('gp_ground_seg')
@@ -36,25 +30,25 @@ class Backend(Protocol):
     n_threads: int
 
     def sort_points(
-        self, xyz: PointArray, grid: GridConfig, tile_size: float, workspace: Workspace
-    ) -> tuple[PointArray, PolarGrid, CellTables, Tiles]:
-        """See `build_polar_grid` and `reduce_cells`; `gp_ground_seg.tiles.build_tiles`.
+        self, xyz: PointArray, config: Config, workspace: Workspace, seeks_faces: bool = True
+    ) -> SortedPoints:
+        """Points of a level frame in columns, sorted into bins and tiles.
 
-        First the points as `gp_ground_seg.points.in_columns` puts them. All but the grid
-        may lie in `workspace`.
+        See `gp_ground_seg.points.in_columns`, `gp_ground_seg.polar_grid`,
+        `gp_ground_seg.tiles` and `gp_ground_seg.faces.find_faces`. All but the grid and the
+        candidates may lie in `workspace`. If `seeks_faces`, other threads begin with them:
+        they, or that they are dropped, are to be waited for before the points change.
         """
 
-    def ground_candidates(
-        self, cells: CellTables, edges: FloatArray, min_extent: float
-    ) -> Candidates:
-        """See `gp_ground_seg.polar_grid.ground_candidates`."""
+    def find_lines(
+        self, candidates: Candidates, is_footless: BoolArray, config: Config
+    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
+        """Candidates that show ground, lines through them, pseudo-inputs, and who follows whom.
 
-    def begin_faces(
-        self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
-    ) -> BegunFaces:
-        """Begin `gp_ground_seg.faces.find_faces`, in another thread if there is one.
-
-        They, or that they are dropped, are to be waited for before the points change.
+        See `gp_ground_seg.hidden_feet.without_hidden_feet`,
+        `gp_ground_seg.line_extraction.extract_lines`,
+        `gp_ground_seg.pseudo_inputs.select_pseudo_inputs` and
+        `gp_ground_seg.line_bends.candidates_that_follow`.
         """
 
     def label_points(
@@ -71,25 +65,18 @@ class Backend(Protocol):
     def grow(
         self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """See `gp_ground_seg.gp.growth.grow_surface_reference`; log length-scales (C,), (M, K)."""
+        """See `gp_ground_seg.gp.growth.grow_surface_reference`; log length-scales (C,), (M, K).
+
+        The surface is fused, see `gp_ground_seg.surface.fuse_neighbours`.
+        """
 
     def grow_on_latent(
-        self, task: GrowthTask, pseudo: PseudoInputs, n_knots: IntArray
+        self, task: GrowthTask, pseudo: PseudoInputs
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Both processes: `gp_ground_seg.gp.latent.latent_rows_reference`, then `grow`.
 
         What `grow` gives, and the log length-scales at the knots (M, K) [log m].
         """
-
-    def fuse_neighbours(
-        self,
-        mean: FloatArray,
-        std: FloatArray,
-        knots: FloatArray,
-        n_neighbours: int,
-        slope_std: float,
-    ) -> tuple[FloatArray, FloatArray]:
-        """See `gp_ground_seg.surface.fuse_neighbours`."""
 
     def objective(
         self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from gp_ground_seg.length_scale import (
     candidate_log_length_scale,
     interpolate_along_segments,
 )
-from gp_ground_seg.line_bends import candidates_that_follow
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
 from gp_ground_seg.pseudo_inputs import PseudoInputs
@@ -43,12 +41,14 @@ class FrameModel:
         Who computes.
     candidates : Candidates
         Ground candidates.
-    height : (C,) float64
-        Their heights about the prior mean [m].
+    prior_mean : float
+        Prior mean of the ground's height [m].
     lines : Lines
         Lines through them.
     pseudo : PseudoInputs
         Pseudo-inputs of the latent process.
+    follows : (C,) bool
+        Candidates that join the inliers if the one before them has.
     knots : (K,) float64
         Ranges where the surface is wanted [m].
     """
@@ -56,16 +56,11 @@ class FrameModel:
     config: Config
     backend: Backend
     candidates: Candidates
-    height: FloatArray
+    prior_mean: float
     lines: Lines
     pseudo: PseudoInputs
+    follows: BoolArray
     knots: FloatArray
-
-    @cached_property
-    def follows(self) -> BoolArray:
-        """Candidates that join the inliers if the one before them has, (C,) bool."""
-        use_compiled = self.backend.name == 'numba'
-        return candidates_that_follow(self.lines, self.candidates, self.config, use_compiled)
 
     def given_theta(self) -> FloatArray:
         """Theta before anything is learned, the same in every segment, (M, 5 + K)."""
@@ -85,42 +80,39 @@ class FrameModel:
         """
         u = candidate_log_length_scale(self.candidates, self.lines, self.config.length_scale)
         knot_u = interpolate_along_segments(self.candidates, u, knots)
-        n_knots = self._n_knots(knots)
+        n_knots = np.minimum(self.candidates.n_edges, len(knots))
         return u, np.where(np.arange(len(knots)) < n_knots[:, None], knot_u, np.nan)
 
     def grow(
-        self, theta: FloatArray, knots: FloatArray, segment_step: int = 1
+        self,
+        theta: FloatArray,
+        knots: FloatArray,
+        n_neighbours: int = 0,
+        segment_step: int = 1,
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Inliers (C,) that grow from low, near seeds; see `surface` for what else."""
-        growth = self.config.growth
-        seed = (self.candidates.r <= growth.seed_range) & (
-            np.abs(self.height) <= growth.seed_height_tolerance
-        )
-        if segment_step > 1:
-            seed &= self.candidates.segment % segment_step == 0
         task = GrowthTask(
             self.candidates,
-            self.height,
-            seed,
+            self.prior_mean,
             self.follows,
             knots,
             theta,
-            # Learned on inliers the noise comes out small, and the gate must not shut for that.
-            np.maximum(np.exp(theta[:, 1]), self.config.observation.sigma_n),
-            self.config.observation.slope_std,
-            growth,
+            self.config.observation,
+            self.config.growth,
+            segment_step,
+            n_neighbours,
         )
         if self.config.length_scale.model == 'latent':
-            return self.backend.grow_on_latent(task, self.pseudo, self._n_knots(knots))
+            return self.backend.grow_on_latent(task, self.pseudo)
         u, knot_u = self._given_log_length_scales(knots)
         return *self.backend.grow(task, u, knot_u), knot_u
 
-    def _n_knots(self, knots: FloatArray) -> IntArray:
-        return np.minimum(self.candidates.n_edges, len(knots))
-
     def surface(self, theta: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
-        """Inliers (C,); at the knots (M, K): height about the prior mean, its std [m], log l."""
-        return self.grow(theta, self.knots)
+        """Inliers (C,); at the knots (M, K): height, its std [m], log l.
+
+        Height and std are fused with those of the segments beside.
+        """
+        return self.grow(theta, self.knots, self.config.surface.n_neighbours)
 
     def learn(
         self, theta: FloatArray, out_of_time: Callable[[], bool]
@@ -128,7 +120,7 @@ class FrameModel:
         """Learn theta on the inliers that grow under it (paper, section III-E)."""
         by_frame = self.config.learning.scope == 'frame'
         step = self.config.learning.segment_step if by_frame else 1
-        inlier, *_ = self.grow(theta, _NO_KNOTS, step)
+        inlier, *_ = self.grow(theta, _NO_KNOTS, segment_step=step)
         frame = self._training_frame(theta, inlier)
         if by_frame:
             learned = [self._learn_one(theta[0], frame, out_of_time)]
@@ -168,7 +160,7 @@ class FrameModel:
         return TrainingFrame(
             offsets=taken[offsets],
             r=self.candidates.r[inlier],
-            z=self.height[inlier],
+            z=self.candidates.z[inlier] - self.prior_mean,
             log_length_scale=u,
             bar_offsets=self.pseudo.offsets if latent else np.zeros_like(offsets),
             r_bar=self.pseudo.r_bar,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.config import GrowthConfig
+from gp_ground_seg.config import GrowthConfig, ObservationConfig
 from gp_ground_seg.gp.observation import posterior
 from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
 
@@ -19,37 +19,67 @@ BoolArray = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class GrowthTask:
-    """What `grow_surface_reference` works on, all but the length-scales.
+    """What `grow_surface_reference` works on, all but the length-scales; and how to fuse.
 
     Attributes
     ----------
     candidates : Candidates
         Ground candidates.
-    height : (C,) float64
-        Their heights about the prior mean [m].
-    seed, follows : (C,) bool
+    prior_mean : float
+        Prior mean of the ground's height [m].
+    follows : (C,) bool
         See `grow_surface_reference`.
     knots : (K,) float64
         Ranges where the surface is wanted [m].
     theta : (M, 5 + K) float64
         Hyper-parameters of each segment (see `gp_ground_seg.gp.objective`).
-    gate_noise : (M,) float64
-        Standard deviation of the noise that residuals are standardised with [m].
-    slope_std : float
-        Prior standard deviation of the mean line's slope.
+    observation : ObservationConfig
+        Prior slope, and noise.
     growth : GrowthConfig
-        Bounds for joining.
+        Where seeds are, and bounds for joining.
+    segment_step : int
+        There are seeds in every n-th segment.
+    n_neighbours : int
+        See `gp_ground_seg.surface.fuse_neighbours`.
     """
 
     candidates: Candidates
-    height: FloatArray
-    seed: BoolArray
+    prior_mean: float
     follows: BoolArray
     knots: FloatArray
     theta: FloatArray
-    gate_noise: FloatArray
-    slope_std: float
+    observation: ObservationConfig
     growth: GrowthConfig
+    segment_step: int
+    n_neighbours: int
+
+    @property
+    def height(self) -> FloatArray:
+        """Heights of the candidates about the prior mean, (C,) float64 [m]."""
+        return self.candidates.z - self.prior_mean
+
+    @property
+    def seed(self) -> BoolArray:
+        """Low, near candidates, that inliers grow from, (C,) bool."""
+        is_seed: BoolArray = self.candidates.r <= self.growth.seed_range
+        is_seed &= np.abs(self.height) <= self.growth.seed_height_tolerance
+        if self.segment_step > 1:
+            is_seed &= self.candidates.segment % self.segment_step == 0
+        return is_seed
+
+    @property
+    def gate_noise(self) -> FloatArray:
+        """Standard deviation of the noise that residuals are standardised with, (M,) [m].
+
+        Learned on inliers the noise comes out small, and the gate must not shut for that.
+        """
+        noise: FloatArray = np.maximum(np.exp(self.theta[:, 1]), self.observation.sigma_n)
+        return noise
+
+    @property
+    def n_knots(self) -> IntArray:
+        """Number of knots up to the bin of the last candidate, (M,) int64."""
+        return np.minimum(self.candidates.n_edges, len(self.knots))
 
 
 def grow_surface_reference(

@@ -16,10 +16,16 @@ from gp_ground_seg.compiled import compiled_vectors, inlined
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.latent import LANES, latent_rows_compiled
+from gp_ground_seg.meeting import Board, all_done, await_settled, claim, ring
 from gp_ground_seg.polar_grid import FloatArray, IntArray
+from gp_ground_seg.surface import fuse_rows
+
+BLOCK = 3
+"""Segments that a thread takes at a time."""
 
 
-def _grow_surface(
+@inlined
+def grow_surface_compiled(
     start: int,
     stop: int,
     step: int,
@@ -220,46 +226,97 @@ def _project_two(
         k += 1
 
 
-grow_surface_compiled = compiled_vectors(_grow_surface)
-grow_surface_inlined = inlined(_grow_surface)
-
-
 @compiled_vectors
-def grow_on_latent_compiled(
-    start: int,
-    stop: int,
-    step: int,
+def estimate_surface(
+    share: int,
+    n_shares: int,
+    board: Board,
+    is_latent: bool,
     theta: FloatArray,
     bar_offsets: IntArray,
     r_bar: FloatArray,
     surface_class: IntArray,
     offsets: IntArray,
+    own_bin: IntArray,
     r: FloatArray,
-    knots: FloatArray,
-    n_knots: IntArray,
-    log_length_scale: FloatArray,
-    knot_log_length_scale: FloatArray,
     z: FloatArray,
-    seed: BoolArray,
+    prior_mean: float,
+    log_length_scale: FloatArray,
     follows: BoolArray,
-    sigma_f: FloatArray,
-    sigma_n: FloatArray,
-    gate_noise: FloatArray,
+    knots: FloatArray,
+    knot_log_length_scale: FloatArray,
+    least_gate_noise: float,
     slope_std: float,
+    seed_range: float,
+    seed_height_tolerance: float,
+    segment_step: int,
     max_std: float,
     max_standardised_residual: float,
     max_standardised_depth: float,
+    n_neighbours: int,
+    n_knots: IntArray,
+    scales: FloatArray,
+    height: FloatArray,
+    is_seed: BoolArray,
+    own_surface: FloatArray,
     inlier: BoolArray,
     mean: FloatArray,
     std: FloatArray,
 ) -> None:
-    """Both processes of segments ``start:stop:step``, in place: threads meet once less."""
-    latent_rows_compiled(
-        start, stop, step, theta, bar_offsets, r_bar, surface_class, offsets, r, knots,
-        n_knots, log_length_scale, knot_log_length_scale,
-    )  # fmt: skip
-    grow_surface_inlined(
-        start, stop, step, offsets, r, z, log_length_scale, seed, follows, knots,
-        knot_log_length_scale, sigma_f, sigma_n, gate_noise, slope_std, max_std,
-        max_standardised_residual, max_standardised_depth, inlier, mean, std,
-    )  # fmt: skip
+    """Length-scales, inliers and surface of every segment; then fused with its neighbours.
+
+    What `gp_ground_seg.gp.growth.GrowthTask` says, in two stages; see
+    `gp_ground_seg.meeting`. Length-scales are given unless `is_latent`. `n_knots` (M,),
+    `scales` (3, M), `height` (C,), `is_seed` (C,) and `own_surface` (2, M, K) are room to
+    work in.
+    """
+    if share == 0:
+        ring(board, n_shares)
+    sigma_f, sigma_n, gate_noise = scales[0], scales[1], scales[2]
+    own_mean, own_std = own_surface[0], own_surface[1]
+    n_segments = len(mean)
+    n_blocks = (n_segments + BLOCK - 1) // BLOCK
+    # No literal: for each of those numba compiles anew.
+    stage, n_own = np.int64(0), 0
+    block = claim(board, stage, share, n_shares, n_blocks)
+    while block >= 0:
+        start, stop = block * BLOCK, min((block + 1) * BLOCK, n_segments)
+        for m in range(start, stop):
+            first, behind = offsets[m], offsets[m + 1]
+            n_knots[m] = min(own_bin[behind - 1] + 2, len(knots)) if behind > first else 0
+            sigma_f[m], sigma_n[m] = math.exp(theta[m, 0]), math.exp(theta[m, 1])
+            gate_noise[m] = max(sigma_n[m], least_gate_noise)
+            for i in range(first, behind):
+                height[i] = z[i] - prior_mean
+                is_low = abs(height[i]) <= seed_height_tolerance
+                is_seed[i] = is_low and r[i] <= seed_range and m % segment_step == 0
+        if is_latent:
+            latent_rows_compiled(
+                start, stop, 1, theta, bar_offsets, r_bar, surface_class, offsets, r, knots,
+                n_knots, log_length_scale, knot_log_length_scale,
+            )  # fmt: skip
+        grow_surface_compiled(
+            start, stop, 1, offsets, r, height, log_length_scale, is_seed, follows, knots,
+            knot_log_length_scale, sigma_f, sigma_n, gate_noise, slope_std, max_std,
+            max_standardised_residual, max_standardised_depth, inlier, own_mean, own_std,
+        )  # fmt: skip
+        for m in range(start, stop):
+            n_knots[m] = 0
+            while n_knots[m] < len(knots) and not math.isnan(own_std[m, n_knots[m]]):
+                n_knots[m] += 1
+        n_own += 1
+        block = claim(board, stage, share, n_shares, n_blocks)
+    if all_done(board, stage, share, n_shares, n_own, n_blocks):
+        stage, n_own = stage + 1, 0
+        block = claim(board, stage, share, n_shares, n_blocks)
+        while block >= 0:
+            start, stop = block * BLOCK, min((block + 1) * BLOCK, n_segments)
+            fuse_rows(
+                start, stop, own_mean, own_std, n_knots, knots, n_neighbours, slope_std,
+                prior_mean, mean, std,
+            )  # fmt: skip
+            n_own += 1
+            block = claim(board, stage, share, n_shares, n_blocks)
+        all_done(board, stage, share, n_shares, n_own, n_blocks)
+    if share == 0:
+        await_settled(board, n_shares - 1)

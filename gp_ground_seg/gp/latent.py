@@ -10,7 +10,6 @@ from gp_ground_seg.compiled import inlined
 from gp_ground_seg.gp import dense
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.kernels import squared_exponential
-from gp_ground_seg.gp.linalg import factorise, solve
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 LANES = 4
@@ -111,6 +110,36 @@ def latent_rows_reference(
 
 
 @inlined
+def _eliminate(matrix: FloatArray, n: int, vector: FloatArray) -> bool:
+    """Replace `vector` by the solution of ``A x = vector``; False if A is not positive definite.
+
+    `matrix` holds the upper triangle of A, in rows of whole vectors. What is on the left of
+    the diagonal, and behind column n, is of no account.
+    """
+    end = (n + LANES - 1) & -LANES
+    for k in range(n):
+        row = matrix[k]
+        # Written so that NaN fails too.
+        if not row[k] > 0.0:
+            return False
+        inverse = 1.0 / row[k]
+        for i in range(k + 1, n):
+            factor = row[i] * inverse
+            below = matrix[i]
+            for j in range(i & -LANES, end):
+                below[j] -= factor * row[j]
+            vector[i] -= factor * vector[k]
+        row[k] = inverse
+    for k in range(n - 1, -1, -1):
+        row = matrix[k]
+        value = vector[k]
+        for j in range(k + 1, n):
+            value -= row[j] * vector[j]
+        vector[k] = value * row[k]
+    return True
+
+
+@inlined
 def latent_rows_compiled(
     start: int,
     stop: int,
@@ -133,7 +162,8 @@ def latent_rows_compiled(
         most_bar = max(most_bar, bar_offsets[m + 1] - bar_offsets[m])
     room = (most + len(knots) + LANES - 1) & -LANES
     wanted, value = np.empty(room), np.empty(room)
-    factor, weight = np.empty((most_bar, most_bar)), np.empty(most_bar)
+    room = (most_bar + LANES - 1) & -LANES
+    matrix, weight, centres = np.empty((most_bar, room)), np.empty(room), np.empty(room)
     for m in range(start, stop, step):
         for j in range(len(knots)):
             at_knots[m, j] = np.nan
@@ -147,19 +177,20 @@ def latent_rows_compiled(
         mean = 0.0
         for i in range(p):
             mean += theta[m, 5 + surface_class[first + i]] / p
+        end = (p + LANES - 1) & -LANES
+        for i in range(end):
+            centres[i] = r_bar[first + i] if i < p else 0.0
         for i in range(p):
             weight[i] = theta[m, 5 + surface_class[first + i]] - mean
-            row = factor[i]
-            for j in range(i, p):
-                d = r_bar[first + i] - r_bar[first + j]
+            row = matrix[i]
+            for j in range(i & -LANES, end):
+                d = centres[i] - centres[j]
                 row[j] = variance * decay(sharpness * d * d)
             row[i] += noise
-        if not factorise(factor, p):
+        if not _eliminate(matrix, p, weight):
             # Rounding beat the noise term: the mean is what is left to say.
             for i in range(p):
                 weight[i] = 0.0
-        else:
-            solve(factor, p, weight)
         # From pseudo-input to pseudo-input: the inner loop runs along a row.
         size = (n + n_wanted + LANES - 1) & -LANES
         # Element by element: to assign slices takes no less time, and seconds to compile.
@@ -173,7 +204,7 @@ def latent_rows_compiled(
             value[i] = mean
         for j in range(p):
             scaled = weight[j] * variance
-            centre = r_bar[first + j]
+            centre = centres[j]
             for i in range(size):
                 d = wanted[i] - centre
                 value[i] += scaled * decay(sharpness * d * d)

@@ -63,18 +63,3 @@ def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray
     for i in range(n):
         for j in range(i):
             inverse[j, i] = inverse[i, j]
-
-
-@compiled_vectors
-def solve(factor: FloatArray, n: int, vector: FloatArray) -> None:
-    """Replace `vector` by the solution of ``U^T U x = vector``."""
-    for i in range(n):
-        row = factor[i]
-        vector[i] /= row[i]
-        for k in range(i + 1, n):
-            vector[k] -= row[k] * vector[i]
-    for i in range(n - 1, -1, -1):
-        row = factor[i]
-        for k in range(i + 1, n):
-            vector[i] -= row[k] * vector[k]
-        vector[i] /= row[i]

@@ -5,28 +5,30 @@ from __future__ import annotations
 import numpy as np
 
 from gp_ground_seg.blas import single_threaded_blas
-from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
-from gp_ground_seg.faces import BegunFaces, Faces, find_faces
+from gp_ground_seg.config import Config, LabelConfig
+from gp_ground_seg.faces import Faces, find_faces
 from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.objective import TrainingFrame
+from gp_ground_seg.hidden_feet import without_hidden_feet
 from gp_ground_seg.labelling import Labelled, label_points, local_roughness
+from gp_ground_seg.line_bends import candidates_that_follow
+from gp_ground_seg.line_extraction import Lines, extract_lines
 from gp_ground_seg.points import in_columns
 from gp_ground_seg.polar_grid import (
     Candidates,
-    CellTables,
     FloatArray,
-    IntArray,
     PointArray,
     PolarGrid,
     build_polar_grid,
     ground_candidates,
     reduce_cells,
 )
-from gp_ground_seg.pseudo_inputs import PseudoInputs
+from gp_ground_seg.pseudo_inputs import PseudoInputs, select_pseudo_inputs
+from gp_ground_seg.sorted_points import SortedPoints
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours
-from gp_ground_seg.tiles import Tiles, build_tiles
+from gp_ground_seg.tiles import build_tiles
 from gp_ground_seg.workspace import Workspace
 
 
@@ -37,25 +39,28 @@ class NumpyBackend:
     n_threads = 1
 
     def sort_points(
-        self, xyz: PointArray, grid: GridConfig, tile_size: float, workspace: Workspace
-    ) -> tuple[PointArray, PolarGrid, CellTables, Tiles]:
-        """Cell and tile of each point, extremes of each."""
+        self, xyz: PointArray, config: Config, workspace: Workspace, seeks_faces: bool = True
+    ) -> SortedPoints:
+        """Cell and tile of each point, candidates; faces when they are asked for."""
         xyz = in_columns(xyz, workspace)
-        cells = build_polar_grid(xyz, grid)
-        tiles = build_tiles(xyz, cells, tile_size)
-        return xyz, cells, reduce_cells(cells, xyz[:, 2], tiles.tile), tiles
+        grid = build_polar_grid(xyz, config.grid)
+        tiles = build_tiles(xyz, grid, config.faces.cell_size)
+        cells = reduce_cells(grid, xyz[:, 2], tiles.tile)
+        candidates = ground_candidates(cells, grid.edges, config.lines.min_density_extent)
 
-    def ground_candidates(
-        self, cells: CellTables, edges: FloatArray, min_extent: float
-    ) -> Candidates:
-        """Lowest point and vertical density of each occupied bin."""
-        return ground_candidates(cells, edges, min_extent)
+        def find() -> Faces:
+            return find_faces(xyz, tiles, config.faces, config.label.obstacle_max_height)
 
-    def begin_faces(
-        self, xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float
-    ) -> BegunFaces:
-        """Upright faces, when they are asked for."""
-        return BegunFaces(lambda: find_faces(xyz, tiles, faces, max_height), lambda: None)
+        return SortedPoints(xyz, grid, candidates, find, lambda: None)
+
+    def find_lines(
+        self, candidates: Candidates, is_footless: BoolArray, config: Config
+    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
+        """Candidates that show ground, lines through them, pseudo-inputs, and who follows whom."""
+        kept = without_hidden_feet(candidates, is_footless)
+        lines = extract_lines(kept, config.lines)
+        pseudo = select_pseudo_inputs(kept, lines, config)
+        return kept, lines, pseudo, candidates_that_follow(lines, kept, config)
 
     def label_points(
         self,
@@ -77,8 +82,8 @@ class NumpyBackend:
     def grow(
         self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Inliers, mean and standard deviation of the surface."""
-        return grow_surface_batched(
+        """Inliers, mean and standard deviation of the fused surface."""
+        inlier, mean, std = grow_surface_batched(
             task.candidates.offsets,
             task.candidates.r,
             task.height,
@@ -90,13 +95,17 @@ class NumpyBackend:
             np.exp(task.theta[:, 0]),
             np.exp(task.theta[:, 1]),
             task.gate_noise,
-            task.slope_std,
+            task.observation.slope_std,
             task.growth,
         )
+        mean, std = fuse_neighbours(
+            mean, std, task.knots, task.n_neighbours, task.observation.slope_std
+        )
+        return inlier, mean + task.prior_mean, std
 
     @single_threaded_blas()
     def grow_on_latent(
-        self, task: GrowthTask, pseudo: PseudoInputs, n_knots: IntArray
+        self, task: GrowthTask, pseudo: PseudoInputs
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Both processes; the log length-scales at the knots as well."""
         u, knot_u = latent_rows_batched(
@@ -107,20 +116,9 @@ class NumpyBackend:
             task.candidates.offsets,
             task.candidates.r,
             task.knots,
-            n_knots,
+            task.n_knots,
         )
         return *self.grow(task, u, knot_u), knot_u
-
-    def fuse_neighbours(
-        self,
-        mean: FloatArray,
-        std: FloatArray,
-        knots: FloatArray,
-        n_neighbours: int,
-        slope_std: float,
-    ) -> tuple[FloatArray, FloatArray]:
-        """Surfaces fused with those of the segments beside."""
-        return fuse_neighbours(mean, std, knots, n_neighbours, slope_std)
 
     @single_threaded_blas()
     def objective(

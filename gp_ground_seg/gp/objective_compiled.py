@@ -6,19 +6,24 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled import compiled_vectors
+from gp_ground_seg.compiled import compiled_vectors, inlined
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.linalg import factorise, invert
+from gp_ground_seg.meeting import Board, all_done, await_settled, claim, ring
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
+BLOCK = 4
+"""Segments that a thread takes at a time."""
+
+
 @compiled_vectors
 def objective_rows(
-    start: int,
-    stop: int,
-    step: int,
+    share: int,
+    n_shares: int,
+    board: Board,
     theta: FloatArray,
     offsets: IntArray,
     r: FloatArray,
@@ -34,12 +39,48 @@ def objective_rows(
 ) -> None:
     """Do what `gp_ground_seg.gp.objective.objective_reference` does, segment by segment.
 
-    ``values[m]`` and ``gradients[m]`` are set for segments ``start:stop:step``.
+    ``values[m]`` and ``gradients[m]`` are set, in one stage; see `gp_ground_seg.meeting`.
     """
+    if share == 0:
+        ring(board, n_shares)
+    n_blocks = (len(values) + BLOCK - 1) // BLOCK
+    # No literal: for each of those numba compiles anew.
+    stage, n_own = np.int64(0), 0
+    block = claim(board, stage, share, n_shares, n_blocks)
+    while block >= 0:
+        start, stop = block * BLOCK, min((block + 1) * BLOCK, len(values))
+        _objective_rows(
+            start, stop, theta, offsets, r, z, fixed_u, bar_offsets, r_bar, surface_class,
+            slope_std, latent_terms, values, gradients,
+        )  # fmt: skip
+        n_own += 1
+        block = claim(board, stage, share, n_shares, n_blocks)
+    all_done(board, stage, share, n_shares, n_own, n_blocks)
+    if share == 0:
+        await_settled(board, n_shares - 1)
+
+
+@inlined
+def _objective_rows(
+    start: int,
+    stop: int,
+    theta: FloatArray,
+    offsets: IntArray,
+    r: FloatArray,
+    z: FloatArray,
+    fixed_u: FloatArray,
+    bar_offsets: IntArray,
+    r_bar: FloatArray,
+    surface_class: IntArray,
+    slope_std: float,
+    latent_terms: bool,
+    values: FloatArray,
+    gradients: FloatArray,
+) -> None:
     sigma_f, sigma_n = math.exp(theta[0]), math.exp(theta[1])
     sigma_f_bar, sigma_l_bar = math.exp(theta[2]), math.exp(theta[3])
     sigma_n_bar = math.exp(theta[4])
-    for m in range(start, stop, step):
+    for m in range(start, stop):
         first, bar_first = offsets[m], bar_offsets[m]
         n, p = offsets[m + 1] - first, bar_offsets[m + 1] - bar_first
         gradients[m] = 0.0

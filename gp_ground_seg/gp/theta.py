@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,22 +54,17 @@ def theta_centre(config: Config, first_guess: FloatArray) -> FloatArray:
         First guess of the surface classes' log length-scales [log m].
     """
     observation, latent, limits = config.observation, config.latent, config.length_scale
-    log = np.log(
-        [
-            observation.sigma_f,
-            observation.sigma_n,
-            latent.sigma_f_bar,
-            latent.sigma_l_bar,
-            latent.sigma_n_bar,
-            limits.min,
-            limits.max,
-        ]
+    # Every frame begins with this: numpy would take as long for each of seven logarithms.
+    values = (
+        observation.sigma_f,
+        observation.sigma_n,
+        latent.sigma_f_bar,
+        latent.sigma_l_bar,
+        latent.sigma_n_bar,
     )
-    centre = np.empty(N_SCALARS + len(first_guess))
-    centre[:N_SCALARS] = log[:N_SCALARS]
-    # Every frame begins with this; `np.clip` would take as long as the rest.
-    np.maximum(first_guess, log[N_SCALARS], out=centre[N_SCALARS:])
-    np.minimum(centre[N_SCALARS:], log[N_SCALARS + 1], out=centre[N_SCALARS:])
+    shortest, longest = math.log(limits.min), math.log(limits.max)
+    guessed = [min(max(guess, shortest), longest) for guess in first_guess.tolist()]
+    centre = np.array([*map(math.log, values), *guessed])
     return centre
 
 
