@@ -307,6 +307,21 @@ def test_shares_of_the_points_are_merged(n_threads):
     backend.close()
 
 
+@pytest.mark.parametrize('n_threads', [1, 2, 3])
+def test_other_points_may_be_sorted_while_faces_are_looked_for(n_threads):
+    backend, config = CompiledBackend(n_threads), Config()
+    for _ in range(5):
+        found = backend.sort_points(taken(hilly_scan(50_000, seed=5)), config, Workspace())
+        for n_points in (300, 0):
+            other = taken(hilly_scan(n_points, seed=3))
+            sample = backend.sort_points(other, config, Workspace(), seeks_faces=False)
+            assert_same_candidates(sample.candidates, sort(other).candidates)
+        faces, same = found.find_faces(), sort(found.xyz).find_faces()
+        assert_same_tiles(faces.tiles, same.tiles)
+        np.testing.assert_array_equal(faces.is_face, same.is_face)
+    backend.close()
+
+
 @given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi), st.floats(0.01, 1e3))
 def test_pseudo_angle_grows_with_the_angle(one, other, r):
     x, y = r * np.cos([one, other]), r * np.sin([one, other])

@@ -37,7 +37,8 @@ class Backend(Protocol):
         See `gp_ground_seg.points.in_columns`, `gp_ground_seg.polar_grid`,
         `gp_ground_seg.tiles` and `gp_ground_seg.faces.find_faces`. All but the grid and the
         candidates may lie in `workspace`. If `seeks_faces`, other threads begin with them:
-        they, or that they are dropped, are to be waited for before the points change.
+        they, or that they are dropped, are to be waited for before the points change and
+        before anything is asked of the backend but to sort other points without faces.
         """
 
     def find_lines(

@@ -16,8 +16,8 @@ from gp_ground_seg.gp.objective_compiled import objective_rows
 from gp_ground_seg.labelling import Labelled
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.line_passes import find_lines_compiled
-from gp_ground_seg.meeting import Board
-from gp_ground_seg.parallel import RowPool
+from gp_ground_seg.meeting import Board, make_board
+from gp_ground_seg.parallel import RowPool, Team
 from gp_ground_seg.points import as_read_only, flat_rows, in_columns
 from gp_ground_seg.polar_grid import (
     Candidates,
@@ -66,7 +66,8 @@ class CompiledBackend:
         columns = xyz.T
         edges, ranges, turns = grid_rulers(grid, xyz.dtype)
         n_sides = tiles_per_side(grid.r_max, faces.cell_size)
-        n_shares = self._pool.n_shares(n_points)
+        # Who asks for no faces may do so while others still look for those of another scan.
+        n_shares = self._pool.n_shares(n_points) if seeks_faces else 1
         n_cells, n_tiles = grid.n_segments * grid.n_bins, n_sides**2
         take = workspace.take
         cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points, dtype=xyz.dtype)
@@ -81,7 +82,7 @@ class CompiledBackend:
         room = 2 * n_tiles if seeks_faces else 0
         slots = take('slots', (room + 1,), np.int32)
         sums = take('sums', (n_shares, room, face_passes.N_COLUMNS), np.float64)
-        team = self._pool.team(n_shares)
+        team = self._pool.team(n_shares) if seeks_faces else Team([], make_board(1, 1))
 
         def sort(share: int) -> None:
             point_passes.sort_points(
@@ -134,7 +135,7 @@ class CompiledBackend:
             tiles = Tiles(tile, tile_extremes[0, :-1], touched[0, 1 : 1 + touched[0, 0]])
             return Faces(tiles, is_face, is_footless)
 
-        team.start(*([sort, judge] if seeks_faces else [sort]))
+        team.start(sort, judge)
         team.take_part(sort)
         candidates = _collect_candidates(
             team.board, extremes, numbers, grid, edges, config.lines.min_density_extent
