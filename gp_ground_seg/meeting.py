@@ -26,16 +26,13 @@ else:
 
 Board = npt.NDArray[np.int64]
 
-GIVEN_UP, RUNG, SETTLED = 0, 1, 2
-"""Rows of the board: threads that failed; how often the others were rung for; how many of them
-have settled. All but the second begin at zero."""
-_FIRST_STAGE = 3
+GIVEN_UP, SETTLED = 0, 1
+"""Rows of the board: threads that failed; how many of the others have settled."""
+_FIRST_STAGE = 2
 _CACHE_LINE = 8  # whole numbers: two threads that count do not hinder each other
-# In looks at the board, of a few nanoseconds each: some 100, 50 and 2000 us.
+# In looks at the board, of a few nanoseconds each: some 100 and 50 us.
 _BEFORE_SLEEP = 0 if DISABLE_JIT else 40_000
 _FOR_OTHERS = 0 if DISABLE_JIT else 20_000
-BEFORE_LEAVING = 0 if DISABLE_JIT else 800_000
-"""Patience of who lingers: longer than Python takes between two calls of a frame."""
 _PAUSE = 50  # us
 
 
@@ -166,15 +163,8 @@ def give_up(board: Board) -> None:
 
 
 @compiled
-def ring(board: Board, n_shares: int) -> None:
-    """Call those who `linger`: here, where the interpreter's lock is free for them to take."""
-    if n_shares > 1:
-        _add(board, RUNG, 1)
-
-
-@compiled
 def settle(board: Board) -> None:
-    """Tell that this thread is in compiled code, and needs the interpreter's lock no more."""
+    """Tell that this thread goes to sleep, or on in compiled code: it needs no lock any more."""
     _add(board, SETTLED, 1)
 
 
@@ -188,16 +178,3 @@ def await_settled(board: Board, number: int) -> None:
         if _look(board, SETTLED) >= number:
             break
         _breathe(board, GIVEN_UP)
-
-
-@compiled
-def linger(board: Board, n_rung: int, patience: int, own: Board) -> None:
-    """Wait for more than `n_rung` rings, for some milliseconds at most.
-
-    `own` is a board of this thread, to be about something.
-    """
-    settle(board)
-    for _ in range(patience):
-        if _look(board, RUNG) > n_rung:
-            break
-        _breathe(own, 0)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from threading import Lock, Thread
 from typing import Any
 
-from gp_ground_seg.meeting import BEFORE_LEAVING, RUNG, Board, give_up, linger, make_board
+from gp_ground_seg.meeting import Board, give_up, make_board, settle
 
 MOST_STAGES = 4
 """Stages of the longest work that is shared out."""
@@ -22,28 +22,23 @@ more than its share of what is left is worth."""
 class _Worker:
     """Thread that waits for one call at a time.
 
-    For a while in compiled code, from where it begins at once when it is rung for; then
-    asleep. Two bare locks: an executor with its queue and futures takes longer to pass a
-    call on, and some calls are as short as that.
+    Two bare locks: an executor with its queue and futures takes longer to pass a call on,
+    and some calls are as short as that.
 
     Parameters
     ----------
     board : Board
-        Where it is rung for.
-    patience : int
-        How long it stays awake, see `gp_ground_seg.meeting.linger`.
+        Where it tells that it has settled.
     """
 
-    def __init__(self, board: Board, patience: int) -> None:
+    def __init__(self, board: Board) -> None:
         self._call: tuple[Callable[..., None], tuple[Any, ...]] | None = None
         self._error: BaseException | None = None
         self._go, self._done = Lock(), Lock()
         self._go.acquire()
         self._done.acquire()
         self._is_busy = False
-        Thread(
-            target=self._work, args=(board, patience), name='gp_ground_seg', daemon=True
-        ).start()
+        Thread(target=self._work, args=(board,), name='gp_ground_seg', daemon=True).start()
 
     def start(self, function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
         """Call ``function(*arguments)`` in the thread, which is at nothing else."""
@@ -63,8 +58,7 @@ class _Worker:
         self._call = None
         self._go.release()
 
-    def _work(self, board: Board, patience: int) -> None:
-        own = make_board(0, 1)
+    def _work(self, board: Board) -> None:
         while True:
             self._go.acquire()
             if self._call is None:
@@ -77,9 +71,8 @@ class _Worker:
             # Nothing is held until the next call: frames are large.
             self._call = None
             del function, arguments
-            n_rung = int(board[RUNG, 0])
             self._done.release()
-            linger(board, n_rung, patience, own)
+            settle(board)
 
 
 class Team:
@@ -148,13 +141,10 @@ class RowPool:
     """
 
     def __init__(self, n_threads: int) -> None:
-        n_cores = len(os.sched_getaffinity(0))
-        self.n_threads = n_threads or min(n_cores, MOST_UNASKED)
+        self.n_threads = n_threads or min(len(os.sched_getaffinity(0)), MOST_UNASKED)
         self._board = make_board(MOST_STAGES, self.n_threads)
-        # Who stays awake needs a core to be awake on.
-        patience = BEFORE_LEAVING if self.n_threads <= n_cores else 0
         # The caller's thread takes a share too.
-        self._workers = [_Worker(self._board, patience) for _ in range(self.n_threads - 1)]
+        self._workers = [_Worker(self._board) for _ in range(self.n_threads - 1)]
         self._team: Team | None = None
         self._end = weakref.finalize(self, _end_all, self._workers)
 
@@ -165,9 +155,7 @@ class RowPool:
     def team(self, n_shares: int) -> Team:
         """Team of that many threads, all or one. The one before is waited for."""
         self._settle()
-        n_rung = self._board[RUNG, 0]
         self._board.fill(0)
-        self._board[RUNG, 0] = n_rung
         self._team = Team(self._workers[: n_shares - 1], self._board)
         return self._team
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from gp_ground_seg.compiled import compiled, inlined
-from gp_ground_seg.meeting import Board, all_done, await_settled, claim, n_taken, ring
+from gp_ground_seg.meeting import Board, all_done, await_settled, claim, n_taken
 from gp_ground_seg.polar_grid import (
     NO_TILE,
     NOT_FINITE,
@@ -56,8 +56,6 @@ def sort_points(
     the points that are in none. Block by block: where the points lie, in loops without
     branches; then the extremes.
     """
-    if share == 0:
-        ring(board, n_shares)
     n_points = len(cell)
     n_blocks = (n_points + _TAKEN - 1) // _TAKEN
     own_extremes, own_numbers = extremes[share], numbers[share]

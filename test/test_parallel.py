@@ -148,24 +148,12 @@ def test_threads_begin_with_neighbours_and_help_out_when_those_are_done():
     assert board[GIVEN_UP, 0] == 0
 
 
-@pytest.mark.skipif(meeting.DISABLE_JIT, reason='without compiled code nobody lingers')
-def test_who_lingers_comes_when_it_is_rung_for():
-    """Not before, and in the end without."""
-    board, own = meeting.make_board(0, 2), meeting.make_board(0, 1)
-    endless = 2**40
-    thread = threading.Thread(target=meeting.linger, args=(board, 0, endless, own), daemon=True)
-    thread.start()
+def test_nobody_waits_for_ever_for_others_to_settle():
+    board = meeting.make_board(0, 3)
+    meeting.settle(board)
     meeting.await_settled(board, 1)
-    thread.join(timeout=0.1)
-    assert thread.is_alive()
-    meeting.ring(board, 1)  # nobody else is wanted
-    thread.join(timeout=0.1)
-    assert thread.is_alive()
-    meeting.ring(board, 2)
-    thread.join(timeout=10.0)
-    assert not thread.is_alive()
-    meeting.linger(board, 1, 1000, own)
-    meeting.await_settled(board, 3)  # only two came: it does not wait for ever
+    meeting.await_settled(board, 2)
+    assert board[meeting.SETTLED, 0] == 1
 
 
 def threads_of(n_threads):

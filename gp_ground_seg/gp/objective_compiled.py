@@ -9,7 +9,7 @@ import numpy as np
 from gp_ground_seg.compiled import compiled_vectors, inlined
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.linalg import factorise, invert
-from gp_ground_seg.meeting import Board, all_done, await_settled, claim, ring
+from gp_ground_seg.meeting import Board, all_done, await_settled, claim
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -41,8 +41,6 @@ def objective_rows(
 
     ``values[m]`` and ``gradients[m]`` are set, in one stage; see `gp_ground_seg.meeting`.
     """
-    if share == 0:
-        ring(board, n_shares)
     n_blocks = (len(values) + BLOCK - 1) // BLOCK
     # No literal: for each of those numba compiles anew.
     stage, n_own = np.int64(0), 0

@@ -24,8 +24,8 @@ from gp_ground_seg.sensor_pose import given_pose
 _RINGS = 24
 _DIRECTIONS = 64
 _PARTS = {
-    'points': ('sort_points', 'label_points'),
-    'processes': ('find_lines', 'grow', 'grow_on_latent', 'objective'),
+    'points': ('sort_points', 'find_lines', 'label_points'),
+    'processes': ('grow', 'grow_on_latent', 'objective'),
 }
 """Methods of the backend whose code is compiled side by side."""
 _LOOK_AROUND = 0.2
@@ -94,7 +94,7 @@ def _half_compiled(part: str) -> Backend:
     """Backend with the methods of a part in compiled code, the others in numpy."""
     from gp_ground_seg.gp.compiled_backend import CompiledBackend
 
-    # Two threads, for there is code for those that wait for others.
+    # Two threads, for there is code for the other one.
     compiled, plain = CompiledBackend(2), NumpyBackend()
     # What else is compiled, about the candidates, goes by the name.
     half: Backend = CompiledBackend(1) if part == 'points' else NumpyBackend()
