@@ -20,6 +20,8 @@ _LOGGER = logging.getLogger('gp_ground_seg')
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 
 HAVE_NUMBA = numba is not None
+COMPILES = HAVE_NUMBA and not numba.config.DISABLE_JIT
+"""Whether functions are compiled, and do not stay plain Python."""
 
 _dispatchers: list[Any] = []
 
@@ -44,14 +46,14 @@ def inlined(function: _Function) -> _Function:
     It is never compiled by itself, which takes longer than the work it does in them; sums
     are taken in the order that those say.
     """
-    if numba is None or numba.config.DISABLE_JIT:
+    if not COMPILES:
         return function
     part: _Function = numba.njit(inline='always', nogil=True, error_model='numpy')(function)
     return part
 
 
 def _compile(function: _Function, fastmath: frozenset[str]) -> _Function:
-    if numba is None or numba.config.DISABLE_JIT:
+    if not COMPILES:
         return function
     result = numba.njit(nogil=True, error_model='numpy', fastmath=set(fastmath))(function)
     try:

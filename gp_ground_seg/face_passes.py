@@ -82,33 +82,30 @@ def judge_faces(
     if share > 0:
         settle(board)
     n_tiles = len(is_face)
-    # No literals: for each of those numba compiles anew.
-    stage, n_blocks, n_own = np.int64(MERGING), np.int64(1), 0
+    stage, n_blocks = np.int64(MERGING), np.int64(1)
     if claim(board, stage, share, n_shares, n_blocks) == 0:
         _merge_tiles(board, n_shares, extremes, touched)
         slots[2 * n_tiles] = _take_tall(extremes[0], touched[0], min_height, slots, n_tiles)
         is_face[:] = False
         is_footless[:] = False
-        n_own = 1
-    if not all_done(board, stage, share, n_shares, n_own, n_blocks):
+    if not all_done(board, stage, share, n_shares, n_blocks):
         return
     n_slots = slots[2 * n_tiles]
 
-    stage, n_own = np.int64(SUMMING), 0
+    stage = np.int64(SUMMING)
     n_blocks = (len(tile) + BLOCK - 1) // BLOCK
     block = claim(board, stage, share, n_shares, n_blocks)
+    if block >= 0:
+        _empty(extremes[0], tile_size, n_slots, slots, sums[share])
     while block >= 0:
-        if n_own == 0:
-            _empty(extremes[0], tile_size, n_slots, slots, sums[share])
         own = slice(block * BLOCK, min((block + 1) * BLOCK, len(tile)))
         x, y, z = columns[0, own], columns[1, own], columns[2, own]
         _sum_up(x, y, z, tile[own], slots, max_height, tolerance, sums[share])
-        n_own += 1
         block = claim(board, stage, share, n_shares, n_blocks)
-    if not all_done(board, stage, share, n_shares, n_own, n_blocks):
+    if not all_done(board, stage, share, n_shares, n_blocks):
         return
 
-    stage, n_own = np.int64(JUDGING), 0
+    stage = np.int64(JUDGING)
     n_blocks = (n_slots + _SLOTS - 1) // _SLOTS
     low, high = np.empty(N_COLUMNS), np.empty(N_COLUMNS)
     block = claim(board, stage, share, n_shares, n_blocks)
@@ -124,11 +121,9 @@ def judge_faces(
             is_footless[t] = hides_foot_compiled(
                 low, high, top, tolerance, max_foot_distance, max_foot_density
             )
-        n_own += 1
         block = claim(board, stage, share, n_shares, n_blocks)
-    all_done(board, stage, share, n_shares, n_own, n_blocks)
-    if share == 0:
-        await_settled(board, 2 * (n_shares - 1))
+    all_done(board, stage, share, n_shares, n_blocks)
+    await_settled(board, share, 2 * (n_shares - 1))
 
 
 @compiled

@@ -76,30 +76,27 @@ def label_scan(
     pieces[n_segments * n_bins] = np.nan
     n_blocks = (n_points + BLOCK - 1) // BLOCK
 
-    # No literal: for each of those numba compiles anew.
-    stage, n_own = np.int64(0), 0
+    stage = np.int64(0)
     m = claim(board, stage, share, n_shares, n_segments)
     while m >= 0:
         _level_and_slope(knots, mean[m], pieces[m * n_bins : (m + 1) * n_bins])
-        n_own += 1
         m = claim(board, stage, share, n_shares, n_segments)
-    if not all_done(board, stage, share, n_shares, n_own, n_segments):
+    if not all_done(board, stage, share, n_shares, n_segments):
         return
 
-    stage, n_own = stage + 1, 0
+    stage += 1
     block = claim(board, stage, share, n_shares, n_blocks)
+    if block >= 0:
+        sums[share] = 0
     while block >= 0:
         own = slice(block * BLOCK, min((block + 1) * BLOCK, n_points))
-        if n_own == 0:
-            sums[share] = 0
         _survey(columns[2, own], cell[own], r[own], tile[own], is_face, pieces, knots[0],
                 min_height, max_height, height[own], sums[share])  # fmt: skip
-        n_own += 1
         block = claim(board, stage, share, n_shares, n_blocks)
-    if not all_done(board, stage, share, n_shares, n_own, n_blocks):
+    if not all_done(board, stage, share, n_shares, n_blocks):
         return
 
-    stage, n_own = stage + 1, 0
+    stage += 1
     number, squares = np.empty(n_bins + 2, np.int64), np.empty(n_bins + 2, np.int64)
     stands = np.empty(n_bins, np.int64)
     m = claim(board, stage, share, n_shares, n_segments)
@@ -108,25 +105,22 @@ def label_scan(
         own = slice(m * n_bins, (m + 1) * n_bins)
         _bands(number, squares, stands, ground_tolerance, roughness_gain, obstacle_tolerance,
                obstacle_roughness_gain, min_height, roughness[m], band[own])  # fmt: skip
-        n_own += 1
         m = claim(board, stage, share, n_shares, n_segments)
     # Whoever comes first or last: it is always the same.
     band[n_segments * n_bins] = np.nan
-    if not all_done(board, stage, share, n_shares, n_own, n_segments):
+    if not all_done(board, stage, share, n_shares, n_segments):
         return
 
-    stage, n_own = stage + 1, 0
+    stage += 1
     block = claim(board, stage, share, n_shares, n_blocks)
     while block >= 0:
         own = slice(block * BLOCK, min((block + 1) * BLOCK, n_points))
         _label(columns[2, own], cell[own], tile[own], height[own], is_face, is_footless,
                tile_extremes, band, below_tolerance, face_tolerance, label[own],
                margin[own])  # fmt: skip
-        n_own += 1
         block = claim(board, stage, share, n_shares, n_blocks)
-    all_done(board, stage, share, n_shares, n_own, n_blocks)
-    if share == 0:
-        await_settled(board, n_shares - 1)
+    all_done(board, stage, share, n_shares, n_blocks)
+    await_settled(board, share, n_shares - 1)
 
 
 @compiled

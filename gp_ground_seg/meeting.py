@@ -14,15 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.compiled import HAVE_NUMBA, compiled, inlined
+from gp_ground_seg.compiled import COMPILES, compiled, inlined
 
-if HAVE_NUMBA:
+if COMPILES:
     from numba import types
     from numba.core import cgutils
-    from numba.core.config import DISABLE_JIT
     from numba.extending import intrinsic
-else:
-    DISABLE_JIT = True
 
 Board = npt.NDArray[np.int64]
 
@@ -31,8 +28,8 @@ GIVEN_UP, SETTLED = 0, 1
 _FIRST_STAGE = 2
 _CACHE_LINE = 8  # whole numbers: two threads that count do not hinder each other
 # In looks at the board, of a few nanoseconds each: some 100 and 50 us.
-_BEFORE_SLEEP = 0 if DISABLE_JIT else 40_000
-_FOR_OTHERS = 0 if DISABLE_JIT else 20_000
+_BEFORE_SLEEP = 40_000 if COMPILES else 0
+_FOR_OTHERS = 20_000 if COMPILES else 0
 _PAUSE = 50  # us
 
 
@@ -78,15 +75,17 @@ def _atomic_look(typing_context: Any, board: Any, row: Any) -> Any:
     return types.int64(board, types.intp), generate
 
 
-if DISABLE_JIT:
-    _add: Any = _plain_add
-    _look: Any = _plain_look
-    _usleep: Any = lambda pause: time.sleep(1e-6 * pause)  # noqa: E731
-else:
+if COMPILES:
     # Add to a row of the board, at once for all threads, and return what was there; see
     # what is there now.
-    _add, _look = intrinsic(_atomic_add), intrinsic(_atomic_look)
-    _usleep = types.ExternalFunction('usleep', types.int32(types.uint32))
+    _add: Any = intrinsic(_atomic_add)
+    _look: Any = intrinsic(_atomic_look)
+    _usleep: Any = types.ExternalFunction('usleep', types.int32(types.uint32))
+else:
+    _add, _look = _plain_add, _plain_look
+
+    def _usleep(pause: int) -> None:
+        time.sleep(1e-6 * pause)
 
 
 @compiled
@@ -94,7 +93,8 @@ def claim(board: Board, stage: int, share: int, n_shares: int, n_blocks: int) ->
     """Next of the `n_blocks` blocks of a stage that nobody has, or -1.
 
     Each thread begins with its own share, so that it sees neighbours, and helps out with
-    the others' when that is done. Which thread does a block is chance.
+    the others' when that is done. Which thread does a block is chance. (`stage` is to be no
+    literal: for each of those numba would compile anew.)
     """
     row = _first_row(stage, n_shares)
     for k in range(n_shares):
@@ -103,15 +103,14 @@ def claim(board: Board, stage: int, share: int, n_shares: int, n_blocks: int) ->
         end = n_blocks * (owner + 1) // n_shares
         block: int = first + _add(board, row + 1 + owner, 1)
         if block < end:
+            board[row + 1 + share, 1] += 1
             return block
     return -1
 
 
 @compiled
-def all_done(
-    board: Board, stage: int, share: int, n_shares: int, n_own: int, n_blocks: int
-) -> bool:
-    """Wait until all blocks of a stage are done, of which this thread did `n_own`.
+def all_done(board: Board, stage: int, share: int, n_shares: int, n_blocks: int) -> bool:
+    """Wait until all blocks of a stage are done, as are those that this thread claimed.
 
     Not until all threads are here: one that wakes late finds nothing left to do. Whoever
     waits looks again and again for a while, and then sleeps in between: where there are
@@ -123,7 +122,7 @@ def all_done(
         False if they never will be: a thread has given up.
     """
     row = _first_row(stage, n_shares)
-    board[row + 1 + share, 1] = n_own
+    n_own = n_taken(board, stage, share, n_shares)
     n_done = _add(board, row, n_own) + n_own
     n_looks = 0
     while n_done < n_blocks:
@@ -169,12 +168,13 @@ def settle(board: Board) -> None:
 
 
 @compiled
-def await_settled(board: Board, number: int) -> None:
+def await_settled(board: Board, share: int, number: int) -> None:
     """Give others the time to `settle`, so often in all: two that want the lock wait longer.
 
-    Not for ever: one that has not woken up will not be in the way either.
+    That is what share 0 does. Not for ever: one that has not woken up will not be in the
+    way either.
     """
     for _ in range(_FOR_OTHERS):
-        if _look(board, SETTLED) >= number:
+        if share > 0 or _look(board, SETTLED) >= number:
             break
         _breathe(board, GIVEN_UP)

@@ -62,9 +62,8 @@ def sort_points(
     own_tile_extremes, own_touched = tile_extremes[share], touched[share]
     own_r_entry = np.empty(BLOCK, dtype=np.int32)
     own_turn, own_turn_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
-    taken = np.empty(n_blocks, dtype=np.int64)
-    # No literal: for each of those numba compiles anew.
-    stage, n_own = np.int64(SORTING), 0
+    taken, n_own = np.empty(n_blocks, dtype=np.int64), 0
+    stage = np.int64(SORTING)
     block = claim(board, stage, share, n_shares, n_blocks)
     # Not where others took all: they may have gone on to the next stage.
     if block >= 0:
@@ -90,9 +89,8 @@ def sort_points(
     for block in taken[:n_own]:
         own = slice(block * _TAKEN, min((block + 1) * _TAKEN, n_points))
         _settle_lowest(columns[2, own], r[own], cell[own], tile[own], own_extremes, own_numbers)
-    all_done(board, stage, share, n_shares, n_own, n_blocks)
-    if share == 0:
-        await_settled(board, n_shares - 1)
+    all_done(board, stage, share, n_shares, n_blocks)
+    await_settled(board, share, n_shares - 1)
 
 
 @compiled

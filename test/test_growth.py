@@ -45,7 +45,6 @@ def compiled(frame, growth, chunks=1, sigma_f=None, sigma_n=None, gate_noise=Non
         grow_surface_compiled(
             start,
             stop,
-            1,
             *frame[:3],
             np.log(frame[3]),
             *frame[4:7],

@@ -216,6 +216,6 @@ def test_compiled_latent_rows_are_the_reference(seed):
     )
     expected = latent_rows_reference(*arguments)
     found = np.empty(counts.sum()), np.zeros((5, 7))
-    latent_rows_compiled(0, 5, 1, *arguments, *found)
+    latent_rows_compiled(0, 5, *arguments, *found)
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9)

@@ -59,7 +59,7 @@ def test_nobody_waits_for_what_a_thread_that_failed_had_claimed(pool, bad):
         claim(board, 0, share, n_shares, 3)
         if share == bad:
             raise ValueError(f'share {share}')
-        came_to_an_end[share] = all_done(board, 0, share, n_shares, 1, 3)
+        came_to_an_end[share] = all_done(board, 0, share, n_shares, 3)
 
     came_to_an_end = {}
     with pytest.raises(ValueError, match=f'share {bad}'):
@@ -126,7 +126,7 @@ def test_each_block_of_each_stage_is_done_once_and_before_the_next_stage(n_threa
                 own.append(block)
                 if block % 50 == 0:
                     time.sleep(1e-3)
-            assert all_done(board, stage, share, n_shares, len(own), n_blocks)
+            assert all_done(board, stage, share, n_shares, n_blocks)
             assert len(done) >= (stage + 1) * n_blocks
             taken[stage, share] = len(own)
         seen = [[n_taken(board, s, k, n_shares) for k in range(n_shares)] for s in range(3)]
@@ -151,8 +151,8 @@ def test_threads_begin_with_neighbours_and_help_out_when_those_are_done():
 def test_nobody_waits_for_ever_for_others_to_settle():
     board = meeting.make_board(0, 3)
     meeting.settle(board)
-    meeting.await_settled(board, 1)
-    meeting.await_settled(board, 2)
+    meeting.await_settled(board, 0, 1)
+    meeting.await_settled(board, 0, 2)
     assert board[meeting.SETTLED, 0] == 1
 
 

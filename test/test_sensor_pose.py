@@ -426,21 +426,6 @@ def test_angles_given_silence_the_refusal_but_not_the_contradiction():
     assert said.startswith('z does not point up: ')
 
 
-@pytest.mark.parametrize('n_threads', [1, 2])
-def test_looking_another_way_does_not_disturb_the_search_for_faces(n_threads):
-    """The ground stands upright here, and is an upright face."""
-    points = tilted(scan_of('urban', HDL_64E, 1.73).points[:, :3], math.pi / 2, 0.0)
-    given = {'sensor.roll': 0.0, 'sensor.pitch': 0.0}
-    own, plain = (
-        GroundSegmenter(Config().replace(**given, **runtime)).segment(points)
-        for runtime in ({'runtime.n_threads': n_threads}, {'runtime.backend': 'numpy'})
-    )
-    assert own.pose.contradictions == plain.pose.contradictions
-    assert own.pose.contradictions[0].startswith('z does not point up: ')
-    np.testing.assert_array_equal(own.label, plain.label)
-    np.testing.assert_allclose(own.margin, plain.margin, atol=1e-8)
-
-
 @pytest.mark.parametrize('sensor', [HDL_64E, VLP_16, OS1_128], ids=lambda s: s.name)
 @pytest.mark.parametrize('scene', SCENES)
 @pytest.mark.parametrize('height', [0.4, 2.5])

@@ -28,7 +28,6 @@ BLOCK = 3
 def grow_surface_compiled(
     start: int,
     stop: int,
-    step: int,
     offsets: IntArray,
     r: FloatArray,
     z: FloatArray,
@@ -48,12 +47,12 @@ def grow_surface_compiled(
     mean: FloatArray,
     std: FloatArray,
 ) -> None:
-    """Do what `grow_surface_reference` does for segments ``start:stop:step``, in place.
+    """Do what `grow_surface_reference` does for segments `start` to `stop`, in place.
 
     Of the length-scales the logarithms.
     """
     most = 0
-    for m in range(start, stop, step):
+    for m in range(start, stop):
         most = max(most, offsets[m + 1] - offsets[m])
     room = (most + len(knots) + LANES - 1) & -LANES
     columns, whitened = np.empty((5, room)), np.empty((most, room))
@@ -62,7 +61,7 @@ def grow_surface_compiled(
     height, variance = columns[3], columns[4]
     new = np.empty(most, np.int64)
     slope = slope_std**2
-    for m in range(start, stop, step):
+    for m in range(start, stop):
         first = offsets[m]
         n = offsets[m + 1] - first
         for j in range(len(knots)):
@@ -274,8 +273,7 @@ def estimate_surface(
     own_mean, own_std = own_surface[0], own_surface[1]
     n_segments = len(mean)
     n_blocks = (n_segments + BLOCK - 1) // BLOCK
-    # No literal: for each of those numba compiles anew.
-    stage, n_own = np.int64(0), 0
+    stage = np.int64(0)
     block = claim(board, stage, share, n_shares, n_blocks)
     while block >= 0:
         start, stop = block * BLOCK, min((block + 1) * BLOCK, n_segments)
@@ -290,11 +288,11 @@ def estimate_surface(
                 is_seed[i] = is_low and r[i] <= seed_range and m % segment_step == 0
         if is_latent:
             latent_rows_compiled(
-                start, stop, 1, theta, bar_offsets, r_bar, surface_class, offsets, r, knots,
+                start, stop, theta, bar_offsets, r_bar, surface_class, offsets, r, knots,
                 n_knots, log_length_scale, knot_log_length_scale,
             )  # fmt: skip
         grow_surface_compiled(
-            start, stop, 1, offsets, r, height, log_length_scale, is_seed, follows, knots,
+            start, stop, offsets, r, height, log_length_scale, is_seed, follows, knots,
             knot_log_length_scale, sigma_f, sigma_n, gate_noise, slope_std, max_std,
             max_standardised_residual, max_standardised_depth, inlier, own_mean, own_std,
         )  # fmt: skip
@@ -302,10 +300,9 @@ def estimate_surface(
             n_knots[m] = 0
             while n_knots[m] < len(knots) and not math.isnan(own_std[m, n_knots[m]]):
                 n_knots[m] += 1
-        n_own += 1
         block = claim(board, stage, share, n_shares, n_blocks)
-    if all_done(board, stage, share, n_shares, n_own, n_blocks):
-        stage, n_own = stage + 1, 0
+    if all_done(board, stage, share, n_shares, n_blocks):
+        stage += 1
         block = claim(board, stage, share, n_shares, n_blocks)
         while block >= 0:
             start, stop = block * BLOCK, min((block + 1) * BLOCK, n_segments)
@@ -313,8 +310,6 @@ def estimate_surface(
                 start, stop, own_mean, own_std, n_knots, knots, n_neighbours, slope_std,
                 prior_mean, mean, std,
             )  # fmt: skip
-            n_own += 1
             block = claim(board, stage, share, n_shares, n_blocks)
-        all_done(board, stage, share, n_shares, n_own, n_blocks)
-    if share == 0:
-        await_settled(board, n_shares - 1)
+        all_done(board, stage, share, n_shares, n_blocks)
+    await_settled(board, share, n_shares - 1)

@@ -143,7 +143,6 @@ def _eliminate(matrix: FloatArray, n: int, vector: FloatArray) -> bool:
 def latent_rows_compiled(
     start: int,
     stop: int,
-    step: int,
     theta: FloatArray,
     bar_offsets: IntArray,
     r_bar: FloatArray,
@@ -155,16 +154,16 @@ def latent_rows_compiled(
     at_candidates: FloatArray,
     at_knots: FloatArray,
 ) -> None:
-    """Do what `latent_rows_reference` does for segments ``start:stop:step``, in place."""
+    """Do what `latent_rows_reference` does for segments `start` to `stop`, in place."""
     most = most_bar = 0
-    for m in range(start, stop, step):
+    for m in range(start, stop):
         most = max(most, offsets[m + 1] - offsets[m])
         most_bar = max(most_bar, bar_offsets[m + 1] - bar_offsets[m])
     room = (most + len(knots) + LANES - 1) & -LANES
     wanted, value = np.empty(room), np.empty(room)
     room = (most_bar + LANES - 1) & -LANES
     matrix, weight, centres = np.empty((most_bar, room)), np.empty(room), np.empty(room)
-    for m in range(start, stop, step):
+    for m in range(start, stop):
         for j in range(len(knots)):
             at_knots[m, j] = np.nan
         first, own = bar_offsets[m], offsets[m]

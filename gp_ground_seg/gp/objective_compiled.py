@@ -42,8 +42,7 @@ def objective_rows(
     ``values[m]`` and ``gradients[m]`` are set, in one stage; see `gp_ground_seg.meeting`.
     """
     n_blocks = (len(values) + BLOCK - 1) // BLOCK
-    # No literal: for each of those numba compiles anew.
-    stage, n_own = np.int64(0), 0
+    stage = np.int64(0)
     block = claim(board, stage, share, n_shares, n_blocks)
     while block >= 0:
         start, stop = block * BLOCK, min((block + 1) * BLOCK, len(values))
@@ -51,11 +50,9 @@ def objective_rows(
             start, stop, theta, offsets, r, z, fixed_u, bar_offsets, r_bar, surface_class,
             slope_std, latent_terms, values, gradients,
         )  # fmt: skip
-        n_own += 1
         block = claim(board, stage, share, n_shares, n_blocks)
-    all_done(board, stage, share, n_shares, n_own, n_blocks)
-    if share == 0:
-        await_settled(board, n_shares - 1)
+    all_done(board, stage, share, n_shares, n_blocks)
+    await_settled(board, share, n_shares - 1)
 
 
 @inlined
