@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import weakref
 from collections.abc import Callable
 from threading import Lock, Thread
 from typing import Any
 
+from gp_ground_seg.cores import OutOfTheWay, usable_cores
 from gp_ground_seg.meeting import Board, give_up, make_board, settle
 
 MOST_STAGES = 4
@@ -29,6 +29,11 @@ class _Worker:
     ----------
     board : Board
         Where it tells that it has settled.
+
+    Attributes
+    ----------
+    thread : Thread
+        The thread.
     """
 
     def __init__(self, board: Board) -> None:
@@ -38,7 +43,8 @@ class _Worker:
         self._go.acquire()
         self._done.acquire()
         self._is_busy = False
-        Thread(target=self._work, args=(board,), name='gp_ground_seg', daemon=True).start()
+        self.thread = Thread(target=self._work, args=(board,), name='gp_ground_seg', daemon=True)
+        self.thread.start()
 
     def start(self, function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
         """Call ``function(*arguments)`` in the thread, which is at nothing else."""
@@ -141,10 +147,11 @@ class RowPool:
     """
 
     def __init__(self, n_threads: int) -> None:
-        self.n_threads = n_threads or min(len(os.sched_getaffinity(0)), MOST_UNASKED)
+        self.n_threads = n_threads or min(len(usable_cores()), MOST_UNASKED)
         self._board = make_board(MOST_STAGES, self.n_threads)
         # The caller's thread takes a share too.
         self._workers = [_Worker(self._board) for _ in range(self.n_threads - 1)]
+        self._out_of_the_way = OutOfTheWay([worker.thread for worker in self._workers])
         self._team: Team | None = None
         self._end = weakref.finalize(self, _end_all, self._workers)
 
@@ -156,6 +163,8 @@ class RowPool:
         """Team of that many threads, all or one. The one before is waited for."""
         self._settle()
         self._board.fill(0)
+        if n_shares > 1:
+            self._out_of_the_way.leave_own_core()
         self._team = Team(self._workers[: n_shares - 1], self._board)
         return self._team
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
@@ -19,6 +18,7 @@ from gp_ground_seg.cli.notes import note
 from gp_ground_seg.cli.options import add_config_options, config_from_options
 from gp_ground_seg.compiled import HAVE_NUMBA
 from gp_ground_seg.config import Config
+from gp_ground_seg.cores import usable_cores
 from gp_ground_seg.datasets.staging import staged_file
 from gp_ground_seg.errors import DataError, MissingDependencyError
 from gp_ground_seg.evaluation.bench import bench_cases, run_cases
@@ -166,7 +166,7 @@ def _threads(text: str | None, config: Config) -> list[int]:
     if not HAVE_NUMBA or config.runtime.backend == 'numpy':
         return [1]
     if text is None:
-        return sorted({1, len(os.sched_getaffinity(0))})
+        return sorted({1, len(usable_cores())})
     try:
         threads = [int(word) for word in text.split(',')]
     except ValueError:

@@ -1,0 +1,76 @@
+"""Threads of a pool keep off the core of the thread that they work for."""
+
+import os
+import threading
+
+import pytest
+
+from gp_ground_seg.cores import OutOfTheWay, own_core, usable_cores
+from gp_ground_seg.parallel import RowPool
+
+
+@pytest.fixture
+def own_affinity():
+    """Cores of this thread, as they were before and are to be after."""
+    before = os.sched_getaffinity(0)
+    yield before
+    os.sched_setaffinity(0, before)
+
+
+def test_a_thread_knows_its_core(own_affinity):
+    for core in own_affinity:
+        os.sched_setaffinity(0, {core})
+        assert own_core() == core
+        assert usable_cores() == {core}
+
+
+def test_workers_use_any_core_but_that_of_the_caller(monkeypatch):
+    given = {}
+    monkeypatch.setattr('gp_ground_seg.cores.usable_cores', lambda: {0, 1, 2, 5})
+    monkeypatch.setattr(
+        os, 'sched_setaffinity', lambda thread, cores: given.update({thread: cores})
+    )
+    own = threading.current_thread()
+    away = OutOfTheWay([own])
+    for core, others in ((1, {0, 2, 5}), (5, {0, 1, 2})):
+        monkeypatch.setattr('gp_ground_seg.cores.own_core', lambda core=core: core)
+        away.leave_own_core()
+        assert given == {own.native_id: others}
+        given.clear()
+        away.leave_own_core()
+        assert not given, 'they are there already'
+
+
+@pytest.mark.parametrize('cores', [{3}, {3, 4}])
+def test_nobody_moves_together_for_one_who_wants_a_core_alone(monkeypatch, cores):
+    given = []
+    monkeypatch.setattr('gp_ground_seg.cores.usable_cores', lambda: cores)
+    monkeypatch.setattr('gp_ground_seg.cores.own_core', lambda: 3)
+    monkeypatch.setattr(os, 'sched_setaffinity', lambda *call: given.append(call))
+    OutOfTheWay([threading.current_thread()] * 2).leave_own_core()
+    assert not given
+
+
+def test_work_goes_on_where_threads_cannot_be_moved(monkeypatch):
+    def refuse(thread, cores):
+        raise PermissionError(1, 'Operation not permitted')
+
+    pool = RowPool(2)
+    monkeypatch.setattr(os, 'sched_setaffinity', refuse)
+    seen = []
+    pool.run(lambda share, *_: seen.append(share), 2)
+    assert sorted(seen) == [0, 1]
+    pool.close()
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason='there is one core for all')
+def test_real_workers_are_moved_off_and_the_caller_never(own_affinity):
+    before = set(threading.enumerate())
+    pool = RowPool(2)
+    (worker,) = set(threading.enumerate()) - before
+    for _ in range(20):
+        pool.run(lambda *_: None, 2)
+        cores = os.sched_getaffinity(worker.native_id)
+        assert len(own_affinity - cores) == 1
+        assert os.sched_getaffinity(0) == own_affinity
+    pool.close()
