@@ -162,8 +162,8 @@ def _feed(hasher: Any, function: FunctionType, seen: set[int]) -> None:
     seen.add(id(function))
     for name in _feed_code(hasher, function.__code__):
         value = function.__globals__.get(name)
-        # Of a compiled function, or of what generates instructions by hand.
-        compiled_from = getattr(value, 'py_func', getattr(value, '_defn', None))
+        # Of a compiled function, or of what generates instructions by hand and its helpers.
+        compiled_from = getattr(value, 'py_func', getattr(value, '_defn', value))
         if isinstance(compiled_from, FunctionType):
             _feed(hasher, compiled_from, seen)
         elif isinstance(value, np.ndarray):

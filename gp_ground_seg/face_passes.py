@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gp_ground_seg.compiled import compiled, inlined
 from gp_ground_seg.faces import FEWEST_RETURNS, UNITS_PER_METRE
 from gp_ground_seg.hidden_feet import hides_foot_compiled
-from gp_ground_seg.meeting import Board, all_done, await_settled, claim, n_taken, settle
+from gp_ground_seg.meeting import Board, all_done, claim, enlist, n_taken
 from gp_ground_seg.point_passes import SORTING, empty_tiles
 from gp_ground_seg.polar_grid import OUTSIDE, FloatArray, PointArray
 from gp_ground_seg.rulers import CellArray
@@ -79,8 +79,9 @@ def judge_faces(
     is_face, is_footless : (T,) bool
         Result.
     """
-    if share > 0:
-        settle(board)
+    share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     n_tiles = len(is_face)
     stage, n_blocks = np.int64(MERGING), np.int64(1)
     if claim(board, stage, share, n_shares, n_blocks) == 0:
@@ -123,7 +124,6 @@ def judge_faces(
             )
         block = claim(board, stage, share, n_shares, n_blocks)
     all_done(board, stage, share, n_shares, n_blocks)
-    await_settled(board, share, 2 * (n_shares - 1))
 
 
 @compiled

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.labelling import SQUARE_UNITS
 from gp_ground_seg.labels import Label
-from gp_ground_seg.meeting import Board, all_done, await_settled, claim, n_taken
+from gp_ground_seg.meeting import Board, all_done, claim, enlist, n_taken
 from gp_ground_seg.polar_grid import NOT_FINITE, FloatArray, IntArray, PointArray
 from gp_ground_seg.rulers import CellArray
 
@@ -72,6 +72,9 @@ def label_scan(
     band : (M * (K - 1) + 1,) float64
         Room for the band of each cell.
     """
+    share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     n_segments, n_bins, n_points = len(mean), len(knots) - 1, len(cell)
     pieces[n_segments * n_bins] = np.nan
     n_blocks = (n_points + BLOCK - 1) // BLOCK
@@ -120,7 +123,6 @@ def label_scan(
                margin[own])  # fmt: skip
         block = claim(board, stage, share, n_shares, n_blocks)
     all_done(board, stage, share, n_shares, n_blocks)
-    await_settled(board, share, n_shares - 1)
 
 
 @compiled

@@ -4,11 +4,23 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from threading import Lock, Thread
+from threading import Thread
 from typing import Any
 
+from gp_ground_seg.compiled import COMPILES
 from gp_ground_seg.cores import OutOfTheWay, usable_cores
-from gp_ground_seg.meeting import Board, give_up, make_board, settle
+from gp_ground_seg.meeting import (
+    GIVEN_UP,
+    TO_BEGIN,
+    TO_JOIN,
+    Board,
+    clear,
+    dismiss,
+    give_up,
+    make_board,
+    send_home,
+    serve,
+)
 
 MOST_STAGES = 4
 """Stages of the longest work that is shared out."""
@@ -19,126 +31,65 @@ MOST_UNASKED = 4
 more than its share of what is left is worth."""
 
 
-class _Worker:
-    """Thread that waits for one call at a time.
+class Team:
+    """Threads that share out the stages of compiled functions, see `gp_ground_seg.meeting`.
 
-    Two bare locks: an executor with its queue and futures takes longer to pass a call on,
-    and some calls are as short as that.
+    Such a function takes a share, the number of them and the board before anything else,
+    and begins with `gp_ground_seg.meeting.enlist`.
 
     Parameters
     ----------
     board : Board
-        Where it tells that it has settled.
-
-    Attributes
-    ----------
-    thread : Thread
-        The thread.
+        Where they meet. No other team may be at work there.
+    n_shares : int
+        Number of threads.
     """
 
-    def __init__(self, board: Board) -> None:
-        self._call: tuple[Callable[..., None], tuple[Any, ...]] | None = None
-        self._error: BaseException | None = None
-        self._go, self._done = Lock(), Lock()
-        self._go.acquire()
-        self._done.acquire()
-        self._is_busy = False
-        self.thread = Thread(target=self._work, args=(board,), name='gp_ground_seg', daemon=True)
-        self.thread.start()
+    def __init__(self, board: Board, n_shares: int) -> None:
+        self.board, self.n_shares = board, n_shares
+        clear(board, n_shares)
+        self._begun: Callable[[int], None] = lambda share: None
 
-    def start(self, function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-        """Call ``function(*arguments)`` in the thread, which is at nothing else."""
-        self._call, self._is_busy, self._error = (function, arguments), True, None
-        self._go.release()
+    def run(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Call ``function(share, n_shares, board, *arguments)`` in all threads."""
+        self._take(function, arguments)
+        self._take_part(TO_JOIN)
 
-    def wait(self) -> BaseException | None:
-        """Wait until the call has returned; what it raised."""
-        if self._is_busy:
-            self._done.acquire()
-        self._is_busy = False
-        return self._error
+    def begin(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Do what `run` does, in all threads but the calling one: it may `finish` later."""
+        self._take(function, arguments)
+        if self.n_shares > 1:
+            self._begun(TO_BEGIN)
 
-    def end(self) -> None:
-        """End the thread."""
-        self.wait()
-        self._call = None
-        self._go.release()
+    def finish(self) -> None:
+        """Take part in what the others began, until all of it is done."""
+        self._take_part(0)
 
-    def _work(self, board: Board) -> None:
-        while True:
-            self._go.acquire()
-            if self._call is None:
-                return
-            function, arguments = self._call
-            try:
-                function(*arguments)
-            except BaseException as error:
-                self._error = error
-            # Nothing is held until the next call: frames are large.
-            self._call = None
-            del function, arguments
-            self._done.release()
-            settle(board)
+    def dismiss(self) -> None:
+        """Wait until no worker is at it any more, whether or not all of it is done."""
+        dismiss(self.board, self.n_shares)
 
+    def _take(self, function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+        self._begun = lambda share: function(share, self.n_shares, self.board, *arguments)
 
-class Team:
-    """Threads that share out the work of some stages, see `gp_ground_seg.meeting`.
-
-    What the workers do is started once; the caller, share 0, takes part when it likes.
-
-    Attributes
-    ----------
-    board : Board
-        Where they meet.
-    """
-
-    def __init__(self, workers: list[_Worker], board: Board) -> None:
-        self._idle, self._working = workers, list[_Worker]()
-        self.board = board
-
-    def start(self, *functions: Callable[[int], None]) -> None:
-        """Have every worker call the functions one after the other, with its share."""
-        while self._idle:
-            worker = self._idle.pop(0)
-            self._working.append(worker)
-            worker.start(self._call, (len(self._working), *functions))
-
-    def take_part(self, function: Callable[[int], None]) -> None:
-        """Call ``function(0)``; the workers go on meanwhile and after it."""
+    def _take_part(self, share: int) -> None:
         try:
-            self._call(0, function)
-        except BaseException:
-            # They work on arrays that are the caller's again afterwards.
-            self.settle()
-            raise
-
-    def wait(self) -> None:
-        """Wait until no worker is at it any more, and raise what they raised."""
-        for error in self.settle():
-            raise error
-
-    def settle(self) -> list[BaseException]:
-        """Wait until no worker is at it any more; what they raised."""
-        errors = []
-        while self._working:
-            error = self._working[-1].wait()
-            self._working.pop()
-            errors += [error] if error is not None else []
-        return errors
-
-    def _call(self, share: int, *functions: Callable[[int], None]) -> None:
-        try:
-            for function in functions:
-                function(share)
+            self._begun(share)
         except BaseException:
             give_up(self.board)
             raise
+        finally:
+            # They work on arrays that are the caller's again afterwards.
+            self.dismiss()
+        if self.board[GIVEN_UP, 0] > 0:
+            raise RuntimeError('a thread of the segmentation failed, for lack of memory perhaps')
 
 
 class RowPool:
-    """Threads for compiled functions that share out their work, see `gp_ground_seg.meeting`.
+    """Threads for compiled functions that share out their work, see `Team`.
 
-    Whatever thread does a block, its results are the same.
+    Whatever thread does a block, its results are the same. Where nothing is compiled there
+    are no threads: they would only take turns. They start when they are first needed.
 
     Parameters
     ----------
@@ -147,49 +98,63 @@ class RowPool:
     """
 
     def __init__(self, n_threads: int) -> None:
-        self.n_threads = n_threads or min(len(usable_cores()), MOST_UNASKED)
-        self._board = make_board(MOST_STAGES, self.n_threads)
-        # The caller's thread takes a share too.
-        self._workers = [_Worker(self._board) for _ in range(self.n_threads - 1)]
-        self._out_of_the_way = OutOfTheWay([worker.thread for worker in self._workers])
+        asked = n_threads or min(len(usable_cores()), MOST_UNASKED)
+        self.n_threads = asked if COMPILES else 1
+        self._boards = {n: make_board(MOST_STAGES, n) for n in {1, self.n_threads}}
+        self._out_of_the_way: OutOfTheWay | None = None
         self._team: Team | None = None
-        self._end = weakref.finalize(self, _end_all, self._workers)
+        self._end: Callable[[], Any] = lambda: None
 
     def n_shares(self, n_rows: int) -> int:
         """Into how many threads so many points are worth to be shared out."""
         return self.n_threads if n_rows >= FEWEST_POINTS else 1
 
     def team(self, n_shares: int) -> Team:
-        """Team of that many threads, all or one. The one before is waited for."""
-        self._settle()
-        self._board.fill(0)
+        """Team of that many threads, all or one. The one before is dismissed."""
+        self._dismiss()
         if n_shares > 1:
+            if self._out_of_the_way is None:
+                self._out_of_the_way = OutOfTheWay(self._start())
             self._out_of_the_way.leave_own_core()
-        self._team = Team(self._workers[: n_shares - 1], self._board)
+        self._team = Team(self._boards[n_shares], n_shares)
         return self._team
 
     def run(self, function: Callable[..., None], n_shares: int, *arguments: Any) -> None:
         """Call ``function(share, n_shares, board, *arguments)`` in a team."""
-        team = self.team(n_shares)
+        self.team(n_shares).run(function, *arguments)
 
-        def work(share: int) -> None:
-            function(share, n_shares, team.board, *arguments)
+    def _start(self) -> list[Thread]:
+        """Start the threads, of which the caller's is none: it takes a share too."""
+        _compile_serve()
+        board, n_threads = self._boards[self.n_threads], self.n_threads
+        workers = [
+            Thread(target=serve, args=(board, k, n_threads), name='gp_ground_seg', daemon=True)
+            for k in range(1, n_threads)
+        ]
+        for worker in workers:
+            worker.start()
+        self._end = weakref.finalize(self, _end_all, board, n_threads)
+        return workers
 
-        team.start(work)
-        team.take_part(work)
-        team.wait()
-
-    def _settle(self) -> None:
+    def _dismiss(self) -> None:
         if self._team is not None:
-            self._team.settle()
+            self._team.dismiss()
             self._team = None
 
     def close(self) -> None:
         """End the threads."""
-        self._settle()
+        self._dismiss()
         self._end()
 
 
-def _end_all(workers: list[_Worker]) -> None:
-    while workers:
-        workers.pop().end()
+def _compile_serve() -> None:
+    """Have it compiled here and now: threads would all do so, and tell nobody what failed."""
+    board = make_board(0, 2)
+    send_home(board, 2)
+    serve(board, 1, 2)
+
+
+def _end_all(board: Board, n_threads: int) -> None:
+    # What they may still be at is on arrays that go when this returns.
+    dismiss(board, n_threads)
+    send_home(board, n_threads)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from gp_ground_seg.compiled import compiled, inlined
-from gp_ground_seg.meeting import Board, all_done, await_settled, claim, n_taken
+from gp_ground_seg.meeting import Board, all_done, claim, enlist, n_taken
 from gp_ground_seg.polar_grid import (
     NO_TILE,
     NOT_FINITE,
@@ -56,6 +56,9 @@ def sort_points(
     the points that are in none. Block by block: where the points lie, in loops without
     branches; then the extremes.
     """
+    share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     n_points = len(cell)
     n_blocks = (n_points + _TAKEN - 1) // _TAKEN
     own_extremes, own_numbers = extremes[share], numbers[share]
@@ -90,7 +93,6 @@ def sort_points(
         own = slice(block * _TAKEN, min((block + 1) * _TAKEN, n_points))
         _settle_lowest(columns[2, own], r[own], cell[own], tile[own], own_extremes, own_numbers)
     all_done(board, stage, share, n_shares, n_blocks)
-    await_settled(board, share, n_shares - 1)
 
 
 @compiled

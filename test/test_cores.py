@@ -3,9 +3,12 @@
 import os
 import threading
 
+import numpy as np
 import pytest
 
+from gp_ground_seg.compiled import compiled
 from gp_ground_seg.cores import OutOfTheWay, own_core, usable_cores
+from gp_ground_seg.meeting import all_done, claim, enlist
 from gp_ground_seg.parallel import RowPool
 
 
@@ -15,6 +18,17 @@ def own_affinity():
     before = os.sched_getaffinity(0)
     yield before
     os.sched_setaffinity(0, before)
+
+
+@compiled
+def count(share, n_shares, board, seen):
+    share = enlist(board, share, n_shares)
+    stage = np.int64(0)
+    block = claim(board, stage, share, n_shares, len(seen))
+    while block >= 0:
+        seen[block] += 1
+        block = claim(board, stage, share, n_shares, len(seen))
+    all_done(board, stage, share, n_shares, len(seen))
 
 
 def test_a_thread_knows_its_core(own_affinity):
@@ -57,9 +71,9 @@ def test_work_goes_on_where_threads_cannot_be_moved(monkeypatch):
 
     pool = RowPool(2)
     monkeypatch.setattr(os, 'sched_setaffinity', refuse)
-    seen = []
-    pool.run(lambda share, *_: seen.append(share), 2)
-    assert sorted(seen) == [0, 1]
+    seen = np.zeros(40)
+    pool.run(count, 2, seen)
+    np.testing.assert_array_equal(seen, 1)
     pool.close()
 
 
@@ -67,9 +81,10 @@ def test_work_goes_on_where_threads_cannot_be_moved(monkeypatch):
 def test_real_workers_are_moved_off_and_the_caller_never(own_affinity):
     before = set(threading.enumerate())
     pool = RowPool(2)
+    pool.team(2)
     (worker,) = set(threading.enumerate()) - before
     for _ in range(20):
-        pool.run(lambda *_: None, 2)
+        pool.run(count, 2, np.zeros(40))
         cores = os.sched_getaffinity(worker.native_id)
         assert len(own_affinity - cores) == 1
         assert os.sched_getaffinity(0) == own_affinity

@@ -1,14 +1,70 @@
 """Shares of work in threads: all done, errors passed on, threads gone in the end."""
 
 import gc
+import sys
 import threading
 import time
+import weakref
 
+import numpy as np
 import pytest
 
 from gp_ground_seg import meeting
-from gp_ground_seg.meeting import GIVEN_UP, all_done, claim, n_taken
-from gp_ground_seg.parallel import FEWEST_POINTS, MOST_UNASKED, RowPool
+from gp_ground_seg.compiled import compiled
+from gp_ground_seg.meeting import GIVEN_UP, TO_BEGIN, all_done, claim, enlist, n_taken
+from gp_ground_seg.parallel import FEWEST_POINTS, MOST_UNASKED, RowPool, Team
+
+_MS = np.uint32(1000)
+
+
+@compiled
+def add(share, n_shares, board, late_share, failing_share, n_done, result):
+    """Add one to each of `result`, in one stage."""
+    share = enlist(board, share, n_shares)
+    if share < 0:
+        return
+    if share == late_share:
+        meeting._usleep(20 * _MS)
+    stage, n_blocks = np.int64(0), len(result)
+    block = claim(board, stage, share, n_shares, n_blocks)
+    if share == failing_share:
+        raise ValueError('that share')
+    while block >= 0:
+        result[block] += 1
+        # So that there is something left for others.
+        meeting._usleep(np.uint32(100))
+        block = claim(board, stage, share, n_shares, n_blocks)
+    n_done[share] = 1 if all_done(board, stage, share, n_shares, n_blocks) else -1
+
+
+@compiled
+def double(share, n_shares, board, late_share, before, after):
+    """Twice the numbers, in two stages of which the second needs all of the first."""
+    share = enlist(board, share, n_shares)
+    if share < 0:
+        return
+    if share == late_share:
+        meeting._usleep(20 * _MS)
+    n_blocks = len(before)
+    stage = np.int64(0)
+    block = claim(board, stage, share, n_shares, n_blocks)
+    while block >= 0:
+        before[block] += block
+        if block % 50 == 0:
+            meeting._usleep(np.uint32(200))
+        block = claim(board, stage, share, n_shares, n_blocks)
+    if not all_done(board, stage, share, n_shares, n_blocks):
+        return
+    stage += 1
+    block = claim(board, stage, share, n_shares, n_blocks)
+    while block >= 0:
+        after[block, 0] += before[block] + before[n_blocks - 1 - block]
+        after[block, 1] = share
+        block = claim(board, stage, share, n_shares, n_blocks)
+    all_done(board, stage, share, n_shares, n_blocks)
+
+
+NOBODY = -9
 
 
 @pytest.fixture
@@ -18,127 +74,168 @@ def pool():
     pool.close()
 
 
+def run_add(pool, n_shares=3, n_blocks=30, late=NOBODY, failing=NOBODY):
+    n_done, result = np.zeros(n_shares, dtype=np.int64), np.zeros(n_blocks, dtype=np.int64)
+    pool.run(add, n_shares, late, failing, n_done, result)
+    return n_done, result
+
+
 def test_small_clouds_are_not_shared_out(pool):
     assert pool.n_shares(FEWEST_POINTS) == 3
     assert pool.n_shares(FEWEST_POINTS - 1) == 1
-
-
-def test_everyone_has_another_share_and_all_are_done(pool):
-    for n_shares in (3, 1, 3):
-        done = []
-        pool.run(lambda share, n, board, to: to.append((share, n)), n_shares, done)
-        assert sorted(done) == [(k, n_shares) for k in range(n_shares)]
-
-
-def test_shares_are_done_side_by_side(pool):
-    meeting = threading.Barrier(3, timeout=10.0)
-    pool.run(lambda *_: meeting.wait(), 3)
-
-
-@pytest.mark.parametrize('bad', [0, 1, 2])
-def test_an_error_in_any_share_is_raised_and_the_pool_goes_on(pool, bad):
-    def work(share, *_):
-        time.sleep(0.02 * (share != bad))
-        done.append(share)
-        if share == bad:
-            raise ValueError(f'share {share}')
-
-    for _ in range(3):
-        done = []
-        with pytest.raises(ValueError, match=f'share {bad}'):
-            pool.run(work, 3)
-        # No thread is still at work on arrays that the caller takes for its own.
-        assert sorted(done) == [0, 1, 2]
-    pool.run(lambda share, *_: done.append(share), 3)
-    assert sorted(done) == [0, 0, 1, 1, 2, 2]
-
-
-@pytest.mark.parametrize('bad', [0, 1, 2])
-def test_nobody_waits_for_what_a_thread_that_failed_had_claimed(pool, bad):
-    def work(share, n_shares, board):
-        claim(board, 0, share, n_shares, 3)
-        if share == bad:
-            raise ValueError(f'share {share}')
-        came_to_an_end[share] = all_done(board, 0, share, n_shares, 3)
-
-    came_to_an_end = {}
-    with pytest.raises(ValueError, match=f'share {bad}'):
-        pool.run(work, 3)
-    assert came_to_an_end == {share: False for share in range(3) if share != bad}
-
-
-def test_an_interrupted_wait_is_made_up_for(pool):
-    begun = threading.Event()
-
-    def slow(share, *_):
-        if share == 0:
-            begun.wait(10.0)
-            raise KeyboardInterrupt
-        begun.set()
-        time.sleep(0.1)
-        late.append(share)
-
-    late = []
-    with pytest.raises(KeyboardInterrupt):
-        pool.run(slow, 3)
-    pool.run(lambda share, *_: late.append(10 + share), 3)
-    assert sorted(late) == [1, 2, 10, 11, 12]
-
-
-@pytest.mark.parametrize('n_threads', [1, 2, 3])
-def test_others_go_on_with_what_the_caller_takes_part_in_later(n_threads):
-    pool, done = RowPool(n_threads), []
-    team = pool.team(n_threads)
-    team.start(lambda share: done.append(('first', share)), lambda k: done.append(('then', k)))
-    team.take_part(lambda share: done.append(('first', share)))
-    team.take_part(lambda share: done.append(('then', share)))
-    team.wait()
-    team.wait()
-    assert sorted(done) == [(word, k) for word in ('first', 'then') for k in range(n_threads)]
-    pool.close()
-
-
-def test_what_nobody_waited_for_is_done_before_anything_else(pool):
-    done = []
-
-    def slow(_):
-        time.sleep(0.05)
-        done.append('slow')
-        raise ValueError('that nobody asks for')
-
-    pool.team(3).start(slow)
-    pool.run(lambda *_: done.append('run'), 3)
-    assert done == 2 * ['slow'] + 3 * ['run']
 
 
 @pytest.mark.parametrize('n_threads', [1, 2, 3, 7])
 @pytest.mark.parametrize('n_blocks', [0, 1, 5, 200])
 def test_each_block_of_each_stage_is_done_once_and_before_the_next_stage(n_threads, n_blocks):
     """Also by more threads than there are cores, and by some that come late."""
-
-    def work(share, n_shares, board):
-        if share == n_shares - 1 > 0:
-            time.sleep(0.01)
-        for stage in range(3):
-            own = []
-            while (block := claim(board, stage, share, n_shares, n_blocks)) >= 0:
-                done.append((stage, block))
-                own.append(block)
-                if block % 50 == 0:
-                    time.sleep(1e-3)
-            assert all_done(board, stage, share, n_shares, n_blocks)
-            assert len(done) >= (stage + 1) * n_blocks
-            taken[stage, share] = len(own)
-        seen = [[n_taken(board, s, k, n_shares) for k in range(n_shares)] for s in range(3)]
-        assert [sum(numbers) for numbers in seen] == 3 * [n_blocks]
-
     pool = RowPool(n_threads)
-    for _ in range(3):
-        done, taken = [], {}
-        pool.run(work, n_threads)
-        assert sorted(done) == [(stage, k) for stage in range(3) for k in range(n_blocks)]
-        assert sum(taken.values()) == 3 * n_blocks
+    for late in (NOBODY, 0, n_threads - 1):
+        before, after = np.zeros(n_blocks), np.zeros((n_blocks, 2))
+        pool.run(double, n_threads, late, before, after)
+        np.testing.assert_array_equal(before, np.arange(n_blocks))
+        np.testing.assert_array_equal(after[:, 0], n_blocks - 1)
     pool.close()
+
+
+def test_others_take_their_part(pool):
+    for n_shares in (3, 1, 3):
+        n_done, result = run_add(pool, n_shares, n_blocks=300)
+        np.testing.assert_array_equal(result, 1)
+        np.testing.assert_array_equal(n_done, 1)
+
+
+def test_who_did_how_much_is_known(pool):
+    team = pool.team(3)
+    before, after = np.zeros(200), np.zeros((200, 2))
+    team.run(double, NOBODY, before, after)
+    for stage in range(2):
+        numbers = [n_taken(team.board, stage, share, 3) for share in range(3)]
+        assert sum(numbers) == 200
+    assert [np.sum(after[:, 1] == share) for share in range(3)] == numbers
+
+
+def test_nobody_waits_for_threads_that_do_not_wake():
+    """As in a forked process, which has none of its parent's threads."""
+    team = Team(meeting.make_board(2, 3), 3)
+    before, after = np.zeros(20), np.zeros((20, 2))
+    for k in range(1, 3):
+        team.run(double, NOBODY, before, after)
+        np.testing.assert_array_equal(before, k * np.arange(20))
+        team = Team(team.board, 3)
+
+
+def test_who_comes_when_all_is_over_finds_nothing_to_do():
+    board = meeting.make_board(2, 2)
+    before, after = np.zeros(20), np.zeros((20, 2))
+    Team(board, 2).run(double, NOBODY, before, after)
+    late = threading.Thread(target=meeting.serve, args=(board, 1, 2))
+    late.start()
+    time.sleep(0.05)
+    meeting.send_home(board, 2)
+    late.join(timeout=10.0)
+    assert not late.is_alive()
+    np.testing.assert_array_equal(before, np.arange(20))
+    np.testing.assert_array_equal(after[:, 1], 0)
+
+
+@pytest.mark.parametrize('n_threads', [1, 2, 3])
+@pytest.mark.parametrize('late', [NOBODY, 1])
+def test_others_go_on_with_what_the_caller_takes_part_in_later(n_threads, late):
+    pool = RowPool(n_threads)
+    team = pool.team(n_threads)
+    n_done, result = np.zeros(n_threads, dtype=np.int64), np.zeros(30, dtype=np.int64)
+    team.begin(add, late, NOBODY, n_done, result)
+    if n_threads > 1:
+        deadline = time.monotonic() + 10.0
+        while not result.all() and time.monotonic() < deadline:
+            time.sleep(1e-3)
+    assert result.all() == (n_threads > 1)
+    team.finish()
+    np.testing.assert_array_equal(result, 1)
+    np.testing.assert_array_equal(n_done, 1)
+    team.dismiss()
+    team.dismiss()
+    pool.close()
+
+
+def test_what_was_begun_and_is_not_wanted_is_left_before_anything_else(pool):
+    n_done, unwanted = np.zeros(3, dtype=np.int64), np.zeros(3000, dtype=np.int64)
+    pool.team(3).begin(add, NOBODY, NOBODY, n_done, unwanted)
+    _, result = run_add(pool)
+    np.testing.assert_array_equal(result, 1)
+    left = unwanted.copy()
+    time.sleep(0.02)
+    np.testing.assert_array_equal(unwanted, left)
+
+
+def test_arrays_are_lent_and_given_back(pool):
+    class Owned(np.ndarray):
+        """Array that a weak reference can be had of."""
+
+    result = np.zeros(30, dtype=np.int64).view(Owned)
+    n_done, gone = np.zeros(3, dtype=np.int64), weakref.ref(result)
+    n_references = sys.getrefcount(result)
+    for _ in range(20):
+        team = pool.team(3)
+        team.begin(add, NOBODY, NOBODY, n_done, result)
+        team.dismiss()
+        team.run(double, NOBODY, np.zeros(5), np.zeros((5, 2)))
+    pool.team(3)
+    del team
+    assert sys.getrefcount(result) == n_references
+    del result
+    gc.collect()
+    assert gone() is None
+
+
+@pytest.mark.parametrize(
+    ('failing', 'error', 'message'),
+    [
+        (0, ValueError, 'that share'),
+        (1, RuntimeError, 'a thread of the segmentation failed'),
+        (2, RuntimeError, 'a thread of the segmentation failed'),
+    ],
+)
+def test_an_error_in_any_share_is_raised_and_the_pool_goes_on(pool, failing, error, message):
+    for _ in range(3):
+        # Only the caller late: the others get as far as to fail.
+        with pytest.raises(error, match=message):
+            run_add(pool, n_blocks=300, late=NOBODY if failing == 0 else 0, failing=failing)
+    n_done, result = run_add(pool, n_blocks=300)
+    np.testing.assert_array_equal(result, 1)
+    np.testing.assert_array_equal(n_done, 1)
+
+
+def test_an_interrupted_call_is_made_up_for(pool):
+    @compiled
+    def slow(share, n_shares, board, late):
+        share = enlist(board, share, n_shares)
+        if share > 0:
+            meeting._usleep(50 * _MS)
+            late[share] += 1
+
+    def interrupted(share, n_shares, board, late):
+        slow(TO_BEGIN, n_shares, board, late)
+        time.sleep(0.02)
+        raise KeyboardInterrupt
+
+    late = np.zeros(3)
+    slow(0, 1, pool.team(1).board, late)
+    for k in range(1, 3):
+        with pytest.raises(KeyboardInterrupt):
+            pool.run(interrupted, 3, late)
+        # No thread is still at work on arrays that the caller takes for its own.
+        np.testing.assert_array_equal(late, [0, k, k])
+
+
+def test_more_arguments_than_there_is_room_for_are_refused():
+    @compiled
+    def greedy(share, n_shares, board, arrays):
+        share = enlist(board, share, n_shares)
+
+    with pytest.raises(ValueError, match='too many arguments'):
+        greedy(0, 1, meeting.make_board(1, 1), 80 * (np.zeros(1),))
 
 
 def test_threads_begin_with_neighbours_and_help_out_when_those_are_done():
@@ -148,18 +245,13 @@ def test_threads_begin_with_neighbours_and_help_out_when_those_are_done():
     assert board[GIVEN_UP, 0] == 0
 
 
-def test_nobody_waits_for_ever_for_others_to_settle():
-    board = meeting.make_board(0, 3)
-    meeting.settle(board)
-    meeting.await_settled(board, 0, 1)
-    meeting.await_settled(board, 0, 2)
-    assert board[meeting.SETTLED, 0] == 1
-
-
 def threads_of(n_threads):
     """A pool, and the threads that it has started."""
     before = set(threading.enumerate())
-    return RowPool(n_threads), set(threading.enumerate()) - before
+    pool = RowPool(n_threads)
+    assert set(threading.enumerate()) == before, 'nothing to do yet'
+    pool.team(n_threads)
+    return pool, set(threading.enumerate()) - before
 
 
 def wait_for_end(threads):

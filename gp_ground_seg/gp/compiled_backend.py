@@ -17,7 +17,7 @@ from gp_ground_seg.labelling import Labelled
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.line_passes import find_lines_compiled
 from gp_ground_seg.meeting import Board, make_board
-from gp_ground_seg.parallel import RowPool, Team
+from gp_ground_seg.parallel import MOST_STAGES, RowPool, Team
 from gp_ground_seg.points import as_read_only, flat_rows, in_columns
 from gp_ground_seg.polar_grid import (
     Candidates,
@@ -82,35 +82,30 @@ class CompiledBackend:
         room = 2 * n_tiles if seeks_faces else 0
         slots = take('slots', (room + 1,), np.int32)
         sums = take('sums', (n_shares, room, face_passes.N_COLUMNS), np.float64)
-        team = self._pool.team(n_shares) if seeks_faces else Team([], make_board(1, 1))
+        team = self._pool.team(n_shares) if seeks_faces else Team(make_board(MOST_STAGES, 1), 1)
 
-        def sort(share: int) -> None:
-            point_passes.sort_points(
-                share,
-                n_shares,
-                team.board,
-                flat,
-                step,
-                target,
-                columns,
-                ranges,
-                turns,
-                1.0 / faces.cell_size,
-                n_sides,
-                cell,
-                r,
-                extremes,
-                numbers,
-                tile,
-                tile_extremes,
-                touched,
-            )
-
-        def judge(share: int) -> None:
-            face_passes.judge_faces(
-                share,
-                n_shares,
-                team.board,
+        team.run(
+            point_passes.sort_points,
+            flat,
+            step,
+            target,
+            columns,
+            ranges,
+            turns,
+            1.0 / faces.cell_size,
+            n_sides,
+            cell,
+            r,
+            extremes,
+            numbers,
+            tile,
+            tile_extremes,
+            touched,
+        )
+        if seeks_faces:
+            # The caller has something else to see to first.
+            team.begin(
+                face_passes.judge_faces,
                 columns,
                 tile,
                 tile_extremes,
@@ -130,18 +125,15 @@ class CompiledBackend:
 
         @cache
         def find() -> Faces:
-            team.take_part(judge)
-            team.wait()
+            team.finish()
             tiles = Tiles(tile, tile_extremes[0, :-1], touched[0, 1 : 1 + touched[0, 0]])
             return Faces(tiles, is_face, is_footless)
 
-        team.start(sort, judge)
-        team.take_part(sort)
         candidates = _collect_candidates(
             team.board, extremes, numbers, grid, edges, config.lines.min_density_extent
         )
         return SortedPoints(
-            xyz, PolarGrid(cell, r, edges, grid.n_segments), candidates, find, team.wait
+            xyz, PolarGrid(cell, r, edges, grid.n_segments), candidates, find, team.dismiss
         )
 
     def find_lines(

@@ -16,7 +16,7 @@ from gp_ground_seg.compiled import compiled_vectors, inlined
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.growth import BoolArray
 from gp_ground_seg.gp.latent import LANES, latent_rows_compiled
-from gp_ground_seg.meeting import Board, all_done, await_settled, claim
+from gp_ground_seg.meeting import Board, all_done, claim, enlist
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 from gp_ground_seg.surface import fuse_rows
 
@@ -269,6 +269,9 @@ def estimate_surface(
     `scales` (3, M), `height` (C,), `is_seed` (C,) and `own_surface` (2, M, K) are room to
     work in.
     """
+    share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     sigma_f, sigma_n, gate_noise = scales[0], scales[1], scales[2]
     own_mean, own_std = own_surface[0], own_surface[1]
     n_segments = len(mean)
@@ -312,4 +315,3 @@ def estimate_surface(
             )  # fmt: skip
             block = claim(board, stage, share, n_shares, n_blocks)
         all_done(board, stage, share, n_shares, n_blocks)
-    await_settled(board, share, n_shares - 1)

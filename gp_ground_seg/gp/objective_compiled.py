@@ -9,7 +9,7 @@ import numpy as np
 from gp_ground_seg.compiled import compiled_vectors, inlined
 from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.linalg import factorise, invert
-from gp_ground_seg.meeting import Board, all_done, await_settled, claim
+from gp_ground_seg.meeting import Board, all_done, claim, enlist
 from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -41,6 +41,9 @@ def objective_rows(
 
     ``values[m]`` and ``gradients[m]`` are set, in one stage; see `gp_ground_seg.meeting`.
     """
+    share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     n_blocks = (len(values) + BLOCK - 1) // BLOCK
     stage = np.int64(0)
     block = claim(board, stage, share, n_shares, n_blocks)
@@ -52,7 +55,6 @@ def objective_rows(
         )  # fmt: skip
         block = claim(board, stage, share, n_shares, n_blocks)
     all_done(board, stage, share, n_shares, n_blocks)
-    await_settled(board, share, n_shares - 1)
 
 
 @inlined
