@@ -36,7 +36,7 @@ class OutOfTheWay:
     """
 
     def __init__(self, threads: list[Thread]) -> None:
-        self._ids = [thread.native_id for thread in threads if thread.native_id is not None]
+        self._threads = threads
         self._left: int | None = None
 
     def leave_own_core(self) -> None:
@@ -48,10 +48,12 @@ class OutOfTheWay:
         if core == self._left or core is None:
             return
         others = usable_cores() - {core}
-        if len(others) < len(self._ids):
+        # None of them is alive in a process forked off this one.
+        ids = [thread.native_id for thread in self._threads if thread.is_alive()]
+        if len(others) < len(ids):
             return
         self._left = core
-        for number in self._ids:
+        for number in filter(None, ids):
             # Where that is forbidden they stay where they are, which costs nothing but time.
             with contextlib.suppress(OSError):
                 os.sched_setaffinity(number, others)

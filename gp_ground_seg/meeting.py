@@ -8,22 +8,24 @@ a microsecond, and need no lock. All of it goes by a board of whole numbers, see
 
 from __future__ import annotations
 
-import time
-from threading import Lock
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 
-from gp_ground_seg.compiled import COMPILES, compiled, inlined
+from gp_ground_seg.compiled import compiled, inlined
+from gp_ground_seg.instructions import (
+    CALL_SIZE,
+    Rows,
+    add_to_row,
+    address_of_row,
+    call_kept,
+    keep_own_call,
+    look_at_row,
+    make_semaphore,
+    pause,
+    sleep,
+    wake,
+)
 
-if COMPILES:
-    from llvmlite import ir
-    from numba import types
-    from numba.core import cgutils
-    from numba.extending import intrinsic
-
-Board = npt.NDArray[np.int64]
+Board = Rows
 
 TO_JOIN, TO_BEGIN = -1, -2
 """Instead of a share, see `enlist`."""
@@ -33,8 +35,7 @@ GIVEN_UP = 0
 # Other rows: how often there was a call; whether somebody may still be at it; what is
 # called, and with what.
 _POSTED, _IS_OPEN, _FUNCTION, _ARGUMENTS = 1, 2, 3, 4
-_MOST_ARGUMENTS = 64  # rows
-_FIRST_WORKER = _ARGUMENTS + _MOST_ARGUMENTS
+_FIRST_WORKER = _ARGUMENTS + CALL_SIZE // (8 * _CACHE_LINE)
 # For each worker: what it sleeps by; who was first to take the call; whether it is done.
 _SLEEP, _TICKET, _IS_DONE = range(3)
 _ROWS = 3
@@ -46,131 +47,10 @@ _PAUSE = 50  # us
 def make_board(n_stages: int, n_shares: int) -> Board:
     """Board for that many stages in that many threads, none of which has begun."""
     n_rows = _FIRST_WORKER + _ROWS * (n_shares - 1) + n_stages * (1 + n_shares)
-    return np.zeros((n_rows, _CACHE_LINE), dtype=np.int64)
-
-
-_lock = Lock()
-
-
-def _plain_add(board: Board, row: int, amount: int) -> int:
-    with _lock:
-        before = int(board[row, 0])
-        board[row, 0] += amount
-    return before
-
-
-def _plain_look(board: Board, row: int) -> int:
-    return int(board[row, 0])
-
-
-def _place_of(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    kind = signature.args[0]
-    array = context.make_array(kind)(context, builder, arguments[0])
-    place = [arguments[1], context.get_constant(types.intp, 0)]
-    return cgutils.get_item_pointer(context, builder, kind, array, place)
-
-
-def _atomic_add(typing_context: Any, board: Any, row: Any, amount: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _place_of(context, builder, signature, arguments)
-        return builder.atomic_rmw('add', pointer, arguments[2], 'seq_cst')
-
-    return types.int64(board, types.intp, types.int64), generate
-
-
-def _atomic_look(typing_context: Any, board: Any, row: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _place_of(context, builder, signature, arguments)
-        return builder.load_atomic(pointer, 'acquire', 8)
-
-    return types.int64(board, types.intp), generate
-
-
-def _address_of_row(typing_context: Any, board: Any, row: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _place_of(context, builder, signature, arguments)
-        return builder.ptrtoint(pointer, ir.IntType(64))
-
-    return types.int64(board, types.intp), generate
-
-
-def _keep_own_call(typing_context: Any, board: Any, row: Any) -> Any:
-    """Keep what the function that this is in was called with, from a row on.
-
-    What comes back is the address of a function that calls it so again, but for the first
-    argument, and returns whether that went well. Arrays are lent: nobody counts who uses
-    them.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _place_of(context, builder, signature, arguments)
-        own = builder.function
-        kept = own.args[2:]
-        layout = ir.LiteralStructType([argument.type for argument in kept])
-        size = context.get_abi_sizeof(layout)
-        if size > 8 * _CACHE_LINE * _MOST_ARGUMENTS:
-            raise ValueError(f'{own.name}: too many arguments, {size} bytes')
-        place = builder.bitcast(pointer, layout.as_pointer())
-        for k, argument in enumerate(kept):
-            value = ir.Constant(argument.type, None) if _owns(argument) else argument
-            builder.store(value, cgutils.gep_inbounds(builder, place, 0, k))
-
-        number = ir.IntType(64)
-        again = ir.Function(
-            builder.module,
-            ir.FunctionType(number, [number, number]),
-            name=own.name + '.again',
-        )
-        again.linkage = 'internal'
-        inside = ir.IRBuilder(again.append_basic_block())
-        place = inside.inttoptr(again.args[0], layout.as_pointer())
-        values = [inside.load(cgutils.gep_inbounds(inside, place, 0, k)) for k in range(len(kept))]
-        values[0] = again.args[1]
-        # Where a result, which there is none of, and an exception would be told.
-        told = [inside.bitcast(inside.alloca(number), argument.type) for argument in own.args[:2]]
-        code = inside.call(own, [*told, *values])
-        went_well = inside.or_(
-            inside.icmp_signed('==', code, ir.Constant(code.type, 0)),
-            inside.icmp_signed('==', code, ir.Constant(code.type, -2)),  # None
-        )
-        inside.ret(inside.zext(went_well, number))
-        return builder.ptrtoint(again, number)
-
-    return types.int64(board, types.intp), generate
-
-
-def _owns(argument: Any) -> bool:
-    """Whether an argument of a compiled function is a reference to an array's owner."""
-    name = argument.name
-    is_pointer = isinstance(argument.type, ir.PointerType)
-    return is_pointer and (name.endswith('.0') or name.endswith('.1'))
-
-
-def _call_kept(typing_context: Any, function: Any, address: Any, share: Any) -> Any:
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        number = ir.IntType(64)
-        kind = ir.FunctionType(number, [number, number]).as_pointer()
-        return builder.call(builder.inttoptr(arguments[0], kind), arguments[1:])
-
-    return types.int64(types.int64, types.int64, types.int64), generate
-
-
-if COMPILES:
-    # Add to a row of the board, at once for all threads, and return what was there; see
-    # what is there now.
-    _add: Any = intrinsic(_atomic_add)
-    _look: Any = intrinsic(_atomic_look)
-    _address: Any = intrinsic(_address_of_row)
-    _keep_call: Any = intrinsic(_keep_own_call)
-    _call: Any = intrinsic(_call_kept)
-    _usleep: Any = types.ExternalFunction('usleep', types.int32(types.uint32))
-    _sem_post: Any = types.ExternalFunction('sem_post', types.int32(types.int64))
-    _sem_wait: Any = types.ExternalFunction('sem_wait', types.int32(types.int64))
-else:
-    _add, _look = _plain_add, _plain_look
-
-    def _usleep(pause: int) -> None:
-        time.sleep(1e-6 * pause)
+    board = np.zeros((n_rows, _CACHE_LINE), dtype=np.int64)
+    for share in range(1, n_shares):
+        make_semaphore(board, _FIRST_WORKER + _ROWS * (share - 1) + _SLEEP)
+    return board
 
 
 @inlined
@@ -202,7 +82,7 @@ def enlist(board: Board, share: int, n_shares: int) -> int:
     """
     if share < 0:
         if n_shares > 1:
-            board[_FUNCTION, 0] = _keep_call(board, _ARGUMENTS)
+            board[_FUNCTION, 0] = keep_own_call(board, _ARGUMENTS)
             _post(board, n_shares)
         share = 0 if share == TO_JOIN else -1
     return share
@@ -215,10 +95,10 @@ def _post(board: Board, n_shares: int) -> None:
         row = _own_row(share)
         board[row + _IS_DONE, 0] = 0
         # From here on it may be taken, by who still was to look for the one before.
-        _add(board, row + _TICKET, -_look(board, row + _TICKET))
-    _add(board, _POSTED, 1)
+        add_to_row(board, row + _TICKET, -look_at_row(board, row + _TICKET))
+    add_to_row(board, _POSTED, 1)
     for share in range(1, n_shares):
-        _sem_post(_address(board, _own_row(share) + _SLEEP))
+        wake(address_of_row(board, _own_row(share) + _SLEEP))
 
 
 @compiled
@@ -236,12 +116,12 @@ def dismiss(board: Board, n_shares: int) -> None:
     board[_IS_OPEN, 0] = 0
     for share in range(1, n_shares):
         row = _own_row(share)
-        if _add(board, row + _TICKET, 1) > 0:
+        if add_to_row(board, row + _TICKET, 1) > 0:
             n_looks = 0
-            while _look(board, row + _IS_DONE) == 0:
+            while look_at_row(board, row + _IS_DONE) == 0:
                 n_looks += 1
                 if n_looks > _BEFORE_SLEEP:
-                    _usleep(_PAUSE)
+                    pause(_PAUSE)
 
 
 @compiled
@@ -249,15 +129,15 @@ def serve(board: Board, share: int, n_shares: int) -> None:
     """Do what others are called for, as that share, until sent home."""
     row, seen = _own_row(share), 0
     while True:
-        while _look(board, _POSTED) == seen:
-            _sem_wait(_address(board, row + _SLEEP))
-        seen = _look(board, _POSTED)
-        if _add(board, row + _TICKET, 1) == 0:
+        while look_at_row(board, _POSTED) == seen:
+            sleep(address_of_row(board, row + _SLEEP))
+        seen = look_at_row(board, _POSTED)
+        if add_to_row(board, row + _TICKET, 1) == 0:
             if board[_FUNCTION, 0] == 0:
                 break
-            if not _call(board[_FUNCTION, 0], _address(board, _ARGUMENTS), share):
+            if not call_kept(board[_FUNCTION, 0], address_of_row(board, _ARGUMENTS), share):
                 give_up(board)
-            _add(board, row + _IS_DONE, 1)
+            add_to_row(board, row + _IS_DONE, 1)
 
 
 @compiled
@@ -273,7 +153,7 @@ def claim(board: Board, stage: int, share: int, n_shares: int, n_blocks: int) ->
         owner = (share + k) % n_shares
         first = n_blocks * owner // n_shares
         end = n_blocks * (owner + 1) // n_shares
-        block: int = first + _add(board, row + 1 + owner, 1)
+        block: int = first + add_to_row(board, row + 1 + owner, 1)
         if block < end:
             board[row + 1 + share, 1] += 1
             return block
@@ -295,17 +175,17 @@ def all_done(board: Board, stage: int, share: int, n_shares: int, n_blocks: int)
     """
     row = _first_row(stage, n_shares)
     n_own = n_taken(board, stage, share, n_shares)
-    n_done = _add(board, row, n_own) + n_own
+    n_done = add_to_row(board, row, n_own) + n_own
     n_looks = 0
     while n_done < n_blocks:
-        if _look(board, GIVEN_UP) > 0:
+        if look_at_row(board, GIVEN_UP) > 0:
             return False
         n_looks += 1
         if n_looks > _BEFORE_SLEEP:
-            _usleep(_PAUSE)
+            pause(_PAUSE)
         # Some nanoseconds, at nobody's expense.
-        _add(board, row + 1 + share, 0)
-        n_done = _look(board, row)
+        add_to_row(board, row + 1 + share, 0)
+        n_done = look_at_row(board, row)
     return True
 
 
@@ -325,4 +205,4 @@ def _first_row(stage: int, n_shares: int) -> int:
 @compiled
 def give_up(board: Board) -> None:
     """Tell the others that what this thread has claimed will never be done."""
-    _add(board, GIVEN_UP, 1)
+    add_to_row(board, GIVEN_UP, 1)

@@ -48,33 +48,35 @@ class Team:
     def __init__(self, board: Board, n_shares: int) -> None:
         self.board, self.n_shares = board, n_shares
         clear(board, n_shares)
-        self._begun: Callable[[int], None] = lambda share: None
+        self._begun: Callable[[int], None] | None = None
 
     def run(self, function: Callable[..., None], *arguments: Any) -> None:
         """Call ``function(share, n_shares, board, *arguments)`` in all threads."""
-        self._take(function, arguments)
-        self._take_part(TO_JOIN)
+        self._take_part(
+            lambda share: function(share, self.n_shares, self.board, *arguments), TO_JOIN
+        )
 
     def begin(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Do what `run` does, in all threads but the calling one: it may `finish` later."""
-        self._take(function, arguments)
+        """Do what `run` does, in all threads but the calling one: that is to `finish` it."""
+        self._begun = lambda share: function(share, self.n_shares, self.board, *arguments)
         if self.n_shares > 1:
             self._begun(TO_BEGIN)
 
     def finish(self) -> None:
-        """Take part in what the others began, until all of it is done."""
-        self._take_part(0)
+        """Take part in what the others began, if there is such, until all of it is done."""
+        begun, self._begun = self._begun, None
+        if begun is not None:
+            self._take_part(begun, 0)
 
     def dismiss(self) -> None:
         """Wait until no worker is at it any more, whether or not all of it is done."""
         dismiss(self.board, self.n_shares)
+        # Nothing is held until the next call: frames are large.
+        self._begun = None
 
-    def _take(self, function: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-        self._begun = lambda share: function(share, self.n_shares, self.board, *arguments)
-
-    def _take_part(self, share: int) -> None:
+    def _take_part(self, call: Callable[[int], None], share: int) -> None:
         try:
-            self._begun(share)
+            call(share)
         except BaseException:
             give_up(self.board)
             raise

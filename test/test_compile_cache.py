@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip('numba', reason='there is no compiled code without numba')
 
-from gp_ground_seg import Config, GroundSegmenter, meeting
+from gp_ground_seg import Config, GroundSegmenter, instructions, meeting
 from gp_ground_seg.compile_cache import digest
 from gp_ground_seg.compiled import compiled_signatures
 
@@ -256,8 +256,14 @@ def test_the_first_frame_of_the_node_compiles_all_there_is():
     assert (done.returncode, done.stdout) == (0, 6 * '{}\n'), done.stderr
 
 
+def test_helpers_of_instructions_made_by_hand_are_part_of_the_key(monkeypatch):
+    before = digest(meeting.enlist.py_func)
+    monkeypatch.setattr(instructions, '_is_owner', lambda argument: False)
+    assert digest(meeting.enlist.py_func) != before
+
+
 def test_instructions_made_by_hand_are_part_of_the_key(monkeypatch):
     before = digest(meeting.claim.py_func)
     assert digest(meeting.claim.py_func) == before
-    monkeypatch.setattr(meeting, '_add', meeting._look)
+    monkeypatch.setattr(meeting, 'add_to_row', meeting.look_at_row)
     assert digest(meeting.claim.py_func) != before

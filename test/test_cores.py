@@ -65,6 +65,18 @@ def test_nobody_moves_together_for_one_who_wants_a_core_alone(monkeypatch, cores
     assert not given
 
 
+def test_threads_that_are_gone_are_let_be(monkeypatch):
+    """As in a forked process: the threads by those numbers are its parent's."""
+    given = []
+    monkeypatch.setattr('gp_ground_seg.cores.usable_cores', lambda: {0, 1, 2, 5})
+    monkeypatch.setattr(os, 'sched_setaffinity', lambda *call: given.append(call))
+    gone = threading.Thread(target=str)
+    gone.start()
+    gone.join()
+    OutOfTheWay([gone]).leave_own_core()
+    assert not given
+
+
 def test_work_goes_on_where_threads_cannot_be_moved(monkeypatch):
     def refuse(thread, cores):
         raise PermissionError(1, 'Operation not permitted')

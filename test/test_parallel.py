@@ -11,6 +11,7 @@ import pytest
 
 from gp_ground_seg import meeting
 from gp_ground_seg.compiled import compiled
+from gp_ground_seg.instructions import pause
 from gp_ground_seg.meeting import GIVEN_UP, TO_BEGIN, all_done, claim, enlist, n_taken
 from gp_ground_seg.parallel import FEWEST_POINTS, MOST_UNASKED, RowPool, Team
 
@@ -24,7 +25,7 @@ def add(share, n_shares, board, late_share, failing_share, n_done, result):
     if share < 0:
         return
     if share == late_share:
-        meeting._usleep(20 * _MS)
+        pause(20 * _MS)
     stage, n_blocks = np.int64(0), len(result)
     block = claim(board, stage, share, n_shares, n_blocks)
     if share == failing_share:
@@ -32,7 +33,7 @@ def add(share, n_shares, board, late_share, failing_share, n_done, result):
     while block >= 0:
         result[block] += 1
         # So that there is something left for others.
-        meeting._usleep(np.uint32(100))
+        pause(np.uint32(100))
         block = claim(board, stage, share, n_shares, n_blocks)
     n_done[share] = 1 if all_done(board, stage, share, n_shares, n_blocks) else -1
 
@@ -44,14 +45,14 @@ def double(share, n_shares, board, late_share, before, after):
     if share < 0:
         return
     if share == late_share:
-        meeting._usleep(20 * _MS)
+        pause(20 * _MS)
     n_blocks = len(before)
     stage = np.int64(0)
     block = claim(board, stage, share, n_shares, n_blocks)
     while block >= 0:
         before[block] += block
         if block % 50 == 0:
-            meeting._usleep(np.uint32(200))
+            pause(np.uint32(200))
         block = claim(board, stage, share, n_shares, n_blocks)
     if not all_done(board, stage, share, n_shares, n_blocks):
         return
@@ -212,7 +213,7 @@ def test_an_interrupted_call_is_made_up_for(pool):
     def slow(share, n_shares, board, late):
         share = enlist(board, share, n_shares)
         if share > 0:
-            meeting._usleep(50 * _MS)
+            pause(50 * _MS)
             late[share] += 1
 
     def interrupted(share, n_shares, board, late):
