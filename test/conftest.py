@@ -61,6 +61,14 @@ def scan() -> np.ndarray:
     return hilly_scan()
 
 
+@pytest.fixture(scope='session', autouse=True)
+def heeded_interrupt():
+    """SIGINT as in a terminal, also where a shell runs the tests in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture
 def heeded_hangup():
     """SIGHUP as in a terminal, also where the tests run under nohup."""
