@@ -24,8 +24,8 @@ from gp_ground_seg.sensor_pose import given_pose
 _RINGS = 24
 _DIRECTIONS = 64
 _PARTS = {
-    'points': ('sort_points', 'find_lines', 'label_points'),
-    'processes': ('grow', 'grow_on_latent', 'objective'),
+    'points': ('sort_points', 'find_lines'),
+    'processes': ('grow', 'grow_on_latent', 'objective', 'label_points'),
 }
 """Methods of the backend whose code is compiled side by side."""
 _LOOK_AROUND = 0.2
