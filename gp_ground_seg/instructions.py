@@ -62,6 +62,14 @@ def _atomic_add(typing_context: Any, rows: Any, row: Any, amount: Any) -> Any:
     return types.int64(rows, types.intp, types.int64), generate
 
 
+def _atomic_put(typing_context: Any, rows: Any, row: Any, number: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer = _place_of(context, builder, signature, arguments)
+        return builder.atomic_rmw('xchg', pointer, arguments[2], 'seq_cst')
+
+    return types.int64(rows, types.intp, types.int64), generate
+
+
 def _atomic_look(typing_context: Any, rows: Any, row: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _place_of(context, builder, signature, arguments)
@@ -139,6 +147,8 @@ def _nothing_is_compiled(*arguments: Any) -> Any:
 
 add_to_row: Any = _plain_add
 """Add to a row, at once for all threads, and return what was there: ``(rows, row, amount)``."""
+put_in_row: Any = _nothing_is_compiled
+"""Put a number in a row, at once for all threads, and return what was there."""
 look_at_row: Any = _plain_look
 """What is in a row now, and what was written before that was: ``(rows, row)``."""
 pause: Any = _plain_pause
@@ -164,7 +174,7 @@ sleep: Any = _nothing_is_compiled
 
 if COMPILES:
     add_to_row, look_at_row = intrinsic(_atomic_add), intrinsic(_atomic_look)
-    address_of_row = intrinsic(_address)
+    put_in_row, address_of_row = intrinsic(_atomic_put), intrinsic(_address)
     keep_own_call, call_kept = intrinsic(_keep_own_call), intrinsic(_call_kept)
     pause = types.ExternalFunction('usleep', types.int32(types.uint32))
     wake = types.ExternalFunction('sem_post', types.int32(types.int64))

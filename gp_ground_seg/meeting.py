@@ -21,6 +21,7 @@ from gp_ground_seg.instructions import (
     look_at_row,
     make_semaphore,
     pause,
+    put_in_row,
     sleep,
     wake,
 )
@@ -72,7 +73,8 @@ def enlist(board: Board, share: int, n_shares: int) -> int:
     """Have the workers call the function that this is in, with their shares.
 
     The first thing that a function does that shares out its work. Of such a call, and of
-    its arrays, the workers know until they are dismissed, see `dismiss`.
+    its arrays, the workers know until they are dismissed, see `dismiss`. (`share` is to be
+    no literal: they would call what was compiled for it alone, and not with their shares.)
 
     Returns
     -------
@@ -95,7 +97,7 @@ def _post(board: Board, n_shares: int) -> None:
         row = _own_row(share)
         board[row + _IS_DONE, 0] = 0
         # From here on it may be taken, by who still was to look for the one before.
-        add_to_row(board, row + _TICKET, -look_at_row(board, row + _TICKET))
+        put_in_row(board, row + _TICKET, 0)
     add_to_row(board, _POSTED, 1)
     for share in range(1, n_shares):
         wake(address_of_row(board, _own_row(share) + _SLEEP))

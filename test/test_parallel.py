@@ -12,10 +12,21 @@ import pytest
 from gp_ground_seg import meeting
 from gp_ground_seg.compiled import compiled
 from gp_ground_seg.instructions import pause
-from gp_ground_seg.meeting import GIVEN_UP, TO_BEGIN, all_done, claim, enlist, n_taken
+from gp_ground_seg.meeting import (
+    GIVEN_UP,
+    TO_BEGIN,
+    TO_JOIN,
+    all_done,
+    claim,
+    clear,
+    dismiss,
+    enlist,
+    n_taken,
+)
 from gp_ground_seg.parallel import FEWEST_POINTS, MOST_UNASKED, RowPool, Team
 
 _MS = np.uint32(1000)
+NOBODY, NO_PAUSE = -9, -8
 
 
 @compiled
@@ -51,7 +62,7 @@ def double(share, n_shares, board, late_share, before, after):
     block = claim(board, stage, share, n_shares, n_blocks)
     while block >= 0:
         before[block] += block
-        if block % 50 == 0:
+        if block % 50 == 0 and late_share != NO_PAUSE:
             pause(np.uint32(200))
         block = claim(board, stage, share, n_shares, n_blocks)
     if not all_done(board, stage, share, n_shares, n_blocks):
@@ -65,7 +76,20 @@ def double(share, n_shares, board, late_share, before, after):
     all_done(board, stage, share, n_shares, n_blocks)
 
 
-NOBODY = -9
+@compiled
+def hammer(n_calls, n_shares, board, before, after):
+    """Call `double` again and again without a pause; calls that did not do everything once."""
+    n_wrong, n_blocks = 0, len(before)
+    for _ in range(n_calls):
+        clear(board, n_shares)
+        before[:], after[:] = 0.0, 0.0
+        double(np.int64(TO_JOIN), n_shares, board, NO_PAUSE, before, after)
+        dismiss(board, n_shares)
+        for block in range(n_blocks):
+            if before[block] != block or after[block, 0] != n_blocks - 1:
+                n_wrong += 1
+                break
+    return n_wrong
 
 
 @pytest.fixture
@@ -124,6 +148,22 @@ def test_nobody_waits_for_threads_that_do_not_wake():
         team.run(double, NOBODY, before, after)
         np.testing.assert_array_equal(before, k * np.arange(20))
         team = Team(team.board, 3)
+
+
+@pytest.mark.parametrize('n_threads', [2, 3, 5])
+@pytest.mark.parametrize('n_blocks', [1, 3, 60])
+def test_calls_that_follow_at_once_do_not_get_in_each_others_way(n_threads, n_blocks):
+    """Workers come while one call ends and the next begins, some of them for the one before."""
+    pool, n_wrong = RowPool(n_threads), []
+    arguments = pool.team(n_threads).board, np.zeros(n_blocks), np.zeros((n_blocks, 2))
+    # In a thread of its own: if one waits for ever, it is not this one.
+    calls = threading.Thread(
+        target=lambda: n_wrong.append(hammer(20_000, n_threads, *arguments)), daemon=True
+    )
+    calls.start()
+    calls.join(timeout=60.0)
+    assert n_wrong == [0]
+    pool.close()
 
 
 def test_who_comes_when_all_is_over_finds_nothing_to_do():
