@@ -6,8 +6,6 @@ Where nothing is compiled, one thread has the twins in plain Python that it need
 from __future__ import annotations
 
 import ctypes
-import time
-from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -28,22 +26,16 @@ CALL_SIZE = 4096
 """Bytes that a call can be kept in."""
 # What compiled functions return, see `numba.core.callconv`.
 _OK, _NONE = 0, -2
-_lock = Lock()
 
 
 def _plain_add(rows: Rows, row: int, amount: int) -> int:
-    with _lock:
-        before = int(rows[row, 0])
-        rows[row, 0] += amount
+    before = int(rows[row, 0])
+    rows[row, 0] += amount
     return before
 
 
 def _plain_look(rows: Rows, row: int) -> int:
     return int(rows[row, 0])
-
-
-def _plain_pause(microseconds: int) -> None:
-    time.sleep(1e-6 * microseconds)
 
 
 def _place_of(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -151,7 +143,7 @@ put_in_row: Any = _nothing_is_compiled
 """Put a number in a row, at once for all threads, and return what was there."""
 look_at_row: Any = _plain_look
 """What is in a row now, and what was written before that was: ``(rows, row)``."""
-pause: Any = _plain_pause
+pause: Any = _nothing_is_compiled
 """Let others use the core for some microseconds."""
 address_of_row: Any = _nothing_is_compiled
 """Address of a row in memory: ``(rows, row)``."""
