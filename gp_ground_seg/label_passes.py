@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.compiled import compiled
+from gp_ground_seg.gp.growth_compiled import N_STAGES
 from gp_ground_seg.labelling import SQUARE_UNITS
 from gp_ground_seg.labels import Label
 from gp_ground_seg.meeting import Board, all_done, claim, enlist, n_taken
@@ -18,7 +19,9 @@ BoolArray = npt.NDArray[np.bool_]
 
 # Plain integers: compiled code knows no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
-_SURVEYING = 1  # stage of `_survey`
+# Stages, after those of `gp_ground_seg.gp.growth_compiled.estimate_surface`.
+_LEVELLING = N_STAGES
+_SURVEYING = _LEVELLING + 1
 _STANDS = 2**32  # more than there are points
 BLOCK = 2048
 """Points labelled at a time."""
@@ -73,13 +76,11 @@ def label_scan(
         Room for the band of each cell.
     """
     share = enlist(board, share, n_shares)
-    if share < 0:
-        return
     n_segments, n_bins, n_points = len(mean), len(knots) - 1, len(cell)
     pieces[n_segments * n_bins] = np.nan
     n_blocks = (n_points + BLOCK - 1) // BLOCK
 
-    stage = np.int64(0)
+    stage = np.int64(_LEVELLING)
     m = claim(board, stage, share, n_shares, n_segments)
     while m >= 0:
         _level_and_slope(knots, mean[m], pieces[m * n_bins : (m + 1) * n_bins])

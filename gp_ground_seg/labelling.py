@@ -10,12 +10,37 @@ import numpy.typing as npt
 from gp_ground_seg.config import LabelConfig
 from gp_ground_seg.faces import Faces
 from gp_ground_seg.labels import Label
-from gp_ground_seg.polar_grid import NOT_FINITE, FloatArray, PolarGrid
+from gp_ground_seg.polar_grid import NOT_FINITE, FloatArray, PointArray, PolarGrid
 
 BoolArray = npt.NDArray[np.bool_]
 
 SQUARE_UNITS = 2.0**40
 """Squared heights are summed in whole multiples of 1 / this [1/m^2]."""
+
+
+@dataclass(frozen=True)
+class LabelTask:
+    """Points to label, and what is known of them before there is a surface.
+
+    Attributes
+    ----------
+    xyz : (N, 3) float32 or float64
+        Points of a level frame [m].
+    grid : PolarGrid
+        Their bins.
+    faces : Faces
+        Upright faces.
+    label : LabelConfig
+        Bands.
+    face_tolerance : float
+        See `label_points` [m].
+    """
+
+    xyz: PointArray
+    grid: PolarGrid
+    faces: Faces
+    label: LabelConfig
+    face_tolerance: float
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from gp_ground_seg.instructions import (
 
 Board = Rows
 
-TO_JOIN, TO_BEGIN = -1, -2
+TO_JOIN = -1
 """Instead of a share, see `enlist`."""
 _CACHE_LINE = 8  # whole numbers: two threads that count do not hinder each other
 GIVEN_UP = 0
@@ -79,14 +79,14 @@ def enlist(board: Board, share: int, n_shares: int) -> int:
     Returns
     -------
     int
-        Share of this call. 0 where `share` was `TO_JOIN`, -1 where it was `TO_BEGIN`: then
-        the function is to return. Otherwise `share`, and nobody else is called.
+        Share of this call: 0 where `share` was `TO_JOIN`. Otherwise `share`, and nobody else
+        is called.
     """
-    if share < 0:
+    if share == TO_JOIN:
         if n_shares > 1:
             board[_FUNCTION, 0] = keep_own_call(board, _ARGUMENTS)
             _post(board, n_shares)
-        share = 0 if share == TO_JOIN else -1
+        share = 0
     return share
 
 

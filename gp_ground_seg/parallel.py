@@ -11,7 +11,6 @@ from gp_ground_seg.compiled import COMPILES
 from gp_ground_seg.cores import OutOfTheWay, usable_cores
 from gp_ground_seg.meeting import (
     GIVEN_UP,
-    TO_BEGIN,
     TO_JOIN,
     Board,
     clear,
@@ -22,7 +21,7 @@ from gp_ground_seg.meeting import (
     serve,
 )
 
-MOST_STAGES = 4
+MOST_STAGES = 6
 """Stages of the longest work that is shared out."""
 FEWEST_POINTS = 4096
 """Points below which sharing out costs more than it saves."""
@@ -48,43 +47,65 @@ class Team:
     def __init__(self, board: Board, n_shares: int) -> None:
         self.board, self.n_shares = board, n_shares
         clear(board, n_shares)
-        self._begun: Callable[[int], None] | None = None
+        self._rest: Callable[[], None] | None = None
 
     def run(self, function: Callable[..., None], *arguments: Any) -> None:
         """Call ``function(share, n_shares, board, *arguments)`` in all threads."""
+        self._take_part(lambda: function(TO_JOIN, self.n_shares, self.board, *arguments))
+        self.dismiss()
+
+    def begin(
+        self,
+        both: Callable[..., None],
+        first_arguments: tuple[Any, ...],
+        second: Callable[..., None],
+        second_arguments: tuple[Any, ...],
+    ) -> None:
+        """Take part in the first of two works; the others go on to the second.
+
+        Nobody has to be woken for that, and who called may have something else to see to
+        before it helps them, see `finish`.
+
+        Parameters
+        ----------
+        both : callable
+            ``both(share, n_shares, board, first_arguments, second_arguments)`` does the
+            first work, and unless the share is 0 the second.
+        second : callable
+            ``second(share, n_shares, board, *second_arguments)`` does the second.
+        first_arguments, second_arguments : tuple
+            What they take.
+        """
+        self._rest = lambda: second(0, self.n_shares, self.board, *second_arguments)
         self._take_part(
-            lambda share: function(share, self.n_shares, self.board, *arguments), TO_JOIN
+            lambda: both(TO_JOIN, self.n_shares, self.board, first_arguments, second_arguments)
         )
 
-    def begin(self, function: Callable[..., None], *arguments: Any) -> None:
-        """Do what `run` does, in all threads but the calling one: that is to `finish` it."""
-        self._begun = lambda share: function(share, self.n_shares, self.board, *arguments)
-        if self.n_shares > 1:
-            self._begun(TO_BEGIN)
-
     def finish(self) -> None:
-        """Take part in what the others began, if there is such, until all of it is done."""
-        begun, self._begun = self._begun, None
-        if begun is not None:
-            self._take_part(begun, 0)
+        """Take part in the second work, if it is still to be done, until all of it is."""
+        rest, self._rest = self._rest, None
+        if rest is not None:
+            self._take_part(rest)
+            self.dismiss()
 
     def dismiss(self) -> None:
         """Wait until no worker is at it any more, whether or not all of it is done."""
         dismiss(self.board, self.n_shares)
         # Nothing is held until the next call: frames are large.
-        self._begun = None
+        self._rest = None
 
-    def _take_part(self, call: Callable[[int], None], share: int) -> None:
+    def _take_part(self, call: Callable[[], None]) -> None:
         try:
-            call(share)
+            call()
+            if self.board[GIVEN_UP, 0] > 0:
+                raise RuntimeError(
+                    'a thread of the segmentation failed, for lack of memory perhaps'
+                )
         except BaseException:
             give_up(self.board)
-            raise
-        finally:
             # They work on arrays that are the caller's again afterwards.
             self.dismiss()
-        if self.board[GIVEN_UP, 0] > 0:
-            raise RuntimeError('a thread of the segmentation failed, for lack of memory perhaps')
+            raise
 
 
 class RowPool:

@@ -105,17 +105,16 @@ def flat_rows(xyz: PointArray) -> tuple[PointArray, int]:
     step = row // size
     length = (len(xyz) - 1) * step + 3
     owner = xyz.base
-    if isinstance(owner, np.ndarray) and owner.flags.c_contiguous and owner.dtype == xyz.dtype:
-        # What `as_strided` gives, in a tenth of the time.
-        start, odd = divmod(_address(xyz) - _address(owner), size)
-        if odd == 0 and start >= 0 and start + length <= owner.size:
-            return as_read_only(owner.reshape(-1)[start : start + length]), step
+    if (
+        isinstance(owner, np.ndarray)
+        and owner.flags.c_contiguous
+        and owner.dtype == xyz.dtype
+        and owner.shape == (len(xyz), step)
+        and np.may_share_memory(owner[:1, :1], xyz[:1, :1])
+    ):
+        # The first columns of a table: what `as_strided` gives, in a tenth of the time.
+        return as_read_only(owner.reshape(-1)[:length]), step
     return as_strided(xyz, (length,), (size,), writeable=False), step
-
-
-def _address(array: PointArray) -> int:
-    address: int = array.__array_interface__['data'][0]
-    return address
 
 
 def as_read_only(xyz: PointArray) -> PointArray:

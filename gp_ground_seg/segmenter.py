@@ -14,6 +14,7 @@ from gp_ground_seg.config import Config, SensorConfig
 from gp_ground_seg.gp.backend import Backend, make_backend
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
+from gp_ground_seg.labelling import LabelTask
 from gp_ground_seg.points import take_points
 from gp_ground_seg.polar_grid import Candidates, FloatArray, PointArray
 from gp_ground_seg.segmentation import Fitting, Segmentation
@@ -135,13 +136,12 @@ class GroundSegmenter:
         theta, learned = self._learn(model)
         timer.mark('learning')
 
-        inlier, mean, std, log_length_scale = model.surface(theta)
+        to_label = LabelTask(scan.xyz, grid, faces, config.label, config.faces.tolerance)
+        inlier, mean, std, log_length_scale = model.surface(theta, to_label)
         surface = GroundSurface(grid.edges, mean, std, inlier)
         timer.mark('surface')
 
-        labelled = self._backend.label_points(
-            scan.xyz, grid, surface, faces, config.label, config.faces.tolerance
-        )
+        labelled = self._backend.label_points(to_label, surface)
         tilted_ground_z = (
             None if pose.is_level else pose.ground_z(placed.own_xyz[:, 2], labelled.height)
         )

@@ -14,7 +14,6 @@ from gp_ground_seg.compiled import compiled
 from gp_ground_seg.instructions import pause
 from gp_ground_seg.meeting import (
     GIVEN_UP,
-    TO_BEGIN,
     TO_JOIN,
     all_done,
     claim,
@@ -31,13 +30,11 @@ NOBODY, NO_PAUSE = -9, -8
 
 @compiled
 def add(share, n_shares, board, late_share, failing_share, n_done, result):
-    """Add one to each of `result`, in one stage."""
+    """Add one to each of `result`, in one stage, after those of `double`."""
     share = enlist(board, share, n_shares)
-    if share < 0:
-        return
     if share == late_share:
         pause(20 * _MS)
-    stage, n_blocks = np.int64(0), len(result)
+    stage, n_blocks = np.int64(2), len(result)
     block = claim(board, stage, share, n_shares, n_blocks)
     if share == failing_share:
         raise ValueError('that share')
@@ -53,8 +50,6 @@ def add(share, n_shares, board, late_share, failing_share, n_done, result):
 def double(share, n_shares, board, late_share, before, after):
     """Twice the numbers, in two stages of which the second needs all of the first."""
     share = enlist(board, share, n_shares)
-    if share < 0:
-        return
     if share == late_share:
         pause(20 * _MS)
     n_blocks = len(before)
@@ -74,6 +69,15 @@ def double(share, n_shares, board, late_share, before, after):
         after[block, 1] = share
         block = claim(board, stage, share, n_shares, n_blocks)
     all_done(board, stage, share, n_shares, n_blocks)
+
+
+@compiled
+def double_then_add(share, n_shares, board, doubling, adding):
+    """Do both, in share 0 only the first; and in the last share that begins late."""
+    share = enlist(board, share, n_shares)
+    double(share, n_shares, board, *doubling)
+    if share > 0:
+        add(share, n_shares, board, *adding)
 
 
 @compiled
@@ -185,8 +189,10 @@ def test_who_comes_when_all_is_over_finds_nothing_to_do():
 def test_others_go_on_with_what_the_caller_takes_part_in_later(n_threads, late):
     pool = RowPool(n_threads)
     team = pool.team(n_threads)
+    before, after = np.zeros(20), np.zeros((20, 2))
     n_done, result = np.zeros(n_threads, dtype=np.int64), np.zeros(30, dtype=np.int64)
-    team.begin(add, late, NOBODY, n_done, result)
+    team.begin(double_then_add, (late, before, after), add, (NOBODY, NOBODY, n_done, result))
+    np.testing.assert_array_equal(after[:, 0], 19)
     if n_threads > 1:
         deadline = time.monotonic() + 10.0
         while not result.all() and time.monotonic() < deadline:
@@ -202,7 +208,8 @@ def test_others_go_on_with_what_the_caller_takes_part_in_later(n_threads, late):
 
 def test_what_was_begun_and_is_not_wanted_is_left_before_anything_else(pool):
     n_done, unwanted = np.zeros(3, dtype=np.int64), np.zeros(3000, dtype=np.int64)
-    pool.team(3).begin(add, NOBODY, NOBODY, n_done, unwanted)
+    first = NOBODY, np.zeros(5), np.zeros((5, 2))
+    pool.team(3).begin(double_then_add, first, add, (NOBODY, NOBODY, n_done, unwanted))
     _, result = run_add(pool)
     np.testing.assert_array_equal(result, 1)
     left = unwanted.copy()
@@ -219,7 +226,8 @@ def test_arrays_are_lent_and_given_back(pool):
     n_references = sys.getrefcount(result)
     for _ in range(20):
         team = pool.team(3)
-        team.begin(add, NOBODY, NOBODY, n_done, result)
+        first = NOBODY, np.zeros(5), np.zeros((5, 2))
+        team.begin(double_then_add, first, add, (NOBODY, NOBODY, n_done, result))
         team.dismiss()
         team.run(double, NOBODY, np.zeros(5), np.zeros((5, 2)))
     pool.team(3)
@@ -248,6 +256,18 @@ def test_an_error_in_any_share_is_raised_and_the_pool_goes_on(pool, failing, err
     np.testing.assert_array_equal(n_done, 1)
 
 
+def test_an_error_in_the_second_work_is_raised_when_that_is_to_be_finished(pool):
+    for failing, error in ((0, ValueError), (1, RuntimeError)):
+        n_done, result = np.zeros(3, dtype=np.int64), np.zeros(3000, dtype=np.int64)
+        first = NOBODY, np.zeros(5), np.zeros((5, 2))
+        team = pool.team(3)
+        team.begin(double_then_add, first, add, (0, failing, n_done, result))
+        with pytest.raises(error):
+            team.finish()
+    n_done, result = run_add(pool, n_blocks=300)
+    np.testing.assert_array_equal(result, 1)
+
+
 def test_an_interrupted_call_is_made_up_for(pool):
     @compiled
     def slow(share, n_shares, board, late):
@@ -257,7 +277,7 @@ def test_an_interrupted_call_is_made_up_for(pool):
             late[share] += 1
 
     def interrupted(share, n_shares, board, late):
-        slow(TO_BEGIN, n_shares, board, late)
+        slow(TO_JOIN, n_shares, board, late)
         time.sleep(0.02)
         raise KeyboardInterrupt
 

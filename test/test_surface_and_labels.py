@@ -11,6 +11,7 @@ from gp_ground_seg.config import Config, GridConfig, LabelConfig
 from gp_ground_seg.faces import Faces
 from gp_ground_seg.gp.numpy_backend import NumpyBackend
 from gp_ground_seg.labelling import (
+    LabelTask,
     ground_probability,
     label_points,
     local_roughness,
@@ -19,6 +20,7 @@ from gp_ground_seg.labelling import (
 from gp_ground_seg.labels import Label
 from gp_ground_seg.points import in_columns
 from gp_ground_seg.polar_grid import build_polar_grid
+from gp_ground_seg.segmenter import GroundSegmenter
 from gp_ground_seg.surface import GroundSurface, fuse_neighbours, fuse_rows
 from gp_ground_seg.tiles import Tiles
 from gp_ground_seg.workspace import Workspace
@@ -219,13 +221,39 @@ def test_compiled_surface_and_labels_are_the_reference(seed, dtype, n_threads):
         np.testing.assert_array_equal(faces.is_face, same.is_face)
         np.testing.assert_array_equal(faces.is_footless, same.is_footless)
         assert faces.is_face.any()
-        found = backend.label_points(xyz, grid, surface, faces, LabelConfig(), 0.1)
-    expected = plain.label_points(xyz, grid, surface, faces, LabelConfig(), 0.1)
+        task = LabelTask(xyz, grid, faces, LabelConfig(), 0.1)
+        found = backend.label_points(task, surface)
+    expected = plain.label_points(task, surface)
     np.testing.assert_array_equal(found.label, expected.label)
     for name in ('height', 'margin', 'roughness'):
         np.testing.assert_allclose(
             getattr(found, name), getattr(expected, name), atol=1e-12, err_msg=name
         )
+
+
+def test_labels_by_another_surface_than_others_went_on_with(monkeypatch):
+    """Other threads may be at it; what they do is of no account."""
+    seen = []
+    x, y = np.meshgrid(np.linspace(-20, 20, 120), np.linspace(-20, 20, 120))
+    xyz = np.stack([x, y, 0.02 * np.sin(x) - 1.73], axis=-1).reshape(-1, 3)
+    with sharing(2) as backend:
+        label = backend.label_points
+
+        def label_raised(task, surface):
+            seen.append((task, surface))
+            return label(task, dataclasses.replace(surface, mean=surface.mean + 0.5))
+
+        monkeypatch.setattr(backend, 'label_points', label_raised)
+        segmenter = GroundSegmenter(backend=backend)
+        for _ in range(3):
+            found = segmenter.segment(xyz)
+    task, surface = seen[-1]
+    plain = NumpyBackend()
+    raised = dataclasses.replace(surface, mean=surface.mean + 0.5)
+    expected = plain.label_points(task, raised)
+    np.testing.assert_array_equal(found.label, expected.label)
+    np.testing.assert_allclose(found.height, expected.height, atol=1e-12)
+    assert np.nanmax(np.abs(plain.label_points(task, surface).height - found.height)) > 0.4
 
 
 @given(st.integers(0, 10_000), st.integers(0, 3))

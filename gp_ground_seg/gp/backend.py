@@ -6,14 +6,13 @@ import logging
 from typing import Protocol
 
 from gp_ground_seg.compiled import HAVE_NUMBA
-from gp_ground_seg.config import Config, LabelConfig, RuntimeConfig
+from gp_ground_seg.config import Config, RuntimeConfig
 from gp_ground_seg.errors import MissingDependencyError
-from gp_ground_seg.faces import Faces
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.objective import TrainingFrame
-from gp_ground_seg.labelling import Labelled
+from gp_ground_seg.labelling import Labelled, LabelTask
 from gp_ground_seg.line_extraction import Lines
-from gp_ground_seg.polar_grid import Candidates, FloatArray, PointArray, PolarGrid
+from gp_ground_seg.polar_grid import Candidates, FloatArray, PointArray
 from gp_ground_seg.pseudo_inputs import PseudoInputs
 from gp_ground_seg.sorted_points import SortedPoints
 from gp_ground_seg.surface import GroundSurface
@@ -52,32 +51,29 @@ class Backend(Protocol):
         `gp_ground_seg.line_bends.candidates_that_follow`.
         """
 
-    def label_points(
-        self,
-        xyz: PointArray,
-        grid: PolarGrid,
-        surface: GroundSurface,
-        faces: Faces,
-        label: LabelConfig,
-        face_tolerance: float,
-    ) -> Labelled:
-        """See `gp_ground_seg.labelling`."""
-
     def grow(
-        self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
+        self,
+        task: GrowthTask,
+        log_length_scale: FloatArray,
+        knot_log_length_scale: FloatArray,
+        to_label: LabelTask | None = None,
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
         """See `gp_ground_seg.gp.growth.grow_surface_reference`; log length-scales (C,), (M, K).
 
-        The surface is fused, see `gp_ground_seg.surface.fuse_neighbours`.
+        The surface is fused, see `gp_ground_seg.surface.fuse_neighbours`. Other threads may
+        go on to label by it what is `to_label`: that is to be asked for next.
         """
 
     def grow_on_latent(
-        self, task: GrowthTask, pseudo: PseudoInputs
+        self, task: GrowthTask, pseudo: PseudoInputs, to_label: LabelTask | None = None
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Both processes: `gp_ground_seg.gp.latent.latent_rows_reference`, then `grow`.
 
         What `grow` gives, and the log length-scales at the knots (M, K) [log m].
         """
+
+    def label_points(self, task: LabelTask, surface: GroundSurface) -> Labelled:
+        """See `gp_ground_seg.labelling`."""
 
     def objective(
         self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 
-from gp_ground_seg import face_passes, label_passes, point_passes
-from gp_ground_seg.config import Config, GridConfig, LabelConfig
+from gp_ground_seg.config import Config, GridConfig
+from gp_ground_seg.face_passes import N_COLUMNS, judge_faces
 from gp_ground_seg.faces import Faces
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.growth_compiled import estimate_surface
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.objective_compiled import objective_rows
-from gp_ground_seg.labelling import Labelled
+from gp_ground_seg.label_passes import label_scan
+from gp_ground_seg.labelling import Labelled, LabelTask
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.line_passes import find_lines_compiled
 from gp_ground_seg.meeting import Board, make_board
+from gp_ground_seg.paired_passes import estimate_then_label, sort_then_judge
 from gp_ground_seg.parallel import MOST_STAGES, RowPool, Team
+from gp_ground_seg.point_passes import collect_candidates, sort_points
 from gp_ground_seg.points import as_read_only, flat_rows, in_columns
 from gp_ground_seg.polar_grid import (
     Candidates,
@@ -31,6 +36,16 @@ from gp_ground_seg.sorted_points import SortedPoints
 from gp_ground_seg.surface import GroundSurface
 from gp_ground_seg.tiles import Tiles, tiles_per_side
 from gp_ground_seg.workspace import Workspace
+
+
+@dataclass(frozen=True)
+class _BegunLabels:
+    """Labels that other threads have gone on to, by the surface of that `mean`."""
+
+    task: LabelTask
+    mean: FloatArray
+    team: Team
+    labelled: Labelled
 
 
 class CompiledBackend:
@@ -48,6 +63,7 @@ class CompiledBackend:
         self._pool = RowPool(n_threads)
         self.n_threads = self._pool.n_threads
         self._workspace = Workspace()
+        self._begun: _BegunLabels | None = None
 
     def sort_points(
         self, xyz: PointArray, config: Config, workspace: Workspace, seeks_faces: bool = True
@@ -81,11 +97,10 @@ class CompiledBackend:
         # As much as could be needed: what is not used takes no memory.
         room = 2 * n_tiles if seeks_faces else 0
         slots = take('slots', (room + 1,), np.int32)
-        sums = take('sums', (n_shares, room, face_passes.N_COLUMNS), np.float64)
+        sums = take('sums', (n_shares, room, N_COLUMNS), np.float64)
         team = self._pool.team(n_shares) if seeks_faces else Team(make_board(MOST_STAGES, 1), 1)
 
-        team.run(
-            point_passes.sort_points,
+        sorting = (
             flat,
             step,
             target,
@@ -103,9 +118,7 @@ class CompiledBackend:
             touched,
         )
         if seeks_faces:
-            # The caller has something else to see to first.
-            team.begin(
-                face_passes.judge_faces,
+            judging = (
                 columns,
                 tile,
                 tile_extremes,
@@ -122,6 +135,9 @@ class CompiledBackend:
                 is_face,
                 is_footless,
             )
+            team.begin(sort_then_judge, sorting, judge_faces, judging)
+        else:
+            team.run(sort_points, *sorting)
 
         @cache
         def find() -> Faces:
@@ -142,16 +158,21 @@ class CompiledBackend:
         """Candidates that show ground, lines through them, pseudo-inputs, and who follows whom."""
         return find_lines_compiled(candidates, is_footless, config)
 
-    def label_points(
-        self,
-        xyz: PointArray,
-        grid: PolarGrid,
-        surface: GroundSurface,
-        faces: Faces,
-        label: LabelConfig,
-        face_tolerance: float,
-    ) -> Labelled:
+    def label_points(self, task: LabelTask, surface: GroundSurface) -> Labelled:
         """Height, label and margin of each point; roughness of each bin."""
+        begun, self._begun = self._begun, None
+        if begun is not None and begun.task is task and begun.mean is surface.mean:
+            begun.team.finish()
+            return begun.labelled
+        labelled, arguments = self._to_label(task, surface.knots, surface.mean)
+        self._pool.run(label_scan, self._pool.n_shares(len(task.xyz)), *arguments)
+        return labelled
+
+    def _to_label(
+        self, task: LabelTask, knots: FloatArray, mean: FloatArray
+    ) -> tuple[Labelled, tuple[Any, ...]]:
+        """Room for the result, and the arguments of `label_scan`."""
+        xyz, grid, faces, label = task.xyz, task.grid, task.faces, task.label
         n_points, n_cells = len(xyz), grid.n_segments * grid.n_bins
         take = self._workspace.take
         # One row more, for the points of no cell.
@@ -161,9 +182,7 @@ class CompiledBackend:
         height, margin = np.empty(n_points), np.empty(n_points)
         labels = np.empty(n_points, dtype=np.uint8)
         roughness = np.empty((grid.n_segments, grid.n_bins))
-        self._pool.run(
-            label_passes.label_scan,
-            self._pool.n_shares(n_points),
+        arguments = (
             xyz.T,
             grid.cell,
             grid.r,
@@ -171,8 +190,8 @@ class CompiledBackend:
             faces.tiles.extremes,
             faces.is_face,
             faces.is_footless,
-            surface.knots,
-            surface.mean,
+            knots,
+            mean,
             label.ground_tolerance,
             label.roughness_gain,
             label.obstacle_tolerance,
@@ -180,7 +199,7 @@ class CompiledBackend:
             label.obstacle_min_height,
             label.obstacle_max_height,
             label.below_tolerance,
-            face_tolerance,
+            task.face_tolerance,
             pieces,
             sums,
             own_band,
@@ -189,21 +208,26 @@ class CompiledBackend:
             labels,
             margin,
         )
-        return Labelled(labels, height, margin, roughness)
+        return Labelled(labels, height, margin, roughness), arguments
 
     def grow(
-        self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
+        self,
+        task: GrowthTask,
+        log_length_scale: FloatArray,
+        knot_log_length_scale: FloatArray,
+        to_label: LabelTask | None = None,
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
         """Inliers, mean and standard deviation of the fused surface."""
-        return self._estimate_surface(task, None, log_length_scale, knot_log_length_scale)
+        given = log_length_scale, knot_log_length_scale
+        return self._estimate_surface(task, None, *given, to_label)
 
     def grow_on_latent(
-        self, task: GrowthTask, pseudo: PseudoInputs
+        self, task: GrowthTask, pseudo: PseudoInputs, to_label: LabelTask | None = None
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Both processes; the log length-scales at the knots as well."""
         u = self._workspace.take('u', (len(task.candidates.r),), np.float64)
         knot_u = np.empty((len(task.theta), len(task.knots)))
-        return *self._estimate_surface(task, pseudo, u, knot_u), knot_u
+        return *self._estimate_surface(task, pseudo, u, knot_u, to_label), knot_u
 
     def _estimate_surface(
         self,
@@ -211,6 +235,7 @@ class CompiledBackend:
         pseudo: PseudoInputs | None,
         log_length_scale: FloatArray,
         knot_log_length_scale: FloatArray,
+        to_label: LabelTask | None,
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
         is_latent = pseudo is not None
         if pseudo is None:
@@ -219,9 +244,7 @@ class CompiledBackend:
         candidates, growth, shape = task.candidates, task.growth, knot_log_length_scale.shape
         size, take = len(candidates.r), self._workspace.take
         mean, std, inlier = np.empty(shape), np.empty(shape), np.empty(size, np.bool_)
-        self._pool.run(
-            estimate_surface,
-            self.n_threads,
+        arguments = (
             is_latent,
             task.theta,
             pseudo.offsets,
@@ -254,6 +277,13 @@ class CompiledBackend:
             mean,
             std,
         )
+        if to_label is None:
+            self._pool.run(estimate_surface, self.n_threads, *arguments)
+        else:
+            labelled, labelling = self._to_label(to_label, task.knots, mean)
+            team = self._pool.team(self._pool.n_shares(len(to_label.xyz)))
+            team.begin(estimate_then_label, arguments, label_scan, labelling)
+            self._begun = _BegunLabels(to_label, mean, team, labelled)
         return inlier, mean, std
 
     def objective(
@@ -301,7 +331,7 @@ def _collect_candidates(
     offsets, own_bin = np.empty(grid.n_segments + 1, np.int64), np.empty(size, np.int64)
     r, z, density = np.empty((3, size))
     tile = np.empty(size, dtype=np.int32)
-    n = point_passes.collect_candidates(
+    n = collect_candidates(
         board, extremes, numbers, np.diff(edges), min_extent, offsets, r, z, own_bin, density, tile
     )
     return Candidates(r[:n], z[:n], own_bin[:n], density[:n], offsets, tile[:n])

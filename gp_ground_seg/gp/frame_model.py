@@ -13,6 +13,7 @@ from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.learning import Learned, learn
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.theta import ThetaSpace, theta_centre, theta_space
+from gp_ground_seg.labelling import LabelTask
 from gp_ground_seg.length_scale import (
     candidate_log_length_scale,
     interpolate_along_segments,
@@ -89,6 +90,7 @@ class FrameModel:
         knots: FloatArray,
         n_neighbours: int = 0,
         segment_step: int = 1,
+        to_label: LabelTask | None = None,
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Inliers (C,) that grow from low, near seeds; see `surface` for what else."""
         task = GrowthTask(
@@ -103,16 +105,19 @@ class FrameModel:
             n_neighbours,
         )
         if self.config.length_scale.model == 'latent':
-            return self.backend.grow_on_latent(task, self.pseudo)
+            return self.backend.grow_on_latent(task, self.pseudo, to_label)
         u, knot_u = self._given_log_length_scales(knots)
-        return *self.backend.grow(task, u, knot_u), knot_u
+        return *self.backend.grow(task, u, knot_u, to_label), knot_u
 
-    def surface(self, theta: FloatArray) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
+    def surface(
+        self, theta: FloatArray, to_label: LabelTask | None = None
+    ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Inliers (C,); at the knots (M, K): height, its std [m], log l.
 
-        Height and std are fused with those of the segments beside.
+        Height and std are fused with those of the segments beside. What is `to_label` by
+        them other threads may go on to.
         """
-        return self.grow(theta, self.knots, self.config.surface.n_neighbours)
+        return self.grow(theta, self.knots, self.config.surface.n_neighbours, to_label=to_label)
 
     def learn(
         self, theta: FloatArray, out_of_time: Callable[[], bool]

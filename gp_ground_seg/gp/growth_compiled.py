@@ -22,6 +22,8 @@ from gp_ground_seg.surface import fuse_rows
 
 BLOCK = 3
 """Segments that a thread takes at a time."""
+N_STAGES = 2
+"""Stages of `estimate_surface`."""
 
 
 @inlined
@@ -270,8 +272,6 @@ def estimate_surface(
     work in.
     """
     share = enlist(board, share, n_shares)
-    if share < 0:
-        return
     sigma_f, sigma_n, gate_noise = scales[0], scales[1], scales[2]
     own_mean, own_std = own_surface[0], own_surface[1]
     n_segments = len(mean)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from gp_ground_seg.blas import single_threaded_blas
-from gp_ground_seg.config import Config, LabelConfig
+from gp_ground_seg.config import Config
 from gp_ground_seg.faces import Faces, find_faces
 from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
 from gp_ground_seg.gp.growth import BoolArray, GrowthTask
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.hidden_feet import without_hidden_feet
-from gp_ground_seg.labelling import Labelled, label_points, local_roughness
+from gp_ground_seg.labelling import Labelled, LabelTask, label_points, local_roughness
 from gp_ground_seg.line_bends import candidates_that_follow
 from gp_ground_seg.line_extraction import Lines, extract_lines
 from gp_ground_seg.points import in_columns
@@ -20,7 +20,6 @@ from gp_ground_seg.polar_grid import (
     Candidates,
     FloatArray,
     PointArray,
-    PolarGrid,
     build_polar_grid,
     ground_candidates,
     reduce_cells,
@@ -62,25 +61,13 @@ class NumpyBackend:
         pseudo = select_pseudo_inputs(kept, lines, config)
         return kept, lines, pseudo, candidates_that_follow(lines, kept, config)
 
-    def label_points(
-        self,
-        xyz: PointArray,
-        grid: PolarGrid,
-        surface: GroundSurface,
-        faces: Faces,
-        label: LabelConfig,
-        face_tolerance: float,
-    ) -> Labelled:
-        """Height, label and margin of each point; roughness of each bin."""
-        z = xyz[:, 2].astype(np.float64)
-        height = z - surface.at(grid)[0]
-        roughness = local_roughness(height, grid, faces, label.obstacle_min_height)
-        labels, margin = label_points(z, height, grid, faces, roughness, label, face_tolerance)
-        return Labelled(labels, height, margin, roughness)
-
     @single_threaded_blas()
     def grow(
-        self, task: GrowthTask, log_length_scale: FloatArray, knot_log_length_scale: FloatArray
+        self,
+        task: GrowthTask,
+        log_length_scale: FloatArray,
+        knot_log_length_scale: FloatArray,
+        to_label: LabelTask | None = None,
     ) -> tuple[BoolArray, FloatArray, FloatArray]:
         """Inliers, mean and standard deviation of the fused surface."""
         inlier, mean, std = grow_surface_batched(
@@ -105,7 +92,7 @@ class NumpyBackend:
 
     @single_threaded_blas()
     def grow_on_latent(
-        self, task: GrowthTask, pseudo: PseudoInputs
+        self, task: GrowthTask, pseudo: PseudoInputs, to_label: LabelTask | None = None
     ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
         """Both processes; the log length-scales at the knots as well."""
         u, knot_u = latent_rows_batched(
@@ -119,6 +106,16 @@ class NumpyBackend:
             task.n_knots,
         )
         return *self.grow(task, u, knot_u), knot_u
+
+    def label_points(self, task: LabelTask, surface: GroundSurface) -> Labelled:
+        """Height, label and margin of each point; roughness of each bin."""
+        z, grid, faces = task.xyz[:, 2].astype(np.float64), task.grid, task.faces
+        height = z - surface.at(grid)[0]
+        roughness = local_roughness(height, grid, faces, task.label.obstacle_min_height)
+        labels, margin = label_points(
+            z, height, grid, faces, roughness, task.label, task.face_tolerance
+        )
+        return Labelled(labels, height, margin, roughness)
 
     @single_threaded_blas()
     def objective(
