@@ -20,6 +20,8 @@ from gp_ground_seg.rulers import CellArray, Ruler
 
 SORTING = 0
 """Stage of `sort_points`."""
+UNKNOWN = -1
+"""Instead of the number of touched tiles: what is in the table may be anything."""
 BLOCK = 512
 """Points sorted at a time: what is known of them stays in the nearest cache."""
 _TAKEN = 4 * BLOCK
@@ -104,9 +106,19 @@ def empty_cells(extremes: PointArray, numbers: CellArray) -> None:
 
 @compiled
 def empty_tiles(extremes: PointArray, touched: CellArray) -> None:
-    """Make the tables of the tiles those of no points."""
-    for k in range(len(extremes)):
-        extremes[k, 0], extremes[k, 1] = np.inf, -np.inf
+    """Make the tables of the tiles those of no points.
+
+    Only what was touched before, if that is known: it is a tenth of them.
+    """
+    if touched[0] == UNKNOWN:
+        for k in range(len(extremes)):
+            extremes[k, 0], extremes[k, 1] = np.inf, -np.inf
+    else:
+        for place in range(1, touched[0] + 1):
+            k = np.uintp(touched[place])
+            extremes[k, 0], extremes[k, 1] = np.inf, -np.inf
+        # It is written for the points in no tile, but never counted.
+        extremes[len(extremes) - 1, 0], extremes[len(extremes) - 1, 1] = np.inf, -np.inf
     touched[0] = 0
 
 

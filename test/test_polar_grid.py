@@ -3,7 +3,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import hilly_scan
+from conftest import hilly_scan, sharing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.stride_tricks import as_strided
@@ -305,6 +305,36 @@ def test_shares_of_the_points_are_merged(n_threads):
         np.testing.assert_array_equal(faces.is_footless, same.is_footless)
         assert faces.is_face.any() or n_points == 300
     backend.close()
+
+
+@pytest.mark.parametrize('n_threads', [1, 2, 3])
+def test_what_a_scan_leaves_in_the_tables_does_not_show_in_the_next(n_threads):
+    other = Config().replace(**{'faces.cell_size': 0.7})
+    workspace = Workspace()
+    with sharing(n_threads) as backend:
+        for seed, config, dtype, seeks_faces, are_wanted in (
+            (1, Config(), np.float64, True, True),
+            (2, Config(), np.float64, True, True),
+            (3, Config(), np.float64, True, False),
+            (4, Config(), np.float64, True, True),
+            (5, other, np.float64, True, True),
+            (6, Config(), np.float64, True, True),
+            (7, Config(), np.float64, False, False),
+            (8, Config(), np.float64, True, True),
+            (9, Config(), np.float32, True, True),
+            (10, Config(), np.float64, True, True),
+        ):
+            xyz = taken(hilly_scan(5000, seed=seed).astype(dtype))
+            found = backend.sort_points(xyz, config, workspace, seeks_faces)
+            if not are_wanted:
+                found.drop_faces()
+                continue
+            fresh = CompiledBackend(1).sort_points(xyz, config, Workspace())
+            faces, same = found.find_faces(), fresh.find_faces()
+            assert_same_candidates(found.candidates, fresh.candidates)
+            assert_same_tiles(faces.tiles, same.tiles)
+            np.testing.assert_array_equal(faces.is_face, same.is_face)
+            np.testing.assert_array_equal(faces.is_footless, same.is_footless)
 
 
 @pytest.mark.parametrize('n_threads', [1, 2, 3])

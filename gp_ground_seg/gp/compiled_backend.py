@@ -22,7 +22,7 @@ from gp_ground_seg.line_passes import find_lines_compiled
 from gp_ground_seg.meeting import Board, make_board
 from gp_ground_seg.paired_passes import estimate_then_label, sort_then_judge
 from gp_ground_seg.parallel import MOST_STAGES, RowPool, Team
-from gp_ground_seg.point_passes import collect_candidates, sort_points
+from gp_ground_seg.point_passes import UNKNOWN, collect_candidates, sort_points
 from gp_ground_seg.points import as_read_only, flat_rows, in_columns
 from gp_ground_seg.polar_grid import (
     Candidates,
@@ -64,6 +64,7 @@ class CompiledBackend:
         self.n_threads = self._pool.n_threads
         self._workspace = Workspace()
         self._begun: _BegunLabels | None = None
+        self._tables: tuple[PointArray, CellArray] | None = None
 
     def sort_points(
         self, xyz: PointArray, config: Config, workspace: Workspace, seeks_faces: bool = True
@@ -93,6 +94,8 @@ class CompiledBackend:
         numbers = take('numbers', (n_shares, n_cells + 1, 2), np.int32)
         tile_extremes = take('tiles', (n_shares, n_tiles + 1, 2), xyz.dtype)
         touched = take('touched', (n_shares, n_tiles + 2), np.int32)
+        if not (seeks_faces and self._takes_back(tile_extremes, touched)):
+            touched[:, 0] = UNKNOWN
         is_face, is_footless = take('faces', (2, n_tiles), np.bool_)
         # As much as could be needed: what is not used takes no memory.
         room = 2 * n_tiles if seeks_faces else 0
@@ -136,6 +139,7 @@ class CompiledBackend:
                 is_footless,
             )
             team.begin(sort_then_judge, sorting, judge_faces, judging)
+            self._tables = tile_extremes, touched
         else:
             team.run(sort_points, *sorting)
 
@@ -151,6 +155,14 @@ class CompiledBackend:
         return SortedPoints(
             xyz, PolarGrid(cell, r, edges, grid.n_segments), candidates, find, team.dismiss
         )
+
+    def _takes_back(self, tile_extremes: PointArray, touched: CellArray) -> bool:
+        """Tell whether these tables of tiles are as the scan before left them.
+
+        They count as lost until the next one is sorted, too.
+        """
+        left, self._tables = self._tables, None
+        return left is not None and left[0] is tile_extremes and left[1] is touched
 
     def find_lines(
         self, candidates: Candidates, is_footless: BoolArray, config: Config
