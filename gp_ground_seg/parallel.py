@@ -52,7 +52,6 @@ class Team:
     def run(self, function: Callable[..., None], *arguments: Any) -> None:
         """Call ``function(share, n_shares, board, *arguments)`` in all threads."""
         self._take_part(lambda: function(TO_JOIN, self.n_shares, self.board, *arguments))
-        self.dismiss()
 
     def begin(
         self,
@@ -78,7 +77,8 @@ class Team:
         """
         self._rest = lambda: second(0, self.n_shares, self.board, *second_arguments)
         self._take_part(
-            lambda: both(TO_JOIN, self.n_shares, self.board, first_arguments, second_arguments)
+            lambda: both(TO_JOIN, self.n_shares, self.board, first_arguments, second_arguments),
+            others_go_on=True,
         )
 
     def finish(self) -> None:
@@ -86,7 +86,6 @@ class Team:
         rest, self._rest = self._rest, None
         if rest is not None:
             self._take_part(rest)
-            self.dismiss()
 
     def dismiss(self) -> None:
         """Wait until no worker is at it any more, whether or not all of it is done."""
@@ -94,18 +93,22 @@ class Team:
         # Nothing is held until the next call: frames are large.
         self._rest = None
 
-    def _take_part(self, call: Callable[[], None]) -> None:
+    def _take_part(self, call: Callable[[], None], others_go_on: bool = False) -> None:
+        is_over = True
         try:
             call()
             if self.board[GIVEN_UP, 0] > 0:
                 raise RuntimeError(
                     'a thread of the segmentation failed, for lack of memory perhaps'
                 )
+            is_over = not others_go_on
         except BaseException:
             give_up(self.board)
-            # They work on arrays that are the caller's again afterwards.
-            self.dismiss()
             raise
+        finally:
+            # They work on arrays that are the caller's again afterwards.
+            if is_over:
+                self.dismiss()
 
 
 class RowPool:

@@ -73,7 +73,7 @@ def double(share, n_shares, board, late_share, before, after):
 
 @compiled
 def double_then_add(share, n_shares, board, doubling, adding):
-    """Do both, in share 0 only the first; and in the last share that begins late."""
+    """Do both, but in share 0 only the first, see `Team.begin`."""
     share = enlist(board, share, n_shares)
     double(share, n_shares, board, *doubling)
     if share > 0:

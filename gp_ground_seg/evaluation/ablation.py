@@ -42,9 +42,6 @@ METHODS: dict[str, dict[str, ParameterValue]] = {
 }
 """Methods by title, as changes of the configuration; the last one is the paper's."""
 
-BY_SEGMENT = 'Z-L, learned per segment'
-"""The slow one: an optimisation for each segment."""
-
 
 @dataclass(frozen=True)
 class FrameResult:
