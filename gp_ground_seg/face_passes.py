@@ -80,6 +80,8 @@ def judge_faces(
         Result.
     """
     share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     n_tiles = len(is_face)
     stage, n_blocks = np.int64(MERGING), np.int64(1)
     if claim(board, stage, share, n_shares, n_blocks) == 0:

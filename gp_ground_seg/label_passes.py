@@ -76,6 +76,8 @@ def label_scan(
         Room for the band of each cell.
     """
     share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     n_segments, n_bins, n_points = len(mean), len(knots) - 1, len(cell)
     pieces[n_segments * n_bins] = np.nan
     n_blocks = (n_points + BLOCK - 1) // BLOCK

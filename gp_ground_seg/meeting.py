@@ -28,15 +28,16 @@ from gp_ground_seg.instructions import (
 
 Board = Rows
 
-TO_JOIN = -1
+TO_JOIN, TO_FOLLOW = -1, -2
 """Instead of a share, see `enlist`."""
 _CACHE_LINE = 8  # whole numbers: two threads that count do not hinder each other
 GIVEN_UP = 0
 """Row of the board: how many threads failed."""
-# Other rows: how often there was a call; whether somebody may still be at it; what is
-# called, and with what.
-_POSTED, _IS_OPEN, _FUNCTION, _ARGUMENTS = 1, 2, 3, 4
-_FIRST_WORKER = _ARGUMENTS + CALL_SIZE // (8 * _CACHE_LINE)
+# Other rows: how often there was a call; whether somebody may still be at it; the function
+# that is called, and in the rows behind what it is called with; the same of what follows.
+_POSTED, _IS_OPEN, _CALLED = 1, 2, 3
+_FOLLOWS = _CALLED + 1 + CALL_SIZE // (8 * _CACHE_LINE)
+_FIRST_WORKER = _FOLLOWS + 1 + CALL_SIZE // (8 * _CACHE_LINE)
 # For each worker: what it sleeps by; who was first to take the call; whether it is done.
 _SLEEP, _TICKET, _IS_DONE = range(3)
 _ROWS = 3
@@ -79,14 +80,18 @@ def enlist(board: Board, share: int, n_shares: int) -> int:
     Returns
     -------
     int
-        Share of this call: 0 where `share` was `TO_JOIN`. Otherwise `share`, and nobody else
-        is called.
+        Share of this call. 0 where `share` was `TO_JOIN`, -1 where it was `TO_FOLLOW`: then
+        the function is to return, and the workers will go on to it from what they are
+        called for next. Otherwise `share`, and nobody else is called.
     """
-    if share == TO_JOIN:
+    if share < 0:
+        joins = share == TO_JOIN
         if n_shares > 1:
-            board[_FUNCTION, 0] = keep_own_call(board, _ARGUMENTS)
-            _post(board, n_shares)
-        share = 0
+            row = _CALLED if joins else _FOLLOWS
+            board[row, 0] = keep_own_call(board, row + 1)
+            if joins:
+                _post(board, n_shares)
+        share = 0 if joins else -1
     return share
 
 
@@ -106,24 +111,24 @@ def _post(board: Board, n_shares: int) -> None:
 @compiled
 def send_home(board: Board, n_shares: int) -> None:
     """End `serve` in all workers."""
-    board[_FUNCTION, 0] = 0
+    board[_CALLED, 0] = 0
     _post(board, n_shares)
 
 
 @compiled
 def dismiss(board: Board, n_shares: int) -> None:
     """Wait until no worker is at what it was called for; who has not begun never will."""
-    if board[_IS_OPEN, 0] == 0:
-        return
-    board[_IS_OPEN, 0] = 0
-    for share in range(1, n_shares):
-        row = _own_row(share)
-        if add_to_row(board, row + _TICKET, 1) > 0:
-            n_looks = 0
-            while look_at_row(board, row + _IS_DONE) == 0:
-                n_looks += 1
-                if n_looks > _BEFORE_SLEEP:
-                    pause(_PAUSE)
+    if board[_IS_OPEN, 0] != 0:
+        board[_IS_OPEN, 0] = 0
+        for share in range(1, n_shares):
+            row = _own_row(share)
+            if add_to_row(board, row + _TICKET, 1) > 0:
+                n_looks = 0
+                while look_at_row(board, row + _IS_DONE) == 0:
+                    n_looks += 1
+                    if n_looks > _BEFORE_SLEEP:
+                        pause(_PAUSE)
+    board[_FOLLOWS, 0] = 0
 
 
 @compiled
@@ -135,9 +140,12 @@ def serve(board: Board, share: int, n_shares: int) -> None:
             sleep(address_of_row(board, row + _SLEEP))
         seen = look_at_row(board, _POSTED)
         if add_to_row(board, row + _TICKET, 1) == 0:
-            if board[_FUNCTION, 0] == 0:
+            if board[_CALLED, 0] == 0:
                 break
-            if not call_kept(board[_FUNCTION, 0], address_of_row(board, _ARGUMENTS), share):
+            is_fine = call_kept(board[_CALLED, 0], address_of_row(board, _CALLED + 1), share)
+            if is_fine and board[_FOLLOWS, 0] != 0 and look_at_row(board, GIVEN_UP) == 0:
+                is_fine = call_kept(board[_FOLLOWS, 0], address_of_row(board, _FOLLOWS + 1), share)
+            if not is_fine:
                 give_up(board)
             add_to_row(board, row + _IS_DONE, 1)
 

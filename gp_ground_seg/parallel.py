@@ -11,6 +11,7 @@ from gp_ground_seg.compiled import COMPILES
 from gp_ground_seg.cores import OutOfTheWay, usable_cores
 from gp_ground_seg.meeting import (
     GIVEN_UP,
+    TO_FOLLOW,
     TO_JOIN,
     Board,
     clear,
@@ -55,7 +56,7 @@ class Team:
 
     def begin(
         self,
-        both: Callable[..., None],
+        first: Callable[..., None],
         first_arguments: tuple[Any, ...],
         second: Callable[..., None],
         second_arguments: tuple[Any, ...],
@@ -67,19 +68,22 @@ class Team:
 
         Parameters
         ----------
-        both : callable
-            ``both(share, n_shares, board, first_arguments, second_arguments)`` does the
-            first work, and unless the share is 0 the second.
-        second : callable
-            ``second(share, n_shares, board, *second_arguments)`` does the second.
+        first, second : callable
+            As for `run`; with other stages, so that who is late is told from who is early.
         first_arguments, second_arguments : tuple
-            What they take.
+            What they take after share, number of shares and board.
         """
-        self._rest = lambda: second(0, self.n_shares, self.board, *second_arguments)
-        self._take_part(
-            lambda: both(TO_JOIN, self.n_shares, self.board, first_arguments, second_arguments),
-            others_go_on=True,
-        )
+
+        def call(function: Callable[..., None], share: int, arguments: tuple[Any, ...]) -> None:
+            function(share, self.n_shares, self.board, *arguments)
+
+        def begin() -> None:
+            if self.n_shares > 1:
+                call(second, TO_FOLLOW, second_arguments)
+            call(first, TO_JOIN, first_arguments)
+
+        self._rest = lambda: call(second, 0, second_arguments)
+        self._take_part(begin, others_go_on=True)
 
     def finish(self) -> None:
         """Take part in the second work, if it is still to be done, until all of it is."""

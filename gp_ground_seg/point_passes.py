@@ -59,6 +59,8 @@ def sort_points(
     branches; then the extremes.
     """
     share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     n_points = len(cell)
     n_blocks = (n_points + _TAKEN - 1) // _TAKEN
     own_extremes, own_numbers = extremes[share], numbers[share]

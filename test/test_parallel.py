@@ -32,6 +32,8 @@ NOBODY, NO_PAUSE = -9, -8
 def add(share, n_shares, board, late_share, failing_share, n_done, result):
     """Add one to each of `result`, in one stage, after those of `double`."""
     share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     if share == late_share:
         pause(20 * _MS)
     stage, n_blocks = np.int64(2), len(result)
@@ -50,6 +52,8 @@ def add(share, n_shares, board, late_share, failing_share, n_done, result):
 def double(share, n_shares, board, late_share, before, after):
     """Twice the numbers, in two stages of which the second needs all of the first."""
     share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     if share == late_share:
         pause(20 * _MS)
     n_blocks = len(before)
@@ -69,15 +73,6 @@ def double(share, n_shares, board, late_share, before, after):
         after[block, 1] = share
         block = claim(board, stage, share, n_shares, n_blocks)
     all_done(board, stage, share, n_shares, n_blocks)
-
-
-@compiled
-def double_then_add(share, n_shares, board, doubling, adding):
-    """Do both, but in share 0 only the first, see `Team.begin`."""
-    share = enlist(board, share, n_shares)
-    double(share, n_shares, board, *doubling)
-    if share > 0:
-        add(share, n_shares, board, *adding)
 
 
 @compiled
@@ -191,7 +186,7 @@ def test_others_go_on_with_what_the_caller_takes_part_in_later(n_threads, late):
     team = pool.team(n_threads)
     before, after = np.zeros(20), np.zeros((20, 2))
     n_done, result = np.zeros(n_threads, dtype=np.int64), np.zeros(30, dtype=np.int64)
-    team.begin(double_then_add, (late, before, after), add, (NOBODY, NOBODY, n_done, result))
+    team.begin(double, (late, before, after), add, (NOBODY, NOBODY, n_done, result))
     np.testing.assert_array_equal(after[:, 0], 19)
     if n_threads > 1:
         deadline = time.monotonic() + 10.0
@@ -209,7 +204,7 @@ def test_others_go_on_with_what_the_caller_takes_part_in_later(n_threads, late):
 def test_what_was_begun_and_is_not_wanted_is_left_before_anything_else(pool):
     n_done, unwanted = np.zeros(3, dtype=np.int64), np.zeros(3000, dtype=np.int64)
     first = NOBODY, np.zeros(5), np.zeros((5, 2))
-    pool.team(3).begin(double_then_add, first, add, (NOBODY, NOBODY, n_done, unwanted))
+    pool.team(3).begin(double, first, add, (NOBODY, NOBODY, n_done, unwanted))
     _, result = run_add(pool)
     np.testing.assert_array_equal(result, 1)
     left = unwanted.copy()
@@ -227,7 +222,7 @@ def test_arrays_are_lent_and_given_back(pool):
     for _ in range(20):
         team = pool.team(3)
         first = NOBODY, np.zeros(5), np.zeros((5, 2))
-        team.begin(double_then_add, first, add, (NOBODY, NOBODY, n_done, result))
+        team.begin(double, first, add, (NOBODY, NOBODY, n_done, result))
         team.dismiss()
         team.run(double, NOBODY, np.zeros(5), np.zeros((5, 2)))
     pool.team(3)
@@ -261,7 +256,7 @@ def test_an_error_in_the_second_work_is_raised_when_that_is_to_be_finished(pool)
         n_done, result = np.zeros(3, dtype=np.int64), np.zeros(3000, dtype=np.int64)
         first = NOBODY, np.zeros(5), np.zeros((5, 2))
         team = pool.team(3)
-        team.begin(double_then_add, first, add, (0, failing, n_done, result))
+        team.begin(double, first, add, (0, failing, n_done, result))
         with pytest.raises(error):
             team.finish()
     n_done, result = run_add(pool, n_blocks=300)

@@ -20,7 +20,6 @@ from gp_ground_seg.labelling import Labelled, LabelTask
 from gp_ground_seg.line_extraction import Lines
 from gp_ground_seg.line_passes import find_lines_compiled
 from gp_ground_seg.meeting import Board, make_board
-from gp_ground_seg.paired_passes import estimate_then_label, sort_then_judge
 from gp_ground_seg.parallel import MOST_STAGES, RowPool, Team
 from gp_ground_seg.point_passes import UNKNOWN, collect_candidates, sort_points
 from gp_ground_seg.points import as_read_only, flat_rows, in_columns
@@ -138,7 +137,7 @@ class CompiledBackend:
                 is_face,
                 is_footless,
             )
-            team.begin(sort_then_judge, sorting, judge_faces, judging)
+            team.begin(sort_points, sorting, judge_faces, judging)
             self._tables = tile_extremes, touched
         else:
             team.run(sort_points, *sorting)
@@ -294,7 +293,7 @@ class CompiledBackend:
         else:
             labelled, labelling = self._to_label(to_label, task.knots, mean)
             team = self._pool.team(self._pool.n_shares(len(to_label.xyz)))
-            team.begin(estimate_then_label, arguments, label_scan, labelling)
+            team.begin(estimate_surface, arguments, label_scan, labelling)
             self._begun = _BegunLabels(to_label, mean, team, labelled)
         return inlier, mean, std
 

@@ -272,6 +272,8 @@ def estimate_surface(
     work in.
     """
     share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     sigma_f, sigma_n, gate_noise = scales[0], scales[1], scales[2]
     own_mean, own_std = own_surface[0], own_surface[1]
     n_segments = len(mean)

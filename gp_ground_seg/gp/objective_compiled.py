@@ -42,6 +42,8 @@ def objective_rows(
     ``values[m]`` and ``gradients[m]`` are set, in one stage; see `gp_ground_seg.meeting`.
     """
     share = enlist(board, share, n_shares)
+    if share < 0:
+        return
     n_blocks = (len(values) + BLOCK - 1) // BLOCK
     stage = np.int64(0)
     block = claim(board, stage, share, n_shares, n_blocks)
