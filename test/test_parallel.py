@@ -14,6 +14,7 @@ from gp_ground_seg.compiled import compiled
 from gp_ground_seg.instructions import pause
 from gp_ground_seg.meeting import (
     GIVEN_UP,
+    TO_FOLLOW,
     TO_JOIN,
     all_done,
     claim,
@@ -49,7 +50,7 @@ def add(share, n_shares, board, late_share, failing_share, n_done, result):
 
 
 @compiled
-def double(share, n_shares, board, late_share, before, after):
+def double(share, n_shares, board, stage, late_share, before, after):
     """Twice the numbers, in two stages of which the second needs all of the first."""
     share = enlist(board, share, n_shares)
     if share < 0:
@@ -57,7 +58,6 @@ def double(share, n_shares, board, late_share, before, after):
     if share == late_share:
         pause(20 * _MS)
     n_blocks = len(before)
-    stage = np.int64(0)
     block = claim(board, stage, share, n_shares, n_blocks)
     while block >= 0:
         before[block] += block
@@ -76,16 +76,32 @@ def double(share, n_shares, board, late_share, before, after):
 
 
 @compiled
-def hammer(n_calls, n_shares, board, before, after):
-    """Call `double` again and again without a pause; calls that did not do everything once."""
+def hammer(n_calls, n_shares, board, follows, before, after):
+    """Call `double` again and again without a pause; calls that did not do everything once.
+
+    If it `follows`, each time twice: the others go on to the second unasked.
+    """
     n_wrong, n_blocks = 0, len(before)
+    later_before, later_after = np.zeros_like(before), np.zeros_like(after)
+    first, second = np.int64(0), np.int64(2)
     for _ in range(n_calls):
         clear(board, n_shares)
         before[:], after[:] = 0.0, 0.0
-        double(np.int64(TO_JOIN), n_shares, board, NO_PAUSE, before, after)
+        later_before[:], later_after[:] = 0.0, 0.0
+        if follows:
+            later = np.int64(TO_FOLLOW)
+            double(later, n_shares, board, second, NO_PAUSE, later_before, later_after)
+        double(np.int64(TO_JOIN), n_shares, board, first, NO_PAUSE, before, after)
+        if follows:
+            double(np.int64(0), n_shares, board, second, NO_PAUSE, later_before, later_after)
         dismiss(board, n_shares)
+        wanted = n_blocks - 1
         for block in range(n_blocks):
-            if before[block] != block or after[block, 0] != n_blocks - 1:
+            later_wanted = wanted if follows else 0
+            if before[block] != block or after[block, 0] != wanted:
+                n_wrong += 1
+                break
+            if later_after[block, 0] != later_wanted:
                 n_wrong += 1
                 break
     return n_wrong
@@ -116,7 +132,7 @@ def test_each_block_of_each_stage_is_done_once_and_before_the_next_stage(n_threa
     pool = RowPool(n_threads)
     for late in (NOBODY, 0, n_threads - 1):
         before, after = np.zeros(n_blocks), np.zeros((n_blocks, 2))
-        pool.run(double, n_threads, late, before, after)
+        pool.run(double, n_threads, 0, late, before, after)
         np.testing.assert_array_equal(before, np.arange(n_blocks))
         np.testing.assert_array_equal(after[:, 0], n_blocks - 1)
     pool.close()
@@ -132,7 +148,7 @@ def test_others_take_their_part(pool):
 def test_who_did_how_much_is_known(pool):
     team = pool.team(3)
     before, after = np.zeros(200), np.zeros((200, 2))
-    team.run(double, NOBODY, before, after)
+    team.run(double, 0, NOBODY, before, after)
     for stage in range(2):
         numbers = [n_taken(team.board, stage, share, 3) for share in range(3)]
         assert sum(numbers) == 200
@@ -144,17 +160,19 @@ def test_nobody_waits_for_threads_that_do_not_wake():
     team = Team(meeting.make_board(2, 3), 3)
     before, after = np.zeros(20), np.zeros((20, 2))
     for k in range(1, 3):
-        team.run(double, NOBODY, before, after)
+        team.run(double, 0, NOBODY, before, after)
         np.testing.assert_array_equal(before, k * np.arange(20))
         team = Team(team.board, 3)
 
 
 @pytest.mark.parametrize('n_threads', [2, 3, 5])
 @pytest.mark.parametrize('n_blocks', [1, 3, 60])
-def test_calls_that_follow_at_once_do_not_get_in_each_others_way(n_threads, n_blocks):
+@pytest.mark.parametrize('follows', [False, True])
+def test_calls_that_follow_at_once_do_not_get_in_each_others_way(n_threads, n_blocks, follows):
     """Workers come while one call ends and the next begins, some of them for the one before."""
     pool, n_wrong = RowPool(n_threads), []
-    arguments = pool.team(n_threads).board, np.zeros(n_blocks), np.zeros((n_blocks, 2))
+    board = pool.team(n_threads).board
+    arguments = board, follows, np.zeros(n_blocks), np.zeros((n_blocks, 2))
     # In a thread of its own: if one waits for ever, it is not this one.
     calls = threading.Thread(
         target=lambda: n_wrong.append(hammer(20_000, n_threads, *arguments)), daemon=True
@@ -168,7 +186,7 @@ def test_calls_that_follow_at_once_do_not_get_in_each_others_way(n_threads, n_bl
 def test_who_comes_when_all_is_over_finds_nothing_to_do():
     board = meeting.make_board(2, 2)
     before, after = np.zeros(20), np.zeros((20, 2))
-    Team(board, 2).run(double, NOBODY, before, after)
+    Team(board, 2).run(double, 0, NOBODY, before, after)
     late = threading.Thread(target=meeting.serve, args=(board, 1, 2))
     late.start()
     time.sleep(0.05)
@@ -186,7 +204,7 @@ def test_others_go_on_with_what_the_caller_takes_part_in_later(n_threads, late):
     team = pool.team(n_threads)
     before, after = np.zeros(20), np.zeros((20, 2))
     n_done, result = np.zeros(n_threads, dtype=np.int64), np.zeros(30, dtype=np.int64)
-    team.begin(double, (late, before, after), add, (NOBODY, NOBODY, n_done, result))
+    team.begin(double, (0, late, before, after), add, (NOBODY, NOBODY, n_done, result))
     np.testing.assert_array_equal(after[:, 0], 19)
     if n_threads > 1:
         deadline = time.monotonic() + 10.0
@@ -203,7 +221,7 @@ def test_others_go_on_with_what_the_caller_takes_part_in_later(n_threads, late):
 
 def test_what_was_begun_and_is_not_wanted_is_left_before_anything_else(pool):
     n_done, unwanted = np.zeros(3, dtype=np.int64), np.zeros(3000, dtype=np.int64)
-    first = NOBODY, np.zeros(5), np.zeros((5, 2))
+    first = 0, NOBODY, np.zeros(5), np.zeros((5, 2))
     pool.team(3).begin(double, first, add, (NOBODY, NOBODY, n_done, unwanted))
     _, result = run_add(pool)
     np.testing.assert_array_equal(result, 1)
@@ -221,10 +239,10 @@ def test_arrays_are_lent_and_given_back(pool):
     n_references = sys.getrefcount(result)
     for _ in range(20):
         team = pool.team(3)
-        first = NOBODY, np.zeros(5), np.zeros((5, 2))
+        first = 0, NOBODY, np.zeros(5), np.zeros((5, 2))
         team.begin(double, first, add, (NOBODY, NOBODY, n_done, result))
         team.dismiss()
-        team.run(double, NOBODY, np.zeros(5), np.zeros((5, 2)))
+        team.run(double, 0, NOBODY, np.zeros(5), np.zeros((5, 2)))
     pool.team(3)
     del team
     assert sys.getrefcount(result) == n_references
@@ -251,15 +269,19 @@ def test_an_error_in_any_share_is_raised_and_the_pool_goes_on(pool, failing, err
     np.testing.assert_array_equal(n_done, 1)
 
 
-def test_an_error_in_the_second_work_is_raised_when_that_is_to_be_finished(pool):
-    for failing, error in ((0, ValueError), (1, RuntimeError)):
+def test_an_error_in_the_second_work_is_raised_and_the_pool_goes_on(pool):
+    def do_both(failing):
         n_done, result = np.zeros(3, dtype=np.int64), np.zeros(3000, dtype=np.int64)
-        first = NOBODY, np.zeros(5), np.zeros((5, 2))
+        first = 0, NOBODY, np.zeros(5), np.zeros((5, 2))
         team = pool.team(3)
+        # Of another thread's it may be known before the caller comes to that work.
         team.begin(double, first, add, (0, failing, n_done, result))
+        team.finish()
+
+    for failing, error in ((0, ValueError), (1, RuntimeError)):
         with pytest.raises(error):
-            team.finish()
-    n_done, result = run_add(pool, n_blocks=300)
+            do_both(failing)
+    _, result = run_add(pool, n_blocks=300)
     np.testing.assert_array_equal(result, 1)
 
 
