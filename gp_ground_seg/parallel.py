@@ -23,7 +23,7 @@ from gp_ground_seg.meeting import (
 )
 
 MOST_STAGES = 6
-"""Stages of the longest work that is shared out."""
+"""Stages of the longest works that follow one another."""
 FEWEST_POINTS = 4096
 """Points below which sharing out costs more than it saves."""
 MOST_UNASKED = 4
@@ -85,11 +85,13 @@ class Team:
         self._rest = lambda: call(second, 0, second_arguments)
         self._take_part(begin, others_go_on=True)
 
-    def finish(self) -> None:
-        """Take part in the second work, if it is still to be done, until all of it is."""
+    def finish(self) -> bool:
+        """Take part in the second work until all of it is done; False if it was dismissed."""
         rest, self._rest = self._rest, None
-        if rest is not None:
-            self._take_part(rest)
+        if rest is None:
+            return False
+        self._take_part(rest)
+        return True
 
     def dismiss(self) -> None:
         """Wait until no worker is at it any more, whether or not all of it is done."""

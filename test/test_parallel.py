@@ -96,12 +96,10 @@ def hammer(n_calls, n_shares, board, follows, before, after):
             double(np.int64(0), n_shares, board, second, NO_PAUSE, later_before, later_after)
         dismiss(board, n_shares)
         wanted = n_blocks - 1
+        later_wanted = wanted if follows else 0
         for block in range(n_blocks):
-            later_wanted = wanted if follows else 0
-            if before[block] != block or after[block, 0] != wanted:
-                n_wrong += 1
-                break
-            if later_after[block, 0] != later_wanted:
+            is_done = before[block] == block and after[block, 0] == wanted
+            if not is_done or later_after[block, 0] != later_wanted:
                 n_wrong += 1
                 break
     return n_wrong

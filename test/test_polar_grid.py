@@ -328,6 +328,8 @@ def test_what_a_scan_leaves_in_the_tables_does_not_show_in_the_next(n_threads):
             found = backend.sort_points(xyz, config, workspace, seeks_faces)
             if not are_wanted:
                 found.drop_faces()
+                with pytest.raises(RuntimeError, match='dropped'):
+                    found.find_faces()
                 continue
             fresh = CompiledBackend(1).sort_points(xyz, config, Workspace())
             faces, same = found.find_faces(), fresh.find_faces()

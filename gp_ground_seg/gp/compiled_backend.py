@@ -144,7 +144,8 @@ class CompiledBackend:
 
         @cache
         def find() -> Faces:
-            team.finish()
+            if not team.finish():
+                raise RuntimeError('faces are wanted that were dropped')
             tiles = Tiles(tile, tile_extremes[0, :-1], touched[0, 1 : 1 + touched[0, 0]])
             return Faces(tiles, is_face, is_footless)
 
@@ -172,8 +173,13 @@ class CompiledBackend:
     def label_points(self, task: LabelTask, surface: GroundSurface) -> Labelled:
         """Height, label and margin of each point; roughness of each bin."""
         begun, self._begun = self._begun, None
-        if begun is not None and begun.task is task and begun.mean is surface.mean:
-            begun.team.finish()
+        if (
+            begun is not None
+            and begun.task is task
+            and begun.mean is surface.mean
+            # Not so if the threads were called for something else in between.
+            and begun.team.finish()
+        ):
             return begun.labelled
         labelled, arguments = self._to_label(task, surface.knots, surface.mean)
         self._pool.run(label_scan, self._pool.n_shares(len(task.xyz)), *arguments)
