@@ -6,10 +6,10 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gp_ground_seg.config import Config
     from gp_ground_seg.errors import ConfigError, GroundSegError, PointCloudError
-    from gp_ground_seg.labels import Label
-    from gp_ground_seg.segmentation import Segmentation
+    from gp_ground_seg.frame import Label
+    from gp_ground_seg.parameters.config import Config
+    from gp_ground_seg.result import Segmentation
     from gp_ground_seg.segmenter import GroundSegmenter
 
 __version__ = '0.1.0'
@@ -26,13 +26,13 @@ __all__ = [
 ]
 
 _MODULES = {
-    'Config': 'config',
+    'Config': 'parameters.config',
     'ConfigError': 'errors',
     'GroundSegError': 'errors',
     'GroundSegmenter': 'segmenter',
-    'Label': 'labels',
+    'Label': 'frame',
     'PointCloudError': 'errors',
-    'Segmentation': 'segmentation',
+    'Segmentation': 'result',
 }
 
 

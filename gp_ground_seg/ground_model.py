@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.polar_grid import FloatArray
-from gp_ground_seg.segmentation import Segmentation
-from gp_ground_seg.tilt import rotation
+from gp_ground_seg.frame import FloatArray
+from gp_ground_seg.pipeline.tilt import rotation
+from gp_ground_seg.result import Segmentation
 
 N_ITERATIONS = 12
 """Steps along the z axis of a tilted frame to the ground; each leaves slope times tangent of

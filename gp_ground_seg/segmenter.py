@@ -9,21 +9,20 @@ from dataclasses import dataclass
 
 import numpy.typing as npt
 
-from gp_ground_seg.blas import single_threaded_blas
-from gp_ground_seg.config import Config, SensorConfig
-from gp_ground_seg.gp.backend import Backend, make_backend
+from gp_ground_seg.backend import Backend, make_backend
+from gp_ground_seg.compiled.workspace import Workspace
+from gp_ground_seg.frame import Candidates, FloatArray, GroundSurface, PointArray
+from gp_ground_seg.gp.blas import single_threaded_blas
 from gp_ground_seg.gp.frame_model import FrameModel
 from gp_ground_seg.gp.learning import Learned
-from gp_ground_seg.labelling import LabelTask
-from gp_ground_seg.points import take_points
-from gp_ground_seg.polar_grid import Candidates, FloatArray, PointArray
-from gp_ground_seg.segmentation import Fitting, Segmentation
-from gp_ground_seg.sensor_pose import SensorPose, estimate_pose, given_pose
-from gp_ground_seg.sorted_points import SortedPoints
-from gp_ground_seg.surface import GroundSurface
-from gp_ground_seg.tilt import turned_sample
+from gp_ground_seg.parameters.config import Config, SensorConfig
+from gp_ground_seg.pipeline.labelling import LabelTask
+from gp_ground_seg.pipeline.points import take_points
+from gp_ground_seg.pipeline.sensor_pose import SensorPose, estimate_pose, given_pose
+from gp_ground_seg.pipeline.sorted_points import SortedPoints
+from gp_ground_seg.pipeline.tilt import turned_sample
+from gp_ground_seg.result import Fitting, Segmentation
 from gp_ground_seg.timing import StageTimer
-from gp_ground_seg.workspace import Workspace
 
 
 @dataclass(frozen=True)

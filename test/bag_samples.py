@@ -4,7 +4,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gp_ground_seg.datasets.bags import (
+from gp_ground_seg.data.bags import (
     BagWriter,
     CloudMessage,
     PointField,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from gp_ground_seg.gp.compiled_backend import CompiledBackend
+from gp_ground_seg.compiled.backend import CompiledBackend
 
 # How long an example takes says more of the machine than of the code.
 settings.register_profile('default', deadline=None)
@@ -51,7 +51,7 @@ def hilly_scan(n_points: int = 4000, seed: int = 0, sensor_height: float = 1.73)
 def sharing(n_threads: int) -> Iterator[CompiledBackend]:
     """Backend whose threads share out even the smallest clouds."""
     backend = CompiledBackend(n_threads)
-    with patch('gp_ground_seg.parallel.FEWEST_POINTS', 1):
+    with patch('gp_ground_seg.compiled.parallel.FEWEST_POINTS', 1):
         yield backend
     backend.close()
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gp_ground_seg.evaluation.semantic_classes import SemanticClass
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

@@ -19,17 +19,17 @@ from gp_ground_seg.cli import ablation as command
 from gp_ground_seg.cli.leave_out import split_settings
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import config_from_options
-from gp_ground_seg.datasets.semantic_kitti import read_labels, read_points
-from gp_ground_seg.datasets.simulator import HDL_64E, SCENES, simulate_scan
+from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import ablation as runner
 from gp_ground_seg.evaluation import ablation_synthetic as synthetic
-from gp_ground_seg.evaluation.ablation import METHODS, ablate, open_segmenters
-from gp_ground_seg.evaluation.ablation_synthetic import STRETCHES, ablate_synthetic
 from gp_ground_seg.evaluation.conventions import GROUNDGRID
 from gp_ground_seg.evaluation.evaluate import labelled_frames
 from gp_ground_seg.evaluation.height_error import height_error, pool_height_errors
 from gp_ground_seg.evaluation.scores import count_confusion
+from gp_ground_seg.experiments.ablation import METHODS, ablate, open_segmenters
+from gp_ground_seg.experiments.ablation_synthetic import STRETCHES, ablate_synthetic
+from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_scan
 
 
 def run(*words):

@@ -16,8 +16,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gp_ground_seg.datasets.bag_writer import is_bag_folder
-from gp_ground_seg.datasets.bags import (
+from gp_ground_seg.data.atomic_output import leftovers, staged_files
+from gp_ground_seg.data.bag_writer import is_bag_folder
+from gp_ground_seg.data.bags import (
     POINT_CLOUD2,
     BagWriter,
     cloud_from_columns,
@@ -29,7 +30,6 @@ from gp_ground_seg.datasets.bags import (
     open_bag,
     resolve_storage,
 )
-from gp_ground_seg.datasets.staging import leftovers, staged_files
 from gp_ground_seg.errors import DataError, PointCloudError
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
@@ -605,7 +605,7 @@ def test_without_rosbags_the_error_says_what_to_install(tmp_path):
     code = (
         'import sys\n'
         'sys.modules["rosbags"] = None\n'
-        'from gp_ground_seg.datasets import bags\n'
+        'from gp_ground_seg.data import bags\n'
         'from gp_ground_seg.errors import MissingDependencyError\n'
         'for call in (bags.open_bag, bags.BagWriter, bags.decode_cloud):\n'
         '    try:\n'

@@ -12,7 +12,6 @@ from test_objective import N_CLASSES, THETAS, TYPICAL
 from test_objective import random_frame as random_training_frame
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.config import GrowthConfig
 from gp_ground_seg.gp import numpy_backend
 from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
@@ -20,6 +19,7 @@ from gp_ground_seg.gp.growth import grow_surface_reference
 from gp_ground_seg.gp.latent import latent_rows_reference
 from gp_ground_seg.gp.objective import objective_reference
 from gp_ground_seg.gp.padding import SEGMENTS_PER_BATCH, Padded, batches
+from gp_ground_seg.parameters.config import GrowthConfig
 
 SEEDS = st.integers(0, 100_000)
 # None, some, and more than go into one batch.

@@ -9,12 +9,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from gp_ground_seg import Label
-from gp_ground_seg.errors import (
-    ConfigError,
-    DataError,
-    MissingDependencyError,
-    PointCloudError,
-)
+from gp_ground_seg.errors import ConfigError, DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.plotting import birds_eye, canvas
 from gp_ground_seg.plotting.birds_eye import plot_birds_eye
 

@@ -17,12 +17,7 @@ from test_cli_evaluate import run, table
 
 from gp_ground_seg import Label
 from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.evaluation.calibration import (
-    BIN_EDGES,
-    N_BINS,
-    THRESHOLDS,
-    count_calibration,
-)
+from gp_ground_seg.evaluation.calibration import BIN_EDGES, N_BINS, THRESHOLDS, count_calibration
 from gp_ground_seg.evaluation.evaluate import evaluate, labelled_frames
 from gp_ground_seg.evaluation.methods import OurMethod
 from gp_ground_seg.evaluation.scores import count_confusion

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config
+from gp_ground_seg.compiled.line_passes import find_lines_compiled
+from gp_ground_seg.frame import Candidates
 from gp_ground_seg.gp.numpy_backend import NumpyBackend
-from gp_ground_seg.line_bends import candidates_that_follow
-from gp_ground_seg.line_extraction import extract_lines, turns
-from gp_ground_seg.line_passes import find_lines_compiled
-from gp_ground_seg.polar_grid import Candidates
+from gp_ground_seg.pipeline.line_bends import candidates_that_follow
+from gp_ground_seg.pipeline.line_extraction import extract_lines, turns
 
 N_TILES = 50
 CONFIG = Config().replace(**{'lines.max_gap': 6.0, 'growth.min_bend_extent': 3.0})

@@ -20,9 +20,9 @@ from gp_ground_seg.cli.demo_node import NodeProcess, private_network
 from gp_ground_seg.cli.demo_tally import BACKLOG, GROUND, OBSTACLES, Tally
 from gp_ground_seg.cli.demo_text import result_text
 from gp_ground_seg.cli.main import main
-from gp_ground_seg.datasets.bags import decode_cloud, encode_cloud, open_bag
+from gp_ground_seg.data.bags import decode_cloud, encode_cloud, open_bag
 from gp_ground_seg.errors import GroundSegError, PointCloudError
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 from gp_ground_seg.ros import transport
 
 REPOSITORY = Path(__file__).parents[1]

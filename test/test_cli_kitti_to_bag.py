@@ -12,7 +12,7 @@ import pytest
 from rosbags.interfaces import QosReliability
 
 from gp_ground_seg.cli.kitti_to_bag import EPOCH
-from gp_ground_seg.datasets.bags import POINT_CLOUD2, decode_cloud, open_bag
+from gp_ground_seg.data.bags import POINT_CLOUD2, decode_cloud, open_bag
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 KITTI = Path(os.environ.get('GP_GROUND_SEG_KITTI', REPOSITORY.parent / 'shared' / 'kitti'))

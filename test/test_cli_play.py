@@ -24,7 +24,7 @@ from sensor_msgs.msg import PointCloud2
 from gp_ground_seg.cli import notes
 from gp_ground_seg.cli import play as cli_play
 from gp_ground_seg.cli.main import main
-from gp_ground_seg.datasets.bags import decode_cloud, open_bag
+from gp_ground_seg.data.bags import decode_cloud, open_bag
 from gp_ground_seg.ros import delivery, player, transport
 from gp_ground_seg.ros.session import ros_session
 

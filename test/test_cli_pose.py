@@ -12,16 +12,9 @@ from cli_runner import error_line, run
 
 from gp_ground_seg import Config
 from gp_ground_seg.cli.main import build_parser
-from gp_ground_seg.datasets.semantic_kitti import list_frames, list_sequences
-from gp_ground_seg.datasets.simulator import (
-    HDL_64E,
-    SCENES,
-    VLP_16,
-    simulate_scan,
-    write_semantic_kitti,
-)
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.pose_trials import (
+from gp_ground_seg.experiments.pose_trials import (
     AXES_UP,
     FOUND,
     HEIGHTS,
@@ -33,7 +26,8 @@ from gp_ground_seg.evaluation.pose_trials import (
     check_simulated,
     pooled,
 )
-from gp_ground_seg.tilt import rotation
+from gp_ground_seg.pipeline.tilt import rotation
+from gp_ground_seg.simulation import HDL_64E, SCENES, VLP_16, simulate_scan, write_semantic_kitti
 
 SMALL = dataclasses.replace(HDL_64E, n_columns=500)
 FIXED = Config().replace(**{'learning.mode': 'fixed'})

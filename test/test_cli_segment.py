@@ -16,13 +16,7 @@ import numpy as np
 import pytest
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.datasets.bags import (
-    BagWriter,
-    cloud_topic,
-    decode_cloud,
-    encode_cloud,
-    open_bag,
-)
+from gp_ground_seg.data.bags import BagWriter, cloud_topic, decode_cloud, encode_cloud, open_bag
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 KITTI = Path(os.environ.get('GP_GROUND_SEG_KITTI', REPOSITORY.parent / 'shared' / 'kitti'))

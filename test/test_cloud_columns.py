@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.datasets.cloud_columns import append_columns, read_columns
+from gp_ground_seg.data.cloud_columns import append_columns, read_columns
 from gp_ground_seg.errors import PointCloudError
 
 CODES = {1: 'b', 2: 'B', 3: 'h', 4: 'H', 5: 'i', 6: 'I', 7: 'f', 8: 'd'}

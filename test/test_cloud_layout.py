@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg.datasets.cloud_layout import read_xyz, select_rows
+from gp_ground_seg.data.cloud_layout import read_xyz, select_rows
 from gp_ground_seg.errors import PointCloudError
 
 FLOAT32, FLOAT64, UINT16 = 7, 8, 4

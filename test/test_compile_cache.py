@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 
 pytest.importorskip('numba', reason='there is no compiled code without numba')
 
-from gp_ground_seg import Config, GroundSegmenter, instructions, meeting
-from gp_ground_seg.compile_cache import digest
-from gp_ground_seg.compiled import compiled_signatures
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.compiled import instructions, meeting
+from gp_ground_seg.compiled.compile_cache import digest
+from gp_ground_seg.jit import compiled_signatures
 
 CONSTANT = 'FACTOR = {factor}\n'
 CALLEE = """

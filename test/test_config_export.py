@@ -11,16 +11,16 @@ from hypothesis import given, settings
 
 from gp_ground_seg import Config
 from gp_ground_seg.cli import config as command
-from gp_ground_seg.config import parameter_specs
-from gp_ground_seg.config_export import (
+from gp_ground_seg.errors import ConfigError, DataError
+from gp_ground_seg.parameters.config import parameter_specs
+from gp_ground_seg.parameters.export import (
     README_BEGIN,
     README_END,
     replace_readme_table,
     to_markdown_table,
     to_yaml,
 )
-from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.presets import PRESETS
+from gp_ground_seg.parameters.presets import PRESETS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

@@ -6,10 +6,10 @@ import threading
 import numpy as np
 import pytest
 
-from gp_ground_seg.compiled import compiled
-from gp_ground_seg.cores import OutOfTheWay, own_core, usable_cores
-from gp_ground_seg.meeting import all_done, claim, enlist
-from gp_ground_seg.parallel import RowPool
+from gp_ground_seg.compiled.cores import OutOfTheWay, own_core, usable_cores
+from gp_ground_seg.compiled.meeting import all_done, claim, enlist
+from gp_ground_seg.compiled.parallel import RowPool
+from gp_ground_seg.jit import compiled
 
 
 @pytest.fixture
@@ -40,14 +40,14 @@ def test_a_thread_knows_its_core(own_affinity):
 
 def test_workers_use_any_core_but_that_of_the_caller(monkeypatch):
     given = {}
-    monkeypatch.setattr('gp_ground_seg.cores.usable_cores', lambda: {0, 1, 2, 5})
+    monkeypatch.setattr('gp_ground_seg.compiled.cores.usable_cores', lambda: {0, 1, 2, 5})
     monkeypatch.setattr(
         os, 'sched_setaffinity', lambda thread, cores: given.update({thread: cores})
     )
     own = threading.current_thread()
     away = OutOfTheWay([own])
     for core, others in ((1, {0, 2, 5}), (5, {0, 1, 2})):
-        monkeypatch.setattr('gp_ground_seg.cores.own_core', lambda core=core: core)
+        monkeypatch.setattr('gp_ground_seg.compiled.cores.own_core', lambda core=core: core)
         away.leave_own_core()
         assert given == {own.native_id: others}
         given.clear()
@@ -58,8 +58,8 @@ def test_workers_use_any_core_but_that_of_the_caller(monkeypatch):
 @pytest.mark.parametrize('cores', [{3}, {3, 4}])
 def test_nobody_moves_together_for_one_who_wants_a_core_alone(monkeypatch, cores):
     given = []
-    monkeypatch.setattr('gp_ground_seg.cores.usable_cores', lambda: cores)
-    monkeypatch.setattr('gp_ground_seg.cores.own_core', lambda: 3)
+    monkeypatch.setattr('gp_ground_seg.compiled.cores.usable_cores', lambda: cores)
+    monkeypatch.setattr('gp_ground_seg.compiled.cores.own_core', lambda: 3)
     monkeypatch.setattr(os, 'sched_setaffinity', lambda *call: given.append(call))
     OutOfTheWay([threading.current_thread()] * 2).leave_own_core()
     assert not given
@@ -68,7 +68,7 @@ def test_nobody_moves_together_for_one_who_wants_a_core_alone(monkeypatch, cores
 def test_threads_that_are_gone_are_let_be(monkeypatch):
     """As in a forked process: the threads by those numbers are its parent's."""
     given = []
-    monkeypatch.setattr('gp_ground_seg.cores.usable_cores', lambda: {0, 1, 2, 5})
+    monkeypatch.setattr('gp_ground_seg.compiled.cores.usable_cores', lambda: {0, 1, 2, 5})
     monkeypatch.setattr(os, 'sched_setaffinity', lambda *call: given.append(call))
     gone = threading.Thread(target=str)
     gone.start()

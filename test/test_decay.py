@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.gp.decay import NEGLIGIBLE_EXPONENT, decay
+from gp_ground_seg.compiled.decay import NEGLIGIBLE_EXPONENT, decay
 
 
 @given(st.floats(0.0, 1e300))

@@ -22,18 +22,12 @@ from gp_ground_seg.cli.demo_check import check_scan
 from gp_ground_seg.cli.demo_frames import numbered_cloud
 from gp_ground_seg.cli.demo_node import NodeProcess, private_network
 from gp_ground_seg.cli.demo_tally import GROUND, OBSTACLES, OUTPUTS
-from gp_ground_seg.datasets.bags import (
-    BagWriter,
-    cloud_topic,
-    decode_cloud,
-    encode_cloud,
-    open_bag,
-)
-from gp_ground_seg.datasets.simulator import HDL_64E, SCENES, simulate_drive
-from gp_ground_seg.datasets.simulator.kinds import semantic_kitti_labels
+from gp_ground_seg.data.bags import BagWriter, cloud_topic, decode_cloud, encode_cloud, open_bag
 from gp_ground_seg.ros.receiver import OutputReceiver
 from gp_ground_seg.ros.session import ros_session
 from gp_ground_seg.ros.transport import large_cloud_transport
+from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_drive
+from gp_ground_seg.simulation.kinds import semantic_kitti_labels
 
 INPUT = '/points'
 COMMAND = (sys.executable, '-m', 'gp_ground_seg')

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.datasets.semantic_kitti import read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation.conventions import (
     CONVENTIONS,

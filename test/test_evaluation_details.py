@@ -15,7 +15,7 @@ from matplotlib.image import imread
 from test_cli_evaluate import run, table
 
 from gp_ground_seg import Label
-from gp_ground_seg.datasets.semantic_kitti import Frame, read_points
+from gp_ground_seg.data.semantic_kitti import Frame, read_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation.class_errors import class_errors
 from gp_ground_seg.evaluation.conventions import GROUNDGRID, PATCHWORK

@@ -3,10 +3,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg.config import FacesConfig, GridConfig
-from gp_ground_seg.faces import find_faces, uprightness
-from gp_ground_seg.polar_grid import OUTSIDE, build_polar_grid
-from gp_ground_seg.tiles import build_tiles
+from gp_ground_seg.frame import OUTSIDE
+from gp_ground_seg.parameters.config import FacesConfig, GridConfig
+from gp_ground_seg.pipeline.faces import find_faces, uprightness
+from gp_ground_seg.pipeline.polar_grid import build_polar_grid
+from gp_ground_seg.pipeline.tiles import build_tiles
 
 GRID = GridConfig(r_max=30.0)
 

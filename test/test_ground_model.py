@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.length_scale_colours import UNKNOWN, length_scale_colours
-from gp_ground_seg.tilt import rotation
+from gp_ground_seg.pipeline.tilt import rotation
+from gp_ground_seg.plotting.length_scale_colours import UNKNOWN, length_scale_colours
 
 # No neighbours, so that segments without a model stay without one; r_min of 0 is the hard case.
 CONFIGS = [

@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg.config import GrowthConfig
+from gp_ground_seg.compiled.growth_compiled import grow_surface_compiled
 from gp_ground_seg.gp.growth import grow_surface_reference
-from gp_ground_seg.gp.growth_compiled import grow_surface_compiled
+from gp_ground_seg.parameters.config import GrowthConfig
 
 KNOTS = np.linspace(2.0, 60.0, 30)
 

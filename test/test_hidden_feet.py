@@ -7,15 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.config import FacesConfig, GridConfig, LabelConfig
-from gp_ground_seg.faces import Faces, find_faces
+from gp_ground_seg.compiled.workspace import Workspace
+from gp_ground_seg.frame import Faces, Label, Tiles
 from gp_ground_seg.gp.numpy_backend import NumpyBackend
-from gp_ground_seg.labelling import label_points
-from gp_ground_seg.labels import Label
-from gp_ground_seg.points import in_columns
-from gp_ground_seg.polar_grid import build_polar_grid, ground_candidates, reduce_cells
-from gp_ground_seg.tiles import Tiles, build_tiles
-from gp_ground_seg.workspace import Workspace
+from gp_ground_seg.parameters.config import FacesConfig, GridConfig, LabelConfig
+from gp_ground_seg.pipeline.faces import find_faces
+from gp_ground_seg.pipeline.labelling import label_points
+from gp_ground_seg.pipeline.points import in_columns
+from gp_ground_seg.pipeline.polar_grid import build_polar_grid, ground_candidates, reduce_cells
+from gp_ground_seg.pipeline.tiles import build_tiles
 
 GRID = GridConfig(r_max=30.0)
 CORNER = np.array([10.0, 5.0, 0.0])

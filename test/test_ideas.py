@@ -11,9 +11,9 @@ from gp_ground_seg.cli import ideas as command
 from gp_ground_seg.cli.ideas import parse_idea
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import ablation as runner
-from gp_ground_seg.evaluation.ablation import ablate
 from gp_ground_seg.evaluation.evaluate import labelled_frames
-from gp_ground_seg.evaluation.ideas import IDEAS, Idea, weigh_ideas
+from gp_ground_seg.experiments.ablation import ablate
+from gp_ground_seg.experiments.ideas import IDEAS, Idea, weigh_ideas
 
 
 def run(*words):

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.datasets.semantic_kitti import (
-    list_frames,
-    list_sequences,
-    read_labels,
-    read_points,
-)
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_labels, read_points
 
 GROUND_CLASSES = [40, 44, 48, 49, 60, 72]
 LEFT_OUT = [0, 1, 70]

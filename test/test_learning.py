@@ -5,7 +5,7 @@ import pytest
 from conftest import hilly_scan
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.gp.compiled_backend import CompiledBackend
+from gp_ground_seg.compiled.backend import CompiledBackend
 from gp_ground_seg.gp.kernels import paciorek
 from gp_ground_seg.gp.latent import log_length_scale
 from gp_ground_seg.gp.learning import learn

@@ -14,15 +14,15 @@ from gp_ground_seg.cli import leave_out as command
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import leave_out as runner
 from gp_ground_seg.evaluation.evaluate import evaluate, labelled_frames
-from gp_ground_seg.evaluation.leave_out import (
+from gp_ground_seg.evaluation.methods import OurMethod
+from gp_ground_seg.evaluation.scores import Confusion
+from gp_ground_seg.experiments.leave_out import (
     ConfigScorer,
     SequenceScore,
     coordinate_search,
     leave_one_out,
     pool,
 )
-from gp_ground_seg.evaluation.methods import OurMethod
-from gp_ground_seg.evaluation.scores import Confusion
 
 GRID = {'a': [0, 1, 2], 'b': [0, 1, 2]}
 

@@ -1,14 +1,13 @@
 import numpy as np
 import pytest
 
-from gp_ground_seg.config import LengthScaleConfig
-from gp_ground_seg.length_scale import (
+from gp_ground_seg.frame import Candidates, Lines
+from gp_ground_seg.parameters.config import LengthScaleConfig
+from gp_ground_seg.pipeline.length_scale import (
     candidate_log_length_scale,
     interpolate_along_segments,
     line_gradient_length_scale,
 )
-from gp_ground_seg.line_extraction import Lines
-from gp_ground_seg.polar_grid import Candidates
 
 CANDIDATES = Candidates(
     r=np.array([2.0, 4.0, 8.0, 5.0]),

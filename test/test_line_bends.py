@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from gp_ground_seg import GroundSegmenter
-from gp_ground_seg.config import LinesConfig
-from gp_ground_seg.evaluation.scene_scores import SceneScan
-from gp_ground_seg.line_bends import set_off_at_bend
-from gp_ground_seg.line_extraction import extract_lines
-from gp_ground_seg.polar_grid import Candidates
-from gp_ground_seg.presets import find_preset
+from gp_ground_seg.experiments.scene_scores import SceneScan
+from gp_ground_seg.frame import Candidates
+from gp_ground_seg.parameters.config import LinesConfig
+from gp_ground_seg.parameters.presets import find_preset
+from gp_ground_seg.pipeline.line_bends import set_off_at_bend
+from gp_ground_seg.pipeline.line_extraction import extract_lines
 
 ROAD = np.array([3.0, 4.0, 5.0, 6.6, 9.2, 15.0])
 SPARSE = LinesConfig(max_gap=6.0, max_gap_growth=0.6)

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from gp_ground_seg.config import LinesConfig
-from gp_ground_seg.line_extraction import deming_slope, extract_lines
-from gp_ground_seg.polar_grid import Candidates
+from gp_ground_seg.frame import Candidates
+from gp_ground_seg.parameters.config import LinesConfig
+from gp_ground_seg.pipeline.line_extraction import deming_slope, extract_lines
 
 
 def one_segment(r, z, density=None):

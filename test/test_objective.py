@@ -6,13 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from gp_ground_seg.gp.compiled_backend import CompiledBackend
+from gp_ground_seg.compiled.backend import CompiledBackend
 from gp_ground_seg.gp.kernels import paciorek, squared_exponential
-from gp_ground_seg.gp.latent import (
-    latent_rows_compiled,
-    latent_rows_reference,
-    log_length_scale,
-)
+from gp_ground_seg.gp.latent import latent_rows_compiled, latent_rows_reference, log_length_scale
 from gp_ground_seg.gp.objective import TrainingFrame, objective_reference
 
 N_CLASSES = 4

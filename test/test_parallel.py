@@ -9,10 +9,9 @@ import weakref
 import numpy as np
 import pytest
 
-from gp_ground_seg import meeting
-from gp_ground_seg.compiled import compiled
-from gp_ground_seg.instructions import pause
-from gp_ground_seg.meeting import (
+from gp_ground_seg.compiled import meeting
+from gp_ground_seg.compiled.instructions import pause
+from gp_ground_seg.compiled.meeting import (
     GIVEN_UP,
     TO_FOLLOW,
     TO_JOIN,
@@ -23,7 +22,8 @@ from gp_ground_seg.meeting import (
     enlist,
     n_taken,
 )
-from gp_ground_seg.parallel import FEWEST_POINTS, MOST_UNASKED, RowPool, Team
+from gp_ground_seg.compiled.parallel import FEWEST_POINTS, MOST_UNASKED, RowPool, Team
+from gp_ground_seg.jit import compiled
 
 _MS = np.uint32(1000)
 NOBODY, NO_PAUSE = -9, -8

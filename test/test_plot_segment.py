@@ -15,17 +15,12 @@ from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.cli import plot_segment as command
-from gp_ground_seg.config import GridConfig
-from gp_ground_seg.errors import (
-    ConfigError,
-    DataError,
-    MissingDependencyError,
-    PointCloudError,
-)
+from gp_ground_seg.errors import ConfigError, DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.parameters.config import GridConfig
+from gp_ground_seg.pipeline.polar_grid import build_polar_grid
 from gp_ground_seg.plotting import segment_view
 from gp_ground_seg.plotting.segment_profile import plot_segment, segment_at
 from gp_ground_seg.plotting.segment_view import SegmentView, line_ends
-from gp_ground_seg.polar_grid import build_polar_grid
 
 SEGMENT = 90
 ROAD, BUILDING, UNLABELLED = 40, 50, 0

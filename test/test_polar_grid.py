@@ -8,20 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.stride_tricks import as_strided
 
-from gp_ground_seg.config import Config, FacesConfig, GridConfig
-from gp_ground_seg.gp.compiled_backend import CompiledBackend
-from gp_ground_seg.points import flat_rows, in_columns, single_precision, take_points
-from gp_ground_seg.polar_grid import (
-    OUTSIDE,
+from gp_ground_seg.compiled.backend import CompiledBackend
+from gp_ground_seg.compiled.rulers import grid_rulers
+from gp_ground_seg.compiled.workspace import Workspace
+from gp_ground_seg.frame import OUTSIDE
+from gp_ground_seg.parameters.config import Config, FacesConfig, GridConfig
+from gp_ground_seg.pipeline.points import flat_rows, in_columns, single_precision, take_points
+from gp_ground_seg.pipeline.polar_grid import (
     bin_edges,
     build_polar_grid,
     ground_candidates,
     pseudo_angle,
     reduce_cells,
 )
-from gp_ground_seg.rulers import grid_rulers
-from gp_ground_seg.tiles import build_tiles
-from gp_ground_seg.workspace import Workspace
+from gp_ground_seg.pipeline.tiles import build_tiles
 
 MIN_EXTENT = Config().lines.min_density_extent
 

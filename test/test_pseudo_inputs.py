@@ -3,8 +3,9 @@ import pytest
 from conftest import hilly_scan
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.config import LatentConfig
-from gp_ground_seg.pseudo_inputs import N_CLASSES, classify_lines
+from gp_ground_seg.frame import N_CLASSES
+from gp_ground_seg.parameters.config import LatentConfig
+from gp_ground_seg.pipeline.pseudo_inputs import classify_lines
 
 
 def test_classes_by_slope_and_extent():

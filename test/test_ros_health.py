@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.config import DiagnosticsConfig
+from gp_ground_seg.parameters.config import DiagnosticsConfig
+from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.ros.health.health import Health
 from gp_ground_seg.ros.health.hysteresis import Hysteresis
 from gp_ground_seg.ros.health.input import InputFacts, InputStatistics
@@ -19,7 +20,6 @@ from gp_ground_seg.ros.health.processing import WINDOW, ProcessingStatistics
 from gp_ground_seg.ros.health.rate import WINDOW as RATE_WINDOW
 from gp_ground_seg.ros.health.rate import Rate, SequenceGaps
 from gp_ground_seg.ros.health.status import Level, Status
-from gp_ground_seg.sensor_pose import SensorPose
 
 LIMITS = DiagnosticsConfig(stale_after=2.0, max_latency=0.1)
 FACTS = InputFacts('/points', 'reliable, keep_last 5, volatile', n_publishers=1, ros_time=1000.5)

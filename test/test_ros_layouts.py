@@ -15,7 +15,7 @@ from ros_helpers import Collector, bench, street, wait_for
 from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.points import single_precision
+from gp_ground_seg.pipeline.points import single_precision
 from gp_ground_seg.ros.labelled import FIELDS, free_names
 
 HAS_ORACLE = importlib.util.find_spec('sensor_msgs_py') is not None

@@ -15,9 +15,9 @@ from rclpy.parameter import parameter_value_to_python
 from ros_helpers import bench, isolated_context, parameter_message, spinning, street, to_message
 
 from gp_ground_seg import Config
-from gp_ground_seg.config import parameter_specs
-from gp_ground_seg.config_check import file_problems
-from gp_ground_seg.presets import PRESETS
+from gp_ground_seg.parameters.check import file_problems
+from gp_ground_seg.parameters.config import parameter_specs
+from gp_ground_seg.parameters.presets import PRESETS
 from gp_ground_seg.ros.node import GroundSegmentationNode
 
 OWN = [spec.name for spec in parameter_specs()]

@@ -22,7 +22,7 @@ from ros_helpers import (
 )
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
-from gp_ground_seg.config import find_spec, parameter_specs
+from gp_ground_seg.parameters.config import find_spec, parameter_specs
 from gp_ground_seg.ros.node import GroundSegmentationNode, main
 
 TYPES = {

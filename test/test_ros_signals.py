@@ -23,7 +23,7 @@ from ros_helpers import (
     wait_for,
 )
 
-from gp_ground_seg.compiled import HAVE_NUMBA
+from gp_ground_seg.jit import HAVE_NUMBA
 
 BOTH = (signal.SIGINT, signal.SIGTERM)
 IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}', '-p', 'learning.mode:=fixed')

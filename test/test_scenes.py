@@ -10,20 +10,20 @@ import pytest
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.cli import scenes as command
-from gp_ground_seg.datasets.simulator import HDL_64E, SCENES, SENSORS, Kind, simulate_scan
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation import scene_scores
 from gp_ground_seg.evaluation.height_error import height_error
 from gp_ground_seg.evaluation.methods import PatchworkppMethod
-from gp_ground_seg.evaluation.scene_scores import (
+from gp_ground_seg.evaluation.scores import Confusion, count_confusion
+from gp_ground_seg.experiments import scene_scores
+from gp_ground_seg.experiments.scene_scores import (
     SENSOR_X,
     SceneScan,
     exact_labels,
     scene_scans,
     score_scenes,
 )
-from gp_ground_seg.evaluation.scores import Confusion, count_confusion
-from gp_ground_seg.presets import PRESETS
+from gp_ground_seg.parameters.presets import PRESETS
+from gp_ground_seg.simulation import HDL_64E, SCENES, SENSORS, Kind, simulate_scan
 
 
 def run(*words):

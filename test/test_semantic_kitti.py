@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gp_ground_seg.datasets.semantic_kitti import (
+from gp_ground_seg.data.semantic_kitti import (
     FRAME_PERIOD,
     list_frames,
     list_sequences,

@@ -11,20 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
-from gp_ground_seg.datasets.semantic_kitti import list_frames, list_sequences, read_points
-from gp_ground_seg.datasets.simulator import (
-    HDL_64E,
-    OS1_128,
-    SCENES,
-    VLP_16,
-    Scene,
-    landforms,
-    simulate_scan,
-)
-from gp_ground_seg.datasets.simulator.objects import floating_box, wall
-from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.low_cells import directions, low_cells
-from gp_ground_seg.plane_passes import (
+from gp_ground_seg.compiled.plane_passes import (
     ALLOWED,
     INVERSE,
     N_LARGEST,
@@ -35,10 +22,29 @@ from gp_ground_seg.plane_passes import (
     plane_below,
     tabulate,
 )
-from gp_ground_seg.points import check_points
-from gp_ground_seg.polar_grid import Candidates, build_polar_grid, ground_candidates, reduce_cells
-from gp_ground_seg.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT, SensorPose, estimate_pose
-from gp_ground_seg.tilt import angles_of, rotation, turned_sample
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
+from gp_ground_seg.frame import Candidates
+from gp_ground_seg.ground_model import GroundModel
+from gp_ground_seg.pipeline.low_cells import directions, low_cells
+from gp_ground_seg.pipeline.points import check_points
+from gp_ground_seg.pipeline.polar_grid import build_polar_grid, ground_candidates, reduce_cells
+from gp_ground_seg.pipeline.sensor_pose import (
+    CLEAR_TILT,
+    DEFAULT_HEIGHT,
+    SensorPose,
+    estimate_pose,
+)
+from gp_ground_seg.pipeline.tilt import angles_of, rotation, turned_sample
+from gp_ground_seg.simulation import (
+    HDL_64E,
+    OS1_128,
+    SCENES,
+    VLP_16,
+    Scene,
+    landforms,
+    simulate_scan,
+)
+from gp_ground_seg.simulation.objects import floating_box, wall
 
 FIXED = {'learning.mode': 'fixed'}
 SEGMENTER = GroundSegmenter(Config().replace(**FIXED))

@@ -7,13 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gp_ground_seg.datasets.semantic_kitti import (
-    list_frames,
-    list_sequences,
-    read_labels,
-    read_points,
-)
-from gp_ground_seg.datasets.simulator import (
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_labels, read_points
+from gp_ground_seg.errors import DataError
+from gp_ground_seg.simulation import (
     HDL_64E,
     SCENES,
     SEMANTIC_KITTI_CLASS,
@@ -21,7 +17,6 @@ from gp_ground_seg.datasets.simulator import (
     simulate_drive,
     write_semantic_kitti,
 )
-from gp_ground_seg.errors import DataError
 
 SENSOR = dataclasses.replace(HDL_64E, n_columns=180)
 

@@ -8,7 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from gp_ground_seg.datasets.simulator import (
+from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.simulation import (
     HDL_32E,
     HDL_64E,
     MID_360,
@@ -24,7 +25,6 @@ from gp_ground_seg.datasets.simulator import (
     simulate_drive,
     simulate_scan,
 )
-from gp_ground_seg.errors import ConfigError
 
 COARSE = dataclasses.replace(HDL_64E, n_columns=240)
 EXACT = dataclasses.replace(COARSE, range_std=0.0, dropout=0.0)

@@ -7,23 +7,21 @@ from conftest import sharing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg.config import Config, GridConfig, LabelConfig
-from gp_ground_seg.faces import Faces
+from gp_ground_seg.compiled.workspace import Workspace
+from gp_ground_seg.frame import Faces, GroundSurface, Label, Tiles
 from gp_ground_seg.gp.numpy_backend import NumpyBackend
-from gp_ground_seg.labelling import (
+from gp_ground_seg.parameters.config import Config, GridConfig, LabelConfig
+from gp_ground_seg.pipeline.labelling import (
     LabelTask,
     ground_probability,
     label_points,
     local_roughness,
     stands_in_bin,
 )
-from gp_ground_seg.labels import Label
-from gp_ground_seg.points import in_columns
-from gp_ground_seg.polar_grid import build_polar_grid
+from gp_ground_seg.pipeline.points import in_columns
+from gp_ground_seg.pipeline.polar_grid import build_polar_grid
+from gp_ground_seg.pipeline.surface import fuse_neighbours, fuse_rows
 from gp_ground_seg.segmenter import GroundSegmenter
-from gp_ground_seg.surface import GroundSurface, fuse_neighbours, fuse_rows
-from gp_ground_seg.tiles import Tiles
-from gp_ground_seg.workspace import Workspace
 
 GRID = GridConfig(n_segments=4, n_bins=4, r_min=2.0, r_max=10.0, bin_growth=1.0)
 KNOTS = np.array([2.0, 4.0, 6.0, 8.0, 10.0])

@@ -9,16 +9,11 @@ from evaluation_samples import write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.cli import table1 as command
-from gp_ground_seg.datasets.semantic_kitti import read_labels, read_points
-from gp_ground_seg.datasets.simulator import (
-    HDL_32E,
-    SCENES,
-    simulate_scan,
-    write_semantic_kitti,
-)
+from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import table1 as runner
-from gp_ground_seg.evaluation.table1 import DEFAULT_CHOICES, Choice, is_candidate, table1
+from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, is_candidate, table1
+from gp_ground_seg.simulation import HDL_32E, SCENES, simulate_scan, write_semantic_kitti
 
 SEGMENTS = (90, 91)
 ROAD = 40

@@ -9,7 +9,7 @@ import pytest
 from conftest import hilly_scan
 
 from gp_ground_seg import GroundSegmenter
-from gp_ground_seg.compiled import HAVE_NUMBA
+from gp_ground_seg.jit import HAVE_NUMBA
 
 needs_numba = pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
 

@@ -20,29 +20,20 @@ from gp_ground_seg.cli.ablation_report import (
     synthetic_table,
     synthetic_title,
 )
-from gp_ground_seg.cli.experiment_text import (
-    config_words,
-    machine_text,
-    markdown_table,
-    wrapped,
-)
+from gp_ground_seg.cli.experiment_text import config_words, machine_text, markdown_table, wrapped
 from gp_ground_seg.cli.options import add_config_options, config_from_options
 from gp_ground_seg.cli.tables import format_table
-from gp_ground_seg.config import Config
-from gp_ground_seg.datasets.semantic_kitti import Frame
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.ablation import METHODS, ablate
-from gp_ground_seg.evaluation.ablation_synthetic import (
-    METHODS as SYNTHETIC_METHODS,
-)
-from gp_ground_seg.evaluation.ablation_synthetic import (
-    ablate_synthetic,
-)
 from gp_ground_seg.evaluation.environment import describe_environment
 from gp_ground_seg.evaluation.evaluate import labelled_frames
 from gp_ground_seg.evaluation.report import changed_parameters, write_json
-from gp_ground_seg.segmentation import FitReport
+from gp_ground_seg.experiments.ablation import METHODS, ablate
+from gp_ground_seg.experiments.ablation_synthetic import METHODS as SYNTHETIC_METHODS
+from gp_ground_seg.experiments.ablation_synthetic import ablate_synthetic
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.result import FitReport
 
 DESCRIPTION = """\
 Compare length-scale models and ways to learn on the same data.

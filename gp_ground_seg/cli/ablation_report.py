@@ -8,9 +8,9 @@ from typing import Any
 
 from gp_ground_seg.cli.output import count
 from gp_ground_seg.cli.tables import milliseconds, percent
-from gp_ground_seg.evaluation.ablation import MethodResult
-from gp_ground_seg.evaluation.ablation_synthetic import STRETCHES, SyntheticResult
 from gp_ground_seg.evaluation.height_error import HeightError
+from gp_ground_seg.experiments.ablation import MethodResult
+from gp_ground_seg.experiments.ablation_synthetic import STRETCHES, SyntheticResult
 
 Table = tuple[list[str], list[list[str]]]
 """Header and rows."""

@@ -16,10 +16,8 @@ from gp_ground_seg.cli.bench_input import load_frames
 from gp_ground_seg.cli.bench_text import bench_text, replace_section
 from gp_ground_seg.cli.notes import note
 from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.compiled import HAVE_NUMBA
-from gp_ground_seg.config import Config
-from gp_ground_seg.cores import usable_cores
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.compiled.cores import usable_cores
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import DataError, MissingDependencyError
 from gp_ground_seg.evaluation.bench import bench_cases, run_cases
 from gp_ground_seg.evaluation.bench_report import bench_report
@@ -27,6 +25,8 @@ from gp_ground_seg.evaluation.bench_scaling import time_merged, time_scaling
 from gp_ground_seg.evaluation.environment import describe_environment
 from gp_ground_seg.evaluation.methods import PATCHWORKPP, PatchworkppMethod
 from gp_ground_seg.evaluation.report import write_json
+from gp_ground_seg.jit import HAVE_NUMBA
+from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.plotting.stage_bars import plot_stage_bars
 
 DESCRIPTION = """\

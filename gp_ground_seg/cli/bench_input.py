@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli.segment_scans import find_scans
-from gp_ground_seg.datasets.bags import decode_cloud, is_bag, open_bag
-from gp_ground_seg.datasets.semantic_kitti import list_frames, list_sequences, read_points
+from gp_ground_seg.data.bags import decode_cloud, is_bag, open_bag
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation.bench import BenchFrame
 from gp_ground_seg.evaluation.bench_scaling import spread

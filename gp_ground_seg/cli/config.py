@@ -7,10 +7,10 @@ from pathlib import Path
 
 from gp_ground_seg.cli import config_files
 from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.config_export import replace_readme_table, to_markdown_table, to_yaml
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.presets import PRESETS, find_preset
+from gp_ground_seg.parameters.export import replace_readme_table, to_markdown_table, to_yaml
+from gp_ground_seg.parameters.presets import PRESETS, find_preset
 
 YAML_FOLDER = 'config'
 """Folder of the generated files, below the root of a checkout: one for each preset."""
@@ -60,7 +60,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         'generate',
         help='for developers: rewrite what is generated in a checkout',
         description='Rewrite the files of the presets in config/ and the parameter table of '
-        'README.md from gp_ground_seg/config.py and gp_ground_seg/presets.py.',
+        'README.md from gp_ground_seg/parameters.',
     )
     generate.add_argument(
         'root', metavar='REPO_ROOT', nargs='?', default='.', help='the checkout (default: here)'

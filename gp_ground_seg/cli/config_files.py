@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 
-from gp_ground_seg.config import Config, parameter_specs
-from gp_ground_seg.config_check import differences, file_problems
-from gp_ground_seg.config_export import yaml_scalar
-from gp_ground_seg.parameter_files import read_parameters
-from gp_ground_seg.presets import PRESETS
+from gp_ground_seg.parameters.check import differences, file_problems
+from gp_ground_seg.parameters.config import Config, parameter_specs
+from gp_ground_seg.parameters.export import yaml_scalar
+from gp_ground_seg.parameters.presets import PRESETS
+from gp_ground_seg.parameters.yaml_io import read_parameters
 
 EXIT_DIFFERENT = 1
 EXIT_WRONG = 2

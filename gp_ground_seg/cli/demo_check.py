@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.datasets.bags import CloudMessage
+from gp_ground_seg.data.bags import CloudMessage
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation.conventions import GROUNDGRID
 from gp_ground_seg.evaluation.scores import Confusion, count_confusion
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 
 _NUMPY_TYPES = {6: '<u4', 7: '<f4'}
 """Those of `numbered_cloud`, by code of ``sensor_msgs/PointField``."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gp_ground_seg.cli.demo_check import ScanCheck, check_scan
-from gp_ground_seg.datasets.bags import CloudMessage, decode_cloud
+from gp_ground_seg.data.bags import CloudMessage, decode_cloud
 from gp_ground_seg.evaluation.scores import Confusion
 
 GROUND = '/ground'

@@ -14,9 +14,8 @@ from tqdm import tqdm
 from gp_ground_seg.cli.evaluation_text import evaluation_text
 from gp_ground_seg.cli.options import add_config_options, config_from_options
 from gp_ground_seg.cli.worst_sheet import write_worst_sheet
-from gp_ground_seg.config import Config
-from gp_ground_seg.datasets.semantic_kitti import Frame
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation.environment import describe_environment
 from gp_ground_seg.evaluation.evaluate import evaluate, labelled_frames
@@ -31,6 +30,7 @@ from gp_ground_seg.evaluation.methods import (
 from gp_ground_seg.evaluation.report import report, write_json
 from gp_ground_seg.evaluation.scores import MethodScore
 from gp_ground_seg.evaluation.worst import WorstFrames
+from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.plotting.reliability import plot_reliability
 
 EXAMPLES = """\

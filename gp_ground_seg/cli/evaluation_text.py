@@ -15,7 +15,7 @@ from gp_ground_seg.evaluation.methods import PATCHWORKPP
 from gp_ground_seg.evaluation.rings import ring_titles
 from gp_ground_seg.evaluation.scores import RATIOS, MethodScore
 from gp_ground_seg.evaluation.semantic_classes import class_name
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 
 WIDTH = 100
 POOLED = 'all'

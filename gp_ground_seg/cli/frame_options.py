@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gp_ground_seg.cli.argument_types import positive
-from gp_ground_seg.datasets.semantic_kitti import Frame
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.evaluation.evaluate import labelled_frames
 
 

@@ -13,26 +13,21 @@ from typing import Any
 from tqdm import tqdm
 
 from gp_ground_seg.cli.ablation_report import frames_data, frames_title
-from gp_ground_seg.cli.experiment_text import (
-    config_words,
-    machine_text,
-    markdown_table,
-    wrapped,
-)
+from gp_ground_seg.cli.experiment_text import config_words, machine_text, markdown_table, wrapped
 from gp_ground_seg.cli.frame_options import add_frame_options, frames_from_options
 from gp_ground_seg.cli.options import add_config_options, config_from_options, parse_setting
 from gp_ground_seg.cli.tables import format_table, percent
-from gp_ground_seg.datasets.semantic_kitti import Frame
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.ablation import MethodResult
 from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.ideas import AS_GIVEN, IDEAS, Idea, IdeaResult, weigh_ideas
 from gp_ground_seg.evaluation.report import changed_parameters, write_json
+from gp_ground_seg.experiments.ablation import MethodResult
+from gp_ground_seg.experiments.ideas import AS_GIVEN, IDEAS, Idea, IdeaResult, weigh_ideas
 
 DESCRIPTION = """\
 Switch off one idea after the other on the same labelled frames, and print what is lost.
-The ideas are the rows of gp_ground_seg/evaluation/ideas.py; --idea tries others without
+The ideas are the rows of gp_ground_seg/experiments/ideas.py; --idea tries others without
 touching it: a title, a colon, and the parameters that switch it off.
 """
 

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 
 from tqdm import tqdm
 
+from gp_ground_seg.backend import make_backend
 from gp_ground_seg.cli.experiment_text import machine_text, wrapped
 from gp_ground_seg.cli.frame_options import add_frame_options, frames_from_options
 from gp_ground_seg.cli.leave_out_report import (
@@ -20,14 +21,13 @@ from gp_ground_seg.cli.leave_out_report import (
 )
 from gp_ground_seg.cli.options import add_config_options, config_from_options, parse_setting
 from gp_ground_seg.cli.tables import format_table
-from gp_ground_seg.datasets.semantic_kitti import Frame
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.leave_out import leave_one_out
 from gp_ground_seg.evaluation.report import changed_parameters, write_json
-from gp_ground_seg.gp.backend import make_backend
-from gp_ground_seg.parameter_spec import ParameterValue
+from gp_ground_seg.experiments.leave_out import leave_one_out
+from gp_ground_seg.parameters.schema import ParameterValue
 
 DESCRIPTION = """\
 Choose parameters by pooled IoU (GroundGrid convention) on all sequences but one, and

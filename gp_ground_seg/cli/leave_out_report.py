@@ -6,7 +6,7 @@ from typing import Any
 
 from gp_ground_seg.cli.output import count
 from gp_ground_seg.cli.tables import percent
-from gp_ground_seg.evaluation.leave_out import Choice, LeaveOut, SequenceScore, pool
+from gp_ground_seg.experiments.leave_out import Choice, LeaveOut, SequenceScore, pool
 
 Table = tuple[list[str], list[list[str]]]
 """Header and rows."""

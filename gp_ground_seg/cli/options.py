@@ -7,10 +7,10 @@ from typing import Any
 
 import yaml
 
-from gp_ground_seg.config import Config
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.parameter_files import load_yaml
-from gp_ground_seg.presets import PRESETS, find_preset
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.presets import PRESETS, find_preset
+from gp_ground_seg.parameters.yaml_io import load_yaml
 
 DEFAULT_PRESET = 'default'
 

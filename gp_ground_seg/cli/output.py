@@ -12,9 +12,9 @@ import numpy as np
 from tqdm import tqdm
 
 from gp_ground_seg.cli.notes import note
-from gp_ground_seg.datasets.staging import leftovers
-from gp_ground_seg.labels import Label
-from gp_ground_seg.segmentation import Segmentation
+from gp_ground_seg.data.atomic_output import leftovers
+from gp_ground_seg.frame import Label
+from gp_ground_seg.result import Segmentation
 
 
 @dataclass

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from gp_ground_seg.cli.notes import note
 from gp_ground_seg.cli.output import count, progress_bar
-from gp_ground_seg.datasets.bags import BagReader, open_bag
+from gp_ground_seg.data.bags import BagReader, open_bag
 from gp_ground_seg.errors import GroundSegError, MissingDependencyError
 from gp_ground_seg.ros.transport import large_cloud_transport
 

@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.datasets.semantic_kitti import read_points
-from gp_ground_seg.datasets.simulator import SCENES, SENSORS, simulate_scan
+from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.plotting.scan_view import plot_scan_view
 from gp_ground_seg.segmenter import GroundSegmenter
+from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 
 DESCRIPTION = """\
 Draw a scan as RViz would show the node's topics: ground, obstacles, and the ground

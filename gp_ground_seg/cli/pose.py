@@ -11,10 +11,10 @@ from pathlib import Path
 from gp_ground_seg.cli.options import add_config_options, config_from_options
 from gp_ground_seg.cli.segment_scans import find_scans
 from gp_ground_seg.cli.tables import format_table
-from gp_ground_seg.datasets.semantic_kitti import read_points
+from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.segmenter import GroundSegmenter
-from gp_ground_seg.sensor_pose import SensorPose
 
 DESCRIPTION = """\
 Find out from scans how high the sensor is and how it is tilted.

@@ -14,11 +14,11 @@ from tqdm import tqdm
 from gp_ground_seg.cli.experiment_text import config_words
 from gp_ground_seg.cli.options import add_config_options, config_from_options
 from gp_ground_seg.cli.pose_text import pose_tables
-from gp_ground_seg.datasets.simulator import SCENES
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation.evaluate import labelled_frames
-from gp_ground_seg.evaluation.pose_trials import check_frames, check_simulated
+from gp_ground_seg.experiments.pose_trials import check_frames, check_simulated
+from gp_ground_seg.simulation import SCENES
 
 DESCRIPTION = """\
 Compare the segmentation with height and tilt of the sensor told, and found out.

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from gp_ground_seg.cli.experiment_text import markdown_table, wrapped
 from gp_ground_seg.cli.tables import format_table, percent
-from gp_ground_seg.evaluation.pose_trials import (
+from gp_ground_seg.experiments.pose_trials import (
     FOUND,
     LEVEL,
     TILT,

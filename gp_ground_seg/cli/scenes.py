@@ -15,20 +15,15 @@ from tqdm import tqdm
 from gp_ground_seg.cli.argument_types import positive, some_of
 from gp_ground_seg.cli.experiment_text import machine_text, markdown_table, wrapped
 from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.cli.scenes_report import (
-    scenes_behind,
-    scenes_data,
-    scenes_table,
-    scenes_title,
-)
+from gp_ground_seg.cli.scenes_report import scenes_behind, scenes_data, scenes_table, scenes_title
 from gp_ground_seg.cli.tables import format_table
-from gp_ground_seg.config import Config
-from gp_ground_seg.datasets.simulator import SCENES, SENSORS
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.evaluation.environment import describe_environment
 from gp_ground_seg.evaluation.methods import OURS, PATCHWORKPP
 from gp_ground_seg.evaluation.report import changed_parameters, write_json
-from gp_ground_seg.evaluation.scene_scores import SceneScan, scene_scans, score_scenes
+from gp_ground_seg.experiments.scene_scores import SceneScan, scene_scans, score_scenes
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.simulation import SCENES, SENSORS
 
 PRESET_OF = {
     'hdl-64e': 'hdl64',

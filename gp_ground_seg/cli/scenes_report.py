@@ -8,8 +8,8 @@ from typing import Any
 
 from gp_ground_seg.cli.output import count
 from gp_ground_seg.cli.tables import percent
-from gp_ground_seg.evaluation.scene_scores import SceneScore
 from gp_ground_seg.evaluation.scores import RATIOS
+from gp_ground_seg.experiments.scene_scores import SceneScore
 
 Table = tuple[list[str], list[list[str]]]
 """Header and rows."""

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from gp_ground_seg.cli.notes import note
 from gp_ground_seg.cli.output import SegmentationTally, note_leftovers, progress_bar
-from gp_ground_seg.config import Config
-from gp_ground_seg.datasets.bags import (
+from gp_ground_seg.data.bags import (
     BAG_SUFFIXES,
     BagReader,
     BagWriter,
@@ -20,8 +19,9 @@ from gp_ground_seg.datasets.bags import (
     open_bag,
 )
 from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.labels import Label
-from gp_ground_seg.segmentation import Segmentation
+from gp_ground_seg.frame import Label
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
 
 DEFAULT_GROUND_TOPIC = '/ground'

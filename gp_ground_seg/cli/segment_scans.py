@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli.output import SegmentationTally, note_leftovers, progress_bar
-from gp_ground_seg.config import Config
-from gp_ground_seg.datasets.semantic_kitti import read_points
-from gp_ground_seg.datasets.staging import staged_file, staged_files
+from gp_ground_seg.data.atomic_output import staged_file, staged_files
+from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
+from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.segmenter import GroundSegmenter
 
 SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}

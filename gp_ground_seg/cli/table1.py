@@ -12,26 +12,14 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from gp_ground_seg.cli.experiment_text import (
-    config_words,
-    machine_text,
-    markdown_table,
-    wrapped,
-)
+from gp_ground_seg.cli.experiment_text import config_words, machine_text, markdown_table, wrapped
 from gp_ground_seg.cli.options import add_config_options, config_from_options
 from gp_ground_seg.cli.tables import format_table
-from gp_ground_seg.config import Config
-from gp_ground_seg.datasets.semantic_kitti import Frame
-from gp_ground_seg.datasets.staging import staged_files
+from gp_ground_seg.data.atomic_output import staged_files
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.table1 import (
-    DEFAULT_CHOICES,
-    MODELS,
-    Choice,
-    Row,
-    Table1,
-    table1,
-)
+from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, MODELS, Choice, Row, Table1, table1
+from gp_ground_seg.parameters.config import Config
 
 CSV_NAME, MARKDOWN_NAME = 'table1.csv', 'table1.md'
 

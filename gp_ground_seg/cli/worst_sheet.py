@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gp_ground_seg.cli.tables import percent
-from gp_ground_seg.datasets.semantic_kitti import read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation.class_errors import class_errors
 from gp_ground_seg.evaluation.conventions import GROUNDGRID

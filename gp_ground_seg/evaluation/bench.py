@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.config import Config
 from gp_ground_seg.evaluation.methods import Method
-from gp_ground_seg.segmentation import FitReport
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.result import FitReport
 from gp_ground_seg.segmenter import GroundSegmenter
 
 NO_TIME = float('nan')

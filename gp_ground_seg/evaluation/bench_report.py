@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.config import Config
 from gp_ground_seg.evaluation.bench import CaseTimes
 from gp_ground_seg.evaluation.bench_scaling import Merged, ScalingPoint
 from gp_ground_seg.evaluation.environment import Environment
 from gp_ground_seg.evaluation.report import changed_parameters
+from gp_ground_seg.parameters.config import Config
 
 REST = 'rest'
 """Stage that stands for what the stages leave of a frame's time."""

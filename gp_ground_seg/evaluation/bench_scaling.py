@@ -12,10 +12,10 @@ from itertools import groupby
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.config import Config
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.evaluation.bench import BenchFrame
-from gp_ground_seg.segmentation import Segmentation
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
 
 Points = npt.NDArray[np.float32]

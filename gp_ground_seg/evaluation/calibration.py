@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation.scores import Confusion
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 
 N_BINS = 15
 """Bins of equal width in the expected calibration error."""

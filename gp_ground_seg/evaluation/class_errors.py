@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from gp_ground_seg.evaluation.conventions import GROUNDGRID, Convention
 from gp_ground_seg.evaluation.scores import ClassCount
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 
 
 @dataclass(frozen=True)

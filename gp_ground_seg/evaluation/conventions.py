@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.evaluation.semantic_classes import SemanticClass
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 
 SENSOR_HEIGHT = 1.73
 """Height of the sensor [m] in SemanticKITTI. The truth is a property of the data:

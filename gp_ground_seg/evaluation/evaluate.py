@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.datasets.semantic_kitti import (
+from gp_ground_seg.data.semantic_kitti import (
     Frame,
     list_frames,
     list_sequences,
@@ -21,12 +21,7 @@ from gp_ground_seg.evaluation.calibration import count_calibration
 from gp_ground_seg.evaluation.conventions import CONVENTIONS, GROUNDGRID
 from gp_ground_seg.evaluation.methods import Method
 from gp_ground_seg.evaluation.rings import count_rings
-from gp_ground_seg.evaluation.scores import (
-    FrameScore,
-    MethodScore,
-    count_classes,
-    count_confusion,
-)
+from gp_ground_seg.evaluation.scores import FrameScore, MethodScore, count_classes, count_confusion
 
 Observer = Callable[[str, Frame, FrameScore, npt.NDArray[np.uint8]], None]
 """Looks at a frame as it is scored: method, frame, score, labels."""

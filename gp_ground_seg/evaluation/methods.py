@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from gp_ground_seg.config import Config
 from gp_ground_seg.errors import MissingDependencyError
-from gp_ground_seg.labels import Label
-from gp_ground_seg.segmentation import FitReport
+from gp_ground_seg.frame import Label
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.result import FitReport
 from gp_ground_seg.segmenter import GroundSegmenter
 
 OURS = 'gp_ground_seg'

@@ -8,7 +8,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.config import Config, parameter_specs
 from gp_ground_seg.evaluation.calibration import BIN_EDGES, THRESHOLDS, Calibration
 from gp_ground_seg.evaluation.class_errors import class_errors
 from gp_ground_seg.evaluation.conventions import CONVENTIONS, GROUNDGRID
@@ -16,7 +15,8 @@ from gp_ground_seg.evaluation.environment import Environment
 from gp_ground_seg.evaluation.rings import ring_titles
 from gp_ground_seg.evaluation.scores import RATIOS, Confusion, MethodScore
 from gp_ground_seg.evaluation.semantic_classes import class_name
-from gp_ground_seg.parameter_spec import ParameterValue
+from gp_ground_seg.parameters.config import Config, parameter_specs
+from gp_ground_seg.parameters.schema import ParameterValue
 
 
 def changed_parameters(config: Config) -> dict[str, ParameterValue]:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.evaluation.scores import Confusion
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 
 RING_EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, math.inf)
 """Edges of the rings [m]; each holds its inner edge, not its outer one."""

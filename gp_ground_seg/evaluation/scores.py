@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 
 if TYPE_CHECKING:
     from gp_ground_seg.evaluation.calibration import Calibration

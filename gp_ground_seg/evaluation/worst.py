@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.datasets.semantic_kitti import Frame
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.evaluation.conventions import GROUNDGRID
 from gp_ground_seg.evaluation.scores import FrameScore
 

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gp_ground_seg.config import GrowthConfig
-from gp_ground_seg.gp.growth import BoolArray
+from gp_ground_seg.frame import BoolArray, FloatArray, IntArray
 from gp_ground_seg.gp.padding import Padded, batches, regularised
-from gp_ground_seg.polar_grid import FloatArray, IntArray
+from gp_ground_seg.parameters.config import GrowthConfig
 
 
 def latent_rows_batched(

@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
+from gp_ground_seg.frame import FloatArray, IntArray
 from gp_ground_seg.gp.objective import N_SCALARS, TrainingFrame
 from gp_ground_seg.gp.padding import Padded, batches, regularised
-from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 _LOG_2PI = math.log(2.0 * math.pi)
 

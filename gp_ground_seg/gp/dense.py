@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import LinAlgError, lapack
 
-from gp_ground_seg.polar_grid import FloatArray
+from gp_ground_seg.frame import FloatArray
 
 
 def factorise(a: FloatArray) -> FloatArray:

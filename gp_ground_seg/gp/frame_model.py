@@ -7,20 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gp_ground_seg.config import Config
-from gp_ground_seg.gp.backend import Backend
-from gp_ground_seg.gp.growth import BoolArray, GrowthTask
+from gp_ground_seg.backend import Backend
+from gp_ground_seg.frame import BoolArray, Candidates, FloatArray, IntArray, Lines, PseudoInputs
+from gp_ground_seg.gp.growth import GrowthTask
 from gp_ground_seg.gp.learning import Learned, learn
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.gp.theta import ThetaSpace, theta_centre, theta_space
-from gp_ground_seg.labelling import LabelTask
-from gp_ground_seg.length_scale import (
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.labelling import LabelTask
+from gp_ground_seg.pipeline.length_scale import (
     candidate_log_length_scale,
     interpolate_along_segments,
 )
-from gp_ground_seg.line_extraction import Lines
-from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
-from gp_ground_seg.pseudo_inputs import PseudoInputs
 
 _NO_KNOTS = np.empty(0)
 # Like the edges of the bins: for compiled code what may be written to is another type.

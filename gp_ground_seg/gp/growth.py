@@ -1,6 +1,6 @@
 """Inlier growth and the surface of every segment, said plainly.
 
-`gp_ground_seg.gp.growth_compiled` does the same, to rounding, without factoring anew.
+`gp_ground_seg.compiled.growth_compiled` does the same, to rounding, without factoring anew.
 """
 
 from __future__ import annotations
@@ -8,13 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from gp_ground_seg.config import GrowthConfig, ObservationConfig
+from gp_ground_seg.frame import BoolArray, Candidates, FloatArray, IntArray
 from gp_ground_seg.gp.observation import posterior
-from gp_ground_seg.polar_grid import Candidates, FloatArray, IntArray
-
-BoolArray = npt.NDArray[np.bool_]
+from gp_ground_seg.parameters.config import GrowthConfig, ObservationConfig
 
 
 @dataclass(frozen=True)
@@ -40,7 +37,7 @@ class GrowthTask:
     segment_step : int
         There are seeds in every n-th segment.
     n_neighbours : int
-        See `gp_ground_seg.surface.fuse_neighbours`.
+        See `gp_ground_seg.pipeline.surface.fuse_neighbours`.
     """
 
     candidates: Candidates

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gp_ground_seg.polar_grid import FloatArray
+from gp_ground_seg.frame import FloatArray
 
 
 def paciorek(

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled import inlined
+from gp_ground_seg.compiled.decay import decay
+from gp_ground_seg.frame import FloatArray, IntArray
 from gp_ground_seg.gp import dense
-from gp_ground_seg.gp.decay import decay
 from gp_ground_seg.gp.kernels import squared_exponential
-from gp_ground_seg.polar_grid import FloatArray, IntArray
+from gp_ground_seg.jit import inlined
 
 LANES = 4
 """Columns that vector instructions take at once: rows end at multiples of it, as what is left
@@ -73,7 +73,7 @@ def latent_rows_reference(
     theta : (M, 5 + K) float64
         Hyper-parameters of each segment (see `gp_ground_seg.gp.objective`).
     bar_offsets, r_bar, surface_class
-        Pseudo-inputs (see `gp_ground_seg.pseudo_inputs.PseudoInputs`).
+        Pseudo-inputs (see `gp_ground_seg.pipeline.pseudo_inputs.PseudoInputs`).
     offsets : (M + 1,) int64
         Candidates of segment m are ``offsets[m]:offsets[m + 1]``.
     r : (C,) float64

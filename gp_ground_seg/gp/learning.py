@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
+from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.gp.theta import ThetaSpace
-from gp_ground_seg.polar_grid import FloatArray
 
 Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 

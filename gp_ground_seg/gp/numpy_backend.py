@@ -4,35 +4,39 @@ from __future__ import annotations
 
 import numpy as np
 
-from gp_ground_seg.blas import single_threaded_blas
-from gp_ground_seg.config import Config
-from gp_ground_seg.faces import Faces, find_faces
+from gp_ground_seg.compiled.workspace import Workspace
+from gp_ground_seg.frame import (
+    BoolArray,
+    Candidates,
+    Faces,
+    FloatArray,
+    GroundSurface,
+    Labelled,
+    Lines,
+    PointArray,
+    PseudoInputs,
+)
 from gp_ground_seg.gp.batched import grow_surface_batched, latent_rows_batched
 from gp_ground_seg.gp.batched_objective import objective_batched
-from gp_ground_seg.gp.growth import BoolArray, GrowthTask
+from gp_ground_seg.gp.blas import single_threaded_blas
+from gp_ground_seg.gp.growth import GrowthTask
 from gp_ground_seg.gp.objective import TrainingFrame
-from gp_ground_seg.hidden_feet import without_hidden_feet
-from gp_ground_seg.labelling import Labelled, LabelTask, label_points, local_roughness
-from gp_ground_seg.line_bends import candidates_that_follow
-from gp_ground_seg.line_extraction import Lines, extract_lines
-from gp_ground_seg.points import in_columns
-from gp_ground_seg.polar_grid import (
-    Candidates,
-    FloatArray,
-    PointArray,
-    build_polar_grid,
-    ground_candidates,
-    reduce_cells,
-)
-from gp_ground_seg.pseudo_inputs import PseudoInputs, select_pseudo_inputs
-from gp_ground_seg.sorted_points import SortedPoints
-from gp_ground_seg.surface import GroundSurface, fuse_neighbours
-from gp_ground_seg.tiles import build_tiles
-from gp_ground_seg.workspace import Workspace
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.faces import find_faces
+from gp_ground_seg.pipeline.hidden_feet import without_hidden_feet
+from gp_ground_seg.pipeline.labelling import LabelTask, label_points, local_roughness
+from gp_ground_seg.pipeline.line_bends import candidates_that_follow
+from gp_ground_seg.pipeline.line_extraction import extract_lines
+from gp_ground_seg.pipeline.points import in_columns
+from gp_ground_seg.pipeline.polar_grid import build_polar_grid, ground_candidates, reduce_cells
+from gp_ground_seg.pipeline.pseudo_inputs import select_pseudo_inputs
+from gp_ground_seg.pipeline.sorted_points import SortedPoints
+from gp_ground_seg.pipeline.surface import fuse_neighbours
+from gp_ground_seg.pipeline.tiles import build_tiles
 
 
 class NumpyBackend:
-    """See `gp_ground_seg.gp.backend.Backend`."""
+    """See `gp_ground_seg.backend.Backend`."""
 
     name = 'numpy'
     n_threads = 1

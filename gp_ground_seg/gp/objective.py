@@ -1,6 +1,6 @@
 """Whole-frame objective and its gradient, plainly.
 
-The compiled twin is `gp_ground_seg.gp.objective_compiled`.
+The compiled twin is `gp_ground_seg.compiled.objective_compiled`.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError
 
+from gp_ground_seg.frame import FloatArray, IntArray
 from gp_ground_seg.gp import dense
 from gp_ground_seg.gp.kernels import paciorek, squared_exponential
-from gp_ground_seg.polar_grid import FloatArray, IntArray
 
 N_SCALARS = 5
 """Entries of theta before the log length-scales of the surface classes."""

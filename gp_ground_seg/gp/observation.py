@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.gp import dense
 from gp_ground_seg.gp.kernels import paciorek
-from gp_ground_seg.polar_grid import FloatArray
 
 
 def posterior(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.polar_grid import FloatArray, IntArray
+from gp_ground_seg.frame import FloatArray, IntArray
 
 SEGMENTS_PER_BATCH = 32
 """More waste room on padding and leave the processor's cache, fewer cost calls."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.config import Config
+from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.gp.objective import N_SCALARS
-from gp_ground_seg.polar_grid import FloatArray
+from gp_ground_seg.parameters.config import Config
 
 SCALAR_NAMES = ('sigma_f', 'sigma_n', 'sigma_f_bar', 'sigma_l_bar', 'sigma_n_bar')
 

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import ConfigError, PointCloudError
 from gp_ground_seg.evaluation.scores import count_confusion
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
+from gp_ground_seg.pipeline.points import check_points, finite_points
 from gp_ground_seg.plotting.canvas import new_figure
-from gp_ground_seg.points import check_points, finite_points
 
 # After Okabe and Ito's palette, told apart with any colour vision and in grey print.
 GROUND_COLOUR = '#E3B968'

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.birds_eye import draw_rings
 from gp_ground_seg.plotting.canvas import new_figure
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation.calibration import BIN_EDGES, Calibration
 from gp_ground_seg.plotting.canvas import new_figure

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.config import Config
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import PointCloudError
+from gp_ground_seg.frame import Label
 from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.labels import Label
-from gp_ground_seg.length_scale_colours import length_scale_colours
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.points import check_points, finite_points
 from gp_ground_seg.plotting.canvas import new_figure
-from gp_ground_seg.points import check_points, finite_points
-from gp_ground_seg.segmentation import Segmentation
+from gp_ground_seg.plotting.length_scale_colours import length_scale_colours
+from gp_ground_seg.result import Segmentation
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.config import Config
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.points import check_points
 from gp_ground_seg.plotting.segment_view import SegmentView
-from gp_ground_seg.points import check_points
-from gp_ground_seg.segmentation import Segmentation
+from gp_ground_seg.result import Segmentation
 
 FORMATS = ('.png', '.pdf')
 DPI = 130

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.frame import OUTSIDE, Candidates, FloatArray, Label
 from gp_ground_seg.gp.objective import N_SCALARS
-from gp_ground_seg.labels import Label
-from gp_ground_seg.polar_grid import OUTSIDE, Candidates, FloatArray
-from gp_ground_seg.segmentation import Segmentation
+from gp_ground_seg.result import Segmentation
 
 # After Okabe and Ito's palette; the truth is light, so that what is estimated stands out.
 POINT_COLOUR = '#B4BAC0'

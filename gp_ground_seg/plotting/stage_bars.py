@@ -6,7 +6,7 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.datasets.staging import staged_file
+from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import MissingDependencyError
 
 # After Okabe and Ito's palette, in the order of the stages.

@@ -13,7 +13,7 @@ from rclpy.validate_namespace import validate_namespace
 from rclpy.validate_node_name import validate_node_name
 
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.parameter_files import ROS_NODE_KEY, ROS_PARAMETERS_KEY, load_yaml
+from gp_ground_seg.parameters.yaml_io import ROS_NODE_KEY, ROS_PARAMETERS_KEY, load_yaml
 
 START, END = '--ros-args', '--'
 HIGHEST_DOMAIN = 232

@@ -15,10 +15,10 @@ from array import array
 import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
-from gp_ground_seg.datasets.cloud_columns import read_columns
+from gp_ground_seg.data.cloud_columns import read_columns
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.segmentation import Segmentation
+from gp_ground_seg.result import Segmentation
 
 FIELDS = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
 """Fields of the cloud, all float32 [m, rad]. The last three are what it takes to find a place in

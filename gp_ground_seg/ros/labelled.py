@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from sensor_msgs.msg import PointCloud2, PointField
 
-from gp_ground_seg.datasets.cloud_columns import append_columns
+from gp_ground_seg.data.cloud_columns import append_columns
+from gp_ground_seg.result import Segmentation
 from gp_ground_seg.ros.point_cloud2 import read_xyz
-from gp_ground_seg.segmentation import Segmentation
 
 FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'p_ground')
 """Fields that are added: uint8 `Label`, then float32, [m] but for the probability."""

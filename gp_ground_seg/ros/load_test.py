@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.datasets.bags import CloudMessage, encode_cloud
+from gp_ground_seg.data.bags import CloudMessage, encode_cloud
 from gp_ground_seg.evaluation.trips import Trip
 from gp_ground_seg.ros.receiver import OutputReceiver
 from gp_ground_seg.ros.session import Session

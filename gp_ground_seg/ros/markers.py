@@ -12,10 +12,10 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from gp_ground_seg.config import Config
 from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.length_scale_colours import length_scale_colours
-from gp_ground_seg.segmentation import Segmentation
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.plotting.length_scale_colours import length_scale_colours
+from gp_ground_seg.result import Segmentation
 
 # rclpy takes some microseconds for each vertex: what is drawn is thinned to what an eye
 # can tell apart, so that a viewer costs the node less than the segmentation itself.

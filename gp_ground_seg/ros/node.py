@@ -13,10 +13,10 @@ from rclpy.clock_type import ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.config import Config
+from gp_ground_seg.backend import choose_backend
 from gp_ground_seg.errors import GroundSegError, PointCloudError
-from gp_ground_seg.gp.backend import choose_backend
-from gp_ground_seg.points import single_precision
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.points import single_precision
 from gp_ground_seg.ros.cloud_subscription import Arrival, CloudSubscription
 from gp_ground_seg.ros.diagnostics import DiagnosticsPublisher
 from gp_ground_seg.ros.health.health import Health
@@ -48,7 +48,7 @@ class GroundSegmentationNode(ConfiguredNode):
 
     Each output keeps the header and every field of the input, bit for bit; a
     finite point is in exactly one of the two clouds, another one in neither.
-    Parameters are those of `gp_ground_seg.config` and may change at any time;
+    Parameters are those of `gp_ground_seg.parameters.config` and may change at any time;
     a change takes effect with the next cloud.
 
     Latency is the time between the arrival of a cloud in this process and the

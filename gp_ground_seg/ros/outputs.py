@@ -10,13 +10,13 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.config import Config
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import Label
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.result import Segmentation
 from gp_ground_seg.ros.ground_model import ground_model_cloud
 from gp_ground_seg.ros.labelled import FIELDS, free_names, labelled_cloud
 from gp_ground_seg.ros.point_cloud2 import select_points
 from gp_ground_seg.ros.qos import cloud_profile
-from gp_ground_seg.segmentation import Segmentation
 
 
 @dataclass(frozen=True)

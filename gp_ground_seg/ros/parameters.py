@@ -1,4 +1,4 @@
-"""The parameters of `gp_ground_seg.config` as ROS parameters of a node."""
+"""The parameters of `gp_ground_seg.parameters.config` as ROS parameters of a node."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from gp_ground_seg.config import Config, find_spec, parameter_specs
-from gp_ground_seg.config_check import check_typed
 from gp_ground_seg.errors import ConfigError, GroundSegError
-from gp_ground_seg.parameter_files import OF_EVERY_NODE
-from gp_ground_seg.parameter_spec import ParameterSpec
+from gp_ground_seg.parameters.check import check_typed
+from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
+from gp_ground_seg.parameters.schema import ParameterSpec
+from gp_ground_seg.parameters.yaml_io import OF_EVERY_NODE
 from gp_ground_seg.ros.parameter_service import OrderFreeParameterService
 from gp_ground_seg.ros.qos import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.startup import start_errors

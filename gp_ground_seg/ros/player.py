@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 
-from gp_ground_seg.datasets.bags import BagReader
+from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.ros.delivery import TrackedPublisher
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.datasets import cloud_layout
+from gp_ground_seg.data import cloud_layout
 
 
 def read_xyz(message: PointCloud2) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:

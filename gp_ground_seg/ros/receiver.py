@@ -14,7 +14,7 @@ import numpy as np
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.datasets.bags import CloudMessage, decode_cloud, encode_cloud
+from gp_ground_seg.data.bags import CloudMessage, decode_cloud, encode_cloud
 from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.ros.session import Session
 

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from gp_ground_seg.errors import MissingDependencyError, PointCloudError
-from gp_ground_seg.tilt import angles_of
+from gp_ground_seg.pipeline.tilt import angles_of
 
 
 def require_tf2() -> Any:

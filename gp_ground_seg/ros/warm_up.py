@@ -14,12 +14,12 @@ from threading import Thread
 
 import numpy as np
 
-from gp_ground_seg.config import Config
-from gp_ground_seg.gp.backend import Backend
+from gp_ground_seg.backend import Backend
+from gp_ground_seg.frame import PointArray
 from gp_ground_seg.gp.numpy_backend import NumpyBackend
-from gp_ground_seg.polar_grid import PointArray
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.sensor_pose import given_pose
 from gp_ground_seg.segmenter import GroundSegmenter
-from gp_ground_seg.sensor_pose import given_pose
 
 _RINGS = 24
 _DIRECTIONS = 64
@@ -55,7 +55,11 @@ def warm_up(segmenter: GroundSegmenter) -> float:
 
 def _compile_elsewhere(segmenter: GroundSegmenter, points: PointArray) -> None:
     """Have other processes put on disk what is not there, if they can."""
-    from gp_ground_seg.compile_cache import CodeNotKeptError, refusing, say_that_it_compiles
+    from gp_ground_seg.compiled.compile_cache import (
+        CodeNotKeptError,
+        refusing,
+        say_that_it_compiles,
+    )
 
     try:
         with refusing('compilation'):
@@ -92,7 +96,7 @@ def _run_compilers(config: Config) -> None:
 
 def _half_compiled(part: str) -> Backend:
     """Backend with the methods of a part in compiled code, the others in numpy."""
-    from gp_ground_seg.gp.compiled_backend import CompiledBackend
+    from gp_ground_seg.compiled.backend import CompiledBackend
 
     # Two threads, for there is code for the other one.
     compiled, plain = CompiledBackend(2), NumpyBackend()
@@ -109,7 +113,7 @@ def compile_part(part: str) -> None:
 
     Ends when the process that asked for it has ended, and where nothing can be kept.
     """
-    from gp_ground_seg.compile_cache import CodeNotKeptError, refusing
+    from gp_ground_seg.compiled.compile_cache import CodeNotKeptError, refusing
 
     # The compiler makes objects by the million that stay: looked through less often.
     gc.set_threshold(20_000, 20, 50)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gp_ground_seg.config import DiagnosticsConfig
+from gp_ground_seg.parameters.config import DiagnosticsConfig
 from gp_ground_seg.ros.health.hysteresis import Hysteresis
 from gp_ground_seg.ros.health.input import InputFacts, InputStatistics
 from gp_ground_seg.ros.health.model import ModelStatistics

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gp_ground_seg.config import DiagnosticsConfig
+from gp_ground_seg.parameters.config import DiagnosticsConfig
 from gp_ground_seg.ros.health.rate import Rate
 from gp_ground_seg.ros.health.status import Level, Status, in_digits
 

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gp_ground_seg.config import DiagnosticsConfig
-from gp_ground_seg.gp.growth import BoolArray
-from gp_ground_seg.labels import Label
+from gp_ground_seg.frame import BoolArray, Label
+from gp_ground_seg.parameters.config import DiagnosticsConfig
+from gp_ground_seg.pipeline.sensor_pose import SensorPose
+from gp_ground_seg.result import FitReport, Segmentation
 from gp_ground_seg.ros.health.status import Level, Status, in_digits
-from gp_ground_seg.segmentation import FitReport, Segmentation
-from gp_ground_seg.sensor_pose import SensorPose
 
 TASK = 'model'
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from gp_ground_seg.config import DiagnosticsConfig
+from gp_ground_seg.parameters.config import DiagnosticsConfig
 from gp_ground_seg.ros.health.rate import Rate
 from gp_ground_seg.ros.health.status import Level, Status, percentiles
 

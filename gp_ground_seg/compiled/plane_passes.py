@@ -1,0 +1,293 @@
+"""The plane of the ground around the sensor, compiled; twins: `low_cells`, `ground_plane`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gp_ground_seg.frame import Candidates, FloatArray, IntArray
+from gp_ground_seg.jit import compiled, compiled_vectors
+from gp_ground_seg.pipeline.ground_plane import (
+    CLEARLY_BELOW,
+    ENOUGH_NEAR,
+    FAR,
+    LOOSER,
+    MAX_HEIGHT,
+    MIN_AREA,
+    MIN_CELLS,
+    MIN_HEIGHT,
+    N_LEVEL,
+    N_REFINEMENTS,
+    NEAR,
+    PENALTY,
+    RESOLUTION,
+    SPREAD,
+    GroundPlane,
+    find_plane,
+    solve_plane,
+)
+from gp_ground_seg.pipeline.low_cells import (
+    MAX_Z,
+    N_RINGS,
+    N_SECTORS,
+    RING_EDGES,
+    TOLERANCE,
+    TOLERANCE_GROWTH,
+    directions,
+    low_cells,
+)
+
+X, Y, Z, RANGE, ALLOWED, INVERSE = range(6)
+"""Rows of the table of low cells; `ALLOWED` is the tolerance, `INVERSE` one over it."""
+WIDTH = 32
+"""The table is filled up to a multiple of it: no loop over cells has a remainder."""
+N_LARGEST = -(-N_SECTORS * N_RINGS // WIDTH) * WIDTH
+_OUT_OF_REACH = 1e6
+
+# Ring where each stretch begins, a little early for the sake of rounding: a range in it lies
+# in that ring or the next, as the narrowest ring is four stretches wide.
+_PER_METRE = 4.0 / float(RING_EDGES[1] - RING_EDGES[0])
+_STARTS = RING_EDGES[0] + (np.arange(int(RING_EDGES[-1] * _PER_METRE) + 1) - 0.02) / _PER_METRE
+_RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0, N_RINGS - 1)
+
+Values = tuple[float, float, float, float, float, float, float, float, float, float, int, int]
+
+
+def plane_below(
+    candidates: Candidates, max_slope: float, use_compiled: bool
+) -> GroundPlane | None:
+    """Plane that most of the lowest points around the sensor lie on; None if there is none.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        Lowest points of the bins of the polar grid.
+    max_slope : float
+        Steepest plane to look for, as rise per metre.
+    use_compiled : bool
+        Compiled code, or its twin in numpy; both give the same but for rounding.
+    """
+    if not use_compiled:
+        return find_plane(low_cells(candidates), max_slope)
+    offsets = candidates.offsets
+    values = describe_plane(
+        offsets, candidates.r, candidates.z, directions(len(offsets) - 1), max_slope
+    )
+    return GroundPlane(*values) if values[-1] > 0 else None
+
+
+@compiled
+def describe_plane(
+    offsets: IntArray, r: FloatArray, z: FloatArray, directions: FloatArray, max_slope: float
+) -> Values:
+    """Do what `low_cells`, `find_plane` do; fields of a `GroundPlane`, or no support."""
+    cells, sectors = np.empty((6, N_LARGEST)), np.empty(N_LARGEST, dtype=np.int64)
+    n = tabulate(offsets, r, z, directions, cells, sectors)
+    plane = 0.0, 0.0, 0.0
+    found = False
+    if n >= MIN_CELLS:
+        found, plane = _best_hypothesis(cells, n, max_slope)
+    if not found:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+    height, slope_x, slope_y = plane
+    for _ in range(N_REFINEMENTS):
+        height, slope_x, slope_y = _refined(
+            cells, -(-n // WIDTH) * WIDTH, height, slope_x, slope_y
+        )
+    if not _is_possible(height, slope_x, slope_y, LOOSER * max_slope):
+        height, slope_x, slope_y = plane
+    return _describe(cells, sectors, n, height, slope_x, slope_y)
+
+
+@compiled
+def tabulate(
+    offsets: IntArray,
+    r: FloatArray,
+    z: FloatArray,
+    directions: FloatArray,
+    cells: FloatArray,
+    sectors: IntArray,
+) -> int:
+    """Do what `low_cells` does, with a table (6, N_LARGEST); returns how many cells there are."""
+    n_segments = len(offsets) - 1
+    lowest, cell_of = np.empty(N_SECTORS * N_RINGS), np.empty(len(r), dtype=np.int16)
+    index, home = np.empty(len(lowest), dtype=np.int64), np.empty(len(lowest), dtype=np.int64)
+    for cell in range(len(lowest)):
+        lowest[cell], index[cell], home[cell] = MAX_Z, -1, 0
+    # How low first, without a branch: which of two points is lower is anybody's guess.
+    for m in range(n_segments):
+        first = (m * N_SECTORS // n_segments) * N_RINGS
+        for c in range(offsets[m], offsets[m + 1]):
+            cell_of[c] = -1
+            if RING_EDGES[0] <= r[c] < RING_EDGES[N_RINGS] and abs(z[c]) < MAX_Z:
+                ring = _RING_TABLE[int((r[c] - RING_EDGES[0]) * _PER_METRE)]
+                cell = first + ring + (1 if r[c] >= RING_EDGES[ring + 1] else 0)
+                lowest[cell] = z[c] if z[c] < lowest[cell] else lowest[cell]
+                cell_of[c] = cell
+    for m in range(n_segments):
+        for c in range(offsets[m], offsets[m + 1]):
+            cell = cell_of[c]
+            is_lowest = cell >= 0 and z[c] == lowest[cell]
+            if is_lowest and (index[cell] < 0 or r[c] < r[index[cell]]):
+                index[cell], home[cell] = c, m
+    n = 0
+    for cell in range(len(lowest)):
+        if index[cell] >= 0:
+            own_r, m = r[index[cell]], home[cell]
+            cells[X, n], cells[Y, n] = own_r * directions[0, m], own_r * directions[1, m]
+            cells[Z, n], cells[RANGE, n] = lowest[cell], own_r
+            cells[ALLOWED, n] = TOLERANCE + TOLERANCE_GROWTH * own_r
+            cells[INVERSE, n] = 1.0 / cells[ALLOWED, n]
+            sectors[n] = cell // N_RINGS
+            n += 1
+    for c in range(n, -(-n // WIDTH) * WIDTH):
+        cells[X, c], cells[Y, c], cells[Z, c], cells[INVERSE, c] = 0.0, 0.0, _OUT_OF_REACH, 1.0
+    return n
+
+
+@compiled
+def _best_hypothesis(
+    cells: FloatArray, n: int, max_slope: float
+) -> tuple[bool, tuple[float, float, float]]:
+    """First of the planes with the best score, and whether there is one."""
+    found, most, best = False, 0.0, (0.0, 0.0, 0.0)
+    n_level = min(n, N_LEVEL)
+    for t in range(n_level + len(SPREAD)):
+        if t < n_level:
+            height, slope_x, slope_y = -cells[Z, t * n // n_level], 0.0, 0.0
+        else:
+            s = t - n_level
+            i, j, k = int(SPREAD[s, 0] * n), int(SPREAD[s, 1] * n), int(SPREAD[s, 2] * n)
+            x1, y1, z1 = (
+                cells[X, j] - cells[X, i], cells[Y, j] - cells[Y, i], cells[Z, j] - cells[Z, i]
+            )  # fmt: skip
+            x2, y2, z2 = (
+                cells[X, k] - cells[X, i], cells[Y, k] - cells[Y, i], cells[Z, k] - cells[Z, i]
+            )  # fmt: skip
+            area = x1 * y2 - x2 * y1
+            if not abs(area) > MIN_AREA:
+                continue
+            slope_x, slope_y = (z1 * y2 - z2 * y1) / area, (x1 * z2 - x2 * z1) / area
+            height = slope_x * cells[X, i] + slope_y * cells[Y, i] - cells[Z, i]
+        if not _is_possible(height, slope_x, slope_y, max_slope):
+            continue
+        score = _score(cells, -(-n // WIDTH) * WIDTH, height, slope_x, slope_y)
+        if not found or score > most:
+            found, most, best = True, score, (height, slope_x, slope_y)
+    return found, best
+
+
+@compiled
+def _is_possible(height: float, slope_x: float, slope_y: float, max_slope: float) -> bool:
+    steep = slope_x * slope_x + slope_y * slope_y > max_slope * max_slope
+    return MIN_HEIGHT <= height <= MAX_HEIGHT and not steep
+
+
+@compiled_vectors
+def _score(cells: FloatArray, n: int, height: float, slope_x: float, slope_y: float) -> float:
+    """Support less penalty of a plane; of whole numbers, whose sum is exact in any order."""
+    x, y, z, inverse = cells[X], cells[Y], cells[Z], cells[INVERSE]
+    total = 0.0
+    for c in range(n):
+        total += _gain(x[c], y[c], z[c], inverse[c], height, slope_x, slope_y)
+    return total
+
+
+@compiled
+def _gain(
+    x: float, y: float, z: float, inverse: float, height: float, slope_x: float, slope_y: float
+) -> float:
+    """Score of one cell; not in `_score`, which would not round as the twin does."""
+    d = (z - (slope_x * x + slope_y * y - height)) * inverse
+    gain = RESOLUTION * (1.0 - d * d)
+    gain = gain if gain > 0.0 else 0.0
+    whole: float = np.floor(-PENALTY * RESOLUTION if d < -CLEARLY_BELOW else gain)
+    return whole
+
+
+@compiled_vectors
+def _refined(
+    cells: FloatArray, n: int, height: float, slope_x: float, slope_y: float
+) -> tuple[float, float, float]:
+    """Plane of least squares with Tukey's weights of the plane given."""
+    xs, ys, zs, inverses = cells[X], cells[Y], cells[Z], cells[INVERSE]
+    w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for c in range(n):
+        x, y, z, inverse = xs[c], ys[c], zs[c], inverses[c]
+        d = (z - (slope_x * x + slope_y * y - height)) * inverse
+        root = 1.0 - 0.5 * d * d
+        root = (root if root > 0.0 else 0.0) * inverse
+        weight = root * root
+        w += weight
+        wx += weight * x
+        wy += weight * y
+        wxx += weight * x * x
+        wxy += weight * x * y
+        wyy += weight * y * y
+        wz += weight * z
+        wxz += weight * x * z
+        wyz += weight * y * z
+    return solve_plane(w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, height, slope_x, slope_y)
+
+
+@compiled
+def _describe(
+    cells: FloatArray, sectors: IntArray, n: int, height: float, slope_x: float, slope_y: float
+) -> Values:
+    """Do what the twin does, with the cells on the plane one after the other."""
+    ranges, drops, near = np.empty(n), np.empty(n), np.empty(n)
+    n_on_it, n_near, squares = 0, 0, 0.0
+    n_any, n_covered, n_far = 0, 0, 0
+    last_any, last_covered, last_far = -1, -1, -1
+    for c in range(n):
+        # Sector by sector: a new one is one that was not there before.
+        sector, r = sectors[c], cells[RANGE, c]
+        if sector != last_any:
+            n_any, last_any = n_any + 1, sector
+        distance = cells[Z, c] - (slope_x * cells[X, c] + slope_y * cells[Y, c] - height)
+        if not abs(distance) <= cells[ALLOWED, c]:
+            continue
+        ranges[n_on_it], drops[n_on_it] = r, -cells[Z, c] / r
+        n_on_it += 1
+        squares += distance * distance
+        if r < NEAR:
+            near[n_near] = distance
+            n_near += 1
+        if sector != last_covered:
+            n_covered, last_covered = n_covered + 1, sector
+        if r >= FAR and sector != last_far:
+            n_far, last_far = n_far + 1, sector
+    if n_on_it == 0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+    few, most = n_on_it // 10, (9 * n_on_it) // 10
+    steep = math.atan(_ranked(drops[:n_on_it], most))
+    lift = _ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
+    return (
+        height, slope_x, slope_y, height - lift, n_on_it / n, n_covered / N_SECTORS,
+        n_far / n_any, _ranked(ranges[:n_on_it], most),
+        steep - math.atan(_ranked(drops[:n_on_it], few)), math.sqrt(squares / n_on_it),
+        n, n_on_it,
+    )  # fmt: skip
+
+
+@compiled
+def _ranked(values: FloatArray, rank: int) -> float:
+    """Value that sorting would put at `rank`: Hoare's selection; reorders the values."""
+    low, high = 0, len(values) - 1
+    while low < high:
+        pivot, i, j = values[rank], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if j < rank:
+            low = i
+        if rank < i:
+            high = j
+    value: float = values[rank]
+    return value

@@ -1,0 +1,1 @@
+"""Experiments: configurations scored over frames."""

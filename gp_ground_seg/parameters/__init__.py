@@ -1,0 +1,1 @@
+"""Parameters: their one declaration, files, presets."""

@@ -1,0 +1,135 @@
+"""The declared parameters in other forms: ROS parameter file, README table."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+
+import yaml
+
+from gp_ground_seg.errors import DataError
+from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
+from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue
+from gp_ground_seg.parameters.yaml_io import ROS_NODE_KEY, ROS_PARAMETERS_KEY
+
+README_BEGIN = '<!-- parameters:begin -->'
+README_END = '<!-- parameters:end -->'
+
+_WIDTH = 99
+_INDENT = '  '
+_NBSP = '\xa0'  # textwrap does not break here
+
+
+def to_yaml(config: Config, purpose: str = '', reasons: Mapping[str, str] | None = None) -> str:
+    """Write a ROS parameter file with a comment on each parameter.
+
+    ``Config.from_yaml`` of it gives `config` again, and so does a ROS node.
+
+    Parameters
+    ----------
+    config : Config
+        Values to write.
+    purpose : str
+        What the file is for, written at its top.
+    reasons : mapping of str to str, optional
+        Why a parameter has its value, by name, written above it.
+    """
+    reasons = reasons or {}
+    lines = [
+        *(_comment(purpose, 0) if purpose else ()),
+        '# Parameters of gp_ground_seg, as written by `gp-ground-seg config dump`. To use a copy:',
+        '#   ros2 run gp_ground_seg ground_segmentation_node --ros-args --params-file my.yaml',
+        '#   gp-ground-seg segment --config my.yaml ...',
+        f'{ROS_NODE_KEY}:',
+        f'{_INDENT}{ROS_PARAMETERS_KEY}:',
+    ]
+    for group_name, values in config.nested().items():
+        about = (type(getattr(config, group_name)).__doc__ or '').strip()
+        blank = [] if lines[-1].endswith(f'{ROS_PARAMETERS_KEY}:') else ['']
+        lines += [*blank, *_comment(about, 2), f'{2 * _INDENT}{group_name}:']
+        for field_name, value in values.items():
+            spec = find_spec(f'{group_name}.{field_name}')
+            lines += _comment(_explain(spec), 3)
+            if spec.name in reasons:
+                default = f'(default {yaml_scalar(spec.default)})'.replace(' ', _NBSP)
+                lines += _comment(f'Here: {reasons[spec.name]} {default}', 3)
+            lines.append(f'{3 * _INDENT}{_entry(field_name, value)}')
+    return '\n'.join(lines) + '\n'
+
+
+def _entry(name: str, value: ParameterValue) -> str:
+    """``name: value`` as YAML, quoted where needed."""
+    text: str = yaml.safe_dump({name: value})
+    return text.strip()
+
+
+def _explain(spec: ParameterSpec) -> str:
+    facts = _accepted(spec) + (f' {spec.unit}' if spec.unit else '')
+    if spec.symbol:
+        facts += f'; {spec.symbol} in the paper'
+    # The facts stay on one line.
+    return f'{spec.description} ' + f'[{facts}]'.replace(' ', _NBSP)
+
+
+def _comment(text: str, depth: int) -> list[str]:
+    prefix = depth * _INDENT + '# '
+    lines = textwrap.wrap(
+        text, _WIDTH, initial_indent=prefix, subsequent_indent=prefix, break_on_hyphens=False
+    )
+    return [line.replace(_NBSP, ' ') for line in lines]
+
+
+def to_markdown_table() -> str:
+    """Write all parameters as a Markdown table, one row each, in order of declaration."""
+    rows = [
+        ('Parameter', 'Default', 'Accepted', 'Unit', 'Symbol', 'Meaning'),
+        ('---', '---', '---', '---', '---', '---'),
+    ]
+    for spec in parameter_specs():
+        rows.append(
+            (
+                f'`{spec.name}`',
+                f'`{yaml_scalar(spec.default)}`',
+                _accepted(spec),
+                spec.unit,
+                f'`{spec.symbol}`' if spec.symbol else '',
+                spec.description,
+            )
+        )
+    lines = ['| ' + ' | '.join(cell.replace('|', r'\|') for cell in row) + ' |' for row in rows]
+    return '\n'.join(lines) + '\n'
+
+
+def yaml_scalar(value: ParameterValue) -> str:
+    """Write a value the way it is written in a parameter file."""
+    return _entry('x', value).removeprefix('x: ')
+
+
+def _accepted(spec: ParameterSpec) -> str:
+    if spec.choices:
+        return ' or '.join(spec.choices)
+    if spec.type is bool:
+        return 'true or false'
+    if spec.type is str:
+        return 'a name'
+    auto = f'{AUTO} or ' if spec.auto else ''
+    return f'{auto}{spec.minimum:.10g} to {spec.maximum:.10g}'
+
+
+def replace_readme_table(readme: str) -> str:
+    """Put the current parameter table between the markers of a README.
+
+    Raises
+    ------
+    DataError
+        If the two markers are not there once each, in order.
+    """
+    begin, end = readme.find(README_BEGIN), readme.find(README_END)
+    unique = readme.count(README_BEGIN) == 1 and readme.count(README_END) == 1
+    if not unique or end < begin:
+        raise DataError(
+            f'must hold the lines {README_BEGIN} and {README_END} once each, in this order; '
+            'the parameter table goes between them'
+        )
+    head = readme[: begin + len(README_BEGIN)]
+    return f'{head}\n\n{to_markdown_table()}\n{readme[end:]}'

@@ -1,0 +1,254 @@
+"""Height and tilt of the sensor over the ground near it, from one scan (docs/pose.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from gp_ground_seg.compiled.plane_passes import plane_below
+from gp_ground_seg.errors import PointCloudError
+from gp_ground_seg.frame import Candidates, FloatArray, PointArray
+from gp_ground_seg.parameters.config import SensorConfig
+from gp_ground_seg.parameters.schema import AUTO
+from gp_ground_seg.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.pipeline.tilt import Direction, angles_of, rotation, rounded, turned, vertical
+from gp_ground_seg.pipeline.up_axis import is_suspicious, other_way_up
+
+DEFAULT_HEIGHT = 1.73
+"""Height where `sensor.height` is auto and the scan does not tell: a car's roof (KITTI) [m]."""
+CLEAR_TILT = 0.05
+"""Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
+lean stay below it."""
+MAX_TILT = math.radians(30.0)
+"""Steepest ground that z is still taken to point away from."""
+
+MIN_SUPPORT = 0.35
+"""Share of the low cells on the plane from which a scan tells the tilt."""
+MIN_CELLS = 12
+"""Cells on the plane from which a scan tells anything."""
+MIN_SPREAD = 0.06
+"""Spread of their depression from which it does [rad]: more than one beam."""
+MIN_COVERAGE = 0.25
+"""Share of the sectors with ground in them from which a scan tells the tilt."""
+MIN_REACH = 5.0
+"""Range that the ground must reach for the same [m]."""
+LEAST_COSINE = 0.1
+"""Cosine of the tilt from which the sensor's z axis meets the ground."""
+HEIGHT_CONTRADICTION = 0.3
+"""Difference to a given height from which the scan contradicts it [m]."""
+TILT_CONTRADICTION = 0.15
+"""Tilt left under given angles from which the scan contradicts them [rad]: no usual slope."""
+
+
+@dataclass(frozen=True)
+class MeasuredPose:
+    """What one scan says of the sensor, whatever was given.
+
+    Attributes
+    ----------
+    height : float
+        Height over the ground plane under the sensor, along the vertical of the pose used [m].
+    roll, pitch : float
+        Angles that would make the ground plane level [rad].
+    tells_height, tells_tilt : bool
+        Whether the scan shows enough ground for either.
+    plane : GroundPlane
+        The plane in the frame levelled by the angles given, and what speaks for it.
+    """
+
+    height: float
+    roll: float
+    pitch: float
+    tells_height: bool
+    tells_tilt: bool
+    plane: GroundPlane
+
+
+@dataclass(frozen=True)
+class SensorPose:
+    """Where the sensor was taken to be; the level frame has its origin and heading.
+
+    Attributes
+    ----------
+    height : float
+        Height of the sensor above the ground it stands on [m].
+    roll, pitch : float
+        Fixed-axis angles that turn the sensor frame level, as those of a URDF [rad]:
+        positive roll lifts the left side, positive pitch lowers the nose (REP-103).
+    height_estimated, roll_estimated, pitch_estimated : bool
+        Whether each comes from this scan rather than from the parameters or a default.
+    measured : MeasuredPose or None
+        What the scan says; None if it shows no plane at all.
+    contradictions : tuple of str
+        Parameters that the scan clearly contradicts, a line for each; they are used as given.
+    """
+
+    height: float
+    roll: float
+    pitch: float
+    height_estimated: bool = False
+    roll_estimated: bool = False
+    pitch_estimated: bool = False
+    measured: MeasuredPose | None = None
+    contradictions: tuple[str, ...] = ()
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the level frame is the sensor's own."""
+        return self.roll == 0.0 and self.pitch == 0.0
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Matrix (3, 3) from the sensor frame to the level frame."""
+        return rotation(self.roll, self.pitch)
+
+    def level(self, xyz: PointArray) -> PointArray:
+        """Points (N, 3) of the sensor frame in the level frame; `xyz` itself without tilt."""
+        return xyz if self.is_level else turned(xyz, self.rotation)
+
+    def ground_z(self, z: PointArray, height: FloatArray) -> FloatArray:
+        """Height of the surface along the sensor's z axis, sensor frame [m].
+
+        Parameters
+        ----------
+        z : (N,) float32 or float64
+            Of the points, sensor frame [m].
+        height : (N,) float64
+            Of the points over the surface, vertical [m].
+
+        Returns
+        -------
+        (N,) float64
+            Exact where the surface is level in the level frame. NaN if the axis lies
+            within 6 degrees of the horizontal: it does not meet the ground.
+        """
+        cosine = math.cos(self.roll) * math.cos(self.pitch)
+        if abs(cosine) < LEAST_COSINE:
+            return np.full_like(height, np.nan)
+        below: FloatArray = z - height / cosine
+        return below
+
+
+@lru_cache(maxsize=4)
+def given_pose(sensor: SensorConfig) -> SensorPose:
+    """Pose by the parameters alone: angles that are auto 0, a height that is auto the default."""
+    return SensorPose(
+        DEFAULT_HEIGHT if sensor.height == AUTO else sensor.height,
+        0.0 if sensor.roll == AUTO else sensor.roll,
+        0.0 if sensor.pitch == AUTO else sensor.pitch,
+    )
+
+
+def estimate_pose(
+    candidates: Candidates,
+    sensor: SensorConfig,
+    use_compiled: bool,
+    candidates_turned: Callable[[FloatArray], Candidates],
+) -> SensorPose:
+    """Find out what is auto, and whether the scan contradicts what is not.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        Lowest points of the bins, in the frame levelled by `given_pose`.
+    sensor : SensorConfig
+        Parameters.
+    use_compiled : bool
+        Compiled code, or its twin in numpy.
+    candidates_turned : callable
+        Returns the candidates of the same scan, turned further by a matrix (3, 3); asked
+        for only where z does not seem to be up.
+
+    Raises
+    ------
+    PointCloudError
+        If roll or pitch is auto and z is clearly not up.
+    """
+    given = given_pose(sensor)
+    plane = plane_below(candidates, math.tan(MAX_TILT), use_compiled)
+    not_up = None
+    if is_suspicious(plane):
+        not_up = other_way_up(given.rotation, plane, use_compiled, candidates_turned)
+    if not_up is not None and AUTO in (sensor.roll, sensor.pitch):
+        raise PointCloudError(not_up)
+    contradictions = () if not_up is None else (not_up,)
+    if plane is None:
+        return dataclasses.replace(given, contradictions=contradictions)
+    tells_height = plane.n_support >= MIN_CELLS and plane.spread >= MIN_SPREAD
+    tells_tilt = (
+        tells_height
+        and plane.support >= MIN_SUPPORT
+        and plane.coverage >= MIN_COVERAGE
+        and plane.reach >= MIN_REACH
+    )
+    own_up = plane.normal
+    up = own_up if given.is_level else _turned_back(own_up, given.rotation)
+    roll, pitch = _levelled(up, sensor)
+    levelled = vertical(roll, pitch)
+    corrects = tells_tilt and _angle(levelled, vertical(given.roll, given.pitch)) >= CLEAR_TILT
+    # Along the vertical of the pose used, not across the plane.
+    along = _product(levelled, up) if corrects else own_up[2]
+    if not corrects:
+        roll, pitch = given.roll, given.pitch
+    height = rounded(plane.near_height * own_up[2] / along)
+    own_roll, own_pitch = angles_of(up)
+    measured = MeasuredPose(height, own_roll, own_pitch, tells_height, tells_tilt, plane)
+    estimates_height = sensor.height == AUTO and tells_height
+    return SensorPose(
+        height=height if estimates_height else given.height,
+        roll=roll,
+        pitch=pitch,
+        height_estimated=estimates_height,
+        roll_estimated=sensor.roll == AUTO and corrects,
+        pitch_estimated=sensor.pitch == AUTO and corrects,
+        measured=measured,
+        contradictions=contradictions or _contradictions(sensor, measured),
+    )
+
+
+def _turned_back(up: Direction, matrix: FloatArray) -> Direction:
+    x, y, z = (matrix.T @ up).tolist()
+    return x, y, z
+
+
+def _levelled(up: Direction, sensor: SensorConfig) -> tuple[float, float]:
+    """Roll and pitch [rad] that turn `up` upwards as far as those given allow."""
+    roll = rounded(math.atan2(up[1], up[2])) if sensor.roll == AUTO else sensor.roll
+    if sensor.pitch != AUTO:
+        return roll, sensor.pitch
+    across = up[1] * math.sin(roll) + up[2] * math.cos(roll)
+    return roll, rounded(math.atan2(-up[0], across))
+
+
+def _product(a: Direction, b: Direction) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _angle(a: Direction, b: Direction) -> float:
+    return math.acos(min(max(_product(a, b), -1.0), 1.0))
+
+
+def _contradictions(sensor: SensorConfig, measured: MeasuredPose) -> tuple[str, ...]:
+    found = []
+    plane = measured.plane
+    if measured.tells_height and plane.support >= MIN_SUPPORT and sensor.height != AUTO:
+        difference = abs(sensor.height - measured.height)
+        if difference > max(HEIGHT_CONTRADICTION, 0.1 * sensor.height):
+            found.append(
+                f'sensor.height = {sensor.height:g}: the ground near the sensor is '
+                f'{measured.height:.2f} m below it'
+            )
+    if measured.tells_tilt and math.acos(min(plane.normal[2], 1.0)) > TILT_CONTRADICTION:
+        names = [n for n in ('roll', 'pitch') if getattr(sensor, n) != AUTO]
+        if names:
+            words = ', '.join(f'sensor.{name} = {getattr(sensor, name):g}' for name in names)
+            found.append(
+                f'{words}: the ground near the sensor is level with roll = '
+                f'{measured.roll:.3f}, pitch = {measured.pitch:.3f}'
+            )
+    return tuple(found)

@@ -1,0 +1,232 @@
+"""What segmenting a scan gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.frame import (
+    Candidates,
+    FloatArray,
+    GroundSurface,
+    Label,
+    Labelled,
+    Lines,
+    PolarGrid,
+    PseudoInputs,
+)
+from gp_ground_seg.gp.learning import Learned
+from gp_ground_seg.gp.theta import theta_names
+from gp_ground_seg.pipeline.labelling import ground_probability
+from gp_ground_seg.pipeline.sensor_pose import SensorPose
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """What `FitReport` cannot learn from the results.
+
+    Attributes
+    ----------
+    mode : str
+        ``learning.mode`` of the frame.
+    learned : list of Learned
+        Outcome of the learning, of each segment where each has its own; empty when
+        nothing was learned on this frame.
+    backend : str
+        ``numba`` or ``numpy``.
+    n_threads : int
+        Threads used.
+    """
+
+    mode: str
+    learned: list[Learned]
+    backend: str
+    n_threads: int
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What the learning and the inlier growth did.
+
+    Attributes
+    ----------
+    mode : str
+        ``learning.mode`` of the frame.
+    status : str
+        ``converged``, ``budget`` or ``failed``; ``kept`` when nothing was learned on this frame.
+    n_evaluations : int
+        Evaluations of the objective, over all segments where each has its own.
+    objective : float
+        Objective per inlier at the end; NaN when nothing was learned.
+    theta : dict of str to float
+        Hyper-parameters used: sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m],
+        sigma_n_bar, and length_scale_bar_0 ... [m] of the surface classes. Means of
+        the logarithms where each segment has its own.
+    at_bound : tuple of str
+        Those that ended at a bound.
+    n_segments : int
+        Segments with a ground model.
+    n_candidates, n_inliers, n_lines, n_pseudo_inputs : int
+        Ground candidates, those the surface rests on, lines among them, and
+        pseudo-inputs of the latent process.
+    backend : str
+        ``numba`` or ``numpy``.
+    n_threads : int
+        Threads used.
+    """
+
+    mode: str
+    status: str
+    n_evaluations: int
+    objective: float
+    theta: dict[str, float]
+    at_bound: tuple[str, ...]
+    n_segments: int
+    n_candidates: int
+    n_inliers: int
+    n_lines: int
+    n_pseudo_inputs: int
+    backend: str
+    n_threads: int
+
+    @classmethod
+    def of(cls, frame: Segmentation) -> FitReport:
+        """Sum up one frame."""
+        learned = frame.fitting.learned
+        names = theta_names(frame.theta.shape[1])
+        values = np.exp(frame.theta.mean(axis=0))
+        statuses = {one.status for one in learned}
+        at_bound = np.any([one.at_bound for one in learned], axis=0) if learned else []
+        n_inliers = int(frame.surface.inlier.sum())
+        total = sum(one.objective for one in learned)
+        return cls(
+            mode=frame.fitting.mode,
+            status=next((s for s in ('failed', 'budget', 'converged') if s in statuses), 'kept'),
+            n_evaluations=sum(one.n_evaluations for one in learned),
+            objective=total / n_inliers if learned and n_inliers else float('nan'),
+            theta={name: float(value) for name, value in zip(names, values, strict=True)},
+            at_bound=tuple(n for n, hit in zip(names, at_bound, strict=False) if hit),
+            n_segments=int(np.isfinite(frame.surface.mean[:, 0]).sum()),
+            n_candidates=len(frame.candidates.r),
+            n_inliers=n_inliers,
+            n_lines=len(frame.lines.slope),
+            n_pseudo_inputs=len(frame.pseudo.r_bar),
+            backend=frame.fitting.backend,
+            n_threads=frame.fitting.n_threads,
+        )
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """A segmented scan; per-point arrays are in input order.
+
+    Attributes
+    ----------
+    labelled : Labelled
+        Labels, heights and what they follow from; `label`, `height`, `margin` and
+        `roughness` are taken from it.
+    timings : dict of str to float
+        Seconds per stage, and ``total``.
+    fitting : Fitting
+        How it was fitted; `fit` sums it up.
+    grid, candidates, lines, pseudo, surface
+        Intermediate results, for plots and diagnostics; in the level frame.
+    theta : (M, 5 + K) float64
+        Logarithms of the hyper-parameters of each segment, named by `theta_names`.
+    log_length_scale : (M, knots) float64
+        Log length-scale at the knots of the surface [log m]; NaN in segments
+        without candidates.
+    pose : SensorPose
+        Height and tilt of the sensor that were used, and what the scan says of them;
+        ``pose.level(xyz)`` gives points in the level frame.
+    tilted_ground_z : (N,) float64 or None
+        `ground_z` where `pose` has a tilt.
+    """
+
+    labelled: Labelled
+    timings: dict[str, float]
+    fitting: Fitting
+    grid: PolarGrid
+    candidates: Candidates
+    lines: Lines
+    pseudo: PseudoInputs
+    surface: GroundSurface
+    theta: FloatArray
+    log_length_scale: FloatArray
+    pose: SensorPose
+    tilted_ground_z: FloatArray | None
+
+    @property
+    def label(self) -> npt.NDArray[np.uint8]:
+        """`gp_ground_seg.Label` of each point, (N,) uint8.
+
+        Finite points are GROUND or OBSTACLE; where there is no model nothing speaks
+        for ground, and they are OBSTACLE. Points that are not finite are UNKNOWN.
+        """
+        return self.labelled.label
+
+    @property
+    def height(self) -> FloatArray:
+        """Height of each point over the surface, (N,) float64 [m]; negative below it.
+
+        NaN where there is no model. Vertical in the level frame, like `ground_std`:
+        where `pose` has no tilt, that is the sensor's own.
+        """
+        return self.labelled.height
+
+    @property
+    def margin(self) -> FloatArray:
+        """Distance of each point to the nearer edge of the band that is ground, (N,) float64 [m].
+
+        Not negative for ground; NaN where there is no model.
+        """
+        return self.labelled.margin
+
+    @property
+    def roughness(self) -> FloatArray:
+        """Root mean square height of the returns over the surface about each bin, (M, n_bins)."""
+        return self.labelled.roughness
+
+    # What follows is computed when it is first asked for: not every user asks.
+
+    @cached_property
+    def fit(self) -> FitReport:
+        """What the learning and the inlier growth did."""
+        return FitReport.of(self)
+
+    @cached_property
+    def ground_z(self) -> FloatArray:
+        """Surface height under each point along the sensor's z axis, (N,) float64 [m].
+
+        In the sensor frame; NaN where there is no model. Without tilt ``z - height``;
+        with it ``z - height / cos(tilt)``, exact where the ground is level (see
+        `gp_ground_seg.pipeline.sensor_pose.SensorPose.ground_z`).
+        """
+        if self.tilted_ground_z is not None:
+            return self.tilted_ground_z
+        return self._surface_at_points[0]
+
+    @cached_property
+    def ground_std(self) -> FloatArray:
+        """Standard deviation of the surface's height, (N,) float64 [m]; NaN without a model."""
+        return self._surface_at_points[1]
+
+    @cached_property
+    def _surface_at_points(self) -> tuple[FloatArray, FloatArray]:
+        return self.surface.at(self.grid)
+
+    @cached_property
+    def p_ground(self) -> npt.NDArray[np.float32]:
+        """Probability that each point is ground, (N,) float32.
+
+        At least 0.5 for points labelled ground; 0 where there is no model, NaN for
+        points that are not finite.
+        """
+        rough = self.roughness.ravel()[np.maximum(self.grid.cell, 0)]
+        noise = float(np.exp(self.theta[:, 1].mean()))
+        result = ground_probability(self.margin, self.ground_std, rough, noise)
+        result[self.label == Label.UNKNOWN] = np.nan
+        return result

@@ -1,0 +1,289 @@
+"""Solids that stand on the terrain or float over it: yawed boxes and upright cylinders."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.simulation.kinds import Kind
+from gp_ground_seg.simulation.sensor import FloatArray
+from gp_ground_seg.simulation.terrain import Terrain
+
+BURIED_DEPTH = 3.0
+"""How far standing solids reach below the ground at their centre, so that none hovers [m]."""
+WALL_PANEL = 4.0
+"""Longest panel of a wall; each stands on its own piece of ground [m]."""
+SMALLEST_RATE = 1e-12
+"""Stands in for a zero component of a unit vector; keeps 0 / 0 out of the slab tests."""
+
+
+@dataclass(frozen=True)
+class Solid(ABC):
+    """A convex solid.
+
+    Attributes
+    ----------
+    kind : Kind
+        What it counts as.
+    x, y : float
+        Centre [m].
+    bottom, top : float
+        Heights [m].
+    """
+
+    kind: Kind
+    x: float
+    y: float
+    bottom: float
+    top: float
+
+    @property
+    @abstractmethod
+    def radius(self) -> float:
+        """Radius of the vertical cylinder around it [m]."""
+
+    @abstractmethod
+    def _horizontal_interval(
+        self, offset: FloatArray, direction: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Ranges between which rays are inside its outline, seen from above."""
+
+    def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
+        """Range at which rays enter the solid.
+
+        Parameters
+        ----------
+        origin, direction : (R, 3) array
+            Start [m] and unit vector of each ray.
+
+        Returns
+        -------
+        (R,) float64
+            Range [m]; infinite where a ray misses it or starts inside.
+        """
+        result = np.full(len(direction), np.inf)
+        offset = origin - np.array([self.x, self.y, 0.0])
+        dx, dy = direction[:, 0], direction[:, 1]
+        aside = np.abs(offset[:, 0] * dy - offset[:, 1] * dx)
+        ahead = offset[:, 0] * dx + offset[:, 1] * dy < self.radius
+        near = np.flatnonzero(ahead & (aside <= self.radius * np.hypot(dx, dy)))
+        offset, direction = offset[near], direction[near]
+
+        enter, leave = self._horizontal_interval(offset, direction)
+        z_rate = _without_zeros(direction[:, 2])
+        low, high = (self.bottom - offset[:, 2]) / z_rate, (self.top - offset[:, 2]) / z_rate
+        enter = np.maximum(enter, np.minimum(low, high))
+        leave = np.minimum(leave, np.maximum(low, high))
+        result[near] = np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
+        return result
+
+
+@dataclass(frozen=True)
+class Box(Solid):
+    """Upright box of a length, a width [m] and a yaw [rad]."""
+
+    length: float
+    width: float
+    yaw: float
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal [m]."""
+        return 0.5 * math.hypot(self.length, self.width)
+
+    def _horizontal_interval(
+        self, offset: FloatArray, direction: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        enter, leave = np.full(len(offset), -np.inf), np.full(len(offset), np.inf)
+        for axis, size in (((cos, sin), self.length), ((-sin, cos), self.width)):
+            position = offset[:, :2] @ np.array(axis)
+            rate = _without_zeros(direction[:, :2] @ np.array(axis))
+            low, high = (-0.5 * size - position) / rate, (0.5 * size - position) / rate
+            enter = np.maximum(enter, np.minimum(low, high))
+            leave = np.minimum(leave, np.maximum(low, high))
+        return enter, leave
+
+
+@dataclass(frozen=True)
+class Cylinder(Solid):
+    """Upright cylinder."""
+
+    cylinder_radius: float
+
+    @property
+    def radius(self) -> float:
+        """Radius [m]."""
+        return self.cylinder_radius
+
+    def _horizontal_interval(
+        self, offset: FloatArray, direction: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        xy, rate = offset[:, :2], direction[:, :2]
+        a = np.maximum(np.sum(rate * rate, axis=1), SMALLEST_RATE**2)
+        half_b = np.sum(xy * rate, axis=1)
+        c = np.sum(xy * xy, axis=1) - self.cylinder_radius**2
+        discriminant = half_b**2 - a * c
+        root = np.sqrt(np.maximum(discriminant, 0.0))
+        miss = discriminant < 0.0
+        enter = np.where(miss, np.inf, (-half_b - root) / a)
+        return enter, np.where(miss, -np.inf, (-half_b + root) / a)
+
+
+def _without_zeros(values: FloatArray) -> FloatArray:
+    return np.where(np.abs(values) < SMALLEST_RATE, SMALLEST_RATE, values)
+
+
+def nearest_solid(
+    solids: Iterable[Solid], origin: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
+    """First solid that each ray meets.
+
+    Parameters
+    ----------
+    solids : iterable of Solid
+        Solids.
+    origin : (3,) or (R, 3) array
+        Start of all rays, or of each [m]. One common start is much faster.
+    direction : (R, 3) array
+        Unit vector of each ray.
+
+    Returns
+    -------
+    distance : (R,) float64
+        Range [m], infinite where a ray meets none.
+    kind : (R,) uint8
+        `Kind` of the solid.
+    """
+    distance = np.full(len(direction), np.inf)
+    kind = np.zeros(len(direction), dtype=np.uint8)
+    fan = _Fan(origin, direction) if origin.ndim == 1 else None
+    starts = np.broadcast_to(origin, direction.shape)
+    everything = np.arange(len(direction))
+    for solid in solids:
+        rays = everything if fan is None else fan.towards(solid)
+        entry = solid.entry(starts[rays], direction[rays])
+        nearer = entry < distance[rays]
+        distance[rays[nearer]], kind[rays[nearer]] = entry[nearer], solid.kind
+    return distance, kind
+
+
+class _Fan:
+    """Rays from one point, sorted by azimuth: a solid is compared with those towards it only."""
+
+    def __init__(self, origin: FloatArray, direction: FloatArray) -> None:
+        azimuth = np.arctan2(direction[:, 1], direction[:, 0])
+        self._order = np.argsort(azimuth)
+        self._azimuth = azimuth[self._order]
+        self._origin = origin
+
+    def towards(self, solid: Solid) -> npt.NDArray[np.intp]:
+        """Rays whose azimuth may meet the solid."""
+        dx, dy = solid.x - self._origin[0], solid.y - self._origin[1]
+        distance = math.hypot(dx, dy)
+        if distance <= solid.radius:
+            return self._order
+        # A hair more than the tangents, for rounding.
+        half = math.asin(solid.radius / distance) + 1e-9
+        middle = math.atan2(dy, dx)
+        parts = [
+            self._order[
+                slice(
+                    *np.searchsorted(self._azimuth, [middle - half + turn, middle + half + turn])
+                )
+            ]
+            for turn in (-2.0 * math.pi, 0.0, 2.0 * math.pi)
+        ]
+        return np.concatenate(parts)
+
+
+def standing_box(
+    terrain: Terrain,
+    x: float,
+    y: float,
+    size: tuple[float, float, float],
+    yaw: float = 0.0,
+    kind: Kind = Kind.BOX,
+) -> Box:
+    """Box of a (length, width, height) [m] that stands on the terrain."""
+    ground = float(terrain.height(x, y))
+    length, width, height = size
+    return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, length, width, yaw)
+
+
+def floating_box(
+    terrain: Terrain,
+    x: float,
+    y: float,
+    size: tuple[float, float, float],
+    clearance: float,
+    yaw: float = 0.0,
+    kind: Kind = Kind.OVERHANG,
+) -> Box:
+    """Box of a (length, width, height) [m] that floats `clearance` [m] over the terrain."""
+    bottom = float(terrain.height(x, y)) + clearance
+    length, width, height = size
+    return Box(kind, x, y, bottom, bottom + height, length, width, yaw)
+
+
+def pole(
+    terrain: Terrain, x: float, y: float, height: float = 6.0, radius: float = 0.1
+) -> Cylinder:
+    """Pole that stands on the terrain."""
+    ground = float(terrain.height(x, y))
+    return Cylinder(Kind.POLE, x, y, ground - BURIED_DEPTH, ground + height, radius)
+
+
+def car(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Box, ...]:
+    """Car: a body and a cabin."""
+    body = standing_box(terrain, x, y, (4.3, 1.8, 0.9), yaw)
+    cabin = standing_box(terrain, x, y, (2.3, 1.6, 1.5), yaw)
+    return body, cabin
+
+
+def truck(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Box, ...]:
+    """Truck: a load and a lower cab in front of it."""
+    cab_x, cab_y = x + 4.2 * math.cos(yaw), y + 4.2 * math.sin(yaw)
+    load = standing_box(terrain, x, y, (6.4, 2.5, 3.6), yaw)
+    cab = standing_box(terrain, cab_x, cab_y, (1.8, 2.3, 2.6), yaw)
+    return load, cab
+
+
+def wall(
+    terrain: Terrain,
+    start: tuple[float, float],
+    end: tuple[float, float],
+    height: float,
+    thickness: float = 0.3,
+) -> tuple[Box, ...]:
+    """Wall from `start` to `end` (x, y) [m], in panels that follow the ground."""
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    n_panels = max(1, math.ceil(math.hypot(dx, dy) / WALL_PANEL))
+    size = (math.hypot(dx, dy) / n_panels, thickness, height)
+    middles = (np.arange(n_panels) + 0.5) / n_panels
+    yaw = math.atan2(dy, dx)
+    return tuple(
+        standing_box(terrain, start[0] + s * dx, start[1] + s * dy, size, yaw, Kind.WALL)
+        for s in middles.tolist()
+    )
+
+
+def bridge(
+    terrain: Terrain, x: float, y: float, length: float, width: float, clearance: float
+) -> tuple[Box, ...]:
+    """Bridge across the x direction: a deck `length` [m] long in y, `width` in x."""
+    return (floating_box(terrain, x, y, (width, length, 0.8), clearance),)
+
+
+def tree(
+    terrain: Terrain, x: float, y: float, crown: float = 3.0, clearance: float = 2.5
+) -> tuple[Solid, ...]:
+    """Tree: a trunk and a floating crown, a cube of size `crown` [m]."""
+    trunk = pole(terrain, x, y, clearance + 0.5, 0.18)
+    size = (crown, crown, crown)
+    return trunk, floating_box(terrain, x, y, size, clearance, kind=Kind.VEGETATION)

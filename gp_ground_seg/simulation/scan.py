@@ -1,0 +1,263 @@
+"""One turn of the sensor in a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.simulation.kinds import Kind, reflectance
+from gp_ground_seg.simulation.objects import Solid, nearest_solid
+from gp_ground_seg.simulation.raycast import first_hit
+from gp_ground_seg.simulation.sensor import FloatArray, SensorModel
+from gp_ground_seg.simulation.terrain import Terrain
+
+FRAME_PERIOD = 0.1
+"""Time of one turn of the sensor [s]."""
+REFLECTION_MIN_DEPTH = 0.1
+"""A mirrored point less deep below the ground than this is the road itself to any sensor [m]."""
+INTENSITY_STD = 0.05
+PLUMB_LINE = 200.0
+"""How far above a point the search for the ground below it starts, for a tilted sensor [m]."""
+
+
+@dataclass(frozen=True)
+class WetPatch:
+    """A disc of wet road that mirrors.
+
+    Attributes
+    ----------
+    x, y, radius : float
+        Where it is [m].
+    reflectivity : float
+        Probability that a ray is mirrored rather than scattered back, in [0, 1].
+    """
+
+    x: float
+    y: float
+    radius: float
+    reflectivity: float = 0.5
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Terrain, the solids on it, and wet patches of it."""
+
+    name: str
+    terrain: Terrain
+    solids: tuple[Solid, ...] = ()
+    wet_patches: tuple[WetPatch, ...] = ()
+
+
+@dataclass(frozen=True)
+class SimulatedScan:
+    """A scan with the truth about every point; arrays are ordered as `SensorModel.directions`.
+
+    All of it is measured at one instant: the motion during a turn is left out. Rays without a
+    return are absent.
+
+    Attributes
+    ----------
+    points : (N, 4) float32
+        x forward, y left, z up in the sensor frame [m], intensity in [0, 1].
+    ring : (N,) uint16
+        Beam of each point, 0 = highest.
+    is_ground : (N,) bool
+        Whether the ray hit the terrain.
+    ground_z : (N,) float64
+        Exact terrain height under (or over) each point along the sensor's z axis, sensor
+        frame [m]. Over a vertical step it is that of one side.
+    kind : (N,) uint8
+        `Kind` that the ray hit.
+    time : float
+        Time since the start of the drive [s].
+    position : (3,) float64
+        Position of the sensor in the world [m].
+    rotation : (3, 3) float64
+        Turns vectors of the sensor frame into the world's.
+    """
+
+    points: npt.NDArray[np.float32]
+    ring: npt.NDArray[np.uint16]
+    is_ground: npt.NDArray[np.bool_]
+    ground_z: FloatArray
+    kind: npt.NDArray[np.uint8]
+    time: float
+    position: FloatArray
+    rotation: FloatArray
+
+
+def simulate_scan(
+    scene: Scene,
+    sensor: SensorModel,
+    rng: np.random.Generator,
+    x: float = 0.0,
+    y: float = 0.0,
+    yaw: float = 0.0,
+    time: float = 0.0,
+) -> SimulatedScan:
+    """Scan the scene from one place.
+
+    Every ray has its own random numbers, drawn whether or not it hits anything: the
+    same generator state gives the same noise in another scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        What there is to see.
+    sensor : SensorModel
+        What looks; it stands `sensor.height` above the ground at x, y.
+    rng : Generator
+        Source of azimuth phase, noise, dropouts and reflections.
+    x, y : float
+        Where the sensor is [m].
+    yaw : float
+        Heading of the vehicle [rad].
+    time : float
+        Passed on to the scan [s].
+    """
+    n_rays = sensor.n_rays
+    phase = rng.uniform(0.0, 2.0 * np.pi / sensor.n_columns)
+    mirror_draw, drop_draw = rng.random(n_rays), rng.random(n_rays)
+    range_noise, intensity_noise = rng.standard_normal(n_rays), rng.standard_normal(n_rays)
+
+    beams = sensor.directions(phase)
+    rotation = sensor.rotation(yaw)
+    direction = beams @ rotation.T
+    position = np.array([x, y, float(scene.terrain.height(x, y)) + sensor.height])
+    origin = np.broadcast_to(position, direction.shape)
+
+    distance = first_hit(scene.terrain, origin, direction, sensor.max_range)
+    solid_distance, solid_kind = nearest_solid(scene.solids, position, direction)
+    blocked = solid_distance < distance
+    distance = np.where(blocked, solid_distance, distance)
+    kind = np.where(blocked, solid_kind, Kind.TERRAIN).astype(np.uint8)
+    _mirror(scene, origin, direction, distance, kind, mirror_draw)
+
+    measured = distance + sensor.range_std * range_noise
+    kept = np.flatnonzero(
+        (measured >= sensor.min_range)
+        & (measured <= sensor.max_range)
+        & (drop_draw >= sensor.dropout)
+    )
+    kind = kind[kept]
+    points = np.empty((len(kept), 4), dtype=np.float32)
+    points[:, :3] = beams[kept] * measured[kept, None]
+    points[:, 3] = np.clip(reflectance(kind) + INTENSITY_STD * intensity_noise[kept], 0.0, 1.0)
+    return SimulatedScan(
+        points=points,
+        ring=sensor.rings()[kept],
+        is_ground=kind == Kind.TERRAIN,
+        ground_z=ground_below(scene.terrain, points, position, rotation),
+        kind=kind,
+        time=time,
+        position=position,
+        rotation=rotation,
+    )
+
+
+def _mirror(
+    scene: Scene,
+    origin: FloatArray,
+    direction: FloatArray,
+    distance: FloatArray,
+    kind: npt.NDArray[np.uint8],
+    draw: FloatArray,
+) -> None:
+    """Move hits on wet road to where the sensor believes the mirrored solids to be, in place.
+
+    The sensor knows the length of the light's way, not its bend: it puts the mirror image
+    straight on along the ray, below the ground.
+    """
+    ray = np.flatnonzero((kind == Kind.TERRAIN) & np.isfinite(distance))
+    foot = origin[ray] + distance[ray, None] * direction[ray]
+    reflectivity = np.zeros(len(ray))
+    for patch in scene.wet_patches:
+        wet = np.hypot(foot[:, 0] - patch.x, foot[:, 1] - patch.y) <= patch.radius
+        reflectivity[wet] = np.maximum(reflectivity[wet], patch.reflectivity)
+    mirrored = draw[ray] < reflectivity
+    ray, foot = ray[mirrored], foot[mirrored]
+
+    slope = scene.terrain.gradient(foot[:, :2])
+    normal = np.column_stack([-slope, np.ones(len(slope))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    across = np.sum(direction[ray] * normal, axis=1, keepdims=True)
+    onward, _ = nearest_solid(scene.solids, foot, direction[ray] - 2.0 * across * normal)
+    found = np.isfinite(onward)
+    ray, total = ray[found], distance[ray[found]] + onward[found]
+    image = origin[ray] + total[:, None] * direction[ray]
+    deep = image[:, 2] < scene.terrain.height(image[:, 0], image[:, 1]) - REFLECTION_MIN_DEPTH
+    distance[ray[deep]], kind[ray[deep]] = total[deep], Kind.REFLECTION
+
+
+def ground_below(
+    terrain: Terrain, points: npt.NDArray[np.floating], position: FloatArray, rotation: FloatArray
+) -> FloatArray:
+    """Exact terrain height along the sensor's z axis under each point.
+
+    Parameters
+    ----------
+    terrain : Terrain
+        The ground.
+    points : (N, >=3) array
+        Points in the sensor frame [m].
+    position : (3,) array
+        Position of the sensor in the world [m].
+    rotation : (3, 3) array
+        Turns vectors of the sensor frame into the world's.
+
+    Returns
+    -------
+    (N,) float64
+        z in the sensor frame [m]; where a tilted axis meets the terrain more than once,
+        the highest.
+    """
+    local = points[:, :3].astype(np.float64)
+    world = local @ rotation.T + position
+    up = rotation[:, 2]
+    if up[2] == 1.0:
+        below: FloatArray = terrain.height(world[:, 0], world[:, 1]) - position[2]
+        return below
+    down = np.broadcast_to(-up, world.shape)
+    fall = first_hit(terrain, world + PLUMB_LINE * up, down, 2.0 * PLUMB_LINE)
+    ground_z: FloatArray = local[:, 2] + PLUMB_LINE - fall
+    return ground_z
+
+
+def simulate_drive(
+    scene: Scene, sensor: SensorModel, n_frames: int, speed: float, seed: int
+) -> Iterator[SimulatedScan]:
+    """Drive along x from the origin, ten scans a second.
+
+    The sensor stays `sensor.height` above the ground under it and does not follow its slope.
+
+    Parameters
+    ----------
+    scene : Scene
+        Where to drive.
+    sensor : SensorModel
+        What looks.
+    n_frames : int
+        Number of scans.
+    speed : float
+        [m/s].
+    seed : int
+        Seed of all noise; the scene has its own.
+
+    Raises
+    ------
+    ConfigError
+        If a value is out of range.
+    """
+    if n_frames < 1 or not np.isfinite(speed):
+        raise ConfigError(
+            f'drive: n_frames = {n_frames}, speed = {speed}: must be >= 1 and finite'
+        )
+    rng = np.random.default_rng(seed)
+    return (
+        simulate_scan(scene, sensor, rng, x=speed * k * FRAME_PERIOD, time=k * FRAME_PERIOD)
+        for k in range(n_frames)
+    )

@@ -1,0 +1,153 @@
+"""Named scenes, each built from a seed around a drive along x that starts at the origin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from gp_ground_seg.simulation import landforms
+from gp_ground_seg.simulation.objects import (
+    Solid,
+    bridge,
+    car,
+    floating_box,
+    pole,
+    standing_box,
+    tree,
+    truck,
+    wall,
+)
+from gp_ground_seg.simulation.scan import Scene, WetPatch
+from gp_ground_seg.simulation.terrain import Terrain
+
+SCATTER_X = (-60.0, 100.0)
+SCATTER_Y = (6.0, 35.0)
+"""Distance of scattered solids from the drive [m]; leaves its lane free."""
+N_SCATTERED = 36
+URBAN_X = (-80.0, 160.0)
+"""Where the street of the urban scene begins and ends [m]."""
+
+
+def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
+    """Cars, trucks, crates, walls, poles and trees on both sides of the drive."""
+    solids: list[Solid] = []
+    for k in range(N_SCATTERED):
+        x = rng.uniform(*SCATTER_X)
+        y = rng.uniform(*SCATTER_Y) * rng.choice([-1.0, 1.0])
+        yaw = rng.uniform(0.0, 2.0 * math.pi)
+        match k % 6:
+            case 0 | 1:
+                solids += car(terrain, x, y, yaw)
+            case 2:
+                solids.append(standing_box(terrain, x, y, (0.8, 0.6, rng.uniform(0.3, 1.0)), yaw))
+            case 3:
+                solids.append(pole(terrain, x, y))
+            case 4:
+                solids += tree(terrain, x, y)
+            case _:
+                along = rng.uniform(4.0, 12.0)
+                solids += wall(terrain, (x, y), (x + along, y), rng.uniform(1.0, 2.5))
+    return tuple(solids)
+
+
+def _open_scene(name: str, terrain: Terrain, rng: np.random.Generator) -> Scene:
+    return Scene(name, terrain, _scattered(terrain, rng))
+
+
+def flat(seed: int) -> Scene:
+    """Level ground."""
+    return _open_scene('flat', landforms.flat(), np.random.default_rng(seed))
+
+
+def slope(seed: int) -> Scene:
+    """Plane that rises or falls by 8 % in a direction of its own."""
+    rng = np.random.default_rng(seed)
+    return _open_scene('slope', landforms.slope(0.08, rng.uniform(-math.pi, math.pi)), rng)
+
+
+def ramp(seed: int) -> Scene:
+    """Level ground, then at once a climb of 12 %."""
+    rng = np.random.default_rng(seed)
+    terrain = landforms.ramp(rng.uniform(12.0, 18.0), 0.12, rng.uniform(-0.3, 0.3))
+    return _open_scene('ramp', terrain, rng)
+
+
+def rough(seed: int) -> Scene:
+    """Open country: waves of 2 to 20 m, 8 cm rms."""
+    rng = np.random.default_rng(seed)
+    return _open_scene('rough', landforms.rough(rng), rng)
+
+
+def road_then_rubble(seed: int) -> Scene:
+    """Smooth road that ends in rubble: waves of 0.8 to 6 m, 15 cm rms."""
+    rng = np.random.default_rng(seed)
+    terrain = landforms.smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0)
+    return _open_scene('road_then_rubble', terrain, rng)
+
+
+def kerb(seed: int) -> Scene:
+    """Road between sidewalks 15 cm higher."""
+    rng = np.random.default_rng(seed)
+    return _open_scene('kerb', landforms.kerb(rng.uniform(3.5, 5.0), 0.15), rng)
+
+
+def ditch(seed: int) -> Scene:
+    """Ditch 1 m deep across the drive, at an angle."""
+    rng = np.random.default_rng(seed)
+    heading = rng.uniform(-0.5, 0.5)
+    terrain = landforms.ditch(rng.uniform(10.0, 14.0), 4.0, 1.5, 1.0, heading)
+    return _open_scene('ditch', terrain, rng)
+
+
+def crest(seed: int) -> Scene:
+    """Hill of 8 % slopes with a rounded top that hides what is behind it."""
+    rng = np.random.default_rng(seed)
+    terrain = landforms.crest(rng.uniform(8.0, 12.0), 15.0, 0.08, 12.0)
+    return _open_scene('crest', terrain, rng)
+
+
+def urban(seed: int) -> Scene:
+    """Street: kerbs, parked cars, a truck, houses, awnings, poles, trees, a bridge, puddles."""
+    rng = np.random.default_rng(seed)
+    road, front = 6.0, 10.0
+    terrain = landforms.kerb(road, 0.15)
+    solids: list[Solid] = []
+    wet: list[WetPatch] = []
+    for side in (-1.0, 1.0):
+        x = URBAN_X[0]
+        while x < URBAN_X[1]:
+            house = rng.uniform(12.0, 25.0)
+            solids += wall(
+                terrain, (x, side * front), (x + house, side * front), rng.uniform(4.0, 9.0)
+            )
+            x += house + rng.uniform(2.0, 8.0)
+        for x in np.arange(URBAN_X[0], URBAN_X[1], 9.0) + rng.uniform(0.0, 2.0):
+            if rng.random() < 0.6:
+                solids += car(terrain, x, side * (road - 1.1), rng.normal(0.0, 0.02))
+                wet.append(WetPatch(x + rng.uniform(-3.0, 3.0), side * 2.5, rng.uniform(0.8, 1.8)))
+        for x in np.arange(URBAN_X[0], URBAN_X[1], 22.0) + rng.uniform(0.0, 10.0):
+            solids.append(pole(terrain, x, side * 7.0))
+            solids += tree(terrain, x + 8.0, side * 8.0)
+    solids += truck(terrain, rng.uniform(25.0, 35.0), 2.6, math.pi)
+    # Low enough for the flat upper beams of an HDL-64E to meet it.
+    solids += bridge(terrain, rng.uniform(40.0, 50.0), 0.0, 2.0 * front, 5.0, 2.8)
+    for x in np.arange(URBAN_X[0], URBAN_X[1], 30.0) + rng.uniform(0.0, 20.0):
+        solids.append(floating_box(terrain, x, front - 1.0, (6.0, 2.0, 0.2), 2.1))
+    solids.append(standing_box(terrain, rng.uniform(10.0, 20.0), -8.0, (0.5, 0.5, 0.4)))
+    return Scene('urban', terrain, tuple(solids), tuple(wet))
+
+
+SCENES: dict[str, Callable[[int], Scene]] = {
+    'flat': flat,
+    'slope': slope,
+    'ramp': ramp,
+    'rough': rough,
+    'road_then_rubble': road_then_rubble,
+    'kerb': kerb,
+    'ditch': ditch,
+    'crest': crest,
+    'urban': urban,
+}
+"""Builders of the named scenes: seed -> scene."""
