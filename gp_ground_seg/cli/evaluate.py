@@ -31,7 +31,7 @@ from gp_ground_seg.evaluation.report import report, write_json
 from gp_ground_seg.evaluation.scores import MethodScore
 from gp_ground_seg.evaluation.worst import WorstFrames
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.reliability import plot_reliability
+from gp_ground_seg.plotting.charts import plot_reliability
 
 EXAMPLES = """\
 examples:

@@ -13,7 +13,7 @@ from gp_ground_seg.evaluation.conventions import GROUNDGRID
 from gp_ground_seg.evaluation.scores import FrameScore
 from gp_ground_seg.evaluation.semantic_classes import class_name
 from gp_ground_seg.evaluation.worst import LabelledFrame
-from gp_ground_seg.plotting.error_sheet import SheetPanel, plot_error_sheet
+from gp_ground_seg.plotting.birds_eye import SheetPanel, plot_error_sheet
 
 LEAST_SHARE = 0.01
 """Classes with less of a frame's errors are not named."""
