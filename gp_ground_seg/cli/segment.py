@@ -146,8 +146,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
     config = config_from_options(arguments)
     source = Path(arguments.input)
-    if not source.exists():
-        raise DataError(f'{source}: no such file or folder')
     holds_bag = is_bag(source) or _holds_bag_files(source)
     scans = [] if holds_bag else find_scans(source)
     kind, foreign = ('scans', FOR_SCANS) if holds_bag else ('bags', FOR_BAGS)
@@ -195,6 +193,8 @@ def find_scans(source: Path) -> list[Path]:
     DataError
         If there is none; the message says what was expected.
     """
+    if not source.exists():
+        raise DataError(f'{source}: no such file or folder')
     if source.is_file():
         if source.suffix != '.bin':
             raise DataError(
