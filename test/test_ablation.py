@@ -56,7 +56,7 @@ def test_commands_of_the_docs_are_accepted():
     """Those above the tables of docs/experiments.md, and those in its text."""
     text = (Path(__file__).parents[1] / 'docs' / 'experiments.md').read_text(encoding='utf-8')
     commands = re.findall(r'`gp-ground-seg (.*?)`', text)
-    names = {'table1', 'plot-segment', 'ablation', 'evaluate', 'ideas', 'leave-out', 'scenes'}
+    names = {'table1', 'plot', 'ablation', 'evaluate', 'ideas', 'leave-out', 'scenes'}
     assert {words.split()[0] for words in commands} == names
     for words in commands:
         arguments = build_parser(words.split()[0]).parse_args(shlex.split(words))

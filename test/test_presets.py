@@ -51,8 +51,8 @@ def test_unknown_preset_is_refused_with_the_nearest():
 
 
 def test_the_paper_preset_has_none_of_our_departures():
-    """What docs/deviations.md says switches a departure back is switched back."""
-    text = (REPOSITORY / 'docs' / 'deviations.md').read_text(encoding='utf-8')
+    """What docs/algorithm.md says switches a departure back is switched back."""
+    text = (REPOSITORY / 'docs' / 'algorithm.md').read_text(encoding='utf-8')
     rows = [line for line in text.splitlines() if line.startswith('| **')]
     switches = [
         setting.split('=')

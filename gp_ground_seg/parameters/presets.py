@@ -62,7 +62,7 @@ _PRESETS = (
     Preset(
         'paper',
         'What arXiv 2112.05847 prints, and none of our departures from it '
-        '(docs/deviations.md); what it leaves open is as in the defaults.',
+        '(docs/algorithm.md); what it leaves open is as in the defaults.',
         (
             Override('sensor.height', 1.73, "of KITTI's sensor, the paper's data"),
             Override('sensor.roll', 0.0, 'nothing is levelled'),
