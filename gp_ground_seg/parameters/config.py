@@ -29,6 +29,7 @@ class SensorConfig:
         low=0.05,
         high=20.0,
         auto=True,
+        basic=True,
     )
     roll: float | Literal['auto'] = parameter(
         AUTO,
@@ -37,6 +38,7 @@ class SensorConfig:
         low=-3.15,
         high=3.15,
         auto=True,
+        basic=True,
     )
     pitch: float | Literal['auto'] = parameter(
         AUTO,
@@ -45,6 +47,7 @@ class SensorConfig:
         low=-1.58,
         high=1.58,
         auto=True,
+        basic=True,
     )
 
 
@@ -56,8 +59,13 @@ class FrameConfig:
         'sensor',
         'where the tilt of the sensor is taken from: sensor.roll and sensor.pitch, or TF',
         choices=('sensor', 'tf'),
+        basic=True,
     )
-    base: str = parameter('base_link', 'frame that is level to TF, with frame.level = tf')
+    base: str = parameter(
+        'base_link',
+        'frame that is level to TF, with frame.level = tf',
+        basic=True,
+    )
 
 
 @dataclass(frozen=True)
@@ -65,7 +73,12 @@ class GridConfig:
     """Radial grid map."""
 
     n_segments: int = parameter(
-        180, 'angular segments of the radial grid', symbol='M', low=4, high=2048
+        180,
+        'angular segments of the radial grid',
+        symbol='M',
+        low=4,
+        high=2048,
+        basic=True,
     )
     n_bins: int = parameter(80, 'radial bins of each segment', symbol='N', low=4, high=1024)
     r_min: float = parameter(
@@ -81,6 +94,7 @@ class GridConfig:
         unit='m',
         low=1.0,
         high=500.0,
+        basic=True,
     )
     bin_growth: float = parameter(
         1.5,
@@ -277,6 +291,7 @@ class GrowthConfig:
         unit='m',
         low=0.01,
         high=5.0,
+        basic=True,
     )
     max_std: float = parameter(
         0.4,
@@ -387,6 +402,7 @@ class LabelConfig:
         symbol='zeta_g',
         low=0.001,
         high=5.0,
+        basic=True,
     )
     roughness_gain: float = parameter(
         3.0,
@@ -400,6 +416,7 @@ class LabelConfig:
         unit='m',
         low=0.001,
         high=50.0,
+        basic=True,
     )
     obstacle_tolerance: float = parameter(
         0.05,
@@ -438,6 +455,7 @@ class LearningConfig:
         'every_frame',
         'when the hyper-parameters are learned; fixed = never, the values given here are used',
         choices=('every_frame', 'every_k', 'first_frame', 'fixed'),
+        basic=True,
     )
     period: int = parameter(
         10, 'frames from one learning to the next in the mode every_k', low=1, high=10000
@@ -499,7 +517,11 @@ class RuntimeConfig:
     """How the work is done; nothing here changes a label."""
 
     n_threads: int = parameter(
-        0, 'threads of the compiled code; 0 = all cores, at most 4', low=0, high=256
+        0,
+        'threads of the compiled code; 0 = all cores, at most 4',
+        low=0,
+        high=256,
+        basic=True,
     )
     backend: str = parameter(
         'auto',

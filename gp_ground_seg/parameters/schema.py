@@ -39,6 +39,8 @@ class ParameterSpec:
         Accepted values of a string; empty for other types, and for names of the user's.
     auto : bool
         Whether a number may also be `AUTO`.
+    basic : bool
+        Whether it is one of the few that are set for a robot; the others are advanced.
     """
 
     name: str
@@ -51,6 +53,7 @@ class ParameterSpec:
     maximum: float | None
     choices: tuple[str, ...]
     auto: bool = False
+    basic: bool = False
 
     @property
     def accepted(self) -> str:
@@ -108,6 +111,7 @@ def parameter(
     high: float | None = None,
     choices: tuple[str, ...] = (),
     auto: bool = False,
+    basic: bool = False,
 ) -> Any:
     """Declare a parameter as a dataclass field; the words are those of `ParameterSpec`."""
     metadata = {
@@ -118,5 +122,6 @@ def parameter(
         'maximum': high,
         'choices': choices,
         'auto': auto,
+        'basic': basic,
     }
     return field(default=default, metadata=metadata)
