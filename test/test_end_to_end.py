@@ -27,8 +27,7 @@ from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz
 from gp_ground_seg.ros.receiver import OutputReceiver
 from gp_ground_seg.ros.session import ros_session
 from gp_ground_seg.ros.transport import large_cloud_transport
-from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_drive
-from gp_ground_seg.simulation.kinds import semantic_kitti_labels
+from gp_ground_seg.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 
 INPUT = '/points'
 COMMAND = (sys.executable, '-m', 'gp_ground_seg')

@@ -38,16 +38,7 @@ OPTIONAL = {
 
 
 def columns_of(message, *names):
-    return read_columns(
-        message.height,
-        message.width,
-        message.fields,
-        message.is_bigendian,
-        message.point_step,
-        message.row_step,
-        message.data,
-        names,
-    )
+    return read_columns(message, names)
 
 
 @pytest.fixture(scope='module')
