@@ -16,9 +16,8 @@ from hypothesis import given, settings
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
 from gp_ground_seg.cli import main as cli
-from gp_ground_seg.parameters.check import differences, file_problems
 from gp_ground_seg.parameters.config import parameter_specs
-from gp_ground_seg.parameters.export import to_yaml
+from gp_ground_seg.parameters.export import differences, file_problems, to_yaml
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 

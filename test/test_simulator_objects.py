@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.simulation import landforms, objects
-from gp_ground_seg.simulation.kinds import Kind
-from gp_ground_seg.simulation.objects import Box, Cylinder, nearest_solid
+from gp_ground_seg.simulation import objects
+from gp_ground_seg.simulation import terrain as landforms
+from gp_ground_seg.simulation.objects import Box, Cylinder, Kind, nearest_solid
 from gp_ground_seg.simulation.scenes import SCENES
 
 SENSOR_POSITION = np.array([0.0, 0.0, 1.73])

@@ -20,11 +20,11 @@ from gp_ground_seg.simulation import (
     Kind,
     Scene,
     WetPatch,
-    landforms,
     objects,
     simulate_drive,
     simulate_scan,
 )
+from gp_ground_seg.simulation import terrain as landforms
 
 COARSE = dataclasses.replace(HDL_64E, n_columns=240)
 EXACT = dataclasses.replace(COARSE, range_std=0.0, dropout=0.0)

@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.simulation import landforms
-from gp_ground_seg.simulation.landforms import polyline
+from gp_ground_seg.simulation import terrain as landforms
 from gp_ground_seg.simulation.raycast import first_hit
-from gp_ground_seg.simulation.waves import random_waves
+from gp_ground_seg.simulation.terrain import polyline, random_waves
 
 MAX_RANGE = 60.0
 

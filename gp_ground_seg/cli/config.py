@@ -9,10 +9,12 @@ from pathlib import Path
 from gp_ground_seg.cli.options import add_config_options, config_from_options, new_parser
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.parameters.check import differences, file_problems
 from gp_ground_seg.parameters.config import Config, parameter_specs
 from gp_ground_seg.parameters.export import (
-    replace_readme_table,
+    README_PATH,
+    differences,
+    file_problems,
+    generated_files,
     to_markdown_table,
     to_yaml,
     yaml_scalar,
@@ -44,8 +46,8 @@ Exit code 1 if any differ, as that of diff(1).
 """
 
 GENERATE = """\
-Rewrite the files of the presets in config/ and the parameter table of README.md from
-gp_ground_seg/parameters.
+Rewrite the files of the presets in config/, docs/parameters.md and the table of README.md
+from gp_ground_seg/parameters.
 """
 
 
@@ -137,16 +139,15 @@ def run_table(_arguments: argparse.Namespace) -> int:
 def run_generate(arguments: argparse.Namespace) -> int:
     """Rewrite the generated files that have changed, and name all of them."""
     root = Path(arguments.root)
-    readme = root / 'README.md'
+    readme = root / README_PATH
     if not readme.is_file():
         raise DataError(f'{readme}: no such file; name the root of a checkout')
-    for preset in PRESETS.values():
-        text = to_yaml(preset.config, preset.title, preset.reasons)
-        _rewrite(root / 'config' / f'{preset.name}.yaml', text)
     try:
-        _rewrite(readme, replace_readme_table(readme.read_bytes().decode('utf-8')))
+        files = generated_files(readme.read_bytes().decode('utf-8'))
     except DataError as error:
         raise DataError(f'{readme}: {error}') from error
+    for name, text in files.items():
+        _rewrite(root / name, text)
     return 0
 
 

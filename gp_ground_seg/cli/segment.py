@@ -22,16 +22,9 @@ from gp_ground_seg.cli.options import (
     progress_bar,
 )
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
-from gp_ground_seg.data.bags import (
-    BAG_SUFFIXES,
-    BagReader,
-    BagWriter,
-    cloud_topic,
-    decode_cloud,
-    encode_cloud,
-    is_bag,
-    open_bag,
-)
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.frame import Label
@@ -294,14 +287,16 @@ def _segment_bag(
                     continue
                 try:
                     cloud = decode_cloud(raw)
-                    result = segmenter.segment(cloud.xyz())
+                    result = segmenter.segment(read_xyz(cloud))
                 except PointCloudError as error:
                     raise DataError(
                         f'{source}: message {len(frames)} of topic {topic}, '
                         f'recorded at {time} ns: {error}'
                     ) from error
                 for part, label in outputs.items():
-                    output.write(part, time, encode_cloud(cloud.select(result.label == label)))
+                    output.write(
+                        part, time, encode_cloud(select_points(cloud, result.label == label))
+                    )
                 frames.append(_count(result))
                 bar.update()
     return frames

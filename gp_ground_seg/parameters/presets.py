@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.schema import ParameterValue
+from gp_ground_seg.parameters.schema import ParameterValue, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Preset:
 
 _FIRST_RING = (
     'the lowest beam meets level ground at {} m, and {} downhill {} m below the foot of the '
-    'sensor: near the default, and ground beyond the tolerance is not believed'
+    'sensor: near the default, and no seed lies beyond the tolerance'
 )
 _PRESETS = (
     Preset('default', 'Chosen on labelled KITTI frames: HDL-64E on the roof of a car.'),
@@ -88,7 +87,9 @@ _PRESETS = (
             Override('label.obstacle_roughness_gain', 0.0, 'one zeta_g for all (Algorithm 2)'),
             Override('learning.objective', 'paper', 'section III-E as printed'),
             Override('learning.scope', 'frame', 'one theta for the whole frame, section III-E'),
-            Override('learning.segment_step', 1, 'every segment speaks, section III-E'),
+            Override(
+                'learning.segment_step', 1, 'theta is learned from every segment, section III-E'
+            ),
         ),
     ),
     Preset('hdl64', 'Velodyne HDL-64E on the roof of a car; the defaults are for this sensor.'),
@@ -137,7 +138,9 @@ _PRESETS = (
             ),
             Override('grid.n_bins', 40, 'as grid.n_segments'),
             Override('grid.r_max', 60.0, 'beyond it hardly a return meets the ground at 0.5 m'),
-            Override('surface.n_neighbours', 3, 'what one segment lacks, those beside it have'),
+            Override(
+                'surface.n_neighbours', 3, 'gaps in one segment are filled from those beside it'
+            ),
             Override(
                 'growth.seed_height_tolerance', 0.6, _FIRST_RING.format('4.1', '6 %', '0.48')
             ),
@@ -158,7 +161,6 @@ def find_preset(name: str) -> Preset:
     """
     preset = PRESETS.get(name)
     if preset is None:
-        near = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.5)
-        hint = f'; did you mean {near[0]}?' if near else ''
+        hint = did_you_mean(name, PRESETS)
         raise ConfigError(f'unknown preset {name!r}{hint} (there are {", ".join(PRESETS)})')
     return preset

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gp_ground_seg.simulation.sensor import FloatArray
+from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.simulation.terrain import Terrain
 
 CLEARANCE_TOLERANCE = 1e-9
