@@ -28,15 +28,10 @@ COMMANDS = {
     'segment': 'label scans, or split the clouds of a bag',
     'evaluate': 'score against SemanticKITTI labels',
     'pose': 'find out height and tilt of the sensor from scans',
-    'pose-check': 'measure what not knowing height and tilt of the sensor costs',
     'bench': 'time the segmentation by stage, beside Patchwork++',
-    'table1': "the paper's Table I on real frames",
+    'experiment': 'repeat an experiment of docs/: ablation, scenes, cross-validation, ...',
     'plot-segment': 'draw one segment from the side',
     'plot-scan': 'draw a scan in perspective, with the ground model on it',
-    'ablation': 'compare length-scale models and ways to learn',
-    'ideas': 'what each idea is worth: switched off one at a time',
-    'leave-out': 'choose parameters, score them on the sequence left out',
-    'scenes': 'score on simulated scenes, flat and rough, beside Patchwork++',
     'kitti-to-bag': 'write a KITTI sequence as a rosbag2',
     'play': "publish a bag's clouds as they were recorded",
     'demo': 'see it work, no data needed',
@@ -55,9 +50,8 @@ examples:
   gp-ground-seg bench KITTI_ROOT                 time per frame by stage, beside Patchwork++
   gp-ground-seg plot-segment scan.bin --azimuth 0 -o ahead.png
   gp-ground-seg plot-scan --simulate urban -o scan.png
-  gp-ground-seg table1 --kitti KITTI_ROOT        the paper's Table I
-  gp-ground-seg ablation KITTI_ROOT              what the model and the learning are worth
-  gp-ground-seg scenes                           simulated scenes, beside Patchwork++
+  gp-ground-seg experiment table1 KITTI_ROOT     the paper's Table I
+  gp-ground-seg experiment scenes                simulated scenes, beside Patchwork++
   gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 00 drive.mcap
   gp-ground-seg play drive.mcap --clock
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud

@@ -24,7 +24,7 @@ from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.bags import CloudMessage, cloud_from_columns
 from gp_ground_seg.errors import DataError, GroundSegError
 from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.report import write_json
+from gp_ground_seg.evaluation.table import write_json
 from gp_ground_seg.evaluation.trips import (
     MemoryResult,
     RateResult,

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import ConfigError, PointCloudError
-from gp_ground_seg.evaluation.scores import count_confusion
+from gp_ground_seg.evaluation.metrics import count_confusion
 from gp_ground_seg.frame import Label
 from gp_ground_seg.pipeline.points import check_points, finite_points
 from gp_ground_seg.plotting.canvas import new_figure
