@@ -24,11 +24,12 @@ from gp_ground_seg.evaluation.environment import (
     parameters_line,
 )
 from gp_ground_seg.evaluation.evaluate import (
-    KeptFrame,
+    KeptScan,
     MethodScore,
     WorstFrames,
-    evaluate,
     labelled_frames,
+    load_kitti,
+    score_methods,
 )
 from gp_ground_seg.evaluation.methods import (
     OURS,
@@ -112,11 +113,11 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.peer is not None:
             methods.append(PatchworkppMethod())
         worst = WorstFrames(OURS, arguments.worst or N_WORST)
-        scores = evaluate(
-            frames, methods, progress=progress('evaluate'),
-            observe=worst.observe if 'sheet' in parts else None,
-        )  # fmt: skip
-        fit = ours.result().fit
+        observe = worst.observe if 'sheet' in parts else None
+        scores = score_methods(
+            frames, load_kitti, methods, observe=observe, progress=progress('evaluate')
+        )
+        fit = scores[0].fit
         assert fit is not None
         environment = describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
         changes = changed_parameters(config)
@@ -129,7 +130,7 @@ def run(arguments: argparse.Namespace) -> int:
                 'n_threads': fit.n_threads,
                 'backend': fit.backend,
                 'environment': dataclasses.asdict(environment),
-                'stages': {score.name: score.median_stages() for score in scores},
+                'stages': {score.name: score.median_stages for score in scores},
                 **{name: table.json() for name, table in tables.items()},
                 'reliability': reliability_table(scores[0]).json(),
                 'by_frame': frame_table(scores).json(),
@@ -138,7 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
         if 'frames_csv' in parts:
             parts['frames_csv'].write_text(frame_table(scores).csv(), encoding='utf-8')
         if 'sheet' in parts:
-            _draw_sheet(worst.found(), len(frames), parts['sheet'])
+            _draw_sheet(worst.kept, len(frames), parts['sheet'])
         if 'reliability' in parts:
             _draw_reliability(scores[0], parts['reliability'])
     print('\n\n'.join([_headline(scores), *(table.text() for table in tables.values())]))
@@ -150,9 +151,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _headline(scores: Sequence[MethodScore]) -> str:
-    ious = [f'{one.title} {100.0 * one.pooled(GROUNDGRID.key).iou:.2f} %' for one in scores]
+    ious = [f'{one.title} {100.0 * one.iou:.2f} %' for one in scores]
     times = [f'{one.title} {1e3 * one.seconds():.1f} ms' for one in scores]
-    frames, sequences = len(scores[0].frames), len(scores[0].sequences)
+    frames, sequences = len(scores[0].scans), len(scores[0].sequences)
     pooled = f'{count(frames, "frame")} of {count(sequences, "sequence")}'
     return (
         f'IoU {", ".join(ious).removeprefix(OURS).strip()}  (GroundGrid convention, {pooled})\n'
@@ -160,13 +161,13 @@ def _headline(scores: Sequence[MethodScore]) -> str:
     )
 
 
-def _draw_sheet(worst: Sequence[KeptFrame], n_frames: int, path: Path) -> None:
+def _draw_sheet(worst: Sequence[KeptScan], n_frames: int, path: Path) -> None:
     """Draw frames with their errors."""
     if not worst:
         raise DataError(f'no sheet of worst frames: nothing to score in {n_frames} frames')
     panels = []
     for kept in worst:
-        scan, confusion = kept.scan, kept.score.confusions[GROUNDGRID.key]
+        scan, confusion = kept.scan, kept.score.confusion
         # The classes with most errors, as in ``missed terrain 68 %, false building 16 %``.
         causes = ', '.join(
             f'{"missed" if one.missed else "false"} {class_name(one.number)} '
@@ -176,19 +177,20 @@ def _draw_sheet(worst: Sequence[KeptFrame], n_frames: int, path: Path) -> None:
         )
         errors = f'{confusion.fp} false, {confusion.fn} missed: {causes}'
         title = f'{scan.sequence} / {scan.index}    IoU {100.0 * confusion.iou:.2f} %'
-        truth = GROUNDGRID.truth(scan.semantic, scan.points[:, 2])
         subtitle = errors if confusion.errors else 'no errors'
-        panels.append(SheetPanel(title, subtitle, scan.points, kept.label, truth))
+        panels.append(
+            SheetPanel(title, subtitle, scan.points, kept.label, scan.truths[GROUNDGRID.key])
+        )
     title = f'Worst {len(worst)} of {n_frames} frames, GroundGrid convention; x up, y left [m]'
     plot_error_sheet(panels, path, title)
 
 
 def _draw_reliability(score: MethodScore, path: Path) -> None:
-    pooled = score.calibration()
+    pooled = score.calibration
     assert pooled is not None, 'our method has probabilities'
-    found = {name: score.calibration(name) for name in score.sequences}
+    found = {name: score.of(name).calibration for name in score.sequences}
     sequences = {name: one for name, one in found.items() if one is not None}
-    plot_reliability(pooled, sequences, path, f'Reliability, {len(score.frames)} frames')
+    plot_reliability(pooled, sequences, path, f'Reliability, {len(score.scans)} frames')
 
 
 # What `experiment` and `bench` share with this command.

@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.evaluation.environment import Environment, changed_parameters
-from gp_ground_seg.evaluation.methods import Method, OurMethod, Progress
+from gp_ground_seg.evaluation.evaluate import Progress
+from gp_ground_seg.evaluation.methods import Method, OurMethod
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
 from gp_ground_seg.result import FitReport
@@ -118,7 +119,7 @@ def run_cases(
     make_baseline: Callable[[BenchCase], Method] | None = None,
     n_passes: int = 1,
     clock: Callable[[], float] = time.perf_counter,
-    progress: Progress[BenchFrame] = iter,
+    progress: Progress = iter,
 ) -> list[CaseTimes]:
     """Time every case on every frame, each time beside the baseline on that frame.
 
@@ -226,7 +227,7 @@ def time_growth(
     frames: Sequence[BenchFrame],
     config: Config,
     clock: Callable[[], float] = time.perf_counter,
-    progress: Progress[Growth] = iter,
+    progress: Progress = iter,
 ) -> list[dict[str, Any]]:
     """Time one size after the other, each beside one frame under `config`, on one thread.
 

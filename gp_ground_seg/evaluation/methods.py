@@ -5,16 +5,15 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from gp_ground_seg.errors import MissingDependencyError, PointCloudError
+from gp_ground_seg.errors import MissingDependencyError
 from gp_ground_seg.frame import FloatArray, Label
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
@@ -192,95 +191,3 @@ def _c_stdout_silenced() -> Iterator[None]:
         os.dup2(kept, 1)
         os.close(sink)
         os.close(kept)
-
-
-class Scan(Protocol):
-    """A scan in memory: where it is from, and x, y, z, intensity of its points, (N, 4)."""
-
-    @property
-    def sequence(self) -> str:
-        """Sequence, or another group of scans that belong together."""
-
-    @property
-    def index(self) -> str:
-        """Name within the sequence."""
-
-    @property
-    def points(self) -> npt.NDArray[np.float32]:
-        """Points."""
-
-
-_Item = TypeVar('_Item')
-_Scan = TypeVar('_Scan', bound=Scan)
-_Score = TypeVar('_Score')
-Progress = Callable[[Sequence[_Item]], Iterable[_Item]]
-"""Wraps items to show how far the work is, as tqdm does."""
-
-
-def run_methods(
-    items: Sequence[_Item],
-    load: Callable[[_Item], _Scan],
-    methods: Sequence[Method],
-    score: Callable[[_Scan, Method, float], _Score],
-    *,
-    each_alone: bool = False,
-    clock: Callable[[], float] = time.perf_counter,
-    progress: Progress[_Item] = iter,
-) -> dict[str, list[_Score]]:
-    """Run methods alternately on the same scans and score each run.
-
-    Which method goes first changes from scan to scan. Before the first scan counts, each method
-    has run on it once: compilation and first allocations are not its speed.
-
-    Parameters
-    ----------
-    items : sequence
-        What is loaded, grouped by sequence.
-    load : callable
-        Loads an item: one scan at a time is in memory.
-    methods : sequence of Method
-        Each with a name of its own.
-    score : callable
-        Score from the scan, the method that has just run on it, and its seconds.
-    each_alone : bool
-        Whether methods forget before every scan, not only before every sequence.
-    clock, progress : callable
-        Source of seconds; wraps the items.
-
-    Returns
-    -------
-    dict of str to list
-        Scores of each method, by name.
-
-    Raises
-    ------
-    DataError
-        If a scan cannot be loaded.
-    PointCloudError
-        If a method refuses a scan.
-    """
-    scores: dict[str, list[_Score]] = {method.name: [] for method in methods}
-    if items:
-        first = load(items[0])
-        for method in methods:
-            _run(method, first)
-    sequence = None
-    for k, item in enumerate(progress(items)):
-        scan = load(item)
-        forgets = each_alone or scan.sequence != sequence
-        sequence = scan.sequence
-        for method in methods if k % 2 == 0 else reversed(methods):
-            if forgets:
-                method.reset()
-            start = clock()
-            _run(method, scan)
-            seconds = clock() - start
-            scores[method.name].append(score(scan, method, seconds))
-    return scores
-
-
-def _run(method: Method, scan: Scan) -> None:
-    try:
-        method.run(scan.points)
-    except PointCloudError as error:
-        raise PointCloudError(f'{scan.sequence}/{scan.index}: {method.name}: {error}') from error

@@ -6,10 +6,9 @@ import statistics
 from collections.abc import Iterable, Sequence
 
 from gp_ground_seg.evaluation.calibration import BIN_EDGES, N_BINS, THRESHOLDS
-from gp_ground_seg.evaluation.evaluate import MethodScore
+from gp_ground_seg.evaluation.evaluate import ALL, MethodScore
 from gp_ground_seg.evaluation.metrics import (
     CONVENTIONS,
-    GROUNDGRID,
     RATIOS,
     RING_TITLES,
     Convention,
@@ -20,7 +19,6 @@ from gp_ground_seg.evaluation.metrics import (
 from gp_ground_seg.evaluation.table import Cell, Column, Table, milliseconds, percent
 from gp_ground_seg.frame import Label
 
-POOLED = 'all'
 COUNTS_AS = {Label.GROUND: 'ground', Label.OBSTACLE: 'obstacle', Label.UNKNOWN: 'left out'}
 RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 
@@ -50,8 +48,8 @@ def _convention_table(scores: Sequence[MethodScore], convention: Convention) -> 
     ours, *peers = scores
     rows = []
     for sequence in (*ours.sequences, None):
-        found, *its = (score.pooled(convention.key, sequence) for score in scores)
-        row: list[Cell] = [sequence or POOLED, len(ours.of(sequence))]
+        found, *its = (score.of(sequence).pooled(convention.key) for score in scores)
+        row: list[Cell] = [sequence or ALL, len(ours.of(sequence).scans)]
         row += [getattr(found, name) for name in RATIOS]
         rows.append([*row, *_with_peers(found.iou, (one.iou for one in its))])
     columns = [Column('sequence'), Column('frames', 'd')]
@@ -63,11 +61,11 @@ def _convention_table(scores: Sequence[MethodScore], convention: Convention) -> 
 def _ring_table(scores: Sequence[MethodScore]) -> Table:
     columns = [Column('range'), Column('points', '_d'), Column('errors', '_d')]
     columns += [percent('of errors', 'share_of_errors'), percent('precision'), percent('recall')]
-    n_errors = scores[0].pooled(GROUNDGRID.key).errors
+    n_errors = scores[0].confusion.errors
     rows = [
         [title, ring.points, ring.errors, ratio(ring.errors, n_errors), ring.precision,
          ring.recall, ring.iou, *_with_peers(ring.iou, (one.iou for one in its))]
-        for title, ring, *its in zip(RING_TITLES, *(s.rings() for s in scores), strict=True)
+        for title, ring, *its in zip(RING_TITLES, *(s.rings for s in scores), strict=True)
     ]  # fmt: skip
     columns = [*columns, percent('IoU', 'iou'), *_peer_columns(scores[1:])]
     return Table(columns, rows, 'Horizontal range (GroundGrid convention)  [%]')
@@ -75,8 +73,8 @@ def _ring_table(scores: Sequence[MethodScore]) -> Table:
 
 def _class_table(score: MethodScore) -> Table:
     """Classes by what they count as, and in that by their number of errors."""
-    found = class_errors(score.classes())
-    n_errors = score.pooled(GROUNDGRID.key).errors
+    found = class_errors(score.classes)
+    n_errors = score.confusion.errors
     n_points = sum(one.n_points for one in found)
     rows: list[list[Cell]] = [
         [
@@ -105,14 +103,14 @@ def _calibration_table(score: MethodScore) -> Table | None:
     """Errors of the probabilities by sequence and pooled; None if there are none."""
     rows: list[list[Cell]] = []
     for sequence in (*score.sequences, None):
-        found = score.calibration(sequence)
+        found = score.of(sequence).calibration
         if found is None:
             return None
         best = found.confusion_at(found.best_step).iou if found.n_total else None
         threshold = float(THRESHOLDS[found.best_step]) if found.n_total else None
-        iou = score.pooled(GROUNDGRID.key, sequence).iou
+        iou = score.of(sequence).iou
         cells = [found.n_total, found.ece, found.brier, iou, best, threshold]
-        rows.append([sequence or POOLED, *cells])
+        rows.append([sequence or ALL, *cells])
     columns = [Column('sequence'), Column('points', '_d'), Column('ECE', '.4f', 'ece')]
     columns += [Column('Brier', '.4f', 'brier'), percent('IoU of labels', 'iou')]
     columns += [percent('best IoU', 'best_iou'), Column('at p_ground', '.3f', 'best_threshold')]
@@ -132,7 +130,7 @@ def _time_table(scores: Sequence[MethodScore]) -> Table:
     ]
     columns = [Column('method'), milliseconds('median'), milliseconds('mean')]
     columns.append(Column('ours / this', '.2f', 'ratio'))
-    stages = ', '.join(f'{name} {1e3 * s:.1f}' for name, s in scores[0].median_stages().items())
+    stages = ', '.join(f'{name} {1e3 * s:.1f}' for name, s in scores[0].median_stages.items())
     return Table(columns, rows, 'Time per frame, reading left out  [ms]', [f'stages: {stages}'])
 
 
@@ -140,7 +138,7 @@ def reliability_table(score: MethodScore) -> Table:
     """Share of ground and mean probability in each bin of probability, by sequence and pooled."""
     rows: list[list[Cell]] = []
     for sequence in (*score.sequences, None):
-        if (found := score.calibration(sequence)) is not None:
+        if (found := score.of(sequence).calibration) is not None:
             bins = (
                 BIN_EDGES[:-1],
                 BIN_EDGES[1:],
@@ -149,7 +147,7 @@ def reliability_table(score: MethodScore) -> Table:
                 found.share_ground,
             )
             columns = (one.tolist() for one in bins)
-            rows += [[sequence or POOLED, *cells] for cells in zip(*columns, strict=True)]
+            rows += [[sequence or ALL, *cells] for cells in zip(*columns, strict=True)]
     names = ('sequence', 'from', 'to', 'points', 'mean_p', 'share_ground')
     return Table([Column(name) for name in names], rows)
 
@@ -158,15 +156,21 @@ def frame_table(scores: Sequence[MethodScore]) -> Table:
     """One row for each frame of each method; what only some methods tell is empty for others."""
     rows: list[dict[str, Cell]] = []
     for score in scores:
-        for frame in score.frames:
-            row: dict[str, Cell] = {'method': score.name, 'sequence': frame.sequence}
-            row['frame'] = frame.index
-            row['points'] = sum(one.n_points for one in frame.classes.values())
-            for key, confusion in frame.confusions.items():
+        for scan in score.scans:
+            row: dict[str, Cell] = {'method': score.name, 'sequence': scan.sequence}
+            row['frame'] = scan.index
+            row['points'] = sum(count.n_points for count in scan.classes.values())
+            for key, confusion in scan.confusions.items():
                 for name in ('tp', 'fp', 'fn', 'tn', *RATIOS):
                     row[f'{key}_{name}'] = getattr(confusion, name)
-            main = next(iter(class_errors(frame.classes)), None)
+            main = next(iter(class_errors(scan.classes)), None)
             row['main_error_class'] = class_name(main.number) if main and main.errors else ''
-            rows.append(row | {'ms': 1e3 * frame.seconds, **frame.facts})
+            row['ms'] = 1e3 * scan.seconds
+            if scan.fit is not None and scan.pose is not None:
+                row |= {'status': scan.fit.status, 'n_segments': scan.fit.n_segments}
+                row |= {'sensor_height': scan.pose.height}
+                row |= {'sensor_height_estimated': 'yes' if scan.pose.height_estimated else 'no'}
+                row |= {'sensor_roll': scan.pose.roll, 'sensor_pitch': scan.pose.pitch}
+            rows.append(row)
     names = list(dict.fromkeys(name for row in rows for name in row))
     return Table([Column(name) for name in names], [[row.get(n) for n in names] for row in rows])

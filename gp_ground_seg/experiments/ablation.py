@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.methods import Progress
+from gp_ground_seg.evaluation.evaluate import (
+    ALL,
+    KnownScan,
+    MethodScore,
+    Progress,
+    load_kitti,
+)
 from gp_ground_seg.evaluation.table import Cell, Column, Table, centimetres, milliseconds, percent
 from gp_ground_seg.experiments.variants import (
-    ALL,
     Changes,
-    KnownScan,
     Report,
     SimulatedFrame,
-    VariantScore,
-    load_kitti,
     load_simulated,
     make_report,
     refuse_changed,
@@ -119,9 +121,7 @@ DEPARTURES: tuple[Departure, ...] = (
 AS_GIVEN = 'as given'
 
 
-def compare_models(
-    frames: Sequence[Frame], config: Config, progress: Progress[Any] = iter
-) -> Report:
+def compare_models(frames: Sequence[Frame], config: Config, progress: Progress = iter) -> Report:
     """Score `MODELS` on labelled frames; ConfigError if `config` sets what they set."""
     refuse_changed(config, {name for changes in MODELS.values() for name in changes})
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
@@ -129,7 +129,7 @@ def compare_models(
     rows: list[list[Cell]] = []
     for one in scores:
         height, worst = one.height(), one.worst_sequence
-        cells = [height.rmse, height.median_absolute, height.smse, one.median_seconds]
+        cells = [height.rmse, height.median_absolute, height.smse, one.seconds()]
         rows.append([one.name, one.iou, one.of(worst).iou, worst, *cells])
     columns = [
         Column('method'),
@@ -145,9 +145,7 @@ def compare_models(
     return make_report({'models': Table(columns, rows, title)}, scores, config, changes=MODELS)
 
 
-def compare_models_simulated(
-    n_seeds: int, config: Config, progress: Progress[Any] = iter
-) -> Report:
+def compare_models_simulated(n_seeds: int, config: Config, progress: Progress = iter) -> Report:
     """Score `SIMULATED_MODELS` by exact heights on a smooth road that ends in rubble.
 
     Each seed is a scene of its own, seen by an HDL-64E from `PLACES`. Raises as `compare_models`.
@@ -160,7 +158,7 @@ def compare_models_simulated(
     for one in scores:
         heights = [one.height(stretch) for stretch in STRETCHES]
         errors = [h.rmse for h in heights] + [h.median_absolute for h in heights]
-        rows.append([one.name, *errors, one.median_seconds])
+        rows.append([one.name, *errors, one.seconds()])
     columns = [Column('length-scale')]
     for name, key in (('RMSE', 'rmse'), ('median', 'median_absolute')):
         columns += [centimetres(f'{name}, {s}', f'{key}_{s}') for s in STRETCHES]
@@ -187,7 +185,7 @@ def compare_departures(
     frames: Sequence[Frame],
     departures: Sequence[Departure],
     config: Config,
-    progress: Progress[Any] = iter,
+    progress: Progress = iter,
 ) -> Report:
     """Switch one departure after the other, on the same frames in the same run.
 
@@ -231,7 +229,7 @@ def compare_departures(
 
 
 def _departure_row(
-    title: str, switch: str | None, worth: float | None, score: VariantScore, given: VariantScore
+    title: str, switch: str | None, worth: float | None, score: MethodScore, given: MethodScore
 ) -> list[Cell]:
     pairs = zip(score.scans, given.scans, strict=True)
     ratio = statistics.median(one.seconds / other.seconds for one, other in pairs)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.methods import Progress
+from gp_ground_seg.evaluation.evaluate import (
+    ALL,
+    MethodScore,
+    Progress,
+    load_kitti,
+    pool,
+)
 from gp_ground_seg.evaluation.table import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import (
-    ALL,
     Report,
-    VariantScore,
-    load_kitti,
     make_report,
-    pool,
     score_variants,
 )
 from gp_ground_seg.parameters.config import Config
@@ -51,7 +52,7 @@ def coordinate_search(grid: Grid, start: Choice, worth: Callable[[Choice], float
 
 
 def cross_validate(
-    frames: Sequence[Frame], base: Config, grid: Grid, progress: Progress[Any] = iter
+    frames: Sequence[Frame], base: Config, grid: Grid, progress: Progress = iter
 ) -> Report:
     """Choose values by pooled IoU, once on all sequences and once without each.
 
@@ -82,9 +83,9 @@ def cross_validate(
     # As the configuration holds them: 1 and 1.0 are one value.
     tried = {name: [base.replace(**{name: v})[name] for v in grid[name]] for name in grid}
     start: Choice = {name: base[name] for name in grid}
-    known: dict[tuple[ParameterValue, ...], VariantScore] = {}
+    known: dict[tuple[ParameterValue, ...], MethodScore] = {}
 
-    def score(choice: Choice) -> VariantScore:
+    def score(choice: Choice) -> MethodScore:
         key = tuple(choice[name] for name in grid)
         if key not in known:
             variant = {str(len(known)): base.replace(**choice)}
@@ -105,12 +106,12 @@ def cross_validate(
         'scores': _score_table(scores, sequences, len(known)),
         'choices': _choice_table(choices),
     }
-    named = [VariantScore(name, one.scans, one.fit) for name, one in scores.items()]
+    named = [MethodScore(name, one.scans) for name, one in scores.items()]
     return make_report(tables, named, base, n_configurations=len(known), tried=tried)
 
 
 def _score_table(
-    scores: dict[str, VariantScore], sequences: Sequence[str], n_configurations: int
+    scores: dict[str, MethodScore], sequences: Sequence[str], n_configurations: int
 ) -> Table:
     columns = [Column('sequence')]
     columns += [percent(f'IoU {name} [%]', f'iou {name}') for name in scores]

@@ -14,18 +14,21 @@ import numpy as np
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation.methods import MethodResult, OurMethod, Points, Progress
+from gp_ground_seg.evaluation.evaluate import (
+    ALL,
+    KnownScan,
+    MethodScore,
+    Progress,
+    load_kitti,
+    pool,
+)
+from gp_ground_seg.evaluation.methods import MethodResult, OurMethod, Points
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, SENSOR_HEIGHT
 from gp_ground_seg.evaluation.table import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import (
-    ALL,
-    KnownScan,
     Report,
     SimulatedFrame,
-    VariantScore,
-    load_kitti,
     make_report,
-    pool,
     refuse_changed,
     score_variants,
     simulated_frames,
@@ -70,7 +73,7 @@ class Trial:
 
     height: float
     turn: Turn
-    scores: dict[str, VariantScore]
+    scores: dict[str, MethodScore]
 
 
 class TurnedMethod(OurMethod):
@@ -104,7 +107,7 @@ class TurnedMethod(OurMethod):
         return super().ground_z() if n is None else np.full(n, np.nan)
 
 
-def score_poses(frames: Sequence[Frame], config: Config, progress: Progress[Any] = iter) -> Report:
+def score_poses(frames: Sequence[Frame], config: Config, progress: Progress = iter) -> Report:
     """Run labelled frames of KITTI's car, as they are and turned by `TURNS` and `AXES_UP`.
 
     Raises
@@ -126,7 +129,7 @@ def score_simulated_poses(
     config: Config,
     scenes: Sequence[str] = tuple(SCENES),
     sensors: Sequence[str] = SIMULATED_SENSORS,
-    progress: Progress[Any] = iter,
+    progress: Progress = iter,
 ) -> Report:
     """Run simulated scans from sensors at `HEIGHTS`, level and tilted; raises as `score_poses`."""
     frames = simulated_frames(sensors, scenes, n_seeds, (0.0,))
@@ -152,7 +155,7 @@ def load_turned(frame: Frame, turn: Turn) -> KnownScan:
     """Read a labelled frame as a turned sensor would see it."""
     scan = load_kitti(frame)
     points = scan.points[:, :3].astype(np.float64) @ rotation(angles(turn))
-    return dataclasses.replace(scan, points=points, parts={})
+    return dataclasses.replace(scan, points=points, semantic=None, parts={})
 
 
 def load_mounted(frame: SimulatedFrame, height: float, turn: Turn) -> KnownScan:
@@ -165,7 +168,7 @@ def load_mounted(frame: SimulatedFrame, height: float, turn: Turn) -> KnownScan:
     truth = GROUNDGRID.truth(semantic_kitti_labels(made.kind), made.points[:, 2])
     points = made.points[:, :3].astype(np.float64)
     group = f'{frame.sensor} {frame.scene}'
-    return KnownScan(group, str(frame.seed), points, truth, made.ground_z, {})
+    return KnownScan(group, str(frame.seed), points, {GROUNDGRID.key: truth})
 
 
 def _trial(
@@ -174,7 +177,7 @@ def _trial(
     height: float,
     turn: Turn,
     config: Config,
-    progress: Progress[Any],
+    progress: Progress,
 ) -> Trial:
     names = ('sensor.height', 'sensor.roll', 'sensor.pitch')
     refuse_changed(config, names)
@@ -205,7 +208,7 @@ def pose_report(trials: Sequence[Trial], config: Config) -> Report:
     return make_report(tables, named, config)
 
 
-def _pooled(trials: Sequence[Trial], way: str, group: str | None) -> VariantScore:
+def _pooled(trials: Sequence[Trial], way: str, group: str | None) -> MethodScore:
     scores = (trial.scores[way] for trial in trials)
     return pool(way, (one if group is None else one.of(group) for one in scores))
 
@@ -214,7 +217,7 @@ def _groups(trials: Sequence[Trial]) -> list[str]:
     return trials[0].scores[TOLD].sequences
 
 
-def _n_levelled(found: VariantScore) -> int:
+def _n_levelled(found: MethodScore) -> int:
     return sum(scan.pose is not None and not scan.pose.is_level for scan in found.scans)
 
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from gp_ground_seg.evaluation.environment import changed_parameters
-from gp_ground_seg.evaluation.methods import OURS, TITLES, Method, PatchworkppMethod, Progress
+from gp_ground_seg.evaluation.evaluate import (
+    MethodScore,
+    Progress,
+    pool,
+)
+from gp_ground_seg.evaluation.methods import OURS, TITLES, Method, PatchworkppMethod
 from gp_ground_seg.evaluation.metrics import ratio
 from gp_ground_seg.evaluation.table import Cell, Column, Table, centimetres, percent
 from gp_ground_seg.experiments.variants import (
     Report,
-    VariantScore,
     load_simulated,
     make_report,
-    pool,
     score_variants,
     simulated_frames,
 )
@@ -39,7 +41,7 @@ def score_scenes(
     scenes: Sequence[str],
     n_seeds: int,
     with_peer: bool,
-    progress: Progress[Any] = iter,
+    progress: Progress = iter,
 ) -> Report:
     """Segment simulated scans and compare with the truth.
 
@@ -76,7 +78,7 @@ def score_scenes(
     return report
 
 
-def scene_table(ours: VariantScore, peer: VariantScore | None = None) -> Table:
+def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
     """One row for each sensor and scene; the note says where the peer is ahead in IoU."""
     rows: list[list[Cell]] = []
     behind = []

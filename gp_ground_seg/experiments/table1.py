@@ -15,12 +15,13 @@ import numpy as np
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.environment import changed_parameters
-from gp_ground_seg.evaluation.evaluate import load_labelled
-from gp_ground_seg.evaluation.methods import Progress
-from gp_ground_seg.evaluation.metrics import GROUNDGRID, height_error
+from gp_ground_seg.evaluation.evaluate import ALL, Progress, load_kitti
+from gp_ground_seg.evaluation.metrics import height_error
 from gp_ground_seg.evaluation.table import Column, Table
-from gp_ground_seg.experiments.variants import Report
-from gp_ground_seg.frame import OUTSIDE, BoolArray, FloatArray, Label, PolarGrid
+from gp_ground_seg.experiments.variants import (
+    Report,
+)
+from gp_ground_seg.frame import OUTSIDE, BoolArray, FloatArray, PolarGrid
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
@@ -73,7 +74,7 @@ def table1(
     choices: Sequence[Choice],
     config: Config,
     n_repeats: int,
-    progress: Progress[Any] = iter,
+    progress: Progress = iter,
 ) -> Report:
     """Measure the table.
 
@@ -126,7 +127,7 @@ def table1(
     columns = [Column(name, _format(name)) for name in names]
     title = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
     variances = Table(columns, [[row[name] for name in names] for row in rows], title)
-    names = ['segment', *(name for name in rows[0] if name not in names)]
+    names = ['segment', *(n for n in rows[0] if n not in names and not n.startswith('inliers'))]
     columns = [Column(name, _format(name)) for name in names]
     title = 'SMSE in sample (at the inliers) and held out (labelled ground); seconds per frame'
     errors = Table(columns, [[row[name] for name in names] for row in rows], title, [times])
@@ -139,7 +140,7 @@ def table1(
 def _format(name: str) -> str:
     if name == 'segment':
         return ''
-    if name.startswith(('n_', 'inliers')) or name == 'held out':
+    if name.startswith('n_') or name == 'held out':
         return 'd'
     return '.4f' if name.startswith('t ') else '#.4g'
 
@@ -148,9 +149,9 @@ def _rows(
     frame: Frame, choice: Choice, segmenters: dict[str, GroundSegmenter], n_repeats: int
 ) -> tuple[list[dict[str, Any]], Segmentation]:
     """Rows of a frame, by title of the column, and a result of the latent model."""
-    scan = load_labelled(frame)
+    scan = load_kitti(frame)
     z = scan.points[:, 2].astype(np.float64)
-    is_ground = GROUNDGRID.truth(scan.semantic, z) == Label.GROUND
+    is_ground = scan.parts[ALL]
     seconds: dict[str, list[float]] = {name: [] for name in segmenters}
     results: dict[str, Segmentation] = {}
     for k in range(n_repeats + 1):
