@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gp_ground_seg.evaluation.semantic_classes import SemanticClass
+from gp_ground_seg.evaluation.metrics import SemanticClass
 from gp_ground_seg.frame import Label
 
 REPOSITORY = Path(__file__).resolve().parents[1]

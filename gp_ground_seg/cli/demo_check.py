@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation.conventions import GROUNDGRID
-from gp_ground_seg.evaluation.scores import Confusion, count_confusion
+from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confusion
 from gp_ground_seg.frame import Label
 
 _NUMPY_TYPES = {6: '<u4', 7: '<f4'}

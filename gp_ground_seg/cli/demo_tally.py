@@ -9,7 +9,7 @@ import numpy as np
 
 from gp_ground_seg.cli.demo_check import ScanCheck, check_scan
 from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, stamp_of
-from gp_ground_seg.evaluation.scores import Confusion
+from gp_ground_seg.evaluation.metrics import Confusion
 
 GROUND = '/ground'
 OBSTACLES = '/obstacles'
