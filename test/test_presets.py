@@ -37,11 +37,10 @@ def test_every_override_has_a_reason_in_the_file(preset):
     words = ' '.join(re.sub(r'^\s*#', '', line).strip() for line in text.splitlines())
     words = ' '.join(words.split())
     assert preset.purpose in words
-    for override in preset.overrides:
-        assert override.reason
-        assert f'Here: {override.reason} (default ' in words
-    names = [override.name for override in preset.overrides]
-    assert len(set(names)) == len(names)
+    for name, (value, reason) in preset.overrides.items():
+        assert preset.config[name] == value
+        assert reason
+        assert f'Here: {reason} (default ' in words
 
 
 def test_unknown_preset_is_refused_with_the_nearest():

@@ -158,44 +158,31 @@ def _grow_surfaces(
         # Unsigned, as a signed index could count from the end.
         end = np.uintp(size)
         while n_new > 0:
-            a = 0
-            while a < n_new:
-                # Two at a time, so that the rows before are read once for both.
-                i, ii = new[a], new[min(a + 1, n_new - 1)]
-                inlier[first + i] = inlier[first + ii] = True
+            for a in range(n_new):
+                i = new[a]
+                inlier[first + i] = True
                 while done < n and inlier[first + done]:
                     done += 1
                 # The columns before are not needed any more.
                 near = np.uintp(min(i, done) & -LANES)
                 row = whitened[n_inliers]
-                _covariances(i, near, end, all_r, all_l, square, sill, slope, row)
+                own_r, own_l, own_square = all_r[i], 2.0 * all_l[i], square[i]
+                # Prior covariance of column i with the columns from `near` on (paper, eq. 8).
+                for j in range(near, end):
+                    inverse = 1.0 / (own_square + square[j])
+                    distance = own_r - all_r[j]
+                    root = math.sqrt(own_l * all_l[j] * inverse)
+                    value = sill * root * exp_neg(distance * distance * inverse)
+                    row[j] = value + slope * own_r * all_r[j]
+                _project(whitened, n_inliers, i, near, end, row)
                 scale = 1.0 / math.sqrt(variance[i] + noise)
                 innovation = (observed[i] - predicted[i]) * scale
-                if i == ii:
-                    _project(whitened, n_inliers, i, near, end, row)
-                    for j in range(near, end):
-                        value = row[j] * scale
-                        row[j] = value
-                        predicted[j] += value * innovation
-                        variance[j] -= value * value
-                    n_inliers += 1
-                    break
-                after = whitened[n_inliers + 1]
-                _covariances(ii, near, end, all_r, all_l, square, sill, slope, after)
-                _project_two(whitened, n_inliers, i, ii, near, end, row, after)
-                between = row[ii] * scale
-                left = variance[ii] - between * between
-                scale_2 = 1.0 / math.sqrt(left + noise)
-                innovation_2 = (observed[ii] - predicted[ii] - between * innovation) * scale_2
                 for j in range(near, end):
                     value = row[j] * scale
-                    value_2 = (after[j] - between * value) * scale_2
                     row[j] = value
-                    after[j] = value_2
-                    predicted[j] += value * innovation + value_2 * innovation_2
-                    variance[j] -= value * value + value_2 * value_2
-                n_inliers += 2
-                a += 2
+                    predicted[j] += value * innovation
+                    variance[j] -= value * value
+                n_inliers += 1
             n_new = 0
             for i in range(done, n):
                 if inlier[first + i]:
@@ -218,28 +205,6 @@ def _grow_surfaces(
 
 
 @jit(inline=True)
-def _covariances(
-    i: int,
-    near: int,
-    end: int,
-    all_r: FloatArray,
-    all_l: FloatArray,
-    square: FloatArray,
-    sill: float,
-    slope: float,
-    row: FloatArray,
-) -> None:
-    """Prior covariance of column `i` with the columns from `near` on (paper, eq. 8)."""
-    own_r, own_l, own_square = all_r[i], 2.0 * all_l[i], square[i]
-    tilt = slope * own_r
-    for j in range(near, end):
-        inverse = 1.0 / (own_square + square[j])
-        distance = own_r - all_r[j]
-        root = math.sqrt(own_l * all_l[j] * inverse)
-        row[j] = sill * root * exp_neg(distance * distance * inverse) + tilt * all_r[j]
-
-
-@jit(inline=True)
 def _project(
     whitened: FloatArray, n_rows: int, i: int, near: int, end: int, row: FloatArray
 ) -> None:
@@ -257,37 +222,6 @@ def _project(
         w_0 = row_0[i]
         for j in range(near, end):
             row[j] -= w_0 * row_0[j]
-        k += 1
-
-
-@jit(inline=True)
-def _project_two(
-    whitened: FloatArray,
-    n_rows: int,
-    i: int,
-    ii: int,
-    near: int,
-    end: int,
-    row: FloatArray,
-    after: FloatArray,
-) -> None:
-    """Do what `_project` does with the rows of two columns."""
-    k = 0
-    while k + 4 <= n_rows:
-        row_0, row_1, row_2, row_3 = whitened[k], whitened[k + 1], whitened[k + 2], whitened[k + 3]
-        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
-        v_0, v_1, v_2, v_3 = row_0[ii], row_1[ii], row_2[ii], row_3[ii]
-        for j in range(near, end):
-            x_0, x_1, x_2, x_3 = row_0[j], row_1[j], row_2[j], row_3[j]
-            row[j] -= w_0 * x_0 + w_1 * x_1 + w_2 * x_2 + w_3 * x_3
-            after[j] -= v_0 * x_0 + v_1 * x_1 + v_2 * x_2 + v_3 * x_3
-        k += 4
-    while k < n_rows:
-        row_0 = whitened[k]
-        w_0, v_0 = row_0[i], row_0[ii]
-        for j in range(near, end):
-            row[j] -= w_0 * row_0[j]
-            after[j] -= v_0 * row_0[j]
         k += 1
 
 

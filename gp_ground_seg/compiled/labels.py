@@ -131,9 +131,10 @@ def set_bands(n_parts: int, params: LabelParams, room: LabelRoom, roughness: Flo
     squares = np.empty(n_bins + 2, np.int64)
     n_obstacles = np.empty(n_bins, np.int64)
     for m in range(n_segments):
-        number[:] = 0
-        squares[:] = 0
-        n_obstacles[:] = 0
+        for n in range(n_bins + 2):
+            number[n] = squares[n] = 0
+        for n in range(n_bins):
+            n_obstacles[n] = 0
         for index in range(n_parts):
             for k in range(-1, 2):
                 first = (m + k + n_segments) % n_segments * n_bins

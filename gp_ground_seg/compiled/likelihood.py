@@ -31,8 +31,9 @@ def log_likelihood(
     for m in range(part.first, part.stop):
         first, bar_first = inliers.offsets[m], inliers.bar_offsets[m]
         n, p = inliers.offsets[m + 1] - first, inliers.bar_offsets[m + 1] - bar_first
-        gradients[m] = 0.0
         values[m] = 0.0
+        for i in range(len(theta)):
+            gradients[m, i] = 0.0
         if n == 0:
             continue
         u = np.empty(n)
@@ -78,8 +79,10 @@ def log_likelihood(
             for i in range(n):
                 u[i] = inliers.log_length_scale[first + i]
 
-        length_scale = np.exp(u)
-        square = length_scale * length_scale
+        length_scale, square = np.empty(n), np.empty(n)
+        for i in range(n):
+            length_scale[i] = math.exp(u[i])
+            square[i] = length_scale[i] * length_scale[i]
         k = np.empty((n, n))
         factor = np.empty((n, n))
         # l_i^2 / (l_i^2 + l_j^2), from which dlog k / du follows.

@@ -104,7 +104,8 @@ def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray
     """
     for i in range(n):
         row = whitened[i]
-        row[: i + 1] = 0.0
+        for j in range(i + 1):
+            row[j] = 0.0
         for k in range(i):
             weight = factor[k, i]
             above = whitened[k]
@@ -115,7 +116,8 @@ def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray
             row[j] *= scale
         row[i] = scale
     for i in range(n):
-        inverse[i, : i + 1] = 0.0
+        for j in range(i + 1):
+            inverse[i, j] = 0.0
     for k in range(n):
         row = whitened[k]
         for i in range(k + 1):

@@ -150,8 +150,8 @@ def decide_faces(
     n_parts: int, n_tall: int, params: FaceParams, room: FaceSums, faces: Faces
 ) -> None:
     """Decide from the sums of all parts which tiles hold a face, into `faces`."""
-    faces.is_face[:] = False
-    faces.has_occluded_base[:] = False
+    for t in range(len(faces.is_face)):
+        faces.is_face[t] = faces.has_occluded_base[t] = False
     low, high = np.empty(N_COLUMNS), np.empty(N_COLUMNS)
     for k in range(n_tall):
         _add_parts(n_parts, 2 * k, room.sums, low)

@@ -196,14 +196,9 @@ def _sqlite_size(header: bytes) -> int:
 
 
 def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
-    """Storage of a new bag at `path`: 'mcap' or 'sqlite3'.
+    """Storage of a new bag: `wanted`, 'mcap' or 'sqlite3', or by default what the suffix says.
 
-    Parameters
-    ----------
-    path : str or Path
-        Ends in .mcap or .db3 for a single file; anything else is a folder.
-    wanted : {'mcap', 'sqlite3'}, optional
-        By default what the suffix says, MCAP in a folder.
+    A path that ends in .mcap or .db3 is a single file, any other a folder, of MCAP by default.
 
     Raises
     ------

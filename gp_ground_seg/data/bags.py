@@ -70,10 +70,7 @@ def jazzy_topic(name: str, msgtype: str, qos: tuple[Any, ...] = ()) -> BagTopic:
 
 
 def cloud_topic(name: str) -> BagTopic:
-    """PointCloud2 topic offered reliably, as the outputs of the node are.
-
-    A player uses the profile in the bag, and best effort loses large clouds.
-    """
+    """PointCloud2 topic offered reliably; with best effort, large clouds get lost when played."""
     return jazzy_topic(name, POINT_CLOUD2, (_reliable_qos('VOLATILE'),))
 
 
@@ -328,8 +325,7 @@ class BagWriter:
     Parameters
     ----------
     path : str or Path
-        A folder as ``ros2 bag record -o`` makes; or, if it ends in ``.mcap`` or
-        ``.db3``, that single file, which ``ros2 bag play`` and Foxglove open too.
+        A folder as ``ros2 bag record -o`` makes; or a single file, by its suffix.
     storage : {'mcap', 'sqlite3'}, optional
         See `resolve_storage`.
     force : bool

@@ -53,17 +53,7 @@ class Column(NamedTuple):
 
 
 class WiderCloud(NamedTuple):
-    """Points of a cloud with columns added; height and width are those of the cloud.
-
-    Attributes
-    ----------
-    columns : tuple of Column
-        The added columns, in the order given.
-    point_step : int
-        Bytes from one point to the next; a row is ``width`` times that.
-    data : (height * width * point_step,) uint8
-        The points.
-    """
+    """Points of a cloud with columns added, in the order given; rows are not padded."""
 
     columns: tuple[Column, ...]
     point_step: int
@@ -131,8 +121,7 @@ def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray
     Returns
     -------
     (n * point_step,) uint8
-        Every byte of the `n` kept points, in order: the ``data`` of a cloud of height 1,
-        width `n`, the same fields and ``point_step``.
+        Every byte of the `n` kept points, in order.
 
     Raises
     ------
@@ -315,21 +304,9 @@ def with_header(
 def cloud_from_columns(
     stamp: tuple[int, int], frame_id: str, columns: Mapping[str, npt.NDArray[Any]]
 ) -> CloudMessage:
-    """Message with one float32 or uint32 field per column, packed, in the given order.
+    """Message with one float32 or uint32 field per column (N,), packed, in the given order.
 
-    Parameters
-    ----------
-    stamp : (int, int)
-        Seconds and nanoseconds of the header.
-    frame_id : str
-        Frame of the header.
-    columns : mapping of str to (N,) array
-        Floats or unsigned integers.
-
-    Raises
-    ------
-    MissingDependencyError
-        If rosbags is not installed.
+    `stamp` is in seconds and nanoseconds. Raises MissingDependencyError without rosbags.
     """
     types = jazzy_types().types
     codes = {name: f'{values.dtype.kind}4' for name, values in columns.items()}

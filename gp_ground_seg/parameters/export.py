@@ -36,16 +36,8 @@ _NBSP = '\xa0'  # textwrap does not break here
 def to_yaml(config: Config, purpose: str = '', reasons: Mapping[str, str] | None = None) -> str:
     """Write a ROS parameter file with a comment on each parameter.
 
-    ``Config.from_yaml`` of it gives `config` again, and so does a ROS node.
-
-    Parameters
-    ----------
-    config : Config
-        Values to write.
-    purpose : str
-        What the file is for, written at its top.
-    reasons : mapping of str to str, optional
-        Why a parameter has its value, by name, written above it.
+    ``Config.from_yaml`` of it gives `config` again, and so does a ROS node. `purpose`, what the
+    file is for, is written at its top, and the reason of a value, by name, above it.
     """
     reasons = reasons or {}
     lines = [

@@ -111,13 +111,7 @@ class ParameterSpec:
 
 
 def check_typed(spec: ParameterSpec, value: object) -> ParameterValue:
-    """Return `value` if ROS takes it: a ROS parameter keeps its type, an integer is no double.
-
-    Raises
-    ------
-    ConfigError
-        If the type is another or the value out of range.
-    """
+    """Return `value` as `ParameterSpec.check`, but refuse an integer for a number, as ROS does."""
     if spec.type is float and isinstance(value, int) and not isinstance(value, bool):
         raise ConfigError(
             f'{spec.name} = {value}: must be {spec.accepted}, with a decimal point as in {value}.0'
@@ -148,19 +142,11 @@ def declare(
     choices = accepted if accepted and isinstance(accepted[0], str) else ()
     auto = default == AUTO and not choices
     low, high = accepted if accepted and not choices else (None, None)
-    metadata = {
-        'default': default,
-        'type': float if auto else type(default),
-        'description': description,
-        'unit': unit,
-        'symbol': symbol,
-        'minimum': low,
-        'maximum': high,
-        'choices': choices,
-        'auto': auto,
-        'basic': basic,
-    }
-    return field(default=default, metadata=metadata)
+    kind = float if auto else type(default)
+    spec = ParameterSpec(
+        '', kind, default, description, unit, symbol, low, high, choices, auto, basic
+    )
+    return field(default=default, metadata={'spec': spec})
 
 
 basic = functools.partial(declare, basic=True)
@@ -182,7 +168,7 @@ class ParameterGroups:
         """Every declared parameter by its dotted name, in order of declaration."""
         groups: dict[str, Any] = {group.name: group.default for group in dataclasses.fields(cls)}
         specs = (
-            ParameterSpec(f'{name}.{entry.name}', **entry.metadata)
+            dataclasses.replace(entry.metadata['spec'], name=f'{name}.{entry.name}')
             for name, group in groups.items()
             for entry in dataclasses.fields(group)
         )
@@ -190,13 +176,7 @@ class ParameterGroups:
 
     @classmethod
     def find_spec(cls, name: str) -> ParameterSpec:
-        """Return the declaration of one parameter.
-
-        Raises
-        ------
-        ConfigError
-            If there is none; the message names the nearest one.
-        """
+        """Return the declaration of one parameter; raises ConfigError with the nearest name."""
         specs = cls.specs()
         if name in specs:
             return specs[name]

@@ -196,10 +196,8 @@ def nearest_solid(
 
     Returns
     -------
-    distance : (R,) float64
-        Range [m], infinite where a ray meets none.
-    kind : (R,) uint8
-        `Kind` of the solid.
+    (R,) float64, (R,) uint8
+        Range [m], infinite where a ray meets none, and `Kind` of the solid.
     """
     distance = np.full(len(direction), np.inf)
     kind = np.zeros(len(direction), dtype=np.uint8)
@@ -249,8 +247,7 @@ def standing_box(
     kind: Kind = Kind.BOX,
 ) -> Box:
     """Box of a (length, width, height) [m] that stands on the terrain."""
-    ground = float(terrain.height(x, y))
-    length, width, height = size
+    ground, (length, width, height) = float(terrain.height(x, y)), size
     return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, length, width, yaw)
 
 
@@ -260,13 +257,11 @@ def floating_box(
     y: float,
     size: tuple[float, float, float],
     clearance: float,
-    yaw: float = 0.0,
     kind: Kind = Kind.OVERHANG,
 ) -> Box:
     """Box of a (length, width, height) [m] that floats `clearance` [m] over the terrain."""
-    bottom = float(terrain.height(x, y)) + clearance
-    length, width, height = size
-    return Box(kind, x, y, bottom, bottom + height, length, width, yaw)
+    bottom, (length, width, height) = float(terrain.height(x, y)) + clearance, size
+    return Box(kind, x, y, bottom, bottom + height, length, width, yaw=0.0)
 
 
 def pole(
