@@ -11,7 +11,7 @@ from gp_ground_seg.errors import MissingDependencyError
 
 # After Okabe and Ito's palette, in the order of the stages.
 COLOURS = ('#0072B2', '#56B4E9', '#009E73', '#E69F00', '#D55E00', '#CC79A7', '#B4BAC0', '#7A4FA3')
-YARDSTICK_COLOUR = '#3B4046'
+BASELINE_COLOUR = '#3B4046'
 # Inches.
 WIDTH, BAR, AROUND = 10.0, 0.55, 1.9
 DPI = 120
@@ -23,7 +23,7 @@ def plot_stage_bars(document: dict[str, Any], path: str | Path, *, force: bool) 
     Parameters
     ----------
     document : dict
-        Report of `gp_ground_seg.evaluation.bench_report`.
+        Report of `gp_ground_seg.evaluation.benchmark`.
     path : str or Path
         File to write.
     force : bool
@@ -49,7 +49,7 @@ def plot_stage_bars(document: dict[str, Any], path: str | Path, *, force: bool) 
     cases = cases or document['cases']
     stages = list(cases[0]['stages_ms'])
     titles = [case['name'] for case in cases]
-    peer = document['yardstick_ms']
+    peer = document['baseline_ms']
     height = AROUND + BAR * len(titles)
     figure = Figure((WIDTH, height), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
@@ -61,8 +61,8 @@ def plot_stage_bars(document: dict[str, Any], path: str | Path, *, force: bool) 
         start = [a + b for a, b in zip(start, width, strict=True)]
     if peer:
         axes.axvline(
-            peer['median'], color=YARDSTICK_COLOUR, linewidth=1.5, linestyle=(0, (4, 3)),
-            label=f'{document["yardstick"]}, whole frame',
+            peer['median'], color=BASELINE_COLOUR, linewidth=1.5, linestyle=(0, (4, 3)),
+            label=f'{document["baseline"]}, whole frame',
         )  # fmt: skip
     axes.invert_yaxis()
     axes.set_xlabel('median time per frame [ms]')
