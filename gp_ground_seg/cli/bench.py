@@ -122,14 +122,14 @@ def run(arguments: argparse.Namespace) -> int:
 def _plot(document: dict[str, Any], arguments: argparse.Namespace) -> None:
     # Without compiled code a frame takes so long that the others would be but slivers.
     cases = [case for case in document['cases'] if case['backend'] == 'numba']
-    peer = document['yardstick_ms']
+    peer = document['baseline_ms']
     plot_stage_bars(
         {case['name']: case['stages_ms'] for case in cases or document['cases']},
         arguments.plot,
         f'{document["n_frames"]} frames of {document["data"]}, '
         f'{round(document["n_points"]["median"] / 1000)} 000 points each, '
         f'{document["environment"]["cpu"]}',
-        (document['yardstick'], peer['median']) if peer else None,
+        (TITLES[document['baseline']], peer['median']) if peer else None,
         force=arguments.force,
     )
 
