@@ -105,7 +105,9 @@ def test_classes_rings_and_probabilities(evaluated):
     pooled = document['probabilities'][-1]
     bins = [row for row in document['reliability'] if row['sequence'] == 'all']
     assert sum(row['points'] for row in bins) == pooled['points']
-    gaps = [row['points'] * abs(row['share_ground'] - row['mean_p']) for row in bins if row['points']]
+    gaps = [
+        row['points'] * abs(row['share_ground'] - row['mean_p']) for row in bins if row['points']
+    ]
     assert sum(gaps) / pooled['points'] == pytest.approx(pooled['ece'])
 
 
@@ -292,5 +294,3 @@ def test_a_sheet_of_nothing_is_refused(tmp_path, capsys):
     label.write_bytes(bytes(len(label.read_bytes())))  # all unlabelled
     assert run('evaluate', root, '--sheet', tmp_path / 'a.png') == 2
     assert 'nothing to score in 1 frames' in error_line(capsys)
-
-
