@@ -1,4 +1,4 @@
-"""The plane of the ground around the sensor, compiled; twins: `low_cells`, `ground_plane`."""
+"""Compiled twin of `gp_ground_seg.pipeline.ground_plane`."""
 
 from __future__ import annotations
 
@@ -7,46 +7,42 @@ import math
 import numpy as np
 
 from gp_ground_seg.frame import Candidates, FloatArray, IntArray
-from gp_ground_seg.jit import compiled, compiled_vectors
+from gp_ground_seg.jit import jit
+from gp_ground_seg.pipeline import ground_plane
 from gp_ground_seg.pipeline.ground_plane import (
     CLEARLY_BELOW,
     ENOUGH_NEAR,
     FAR,
     LOOSER,
     MAX_HEIGHT,
+    MAX_Z,
     MIN_AREA,
     MIN_CELLS,
     MIN_HEIGHT,
     N_LEVEL,
     N_REFINEMENTS,
+    N_RINGS,
+    N_SECTORS,
     NEAR,
     PENALTY,
     RESOLUTION,
-    SPREAD,
-    GroundPlane,
-    find_plane,
-    solve_plane,
-)
-from gp_ground_seg.pipeline.low_cells import (
-    MAX_Z,
-    N_RINGS,
-    N_SECTORS,
     RING_EDGES,
+    SPREAD,
     TOLERANCE,
     TOLERANCE_GROWTH,
-    directions,
-    low_cells,
+    GroundPlane,
+    segment_directions,
 )
 
 X, Y, Z, RANGE, ALLOWED, INVERSE = range(6)
-"""Rows of the table of low cells; `ALLOWED` is the tolerance, `INVERSE` one over it."""
+"""Rows of the table of lowest points; `ALLOWED` is the tolerance, `INVERSE` one over it."""
 WIDTH = 32
-"""The table is filled up to a multiple of it: no loop over cells has a remainder."""
+"""Rows of the table end at a multiple of it, so that no loop over points has a remainder."""
 N_LARGEST = -(-N_SECTORS * N_RINGS // WIDTH) * WIDTH
 _OUT_OF_REACH = 1e6
 
-# Ring where each stretch begins, a little early for the sake of rounding: a range in it lies
-# in that ring or the next, as the narrowest ring is four stretches wide.
+# Ring at the start of each stretch of range, a little early because of rounding: a range in the
+# stretch lies in that ring or the next, as the narrowest ring is four stretches wide.
 _PER_METRE = 4.0 / float(RING_EDGES[1] - RING_EDGES[0])
 _STARTS = RING_EDGES[0] + (np.arange(int(RING_EDGES[-1] * _PER_METRE) + 1) - 0.02) / _PER_METRE
 _RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0, N_RINGS - 1)
@@ -54,36 +50,24 @@ _RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0,
 Values = tuple[float, float, float, float, float, float, float, float, float, float, int, int]
 
 
-def plane_below(
-    candidates: Candidates, max_slope: float, use_compiled: bool
-) -> GroundPlane | None:
-    """Plane that most of the lowest points around the sensor lie on; None if there is none.
+_solve_plane = jit()(ground_plane.solve_plane)
 
-    Parameters
-    ----------
-    candidates : Candidates
-        Lowest points of the bins of the polar grid.
-    max_slope : float
-        Steepest plane to look for, as rise per metre.
-    use_compiled : bool
-        Compiled code, or its twin in numpy; both give the same but for rounding.
-    """
-    if not use_compiled:
-        return find_plane(low_cells(candidates), max_slope)
+
+def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
+    """Do what `gp_ground_seg.pipeline.ground_plane.fit_plane` does, to rounding."""
     offsets = candidates.offsets
-    values = describe_plane(
-        offsets, candidates.r, candidates.z, directions(len(offsets) - 1), max_slope
-    )
+    directions = segment_directions(len(offsets) - 1)
+    values = _fit_plane(offsets, candidates.r, candidates.z, directions, max_slope)
     return GroundPlane(*values) if values[-1] > 0 else None
 
 
-@compiled
-def describe_plane(
+@jit(entry=True)
+def _fit_plane(
     offsets: IntArray, r: FloatArray, z: FloatArray, directions: FloatArray, max_slope: float
 ) -> Values:
-    """Do what `low_cells`, `find_plane` do; fields of a `GroundPlane`, or no support."""
+    """Fields of the `GroundPlane`; without one, `n_support` is 0."""
     cells, sectors = np.empty((6, N_LARGEST)), np.empty(N_LARGEST, dtype=np.int64)
-    n = tabulate(offsets, r, z, directions, cells, sectors)
+    n = _tabulate(offsets, r, z, directions, cells, sectors)
     plane = 0.0, 0.0, 0.0
     found = False
     if n >= MIN_CELLS:
@@ -100,8 +84,8 @@ def describe_plane(
     return _describe(cells, sectors, n, height, slope_x, slope_y)
 
 
-@compiled
-def tabulate(
+@jit()
+def _tabulate(
     offsets: IntArray,
     r: FloatArray,
     z: FloatArray,
@@ -109,13 +93,13 @@ def tabulate(
     cells: FloatArray,
     sectors: IntArray,
 ) -> int:
-    """Do what `low_cells` does, with a table (6, N_LARGEST); returns how many cells there are."""
+    """Put the lowest points into a table (6, N_LARGEST); return their number."""
     n_segments = len(offsets) - 1
     lowest, cell_of = np.empty(N_SECTORS * N_RINGS), np.empty(len(r), dtype=np.int16)
     index, home = np.empty(len(lowest), dtype=np.int64), np.empty(len(lowest), dtype=np.int64)
     for cell in range(len(lowest)):
         lowest[cell], index[cell], home[cell] = MAX_Z, -1, 0
-    # How low first, without a branch: which of two points is lower is anybody's guess.
+    # Heights first, without a branch: which of two points is lower is unpredictable.
     for m in range(n_segments):
         first = (m * N_SECTORS // n_segments) * N_RINGS
         for c in range(offsets[m], offsets[m + 1]):
@@ -146,7 +130,7 @@ def tabulate(
     return n
 
 
-@compiled
+@jit()
 def _best_hypothesis(
     cells: FloatArray, n: int, max_slope: float
 ) -> tuple[bool, tuple[float, float, float]]:
@@ -178,13 +162,13 @@ def _best_hypothesis(
     return found, best
 
 
-@compiled
+@jit()
 def _is_possible(height: float, slope_x: float, slope_y: float, max_slope: float) -> bool:
     steep = slope_x * slope_x + slope_y * slope_y > max_slope * max_slope
     return MIN_HEIGHT <= height <= MAX_HEIGHT and not steep
 
 
-@compiled_vectors
+@jit(fastmath=True)
 def _score(cells: FloatArray, n: int, height: float, slope_x: float, slope_y: float) -> float:
     """Support less penalty of a plane; of whole numbers, whose sum is exact in any order."""
     x, y, z, inverse = cells[X], cells[Y], cells[Z], cells[INVERSE]
@@ -194,11 +178,11 @@ def _score(cells: FloatArray, n: int, height: float, slope_x: float, slope_y: fl
     return total
 
 
-@compiled
+@jit()
 def _gain(
     x: float, y: float, z: float, inverse: float, height: float, slope_x: float, slope_y: float
 ) -> float:
-    """Score of one cell; not in `_score`, which would not round as the twin does."""
+    """Score of one point; apart from `_score`, whose `fastmath` would change the rounding."""
     d = (z - (slope_x * x + slope_y * y - height)) * inverse
     gain = RESOLUTION * (1.0 - d * d)
     gain = gain if gain > 0.0 else 0.0
@@ -206,7 +190,7 @@ def _gain(
     return whole
 
 
-@compiled_vectors
+@jit(fastmath=True)
 def _refined(
     cells: FloatArray, n: int, height: float, slope_x: float, slope_y: float
 ) -> tuple[float, float, float]:
@@ -228,20 +212,20 @@ def _refined(
         wz += weight * z
         wxz += weight * x * z
         wyz += weight * y * z
-    return solve_plane(w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, height, slope_x, slope_y)
+    return _solve_plane((w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz), (height, slope_x, slope_y))
 
 
-@compiled
+@jit()
 def _describe(
     cells: FloatArray, sectors: IntArray, n: int, height: float, slope_x: float, slope_y: float
 ) -> Values:
-    """Do what the twin does, with the cells on the plane one after the other."""
+    """Evidence for a plane; cells come sector by sector."""
     ranges, drops, near = np.empty(n), np.empty(n), np.empty(n)
     n_on_it, n_near, squares = 0, 0, 0.0
     n_any, n_covered, n_far = 0, 0, 0
     last_any, last_covered, last_far = -1, -1, -1
     for c in range(n):
-        # Sector by sector: a new one is one that was not there before.
+        # A sector that differs from the last one is new.
         sector, r = sectors[c], cells[RANGE, c]
         if sector != last_any:
             n_any, last_any = n_any + 1, sector
@@ -271,9 +255,9 @@ def _describe(
     )  # fmt: skip
 
 
-@compiled
+@jit()
 def _ranked(values: FloatArray, rank: int) -> float:
-    """Value that sorting would put at `rank`: Hoare's selection; reorders the values."""
+    """Value at `rank` in sorted order, by Hoare's selection, which reorders the values."""
     low, high = 0, len(values) - 1
     while low < high:
         pivot, i, j = values[rank], low, high

@@ -1,4 +1,4 @@
-"""Whole-frame objective and its gradient, compiled, one row of results per segment."""
+"""Compiled twin of `gp_ground_seg.gp.likelihood`, one row of results per segment."""
 
 from __future__ import annotations
 
@@ -6,82 +6,34 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled.decay import decay
-from gp_ground_seg.compiled.linalg import factorise, invert
-from gp_ground_seg.compiled.meeting import Board, all_done, claim, enlist
-from gp_ground_seg.frame import FloatArray, IntArray
-from gp_ground_seg.jit import compiled_vectors, inlined
+from gp_ground_seg.compiled.math import exp_neg, factorise, invert
+from gp_ground_seg.compiled.threads import Part
+from gp_ground_seg.frame import FloatArray, Inliers
+from gp_ground_seg.jit import jit
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-BLOCK = 4
-"""Segments that a thread takes at a time."""
-
-
-@compiled_vectors
-def objective_rows(
-    share: int,
-    n_shares: int,
-    board: Board,
+@jit(entry=True, fastmath=True)
+def log_likelihood(
+    part: Part,
     theta: FloatArray,
-    offsets: IntArray,
-    r: FloatArray,
-    z: FloatArray,
-    fixed_u: FloatArray,
-    bar_offsets: IntArray,
-    r_bar: FloatArray,
-    surface_class: IntArray,
+    inliers: Inliers,
     slope_std: float,
     latent_terms: bool,
     values: FloatArray,
     gradients: FloatArray,
 ) -> None:
-    """Do what `gp_ground_seg.gp.objective.objective_reference` does, segment by segment.
-
-    ``values[m]`` and ``gradients[m]`` are set, in one stage; see `gp_ground_seg.compiled.meeting`.
-    """
-    share = enlist(board, share, n_shares)
-    if share < 0:
-        return
-    n_blocks = (len(values) + BLOCK - 1) // BLOCK
-    stage = np.int64(0)
-    block = claim(board, stage, share, n_shares, n_blocks)
-    while block >= 0:
-        start, stop = block * BLOCK, min((block + 1) * BLOCK, len(values))
-        _objective_rows(
-            start, stop, theta, offsets, r, z, fixed_u, bar_offsets, r_bar, surface_class,
-            slope_std, latent_terms, values, gradients,
-        )  # fmt: skip
-        block = claim(board, stage, share, n_shares, n_blocks)
-    all_done(board, stage, share, n_shares, n_blocks)
-
-
-@inlined
-def _objective_rows(
-    start: int,
-    stop: int,
-    theta: FloatArray,
-    offsets: IntArray,
-    r: FloatArray,
-    z: FloatArray,
-    fixed_u: FloatArray,
-    bar_offsets: IntArray,
-    r_bar: FloatArray,
-    surface_class: IntArray,
-    slope_std: float,
-    latent_terms: bool,
-    values: FloatArray,
-    gradients: FloatArray,
-) -> None:
+    """Set ``values[m]`` and ``gradients[m]`` of the segments of a part; -inf where not defined."""
     sigma_f, sigma_n = math.exp(theta[0]), math.exp(theta[1])
     sigma_f_bar, sigma_l_bar = math.exp(theta[2]), math.exp(theta[3])
     sigma_n_bar = math.exp(theta[4])
-    for m in range(start, stop):
-        first, bar_first = offsets[m], bar_offsets[m]
-        n, p = offsets[m + 1] - first, bar_offsets[m + 1] - bar_first
-        gradients[m] = 0.0
+    for m in range(part.first, part.stop):
+        first, bar_first = inliers.offsets[m], inliers.bar_offsets[m]
+        n, p = inliers.offsets[m + 1] - first, inliers.bar_offsets[m + 1] - bar_first
         values[m] = 0.0
+        for i in range(len(theta)):
+            gradients[m, i] = 0.0
         if n == 0:
             continue
         u = np.empty(n)
@@ -92,18 +44,18 @@ def _objective_rows(
         k_star = np.empty((n, p))
         beta = np.zeros(p)
         mean = 0.0
-        own_r = r[first : first + n]
-        own_z = z[first : first + n]
-        own_r_bar = r_bar[bar_first : bar_first + p]
+        own_r = inliers.r[first : first + n]
+        own_z = inliers.z[first : first + n]
+        own_r_bar = inliers.r_bar[bar_first : bar_first + p]
         sharpness = 0.5 / sigma_l_bar**2
         if p > 0:
             for i in range(p):
-                l_bar[i] = theta[5 + surface_class[bar_first + i]]
+                l_bar[i] = theta[5 + inliers.surface_class[bar_first + i]]
                 mean += l_bar[i] / p
                 centre = own_r_bar[i]
                 for j in range(p):
                     d = centre - own_r_bar[j]
-                    value = sigma_f_bar**2 * decay(sharpness * d * d)
+                    value = sigma_f_bar**2 * exp_neg(sharpness * d * d)
                     k_bar[i, j] = value
                     b_factor[i, j] = value
                 b_factor[i, i] += sigma_n_bar**2
@@ -119,33 +71,35 @@ def _objective_rows(
                 centre = own_r[i]
                 for j in range(p):
                     d = centre - own_r_bar[j]
-                    covariance = sigma_f_bar**2 * decay(sharpness * d * d)
+                    covariance = sigma_f_bar**2 * exp_neg(sharpness * d * d)
                     k_star[i, j] = covariance
                     value += covariance * beta[j]
                 u[i] = value
         else:
             for i in range(n):
-                u[i] = fixed_u[first + i]
+                u[i] = inliers.log_length_scale[first + i]
 
-        length_scale = np.exp(u)
-        square = length_scale * length_scale
+        length_scale, square = np.empty(n), np.empty(n)
+        for i in range(n):
+            length_scale[i] = math.exp(u[i])
+            square[i] = length_scale[i] * length_scale[i]
         k = np.empty((n, n))
         factor = np.empty((n, n))
-        # How the kernel bends with either length-scale.
-        bend = np.empty((n, n))
+        # l_i^2 / (l_i^2 + l_j^2), from which dlog k / du follows.
+        ratios = np.empty((n, n))
         for i in range(n):
             centre, own_l, own_square = own_r[i], length_scale[i], square[i]
             tilt = slope_std**2 * centre
-            row, bend_row, factor_row = k[i], bend[i], factor[i]
+            row, ratio_row, factor_row = k[i], ratios[i], factor[i]
             for j in range(i, n):
                 inverse_spread = 1.0 / (own_square + square[j])
                 d = centre - own_r[j]
                 exponent = d * d * inverse_spread
                 root = math.sqrt(2.0 * own_l * length_scale[j] * inverse_spread)
-                value = sigma_f**2 * root * decay(exponent)
+                value = sigma_f**2 * root * exp_neg(exponent)
                 row[j] = value
                 factor_row[j] = value + tilt * own_r[j]
-                bend_row[j] = own_square * inverse_spread
+                ratio_row[j] = own_square * inverse_spread
             factor_row[i] += sigma_n**2
         if not factorise(factor, n):
             values[m] = -np.inf
@@ -170,16 +124,16 @@ def _objective_rows(
             g_trace += g_ii
             g_sigma_f += 2.0 * g_ii * k[i, i]
             own_alpha, centre, own_square = alpha[i], own_r[i], square[i]
-            row, bend_row, inverse_row = k[i], bend[i], inverse[i]
+            row, ratio_row, inverse_row = k[i], ratios[i], inverse[i]
             total = own = 0.0
             for j in range(i + 1, n):
                 g_k = (own_alpha * alpha[j] - inverse_row[j]) * row[j]
                 total += g_k
                 d = centre - own_r[j]
-                ratio = bend_row[j]
-                twist = 2.0 * d * d * ratio / own_square
-                own += g_k * (0.5 - ratio + ratio * twist)
-                g_u[j] += g_k * (ratio - 0.5 + (1.0 - ratio) * twist)
+                ratio = ratio_row[j]
+                curvature = 2.0 * d * d * ratio / own_square
+                own += g_k * (0.5 - ratio + ratio * curvature)
+                g_u[j] += g_k * (ratio - 0.5 + (1.0 - ratio) * curvature)
             g_sigma_f += 2.0 * total
             g_u[i] += own
         gradients[m, 0] = g_sigma_f
@@ -203,7 +157,7 @@ def _objective_rows(
             if latent_terms:
                 value -= math.log(b_factor[i, i]) + 0.5 * _LOG_2PI
         for i in range(p):
-            slot = 5 + surface_class[bar_first + i]
+            slot = 5 + inliers.surface_class[bar_first + i]
             gradients[m, slot] += weight[i] + (g_sum - weight_sum) / p
         g_sigma_f_bar = g_sigma_l_bar = g_noise_bar = 0.0
         share = 0.5 if latent_terms else 0.0
