@@ -9,7 +9,6 @@ from evaluation_samples import HeightRule, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss
@@ -20,9 +19,6 @@ from gp_ground_seg.evaluation.calibration import BIN_EDGES, N_BINS, THRESHOLDS, 
 from gp_ground_seg.evaluation.evaluate import labelled_frames, load_kitti, score_methods
 from gp_ground_seg.evaluation.methods import MethodResult
 from gp_ground_seg.evaluation.metrics import count_confusion
-from gp_ground_seg.plotting import reliability
-from gp_ground_seg.plotting.canvas import DPI
-from gp_ground_seg.plotting.reliability import plot_reliability
 
 PROBABILITY = st.one_of(
     st.floats(0.0, 1.0, width=32), st.sampled_from([0.0, 1.0, 0.5, 0.001, 0.999, math.nan])
@@ -153,26 +149,3 @@ def test_picture_of_the_command(tmp_path):
     picture = tmp_path / 'a.png'
     assert run('evaluate', root, '--reliability', picture) == 0
     assert imread(picture).shape[0] > 500
-    empty = count_calibration(np.full(2, np.nan), np.array([1, 2], dtype=np.uint8))
-    with pytest.raises(PointCloudError, match='no scored point'):
-        plot_reliability(empty, {}, tmp_path / 'b.png')
-
-
-def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
-    """By the pixels of the pooled line: the mean of right minus up in the square."""
-    gaps = []
-    for power in (1.0, 3.0):
-        found = count_calibration(*synthetic(power=power))
-        plot_reliability(found, {'00': found, '08': found}, tmp_path / 'a.png', 'title')
-        image = imread(tmp_path / 'a.png')[:, :, :3]
-        line = np.abs(image - np.array(to_rgb(reliability.POOLED_COLOUR))).max(axis=2) < 0.02
-        top, left, side = (
-            round(x * DPI) for x in (reliability.TITLE, reliability.LEFT, reliability.SQUARE)
-        )
-        square = line[top : top + side, left : left + side]
-        square[3 * side // 4 :, 3 * side // 5 :] = False  # the legend
-        rows, columns = np.nonzero(square)
-        gaps.append(np.mean(rows - (side - columns)) / side)
-    assert abs(gaps[0]) < 0.02
-    # p - p^3 is 0.25 on average.
-    assert 0.15 < gaps[1] < 0.35

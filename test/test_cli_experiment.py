@@ -191,7 +191,7 @@ def test_usage_errors(words, message, capsys):
 def test_commands_of_the_docs_are_accepted():
     """Those above the tables of the docs, and those in their text."""
     names = set()
-    for page in ('experiments', 'accuracy', 'deviations', 'pose', 'performance'):
+    for page in ('experiments', 'accuracy', 'algorithm', 'pose'):
         text = (REPOSITORY / 'docs' / f'{page}.md').read_text(encoding='utf-8')
         for words in re.findall(r'`gp-ground-seg ((?:experiment|evaluate) [^`]*?)`', text):
             arguments = build_parser(words.split()[0]).parse_args(shlex.split(words))

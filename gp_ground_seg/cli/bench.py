@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.cli.argument_types import positive
 from gp_ground_seg.cli.evaluate import progress, staged_options
-from gp_ground_seg.cli.notes import note
-from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.cli.segment_scans import find_scans
+from gp_ground_seg.cli.options import add_config_options, config_from_options, note, positive
+from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.data.bags import decode_cloud, is_bag, open_bag
+from gp_ground_seg.data.bag_files import is_bag
+from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation.benchmark import (
@@ -34,7 +34,7 @@ from gp_ground_seg.evaluation.methods import PATCHWORKPP, TITLES, PatchworkppMet
 from gp_ground_seg.evaluation.table import Cell, Column, Table, fold, write_json
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.stage_bars import plot_stage_bars
+from gp_ground_seg.plotting.charts import plot_stage_bars
 
 DESCRIPTION = """\
 Time the segmentation on your data: theta fixed and learned in every frame, on one
@@ -113,10 +113,25 @@ def run(arguments: argparse.Namespace) -> int:
                 write_json(document, parts['json'])
     print(bench_text(document))
     if arguments.plot is not None:
-        plot_stage_bars(document, arguments.plot, force=arguments.force)
+        _plot(document, arguments)
     if arguments.docs is not None:
         _update_docs(Path(arguments.docs), document)
     return 0
+
+
+def _plot(document: dict[str, Any], arguments: argparse.Namespace) -> None:
+    # Without compiled code a frame takes so long that the others would be but slivers.
+    cases = [case for case in document['cases'] if case['backend'] == 'numba']
+    peer = document['baseline_ms']
+    plot_stage_bars(
+        {case['name']: case['stages_ms'] for case in cases or document['cases']},
+        arguments.plot,
+        f'{document["n_frames"]} frames of {document["data"]}, '
+        f'{round(document["n_points"]["median"] / 1000)} 000 points each, '
+        f'{document["environment"]["cpu"]}',
+        (TITLES[document['baseline']], peer['median']) if peer else None,
+        force=arguments.force,
+    )
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
@@ -244,7 +259,7 @@ def _bag_frames(source: Path, n_frames: int, topic: str | None) -> list[BenchFra
         for k, (_, time, raw) in enumerate(bag.messages([name])):
             if k in wanted:
                 try:
-                    xyz = decode_cloud(raw).xyz()
+                    xyz = read_xyz(decode_cloud(raw))
                 except PointCloudError as error:
                     raise DataError(f'{source}: message {k} of topic {name}: {error}') from error
                 # With full intensity Patchwork++ drops no point as noise.

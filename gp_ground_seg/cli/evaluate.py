@@ -12,9 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from gp_ground_seg.cli.argument_types import positive
-from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.cli.output import count
+from gp_ground_seg.cli.options import add_config_options, config_from_options, count, positive
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import DataError
@@ -41,8 +39,8 @@ from gp_ground_seg.evaluation.methods import (
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, class_errors, class_name
 from gp_ground_seg.evaluation.score_tables import frame_table, reliability_table, score_tables
 from gp_ground_seg.evaluation.table import fold, write_json
-from gp_ground_seg.plotting.error_sheet import SheetPanel, plot_error_sheet
-from gp_ground_seg.plotting.reliability import plot_reliability
+from gp_ground_seg.plotting.birds_eye import SheetPanel, plot_error_sheet
+from gp_ground_seg.plotting.charts import plot_reliability
 
 EXAMPLES = """\
 examples:

@@ -8,13 +8,14 @@ import shlex
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from gp_ground_seg.cli.argument_types import positive, some_of
 from gp_ground_seg.cli.evaluate import frames_from_options, progress, staged_options
 from gp_ground_seg.cli.options import (
     DEFAULT_PRESET,
     add_config_options,
     config_from_options,
     parse_setting,
+    positive,
+    some_of,
 )
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.environment import describe_environment

@@ -37,8 +37,7 @@ from gp_ground_seg.frame import FloatArray, Label
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import AUTO
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
-from gp_ground_seg.simulation.kinds import semantic_kitti_labels
+from gp_ground_seg.simulation import SCENES, SENSORS, semantic_kitti_labels, simulate_scan
 
 TOLD, LEVEL, FOUND = 'told', 'level', 'auto'
 """Ways to run: height and angles given as they are; the height given and the sensor taken to be

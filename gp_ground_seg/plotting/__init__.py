@@ -1,1 +1,1 @@
-"""Pictures of scans and surfaces."""
+"""Pictures of scans, ground models and benchmarks; the only folder that imports matplotlib."""

@@ -8,20 +8,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.frame import Label
+from gp_ground_seg.frame import FloatArray, Label
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.points import check_points, finite_points
-from gp_ground_seg.plotting.canvas import new_figure
-from gp_ground_seg.plotting.length_scale_colours import length_scale_colours
+from gp_ground_seg.plotting.style import VERMILION, length_scale_colours, new_figure, save
 from gp_ground_seg.result import Segmentation
 
-FloatArray = npt.NDArray[np.float64]
-
 GROUND_COLOUR = '#B9BFC6'
-OBSTACLE_COLOUR = '#D55E00'
+OBSTACLE_COLOUR = VERMILION
 WIDTH, HEIGHT, TITLE = 12.0, 6.0, 0.4
 """Size of the picture, and of the line above it [inch]."""
 N_STD = 2.0
@@ -31,7 +27,7 @@ CLOSEST = 1.0
 
 
 class Camera(NamedTuple):
-    """From where to look at what.
+    """Viewpoint of a picture.
 
     Attributes
     ----------
@@ -72,7 +68,7 @@ def plot_scan_view(
     title: str = '',
     camera: Camera = DEFAULT_CAMERA,
 ) -> None:
-    """Draw a scan in perspective as a PNG, replacing the file `path`.
+    """Draw a scan in perspective, replacing the file `path`.
 
     Ground and obstacles, and on them profiles of the ground model with two standard
     deviations, coloured by length-scale: what the node's topics show in RViz.
@@ -82,25 +78,23 @@ def plot_scan_view(
     points : (N, >=3) float array
         The scan, x forward, y left, z up [m].
     segmentation : Segmentation
-        What was made of it.
+        Its segmentation.
     config : Config
-        Parameters it was made with; ``length_scale.min`` and ``max`` end the colours,
+        Parameters of the segmentation; ``length_scale.min`` and ``max`` end the colours,
         ``label.ground_tolerance`` the profiles: less certain ground is not drawn.
     path : str or Path
-        File to write.
+        File to write, a PNG.
     title : str
         Line above the picture.
     camera : Camera
-        From where to look.
+        Viewpoint.
 
     Raises
     ------
     PointCloudError
         If the scan is another one than was segmented.
-    MissingDependencyError
-        If matplotlib is not installed.
-    DataError
-        If the file cannot be written.
+    MissingDependencyError, DataError
+        As `new_figure` and `save`.
     """
     xyz = check_points(points)
     finite = finite_points(xyz)
@@ -109,7 +103,7 @@ def plot_scan_view(
             f'{len(xyz)} points for {len(segmentation.label)} labels: must be the same scan'
         )
     height = HEIGHT + (TITLE if title else 0.0)
-    figure, canvas = new_figure(WIDTH, height)
+    figure = new_figure(WIDTH, height)
     axes = figure.add_axes((0.0, 0.0, 1.0, HEIGHT / height))
     if title:
         figure.text(
@@ -123,13 +117,12 @@ def plot_scan_view(
     axes.set_aspect('equal')
     axes.set_xlim(-0.5, 0.5)
     axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
-    with staged_file(path, force=True) as part:
-        canvas.print_png(str(part))
+    save(figure, path)
 
 
 def _draw_points(axes: Any, xyz: FloatArray, label: npt.NDArray[np.uint8], camera: Camera) -> None:
+    """Draw far points first, and the ground below all obstacles."""
     place, depth = camera.project(xyz)
-    # Far ones first, the ground below all that stands on it.
     for value, colour, layer in (
         (Label.GROUND, GROUND_COLOUR, 1),
         (Label.OBSTACLE, OBSTACLE_COLOUR, 4),
@@ -145,28 +138,24 @@ def _draw_points(axes: Any, xyz: FloatArray, label: npt.NDArray[np.uint8], camer
 def _draw_profiles(axes: Any, model: GroundModel, config: Config, camera: Camera) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
-    n_segments = len(model.height)
-    rows = np.unique(np.linspace(0, n_segments - 1, min(n_segments, N_PROFILES)).round()).astype(
-        int
-    )
-    std = model.std[rows]
+    last = len(model.height) - 1
+    rows = np.unique(np.linspace(0, last, min(last + 1, N_PROFILES)).round()).astype(int)
     middle, lower, upper = (
         camera.project(model.knot_points(n_std)[rows])[0] for n_std in (0.0, -N_STD, N_STD)
     )
-    seen = (std <= config.label.ground_tolerance) & np.isfinite(upper + lower + middle).all(
-        axis=-1
-    )
-    piece = seen[:, :-1] & seen[:, 1:]
-    colours = length_scale_colours(
-        model.length_scale[rows], config.length_scale.min, config.length_scale.max
-    )[:, :-1][piece]
-    bands = [lower[:, :-1], lower[:, 1:], upper[:, 1:], upper[:, :-1]]
-    quads = np.stack([corner[piece] for corner in bands], axis=1)
-    ribbons = PolyCollection(list(quads), facecolors=colours, alpha=0.35, linewidths=0.0, zorder=2)
+    certain = model.std[rows] <= config.label.ground_tolerance
+    shown = certain & np.isfinite(upper + lower + middle).all(axis=-1)
+    piece = shown[:, :-1] & shown[:, 1:]
+    limits = config.length_scale
+    colours = length_scale_colours(model.length_scale[rows], limits.min, limits.max)
+    colours = colours[:, :-1][piece]
+    corners = [lower[:, :-1], lower[:, 1:], upper[:, 1:], upper[:, :-1]]
+    quads = np.stack([corner[piece] for corner in corners], axis=1)
     ends = np.stack([middle[:, :-1][piece], middle[:, 1:][piece]], axis=1)
-    lines = LineCollection(list(ends), colors=colours, linewidths=1.3, zorder=3)
-    axes.add_collection(ribbons)
-    axes.add_collection(lines)
+    axes.add_collection(
+        PolyCollection(list(quads), facecolors=colours, alpha=0.35, linewidths=0.0, zorder=2)
+    )
+    axes.add_collection(LineCollection(list(ends), colors=colours, linewidths=1.3, zorder=3))
 
 
 def _draw_legend(figure: Any, axes: Any, config: Config, height: float) -> None:
@@ -184,10 +173,8 @@ def _draw_legend(figure: Any, axes: Any, config: Config, height: float) -> None:
     axes.add_patch(plate)
     bar = figure.add_axes((0.72, 0.40 / height, 0.255, 0.16 / height))
     low, high = config.length_scale.min, config.length_scale.max
-    scale = np.geomspace(low, high, 200)
-    bar.pcolormesh(
-        np.geomspace(low, high, 201), [0.0, 1.0], length_scale_colours(scale, low, high)[None]
-    )
+    colours = length_scale_colours(np.geomspace(low, high, 200), low, high)
+    bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], colours[None])
     bar.set_xscale('log')
     bar.set_yticks([])
     bar.set_title('length-scale of the ground [m]; ribbons: 2 sigma', fontsize=10)
