@@ -1,5 +1,6 @@
 """Time per frame: alternation, sizes, ratios, record."""
 
+import itertools
 import json
 import math
 
@@ -137,7 +138,7 @@ def test_spread_is_even_and_runs_hold_successive_frames(n_available, n_wanted):
     numbers = [k for _, k in taken]
     assert min(n_available, n_wanted) - RUN_LENGTH < len(taken) <= min(n_available, n_wanted)
     assert numbers == sorted(set(numbers)) and numbers[-1] < n_available
-    for (name, k), (after, next_k) in zip(taken, taken[1:], strict=False):
+    for (name, k), (after, next_k) in itertools.pairwise(taken):
         assert name != after or next_k == k + 1
 
 

@@ -1,4 +1,4 @@
-"""The command `pose`, and the experiment `sensor-pose`."""
+"""The command `pose`."""
 
 import dataclasses
 import math
@@ -10,22 +10,11 @@ import numpy as np
 import pytest
 from cli_runner import error_line, run
 
-from gp_ground_seg import Config
 from gp_ground_seg.cli.main import build_parser
-from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences
-from gp_ground_seg.experiments.sensor_pose import (
-    AXES_UP,
-    HEIGHTS,
-    TURNS,
-    score_poses,
-    score_simulated_poses,
-    turn_text,
-)
 from gp_ground_seg.pipeline.tilt import rotation
-from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_scan, write_semantic_kitti
+from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_scan
 
 SMALL = dataclasses.replace(HDL_64E, n_columns=500)
-FIXED = Config().replace(**{'learning.mode': 'fixed'})
 
 
 def write_scan(path, height, roll=0.0, pitch=0.0, turn=(0.0, 0.0)):
@@ -33,22 +22,6 @@ def write_scan(path, height, roll=0.0, pitch=0.0, turn=(0.0, 0.0)):
     points = simulate_scan(SCENES['flat'](1), mounted, np.random.default_rng(1)).points.copy()
     points[:, :3] = points[:, :3] @ rotation(*turn)
     path.write_bytes(points.astype('<f4').tobytes())
-
-
-@pytest.fixture(scope='module')
-def streets(tmp_path_factory):
-    """Two frames of a simulated street, from KITTI's height."""
-    root = tmp_path_factory.mktemp('streets')
-    scans = (
-        simulate_scan(SCENES['kerb'](seed), SMALL, np.random.default_rng(seed), time=0.1 * seed)
-        for seed in range(2)
-    )
-    write_semantic_kitti(scans, root, '00')
-    return root
-
-
-def frames_of(root):
-    return [frame for name in list_sequences(root) for frame in list_frames(root, name)]
 
 
 def test_height_and_tilt_of_scans_and_their_medians(tmp_path, capsys):
@@ -98,54 +71,6 @@ def test_segment_names_the_scan_that_it_refuses(tmp_path, capsys):
 def test_input_that_is_not_there(tmp_path, capsys):
     assert run('pose', tmp_path / 'none.bin') == 2
     assert 'no such file' in error_line(capsys)
-
-
-def test_frames_turned(streets):
-    tables = score_poses(frames_of(streets), FIXED).tables
-    (own,) = tables['heights'].json()
-    assert (own['scans'], own['silent']) == (2, 0)
-    assert own['told'] > 0.9
-    turns = {row['turned by']: row for row in tables['turns'].json()}
-    assert set(turns) == {'all', *(turn_text(turn) for turn in TURNS if turn != (0, 0))}
-    for row in turns.values():
-        assert row['told'] == pytest.approx(own['told'], abs=1e-3)
-        assert row['auto'] > own['told'] - 0.01
-        assert row['level'] <= row['told'] + 0.01
-    assert [list(row.values()) for row in tables['axes'].json()] == [
-        ['z', 2, 0],
-        *([up, 2, 2] for up in AXES_UP),
-    ]
-
-
-def test_simulated_scans():
-    tables = score_simulated_poses(1, FIXED, ['flat'], ['vlp-16']).tables
-    (own,) = tables['heights'].json()
-    assert own['scans'] == len(HEIGHTS)
-    assert -0.06 < own['low'] <= own['high'] < 0.06
-    *_, turned = tables['turns'].json()
-    assert turned['auto'] > turned['level']
-    assert [row['scans'] for row in tables['axes'].json()] == [len(HEIGHTS)] * (1 + len(AXES_UP))
-
-
-@pytest.mark.parametrize('name', ['sensor.height', 'sensor.roll', 'sensor.pitch'])
-def test_what_is_compared_cannot_be_set(streets, capsys, name):
-    assert run('experiment', 'sensor-pose', streets, '--set', f'{name}=1.0') == 2
-    assert error_line(capsys).startswith(f'{name} = 1.0: ')
-
-
-@pytest.mark.parametrize(
-    ('words', 'reason'),
-    [
-        ([], 'either ROOT or --simulated'),
-        (['ROOT', '--simulated'], 'either ROOT or --simulated'),
-        (['ROOT', '--seeds', '2'], '--seeds: is for --simulated only'),
-        (['ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
-        (['--simulated', '--frame-step', '2'], '--frame-step: is for labelled frames only'),
-    ],
-)
-def test_options_that_contradict_one_another(words, reason, capsys):
-    assert run('experiment', 'sensor-pose', *words) == 2
-    assert reason in error_line(capsys)
 
 
 def test_commands_of_the_docs_are_accepted():

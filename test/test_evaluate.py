@@ -100,9 +100,7 @@ def test_methods_alternate_after_one_warm_up(tmp_path, each_alone):
     journal = []
     methods = [HeightRule(name, -1.5, journal) for name in 'ab']
     ticks = itertools.count()
-    scores = evaluate(
-        tmp_path, *methods, each_alone=each_alone, clock=lambda: float(next(ticks))
-    )
+    scores = evaluate(tmp_path, *methods, each_alone=each_alone, clock=lambda: float(next(ticks)))
     second = ['Rb', 'b', 'Ra', 'a'] if each_alone else ['b', 'a']
     first = ['Ra', 'a', 'Rb', 'b']
     assert journal == ['a', 'b', *first, *second, *first]
@@ -131,9 +129,7 @@ def test_scores_of_a_rule_known_by_hand(tmp_path):
 
 def test_errors_of_classes_and_of_rings_are_all_errors(tmp_path):
     write_streets(tmp_path, s00=2)
-    misses, invents = evaluate(
-        tmp_path, HeightRule('misses', -1.72), HeightRule('invents', -1.0)
-    )
+    misses, invents = evaluate(tmp_path, HeightRule('misses', -1.72), HeightRule('invents', -1.0))
     assert misses.confusion.fn > 0 and invents.confusion.fp > 0
     for score in (misses, invents):
         found = class_errors(score.classes)
