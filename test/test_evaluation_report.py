@@ -70,7 +70,7 @@ def test_parameters_are_recorded():
     assert changed_parameters(config) == changes
     document = make_report([MethodScore('x', ())], config)
     assert document['config_changes'] == changes
-    assert Config.from_flat(document['config_changes']) == config
+    assert Config().replace(**document['config_changes']) == config
     assert document['config'] == config.nested()
 
 

@@ -156,7 +156,7 @@ def test_table_says_what_the_json_says(tmp_path, capsys):
         # What the issue asks of the presets.
         assert own['iou'] >= 0.95
     assert document['config_changes']['vlp-16'] == {
-        one.name: one.value for one in PRESETS['vlp16'].overrides
+        name: value for name, (value, _) in PRESETS['vlp16'].overrides.items()
     }
     n_ahead = sum(own['iou'] > its['iou'] for own, its in zip(ours, peer, strict=True))
     assert f'ahead of Patchwork++ on {n_ahead} of 4 rows' in output

@@ -9,7 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli.segment_scans import find_scans
-from gp_ground_seg.data.bags import decode_cloud, is_bag, open_bag
+from gp_ground_seg.data.bag_files import is_bag
+from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation.bench import BenchFrame
@@ -79,7 +81,7 @@ def _bag_frames(source: Path, n_frames: int, topic: str | None) -> list[BenchFra
         for k, (_, time, raw) in enumerate(bag.messages([name])):
             if k in wanted:
                 try:
-                    found[k] = str(time), _with_intensity(decode_cloud(raw).xyz())
+                    found[k] = str(time), _with_intensity(read_xyz(decode_cloud(raw)))
                 except PointCloudError as error:
                     raise DataError(f'{source}: message {k} of topic {name}: {error}') from error
         return _frames(name, n_messages, n_frames, found.__getitem__)

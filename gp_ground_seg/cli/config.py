@@ -9,14 +9,13 @@ from gp_ground_seg.cli import config_files
 from gp_ground_seg.cli.options import add_config_options, config_from_options
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.parameters.export import replace_readme_table, to_markdown_table, to_yaml
-from gp_ground_seg.parameters.presets import PRESETS, find_preset
-
-YAML_FOLDER = 'config'
-"""Folder of the generated files, below the root of a checkout: one for each preset."""
-
-README_PATH = 'README.md'
-"""File with a generated section, below the root of a checkout."""
+from gp_ground_seg.parameters.export import (
+    README_PATH,
+    generated_files,
+    to_markdown_table,
+    to_yaml,
+)
+from gp_ground_seg.parameters.presets import find_preset
 
 EXAMPLES = """\
 examples:
@@ -59,8 +58,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     generate = commands.add_parser(
         'generate',
         help='for developers: rewrite what is generated in a checkout',
-        description='Rewrite the files of the presets in config/ and the parameter table of '
-        'README.md from gp_ground_seg/parameters.',
+        description='Rewrite the files of the presets in config/, docs/parameters.md and the '
+        'table of README.md from gp_ground_seg/parameters.',
     )
     generate.add_argument(
         'root', metavar='REPO_ROOT', nargs='?', default='.', help='the checkout (default: here)'
@@ -94,13 +93,12 @@ def run_generate(arguments: argparse.Namespace) -> int:
     readme = root / README_PATH
     if not readme.is_file():
         raise DataError(f'{readme}: no such file; name the root of a checkout')
-    for preset in PRESETS.values():
-        text = to_yaml(preset.config, preset.title, preset.reasons)
-        _rewrite(root / YAML_FOLDER / f'{preset.name}.yaml', text)
     try:
-        _rewrite(readme, replace_readme_table(readme.read_bytes().decode('utf-8')))
+        files = generated_files(readme.read_bytes().decode('utf-8'))
     except DataError as error:
         raise DataError(f'{readme}: {error}') from error
+    for name, text in files.items():
+        _rewrite(root / name, text)
     return 0
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 
-from gp_ground_seg.parameters.check import differences, file_problems
 from gp_ground_seg.parameters.config import Config, parameter_specs
-from gp_ground_seg.parameters.export import yaml_scalar
+from gp_ground_seg.parameters.export import differences, file_problems, yaml_scalar
 from gp_ground_seg.parameters.presets import PRESETS
 from gp_ground_seg.parameters.yaml_io import read_parameters
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.data.bags import CloudMessage
+from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation.conventions import GROUNDGRID
 from gp_ground_seg.evaluation.scores import Confusion, count_confusion
@@ -110,7 +110,7 @@ def check_scan(sent: CloudMessage, ground: CloudMessage, obstacles: CloudMessage
 
 
 def _is_alike(sent: CloudMessage, back: CloudMessage) -> bool:
-    names = ('stamp', 'frame_id', 'fields', 'point_step', 'is_bigendian')
+    names = ('header', 'fields', 'point_step', 'is_bigendian')
     return all(getattr(sent, name) == getattr(back, name) for name in names) and (
         len(back.data) == back.height * back.width * back.point_step
     )

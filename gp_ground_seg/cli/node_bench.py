@@ -21,7 +21,7 @@ from gp_ground_seg.cli.output import count, progress_bar
 from gp_ground_seg.cli.play import needing_ros
 from gp_ground_seg.cli.process_memory import peak_memory, resident_memory
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.data.bags import CloudMessage, cloud_from_columns
+from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns
 from gp_ground_seg.errors import DataError, GroundSegError
 from gp_ground_seg.evaluation.environment import describe_environment
 from gp_ground_seg.evaluation.report import write_json

@@ -12,7 +12,7 @@ from gp_ground_seg.cli.segment_bag import (
     segment_bag,
 )
 from gp_ground_seg.cli.segment_scans import find_scans, segment_scans
-from gp_ground_seg.data.bags import BAG_SUFFIXES, is_bag
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.errors import DataError
 
 DESCRIPTION = """\

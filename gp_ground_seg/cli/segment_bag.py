@@ -9,15 +9,9 @@ from pathlib import Path
 
 from gp_ground_seg.cli.notes import note
 from gp_ground_seg.cli.output import SegmentationTally, note_leftovers, progress_bar
-from gp_ground_seg.data.bags import (
-    BAG_SUFFIXES,
-    BagReader,
-    BagWriter,
-    cloud_topic,
-    decode_cloud,
-    encode_cloud,
-    open_bag,
-)
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config
@@ -84,9 +78,9 @@ def split_cloud(raw: bytes, segmenter: GroundSegmenter) -> tuple[bytes, bytes, S
         If the message or its layout cannot be read.
     """
     cloud = decode_cloud(raw)
-    result = segmenter.segment(cloud.xyz())
-    ground = cloud.select(result.label == Label.GROUND)
-    obstacles = cloud.select(result.label == Label.OBSTACLE)
+    result = segmenter.segment(read_xyz(cloud))
+    ground = select_points(cloud, result.label == Label.GROUND)
+    obstacles = select_points(cloud, result.label == Label.OBSTACLE)
     return encode_cloud(ground), encode_cloud(obstacles), result
 
 

@@ -22,8 +22,15 @@ from gp_ground_seg.parameters.schema import AUTO
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.pipeline.tilt import rotation
 from gp_ground_seg.segmenter import GroundSegmenter
-from gp_ground_seg.simulation import HDL_64E, OS1_128, SCENES, VLP_16, SensorModel, simulate_scan
-from gp_ground_seg.simulation.kinds import semantic_kitti_labels
+from gp_ground_seg.simulation import (
+    HDL_64E,
+    OS1_128,
+    SCENES,
+    VLP_16,
+    SensorModel,
+    semantic_kitti_labels,
+    simulate_scan,
+)
 
 TOLD, LEVEL, FOUND = 'told', 'level', 'auto'
 """Ways to run: height and angles given as they are; the height given and the sensor taken to be
