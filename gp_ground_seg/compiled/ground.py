@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.compiled.math import LANES, exp_neg
+from gp_ground_seg.compiled.numerics import LANES, exp_neg
 from gp_ground_seg.compiled.threads import Part
 from gp_ground_seg.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.jit import jit

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled.math import LANES, exp_neg, solve_in_place
+from gp_ground_seg.compiled.numerics import LANES, exp_neg, solve_in_place
 from gp_ground_seg.compiled.threads import Part
 from gp_ground_seg.frame import FloatArray, Frame
 from gp_ground_seg.jit import jit
