@@ -11,6 +11,7 @@ from matplotlib.image import imread
 
 from gp_ground_seg.cli import bench as command
 from gp_ground_seg.cli.bench import load_frames
+from gp_ground_seg.errors import DataError, PointCloudError
 
 QUICK = ('--quick', '--threads', '1', '--set', 'grid.n_segments=24')
 
