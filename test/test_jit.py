@@ -207,11 +207,11 @@ def test_options_of_compiled_functions():
 def test_source_shows_its_module(tmp_path):
     """The digest covers every file that compiled code is made from."""
     before = jit_module._stamp(tmp_path)['sources']
-    changed = textwrap.dedent((jit_module._PACKAGE / 'compiled' / 'math.py').read_text()) + '#'
+    changed = textwrap.dedent((jit_module._PACKAGE / 'compiled' / 'numerics.py').read_text()) + '#'
     real = Path.read_bytes
 
     def read(path):
-        return changed.encode() if path.name == 'math.py' else real(path)
+        return changed.encode() if path.name == 'numerics.py' else real(path)
 
     with patch.object(Path, 'read_bytes', read):
         assert jit_module._stamp(tmp_path)['sources'] != before

@@ -8,7 +8,6 @@ import statistics
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -113,12 +112,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
-class _Counts(NamedTuple):
-    """Points, those of them that are ground, and seconds of one frame."""
-
-    n_points: int
-    n_ground: int
-    seconds: float
+_Counts = tuple[int, int, float]
+"""Points, those of them that are ground, and seconds of one frame."""
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -138,10 +133,10 @@ def run(arguments: argparse.Namespace) -> int:
             frames = _segment_bag(target, arguments, segmenter)
         else:
             frames = _segment_scans(scans, target, arguments, segmenter)
-    n_points = sum(frame.n_points for frame in frames)
-    n_ground = sum(frame.n_ground for frame in frames)
+    all_points, all_ground, seconds = zip(*frames, strict=True)
+    n_points, n_ground = sum(all_points), sum(all_ground)
     share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
-    time = statistics.median(frame.seconds for frame in frames)
+    time = statistics.median(seconds)
     print(
         f'{count(len(frames), "frame")}, {count(n_points, "point")}, {share}, '
         f'{1e3 * time:.1f} ms per frame (median, segmentation only), written to {target}'
@@ -151,7 +146,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _count(result: Segmentation) -> _Counts:
     n_ground = int(np.count_nonzero(result.label == Label.GROUND))
-    return _Counts(len(result.label), n_ground, result.timings['total'])
+    return len(result.label), n_ground, result.timings['total']
 
 
 def _holds_bag_files(source: Path) -> bool:

@@ -21,7 +21,7 @@ STORAGE_OF_SUFFIX = {suffix: storage for storage, suffix in SUFFIX_OF_STORAGE.it
 BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
 
 _FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', '.zstd', '.zst')
-# What rosbags says -> what to do about it.
+# Part of an error of rosbags -> a hint at what to do.
 _NEXT_STEP = {
     'end magic': 'truncated, or still being recorded; `mcap recover` saves what is there',
     'not indexed': 'truncated, or still being recorded; `rosbag reindex` saves what is there',

@@ -275,7 +275,7 @@ def _checked_bytes(cloud: CloudMessage) -> npt.NDArray[np.uint8]:
 def select_points(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> CloudMessage:
     """Message of the points where `mask` is true: same header, same fields, one row.
 
-    ``is_dense`` says whether the kept points are all finite. `cloud` is of rosbags.
+    ``is_dense`` says whether the kept points are all finite. `cloud` is a message of rosbags.
     Raises as `select_rows` and `read_xyz` do.
     """
     data, width = select_rows(cloud, mask), int(np.count_nonzero(mask))

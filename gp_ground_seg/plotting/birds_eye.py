@@ -72,8 +72,6 @@ def plot_birds_eye(
     ------
     PointCloudError, ConfigError
         If the shapes do not fit together; if `extent` is not a positive number.
-    MissingDependencyError, DataError
-        As `new_figure` and `save`.
     """
     xyz = check_points(points)
     check_lengths(len(xyz), label=label, truth=truth)
@@ -161,8 +159,6 @@ def plot_error_sheet(
     ------
     PointCloudError
         If the lengths of a panel differ.
-    MissingDependencyError, DataError
-        As `new_figure` and `save`.
     """
     for panel in panels:
         check_lengths(len(panel.points), label=panel.label, truth=panel.truth)

@@ -60,11 +60,6 @@ def plot_stage_bars(
         Name of another method and its time for a whole frame [ms].
     force : bool
         Whether an existing file is replaced.
-
-    Raises
-    ------
-    MissingDependencyError, DataError
-        As `new_figure` and `save`.
     """
     stages = list(next(iter(cases.values())))
     height = AROUND + BAR * len(cases)
@@ -131,8 +126,6 @@ def plot_reliability(
     ------
     PointCloudError
         If there is no point to draw.
-    MissingDependencyError, DataError
-        As `new_figure` and `save`.
     """
     if not pooled.n_points.sum():
         raise PointCloudError('reliability diagram: no scored point has a probability')

@@ -93,8 +93,6 @@ def plot_scan_view(
     ------
     PointCloudError
         If the scan is another one than was segmented.
-    MissingDependencyError, DataError
-        As `new_figure` and `save`.
     """
     xyz = check_points(points)
     finite = finite_points(xyz)

@@ -90,8 +90,6 @@ def plot_segment(
         If the shapes do not fit together.
     ConfigError
         If the segment, the range or the ending of the file is not one accepted.
-    MissingDependencyError, DataError
-        As `new_figure` and `save`.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     check_lengths(len(z), result=result.label, truth=truth)
@@ -128,19 +126,7 @@ def plot_segment(
 
 
 class SegmentView:
-    """The parts of the picture.
-
-    Parameters
-    ----------
-    result : Segmentation
-        A segmented scan.
-    z : (N,) float64
-        Heights of its points in the level frame [m].
-    segment : int
-        Number of the segment.
-    truth : (N,) uint8 or None
-        True `Label` of each point, if it is known.
-    """
+    """The parts of the picture; `z` is the height of each point in the level frame, (N,) [m]."""
 
     def __init__(
         self,
@@ -163,11 +149,12 @@ class SegmentView:
 
     def title(self, title: str) -> str:
         """Return `title` with the segment and its azimuths."""
-        n_segments = self._result.grid.n_segments
-        first, last = (360.0 * (self._segment + k) / n_segments - 180.0 for k in (0, 1))
-        place = f'segment {self._segment}, azimuth {first:g}° to {last:g}°'
+        width = 360.0 / self._result.grid.n_segments
+        first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
         model = '' if np.isfinite(self._mean).any() else ': no ground model'
-        return f'{title}{", " if title else ""}{place}{model}'
+        parts = [title] if title else []
+        parts += [f'segment {self._segment}', f'azimuth {first:g}° to {last:g}°{model}']
+        return ', '.join(parts)
 
     def reach(self) -> float:
         """Range that holds all candidates, or all points where there are none [m]."""

@@ -144,9 +144,9 @@ def _mirror(
     kind: KindArray,
     draw: FloatArray,
 ) -> None:
-    """Move hits on wet road to where the sensor believes the mirrored solids to be, in place.
+    """Move hits on wet road to the mirror images of solids, in place.
 
-    The sensor knows the length of the light's way, not its bend: it puts the mirror image
+    The measured range is the length of the whole path of the light, so that the image is
     straight on along the ray, below the ground.
     """
     ray = np.flatnonzero((kind == Kind.TERRAIN) & np.isfinite(distance))

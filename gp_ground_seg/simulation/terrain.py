@@ -50,8 +50,8 @@ class Terrain(ABC):
         direction : (R, 2) array
             dx, dy per unit of travel.
         piece : (R, 2) array, optional
-            Points inside the smooth piece meant; it is continued to `at`. By default
-            the piece `at` lies in (on a break line the one on its far side).
+            Points inside the smooth piece to use, continued to `at`; by default the one
+            that `at` lies in, on a break line that on its far side.
         """
 
     @abstractmethod

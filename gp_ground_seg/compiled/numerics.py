@@ -45,7 +45,7 @@ def exp_neg(x: float) -> float:
     return 0.0 if x > NEGLIGIBLE_EXPONENT else value
 
 
-@jit(inline=True)
+@jit(fastmath=True)
 def solve_in_place(matrix: FloatArray, n: int, vector: FloatArray) -> bool:
     """Replace `vector` by the solution of ``A x = vector``; False if not positive definite.
 
