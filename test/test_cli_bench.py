@@ -121,26 +121,16 @@ def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
         (('--from', 'OTHER'), 'not a record'),
         (('DATA', '--quick', '--json', 'OTHER'), 'exists already'),
         (('EMPTY',), 'no point'),
-        (('--from', 'RECORD', '--docs', 'OTHER'), 'once each'),
-        (('--from', 'RECORD', '--docs', 'nowhere.md'), 'nowhere.md: cannot be read'),
     ],
 )
-def test_what_is_wrong_is_said(scans, record, words, says, tmp_path, capsys):
+def test_what_is_wrong_is_said(scans, words, says, tmp_path, capsys):
     other, empty = tmp_path / 'other.json', tmp_path / 'empty.bin'
     other.write_text('{"cases": []}')
     empty.touch()
-    named = {'DATA': scans, 'OTHER': other, 'EMPTY': empty, 'RECORD': record}
+    named = {'DATA': scans, 'OTHER': other, 'EMPTY': empty}
     assert bench(*(named.get(word, word) for word in words)) == 2
     assert says in capsys.readouterr().err
     assert other.read_text() == '{"cases": []}'
-
-
-def test_tables_go_between_the_marks(record, tmp_path, capsys):
-    page = tmp_path / 'page.md'
-    page.write_text('a\n<!-- bench:begin --><!-- bench:end -->\nb\n')
-    assert bench('--from', record, '--docs', page, '--plot', tmp_path / 'a.png') == 0
-    assert capsys.readouterr().out in page.read_text()
-    assert imread(tmp_path / 'a.png').shape[2] == 4
 
 
 def test_a_broken_cloud_of_a_bag_is_named(tmp_path, monkeypatch):
@@ -163,6 +153,8 @@ def test_without_the_baseline_there_are_no_ratios(scans, monkeypatch, tmp_path, 
 
 
 def test_the_picture_leaves_out_cases_without_compiled_code(record, tmp_path, monkeypatch):
+    assert bench('--from', record, '--plot', tmp_path / 'a.png') == 0
+    assert imread(tmp_path / 'a.png').shape[2] == 4
     drawn = []
     monkeypatch.setattr(command, 'plot_stage_bars', lambda cases, *_, force: drawn.append(cases))
     assert bench('--from', record, '--plot', tmp_path / 'bars.png') == 0

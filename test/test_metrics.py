@@ -102,8 +102,6 @@ def test_class_errors_by_hand():
     counts = {40: ClassCount(10, 7), 50: ClassCount(9, 4), 70: ClassCount(8, 8)}
     found = [(one.number, one.missed, one.false, one.errors) for one in class_errors(counts)]
     assert found == [(50, 0, 4, 4), (40, 3, 0, 3), (70, 0, 0, 0)]
-    (high_vegetation,) = class_errors({70: ClassCount(8, 8)}, PATCHWORK)
-    assert high_vegetation.false == 8
 
 
 POINTS = hnp.arrays(
