@@ -44,7 +44,7 @@ def root(tmp_path_factory):
 def evaluated(root, tmp_path_factory):
     """Files of a run beside Patchwork++."""
     folder = tmp_path_factory.mktemp('evaluated')
-    options = ('--json', 'a.json'), ('--sheet', 'a.png')
+    options = ('--json', 'a.json'), ('--sheet', 'a.png'), ('--reliability', 'b.png')
     words = [word for option, name in options for word in (option, folder / name)]
     assert run('evaluate', root, *words, '--worst', 2, '--peer', 'patchworkpp') == 0
     return folder
@@ -108,13 +108,6 @@ def test_classes_rings_and_probabilities(evaluated):
     assert sum(gaps) / pooled['points'] == pytest.approx(pooled['ece'])
 
 
-def test_without_a_peer_nothing_of_it_is_shown(root, capsys):
-    run('evaluate', root, '--sequences', '08')
-    output = capsys.readouterr().out
-    assert 'Patchwork++' not in output
-    assert '1 frame of 1 sequence)' in output
-
-
 def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
     settings = ['label.ground_tolerance=0.011', 'sensor.height=1.7', 'growth.seed_range=19.5']
     settings += ['runtime.n_threads=1', 'lines.max_gap=1.25', 'grid.r_max=15.0']
@@ -127,6 +120,7 @@ def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
     assert b['n_threads'] == 1
     assert b['groundgrid'][-1]['recall'] < a['groundgrid'][-1]['recall']
     output = capsys.readouterr().out
+    assert 'Patchwork++' not in output
     assert 'parameters: defaults' in output
     assert all(setting in output for setting in settings)
     assert max(len(line) for line in output.splitlines() if 'every number' not in line) <= 100
@@ -201,7 +195,7 @@ def test_progress_only_on_a_terminal(root):
 
 
 def test_sheet_of_the_command(root, evaluated, tmp_path, monkeypatch):
-    assert imread(evaluated / 'a.png').shape[2] == 4
+    assert imread(evaluated / 'a.png').shape[2] == imread(evaluated / 'b.png').shape[2] == 4
     drawn = []
 
     def draw(panels, path, title):

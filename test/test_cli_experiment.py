@@ -8,7 +8,6 @@ import pytest
 from cli_runner import error_line, run
 from conftest import REPOSITORY
 from evaluation_samples import write_streets
-from test_cli_evaluate import rows_of
 
 from gp_ground_seg import Config
 from gp_ground_seg.cli.experiment import EXPERIMENTS, parse_departure, split_settings
@@ -69,7 +68,7 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
     tables = {key: found for key, found in document.items() if isinstance(found, list)}
     assert len(tables.pop('rows')) == n_rows
     assert tables[name]
-    # A cell is a word or several with single blanks: rows of text have as many as those of JSON.
+    # Cells stand two blanks apart, so that rows of text and of JSON have equally many.
     for row in (row for table in tables.values() for row in table):
         first = next(str(cell) for cell in row.values() if cell is not None)
         rows = [re.split(r'  +', line.strip()) for line in lines if line.startswith(first)]
@@ -89,20 +88,6 @@ def test_tables_as_markdown(capsys):
     assert header == '| sensor | scene | IoU | RMSE | median | no model |'
     assert rule == '| --- | --- | --: | --: | --: | --: |'
     assert row.startswith('| vlp-16 | kerb | ') and machine.startswith('machine: ')
-
-
-def test_choices_and_scores_of_cross_validation(root, tmp_path, capsys):
-    target = tmp_path / 'a.json'
-    words = ['--set', 'grid.r_max=5,20.0,60', *SMALL, '--json', target]
-    assert run('experiment', 'cross-validation', root, *words) == 0
-    document = json.loads(target.read_text())
-    (choice,) = document['choices']
-    assert (choice['parameter'], choice['given']) == ('grid.r_max', '90')
-    pooled = document['scores'][-1]
-    assert pooled['iou tuned'] >= pooled['iou given']
-    assert document['n_configurations'] == 4
-    rows = rows_of(capsys.readouterr().out, 'sequence')
-    assert rows['all'][0] == f'{100 * pooled["iou given"]:.2f}'
 
 
 def test_scenes_have_the_presets_of_their_sensors(monkeypatch):

@@ -70,18 +70,6 @@ def frames(tmp_path_factory):
 # Variants.
 
 
-def test_variants_are_scored_as_by_themselves(frames):
-    configs = {'given': FAR, 'near': FAR.replace(**NEAR)}
-    for score in score_variants(frames, load_kitti, configs):
-        segmenter = GroundSegmenter(configs[score.name])
-        for frame, found in zip(frames, score.scans, strict=True):
-            scan = load_kitti(frame)
-            segmenter.reset()
-            expected = segmenter.segment(scan.points)
-            assert found.confusion == count_confusion(expected.label, scan.truths['groundgrid'])
-        assert score.scans[0].fit.n_threads >= 1
-
-
 def test_only_what_the_ray_hit_of_the_terrain_is_ground():
     scan = load_simulated(SimulatedFrame('hdl-64e', 'urban', 0, 0.0))
     made = simulate_scan(SCENES['urban'](0), HDL_64E, np.random.default_rng(0))

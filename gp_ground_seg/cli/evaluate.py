@@ -6,8 +6,9 @@ import argparse
 import itertools
 import statistics
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from gp_ground_seg.evaluation.environment import describe_environment, parameter
 from gp_ground_seg.evaluation.evaluate import (
     KnownScan,
     MethodScore,
+    Progress,
     ScanScore,
     labelled_frames,
     load_kitti,
@@ -171,10 +173,13 @@ def _headline(scores: Sequence[MethodScore]) -> str:
 
 def score_tables(scores: Sequence[MethodScore]) -> dict[str, Table]:
     """Tables of an evaluation by name, ours first in `scores`."""
-    tables = {one.key: _convention_table(scores, one) for one in CONVENTIONS}
-    tables |= {'rings': _ring_table(scores), 'classes': _class_table(scores[0])}
-    tables['probabilities'] = _calibration_table(scores[0])
-    return tables | {'times': _time_table(scores)}
+    return {
+        **{one.key: _convention_table(scores, one) for one in CONVENTIONS},
+        'rings': _ring_table(scores),
+        'classes': _class_table(scores[0]),
+        'probabilities': _calibration_table(scores[0]),
+        'times': _time_table(scores),
+    }
 
 
 def _peer_columns(peers: Sequence[MethodScore]) -> list[Column]:
@@ -185,7 +190,7 @@ def _peer_columns(peers: Sequence[MethodScore]) -> list[Column]:
     return columns
 
 
-def _with_peers(iou: float, peers: Iterable[float]) -> list[Cell]:
+def _with_peers(iou: float, peers: Iterator[float]) -> list[Cell]:
     return [cell for its in peers for cell in (its, iou - its)]
 
 
@@ -336,10 +341,9 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
     """Labelled frames of the options, grouped by sequence; errors as `labelled_frames`."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
-    grouped: dict[str, list[Frame]] = {}
-    for frame in labelled_frames(arguments.root, chosen):
-        grouped.setdefault(frame.sequence, []).append(frame)
-    return [frame for group in grouped.values() for frame in group[:: arguments.frame_step or 1]]
+    frames = labelled_frames(arguments.root, chosen)
+    groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
+    return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]
 
 
 @contextmanager
@@ -356,13 +360,6 @@ def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[
         }
 
 
-def progress(title: str, unit: str = 'frame') -> Any:
+def progress(title: str, unit: str = 'frame') -> Progress:
     """Wrap items in a progress bar on standard error, if that is a terminal."""
-
-    def bar(items: Sequence[Any]) -> Iterable[Any]:
-        shown: Iterable[Any] = tqdm(
-            items, unit=unit, desc=title, file=sys.stderr, disable=None, leave=False
-        )
-        return shown
-
-    return bar
+    return partial(tqdm, unit=unit, desc=title, file=sys.stderr, disable=None, leave=False)
