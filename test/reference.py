@@ -183,8 +183,8 @@ def pseudo_inputs(candidates: Candidates, lines: Lines, config) -> PseudoInputs:
         first, stop = lines.start[q], lines.start[q + 1]
         extent = candidates.r[stop - 1] - candidates.r[first]
         steepness = math.inf if math.isnan(slope) else abs(slope)
-        length = (extent >= latent.medium_extent) + (extent >= latent.long_extent)
-        tilt = (steepness >= latent.sloped_gradient) + (steepness >= latent.steep_gradient)
+        length = sum(extent >= one for one in (latent.medium_extent, latent.long_extent))
+        tilt = sum(steepness >= one for one in (latent.sloped_gradient, latent.steep_gradient))
         extents[3 * tilt + length].append(math.log(min(max(extent, limits.min), limits.max)))
         number = max(round((stop - first) / latent.candidates_per_pseudo_input), 1)
         for k in range(number):
