@@ -133,12 +133,8 @@ def test_moments_that_determine_no_plane_or_no_slope():
 
 def test_a_refinement_that_leaves_the_ground_is_not_used(monkeypatch):
     candidates = BACKENDS[0].build_grid(cluttered_plane(0, 1.5, 0.0, 0.0), Config()).candidates
-    monkeypatch.setattr(
-        'gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (99.0, 0.0, 0.0)
-    )
+    monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (99.0, 0.0, 0.0))
     assert fit_plane(candidates, 0.5).height == pytest.approx(1.5, abs=0.1)
     # Nor is a plane that no point lies on.
-    monkeypatch.setattr(
-        'gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (19.0, 0.0, 0.0)
-    )
+    monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (19.0, 0.0, 0.0))
     assert fit_plane(candidates, 0.5) is None

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import Reference
 
-from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.jit import HAVE_NUMBA
@@ -173,17 +173,6 @@ def test_the_input_is_not_written_to_and_may_change_afterwards(backend, scan, ti
         same(result, expected)
 
 
-def test_backends_agree(backend, scan):
-    result = GroundSegmenter(Config(), backend=backend).segment(scan)
-    assert result.fit.backend == backend.name
-    expected = segmenter_of(**{'runtime.backend': 'numpy'}).segment(scan)
-    np.testing.assert_array_equal(result.label, expected.label)
-    for name in VALUES:
-        np.testing.assert_allclose(
-            getattr(result, name), getattr(expected, name), atol=1e-6, err_msg=name
-        )
-
-
 @pytest.mark.parametrize('model', ['latent', 'line_gradient', 'constant'])
 @pytest.mark.parametrize('scope', ['frame', 'segment'])
 @pytest.mark.parametrize('objective', ['map', 'paper'])
@@ -232,11 +221,6 @@ def test_fit_report_counts(scan):
     assert 0 < fit.n_lines <= fit.n_pseudo_inputs
     assert fit.n_threads == SEGMENTER._backend.n_threads
     assert np.isfinite(fit.objective)
-
-
-def test_neighbours_must_fit_round_the_sensor():
-    with pytest.raises(ConfigError, match=r'surface\.n_neighbours = 2'):
-        Config().replace(**{'grid.n_segments': 4})
 
 
 # One scan after the other

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import fewer, hilly_scan
+from conftest import fewer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_ground_plane import cluttered_plane
@@ -17,7 +17,7 @@ from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.jit import JIT_ENABLED
-from gp_ground_seg.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT, SensorPose
+from gp_ground_seg.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
 from gp_ground_seg.pipeline.tilt import angles_of, rotate, rotation
 from gp_ground_seg.simulation import (
     HDL_64E,
@@ -86,13 +86,6 @@ def test_rotated_points_keep_their_precision_and_stay_finite(dtype):
     assert list(np.isfinite(turned).all(axis=1)) == [True, True, False]
 
 
-def test_level_copies_nothing_and_reports_so():
-    xyz, pose = hilly_scan(100), SensorPose(1.0, 0.0, 0.0)
-    assert pose.level(xyz) is xyz
-    assert pose.is_level
-    np.testing.assert_array_equal(pose.rotation, np.eye(3))
-
-
 # Estimation
 
 
@@ -109,15 +102,6 @@ def test_a_cluttered_plane_is_recovered(seed, height, roll, pitch):
     assert pose_of(points[order]) == pose
     other = segmenter(NumpyBackend()).estimate_pose(points)
     assert dataclasses.replace(other, measured=None) == dataclasses.replace(pose, measured=None)
-
-
-@settings(max_examples=fewer(20, 3))
-@given(st.integers(0, 2**32 - 1), st.floats(-np.pi, np.pi))
-def test_turning_about_the_vertical_keeps_the_height(seed, yaw):
-    points = cluttered_plane(seed, 1.5, 0.0, 0.0)
-    c, s = np.cos(yaw), np.sin(yaw)
-    pose = pose_of(points @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T)
-    assert pose.height == pytest.approx(pose_of(points).height, abs=0.02)
 
 
 @SENSORS
