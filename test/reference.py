@@ -65,7 +65,9 @@ def place_of(x, y, grid):
     steps = np.arange(grid.n_bins + 1) / grid.n_bins
     edges = grid.r_min + (grid.r_max - grid.r_min) * steps**grid.bin_growth
     # The origin counts as lying on +x, also where its x is -0.
-    turn = (math.atan2(y, x if x != 0.0 or y != 0.0 else 1.0) / (2.0 * math.pi) + 0.5) * grid.n_segments
+    turn = (
+        math.atan2(y, x if x != 0.0 or y != 0.0 else 1.0) / (2.0 * math.pi) + 0.5
+    ) * grid.n_segments
     if not r < edges[-1]:
         return None, turn
     return next(n for n in range(grid.n_bins) if r < edges[n + 1]), turn
