@@ -8,11 +8,13 @@ import threading
 import time
 from collections.abc import Callable
 
+import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.backend import Backend, make_backend
 from gp_ground_seg.frame import Candidates, FloatArray, Frame, PointArray, Scan
 from gp_ground_seg.gp.learning import Learned, given_theta, learn_frame
+from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config, SensorConfig
 from gp_ground_seg.pipeline.points import take_points
 from gp_ground_seg.pipeline.sensor_pose import SensorPose, estimate_pose, given_pose
@@ -135,6 +137,11 @@ class GroundSegmenter:
         return self._config
 
     @property
+    def backend(self) -> Backend:
+        """Backend of the next scan."""
+        return self._backend
+
+    @property
     def backend_name(self) -> str:
         """Name of the backend: ``numba`` or ``numpy``."""
         return self._backend.name
@@ -212,6 +219,33 @@ class GroundSegmenter:
         self._theta, learned = learn_frame(frame, start, self._config, self._backend, out_of_time)
         self._frames_since_learning = 0
         return self._theta, learned
+
+
+def warm_up(config: Config | None = None) -> Backend:
+    """Compile or load all code that a frame needs, and return the backend it belongs to.
+
+    A small scan of single precision, the type of most sensors, is segmented. Where
+    numba is not installed, or not asked for, there is nothing to compile.
+
+    Parameters
+    ----------
+    config : Config, optional
+        Parameters; hyper-parameters are learned whatever they say.
+
+    Raises
+    ------
+    MissingDependencyError
+        If ``runtime.backend`` is numba and numba is not installed.
+    """
+    config = config if config is not None else Config()
+    segmenter = GroundSegmenter(config.replace(**{'learning.mode': 'every_frame'}))
+    azimuth, r = np.meshgrid(np.linspace(-3.0, 3.0, 400), np.geomspace(2.5, 30.0, 30))
+    xyz = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full_like(r, -1.73)], axis=-1)
+    wall = xyz[25] + [0.0, 0.0, 1.0]
+    points = np.concatenate([xyz.reshape(-1, 3), wall]).astype(np.float32)
+    segmenter.segment(points)
+    keep_code(warm=True)
+    return segmenter.backend
 
 
 class StageTimer:

@@ -20,7 +20,14 @@ from gp_ground_seg.cli.demo_node import NodeProcess, private_network
 from gp_ground_seg.cli.demo_tally import BACKLOG, GROUND, OBSTACLES, Tally
 from gp_ground_seg.cli.demo_text import result_text
 from gp_ground_seg.cli.main import main
-from gp_ground_seg.data.bags import decode_cloud, encode_cloud, open_bag
+from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.point_cloud2 import (
+    decode_cloud,
+    encode_cloud,
+    read_xyz,
+    select_points,
+    with_header,
+)
 from gp_ground_seg.errors import GroundSegError, PointCloudError
 from gp_ground_seg.frame import Label
 from gp_ground_seg.ros import transport
@@ -45,8 +52,8 @@ def sent_cloud(n=40, seed=0, stamp=5_000_000_007):
 
 def split(cloud, is_ground):
     """What a right node makes of a scan: NaN in neither."""
-    finite = np.isfinite(cloud.xyz()).all(axis=1)
-    return cloud.select(is_ground & finite), cloud.select(~is_ground & finite)
+    finite = np.isfinite(read_xyz(cloud)).all(axis=1)
+    return select_points(cloud, is_ground & finite), select_points(cloud, ~is_ground & finite)
 
 
 def perfect(n=40):
@@ -62,7 +69,7 @@ def test_perfect_answer():
     assert (check.confusion.tp, check.confusion.tn) == (20, 19)
     assert check.confusion.errors == 0
     assert check.label[3] == Label.UNKNOWN
-    np.testing.assert_array_equal(check.points[:, :3], cloud.xyz())
+    np.testing.assert_array_equal(check.points[:, :3], read_xyz(cloud))
 
 
 def test_wrong_labels_are_scored():
@@ -105,19 +112,19 @@ def test_every_fault_is_found():
         assert not check.is_exact
         return check.n_missing, check.n_repeated, check.n_altered, check.n_foreign
 
-    assert faults(ground.select(~chosen(20, 4)), obstacles) == (1, 0, 0, 0)
-    in_both = joined(obstacles, cloud.select(chosen(40, 8)))
+    assert faults(select_points(ground, ~chosen(20, 4)), obstacles) == (1, 0, 0, 0)
+    in_both = joined(obstacles, select_points(cloud, chosen(40, 8)))
     assert faults(ground, in_both) == (0, 1, 0, 0)
-    twice_in_one = joined(ground, cloud.select(chosen(40, 8)))
+    twice_in_one = joined(ground, select_points(cloud, chosen(40, 8)))
     assert faults(twice_in_one, obstacles) == (0, 1, 0, 0)
-    not_finite = joined(obstacles, cloud.select(chosen(40, 3)))
+    not_finite = joined(obstacles, select_points(cloud, chosen(40, 3)))
     assert faults(ground, not_finite) == (0, 0, 0, 1)
     # Each byte counts: of coordinates, intensity, label. One of the index makes it another point.
     for byte in range(20):
         assert faults(flipped(ground, 24 * 7 + byte), obstacles) == (0, 0, 1, 0)
     assert faults(flipped(ground, 24 * 7 + 20), obstacles) == (1, 1, 1, 0)
     assert faults(flipped(ground, 24 * 7 + 23), obstacles) == (1, 0, 0, 1)
-    for change in ({'stamp': (5, 8)}, {'frame_id': 'map'}, {'fields': cloud.fields[:-1]}):
+    for change in ({'header': with_header(cloud, (5, 8)).header}, {'fields': cloud.fields[:-1]}):
         changed = dataclasses.replace(ground, **change)
         assert faults(changed, obstacles) == (20, 0, 20, 0)
     assert faults(dataclasses.replace(ground, data=ground.data[:-1]), obstacles) == (20, 0, 20, 0)
@@ -149,7 +156,7 @@ def test_tally():
     tally.arrived(GROUND, ground, 1000 + 3 * 10**8 + 60_000_000)
     assert tally.is_partition_exact
     ground, obstacles = split(clouds[4], perfect())
-    tally.arrived(GROUND, ground.select(~chosen(20, 1, 2)), 1000 + 4 * 10**8 + 10_000_000)
+    tally.arrived(GROUND, select_points(ground, ~chosen(20, 1, 2)), 1000 + 4 * 10**8 + 10_000_000)
     tally.arrived(OBSTACLES, obstacles, 1000 + 4 * 10**8 + 20_000_000)
     tally.look()
 

@@ -25,9 +25,9 @@ from gp_ground_seg.simulation import (
     SCENES,
     VLP_16,
     Scene,
-    landforms,
     simulate_scan,
 )
+from gp_ground_seg.simulation import terrain as landforms
 from gp_ground_seg.simulation.objects import floating_box, wall
 
 # Scans of 100,000 points, too many for the compiled twins as plain Python.

@@ -23,7 +23,8 @@ from gp_ground_seg.cli.demo_text import result_text, thousands
 from gp_ground_seg.cli.output import count, progress_bar
 from gp_ground_seg.cli.play import needing_ros, positive, summary
 from gp_ground_seg.data.atomic_output import staged_files
-from gp_ground_seg.data.bags import BagReader, decode_cloud, open_bag
+from gp_ground_seg.data.bags import BagReader, open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud
 from gp_ground_seg.data.semantic_kitti import list_sequences
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
 from gp_ground_seg.plotting.birds_eye import plot_birds_eye

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.data.bags import CloudMessage
+from gp_ground_seg.data.point_cloud2 import CloudMessage
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation.conventions import GROUNDGRID
-from gp_ground_seg.evaluation.scores import Confusion, count_confusion
+from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confusion
 from gp_ground_seg.frame import Label
 
 _NUMPY_TYPES = {6: '<u4', 7: '<f4'}
@@ -110,7 +109,7 @@ def check_scan(sent: CloudMessage, ground: CloudMessage, obstacles: CloudMessage
 
 
 def _is_alike(sent: CloudMessage, back: CloudMessage) -> bool:
-    names = ('stamp', 'frame_id', 'fields', 'point_step', 'is_bigendian')
+    names = ('header', 'fields', 'point_step', 'is_bigendian')
     return all(getattr(sent, name) == getattr(back, name) for name in names) and (
         len(back.data) == back.height * back.width * back.point_step
     )

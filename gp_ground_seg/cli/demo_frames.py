@@ -9,13 +9,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.data.bags import (
-    BagWriter,
-    CloudMessage,
-    cloud_from_columns,
-    cloud_topic,
-    encode_cloud,
-)
+from gp_ground_seg.data.bags import BagWriter, cloud_topic
+from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import FRAME_PERIOD, read_labels, read_points
 from gp_ground_seg.evaluation.evaluate import labelled_frames
 from gp_ground_seg.simulation import HDL_64E, SCENES, SEMANTIC_KITTI_CLASS, Kind, simulate_drive

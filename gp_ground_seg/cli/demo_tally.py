@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gp_ground_seg.cli.demo_check import ScanCheck, check_scan
-from gp_ground_seg.data.bags import CloudMessage, decode_cloud
-from gp_ground_seg.evaluation.scores import Confusion
+from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, stamp_of
+from gp_ground_seg.evaluation.metrics import Confusion
 
 GROUND = '/ground'
 OBSTACLES = '/obstacles'
@@ -97,19 +97,19 @@ class Tally:
 
     def sent(self, _topic: str, raw: bytes, now: int) -> None:
         """Note a scan that is being sent, at system time `now` [ns]."""
-        self._on_the_way[decode_cloud(raw).stamp] = _Trip(self.n_sent, raw, now)
+        self._on_the_way[stamp_of(decode_cloud(raw))] = _Trip(self.n_sent, raw, now)
         self.n_sent += 1
 
     def arrived(self, topic: str, cloud: CloudMessage, now: int) -> None:
         """Note a cloud that came back on `topic`, at system time `now` [ns]."""
-        trip = self._on_the_way.get(cloud.stamp)
+        trip = self._on_the_way.get(stamp_of(cloud))
         if trip is None or topic in trip.clouds:
             self.n_stray += 1
             return
         trip.clouds[topic] = cloud
         trip.arrived = max(trip.arrived, now)
         if len(trip.clouds) == len(OUTPUTS):
-            del self._on_the_way[cloud.stamp]
+            del self._on_the_way[stamp_of(cloud)]
             self._back.append(trip)
             self.n_back += 1
             self.latencies.append(1e-9 * (trip.arrived - trip.sent))

@@ -11,13 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli.output import count, note_leftovers, progress_bar
-from gp_ground_seg.data.bags import (
-    BagWriter,
-    CloudMessage,
-    cloud_from_columns,
-    cloud_topic,
-    encode_cloud,
-)
+from gp_ground_seg.data.bags import BagWriter, cloud_topic
+from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
 from gp_ground_seg.errors import DataError
 

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gp_ground_seg.cli.bench_input import load_frames
+from gp_ground_seg.cli.bench import load_frames
 from gp_ground_seg.cli.demo import START_TIMEOUT
 from gp_ground_seg.cli.demo_frames import FRAME_ID, TOPIC, simulated_drive
 from gp_ground_seg.cli.demo_node import NodeProcess, private_network
@@ -21,10 +21,10 @@ from gp_ground_seg.cli.output import count, progress_bar
 from gp_ground_seg.cli.play import needing_ros
 from gp_ground_seg.cli.process_memory import peak_memory, resident_memory
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.data.bags import CloudMessage, cloud_from_columns
+from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns
 from gp_ground_seg.errors import DataError, GroundSegError
 from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.report import write_json
+from gp_ground_seg.evaluation.table import write_json
 from gp_ground_seg.evaluation.trips import (
     MemoryResult,
     RateResult,

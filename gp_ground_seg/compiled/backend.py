@@ -6,7 +6,15 @@ import os
 
 import numpy as np
 
-from gp_ground_seg.compiled import ground, ground_plane, labels, likelihood, lines, polar_grid
+from gp_ground_seg.compiled import (
+    ground,
+    ground_plane,
+    labels,
+    latent,
+    likelihood,
+    lines,
+    polar_grid,
+)
 from gp_ground_seg.compiled import vertical_faces as faces_
 from gp_ground_seg.compiled.buffers import Buffers
 from gp_ground_seg.compiled.threads import Workers, equal_parts, parts_of_segments
@@ -134,10 +142,10 @@ class NumbaBackend:
     ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
         """Candidates that show ground, lines, pseudo-inputs, candidates that continue a line."""
         params = lines.LineParams.of(config)
-        found: tuple[Candidates, Lines, PseudoInputs, BoolArray] = lines.find_lines(
-            candidates, faces.has_occluded_base, params
-        )
-        return found
+        kept = lines.keep_visible(candidates, faces.has_occluded_base)
+        found = lines.extract_lines(kept, params)
+        pseudo = lines.select_pseudo_inputs(kept, found, params)
+        return kept, found, pseudo, lines.candidates_on_lines(kept, found, params)
 
     def log_likelihood(
         self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
@@ -166,8 +174,10 @@ class NumbaBackend:
         """Inliers, the surface, and log length-scales at the knots."""
         take, params = self._buffers.take, ground.GroundParams.of(config, segment_step)
         shape, n_candidates = (len(theta), len(frame.knots)), len(frame.candidates.r)
-        if params.is_latent:
+        parts = parts_of_segments(frame.candidates.offsets, self._workers.n_threads)
+        if config.length_scale.model == 'latent':
             u, knot_u = take('u', (n_candidates,), np.float64), np.empty(shape)
+            self._workers.run(latent.latent_log_length_scales, parts, frame, theta, u, knot_u)
         else:
             u, knot_u = given_log_length_scales(frame, config.length_scale)
         own = ground.SegmentSurfaces(
@@ -178,9 +188,7 @@ class NumbaBackend:
             std=take('std', shape, np.float64),
             n_knots=take('n_knots', shape[:1], np.int64),
         )
-        n_threads = self._workers.n_threads
-        parts = parts_of_segments(frame.candidates.offsets, n_threads)
-        self._workers.run(ground.estimate_segments, parts, frame, theta, params, own)
+        self._workers.run(ground.grow_surfaces, parts, frame, theta, params, own)
         mean, std = np.empty((2, *shape))
         ground.fuse_neighbours(own, frame.knots, params, frame.prior_mean, mean, std)
         return GroundSurface(frame.knots, mean, std, own.inlier), knot_u

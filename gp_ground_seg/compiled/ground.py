@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.compiled.latent import latent_log_length_scales
-from gp_ground_seg.compiled.math import LANES, exp_neg
+from gp_ground_seg.compiled.numerics import LANES, exp_neg
 from gp_ground_seg.compiled.threads import Part
 from gp_ground_seg.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.jit import jit
@@ -24,7 +23,6 @@ from gp_ground_seg.parameters.config import Config
 class GroundParams(NamedTuple):
     """Model, gates and seeds, see `gp_ground_seg.parameters.config`."""
 
-    is_latent: bool
     least_gate_noise: float
     slope_std: float
     seed_range: float
@@ -40,7 +38,6 @@ class GroundParams(NamedTuple):
         """Take the values out of a configuration."""
         growth = config.growth
         return cls(
-            config.length_scale.model == 'latent',
             config.observation.sigma_n,
             config.observation.slope_std,
             growth.seed_range,
@@ -59,9 +56,9 @@ class SegmentSurfaces(NamedTuple):
     Attributes
     ----------
     log_length_scale : (C,) float64
-        At the candidates [log m]; given, unless there is a latent process.
+        At the candidates [log m].
     knot_log_length_scale : (M, K) float64
-        At the knots [log m], likewise; NaN from the first knot on that is not wanted.
+        At the knots [log m]; NaN from the first knot on that is not wanted.
     inlier : (C,) bool
         Candidates that the surface rests on.
     mean, std : (M, K) float64
@@ -79,33 +76,10 @@ class SegmentSurfaces(NamedTuple):
 
 
 @jit(entry=True, fastmath=True)
-def estimate_segments(
+def grow_surfaces(
     part: Part, frame: Frame, theta: FloatArray, params: GroundParams, own: SegmentSurfaces
 ) -> None:
-    """Length-scales, inliers and surface of the segments of a part, into `own`."""
-    candidates = frame.candidates
-    for m in range(part.first, part.stop):
-        first, behind = candidates.offsets[m], candidates.offsets[m + 1]
-        own.n_knots[m] = 0
-        if behind > first:
-            own.n_knots[m] = min(candidates.bin[behind - 1] + 2, len(frame.knots))
-    if params.is_latent:
-        latent_log_length_scales(
-            part, frame, theta, own.n_knots, own.log_length_scale, own.knot_log_length_scale
-        )
-    _grow_surfaces(part, frame, theta, params, own)
-
-
-@jit(inline=True)
-def _is_seed(m: int, r: float, z: float, params: GroundParams) -> bool:
-    is_low = abs(z) <= params.seed_height_tolerance
-    return is_low and r <= params.seed_range and m % params.segment_step == 0
-
-
-@jit(inline=True)
-def _grow_surfaces(
-    part: Part, frame: Frame, theta: FloatArray, params: GroundParams, own: SegmentSurfaces
-) -> None:
+    """Inliers and surface of the segments of a part, into `own`."""
     candidates, knots = frame.candidates, frame.knots
     offsets, r = candidates.offsets, candidates.r
     inlier, mean, std = own.inlier, own.mean, own.std
@@ -128,7 +102,8 @@ def _grow_surfaces(
         for i in range(n):
             inlier[first + i] = False
             observed[i] = candidates.z[first + i] - frame.prior_mean
-            if _is_seed(m, r[first + i], observed[i], params):
+            is_low = abs(observed[i]) <= params.seed_height_tolerance
+            if is_low and r[first + i] <= params.seed_range and m % params.segment_step == 0:
                 new[n_new] = i
                 n_new += 1
         own.n_knots[m] = 0
@@ -174,7 +149,21 @@ def _grow_surfaces(
                     root = math.sqrt(own_l * all_l[j] * inverse)
                     value = sill * root * exp_neg(distance * distance * inverse)
                     row[j] = value + slope * own_r * all_r[j]
-                _project(whitened, n_inliers, i, near, end, row)
+                # Subtract the projection on the rows before, four rows at a time, so that the
+                # new row is read and written once for all of them.
+                k = 0
+                while k + 4 <= n_inliers:
+                    row_0, row_1 = whitened[k], whitened[k + 1]
+                    row_2, row_3 = whitened[k + 2], whitened[k + 3]
+                    w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
+                    for j in range(near, end):
+                        row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
+                    k += 4
+                while k < n_inliers:
+                    row_0, w_0 = whitened[k], whitened[k, i]
+                    for j in range(near, end):
+                        row[j] -= w_0 * row_0[j]
+                    k += 1
                 scale = 1.0 / math.sqrt(variance[i] + noise)
                 innovation = (observed[i] - predicted[i]) * scale
                 for j in range(near, end):
@@ -202,27 +191,6 @@ def _grow_surfaces(
             mean[m, j] = predicted[n + j]
             std[m, j] = math.sqrt(max(variance[n + j], 0.0))
         own.n_knots[m] = n_knots
-
-
-@jit(inline=True)
-def _project(
-    whitened: FloatArray, n_rows: int, i: int, near: int, end: int, row: FloatArray
-) -> None:
-    """Subtract from a new row its projection on the rows before."""
-    # Four rows at a time, so that the new row is read and written once for all of them.
-    k = 0
-    while k + 4 <= n_rows:
-        row_0, row_1, row_2, row_3 = whitened[k], whitened[k + 1], whitened[k + 2], whitened[k + 3]
-        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
-        for j in range(near, end):
-            row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
-        k += 4
-    while k < n_rows:
-        row_0 = whitened[k]
-        w_0 = row_0[i]
-        for j in range(near, end):
-            row[j] -= w_0 * row_0[j]
-        k += 1
 
 
 @jit(entry=True, fastmath=True)

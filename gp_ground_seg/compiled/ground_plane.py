@@ -55,45 +55,24 @@ _solve_plane = jit()(ground_plane.solve_plane)
 
 def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     """Do what `gp_ground_seg.pipeline.ground_plane.fit_plane` does, to rounding."""
-    offsets = candidates.offsets
-    directions = segment_directions(len(offsets) - 1)
-    values = _fit_plane(offsets, candidates.r, candidates.z, directions, max_slope)
+    cells, sectors = np.empty((6, N_LARGEST)), np.empty(N_LARGEST, dtype=np.int64)
+    directions = segment_directions(len(candidates.offsets) - 1)
+    n = _tabulate(candidates, directions, cells, sectors)
+    if n < MIN_CELLS:
+        return None
+    found, best = _best_hypothesis(cells, n, max_slope)
+    if not found:
+        return None
+    values = _describe(cells, sectors, n, _refine(cells, n, max_slope, best))
     return GroundPlane(*values) if values[-1] > 0 else None
 
 
 @jit(entry=True)
-def _fit_plane(
-    offsets: IntArray, r: FloatArray, z: FloatArray, directions: FloatArray, max_slope: float
-) -> Values:
-    """Fields of the `GroundPlane`; without one, `n_support` is 0."""
-    cells, sectors = np.empty((6, N_LARGEST)), np.empty(N_LARGEST, dtype=np.int64)
-    n = _tabulate(offsets, r, z, directions, cells, sectors)
-    plane = 0.0, 0.0, 0.0
-    found = False
-    if n >= MIN_CELLS:
-        found, plane = _best_hypothesis(cells, n, max_slope)
-    if not found:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
-    height, slope_x, slope_y = plane
-    for _ in range(N_REFINEMENTS):
-        height, slope_x, slope_y = _refined(
-            cells, -(-n // WIDTH) * WIDTH, height, slope_x, slope_y
-        )
-    if not _is_possible(height, slope_x, slope_y, LOOSER * max_slope):
-        height, slope_x, slope_y = plane
-    return _describe(cells, sectors, n, height, slope_x, slope_y)
-
-
-@jit()
 def _tabulate(
-    offsets: IntArray,
-    r: FloatArray,
-    z: FloatArray,
-    directions: FloatArray,
-    cells: FloatArray,
-    sectors: IntArray,
+    candidates: Candidates, directions: FloatArray, cells: FloatArray, sectors: IntArray
 ) -> int:
     """Put the lowest points into a table (6, N_LARGEST); return their number."""
+    offsets, r, z = candidates.offsets, candidates.r, candidates.z
     n_segments = len(offsets) - 1
     lowest, cell_of = np.empty(N_SECTORS * N_RINGS), np.empty(len(r), dtype=np.int16)
     index, home = np.empty(len(lowest), dtype=np.int64), np.empty(len(lowest), dtype=np.int64)
@@ -130,7 +109,7 @@ def _tabulate(
     return n
 
 
-@jit()
+@jit(entry=True)
 def _best_hypothesis(
     cells: FloatArray, n: int, max_slope: float
 ) -> tuple[bool, tuple[float, float, float]]:
@@ -190,36 +169,44 @@ def _gain(
     return whole
 
 
-@jit(fastmath=True)
-def _refined(
-    cells: FloatArray, n: int, height: float, slope_x: float, slope_y: float
+@jit(entry=True, fastmath=True)
+def _refine(
+    cells: FloatArray, n: int, max_slope: float, plane: tuple[float, float, float]
 ) -> tuple[float, float, float]:
-    """Plane of least squares with Tukey's weights of the plane given."""
+    """Weighted least squares with Tukey's weights of the plane before, again and again."""
     xs, ys, zs, inverses = cells[X], cells[Y], cells[Z], cells[INVERSE]
-    w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for c in range(n):
-        x, y, z, inverse = xs[c], ys[c], zs[c], inverses[c]
-        d = (z - (slope_x * x + slope_y * y - height)) * inverse
-        root = 1.0 - 0.5 * d * d
-        root = (root if root > 0.0 else 0.0) * inverse
-        weight = root * root
-        w += weight
-        wx += weight * x
-        wy += weight * y
-        wxx += weight * x * x
-        wxy += weight * x * y
-        wyy += weight * y * y
-        wz += weight * z
-        wxz += weight * x * z
-        wyz += weight * y * z
-    return _solve_plane((w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz), (height, slope_x, slope_y))
+    height, slope_x, slope_y = plane
+    for _ in range(N_REFINEMENTS):
+        w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for c in range(-(-n // WIDTH) * WIDTH):
+            x, y, z, inverse = xs[c], ys[c], zs[c], inverses[c]
+            d = (z - (slope_x * x + slope_y * y - height)) * inverse
+            root = 1.0 - 0.5 * d * d
+            root = (root if root > 0.0 else 0.0) * inverse
+            weight = root * root
+            w += weight
+            wx += weight * x
+            wy += weight * y
+            wxx += weight * x * x
+            wxy += weight * x * y
+            wyy += weight * y * y
+            wz += weight * z
+            wxz += weight * x * z
+            wyz += weight * y * z
+        height, slope_x, slope_y = _solve_plane(
+            (w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz), (height, slope_x, slope_y)
+        )
+    if not _is_possible(height, slope_x, slope_y, LOOSER * max_slope):
+        return plane
+    return height, slope_x, slope_y
 
 
-@jit()
+@jit(entry=True)
 def _describe(
-    cells: FloatArray, sectors: IntArray, n: int, height: float, slope_x: float, slope_y: float
+    cells: FloatArray, sectors: IntArray, n: int, plane: tuple[float, float, float]
 ) -> Values:
-    """Evidence for a plane; cells come sector by sector."""
+    """Evidence for a plane: fields of the `GroundPlane`; cells come sector by sector."""
+    height, slope_x, slope_y = plane
     ranges, drops, near = np.empty(n), np.empty(n), np.empty(n)
     n_on_it, n_near, squares = 0, 0, 0.0
     n_any, n_covered, n_far = 0, 0, 0

@@ -6,27 +6,24 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled.math import LANES, exp_neg, solve_in_place
+from gp_ground_seg.compiled.numerics import LANES, exp_neg, solve_in_place
 from gp_ground_seg.compiled.threads import Part
-from gp_ground_seg.frame import FloatArray, Frame, IntArray
+from gp_ground_seg.frame import FloatArray, Frame
 from gp_ground_seg.jit import jit
 
 
-@jit(inline=True)
+@jit(entry=True, fastmath=True)
 def latent_log_length_scales(
     part: Part,
     frame: Frame,
     theta: FloatArray,
-    n_knots: IntArray,
     at_candidates: FloatArray,
     at_knots: FloatArray,
 ) -> None:
-    """Do what the twin does for the segments of a part, into the last two arrays.
-
-    `n_knots` (M,) is the number of knots wanted in each segment.
-    """
+    """Do what the twin does for the segments of a part, into the last two arrays."""
     pseudo, knots = frame.pseudo, frame.knots
-    offsets, r = frame.candidates.offsets, frame.candidates.r
+    candidates = frame.candidates
+    offsets, r = candidates.offsets, candidates.r
     most = most_bar = 0
     for m in range(part.first, part.stop):
         most = max(most, offsets[m + 1] - offsets[m])
@@ -39,9 +36,11 @@ def latent_log_length_scales(
         for j in range(len(knots)):
             at_knots[m, j] = np.nan
         first, own = pseudo.offsets[m], offsets[m]
-        p, n, n_wanted = pseudo.offsets[m + 1] - first, offsets[m + 1] - own, n_knots[m]
+        p, n = pseudo.offsets[m + 1] - first, offsets[m + 1] - own
         if p == 0:
             continue
+        # Behind the bin of the last candidate nothing is known of the ground.
+        n_wanted = min(candidates.bin[own + n - 1] + 2, len(knots))
         variance = math.exp(2.0 * theta[m, 2])
         sharpness = 0.5 * math.exp(-2.0 * theta[m, 3])
         noise = math.exp(2.0 * theta[m, 4])

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled.math import exp_neg, factorise, invert
+from gp_ground_seg.compiled.numerics import exp_neg, factorise, invert
 from gp_ground_seg.compiled.threads import Part
 from gp_ground_seg.frame import FloatArray, Inliers
 from gp_ground_seg.jit import jit

@@ -70,18 +70,8 @@ class LineParams(NamedTuple):
 
 
 @jit(entry=True)
-def find_lines(
-    candidates: Candidates, has_occluded_base: BoolArray, params: LineParams
-) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
-    """Do what `gp_ground_seg.pipeline.lines.find_lines` does."""
-    kept = _keep_visible(candidates, has_occluded_base)
-    lines = _extract_lines(kept, params)
-    pseudo = _select_pseudo_inputs(kept, lines, params)
-    return kept, lines, pseudo, _candidates_on_lines(kept, lines, params)
-
-
-@jit(inline=True)
-def _keep_visible(candidates: Candidates, has_occluded_base: BoolArray) -> Candidates:
+def keep_visible(candidates: Candidates, has_occluded_base: BoolArray) -> Candidates:
+    """Leave out candidates in tiles where the base of a face is occluded."""
     size = len(candidates.r)
     r, z, density = np.empty(size), np.empty(size), np.empty(size)
     own_bin, tile = np.empty(size, np.int64), np.empty(size, np.int32)
@@ -97,8 +87,9 @@ def _keep_visible(candidates: Candidates, has_occluded_base: BoolArray) -> Candi
     return Candidates(r[:n], z[:n], own_bin[:n], density[:n], offsets, tile[:n])
 
 
-@jit(inline=True)
-def _extract_lines(candidates: Candidates, params: LineParams) -> Lines:
+@jit(entry=True)
+def extract_lines(candidates: Candidates, params: LineParams) -> Lines:
+    """Do what the twin does."""
     r, z, density, offsets = candidates.r, candidates.z, candidates.density, candidates.offsets
     line = np.empty(len(r), np.int64)
     start = np.empty(len(r) + 1, np.int64)
@@ -172,10 +163,9 @@ def _differs_in_direction(
     return abs(math.atan(new_slope) - math.atan(slope)) > tolerance
 
 
-@jit(inline=True)
-def _select_pseudo_inputs(
-    candidates: Candidates, lines: Lines, params: LineParams
-) -> PseudoInputs:
+@jit(entry=True)
+def select_pseudo_inputs(candidates: Candidates, lines: Lines, params: LineParams) -> PseudoInputs:
+    """Do what the twin does."""
     r, start, slope = candidates.r, lines.start, lines.slope
     n_lines = len(slope)
     r_bar, surface_class = np.empty(len(r)), np.empty(len(r), dtype=np.int64)
@@ -221,8 +211,9 @@ def _select_pseudo_inputs(
     return PseudoInputs(r_bar[:p], surface_class[:p], offsets, first_guess)
 
 
-@jit(inline=True)
-def _candidates_on_lines(candidates: Candidates, lines: Lines, params: LineParams) -> BoolArray:
+@jit(entry=True)
+def candidates_on_lines(candidates: Candidates, lines: Lines, params: LineParams) -> BoolArray:
+    """Do what the twin does."""
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     start, slope = lines.start, lines.slope
     continues_line = np.empty(len(r), dtype=np.bool_)

@@ -67,14 +67,7 @@ class BinLookup(NamedTuple):
     def of(cls, edges: FloatArray, fineness: int, dtype: np.dtype[np.floating]) -> BinLookup:
         """Table for values of type `dtype` in the bins between `edges` (n + 1,).
 
-        Parameters
-        ----------
-        edges : (n + 1,) float64
-            Edges of the bins.
-        fineness : int
-            Entries in the narrowest bin, as far as `LARGEST_TABLE` allows.
-        dtype : dtype
-            Precision of the values.
+        The narrowest bin has `fineness` entries, as far as `LARGEST_TABLE` allows.
         """
         extent, narrowest = float(edges[-1] - edges[0]), float(np.diff(edges).min())
         scale = min(fineness / narrowest, LARGEST_TABLE / extent)
@@ -161,8 +154,7 @@ def sort_points(
     cell, r, tile = places.cell, places.r, places.tile
     extremes, numbers = cells.extremes[part.number], cells.numbers[part.number]
     tile_extremes, occupied = tiles.extremes[part.number], tiles.occupied[part.number]
-    _empty_cells(extremes, numbers)
-    _empty_tiles(tile_extremes, occupied)
+    _clear(extremes, numbers, tile_extremes, occupied)
     range_entry = np.empty(BLOCK, dtype=np.int32)
     key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
     for first in range(part.first, part.stop, BLOCK):
@@ -171,27 +163,26 @@ def sort_points(
         _compute_range(x, y, z, geometry.ranges, r[own], range_entry, cell[own])
         _compute_azimuth_key(x, y, geometry, cell[own], key, key_entry, tile[own])
         _look_up(geometry, r[own], range_entry, key, key_entry, cell[own])
-        _widen_cells(z, cell[own], extremes, numbers)
-        _widen_tiles(z, tile[own], tile_extremes, occupied)
+        _widen(z, cell[own], tile[own], extremes, numbers, tile_extremes, occupied)
     for first in range(part.first, part.stop, BLOCK):
         own = slice(first, min(first + BLOCK, part.stop))
         _resolve_lowest(columns[2, own], r[own], cell[own], tile[own], extremes, numbers)
 
 
-@jit(inline=True)
-def _empty_cells(extremes: PointArray, numbers: CellArray) -> None:
+@jit()
+def _clear(
+    extremes: PointArray, numbers: CellArray, tile_extremes: PointArray, occupied: CellArray
+) -> None:
+    """Make the tables those of no points; of the tiles only those that were occupied."""
     for k in range(len(numbers)):
         extremes[k, 0] = extremes[k, 1] = np.inf
         extremes[k, 2] = -np.inf
         numbers[k, 0], numbers[k, 1] = 0, NO_TILE
-
-
-@jit(inline=True)
-def _empty_tiles(extremes: PointArray, occupied: CellArray) -> None:
     for place in range(1, occupied[0] + 1):
         k = np.uintp(occupied[place])
-        extremes[k, 0], extremes[k, 1] = np.inf, -np.inf
-    extremes[len(extremes) - 1, 0], extremes[len(extremes) - 1, 1] = np.inf, -np.inf
+        tile_extremes[k, 0], tile_extremes[k, 1] = np.inf, -np.inf
+    last = len(tile_extremes) - 1
+    tile_extremes[last, 0], tile_extremes[last, 1] = np.inf, -np.inf
     occupied[0] = 0
 
 
@@ -285,56 +276,34 @@ def _look_up(
 
 
 @jit()
-def _widen_cells(z: PointArray, cell: CellArray, extremes: PointArray, numbers: CellArray) -> None:
-    """Heights and number of the points of each cell, without a branch.
-
-    Neighbours in the scan lie in the same cell, and each would wait until the one before is
-    written: points half a block apart alternate.
-    """
-    half = len(z) // 2
-    for i in range(half):
-        for j in (i, i + half):
-            _widen_cell(z[j], cell[j], extremes, numbers)
-    for i in range(2 * half, len(z)):
-        _widen_cell(z[i], cell[i], extremes, numbers)
-
-
-@jit(inline=True)
-def _widen_cell(z: float, cell: int, extremes: PointArray, numbers: CellArray) -> None:
-    k = np.uintp(cell if cell >= 0 else len(numbers) - 1)
-    low, high = extremes[k, 0], extremes[k, 2]
-    extremes[k, 0] = z if z < low else low
-    extremes[k, 2] = z if z > high else high
-    numbers[k, 0] += np.int32(1)
-
-
-@jit()
-def _widen_tiles(
-    z: PointArray, tile: CellArray, extremes: PointArray, occupied: CellArray
+def _widen(
+    z: PointArray,
+    cell: CellArray,
+    tile: CellArray,
+    extremes: PointArray,
+    numbers: CellArray,
+    tile_extremes: PointArray,
+    occupied: CellArray,
 ) -> None:
-    """Heights of the points of each tile, likewise; lists the tiles that become occupied."""
-    half = len(z) // 2
+    """Heights and number of the points of each cell and tile, without a branch.
+
+    Lists the tiles that become occupied.
+    """
     n_occupied = occupied[0]
-    for i in range(half):
-        for j in (i, i + half):
-            n_occupied = _widen_tile(z[j], tile[j], extremes, occupied, n_occupied)
-    for i in range(2 * half, len(z)):
-        n_occupied = _widen_tile(z[i], tile[i], extremes, occupied, n_occupied)
+    for i in range(len(z)):
+        k = np.uintp(cell[i] if cell[i] >= 0 else len(numbers) - 1)
+        low, high = extremes[k, 0], extremes[k, 2]
+        extremes[k, 0] = z[i] if z[i] < low else low
+        extremes[k, 2] = z[i] if z[i] > high else high
+        numbers[k, 0] += np.int32(1)
+        k = np.uintp(tile[i] if tile[i] >= 0 else len(tile_extremes) - 1)
+        low, high = tile_extremes[k, 0], tile_extremes[k, 1]
+        # Written in any case, counted only where the tile was empty.
+        occupied[np.uintp(n_occupied + 1)] = tile[i]
+        n_occupied += np.int32((low > high) & (tile[i] >= 0))
+        tile_extremes[k, 0] = z[i] if z[i] < low else low
+        tile_extremes[k, 1] = z[i] if z[i] > high else high
     occupied[0] = n_occupied
-
-
-@jit(inline=True)
-def _widen_tile(
-    z: float, tile: int, extremes: PointArray, occupied: CellArray, n_occupied: int
-) -> int:
-    k = np.uintp(tile if tile >= 0 else len(extremes) - 1)
-    low, high = extremes[k, 0], extremes[k, 1]
-    # Written in any case, counted only where the tile was empty.
-    occupied[np.uintp(n_occupied + 1)] = tile
-    n_occupied += np.int32((low > high) & (tile >= 0))
-    extremes[k, 0] = z if z < low else low
-    extremes[k, 1] = z if z > high else high
-    return n_occupied
 
 
 @jit()
@@ -373,20 +342,10 @@ def merge_parts(
     min_extent: float,
     candidates: Candidates,
 ) -> int:
-    """Candidates, into arrays with room for all cells, and their number; merges the tiles too.
+    """Reduce the tables of all parts: candidates, into arrays with room for all cells.
 
-    Parameters
-    ----------
-    n_parts : int
-        Parts that `sort_points` was called for.
-    cells, tiles
-        Their tables; the first table of the tiles becomes that of all points.
-    edges : (n_bins + 1,) float64
-        Ranges of the bin edges [m].
-    min_extent : float
-        See `gp_ground_seg.pipeline.polar_grid.ground_candidates` [m].
-    candidates : Candidates
-        Result; only `offsets` has its final size.
+    Returns the number of candidates. `edges` and `min_extent` are those of `ground_candidates`
+    of the twin. The first table of the tiles becomes that of all points.
     """
     _merge_tiles(n_parts, tiles.extremes, tiles.occupied)
     extremes, numbers, n_bins = cells.extremes, cells.numbers, len(edges) - 1
@@ -419,7 +378,7 @@ def merge_parts(
     return c
 
 
-@jit(inline=True)
+@jit()
 def _merge_tiles(n_parts: int, extremes: PointArray, occupied: CellArray) -> None:
     n_occupied = occupied[0, 0]
     for index in range(1, n_parts):

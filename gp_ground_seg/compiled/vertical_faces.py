@@ -128,7 +128,7 @@ def sum_returns(
         s[_TOP] = max(s[_TOP], above)
 
 
-@jit(inline=True)
+@jit()
 def _clear_sums(
     extremes: PointArray, tile_size: float, n_tall: int, row_to_tile: CellArray, sums: FloatArray
 ) -> None:
@@ -163,7 +163,7 @@ def decide_faces(
             faces.has_occluded_base[t] = _is_base_occluded(low, high, top, params)
 
 
-@jit(inline=True)
+@jit()
 def _add_parts(n_parts: int, row: int, sums: FloatArray, total: FloatArray) -> None:
     for c in range(_TOP + 1):
         total[c] = 0.0

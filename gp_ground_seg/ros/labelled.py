@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from sensor_msgs.msg import PointCloud2, PointField
 
-from gp_ground_seg.data.cloud_columns import append_columns
+from gp_ground_seg.data.point_cloud2 import append_columns
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.ros.point_cloud2 import read_xyz
 
@@ -51,15 +51,7 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
                 values = values.astype(np.float32, copy=False)
             is_dense = is_dense and bool(np.isfinite(values).all())
         columns[names[field]] = values
-    wide = append_columns(
-        cloud.height,
-        cloud.width,
-        cloud.is_bigendian,
-        cloud.point_step,
-        cloud.row_step,
-        cloud.data,
-        columns,
-    )
+    wide = append_columns(cloud, columns)
     data = array('B')
     data.frombytes(wide.data.data)
     message = PointCloud2(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import time
 from collections.abc import Callable, Sequence
@@ -11,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.data.bags import CloudMessage, encode_cloud
+from gp_ground_seg.data.point_cloud2 import CloudMessage, encode_cloud, stamp_of, with_header
 from gp_ground_seg.evaluation.trips import Trip
 from gp_ground_seg.ros.receiver import OutputReceiver
 from gp_ground_seg.ros.session import Session
@@ -107,7 +106,7 @@ class LoadTest:
     def _next(self) -> tuple[bytes, tuple[int, int]]:
         seconds, nanoseconds = divmod(next(self._numbers) * PERIOD_NS, 10**9)
         stamp = START + seconds, nanoseconds
-        return encode_cloud(dataclasses.replace(next(self._clouds), stamp=stamp)), stamp
+        return encode_cloud(with_header(next(self._clouds), stamp)), stamp
 
     def _send(self, raw: bytes, stamp: tuple[int, int]) -> Trip:
         trip = Trip(time.time_ns())
@@ -125,12 +124,12 @@ class LoadTest:
         self._waiting.clear()
 
     def _arrived(self, topic: str, cloud: CloudMessage, now: int) -> None:
-        trip, topics = self._waiting.get(cloud.stamp, (None, set()))
+        trip, topics = self._waiting.get(stamp_of(cloud), (None, set()))
         if trip is None:
             return
         topics.add(topic)
         if len(topics) == self._n_outputs:
-            del self._waiting[cloud.stamp]
+            del self._waiting[stamp_of(cloud)]
             trip.back = now
 
     def _diagnosed(self, array: DiagnosticArray) -> None:

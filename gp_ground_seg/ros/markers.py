@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.length_scale_colours import length_scale_colours
+from gp_ground_seg.plotting.style import length_scale_colours
 from gp_ground_seg.result import Segmentation
 
 # rclpy takes some microseconds for each vertex: what is drawn is thinned to what an eye

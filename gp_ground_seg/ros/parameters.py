@@ -15,9 +15,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from gp_ground_seg.errors import ConfigError, GroundSegError
-from gp_ground_seg.parameters.check import check_typed
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.parameters.schema import ParameterSpec
+from gp_ground_seg.parameters.schema import ParameterSpec, check_typed
 from gp_ground_seg.parameters.yaml_io import OF_EVERY_NODE
 from gp_ground_seg.ros.parameter_service import OrderFreeParameterService
 from gp_ground_seg.ros.qos import QOS_OVERRIDES, check_overrides

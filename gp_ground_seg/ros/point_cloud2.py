@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.data import cloud_layout
+from gp_ground_seg.data import point_cloud2
 
 
 def read_xyz(message: PointCloud2) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
@@ -30,17 +30,7 @@ def read_xyz(message: PointCloud2) -> npt.NDArray[np.float32] | npt.NDArray[np.f
     PointCloudError
         If the message cannot hold what it claims.
     """
-    # Random bytes may be a signalling NaN; it is one of the values that are not finite.
-    with np.errstate(invalid='ignore'):
-        return cloud_layout.read_xyz(
-            message.height,
-            message.width,
-            message.fields,
-            message.is_bigendian,
-            message.point_step,
-            message.row_step,
-            message.data,
-        )
+    return point_cloud2.read_xyz(message)
 
 
 def select_points(message: PointCloud2, mask: npt.NDArray[np.bool_]) -> PointCloud2:
@@ -64,9 +54,7 @@ def select_points(message: PointCloud2, mask: npt.NDArray[np.bool_]) -> PointClo
     PointCloudError
         If the message cannot hold what it claims, or the mask has another length.
     """
-    kept = cloud_layout.select_rows(
-        message.height, message.width, message.point_step, message.row_step, message.data, mask
-    )
+    kept = point_cloud2.select_rows(message, mask)
     # The one type that rclpy takes over without looking at every byte.
     data = array('B')
     data.frombytes(kept.data)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -10,11 +9,17 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-import numpy as np
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.data.bags import CloudMessage, decode_cloud, encode_cloud
+from gp_ground_seg.data.point_cloud2 import (
+    CloudMessage,
+    cloud_from_columns,
+    decode_cloud,
+    encode_cloud,
+    stamp_of,
+    with_header,
+)
 from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.ros.session import Session
 
@@ -85,7 +90,7 @@ class OutputReceiver:
         GroundSegError
             If a topic has not answered in time.
         """
-        nothing = CloudMessage((0, 0), '', 1, 0, (), 0, 0, np.empty(0, np.uint8))
+        nothing = cloud_from_columns((0, 0), '', {})
         with self._publisher(input_topic) as publisher:
             self._ask(publisher, nothing, PROBE_PERIOD, timeout, check)
 
@@ -137,9 +142,7 @@ class OutputReceiver:
         self._n_probes += 1
         self._probe_stamp = (self._n_probes, 0)
         self._unanswered = set(self._topics)
-        raw = encode_cloud(
-            dataclasses.replace(cloud, stamp=self._probe_stamp, frame_id=PROBE_FRAME)
-        )
+        raw = encode_cloud(with_header(cloud, self._probe_stamp, PROBE_FRAME))
         start = next_time = time.monotonic()
         while self._unanswered:
             check()
@@ -158,7 +161,7 @@ class OutputReceiver:
     def _receive(self, topic: str, raw: bytes, info: dict[str, Any]) -> None:
         arrival = info.get('received_timestamp') or time.time_ns()
         cloud = decode_cloud(raw)
-        if cloud.frame_id != PROBE_FRAME:
+        if cloud.header.frame_id != PROBE_FRAME:
             self._on_cloud(topic, cloud, arrival)
-        elif cloud.stamp == self._probe_stamp:
+        elif stamp_of(cloud) == self._probe_stamp:
             self._unanswered.discard(topic)
