@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from typing import Protocol
 
+import numpy as np
+
 from gp_ground_seg.compiled.workspace import Workspace
 from gp_ground_seg.errors import MissingDependencyError
 from gp_ground_seg.frame import (
@@ -18,6 +20,7 @@ from gp_ground_seg.frame import (
     PseudoInputs,
 )
 from gp_ground_seg.gp.growth import GrowthTask
+from gp_ground_seg.gp.numpy_backend import NumpyBackend as NumpyBackend
 from gp_ground_seg.gp.objective import TrainingFrame
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config, RuntimeConfig
@@ -122,3 +125,20 @@ def make_backend(runtime: RuntimeConfig) -> Backend:
     from gp_ground_seg.compiled.backend import CompiledBackend
 
     return CompiledBackend(runtime.n_threads)
+
+
+def warm_up(config: Config | None = None) -> Backend:
+    """Stub of the lead's function."""
+    from gp_ground_seg.pipeline.sensor_pose import given_pose
+    from gp_ground_seg.segmenter import GroundSegmenter
+
+    config = config or Config()
+    backend = make_backend(config.runtime)
+    radius, azimuth = np.meshgrid(np.linspace(2.0, 32.0, 24), np.linspace(-3.1, 3.1, 64))
+    pose = given_pose(config.sensor)
+    height = np.full(radius.shape, -pose.height)
+    level = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=-1)
+    GroundSegmenter(config, backend=backend).segment(
+        (level.reshape(-1, 3) @ pose.rotation).astype(np.float32)
+    )
+    return backend

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 try:
@@ -73,3 +74,21 @@ def compiled_signatures() -> dict[str, int]:
     return {
         f'{d.py_func.__module__}.{d.py_func.__qualname__}': len(d.signatures) for d in _dispatchers
     }
+
+
+def is_code_kept() -> bool:
+    """Stub of the lead's function: whether all code that a frame needs lies on disk."""
+    from gp_ground_seg.backend import warm_up
+    from gp_ground_seg.compiled.compile_cache import CodeNotKeptError, refusing
+
+    try:
+        with refusing('compilation'):
+            warm_up().close()
+    except CodeNotKeptError:
+        return False
+    return True
+
+
+def code_folder() -> Path | None:
+    """Stub of the lead's function: folder where compiled code is kept."""
+    return Path(_dispatchers[0].stats.cache_path) if _dispatchers else None

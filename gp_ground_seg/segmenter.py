@@ -84,6 +84,11 @@ class GroundSegmenter:
             self.reset()
         self._config = config
 
+    def use_backend(self, backend: Backend) -> None:
+        """Segment with `backend` from the next scan on (stub of the lead's method)."""
+        self._backend.close()
+        self._backend = backend
+
     def reset(self) -> None:
         """Forget what earlier scans taught, as after a jump in time."""
         self._theta = None
