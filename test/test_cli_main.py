@@ -28,7 +28,7 @@ def test_help_names_every_command_and_an_unknown_one_is_refused(capsys):
     with pytest.raises(SystemExit, match='0'):
         cli.main(['--help'])
     text = capsys.readouterr().out
-    for name, purpose in cli.COMMANDS.items():
+    for name, (_, purpose) in cli.COMMANDS.items():
         assert re.search(rf'^    {name}\s+{re.escape(purpose)}$', text, re.MULTILINE)
     with pytest.raises(SystemExit, match='2'):
         cli.main(['segmnet', 'scan.bin'])

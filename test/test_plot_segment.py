@@ -1,4 +1,4 @@
-"""The command `plot-segment`, by the pixels of its pictures."""
+"""The command `plot segment`, by the pixels of its pictures."""
 
 import argparse
 import math
@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.cli import plot_segment as command
+from gp_ground_seg.cli import plot as command
 from gp_ground_seg.errors import ConfigError, DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.parameters.config import GridConfig
 from gp_ground_seg.pipeline.polar_grid import build_polar_grid
@@ -29,7 +29,7 @@ ROAD, BUILDING, UNLABELLED = 40, 50, 0
 def run(*words):
     parser = argparse.ArgumentParser()
     command.add_parser(parser.add_subparsers(required=True))
-    arguments = parser.parse_args(['plot-segment', *(str(word) for word in words)])
+    arguments = parser.parse_args(['plot', 'segment', *(str(word) for word in words)])
     return arguments.run(arguments)
 
 

@@ -95,7 +95,7 @@ def test_picture_shows_ground_obstacles_and_model(tmp_path):
 
 def test_command_draws_a_simulated_scan_and_keeps_what_is_there(tmp_path, capsys):
     path = tmp_path / 'a.png'
-    words = ['plot-scan', '--simulate', 'flat', '--sensor', 'vlp-16', '--preset', 'vlp16', '-o']
+    words = ['plot', 'scan', '--simulate', 'flat', '--sensor', 'vlp-16', '--preset', 'vlp16', '-o']
     assert cli.main([*words, str(path)]) == 0
     assert 'points, written to' in capsys.readouterr().out
     before = path.read_bytes()
@@ -115,5 +115,5 @@ def test_command_draws_a_file(tmp_path):
     points = np.zeros((3000, 4), np.float32)
     points[:, :3] = hilly_scan(3000)
     points.tofile(scan)
-    assert cli.main(['plot-scan', str(scan), '-o', str(tmp_path / 'x.png')]) == 0
+    assert cli.main(['plot', 'scan', str(scan), '-o', str(tmp_path / 'x.png')]) == 0
     assert (tmp_path / 'x.png').stat().st_size > 10_000

@@ -9,9 +9,9 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from typing import NamedTuple
 
 from gp_ground_seg import __version__
-from gp_ground_seg.cli.notes import library_notes
 from gp_ground_seg.errors import GroundSegError
 
 EXIT_OK = 0
@@ -20,29 +20,37 @@ EXIT_INTERRUPTED = 130
 
 ROS_ARGS = '--ros-args'
 
-# Name of each command and what it is for. Its module is named alike: `add_parser(subparsers)`
-# declares the options and sets the default `run`, a function of the parsed arguments that
-# returns an exit code. A command that sets the default `accepts_ros_args` finds `ros_args` in
-# them. Only the module of the command at hand is imported: all of them take a second.
+
+class Command(NamedTuple):
+    """A command: its module in `gp_ground_seg.cli`, and what it is for."""
+
+    module: str
+    purpose: str
+
+
+# The `add_parser(subparsers)` of a module declares its command or commands: their options, and
+# the default `run`, a function of the parsed arguments that returns an exit code. A command that
+# sets the default `accepts_ros_args` finds `ros_args` in them. Only the module of the command at
+# hand is imported: all of them take a second.
 COMMANDS = {
-    'segment': 'label scans, or split the clouds of a bag',
-    'evaluate': 'score against SemanticKITTI labels',
-    'pose': 'find out height and tilt of the sensor from scans',
-    'pose-check': 'measure what not knowing height and tilt of the sensor costs',
-    'bench': 'time the segmentation by stage, beside Patchwork++',
-    'table1': "the paper's Table I on real frames",
-    'plot-segment': 'draw one segment from the side',
-    'plot-scan': 'draw a scan in perspective, with the ground model on it',
-    'ablation': 'compare length-scale models and ways to learn',
-    'ideas': 'what each idea is worth: switched off one at a time',
-    'leave-out': 'choose parameters, score them on the sequence left out',
-    'scenes': 'score on simulated scenes, flat and rough, beside Patchwork++',
-    'kitti-to-bag': 'write a KITTI sequence as a rosbag2',
-    'play': "publish a bag's clouds as they were recorded",
-    'demo': 'see it work, no data needed',
-    'config': 'write, check and compare parameter files',
-    'node': 'run the ROS 2 node',
-    'node-bench': 'measure latency, losses and memory of the node',
+    'segment': Command('segment', 'label scans, or split the clouds of a bag'),
+    'evaluate': Command('evaluate', 'score against SemanticKITTI labels'),
+    'bench': Command('bench', 'time the segmentation by stage, beside Patchwork++'),
+    'plot': Command('plot', 'draw a scan in perspective, or a segment of it from the side'),
+    'pose': Command('pose', 'estimate height and tilt of the sensor from scans'),
+    'kitti-to-bag': Command('kitti_to_bag', 'write a KITTI sequence as a rosbag2'),  # -> bags
+    'play': Command('play', "publish a bag's clouds as they were recorded"),  # -> bags
+    'demo': Command('demo', 'see it work, no data needed'),
+    'config': Command('config', 'write, check and compare parameter files'),
+    'node': Command('node', 'run the ROS 2 node'),
+    'node-bench': Command('node_bench', 'latency, losses and memory of the node'),  # -> node
+    # To come: 'experiment' -> experiment, 'warm-up' -> node. To go with `experiment`:
+    'pose-check': Command('pose_check', 'what not knowing height and tilt of the sensor costs'),
+    'table1': Command('table1', "the paper's Table I on real frames"),
+    'ablation': Command('ablation', 'compare length-scale models and ways to learn'),
+    'ideas': Command('ideas', 'what each idea is worth: switched off one at a time'),
+    'leave-out': Command('leave_out', 'choose parameters, score them on the sequence left out'),
+    'scenes': Command('scenes', 'score on simulated scenes, flat and rough'),
 }
 
 EXAMPLES = """\
@@ -53,8 +61,8 @@ examples:
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
   gp-ground-seg pose scan.bin                    how high and how tilted is the sensor?
   gp-ground-seg bench KITTI_ROOT                 time per frame by stage, beside Patchwork++
-  gp-ground-seg plot-segment scan.bin --azimuth 0 -o ahead.png
-  gp-ground-seg plot-scan --simulate urban -o scan.png
+  gp-ground-seg plot segment scan.bin --azimuth 0 -o ahead.png
+  gp-ground-seg plot scan --simulate urban -o scan.png
   gp-ground-seg table1 --kitti KITTI_ROOT        the paper's Table I
   gp-ground-seg ablation KITTI_ROOT              what the model and the learning are worth
   gp-ground-seg scenes                           simulated scenes, beside Patchwork++
@@ -75,10 +83,10 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     parser.add_argument('--version', action='version', version=__version__)
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
     if command is not None:
-        name = command.replace('-', '_')
-        importlib.import_module(f'gp_ground_seg.cli.{name}').add_parser(subparsers)
+        module = COMMANDS[command].module
+        importlib.import_module(f'gp_ground_seg.cli.{module}').add_parser(subparsers)
     else:
-        for name, purpose in COMMANDS.items():
+        for name, (_, purpose) in COMMANDS.items():
             subparsers.add_parser(name, help=purpose)
     return parser
 
@@ -99,6 +107,8 @@ def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
     """Say what the library logs as notes, but not where it has a log of its own."""
     if getattr(arguments, 'accepts_ros_args', False):
         return nullcontext()
+    from gp_ground_seg.cli.options import library_notes
+
     quiet = getattr(arguments, 'quiet', False)
     return library_notes(logging.WARNING if quiet else logging.INFO)
 

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.cli.segment_scans import find_scans
+from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.cli.tables import format_table
 from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError

@@ -1,24 +1,47 @@
-"""``segment``: label scans on disk, or the clouds of a bag."""
+"""``segment``: label scans on disk, or split the clouds of a bag."""
 
 from __future__ import annotations
 
 import argparse
+import re
+import statistics
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.cli.segment_bag import (
-    DEFAULT_GROUND_TOPIC,
-    DEFAULT_OBSTACLES_TOPIC,
-    segment_bag,
+import numpy as np
+
+from gp_ground_seg.cli.options import (
+    add_config_options,
+    config_from_options,
+    count,
+    new_parser,
+    note,
+    note_leftovers,
+    progress_bar,
 )
-from gp_ground_seg.cli.segment_scans import find_scans, segment_scans
-from gp_ground_seg.data.bags import BAG_SUFFIXES, is_bag
-from gp_ground_seg.errors import DataError
+from gp_ground_seg.data.atomic_output import staged_file, staged_files
+from gp_ground_seg.data.bags import (
+    BAG_SUFFIXES,
+    BagReader,
+    BagWriter,
+    cloud_topic,
+    decode_cloud,
+    encode_cloud,
+    is_bag,
+    open_bag,
+)
+from gp_ground_seg.data.semantic_kitti import read_points
+from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.frame import Label
+from gp_ground_seg.result import Segmentation
+from gp_ground_seg.segmenter import GroundSegmenter
 
 DESCRIPTION = """\
 Split scans into ground and obstacles.
 
-INPUT is guessed from what it is:
+INPUT is one of:
   scan.bin             a KITTI scan (float32 x, y, z, intensity)
   folder               of .bin files, or a sequence with velodyne/ in it
   drive.bag            a ROS 1 bag
@@ -39,22 +62,27 @@ Nothing is overwritten without --force. Output is written under a hidden name
 """
 
 EXAMPLES = """\
-examples:
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
 """
 
+GROUND_TOPIC, OBSTACLES_TOPIC = '/ground', '/obstacles'
+"""Topics of the clouds in the output, unless others are given."""
+
+FOR_SCANS = ('raw',)
+FOR_BAGS = ('topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
+
+# Unlabelled, road and other-object.
+SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
+_SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data')
+_TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
-        'segment',
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
     parser.add_argument('input', metavar='INPUT', help='scan, folder of scans, or bag')
     parser.add_argument(
         '-o',
@@ -71,19 +99,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         '--raw', action='store_true', help='write 0 unknown, 1 ground, 2 obstacle as labels'
     )
     bags = parser.add_argument_group('for bags')
-    bags.add_argument(
-        '--topic', metavar='T', help='PointCloud2 topic (default: the only one there is)'
-    )
-    bags.add_argument(
-        '--ground-topic',
-        metavar='T',
-        help=f'topic of the ground (default: {DEFAULT_GROUND_TOPIC})',
-    )
-    bags.add_argument(
-        '--obstacles-topic',
-        metavar='T',
-        help=f'topic of the obstacles (default: {DEFAULT_OBSTACLES_TOPIC})',
-    )
+    for option, text in (
+        ('--topic', 'PointCloud2 topic (default: the only one there is)'),
+        ('--ground-topic', f'topic of the ground (default: {GROUND_TOPIC})'),
+        ('--obstacles-topic', f'topic of the obstacles (default: {OBSTACLES_TOPIC})'),
+    ):
+        bags.add_argument(option, metavar='T', help=text)
     bags.add_argument(
         '--drop',
         metavar='T',
@@ -99,36 +120,214 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
+@dataclass
+class _Tally:
+    """Counts over the frames of a run."""
+
+    n_points: int = 0
+    n_ground: int = 0
+    seconds: list[float] = field(default_factory=list)
+
+    def add(self, result: Segmentation) -> None:
+        self.n_points += len(result.label)
+        self.n_ground += int(np.count_nonzero(result.label == Label.GROUND))
+        self.seconds.append(result.timings['total'])
+
+    def summary(self, target: Path) -> str:
+        share = f'{self.n_ground / self.n_points:.1%} ground' if self.n_points else 'no ground'
+        return (
+            f'{count(len(self.seconds), "frame")}, {count(self.n_points, "point")}, {share}, '
+            f'{1e3 * statistics.median(self.seconds):.1f} ms per frame (median, segmentation '
+            f'only), written to {target}'
+        )
+
+
 def run(arguments: argparse.Namespace) -> int:
-    """Find out what the input is, and segment it."""
+    """Segment the input, by its kind."""
     config = config_from_options(arguments)
     source = Path(arguments.input)
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
-    if is_bag(source) or _holds_bag_files(source):
-        _refuse(arguments, 'scans', raw='--raw')
-        return segment_bag(source, arguments, config)
-    scans = find_scans(source)
-    _refuse(
-        arguments,
-        'bags',
-        topic='--topic',
-        ground_topic='--ground-topic',
-        obstacles_topic='--obstacles-topic',
-        drop='--drop',
-        format='--format',
-    )
-    return segment_scans(source, scans, arguments, config)
+    holds_bag = is_bag(source) or _holds_bag_files(source)
+    scans = [] if holds_bag else find_scans(source)
+    kind, foreign = ('scans', FOR_SCANS) if holds_bag else ('bags', FOR_BAGS)
+    for name in foreign:
+        if getattr(arguments, name):
+            option = name.replace('_', '-')
+            raise DataError(f'--{option}: is for {kind}, which {source} is not')
+    target = Path(arguments.output) if arguments.output else _default_output(source)
+    tally = _Tally()
+    with closing(GroundSegmenter(config)) as segmenter:
+        if holds_bag:
+            _segment_bag(target, arguments, segmenter, tally)
+        else:
+            _segment_scans(scans, target, arguments, segmenter, tally)
+    print(tally.summary(target))
+    return 0
 
 
 def _holds_bag_files(source: Path) -> bool:
-    """Whether a folder has bag files in it and no scans; opening it says what to do."""
+    """Whether a folder holds bag files and no scans: `open_bag` says what is missing there."""
     if not source.is_dir() or any(source.glob('*.bin')):
         return False
     return any(child.suffix in BAG_SUFFIXES for child in source.iterdir())
 
 
-def _refuse(arguments: argparse.Namespace, kind: str, **options: str) -> None:
-    for name, option in options.items():
-        if getattr(arguments, name):
-            raise DataError(f'{option}: is for {kind}, which {arguments.input} is not')
+def _default_output(source: Path) -> Path:
+    """Beside the input: a file for a single-file rosbag2, else a folder."""
+    named = source if source.name not in ('', '..') else source.resolve()
+    if named.is_dir():
+        return named.with_name(f'{named.name}_ground')
+    suffix = '' if named.suffix in ('.bag', '.bin') else named.suffix
+    return named.with_name(f'{named.stem}_ground{suffix}')
+
+
+def find_scans(source: Path) -> list[Path]:
+    """Return the .bin files that `source` stands for, in order.
+
+    Parameters
+    ----------
+    source : Path
+        A .bin file, a folder of them, a SemanticKITTI sequence, or a KITTI raw drive.
+
+    Raises
+    ------
+    DataError
+        If there is none; the message says what was expected.
+    """
+    if source.is_file():
+        if source.suffix != '.bin':
+            raise DataError(
+                f'{source}: not a scan or bag; accepted are .bin, .bag, .mcap and .db3 files, '
+                'folders of .bin files and rosbag2 folders'
+            )
+        return [source]
+    for name in _SCAN_FOLDERS:
+        scans = sorted((source / name).glob('*.bin'))
+        if scans:
+            return scans
+    sequences = sorted(path.parent.name for path in source.glob('sequences/*/velodyne'))
+    hint = ''
+    if sequences:
+        first = source / 'sequences' / sequences[0]
+        hint = f'; give one of its sequences ({", ".join(sequences)}), as in {first}'
+    raise DataError(f'{source}: no .bin file in it, and not a rosbag2 folder{hint}')
+
+
+def _segment_scans(
+    scans: Sequence[Path],
+    target: Path,
+    arguments: argparse.Namespace,
+    segmenter: GroundSegmenter,
+    tally: _Tally,
+) -> None:
+    """Write one label file per scan."""
+    code = np.array(
+        [label if arguments.raw else SEMANTIC_KITTI_CODE[label] for label in sorted(Label)],
+        dtype='<u4',
+    )
+    if not arguments.quiet:
+        note_leftovers(target)
+    with (
+        _label_files(scans, target, arguments) as label_paths,
+        progress_bar(len(scans), quiet=arguments.quiet, title='segment') as bar,
+    ):
+        for scan, label_path in zip(scans, label_paths, strict=True):
+            try:
+                result = segmenter.segment(read_points(scan))
+            except PointCloudError as error:
+                raise PointCloudError(f'{scan}: {error}') from error
+            label_path.write_bytes(code[result.label].tobytes())
+            tally.add(result)
+            bar.update()
+
+
+@contextmanager
+def _label_files(
+    scans: Sequence[Path], target: Path, arguments: argparse.Namespace
+) -> Iterator[list[Path]]:
+    """Yield where to write the labels of each scan; all take their names at the end."""
+    if target.suffix == '.label':
+        if Path(arguments.input).is_dir():
+            raise DataError(f'{target}: must be a folder, {arguments.input} is one')
+        with staged_file(target, force=arguments.force) as path:
+            yield [path]
+        return
+    names = [f'{scan.stem}.label' for scan in scans]
+    with staged_files(target, names, force=arguments.force) as folder:
+        yield [folder / name for name in names]
+
+
+def _segment_bag(
+    target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter, tally: _Tally
+) -> None:
+    """Copy a bag, and write the ground and the obstacles of each cloud after it."""
+    source = Path(arguments.input)
+    here = source.resolve()
+    if target.resolve() in (here, *here.parents):
+        raise DataError(f'{target}: is the input, or has it in it; name another output')
+    outputs = {
+        arguments.ground_topic or GROUND_TOPIC: Label.GROUND,
+        arguments.obstacles_topic or OBSTACLES_TOPIC: Label.OBSTACLE,
+    }
+    with open_bag(source) as bag:
+        topic = bag.pick_point_cloud_topic(arguments.topic)
+        for name in arguments.drop:
+            bag.topic(name)  # Raises where there is none.
+        copied = [name for name in bag.topics if name not in arguments.drop]
+        _check_output_topics(source, arguments, copied)
+        storage = arguments.format
+        if storage is None and target.suffix not in BAG_SUFFIXES and bag.storage != 'ros1':
+            storage = bag.storage
+        if not arguments.quiet:
+            note_leftovers(target)
+            _note_migrated(bag, copied)
+        with (
+            BagWriter(target, storage=storage, force=arguments.force) as output,
+            progress_bar(bag.n_messages(topic), quiet=arguments.quiet, title='segment') as bar,
+        ):
+            for name in copied:
+                output.add_topic(bag.topic(name))
+            for name in outputs:
+                output.add_topic(cloud_topic(name))
+            for name, time, raw in bag.messages([*copied, topic]):
+                if name in copied:
+                    output.write(name, time, raw)
+                if name != topic:
+                    continue
+                try:
+                    cloud = decode_cloud(raw)
+                    result = segmenter.segment(cloud.xyz())
+                except PointCloudError as error:
+                    raise DataError(
+                        f'{source}: message {len(tally.seconds)} of topic {topic}, '
+                        f'recorded at {time} ns: {error}'
+                    ) from error
+                for part, label in outputs.items():
+                    output.write(part, time, encode_cloud(cloud.select(result.label == label)))
+                tally.add(result)
+                bar.update()
+
+
+def _check_output_topics(source: Path, arguments: argparse.Namespace, copied: list[str]) -> None:
+    ground = arguments.ground_topic or GROUND_TOPIC
+    obstacles = arguments.obstacles_topic or OBSTACLES_TOPIC
+    for option, name in (('--ground-topic', ground), ('--obstacles-topic', obstacles)):
+        if not _TOPIC_NAME.fullmatch(name):
+            raise DataError(f'{option} {name}: must be a full topic name, as in {GROUND_TOPIC}')
+        if name in copied:
+            raise DataError(
+                f'{source}: has a topic {name} already; choose another with {option}, '
+                f'or leave that one out with --drop {name}'
+            )
+    if ground == obstacles:
+        raise DataError(f'--obstacles-topic {obstacles}: is the topic of the ground as well')
+
+
+def _note_migrated(bag: BagReader, copied: list[str]) -> None:
+    for name in bag.migrated_topics:
+        if name in copied:
+            note(
+                f'topic {name}: {bag.topics[name]} has other fields in ROS 2; those of the same '
+                'name are kept, new ones are zero'
+            )
