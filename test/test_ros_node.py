@@ -29,7 +29,6 @@ from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.ros.node import GroundSegmentationNode
-from gp_ground_seg.ros.warm_up import warm_up
 
 OFTEN = ('-p', 'diagnostics.period:=0.1', '-p', 'diagnostics.recover_after:=0.3')
 
@@ -243,17 +242,6 @@ def test_drops_are_counted_exactly():
         values = {entry.key: entry.value for entry in status.values}
         assert int(values['Dropped since startup']) > 0
         assert int(values['Clouds since startup']) == len(b.ground.wait(2))
-
-
-def test_warm_up_leaves_no_trace():
-    xyz = xyz_of(street(5000))
-    config = Config().replace(**{'learning.mode': 'first_frame'})
-    segmenter = GroundSegmenter(config)
-    assert warm_up(segmenter) > 0.0
-    expected = GroundSegmenter(config).segment(xyz)
-    found = segmenter.segment(xyz)
-    np.testing.assert_array_equal(found.ground_z, expected.ground_z)
-    assert found.fit == expected.fit
 
 
 def publish_until(publisher, message, condition, what):

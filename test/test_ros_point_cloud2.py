@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.ros.point_cloud2 import read_xyz, select_points
+from gp_ground_seg.ros.input import read_xyz, select_points
 
 STRUCT_CODE = {
     PointField.INT8: 'b',

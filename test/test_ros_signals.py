@@ -162,7 +162,7 @@ def test_a_second_signal_does_not_break_the_end(tmp_path):
 
 DEAF = """
 import hashlib
-from gp_ground_seg.ros.signals import stop_on_signals
+from gp_ground_seg.ros.lifecycle import stop_on_signals
 
 with stop_on_signals():
     print('ready', flush=True)
@@ -186,7 +186,7 @@ def test_a_thread_ends_what_does_not_end_itself():
 def test_without_a_signal_all_is_as_before():
     script = (
         'import signal\n'
-        'from gp_ground_seg.ros.signals import stop_on_signals\n'
+        'from gp_ground_seg.ros.lifecycle import stop_on_signals\n'
         'before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)\n'
         'with stop_on_signals() as outer:\n'
         '    with stop_on_signals() as stop:\n'

@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
-from gp_ground_seg.ros.time_jumps import TOLERANCE, StampWatch
+from gp_ground_seg.ros.input import JUMP_TOLERANCE as TOLERANCE
+from gp_ground_seg.ros.input import StampWatch
 
 
 @given(st.lists(st.floats(0.0, 5.0)))

@@ -38,13 +38,14 @@ COMMANDS = {
     'bench': Command('bench', 'time the segmentation by stage, beside Patchwork++'),
     'plot': Command('plot', 'draw a scan in perspective, or a segment of it from the side'),
     'pose': Command('pose', 'estimate height and tilt of the sensor from scans'),
-    'kitti-to-bag': Command('kitti_to_bag', 'write a KITTI sequence as a rosbag2'),  # -> bags
-    'play': Command('play', "publish a bag's clouds as they were recorded"),  # -> bags
+    'kitti-to-bag': Command('bags', 'write a KITTI sequence as a rosbag2'),
+    'play': Command('bags', "publish a bag's clouds as they were recorded"),
     'demo': Command('demo', 'see it work, no data needed'),
     'config': Command('config', 'write, check and compare parameter files'),
     'node': Command('node', 'run the ROS 2 node'),
-    'node-bench': Command('node_bench', 'latency, losses and memory of the node'),  # -> node
-    # To come: 'experiment' -> experiment, 'warm-up' -> node. To go with `experiment`:
+    'node-bench': Command('node', 'latency, losses and memory of the node'),
+    'warm-up': Command('node', 'compile beforehand what the first start would compile'),
+    # To come: 'experiment' -> experiment. To go with `experiment`:
     'pose-check': Command('pose_check', 'what not knowing height and tilt of the sensor costs'),
     'table1': Command('table1', "the paper's Table I on real frames"),
     'ablation': Command('ablation', 'compare length-scale models and ways to learn'),

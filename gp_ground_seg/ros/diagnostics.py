@@ -18,7 +18,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from gp_ground_seg.frame import Label
+from gp_ground_seg.frame import FloatArray, Label
 from gp_ground_seg.parameters.config import DiagnosticsConfig
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import FitReport, Segmentation
@@ -434,7 +434,7 @@ def _digits(value: float | None, form: str) -> str:
     return 'unknown' if value is None or np.isnan(value) else format(value, form)
 
 
-def _mean(values: npt.NDArray[np.generic]) -> float:
+def _mean(values: npt.NDArray[np.bool_] | FloatArray) -> float:
     return float(np.mean(values)) if len(values) else np.nan
 
 

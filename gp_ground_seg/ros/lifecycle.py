@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from gp_ground_seg.errors import ConfigError, GroundSegError
+from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyError
 
 USAGE = """\
 examples:
@@ -65,6 +65,20 @@ def start_errors() -> Iterator[None]:
         if isinstance(error, GroundSegError):
             raise
         raise ConfigError(' '.join(str(error).split())) from error
+
+
+@contextmanager
+def needing_ros(command: str) -> Iterator[None]:
+    """Turn a failed import of ROS within the block into a MissingDependencyError."""
+    try:
+        yield
+    except ImportError as error:
+        if isinstance(error, GroundSegError) or (error.name or '').startswith('gp_ground_seg'):
+            raise
+        raise MissingDependencyError(
+            f'{command} needs ROS 2, which cannot be imported ({error}): source the setup '
+            "file of a ROS 2 installation, or pip install 'gp_ground_seg[ros]'"
+        ) from error
 
 
 # --- Transport

@@ -360,4 +360,5 @@ def memory_result(resident: Sequence[int], peak: int) -> dict[str, float]:
     start = float(np.median(resident[share : 2 * share]))
     end = float(np.median(resident[-share:]))
     n_clouds = len(resident)
-    return {'n_clouds': n_clouds, 'start': start, 'end': end, 'peak': peak, 'growth': end / start - 1.0}
+    growth = end / start - 1.0
+    return {'n_clouds': n_clouds, 'start': start, 'end': end, 'peak': peak, 'growth': growth}
