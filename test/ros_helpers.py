@@ -39,7 +39,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.backend import choose_backend
-from gp_ground_seg.ros.node import GroundSegmentationNode
+from gp_ground_seg.ros.node import GroundSegmentationNode, main
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS
 
 PATIENCE = 120.0
@@ -248,7 +248,9 @@ class Process:
             self._wait_for_log(CHANGED)
 
     def _wait_for_log(self, text: str) -> None:
-        wait_for(lambda: text in self.log or self.popen.poll() is not None, f'{text!r} of the node')
+        wait_for(
+            lambda: text in self.log or self.popen.poll() is not None, f'{text!r} of the node'
+        )
         assert self.popen.poll() is None, self.log
 
     def stop(self, number: int) -> tuple[int, float]:
@@ -391,3 +393,17 @@ def bench(*words: str) -> Iterator[Bench]:
         with spinning(context, result.node, result.probe):
             result.wait_until_connected()
             yield result
+
+
+def start_error(capfd: pytest.CaptureFixture[str], *words: str) -> str:
+    """Line that the node ends with when it refuses to start with ``--ros-args words``."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in ISOLATION.items():
+            patch.setenv(name, os.environ.get(name, value) if name == 'ROS_DOMAIN_ID' else value)
+        assert main(['--ros-args', *words]) == 2
+    said = capfd.readouterr()
+    assert said.out == ''
+    assert 'Traceback' not in said.err
+    line = said.err.splitlines()[-1]
+    assert line.startswith('ground_segmentation_node: error: ')
+    return line

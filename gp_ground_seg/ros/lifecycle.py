@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import os
 import signal
 import threading
@@ -18,8 +19,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyError
+import yaml
 
+from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyError
+from gp_ground_seg.parameters.yaml_io import load_yaml
+
+HIGHEST_DOMAIN = 232
 USAGE = """\
 examples:
   %(prog)s --ros-args -r points:=/kitti/velo/pointcloud
@@ -40,6 +45,7 @@ def initialize(words: Sequence[str]) -> None:
     from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import remove_ros_args
 
+    check_surroundings(words)
     with start_errors():
         other_words = remove_ros_args(list(words))[1:]
     parser = argparse.ArgumentParser(
@@ -64,7 +70,29 @@ def start_errors() -> Iterator[None]:
     except (ParameterException, NameValidationException, RuntimeError, ValueError) as error:
         if isinstance(error, GroundSegError):
             raise
-        raise ConfigError(' '.join(str(error).split())) from error
+        text = ' '.join(str(error).split())
+        kind = type(error).__name__
+        raise ConfigError(text if kind == 'RCLError' else f'{kind}: {text}') from error
+
+
+def check_surroundings(words: Sequence[str]) -> None:
+    """Raise a ConfigError for what rcl takes without a word, or ends the process for.
+
+    These are parameter files that are not text, hold no parameters or give one twice, and a
+    ``ROS_DOMAIN_ID`` for which DDS has no ports.
+    """
+    domain = os.environ.get('ROS_DOMAIN_ID', '')
+    if domain.isdecimal() and int(domain) > HIGHEST_DOMAIN:
+        raise ConfigError(f'ROS_DOMAIN_ID = {domain}: must be an integer in [0, {HIGHEST_DOMAIN}]')
+    paths = (path for flag, path in itertools.pairwise(words) if flag == '--params-file')
+    for path in paths:
+        with contextlib.suppress(OSError, yaml.YAMLError, RecursionError):
+            try:
+                document = load_yaml(Path(path).read_text(encoding='utf-8'))
+            except (UnicodeDecodeError, ConfigError) as error:
+                raise ConfigError(f'{path}: {error}') from error
+            if not isinstance(document, dict | None):
+                raise ConfigError(f'{path}: no ros__parameters')
 
 
 @contextmanager
@@ -286,6 +314,7 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
     from rclpy.context import Context
     from rclpy.signals import SignalHandlerOptions
 
+    check_surroundings(ros_args)
     context = Context()
     with start_errors():
         options = SignalHandlerOptions.NO
