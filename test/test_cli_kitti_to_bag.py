@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rosbags.interfaces import QosReliability
 
-from gp_ground_seg.cli.kitti_to_bag import EPOCH
+from gp_ground_seg.cli.bags import EPOCH
 from gp_ground_seg.data.bags import POINT_CLOUD2, decode_cloud, open_bag
 
 REPOSITORY = Path(__file__).resolve().parent.parent
