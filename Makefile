@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 KITTI ?= $(abspath $(wildcard ../shared/kitti))
+# Empty, the variable would be a path to the tests.
+WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
 .PHONY: help demo test bench bench-docs node-bench colcon lint format generate clean
 
@@ -15,7 +17,7 @@ help:
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make lint      ruff and mypy'
 	@echo 'make format    format the code'
-	@echo 'make generate  rewrite what is derived from gp_ground_seg/config.py'
+	@echo 'make generate  rewrite the files derived from gp_ground_seg/parameters'
 	@echo 'make clean     remove the environment and build results'
 
 $(VENV)/.python:
@@ -36,7 +38,7 @@ demo: $(VENV)/.ros
 	$(BIN)/gp-ground-seg demo --force $(if $(KITTI_ROOT),--kitti $(KITTI_ROOT))
 
 test: $(VENV)/.dev
-	GP_GROUND_SEG_KITTI=$(KITTI) $(BIN)/python -m pytest
+	$(WITH_KITTI) $(BIN)/python -m pytest
 
 bench: $(VENV)/.dev
 	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy
@@ -50,10 +52,9 @@ node-bench: $(VENV)/.ros
 
 # The interpreter of colcon is that of the node; ROS wheels lie below its prefix.
 colcon: export AMENT_PREFIX_PATH := $(abspath $(VENV))
-colcon: export GP_GROUND_SEG_KITTI := $(KITTI)
 colcon: $(VENV)/.dev
 	$(BIN)/colcon build --packages-select gp_ground_seg
-	$(BIN)/colcon test --packages-select gp_ground_seg --return-code-on-test-failure \
+	$(WITH_KITTI) $(BIN)/colcon test --packages-select gp_ground_seg --return-code-on-test-failure \
 		--event-handlers console_direct+ $(if $(PYTEST_ARGS),--pytest-args $(PYTEST_ARGS))
 	$(BIN)/colcon test-result --all
 

@@ -1,4 +1,4 @@
-"""Who computes a frame: plain numpy, or compiled code in threads."""
+"""Compute backends: the stages of a frame in plain numpy, or compiled with numba."""
 
 from __future__ import annotations
 
@@ -7,90 +7,129 @@ from typing import Protocol
 
 import numpy as np
 
-from gp_ground_seg.compiled.workspace import Workspace
 from gp_ground_seg.errors import MissingDependencyError
 from gp_ground_seg.frame import (
     BoolArray,
     Candidates,
+    Faces,
     FloatArray,
+    Frame,
     GroundSurface,
+    Inliers,
     Labelled,
     Lines,
     PointArray,
     PseudoInputs,
+    Scan,
 )
-from gp_ground_seg.gp.growth import GrowthTask
-from gp_ground_seg.gp.numpy_backend import NumpyBackend as NumpyBackend
-from gp_ground_seg.gp.objective import TrainingFrame
+from gp_ground_seg.gp import ground, likelihood
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config, RuntimeConfig
-from gp_ground_seg.pipeline.labelling import LabelTask
-from gp_ground_seg.pipeline.sorted_points import SortedPoints
+from gp_ground_seg.pipeline import ground_plane, labels, lines, polar_grid, vertical_faces
+from gp_ground_seg.pipeline.points import in_columns
 
 _LOGGER = logging.getLogger('gp_ground_seg')
-_said_slow = False
+_warned_slow = False
 
 
 class Backend(Protocol):
-    """What the segmenter asks of a backend; theta has one row per segment."""
+    """One method per stage; theta has one row per segment.
 
-    name: str
-    n_threads: int
+    Each takes the values of the stages before and returns new ones. Those of `build_grid`
+    and `find_faces` may lie in buffers that the next scan reuses.
+    """
 
-    def sort_points(
-        self, xyz: PointArray, config: Config, workspace: Workspace, seeks_faces: bool = True
-    ) -> SortedPoints:
-        """Points of a level frame in columns, sorted into bins and tiles.
+    @property
+    def name(self) -> str:
+        """``numba`` or ``numpy``."""
 
-        See `gp_ground_seg.pipeline.points.in_columns`, `gp_ground_seg.pipeline.polar_grid`,
-        `gp_ground_seg.pipeline.tiles`, `gp_ground_seg.pipeline.faces`. All but the grid and the
-        candidates may lie in `workspace`. If `seeks_faces`, other threads begin with them:
-        they, or that they are dropped, are to be waited for before the points change and
-        before anything is asked of the backend but to sort other points without faces.
-        """
+    @property
+    def n_threads(self) -> int:
+        """Number of threads, the caller's included."""
 
-    def find_lines(
-        self, candidates: Candidates, is_footless: BoolArray, config: Config
+    def build_grid(self, xyz: PointArray, config: Config) -> Scan:
+        """See `gp_ground_seg.pipeline.polar_grid.build_scan`."""
+
+    def fit_plane(
+        self, candidates: Candidates, max_slope: float
+    ) -> ground_plane.GroundPlane | None:
+        """See `gp_ground_seg.pipeline.ground_plane.fit_plane`."""
+
+    def find_faces(self, scan: Scan, config: Config) -> Faces:
+        """See `gp_ground_seg.pipeline.vertical_faces.find_faces`."""
+
+    def extract_lines(
+        self, candidates: Candidates, faces: Faces, config: Config
     ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
-        """Candidates that show ground, lines through them, pseudo-inputs, and who follows whom.
+        """See `gp_ground_seg.pipeline.lines.find_lines`."""
 
-        See `gp_ground_seg.pipeline.hidden_feet.without_hidden_feet`,
-        `gp_ground_seg.pipeline.line_extraction.extract_lines`,
-        `gp_ground_seg.pipeline.pseudo_inputs.select_pseudo_inputs` and
-        `gp_ground_seg.pipeline.line_bends.candidates_that_follow`.
-        """
-
-    def grow(
-        self,
-        task: GrowthTask,
-        log_length_scale: FloatArray,
-        knot_log_length_scale: FloatArray,
-        to_label: LabelTask | None = None,
-    ) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """See `gp_ground_seg.gp.growth.grow_surface_reference`; log length-scales (C,), (M, K).
-
-        The surface is fused, see `pipeline.surface.fuse_neighbours`. Other threads may
-        go on to label by it what is `to_label`: that is to be asked for next.
-        """
-
-    def grow_on_latent(
-        self, task: GrowthTask, pseudo: PseudoInputs, to_label: LabelTask | None = None
-    ) -> tuple[BoolArray, FloatArray, FloatArray, FloatArray]:
-        """Both processes: `gp_ground_seg.gp.latent.latent_rows_reference`, then `grow`.
-
-        What `grow` gives, and the log length-scales at the knots (M, K) [log m].
-        """
-
-    def label_points(self, task: LabelTask, surface: GroundSurface) -> Labelled:
-        """See `gp_ground_seg.pipeline.labelling`."""
-
-    def objective(
-        self, theta: FloatArray, frame: TrainingFrame, slope_std: float, latent_terms: bool
+    def log_likelihood(
+        self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
     ) -> tuple[float, FloatArray]:
-        """See `gp_ground_seg.gp.objective.objective_reference`."""
+        """See `gp_ground_seg.gp.likelihood.log_likelihood`."""
+
+    def estimate_surface(
+        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
+    ) -> tuple[GroundSurface, FloatArray]:
+        """See `gp_ground_seg.gp.ground.estimate_surface`."""
+
+    def label_points(
+        self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
+    ) -> Labelled:
+        """See `gp_ground_seg.pipeline.labels.label_points`."""
 
     def close(self) -> None:
-        """End worker threads."""
+        """End worker threads; they start again if they are needed again."""
+
+
+class NumpyBackend:
+    """Plain numpy, one thread."""
+
+    name = 'numpy'
+    n_threads = 1
+
+    def build_grid(self, xyz: PointArray, config: Config) -> Scan:
+        """Sort points into cells and tiles; lowest point of each cell."""
+        columns = np.empty((3, len(xyz)), dtype=xyz.dtype)
+        return polar_grid.build_scan(in_columns(xyz, columns), config)
+
+    def fit_plane(
+        self, candidates: Candidates, max_slope: float
+    ) -> ground_plane.GroundPlane | None:
+        """Plane of the ground around the sensor."""
+        return ground_plane.fit_plane(candidates, max_slope)
+
+    def find_faces(self, scan: Scan, config: Config) -> Faces:
+        """Tiles that hold a vertical face."""
+        max_height = config.label.obstacle_max_height
+        return vertical_faces.find_faces(scan.xyz, scan.tiles, config.faces, max_height)
+
+    def extract_lines(
+        self, candidates: Candidates, faces: Faces, config: Config
+    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
+        """Candidates that show ground, lines, pseudo-inputs, candidates that continue a line."""
+        return lines.find_lines(candidates, faces, config)
+
+    def log_likelihood(
+        self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
+    ) -> tuple[float, FloatArray]:
+        """Log marginal likelihood of the frame and its gradient."""
+        return likelihood.log_likelihood(theta, inliers, slope_std, latent_terms)
+
+    def estimate_surface(
+        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
+    ) -> tuple[GroundSurface, FloatArray]:
+        """Inliers, the surface, and log length-scales at the knots."""
+        return ground.estimate_surface(frame, theta, config, segment_step)
+
+    def label_points(
+        self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
+    ) -> Labelled:
+        """Height, label and margin of each point; roughness of each cell."""
+        return labels.label_points(scan, faces, surface, config)
+
+    def close(self) -> None:
+        """Nothing to end."""
 
 
 def choose_backend(wanted: str) -> str:
@@ -101,14 +140,14 @@ def choose_backend(wanted: str) -> str:
     MissingDependencyError
         If numba is asked for by name and not installed.
     """
-    global _said_slow
+    global _warned_slow
     if wanted == 'numba' and not HAVE_NUMBA:
         raise MissingDependencyError(
             'runtime.backend = numba, but numba is not installed: pip install numba, '
             'or set runtime.backend to auto'
         )
-    if wanted == 'auto' and not HAVE_NUMBA and not _said_slow:
-        _said_slow = True
+    if wanted == 'auto' and not HAVE_NUMBA and not _warned_slow:
+        _warned_slow = True
         _LOGGER.warning(
             'numba is not installed: using numpy, several times slower (pip install numba)'
         )
@@ -117,28 +156,9 @@ def choose_backend(wanted: str) -> str:
 
 def make_backend(runtime: RuntimeConfig) -> Backend:
     """Backend for the parameters ``runtime``; raises as `choose_backend`."""
-    # Only the one that is used: the compiled code has its cache to load.
     if choose_backend(runtime.backend) == 'numpy':
-        from gp_ground_seg.gp.numpy_backend import NumpyBackend
-
         return NumpyBackend()
-    from gp_ground_seg.compiled.backend import CompiledBackend
+    # Imported only where it is used, as it loads compiled code.
+    from gp_ground_seg.compiled.backend import NumbaBackend
 
-    return CompiledBackend(runtime.n_threads)
-
-
-def warm_up(config: Config | None = None) -> Backend:
-    """Stub of the lead's function."""
-    from gp_ground_seg.pipeline.sensor_pose import given_pose
-    from gp_ground_seg.segmenter import GroundSegmenter
-
-    config = config or Config()
-    backend = make_backend(config.runtime)
-    radius, azimuth = np.meshgrid(np.linspace(2.0, 32.0, 24), np.linspace(-3.1, 3.1, 64))
-    pose = given_pose(config.sensor)
-    height = np.full(radius.shape, -pose.height)
-    level = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=-1)
-    GroundSegmenter(config, backend=backend).segment(
-        (level.reshape(-1, 3) @ pose.rotation).astype(np.float32)
-    )
-    return backend
+    return NumbaBackend(runtime.n_threads)

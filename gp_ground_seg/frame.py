@@ -1,40 +1,32 @@
-"""What passes from stage to stage of a frame: arrays with their shapes and units."""
+"""Values that pass from stage to stage of a frame: arrays with their shapes and units.
+
+Named tuples, because compiled code reads their fields as numpy code does. Ragged arrays are
+values and `offsets`: those of segment m are ``offsets[m]:offsets[m + 1]``.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
-
-
+IntArray = npt.NDArray[np.int64]
+CellArray = npt.NDArray[np.int32]
+BoolArray = npt.NDArray[np.bool_]
 PointArray = npt.NDArray[np.floating]
 """Coordinates, in single or double precision."""
 
-
-IntArray = npt.NDArray[np.int64]
-
-
 OUTSIDE = -1
-"""Bin and cell of a point that is beyond the grid."""
-
-
+"""Bin, cell and tile of a point that is beyond the grid."""
 NOT_FINITE = -2
 """Cell of a point that is not finite."""
-
-
 NO_TILE = 2**31 - 1
 """Tile of the lowest point of an empty cell."""
-
-
-BoolArray = npt.NDArray[np.bool_]
-
-
-CellArray = npt.NDArray[np.int32]
+N_CLASSES = 9
+"""Surface classes: flat, sloped, steep times short, medium, long."""
 
 
 class Label(IntEnum):
@@ -45,8 +37,7 @@ class Label(IntEnum):
     OBSTACLE = 2
 
 
-@dataclass(frozen=True)
-class PolarGrid:
+class PolarGrid(NamedTuple):
     """Where each point lies in the radial grid.
 
     Attributes
@@ -57,12 +48,12 @@ class PolarGrid:
         Horizontal range [m], in the precision of the points; NaN for points that are
         not finite.
     edges : (n_bins + 1,) float64
-        Range of the bin edges [m].
+        Range of the bin edges [m], read-only.
     n_segments : int
         Number of segments M.
     """
 
-    cell: npt.NDArray[np.int32]
+    cell: CellArray
     r: PointArray
     edges: FloatArray
     n_segments: int
@@ -73,24 +64,48 @@ class PolarGrid:
         return len(self.edges) - 1
 
     @property
-    def inside(self) -> npt.NDArray[np.bool_]:
+    def inside(self) -> BoolArray:
         """Which points lie in a cell, (N,) bool."""
         return self.cell >= 0
 
-    @cached_property
+    @property
     def segment(self) -> IntArray:
         """Angular segment of each point, counter-clockwise from -x, (N,) int64; 0 outside."""
         return np.maximum(self.cell, 0).astype(np.int64) // self.n_bins
 
-    @cached_property
+    @property
     def bin(self) -> IntArray:
         """Radial bin of each point, (N,) int64, or `OUTSIDE`."""
         own = self.cell.astype(np.int64) % self.n_bins
         return np.where(self.inside, own, OUTSIDE)
 
 
-@dataclass(frozen=True)
-class Candidates:
+class Tiles(NamedTuple):
+    """Where each point lies in a square of square tiles that holds the polar grid.
+
+    Attributes
+    ----------
+    tile : (N,) int32
+        Tile of each point, or `OUTSIDE`.
+    extremes : (T, 2) float32 or float64
+        Height of the lowest and of the highest point of each tile [m], in the
+        precision of the points; infinite, minus infinite in empty ones.
+    occupied : (K,) int32
+        Tiles with a point, in any order.
+    """
+
+    tile: CellArray
+    extremes: PointArray
+    occupied: CellArray
+
+    @property
+    def lowest_z(self) -> PointArray:
+        """Height of the lowest point of each tile, (T,) [m]."""
+        value: PointArray = self.extremes[:, 0]
+        return value
+
+
+class Candidates(NamedTuple):
     """Ground candidates PG_m of all segments, near to far in each.
 
     Attributes
@@ -104,7 +119,7 @@ class Candidates:
     offsets : (M + 1,) int64
         Candidates of segment m are ``offsets[m]:offsets[m + 1]``.
     tile : (C,) int32
-        Tile that each of them lies in (see `gp_ground_seg.pipeline.tiles.Tiles`).
+        Tile of each candidate.
     """
 
     r: FloatArray
@@ -112,14 +127,26 @@ class Candidates:
     bin: IntArray
     density: FloatArray
     offsets: IntArray
-    tile: npt.NDArray[np.int32]
+    tile: CellArray
 
     @property
     def segment(self) -> IntArray:
         """Segment of each candidate, (C,) int64."""
         return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
 
-    def where(self, kept: npt.NDArray[np.bool_]) -> Candidates:
+    @property
+    def n_edges(self) -> IntArray:
+        """Bin edges up to the far one of the last bin with a candidate, (M,) int64, or 0."""
+        first, stop = self.offsets[:-1], self.offsets[1:]
+        if len(self.bin) == 0:
+            return np.zeros(len(stop), dtype=np.int64)
+        # The index wraps around in leading segments without a candidate; they get 0 below.
+        result: IntArray = self.bin[stop - 1]
+        result += 2
+        result *= stop > first
+        return result
+
+    def where(self, kept: BoolArray) -> Candidates:
         """Those of the (C,) bool mask `kept`."""
         before = np.concatenate([[0], np.cumsum(kept)])
         return Candidates(
@@ -131,67 +158,47 @@ class Candidates:
             self.tile[kept],
         )
 
-    @property
-    def n_edges(self) -> IntArray:
-        """Bin edges up to the far one of the last bin with a candidate, (M,) int64, or 0."""
-        first, stop = self.offsets[:-1], self.offsets[1:]
-        if len(self.bin) == 0:
-            return np.zeros(len(stop), dtype=np.int64)
-        # Of leading segments without a candidate this is the last of all: they get 0 below.
-        result: IntArray = self.bin[stop - 1]
-        result += 2
-        result *= stop > first
-        return result
 
-
-@dataclass(frozen=True)
-class Tiles:
-    """Where each point lies in a square of square tiles that holds the polar grid.
+class Scan(NamedTuple):
+    """Points of a level frame, sorted into the polar grid and into tiles.
 
     Attributes
     ----------
-    tile : (N,) int32
-        Tile of each point, or `OUTSIDE`.
-    extremes : (T, 2) float32 or float64
-        Height of the lowest and of the highest point of each tile [m], in the
-        precision of the points; infinite, minus infinite in empty ones.
-    touched : (K,) int32
-        Tiles with a point, in any order.
-    """
-
-    tile: npt.NDArray[np.int32]
-    extremes: npt.NDArray[np.floating]
-    touched: npt.NDArray[np.int32]
-
-    @property
-    def foot_z(self) -> npt.NDArray[np.floating]:
-        """Height of the lowest point of each tile, (T,) [m]."""
-        value: npt.NDArray[np.floating] = self.extremes[:, 0]
-        return value
-
-
-@dataclass(frozen=True)
-class Faces:
-    """Which square tiles of the plane an upright face stands in.
-
-    Attributes
-    ----------
+    xyz : (N, 3) float32 or float64
+        Points [m], each coordinate contiguous (Fortran order), read-only.
+    grid : PolarGrid
+        Cells of the points.
     tiles : Tiles
         Tiles of the points.
-    is_face : (T,) bool
-        Whether the returns of the tile are an upright face.
-    is_footless : (T,) bool
-        Whether they are one down to the lowest: no ground is seen in the tile. See
-        `gp_ground_seg.pipeline.hidden_feet`.
+    candidates : Candidates
+        Lowest point of each occupied cell.
+
+    `xyz` and `tiles` may lie in buffers of the backend, which its next scan reuses.
     """
 
+    xyz: PointArray
+    grid: PolarGrid
     tiles: Tiles
-    is_face: npt.NDArray[np.bool_]
-    is_footless: npt.NDArray[np.bool_]
+    candidates: Candidates
 
 
-@dataclass(frozen=True)
-class Lines:
+class Faces(NamedTuple):
+    """Tiles that hold a vertical face: a wall, a fence, a kerb, the side of a car.
+
+    Attributes
+    ----------
+    is_face : (T,) bool
+        Whether the returns of the tile form a vertical face.
+    has_occluded_base : (T,) bool
+        Whether even the lowest returns belong to the face, so that no ground is seen in
+        the tile.
+    """
+
+    is_face: BoolArray
+    has_occluded_base: BoolArray
+
+
+class Lines(NamedTuple):
     """Extracted lines of all segments.
 
     Attributes
@@ -213,25 +220,9 @@ class Lines:
         value: FloatArray = candidates.r[self.start[1:] - 1] - candidates.r[self.start[:-1]]
         return value
 
-    def continued(self, max_slope: float, min_size: int) -> npt.NDArray[np.bool_]:
-        """Candidates that continue the line of the one before them, (C,) bool.
 
-        Of lines that are no steeper than `max_slope` and have at least `min_size`
-        candidates: what is longer and flatter than an obstacle, and hangs together.
-        """
-        counts = (np.abs(self.slope) <= max_slope) & (np.diff(self.start) >= min_size)
-        result: npt.NDArray[np.bool_] = counts[self.line]
-        result[self.start[:-1]] = False
-        return result
-
-
-N_CLASSES = 9
-"""Surface classes: flat, sloped, steep times short, medium, long."""
-
-
-@dataclass(frozen=True)
-class PseudoInputs:
-    """Pseudo-inputs of all segments; those of one surface class share a log length-scale.
+class PseudoInputs(NamedTuple):
+    """Pseudo-inputs of the latent process; those of one surface class share a log length-scale.
 
     Attributes
     ----------
@@ -251,8 +242,62 @@ class PseudoInputs:
     first_guess: FloatArray
 
 
-@dataclass(frozen=True)
-class GroundSurface:
+class Frame(NamedTuple):
+    """What the two processes are fitted to.
+
+    Attributes
+    ----------
+    candidates : Candidates
+        Ground candidates.
+    lines : Lines
+        Lines through them.
+    pseudo : PseudoInputs
+        Pseudo-inputs on the lines.
+    continues_line : (C,) bool
+        Candidates that join the inliers if the one before them has joined.
+    knots : (K,) float64
+        Ranges where the surface is wanted [m], read-only.
+    prior_mean : float
+        Prior mean of the ground's height [m].
+    """
+
+    candidates: Candidates
+    lines: Lines
+    pseudo: PseudoInputs
+    continues_line: BoolArray
+    knots: FloatArray
+    prior_mean: float
+
+
+class Inliers(NamedTuple):
+    """Inliers and pseudo-inputs that the hyper-parameters are learned from.
+
+    Attributes
+    ----------
+    offsets : (M + 1,) int64
+        Inliers of segment m are ``offsets[m]:offsets[m + 1]``.
+    r, z : (n,) float64
+        Their ranges and heights about the prior mean [m].
+    log_length_scale : (n,) float64
+        Their log length-scales where no latent process gives them [log m].
+    bar_offsets : (M + 1,) int64
+        Pseudo-inputs of segment m; all zero without a latent process.
+    r_bar : (P,) float64
+        Ranges of the pseudo-inputs [m].
+    surface_class : (P,) int64
+        Surface class of each pseudo-input.
+    """
+
+    offsets: IntArray
+    r: FloatArray
+    z: FloatArray
+    log_length_scale: FloatArray
+    bar_offsets: IntArray
+    r_bar: FloatArray
+    surface_class: IntArray
+
+
+class GroundSurface(NamedTuple):
     """Ground height over range in every segment.
 
     Attributes
@@ -260,11 +305,11 @@ class GroundSurface:
     knots : (K,) float64
         Ranges [m]: the bin edges.
     mean, std : (M, K) float64
-        Ground height in the sensor frame and its standard deviation [m]; NaN in
+        Ground height in the level frame and its standard deviation [m]; NaN in
         segments without a model, and behind the last bin with a return in a segment
         and in those that are fused with it.
     inlier : (C,) bool
-        Candidates that made the surface.
+        Candidates that the surface rests on.
     """
 
     knots: FloatArray
@@ -283,14 +328,14 @@ class GroundSurface:
         away = np.maximum(grid.r, self.knots[0])
         values = []
         for table in (self.mean, self.std):
-            level, slope = pieces(self.knots, table)
+            level, slope = linear_pieces(self.knots, table)
             value = level[cell] + slope[cell] * away
             value[outside] = np.nan
             values.append(value)
         return values[0], values[1]
 
 
-def pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray]:
+def linear_pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Line across each cell: its value at range 0 and its slope, two (M * n_bins,) float64.
 
     Parameters
@@ -304,20 +349,20 @@ def pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray
     return (table[:, :-1] - slope * knots[:-1]).ravel(), slope.ravel()
 
 
-@dataclass(frozen=True)
-class Labelled:
+class Labelled(NamedTuple):
     """Labels of a scan and what they follow from.
 
     Attributes
     ----------
     label : (N,) uint8
-        See `label_points`.
+        `Label` of each point; UNKNOWN for points that are not finite.
     height : (N,) float64
         Height of each point over the surface [m]; NaN where there is none.
     margin : (N,) float64
-        See `label_points` [m].
+        Distance of each point to the nearer edge of the band that is ground [m], negative
+        for obstacles; NaN where there is no surface.
     roughness : (M, n_bins) float64
-        See `local_roughness` [m].
+        Root mean square height of the returns over the surface about each bin [m].
     """
 
     label: npt.NDArray[np.uint8]

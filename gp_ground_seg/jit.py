@@ -1,94 +1,223 @@
-"""The one policy for code compiled with numba, which is optional.
+"""The one policy for code compiled with numba, which is optional, and for keeping it on disk.
 
-A function decorated with `compiled` is compiled where numba is installed and
-stays plain Python elsewhere. Compiled functions release the GIL, so that the
-caller can run them in threads, each on its own range of rows.
+numba keeps compiled code itself (``cache=True``). Beside its entries lies a stamp with a digest of
+our sources, versions, and a checksum of each entry; entries that do not fit it are deleted
+before numba reads them, and compiled again. A folder that anyone but the user and root could
+write to is not used, as its entries are code.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import grp
+import hashlib
+import json
 import logging
+import os
+import pwd
+import stat
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
 
 try:
     import numba
 except ImportError:  # Ubuntu 24.04 has no package of it
     numba = None
 
+HAVE_NUMBA = numba is not None
+JIT_ENABLED = HAVE_NUMBA and not numba.config.DISABLE_JIT
+"""Whether functions are compiled, rather than left plain Python."""
+
 _LOGGER = logging.getLogger('gp_ground_seg')
 _Function = TypeVar('_Function', bound=Callable[..., Any])
-
-HAVE_NUMBA = numba is not None
-COMPILES = HAVE_NUMBA and not numba.config.DISABLE_JIT
-"""Whether functions are compiled, and do not stay plain Python."""
-
-_dispatchers: list[Any] = []
-
-
-def compiled(function: _Function) -> _Function:
-    """Compile `function` where numba is installed; the code is kept on disk if possible."""
-    return _compile(function, frozenset())
+_PACKAGE = Path(__file__).parent
+_SOURCES = ('jit.py', 'frame.py', 'pipeline', 'gp', 'compiled')
+_entry_points: list[Any] = []
+_folder: Path | None = None
+_is_warm = False
+_n_stamped = 0
 
 
-def compiled_vectors(function: _Function) -> _Function:
-    """Compile like `compiled`, and let sums be taken in any order.
+class _Decorator(Protocol):
+    def __call__(self, function: _Function) -> _Function: ...
 
-    Sums then use vector instructions. The order is fixed by the compiler, not by the
-    number of threads; NaN and infinity keep their meaning.
+
+def jit(*, fastmath: bool = False, inline: bool = False, entry: bool = False) -> _Decorator:
+    """Return a decorator that compiles a function where numba is installed.
+
+    Compiled functions release the interpreter's lock.
+
+    Parameters
+    ----------
+    fastmath : bool
+        Let sums be taken in any order, so that they use vector instructions. The compiler
+        fixes the order, not the number of threads; NaN and infinity keep their meaning.
+    inline : bool
+        Make the function a part of those that call it, which saves compiling it twice.
+    entry : bool
+        Whether it is called from Python: its code, with all that it calls, is kept on disk.
     """
-    return _compile(function, frozenset({'reassoc', 'contract', 'nsz'}))
+
+    def decorate(function: _Function) -> _Function:
+        if not JIT_ENABLED:
+            return function
+        options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
+        if fastmath:
+            options['fastmath'] = {'reassoc', 'contract', 'nsz'}
+        if inline:
+            options['inline'] = 'always'
+        if not entry:
+            part: _Function = numba.njit(**options)(function)
+            return part
+        compiled: _Function = _njit_kept(function, options)
+        _entry_points.append(compiled)
+        return compiled
+
+    return decorate
 
 
-def inlined(function: _Function) -> _Function:
-    """Make `function` a part of the compiled functions that call it.
-
-    It is never compiled by itself, which takes longer than the work it does in them; sums
-    are taken in the order that those say.
-    """
-    if not COMPILES:
-        return function
-    part: _Function = numba.njit(inline='always', nogil=True, error_model='numpy')(function)
-    return part
-
-
-def _compile(function: _Function, fastmath: frozenset[str]) -> _Function:
-    if not COMPILES:
-        return function
-    result = numba.njit(nogil=True, error_model='numpy', fastmath=set(fastmath))(function)
-    try:
-        from gp_ground_seg.compiled.compile_cache import KeptCode
-
-        result._cache = KeptCode(function)
-    except Exception as error:
-        # Parts of numba that it may change at will; without them it compiles at every start.
-        _LOGGER.warning('compiled code is not kept on disk: %r', error)
-    _dispatchers.append(result)
-    kept: _Function = result
-    return kept
+def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    """Compile `function` with its code kept on disk, if there is a folder to trust for it."""
+    # By the XDG specification such a path is invalid; numba would write to the current folder.
+    if os.path.isabs(os.environ.get('XDG_CACHE_HOME', '/')):
+        try:
+            kept = numba.njit(**options, cache=True)(function)
+        except RuntimeError:
+            _log_not_kept('there is no folder to write to')
+        else:
+            if _prepare(Path(kept.stats.cache_path)):
+                return kept
+    else:
+        _log_not_kept('XDG_CACHE_HOME is no absolute path')
+    return numba.njit(**options)(function)
 
 
-def compiled_signatures() -> dict[str, int]:
-    """Count the signatures that each compiled function was compiled or loaded for so far."""
-    return {
-        f'{d.py_func.__module__}.{d.py_func.__qualname__}': len(d.signatures) for d in _dispatchers
-    }
+@functools.cache
+def _log_not_kept(reason: str) -> None:
+    _LOGGER.warning(
+        'compiled code is not kept on disk (%s): every start compiles, which takes 10 to 40 s; '
+        'set NUMBA_CACHE_DIR to a folder of your own',
+        reason,
+    )
 
 
-def is_code_kept() -> bool:
-    """Stub of the lead's function: whether all code that a frame needs lies on disk."""
-    from gp_ground_seg.backend import warm_up
-    from gp_ground_seg.compiled.compile_cache import CodeNotKeptError, refusing
-
-    try:
-        with refusing('compilation'):
-            warm_up().close()
-    except CodeNotKeptError:
+@functools.cache
+def _prepare(folder: Path) -> bool:
+    """Whether code is kept in `folder`; entries that do not fit the stamp are deleted."""
+    global _folder, _is_warm
+    reason = _why_not_trusted(folder)
+    if reason:
+        _log_not_kept(reason)
         return False
+    _folder = folder
+    stamp = _read_stamp(folder)
+    if stamp == {**_stamp(folder), 'warm': stamp.get('warm')}:
+        _is_warm = stamp['warm'] is True
+        return True
+    _LOGGER.info('compiling for this processor, which takes 10 to 40 s')
+    for entry in _entries(folder):
+        with contextlib.suppress(OSError):
+            entry.unlink()
+        if entry.exists():
+            _log_not_kept(f'{entry} cannot be deleted')
+            return False
     return True
 
 
+def _why_not_trusted(folder: Path) -> str:
+    """Reason why others could put code into `folder`; empty if they cannot."""
+    if not folder.is_absolute():
+        return f'{folder} is no absolute path'
+    for path in (folder, *folder.parents):
+        status = path.stat()
+        if status.st_uid not in (0, os.getuid()):
+            return f'{path} belongs to another user'
+        # Of a sticky folder, such as /tmp, only the owner of an entry can replace it.
+        is_sticky = path != folder and status.st_mode & stat.S_ISVTX
+        if not is_sticky and _others_can_write(status):
+            return f'others can write to {path}'
+    return next((f'{e} is not yours' for e in _entries(folder) if not _is_own(e)), '')
+
+
+def _is_own(entry: Path) -> bool:
+    status = entry.lstat()
+    return stat.S_ISREG(status.st_mode) and status.st_uid in (0, os.getuid())
+
+
+def _others_can_write(status: os.stat_result) -> bool:
+    if status.st_mode & stat.S_IWOTH:
+        return True
+    if not status.st_mode & stat.S_IWGRP:
+        return False
+    # Ubuntu gives each user a group of the same name, and lets that group write.
+    try:
+        user, group = pwd.getpwuid(os.getuid()).pw_name, grp.getgrgid(status.st_gid)
+    except KeyError:
+        return True
+    return group.gr_name != user or any(member != user for member in group.gr_mem)
+
+
+def _entries(folder: Path) -> list[Path]:
+    """Files in which numba of this Python keeps code."""
+    major, minor = sys.version_info[:2]
+    return sorted(folder.glob(f'*.py{major}{minor}*.nb[ic]'))
+
+
+def _stamp(folder: Path) -> dict[str, Any]:
+    """Describe the entries in `folder`: sources, versions, checksums."""
+    sources = hashlib.sha256()
+    for source in sorted(_PACKAGE.rglob('*.py')):
+        if source.parent.name in _SOURCES or source.name in _SOURCES:
+            sources.update(source.name.encode() + b'\0' + source.read_bytes())
+    entries = {e.name: hashlib.sha256(e.read_bytes()).hexdigest() for e in _entries(folder)}
+    versions = {'numba': numba.__version__, 'numpy': np.__version__, 'python': sys.version}
+    return {'sources': sources.hexdigest(), 'versions': versions, 'entries': entries}
+
+
+def _stamp_file(folder: Path) -> Path:
+    return folder / f'gp_ground_seg.{sys.implementation.cache_tag}.stamp'
+
+
+def _read_stamp(folder: Path) -> dict[str, Any]:
+    try:
+        stamp = json.loads(_stamp_file(folder).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return stamp if isinstance(stamp, dict) else {}
+
+
+def keep_code(*, warm: bool = False) -> None:
+    """Stamp the code that numba has kept since the last call, so that the next start uses it.
+
+    Parameters
+    ----------
+    warm : bool
+        Whether all code that a frame needs has been compiled.
+    """
+    global _n_stamped, _is_warm
+    n_compiled = sum(len(entry.stats.cache_misses) for entry in _entry_points)
+    if _folder is None or (n_compiled == _n_stamped and (_is_warm or not warm)):
+        return
+    _n_stamped, _is_warm = n_compiled, _is_warm or warm
+    target = _stamp_file(_folder)
+    unfinished = target.with_suffix(f'.{os.getpid()}')
+    try:
+        unfinished.write_text(json.dumps({**_stamp(_folder), 'warm': _is_warm}))
+        os.replace(unfinished, target)
+    except OSError as error:
+        _log_not_kept(f'{target}: {error.strerror}')
+
+
+def is_code_kept() -> bool:
+    """Whether all code that a frame needs lies on disk; `keep_code` was called with `warm`."""
+    return _is_warm
+
+
 def code_folder() -> Path | None:
-    """Stub of the lead's function: folder where compiled code is kept."""
-    return Path(_dispatchers[0].stats.cache_path) if _dispatchers else None
+    """Folder where compiled code is kept; None where it is not kept."""
+    return _folder

@@ -18,9 +18,8 @@ from gp_ground_seg.frame import (
     PolarGrid,
     PseudoInputs,
 )
-from gp_ground_seg.gp.learning import Learned
-from gp_ground_seg.gp.theta import theta_names
-from gp_ground_seg.pipeline.labelling import ground_probability
+from gp_ground_seg.gp.learning import Learned, theta_names
+from gp_ground_seg.pipeline.labels import ground_probability
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 
 

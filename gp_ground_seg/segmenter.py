@@ -1,41 +1,31 @@
-"""Ground segmentation of one LiDAR scan: the paper's Algorithm 2."""
+"""Ground segmentation of one LiDAR scan: the paper's Algorithm 2, stage by stage. Start here."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
+import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.backend import Backend, make_backend
-from gp_ground_seg.compiled.workspace import Workspace
-from gp_ground_seg.frame import Candidates, FloatArray, GroundSurface, PointArray
-from gp_ground_seg.gp.blas import single_threaded_blas
-from gp_ground_seg.gp.frame_model import FrameModel
-from gp_ground_seg.gp.learning import Learned
+from gp_ground_seg.frame import Candidates, FloatArray, Frame, PointArray, Scan
+from gp_ground_seg.gp.learning import Learned, given_theta, learn_frame
+from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config, SensorConfig
-from gp_ground_seg.pipeline.labelling import LabelTask
 from gp_ground_seg.pipeline.points import take_points
 from gp_ground_seg.pipeline.sensor_pose import SensorPose, estimate_pose, given_pose
-from gp_ground_seg.pipeline.sorted_points import SortedPoints
-from gp_ground_seg.pipeline.tilt import turned_sample
+from gp_ground_seg.pipeline.tilt import rotate_sample
 from gp_ground_seg.result import Fitting, Segmentation
-from gp_ground_seg.timing import StageTimer
-
-
-@dataclass(frozen=True)
-class _PlacedScan:
-    """Points (N, 3) in the sensor frame, and in the level frame that the pose leads to."""
-
-    own_xyz: PointArray
-    level: SortedPoints
-    pose: SensorPose
 
 
 class GroundSegmenter:
     """Splits scans into ground and obstacles.
+
+    It may be called from several threads, which then take turns, and in a forked process.
 
     Parameters
     ----------
@@ -44,7 +34,7 @@ class GroundSegmenter:
     clock : callable
         Source of the seconds in ``Segmentation.timings`` and of ``learning.max_time``.
     backend : Backend, optional
-        Who computes, until the parameters ``runtime`` change; by default as they say.
+        Backend to use until the parameters ``runtime`` change; by default as they say.
 
     Raises
     ------
@@ -61,46 +51,15 @@ class GroundSegmenter:
         self._clock = clock
         self._config = config if config is not None else Config()
         self._backend = make_backend(self._config.runtime) if backend is None else backend
-        self._workspace = Workspace()
+        self._sample_backend: Backend | None = None
         self._theta: FloatArray | None = None
         self._frames_since_learning = 0
-
-    @property
-    def config(self) -> Config:
-        """Parameters of the next scan."""
-        return self._config
-
-    @property
-    def backend_name(self) -> str:
-        """Who computes: ``numba`` or ``numpy``."""
-        return self._backend.name
-
-    def configure(self, config: Config) -> None:
-        """Use `config` from the next scan on; what was learned under another is forgotten."""
-        if config.runtime != self._config.runtime:
-            self._backend.close()
-            self._backend = make_backend(config.runtime)
-        if dataclasses.replace(config, diagnostics=self._config.diagnostics) != self._config:
-            self.reset()
-        self._config = config
-
-    def use_backend(self, backend: Backend) -> None:
-        """Segment with `backend` from the next scan on (stub of the lead's method)."""
-        self._backend.close()
-        self._backend = backend
-
-    def reset(self) -> None:
-        """Forget what earlier scans taught, as after a jump in time."""
-        self._theta = None
-
-    def close(self) -> None:
-        """End the worker threads; the segmenter is of no use afterwards."""
-        self._backend.close()
+        self._lock, self._pid = threading.RLock(), os.getpid()
 
     def segment(
         self, points: npt.ArrayLike, tilt: tuple[float, float] | None = None
     ) -> Segmentation:
-        """Label every point of a scan.
+        """Label every point of a scan (paper, Algorithm 2).
 
         Parameters
         ----------
@@ -115,109 +74,141 @@ class GroundSegmenter:
         PointCloudError
             If the array has another shape or type, or z clearly does not point up.
         """
-        config = self._config
-        sensor = config.sensor
-        if tilt is not None:
-            sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
-        timer = StageTimer(self._clock)
-        placed = self._place(points, sensor, timer)
-        scan, pose = placed.level, placed.pose
-        grid = scan.grid
+        with self._turn():
+            config, backend, timer = self._config, self._backend, StageTimer(self._clock)
+            sensor = config.sensor
+            if tilt is not None:
+                sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
 
-        faces = scan.find_faces()
-        timer.mark('faces')
+            # 1. Polar grid: the lowest point of each cell is a ground candidate.
+            # 2. Sensor pose: height and tilt, from a plane through the candidates near the sensor.
+            xyz = take_points(points)
+            scan, pose = self._level(xyz, sensor, timer)
 
-        candidates, lines, pseudo, follows = self._backend.find_lines(
-            scan.candidates, faces.is_footless, config
-        )
-        timer.mark('lines')
+            # 3. Vertical faces: walls, fences, sides of cars.
+            faces = backend.find_faces(scan, config)
+            timer.mark('faces')
 
-        # Of mean zero, the process would be pulled to the height of the sensor.
-        expected_ground = -pose.height
-        model = FrameModel(
-            config, self._backend, candidates, expected_ground, lines, pseudo, follows, grid.edges
-        )
-        theta, learned = self._learn(model)
-        timer.mark('learning')
+            # 4. Lines along each segment, and pseudo-inputs on them.
+            extracted = backend.extract_lines(scan.candidates, faces, config)
+            # With mean zero, the process would be drawn towards the height of the sensor.
+            frame = Frame(*extracted, scan.grid.edges, prior_mean=-pose.height)
+            timer.mark('lines')
 
-        to_label = LabelTask(scan.xyz, grid, faces, config.label, config.faces.tolerance)
-        inlier, mean, std, log_length_scale = model.surface(theta, to_label)
-        surface = GroundSurface(grid.edges, mean, std, inlier)
-        timer.mark('surface')
+            # 5. Both processes: hyper-parameters, then inliers and surface.
+            theta, learned = self._learn(frame)
+            timer.mark('learning')
+            surface, log_length_scale = backend.estimate_surface(frame, theta, config)
+            timer.mark('surface')
 
-        labelled = self._backend.label_points(to_label, surface)
-        tilted_ground_z = (
-            None if pose.is_level else pose.ground_z(placed.own_xyz[:, 2], labelled.height)
-        )
-        timer.mark('label')
+            # 6. Labels: height of each point over the surface, against a band that follows
+            # the roughness.
+            labelled = backend.label_points(scan, faces, surface, config)
+            ground_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
+            timer.mark('label')
 
-        backend = self._backend
-        return Segmentation(
-            labelled,
-            timer.seconds,
-            Fitting(config.learning.mode, learned, backend.name, backend.n_threads),
-            grid,
-            candidates,
-            lines,
-            pseudo,
-            surface,
-            theta,
-            log_length_scale,
-            pose,
-            tilted_ground_z,
-        )
+            return Segmentation(
+                labelled,
+                timer.seconds,
+                Fitting(config.learning.mode, learned, backend.name, backend.n_threads),
+                scan.grid,
+                frame.candidates,
+                frame.lines,
+                frame.pseudo,
+                surface,
+                theta,
+                log_length_scale,
+                pose,
+                ground_z,
+            )
 
     def estimate_pose(self, points: npt.ArrayLike) -> SensorPose:
-        """Find out height and tilt of the sensor as `segment` does, and no more.
+        """Estimate height and tilt of the sensor as `segment` does, and no more.
 
         Parameters and errors are those of `segment`.
         """
-        timer = StageTimer(self._clock)
-        placed = self._place(points, self._config.sensor, timer)
-        placed.level.drop_faces()
-        return placed.pose
+        with self._turn():
+            xyz, timer = take_points(points), StageTimer(self._clock)
+            return self._level(xyz, self._config.sensor, timer)[1]
 
-    def _place(
-        self, points: npt.ArrayLike, sensor: SensorConfig, timer: StageTimer
-    ) -> _PlacedScan:
-        """Scan in the level frame, as given or as it seems to be."""
-        own_xyz = take_points(points)
-        given = given_pose(sensor)
-        scan = self._sort(given.level(own_xyz))
-        try:
-            timer.mark('grid')
-            pose = estimate_pose(
-                scan.candidates,
-                sensor,
-                self._backend.name == 'numba',
-                lambda turn: self._turned_candidates(scan.xyz, turn),
-            )
-        except BaseException:
-            scan.drop_faces()
-            raise
+    @property
+    def config(self) -> Config:
+        """Parameters of the next scan."""
+        return self._config
+
+    @property
+    def backend(self) -> Backend:
+        """Backend of the next scan."""
+        return self._backend
+
+    @property
+    def backend_name(self) -> str:
+        """Name of the backend: ``numba`` or ``numpy``."""
+        return self._backend.name
+
+    def configure(self, config: Config) -> None:
+        """Use `config` from the next scan on; what was learned under another is forgotten."""
+        with self._turn():
+            if config.runtime != self._config.runtime:
+                self.use_backend(make_backend(config.runtime))
+            if dataclasses.replace(config, diagnostics=self._config.diagnostics) != self._config:
+                self.reset()
+            self._config = config
+
+    def use_backend(self, backend: Backend) -> None:
+        """Use `backend` from the next scan on, and close the one before."""
+        with self._turn():
+            self.close()
+            self._backend, self._sample_backend = backend, None
+
+    def reset(self) -> None:
+        """Forget what was learned on earlier scans, as after a jump in time."""
+        self._theta = None
+
+    def close(self) -> None:
+        """End the worker threads, once the scan at hand is segmented."""
+        with self._turn():
+            self._backend.close()
+
+    def _turn(self) -> threading.RLock:
+        """Lock that callers from several threads hold in turn."""
+        if self._pid != os.getpid():
+            # In a forked process it may be held by a thread that does not exist here.
+            self._lock, self._pid = threading.RLock(), os.getpid()
+        return self._lock
+
+    def _level(
+        self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer
+    ) -> tuple[Scan, SensorPose]:
+        """Scan in the level frame, by the angles given or estimated."""
+        backend, config, given = self._backend, self._config, given_pose(sensor)
+        scan = backend.build_grid(given.level(xyz), config)
+        timer.mark('grid')
+
+        def candidates_rotated(matrix: FloatArray) -> Candidates:
+            # Another backend, whose buffers do not hold the scan.
+            if self._sample_backend is None:
+                runtime = dataclasses.replace(config.runtime, n_threads=1, backend=backend.name)
+                self._sample_backend = make_backend(runtime)
+            sample = rotate_sample(scan.xyz, matrix)
+            return self._sample_backend.build_grid(sample, config).candidates
+
+        pose = estimate_pose(scan.candidates, sensor, backend.fit_plane, candidates_rotated)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
-            scan.drop_faces()
-            scan = self._sort(pose.level(own_xyz))
+            scan = backend.build_grid(pose.level(xyz), config)
         timer.mark('pose')
-        return _PlacedScan(own_xyz, scan, pose)
+        return scan, pose
 
-    def _sort(self, xyz: PointArray) -> SortedPoints:
-        return self._backend.sort_points(xyz, self._config, self._workspace)
-
-    def _turned_candidates(self, xyz: PointArray, turn: FloatArray) -> Candidates:
-        """Candidates of a sample of the points turned by a matrix (3, 3)."""
-        sample = turned_sample(xyz, turn)
-        return self._backend.sort_points(sample, self._config, Workspace(), False).candidates
-
-    def _learn(self, model: FrameModel) -> tuple[FloatArray, list[Learned]]:
+    def _learn(self, frame: Frame) -> tuple[FloatArray, list[Learned]]:
         """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""
         learning = self._config.learning
-        given = model.given_theta()
+        given = given_theta(frame, self._config)
         if learning.mode == 'fixed':
             return given, []
-        keeps = {'every_frame': 1, 'every_k': learning.period, 'first_frame': None}[learning.mode]
+        period = {'every_frame': 1, 'every_k': learning.period, 'first_frame': None}[learning.mode]
         self._frames_since_learning += 1
-        if self._theta is not None and (keeps is None or self._frames_since_learning < keeps):
+        is_kept = period is None or self._frames_since_learning < period
+        if self._theta is not None and is_kept:
             return self._theta, []
         started = self._clock() if learning.max_time > 0.0 else 0.0
 
@@ -225,7 +216,55 @@ class GroundSegmenter:
             return 0.0 < learning.max_time <= self._clock() - started
 
         start = self._theta if self._theta is not None and learning.warm_start else given
-        with single_threaded_blas():
-            self._theta, learned = model.learn(start, out_of_time)
+        self._theta, learned = learn_frame(frame, start, self._config, self._backend, out_of_time)
         self._frames_since_learning = 0
         return self._theta, learned
+
+
+def warm_up(config: Config | None = None) -> Backend:
+    """Compile or load all code that a frame needs, and return the backend it belongs to.
+
+    A small scan of single precision, the type of most sensors, is segmented. Where
+    numba is not installed, or not asked for, there is nothing to compile.
+
+    Parameters
+    ----------
+    config : Config, optional
+        Parameters; hyper-parameters are learned whatever they say.
+
+    Raises
+    ------
+    MissingDependencyError
+        If ``runtime.backend`` is numba and numba is not installed.
+    """
+    config = config if config is not None else Config()
+    segmenter = GroundSegmenter(config.replace(**{'learning.mode': 'every_frame'}))
+    azimuth, r = np.meshgrid(np.linspace(-3.0, 3.0, 400), np.geomspace(2.5, 30.0, 30))
+    xyz = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full_like(r, -1.73)], axis=-1)
+    wall = xyz[25] + [0.0, 0.0, 1.0]
+    points = np.concatenate([xyz.reshape(-1, 3), wall]).astype(np.float32)
+    segmenter.segment(points)
+    keep_code(warm=True)
+    return segmenter.backend
+
+
+class StageTimer:
+    """Time of each stage.
+
+    Parameters
+    ----------
+    clock : callable
+        Returns seconds; only differences are used.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._start = self._last = clock()
+        self.seconds: dict[str, float] = {}
+
+    def mark(self, stage: str) -> None:
+        """Record the time since the mark before as that of `stage`."""
+        now = self._clock()
+        self.seconds[stage] = now - self._last
+        self.seconds['total'] = now - self._start
+        self._last = now

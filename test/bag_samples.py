@@ -4,14 +4,9 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gp_ground_seg.data.bags import (
-    BagWriter,
-    CloudMessage,
-    PointField,
-    cloud_topic,
-    encode_cloud,
-    jazzy_topic,
-)
+from gp_ground_seg.data.bag_files import POINT_CLOUD2
+from gp_ground_seg.data.bags import BagWriter, cloud_topic, jazzy_topic
+from gp_ground_seg.data.point_cloud2 import encode_cloud
 
 START = 1_317_000_000_123_456_789
 PERIOD = 100_000_000
@@ -33,18 +28,18 @@ def scan(seed=0, n_ground=1500, n_wall=300):
 def cloud(index=0, **changes):
     """Cloud with a ring and padding, organised in one row unless told otherwise."""
     points = scan(index, **changes)
-    fields = (
-        PointField('x', 0, 7), PointField('y', 4, 7), PointField('z', 8, 7),
-        PointField('i', 12, 7), PointField('ring', 17, 4),
-    )  # fmt: skip
+    new = get_typestore(Stores.ROS2_JAZZY).types
+    layout = (('x', 0, 7), ('y', 4, 7), ('z', 8, 7), ('i', 12, 7), ('ring', 17, 4))
+    fields = [new['sensor_msgs/msg/PointField'](*field, 1) for field in layout]
     rng = np.random.default_rng(index)
     data = rng.integers(0, 256, (len(points), 22), dtype=np.uint8)
     data[:, :16] = points.view(np.uint8)
     seconds, nanoseconds = divmod(START - 5_000 + index * PERIOD, 10**9)
-    return CloudMessage(
-        (seconds, nanoseconds), 'velo_link', 1, len(points), fields,
-        22, 22 * len(points), data.reshape(-1),
-    )  # fmt: skip
+    stamp = new['builtin_interfaces/msg/Time'](seconds, nanoseconds)
+    header = new['std_msgs/msg/Header'](stamp, 'velo_link')
+    return new[POINT_CLOUD2](
+        header, 1, len(points), fields, False, 22, 22 * len(points), data.reshape(-1), False
+    )
 
 
 def string_message(text):
@@ -92,7 +87,11 @@ def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud', extras=True
         for k in range(n_clouds):
             time = START + k * PERIOD
             sample = cloud(k)
-            header = header_type(seq=k, stamp=time_type(*sample.stamp), frame_id=sample.frame_id)
+            header = header_type(
+                seq=k,
+                stamp=time_type(sample.header.stamp.sec, sample.header.stamp.nanosec),
+                frame_id=sample.header.frame_id,
+            )
             message = new['sensor_msgs/msg/PointCloud2'](
                 header=header,
                 height=sample.height,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from gp_ground_seg.compiled.backend import CompiledBackend
+from gp_ground_seg.compiled.backend import NumbaBackend
 
 # How long an example takes says more of the machine than of the code.
 settings.register_profile('default', deadline=None)
@@ -48,10 +48,10 @@ def hilly_scan(n_points: int = 4000, seed: int = 0, sensor_height: float = 1.73)
 
 
 @contextmanager
-def sharing(n_threads: int) -> Iterator[CompiledBackend]:
+def sharing(n_threads: int) -> Iterator[NumbaBackend]:
     """Backend whose threads share out even the smallest clouds."""
-    backend = CompiledBackend(n_threads)
-    with patch('gp_ground_seg.compiled.parallel.FEWEST_POINTS', 1):
+    backend = NumbaBackend(n_threads)
+    with patch('gp_ground_seg.compiled.threads.MIN_POINTS_TO_SPLIT', 1):
         yield backend
     backend.close()
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gp_ground_seg.evaluation.semantic_classes import SemanticClass
+from gp_ground_seg.evaluation.methods import MethodResult
+from gp_ground_seg.evaluation.metrics import SemanticClass
 from gp_ground_seg.frame import Label
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -60,28 +61,29 @@ def write_streets(root: Path, **n_frames: int) -> Path:
 
 
 class HeightRule:
-    """Ground is below a fixed height: a method simple enough to know its scores by hand."""
+    """Ground is below a fixed height: a method simple enough to know its scores by hand.
+
+    The journal gets its name for each run and an R before it for each reset.
+    """
 
     def __init__(self, name: str, height: float, journal: list | None = None) -> None:
         self.name = name
         self.height = height
         self.journal = [] if journal is None else journal
 
-    def start_sequence(self) -> None:
-        self.journal.append((self.name, 'start'))
+    def reset(self) -> None:
+        self.journal.append(f'R{self.name}')
 
     def run(self, points: np.ndarray) -> None:
-        self.journal.append((self.name, len(points)))
-        self._label = np.where(points[:, 2] < self.height, Label.GROUND, Label.OBSTACLE)
+        self.journal.append(self.name)
+        self.points = points
 
-    def label(self) -> np.ndarray:
-        return self._label.astype(np.uint8)
+    def result(self) -> MethodResult:
+        label = np.where(self.points[:, 2] < self.height, Label.GROUND, Label.OBSTACLE)
+        return MethodResult(label.astype(np.uint8))
 
-    def p_ground(self) -> None:
-        return None
+    def ground_z(self) -> np.ndarray:
+        return np.full(len(self.points), self.height)
 
-    def stages(self) -> dict[str, float]:
-        return {}
-
-    def facts(self) -> dict[str, float | str]:
-        return {}
+    def close(self) -> None:
+        pass

@@ -1,29 +1,24 @@
 """Reliability of probabilities: against slow references, scikit-learn's among them."""
 
-import json
 import math
 
 import numpy as np
 import pytest
+from cli_runner import run
 from evaluation_samples import HeightRule, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss
-from test_cli_evaluate import run, table
 
 from gp_ground_seg import Label
-from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation.calibration import BIN_EDGES, N_BINS, THRESHOLDS, count_calibration
-from gp_ground_seg.evaluation.evaluate import evaluate, labelled_frames
-from gp_ground_seg.evaluation.methods import OurMethod
-from gp_ground_seg.evaluation.scores import count_confusion
-from gp_ground_seg.plotting import reliability
-from gp_ground_seg.plotting.canvas import DPI
-from gp_ground_seg.plotting.reliability import plot_reliability
+from gp_ground_seg.evaluation.evaluate import labelled_frames, load_kitti, score_methods
+from gp_ground_seg.evaluation.methods import MethodResult
+from gp_ground_seg.evaluation.metrics import count_confusion
 
 PROBABILITY = st.one_of(
     st.floats(0.0, 1.0, width=32), st.sampled_from([0.0, 1.0, 0.5, 0.001, 0.999, math.nan])
@@ -130,81 +125,27 @@ def test_what_is_no_probability_is_refused(p):
 class GuessedProbabilities(HeightRule):
     """A height rule that also gives a probability, by height."""
 
-    def p_ground(self):
-        return self._p
-
-    def run(self, points):
-        super().run(points)
-        self._p = np.clip(-0.5 - points[:, 2], 0.0, 1.0).astype(np.float32)
+    def result(self):
+        p = np.clip(-0.5 - self.points[:, 2], 0.0, 1.0).astype(np.float32)
+        return MethodResult(super().result().label, p)
 
 
 def test_sequences_are_pooled_by_their_points(tmp_path):
     write_streets(tmp_path, s00=2, s08=1)
     methods = [GuessedProbabilities('p', -1.5), HeightRule('none', -1.5)]
-    score, none = evaluate(labelled_frames(tmp_path), methods)
-    parts, pooled = [score.calibration(s) for s in ('00', '08')], score.calibration()
-    n_scored = sum(ring.points for ring in score.rings())
+    score, none = score_methods(labelled_frames(tmp_path), load_kitti, methods)
+    parts, pooled = [score.of(s).calibration for s in ('00', '08')], score.calibration
+    n_scored = sum(ring.points for ring in score.rings)
     assert pooled.n_total == sum(part.n_total for part in parts) == n_scored
     assert pooled.brier == pytest.approx(
         sum(part.brier * part.n_total for part in parts) / n_scored
     )
-    assert none.calibration() is None and none.calibration('00') is None
+    assert score.ece == pooled.ece
+    assert none.calibration is None
 
 
-@pytest.fixture
-def root(tmp_path):
-    return write_streets(tmp_path / 'kitti', s00=1, s08=1)
-
-
-def guess(method):
-    """Probabilities from the heights over the surface: not ours, but of the right kind."""
-    height = np.nan_to_num(method._result.height, nan=9.0)
-    return (1.0 / (1.0 + np.exp((np.abs(height) - 0.2) / 0.02))).astype(np.float32)
-
-
-def test_tables_and_picture_of_the_command(root, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(OurMethod, 'p_ground', guess)
-    picture, numbers = tmp_path / 'a.png', tmp_path / 'a.json'
-    assert run(root, '--reliability', picture, '--json', numbers) == 0
-    output = capsys.readouterr().out
-    rows = table(output, 'Probabilities')
-    found = json.loads(numbers.read_text())['methods']['gp_ground_seg']['calibration']
-    assert list(rows) == [*found['sequences'], 'all'] == ['00', '08', 'all']
-    for name, one in {**found['sequences'], 'all': found['pooled']}.items():
-        assert rows[name][0].replace(' ', '') == str(one['points'])
-        assert rows[name][1:3] == [f'{one["ece"]:.4f}', f'{one["brier"]:.4f}']
-        best = f'{100 * one["iou_at_best_threshold"]:.2f}'
-        assert rows[name][4:] == [best, f'{one["best_threshold"]:.3f}']
-        assert sum(one['bins']['points']) == one['points']
-    assert max(len(line) for line in output.splitlines() if str(tmp_path) not in line) <= 100
+def test_picture_of_the_command(tmp_path):
+    root = write_streets(tmp_path / 'kitti', s00=1, s08=1)
+    picture = tmp_path / 'a.png'
+    assert run('evaluate', root, '--reliability', picture) == 0
     assert imread(picture).shape[0] > 500
-
-
-def test_a_diagram_needs_probabilities(root, tmp_path, monkeypatch):
-    monkeypatch.setattr(OurMethod, 'p_ground', lambda method: None)
-    with pytest.raises(DataError, match='no probabilities'):
-        run(root, '--reliability', tmp_path / 'a.png')
-    assert not (tmp_path / 'a.png').exists()
-    empty = count_calibration(np.full(2, np.nan), np.array([1, 2], dtype=np.uint8))
-    with pytest.raises(PointCloudError, match='no scored point'):
-        plot_reliability(empty, {}, tmp_path / 'a.png')
-
-
-def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
-    """By the pixels of the pooled line: the mean of right minus up in the square."""
-    gaps = []
-    for power in (1.0, 3.0):
-        found = count_calibration(*synthetic(power=power))
-        plot_reliability(found, {'00': found, '08': found}, tmp_path / 'a.png', 'title')
-        image = imread(tmp_path / 'a.png')[:, :, :3]
-        line = np.abs(image - np.array(to_rgb(reliability.POOLED_COLOUR))).max(axis=2) < 0.02
-        top, left, side = (
-            round(x * DPI) for x in (reliability.TITLE, reliability.LEFT, reliability.SQUARE)
-        )
-        square = line[top : top + side, left : left + side]
-        square[3 * side // 4 :, 3 * side // 5 :] = False  # the legend
-        rows, columns = np.nonzero(square)
-        gaps.append(np.mean(rows - (side - columns)) / side)
-    assert abs(gaps[0]) < 0.02
-    # p - p^3 is 0.25 on average.
-    assert 0.15 < gaps[1] < 0.35

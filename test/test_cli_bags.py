@@ -23,7 +23,8 @@ from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.cli import bags, options
 from gp_ground_seg.cli.main import main
-from gp_ground_seg.data.bags import decode_cloud, open_bag
+from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
 from gp_ground_seg.ros import lifecycle, playback
 from gp_ground_seg.ros.lifecycle import ros_session
 
@@ -174,7 +175,7 @@ def test_bag_of_ros_1_on_another_topic(tmp_path, capsys):
         wait_for(lambda: len(listener.clouds['/points']) == 2, 'last cloud')
     (first, _) = recorded(bag, '/kitti/velo/pointcloud')
     assert listener.clouds['/points'][0] == first
-    assert decode_cloud(first).frame_id == 'velo_link'
+    assert decode_cloud(first).header.frame_id == 'velo_link'
 
 
 def test_nobody_listens(tmp_path, capsys):
@@ -291,7 +292,7 @@ def test_loop_until_interrupted(tmp_path, number):
     assert 'Traceback' not in errors
     numbers = SUMMARY.fullmatch(output).groups()
     assert int(numbers[0]) >= 7
-    stamps = [decode_cloud(raw).stamp for raw in listener.clouds['/points']]
+    stamps = [stamp_of(decode_cloud(raw)) for raw in listener.clouds['/points']]
     assert stamps == list(itertools.islice(itertools.cycle(stamps[:3]), len(stamps)))
     # A period between the last of a round and the first of the next, as between the others.
     steps = np.diff(listener.times['/points'])

@@ -1,27 +1,22 @@
 """The command `bench` on real files, and its picture."""
 
-import argparse
 import json
+import sys
 
 import numpy as np
 import pytest
 from bag_samples import scan, write_ros1_bag, write_ros2_bag
-from matplotlib.colors import to_rgb
+from cli_runner import run
 from matplotlib.image import imread
 
 from gp_ground_seg.cli import bench as command
-from gp_ground_seg.cli.bench_input import load_frames
-from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.plotting.stage_bars import COLOURS, plot_stage_bars
+from gp_ground_seg.cli.bench import load_frames
 
 QUICK = ('--quick', '--threads', '1', '--set', 'grid.n_segments=24')
 
 
-def run(*words):
-    parser = argparse.ArgumentParser()
-    command.add_parser(parser.add_subparsers(required=True))
-    arguments = parser.parse_args(['bench', *(str(word) for word in words)])
-    return arguments.run(arguments)
+def bench(*words):
+    return run('bench', *words)
 
 
 @pytest.fixture(scope='module')
@@ -35,7 +30,7 @@ def scans(tmp_path_factory):
 @pytest.fixture(scope='module')
 def record(scans, tmp_path_factory):
     path = tmp_path_factory.mktemp('record') / 'bench.json'
-    assert run(scans, '--threads', '1,2', '--numpy', '--json', path) == 0
+    assert bench(scans, '--threads', '1,2', '--numpy', '--json', path) == 0
     return path
 
 
@@ -52,23 +47,25 @@ def test_record_holds_machine_cases_stages_and_series(record, scans):
     ]  # fmt: skip
     for case in document['cases']:
         assert len(case['frames']) == 5
-        assert all(frame['ms'] > 0 and frame['yardstick_ms'] > 0 for frame in case['frames'])
+        assert all(frame['ms'] > 0 and frame['baseline_ms'] > 0 for frame in case['frames'])
         assert {'grid', 'learning', 'label', 'rest'} <= set(case['stages_ms'])
         assert all(case['stages_ms'][stage] > 0 for stage in ('grid', 'label'))
         assert case['ratio']['median'] > 0
-    assert document['merged']['n_clouds'] == 1
-    assert set(document['scaling']) == {'points', 'segments', 'bins', 'pseudo_inputs'}
+    series = {row['series'] for row in document['growth']}
+    assert series == {'points', 'grid.n_segments', 'grid.n_bins', 'pseudo-inputs'}
+    # Four frames merged are the largest clouds.
+    sizes = [row['size'] for row in document['growth'] if row['series'] == 'points']
+    assert sizes[-1] > 3.9 * document['n_points']['median']
 
 
 def test_a_record_shows_what_measuring_showed(record, scans, capsys, tmp_path):
-    assert run(scans, *QUICK, '--json', tmp_path / 'bench.json') == 0
+    assert bench(scans, *QUICK, '--json', tmp_path / 'bench.json') == 0
     measured = capsys.readouterr().out
     assert 'Patchwork++' in measured
-    assert run('--from', tmp_path / 'bench.json') == 0
+    assert bench('--from', tmp_path / 'bench.json') == 0
     assert capsys.readouterr().out == measured
-    assert run('--from', record) == 0
+    assert bench('--from', record) == 0
     shown = capsys.readouterr().out
-    assert 'four frames merged' in shown
     assert 'pseudo-inputs' in shown
     assert max(len(line) for line in shown.splitlines()) <= 100
 
@@ -110,57 +107,54 @@ def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ('words', 'error', 'says'),
+    ('words', 'says'),
     [
-        ((), DataError, 'either DATA'),
-        (('DATA', '--from', 'x.json'), DataError, 'either DATA'),
-        (('nowhere',), DataError, 'no such file'),
-        (('DATA', '--topic', '/points'), DataError, 'is for bags'),
-        (('DATA', '--threads', '0'), DataError, '--threads 0'),
-        (('DATA', '--threads', 'two'), DataError, '--threads two'),
-        (('DATA', '--frames', '0'), DataError, '--frames'),
-        (('DATA', '--set', 'grid.n_segments=0'), ConfigError, 'grid.n_segments'),
-        (('--from', 'nowhere.json'), DataError, 'nowhere.json'),
+        ((), 'either DATA'),
+        (('DATA', '--from', 'x.json'), 'either DATA'),
+        (('nowhere',), 'no such file'),
+        (('DATA', '--topic', '/points'), 'is for bags'),
+        (('DATA', '--threads', '0'), '--threads 0'),
+        (('DATA', '--threads', 'two'), '--threads two'),
+        (('DATA', '--set', 'grid.n_segments=0'), 'grid.n_segments'),
+        (('--from', 'nowhere.json'), 'nowhere.json'),
+        (('--from', 'OTHER'), 'not a record'),
+        (('DATA', '--quick', '--json', 'OTHER'), 'exists already'),
+        (('EMPTY',), 'no point'),
+        (('--from', 'RECORD', '--docs', 'OTHER'), 'once each'),
+        (('--from', 'RECORD', '--docs', 'nowhere.md'), 'nowhere.md: cannot be read'),
     ],
 )
-def test_what_is_wrong_is_said(scans, words, error, says):
-    with pytest.raises(error, match=says):
-        run(*(scans if word == 'DATA' else word for word in words))
-
-
-def test_other_json_is_no_record_and_nothing_is_overwritten(scans, tmp_path):
-    other = tmp_path / 'other.json'
+def test_what_is_wrong_is_said(scans, record, words, says, tmp_path, capsys):
+    other, empty = tmp_path / 'other.json', tmp_path / 'empty.bin'
     other.write_text('{"cases": []}')
-    with pytest.raises(DataError, match='not a record'):
-        run('--from', other)
-    with pytest.raises(DataError, match='exists already'):
-        run(scans, *QUICK, '--json', other)
-    assert other.read_text() == '{"cases": []}'
-    empty = tmp_path / 'empty.bin'
     empty.touch()
-    with pytest.raises(DataError, match='no point'):
-        run(empty, *QUICK)
+    named = {'DATA': scans, 'OTHER': other, 'EMPTY': empty, 'RECORD': record}
+    assert bench(*(named.get(word, word) for word in words)) == 2
+    assert says in capsys.readouterr().err
+    assert other.read_text() == '{"cases": []}'
 
 
-def test_bars_are_as_long_as_the_stages(record, tmp_path):
-    document = json.loads(record.read_text())
-    for k, case in enumerate(document['cases']):
-        document['yardstick_ms'] = None  # its line would cut the bars
-        case['stages_ms'] = {'first': 10.0 * (k + 1), 'second': 30.0}
-    path = tmp_path / 'bars.png'
-    plot_stage_bars(document, path, force=False)
-    image = imread(path)[:, :, :3]
+def test_tables_go_between_the_marks(record, tmp_path, capsys):
+    page = tmp_path / 'page.md'
+    page.write_text('a\n<!-- bench:begin --><!-- bench:end -->\nb\n')
+    assert bench('--from', record, '--docs', page, '--plot', tmp_path / 'a.png') == 0
+    assert capsys.readouterr().out in page.read_text()
+    assert imread(tmp_path / 'a.png').shape[2] == 4
 
-    def lengths(colour):
-        return (np.abs(image - to_rgb(colour)).max(axis=2) < 0.02).sum(axis=1)
 
-    # The legend's patches are above the bars.
-    below = slice(image.shape[0] // 3, None)
-    first, second = lengths(COLOURS[0])[below], lengths(COLOURS[1])[below]
-    found = sorted({int(n) for n in first if n > 20})
-    # The case without compiled code is left out: it would be ten times as long.
-    assert len(found) == 4
-    np.testing.assert_allclose(np.array(found) / found[0], [1, 2, 3, 4], rtol=0.05)
-    assert second.max() == pytest.approx(3 * found[0], rel=0.05)
-    with pytest.raises(DataError, match='exists already'):
-        plot_stage_bars(document, path, force=False)
+def test_without_the_baseline_there_are_no_ratios(scans, monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, 'pypatchworkpp', None)
+    assert bench(scans, *QUICK, '--json', tmp_path / 'a.json') == 0
+    assert 'pip install pypatchworkpp' in capsys.readouterr().err
+    document = json.loads((tmp_path / 'a.json').read_text())
+    assert document['baseline'] is document['baseline_ms'] is None
+    assert 'ratio' not in document['cases'][0]
+
+
+def test_the_picture_leaves_out_cases_without_compiled_code(record, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(command, 'plot_stage_bars', lambda cases, *_, force: drawn.append(cases))
+    assert bench('--from', record, '--plot', tmp_path / 'bars.png') == 0
+    cases = json.loads(record.read_text())['cases']
+    compiled = {case['name']: case['stages_ms'] for case in cases if case['backend'] == 'numba'}
+    assert drawn == [compiled] and len(compiled) < len(cases)

@@ -15,9 +15,16 @@ import pytest
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.demo import Tally, check_scan, numbered_cloud, result_text
 from gp_ground_seg.cli.main import main
-from gp_ground_seg.data.bags import decode_cloud, open_bag
+from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.point_cloud2 import (
+    decode_cloud,
+    read_xyz,
+    select_points,
+    stamp_of,
+    with_header,
+)
 from gp_ground_seg.errors import GroundSegError
-from gp_ground_seg.evaluation.scores import count_confusion
+from gp_ground_seg.evaluation.metrics import count_confusion
 from gp_ground_seg.frame import Label
 from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.probe import (
@@ -49,10 +56,10 @@ def sent_cloud(n=40, seed=0, stamp=5_000_000_007):
 
 def split(cloud, is_ground):
     """What a right node makes of a scan: NaN in neither."""
-    finite = np.isfinite(cloud.xyz()).all(axis=1)
+    finite = np.isfinite(read_xyz(cloud)).all(axis=1)
     return {
-        GROUND: cloud.select(is_ground & finite),
-        OBSTACLES: cloud.select(~is_ground & finite),
+        GROUND: select_points(cloud, is_ground & finite),
+        OBSTACLES: select_points(cloud, ~is_ground & finite),
     }
 
 
@@ -73,7 +80,7 @@ def test_labels_are_scored():
     confusion = count_confusion(check.label, check.truth)
     assert (confusion.tp, confusion.tn, confusion.errors) == (20, 19, 0)
     assert check.label[3] == Label.UNKNOWN
-    np.testing.assert_array_equal(check.points[:, :3], cloud.xyz())
+    np.testing.assert_array_equal(check.points[:, :3], read_xyz(cloud))
     is_ground[[0, 2, 5]] ^= True
     check = check_scan(cloud, split(cloud, is_ground))
     assert faults_of(check) == (0, 0, 0)
@@ -110,19 +117,19 @@ def test_every_fault_is_found():
     def faults(ground, obstacles):
         return faults_of(check_scan(cloud, {GROUND: ground, OBSTACLES: obstacles}))
 
-    assert faults(ground.select(~chosen(20, 4)), obstacles) == (1, 0, 0)
-    in_both = joined(obstacles, cloud.select(chosen(40, 8)))
+    assert faults(select_points(ground, ~chosen(20, 4)), obstacles) == (1, 0, 0)
+    in_both = joined(obstacles, select_points(cloud, chosen(40, 8)))
     assert faults(ground, in_both) == (0, 1, 0)
-    twice_in_one = joined(ground, cloud.select(chosen(40, 8)))
+    twice_in_one = joined(ground, select_points(cloud, chosen(40, 8)))
     assert faults(twice_in_one, obstacles) == (0, 1, 0)
-    not_finite = joined(obstacles, cloud.select(chosen(40, 3)))
+    not_finite = joined(obstacles, select_points(cloud, chosen(40, 3)))
     assert faults(ground, not_finite) == (0, 0, 1)
     # Each byte counts: of coordinates, intensity, label and number.
     for byte in range(24):
         assert faults(flipped(ground, 24 * 7 + byte), obstacles) == (1, 0, 1)
     for change in (
-        {'stamp': (5, 8)},
-        {'frame_id': 'map'},
+        {'header': with_header(cloud, (5, 8)).header},
+        {'header': with_header(ground, (5, 7), 'map').header},
         {'fields': cloud.fields[:-1]},
         {'data': ground.data[:-1]},
     ):
@@ -143,7 +150,7 @@ def trips(*latencies, period=0.1):
 
 def test_counts_and_words():
     clouds = [sent_cloud(seed=k, stamp=k * 10**8) for k in range(5)]
-    tally = Tally([cloud.stamp for cloud in clouds])
+    tally = Tally([stamp_of(cloud) for cloud in clouds])
     # 0 comes back whole, 1 and 2 not, 3 with other labels, 4 with a fault; and a trial.
     tally.add(clouds[0], split(clouds[0], perfect()))
     tally.add(clouds[3], split(clouds[3], ~perfect()))
@@ -156,7 +163,7 @@ def test_counts_and_words():
     assert 'median 50.0 ms' in text
     assert text.endswith('FAILED: 2 of 5 scans were lost')
     results = split(clouds[4], perfect())
-    results[GROUND] = results[GROUND].select(~chosen(20, 1, 2))
+    results[GROUND] = select_points(results[GROUND], ~chosen(20, 1, 2))
     tally.add(clouds[4], results)
     assert tally.counts == {'n_points': 117, 'n_missing': 2, 'n_repeated': 0, 'n_altered': 0}
     assert tally.confusion.tp == 20 + 0 + 18
@@ -176,7 +183,7 @@ def test_counts_and_words():
 )
 def test_what_failed_is_said(rate, n_stray, is_good, words):
     cloud = sent_cloud()
-    tally = Tally([cloud.stamp])
+    tally = Tally([stamp_of(cloud)])
     tally.add(cloud, split(cloud, perfect()))
     latencies = (0.15, 0.15, 0.15) if rate == 10.0 else (0.15, 0.15, None)
     result = rate_result(rate, trips(*latencies), 0)
@@ -292,7 +299,7 @@ def test_refused_options(words, capsys):
 def test_rate_that_a_machine_can_do(seconds, rate, capsys):
     class StandInProbe:
         def one_by_one(self, clouds, silence):
-            stamps = [cloud.stamp for cloud in clouds]
+            stamps = [stamp_of(cloud) for cloud in clouds]
             assert len(set(stamps)) == demo.N_TRIALS
             return trips(*[seconds] * len(stamps))
 

@@ -1,6 +1,6 @@
-"""The command `evaluate`, by what it prints and writes."""
+"""The command `evaluate`, by what it prints, writes and draws."""
 
-import argparse
+import csv
 import fcntl
 import json
 import os
@@ -9,21 +9,33 @@ import struct
 import subprocess
 import sys
 import termios
-from pathlib import Path
 
+import numpy as np
 import pytest
-from evaluation_samples import real_kitti, write_streets
+from cli_runner import error_line, run
+from conftest import REPOSITORY
+from evaluation_samples import real_kitti, street, write_streets
+from matplotlib.image import imread
 
-from gp_ground_seg.cli import evaluate as command
-from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import evaluate as runner
+from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore
+from gp_ground_seg.evaluation.metrics import GROUNDGRID, RATIOS, Confusion
+from gp_ground_seg.evaluation.score_tables import frame_table
 
 
-def run(*words):
-    parser = argparse.ArgumentParser()
-    command.add_parser(parser.add_subparsers(required=True))
-    arguments = parser.parse_args(['evaluate', *(str(word) for word in words)])
-    return arguments.run(arguments)
+def rows_of(output, title=''):
+    """Rows below the rule of a table, split at runs of two blanks, by first cell."""
+    lines = output.splitlines()
+    start = next(k for k, line in enumerate(lines) if line.startswith(title))
+    rule = next(k for k in range(start, len(lines)) if lines[k].startswith('---'))
+    rows = {}
+    for line in lines[rule + 1 :]:
+        if not line:
+            break
+        if not line.startswith('---'):
+            first, *cells = (cell.strip() for cell in line.split('  ') if cell.strip())
+            rows[first] = cells
+    return rows
 
 
 @pytest.fixture(scope='module')
@@ -31,85 +43,109 @@ def root(tmp_path_factory):
     return write_streets(tmp_path_factory.mktemp('kitti'), s00=2, s08=1)
 
 
-def table(output, title):
-    """Rows below the rule of a table, split at runs of two blanks, by first cell."""
-    lines = output.splitlines()
-    start = next(k for k, line in enumerate(lines) if line.startswith(title))
-    rows = {}
-    rule = next(k for k in range(start, len(lines)) if lines[k].startswith('---'))
-    for line in lines[rule + 1 :]:
-        if not line:
-            break
-        if line.startswith('---'):
-            continue
-        cells = [cell.strip() for cell in line.split('  ') if cell.strip()]
-        rows[cells[0]] = cells[1:]
-    return rows
+@pytest.fixture(scope='module')
+def evaluated(root, tmp_path_factory):
+    """Files of a run beside Patchwork++."""
+    folder = tmp_path_factory.mktemp('evaluated')
+    options = ('--json', 'a.json'), ('--frames-csv', 'a.csv'), ('--sheet', 'a.png')
+    words = [word for option, name in options for word in (option, folder / name)]
+    assert run('evaluate', root, *words, '--worst', 2, '--peer', 'patchworkpp') == 0
+    return folder
 
 
-def test_tables_say_what_the_json_says(root, tmp_path, capsys):
-    target = tmp_path / 'scores.json'
-    assert run(root, '--json', target, '--peer', 'patchworkpp') == 0
+def test_tables_hold_the_sums_of_the_frames(root, evaluated, capsys):
+    run('evaluate', root, '--peer', 'patchworkpp')
     output = capsys.readouterr().out
-    document = json.loads(target.read_text())
-    ours, peer = (document['methods'][name] for name in ('gp_ground_seg', 'patchworkpp'))
-    for key, title in (('groundgrid', 'GroundGrid convention'), ('patchwork', 'Patchwork conv')):
-        rows = table(output, title)
+    document = json.loads((evaluated / 'a.json').read_text())
+    frames = document['by_frame']
+    for key, title in (('groundgrid', 'GroundGrid conv'), ('patchwork', 'Patchwork conv')):
+        rows = rows_of(output, title)
         for name, n_frames in (('00', '2'), ('08', '1'), ('all', '3')):
-            scores = ours['pooled'] if name == 'all' else ours['sequences'][name]
-            its = peer['pooled'] if name == 'all' else peer['sequences'][name]
-            ratios = ('precision', 'recall', 'f1', 'accuracy', 'iou')
-            expected = [f'{100 * scores[key][ratio]:.2f}' for ratio in ratios]
-            difference = scores[key]['iou'] - its[key]['iou']
-            expected += [f'{100 * its[key]["iou"]:.2f}', f'{100 * difference:+.2f}']
-            assert rows[name] == [n_frames, *expected]
-    headline = f'IoU {100 * ours["pooled"]["groundgrid"]["iou"]:.2f} %'
-    assert output.startswith(f'{headline}, Patchwork++ ')
-    times = table(output, 'Time per frame')
-    assert float(times['Patchwork++'][0]) == pytest.approx(
-        peer['ms_per_frame']['median'], abs=0.051
-    )
-    assert float(times['Patchwork++'][2]) == pytest.approx(
-        document['median_time_ratio']['patchworkpp'], abs=0.0051
-    )
+            sums = []
+            for method in ('gp_ground_seg', 'patchworkpp'):
+                own = [f for f in frames if f['method'] == method and f['sequence'] == name]
+                own = own or [f for f in frames if f['method'] == method]
+                counts = [sum(f[f'{key}_{n}'] for f in own) for n in ('tp', 'fp', 'fn', 'tn')]
+                sums.append(Confusion(*counts))
+            ours, its = sums
+            cells = [f'{100 * getattr(ours, ratio):.2f}' for ratio in RATIOS]
+            cells += [f'{100 * its.iou:.2f}', f'{100 * (ours.iou - its.iou):+.2f}']
+            assert rows[name] == [n_frames, *cells]
+            (row,) = (row for row in document[key] if row['sequence'] == name)
+            assert row['iou'] == pytest.approx(ours.iou)
+    headline = f'IoU {100 * document["groundgrid"][-1]["iou"]:.2f} %, Patchwork++ '
+    assert output.startswith(headline)
+    times = {row['method']: row for row in document['times']}
+    seconds = [f['ms'] for f in frames if f['method'] == 'patchworkpp']
+    assert 1e3 * times['Patchwork++']['median'] == pytest.approx(np.median(seconds))
+    ratio = times['gp_ground_seg']['median'] / times['Patchwork++']['median']
+    assert times['Patchwork++']['ratio'] == pytest.approx(ratio)
     assert document['environment']['versions']['pypatchworkpp']
     assert document['n_threads'] >= 1
 
 
-def test_class_table(root, tmp_path, capsys):
-    run(root, '--json', tmp_path / 'scores.json')
-    rows = table(capsys.readouterr().out, 'Classes')
-    classes = json.loads((tmp_path / 'scores.json').read_text())['methods']['gp_ground_seg'][
-        'classes'
+def test_classes_rings_and_probabilities(evaluated):
+    document = json.loads((evaluated / 'a.json').read_text())
+    classes = {row['class']: row for row in document['classes']}
+    assert (classes['road']['counts_as'], classes['road']['points']) == ('ground', 12_000)
+    assert classes['building']['counts_as'] == 'obstacle'
+    assert classes['building']['missed'] is classes['road']['false'] is None
+    assert {classes[n]['counts_as'] for n in ('vegetation', 'unlabelled')} == {'left out'}
+    assert classes['vegetation']['share_of_errors'] is None
+    for name in ('share_of_points', 'share_of_errors'):
+        assert sum(row[name] or 0.0 for row in classes.values()) == pytest.approx(1.0)
+    rings = {row['range']: row for row in document['rings']}
+    assert rings['> 50 m']['iou'] is rings['> 50 m']['patchworkpp_iou'] is None
+    assert sum(row['share_of_errors'] for row in rings.values()) == pytest.approx(1.0)
+    pooled = document['probabilities'][-1]
+    bins = [row for row in document['reliability'] if row['sequence'] == 'all']
+    assert sum(row['points'] for row in bins) == pooled['points']
+    gaps = [
+        row['points'] * abs(row['share_ground'] - row['mean_p']) for row in bins if row['points']
     ]
-    assert len(rows) == len(classes)
-    assert rows['road'][:2] == ['ground', '12 000']
-    assert rows['building'][0] == 'obstacle'
-    assert rows['vegetation'][0] == rows['unlabelled'][0] == rows['outlier'][0] == 'left out'
-    assert rows['vegetation'][-1] == '-'
-    shares = [float(cells[-1]) for cells in rows.values() if cells[-1] != '-']
-    assert sum(shares) == pytest.approx(100.0, abs=0.1)
+    assert sum(gaps) / pooled['points'] == pytest.approx(pooled['ece'])
+
+
+def test_one_line_per_frame(evaluated):
+    rows = list(csv.DictReader((evaluated / 'a.csv').read_text().splitlines()))
+    frames = json.loads((evaluated / 'a.json').read_text())['by_frame']
+    assert len(rows) == len(frames) == 6
+    for row, frame in zip(rows, frames, strict=True):
+        assert row == {name: '' if value is None else str(value) for name, value in frame.items()}
+        assert int(row['points']) == len(street()[0])
+        assert row['main_error_class'] in ('road', 'building')
+    # What only ours tells is empty for the peer.
+    assert {row['status'] for row in rows if row['method'] == 'patchworkpp'} == {''}
+    assert {row['status'] for row in rows[:3]} <= {'converged', 'budget'}
+
+
+def test_undefined_ratios_are_empty():
+    confusions = {'groundgrid': Confusion(), 'patchwork': Confusion()}
+    scan = ScanScore('00', '7', 0.5, confusions=confusions)
+    table = frame_table([MethodScore('x', (scan,))])
+    (row,) = csv.DictReader(table.csv().splitlines())
+    assert row['groundgrid_iou'] == row['main_error_class'] == ''
+    assert (row['points'], row['ms']) == ('0', '500.0')
 
 
 def test_without_a_peer_nothing_of_it_is_shown(root, capsys):
-    run(root, '--sequences', '08')
+    run('evaluate', root, '--sequences', '08')
     output = capsys.readouterr().out
     assert 'Patchwork++' not in output
     assert '1 frame of 1 sequence)' in output
-    assert 'ours / this' not in output
 
 
 def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
     settings = ['label.ground_tolerance=0.011', 'sensor.height=1.7', 'growth.seed_range=19.5']
     settings += ['runtime.n_threads=1', 'lines.max_gap=1.25', 'grid.r_max=15.0']
-    run(root, '--json', tmp_path / 'a.json')
-    run(root, '--json', tmp_path / 'b.json', *(f'--set={setting}' for setting in settings))
+    run('evaluate', root, '--json', tmp_path / 'a.json')
+    words = [f'--set={setting}' for setting in settings]
+    run('evaluate', root, '--json', tmp_path / 'b.json', *words)
     a, b = (json.loads((tmp_path / f'{name}.json').read_text()) for name in 'ab')
     assert a['config_changes'] == {}
     assert b['config_changes']['label.ground_tolerance'] == 0.011
     assert b['n_threads'] == 1
-    recall = [d['methods']['gp_ground_seg']['pooled']['groundgrid']['recall'] for d in (a, b)]
-    assert recall[1] < recall[0]
+    assert b['groundgrid'][-1]['recall'] < a['groundgrid'][-1]['recall']
     output = capsys.readouterr().out
     assert 'parameters: defaults' in output
     assert all(setting in output for setting in settings)
@@ -117,74 +153,64 @@ def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
 
 
 def test_width_on_real_frames(capsys):
-    run(real_kitti(), '--sequences', '00', '--peer', 'patchworkpp')
+    run('evaluate', real_kitti(), '--sequences', '00', '--frame-step', 5, '--peer', 'patchworkpp')
     output = capsys.readouterr().out
     assert max(len(line) for line in output.splitlines()) <= 100
-    iou = float(output.split()[1])
-    assert iou > 94.0
+    assert float(output.split()[1]) > 94.0
 
 
-def test_json_is_not_overwritten_without_force(root, tmp_path, monkeypatch):
-    target = tmp_path / 'scores.json'
+@pytest.mark.parametrize('option', ['--json', '--frames-csv', '--sheet'])
+def test_files_are_not_overwritten_without_force(root, tmp_path, option, monkeypatch, capsys):
+    target = tmp_path / 'mine'
     target.write_text('mine')
     with monkeypatch.context() as patched:
-        # Refused before any frame is read.
-        patched.setattr(runner, 'read_points', None)
-        with pytest.raises(DataError, match='--force'):
-            run(root, '--json', target)
+        patched.setattr(runner, 'read_points', None)  # refused before any frame is read
+        assert run('evaluate', root, option, target) == 2
+    assert '--force' in error_line(capsys)
     assert target.read_text() == 'mine'
-    run(root, '--json', target, '--force')
-    assert json.loads(target.read_text())['n_frames'] == 3
-    assert [path.name for path in tmp_path.iterdir()] == ['scores.json']
+    assert run('evaluate', root, option, target, '--force') == 0
+    assert target.read_bytes() != b'mine'
+    assert list(tmp_path.iterdir()) == [target]
 
 
-def test_a_run_that_fails_leaves_nothing(tmp_path):
+def test_a_run_that_fails_leaves_nothing(tmp_path, capsys):
     root = write_streets(tmp_path / 'kitti', s00=2)
     broken = root / 'sequences/00/velodyne/000001.bin'
     broken.write_bytes(broken.read_bytes()[:-3])
     (tmp_path / 'out').mkdir()
-    with pytest.raises(DataError, match=r'000001\.bin'):
-        run(root, '--json', tmp_path / 'out' / 'scores.json')
+    assert run('evaluate', root, '--json', tmp_path / 'out' / 'scores.json') == 2
+    assert '000001.bin' in capsys.readouterr().err
     assert list((tmp_path / 'out').iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ('words', 'error', 'message'),
+    ('words', 'message'),
     [
-        (['--sequences', '07'], DataError, 'no sequence 07; sequences here: 00, 08'),
-        (['--sequences', ','], DataError, 'no sequence asked for'),
-        (['--set', 'label.ground_tolerence=1'], ConfigError, 'label.ground_tolerance'),
-        (['--json', '/no/such/folder/x.json'], DataError, '/no/such/folder'),
+        (['--sequences', '07'], 'no sequence 07; sequences here: 00, 08'),
+        (['--sequences', ','], 'no sequence asked for'),
+        (['--set', 'label.ground_tolerence=1'], 'label.ground_tolerance'),
+        (['--json', '/no/such/folder/x.json'], '/no/such/folder'),
+        (['--worst', '2'], '--worst: is for --sheet only'),
+        (['--worst', '61', '--sheet', 'x.png'], 'must be at most 60'),
     ],
 )
-def test_errors_are_said(root, words, error, message):
-    with pytest.raises(error, match=message):
-        run(root, *words)
+def test_errors_are_said(root, words, message, capsys):
+    assert run('evaluate', root, *words) == 2
+    assert message in error_line(capsys)
 
 
-def test_a_root_without_sequences(tmp_path):
-    with pytest.raises(DataError, match='SemanticKITTI layout'):
-        run(tmp_path)
-
-
-SCRIPT = """
-import argparse, sys
-from gp_ground_seg.cli import evaluate
-parser = argparse.ArgumentParser()
-evaluate.add_parser(parser.add_subparsers())
-arguments = parser.parse_args(sys.argv[1:])
-sys.exit(arguments.run(arguments))
-"""
+def test_a_root_without_sequences(tmp_path, capsys):
+    assert run('evaluate', tmp_path) == 2
+    assert 'SemanticKITTI layout' in error_line(capsys)
 
 
 def test_progress_only_on_a_terminal(root):
-    words = [sys.executable, '-c', SCRIPT, 'evaluate', str(root)]
-    repository = Path(__file__).parents[1]
-    quiet = subprocess.run(words, cwd=repository, capture_output=True, timeout=120)
+    words = [sys.executable, '-m', 'gp_ground_seg', 'evaluate', str(root)]
+    quiet = subprocess.run(words, cwd=REPOSITORY, capture_output=True, timeout=120)
     assert (quiet.returncode, quiet.stderr) == (0, b'')
     terminal, end = pty.openpty()
     fcntl.ioctl(end, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 80, 0, 0))
-    shown = subprocess.run(words, cwd=repository, stdout=subprocess.PIPE, stderr=end, timeout=120)
+    shown = subprocess.run(words, cwd=REPOSITORY, stdout=subprocess.PIPE, stderr=end, timeout=120)
     os.close(end)
     progress = os.read(terminal, 100_000)
     os.close(terminal)
@@ -192,3 +218,34 @@ def test_progress_only_on_a_terminal(root):
     assert shown.returncode == 0, progress
     # The tables are the same either way, but for the times.
     assert shown.stdout.splitlines()[3:12] == quiet.stdout.splitlines()[3:12]
+
+
+def test_sheet_of_the_command(root, evaluated, tmp_path, monkeypatch):
+    assert imread(evaluated / 'a.png').shape[2] == 4
+    drawn = []
+
+    def draw(panels, path, title):
+        drawn.append((panels, title))
+        path.write_text('drawn')
+
+    monkeypatch.setattr('gp_ground_seg.cli.evaluate.plot_error_sheet', draw)
+    run('evaluate', root, '--sheet', tmp_path / 'a.png', '--worst', 60)
+    ((panels, title),) = drawn
+    frames = json.loads((evaluated / 'a.json').read_text())['by_frame']
+    ious = sorted(f['groundgrid_iou'] for f in frames if f['method'] == 'gp_ground_seg')
+    assert [float(p.title.split()[-2]) for p in panels] == [round(100 * iou, 2) for iou in ious]
+    assert title.startswith('Worst 3 of 3 frames')
+    for panel in panels:
+        assert panel.truth.tolist() == GROUNDGRID.truth(street()[1], panel.points[:, 2]).tolist()
+        (false,) = (layer for layer in panel.layers() if layer.name == 'false ground')
+        n_false = np.count_nonzero(false.chosen)
+        assert panel.subtitle.startswith(f'{n_false} false, ')
+        assert 'building' in panel.subtitle
+
+
+def test_a_sheet_of_nothing_is_refused(tmp_path, capsys):
+    root = write_streets(tmp_path / 'kitti', s00=1)
+    label = root / 'sequences/00/labels/000000.label'
+    label.write_bytes(bytes(len(label.read_bytes())))  # all unlabelled
+    assert run('evaluate', root, '--sheet', tmp_path / 'a.png') == 2
+    assert 'nothing to score in 1 frames' in error_line(capsys)

@@ -12,7 +12,9 @@ import pytest
 from rosbags.interfaces import QosReliability
 
 from gp_ground_seg.cli.bags import EPOCH
-from gp_ground_seg.data.bags import POINT_CLOUD2, decode_cloud, open_bag
+from gp_ground_seg.data.bag_files import POINT_CLOUD2
+from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 KITTI = Path(os.environ.get('GP_GROUND_SEG_KITTI', REPOSITORY.parent / 'shared' / 'kitti'))
@@ -72,8 +74,8 @@ def test_sequence_as_bag(convert, tmp_path, capsys, name, words, storage):
     assert len(clouds) == 5
     for k, (recorded, cloud) in enumerate(clouds):
         assert recorded == EPOCH * 10**9 + round(TIMES[k] * 1e9)
-        assert cloud.stamp == divmod(recorded, 10**9)
-        assert (cloud.frame_id, cloud.height, cloud.width) == ('velo_link', 1, 1801)
+        assert stamp_of(cloud) == divmod(recorded, 10**9)
+        assert (cloud.header.frame_id, cloud.height, cloud.width) == ('velo_link', 1, 1801)
         assert (cloud.point_step, cloud.row_step) == (20, 20 * 1801)
         assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
             ('x', 0, 7, 1), ('y', 4, 7, 1), ('z', 8, 7, 1), ('intensity', 12, 7, 1),

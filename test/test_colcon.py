@@ -39,7 +39,7 @@ class Workspace:
             command += ['--build-base', str(self.folder / 'build')]
         return subprocess.run(
             [*command, *words], cwd=self.folder, env=self._environment,
-            capture_output=True, text=True, timeout=300.0,
+            capture_output=True, text=True, timeout=1800.0,
         )  # fmt: skip
 
     def sourced(self, command: str, *words: str) -> list[str]:

@@ -16,13 +16,14 @@ from gp_ground_seg.parameters.config import parameter_specs
 from gp_ground_seg.parameters.export import (
     README_BEGIN,
     README_END,
-    replace_readme_table,
+    generated_files,
     to_markdown_table,
     to_yaml,
 )
 from gp_ground_seg.parameters.presets import PRESETS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+GENERATE = 'run: python -m gp_ground_seg config generate'
 
 
 def run(*words):
@@ -86,24 +87,31 @@ def test_every_parameter_is_explained_above_it():
 
 
 @pytest.mark.parametrize('name', PRESETS)
-def test_the_shipped_yaml_is_the_dump(capsys, name):
+def test_a_dumped_preset_is_its_file(capsys, name):
     assert run('dump', '--preset', name) == 0
     shipped = (REPOSITORY / 'config' / f'{name}.yaml').read_text(encoding='utf-8')
-    assert capsys.readouterr().out == shipped, 'run: python -m gp_ground_seg config generate'
+    assert capsys.readouterr().out == shipped, GENERATE
 
 
-def test_every_shipped_yaml_is_of_a_preset():
-    assert {path.stem for path in (REPOSITORY / 'config').glob('*.yaml')} == set(PRESETS)
+def test_generated_files_are_up_to_date():
+    files = generated_files((REPOSITORY / 'README.md').read_text(encoding='utf-8'))
+    assert set(files) == {
+        'README.md', 'docs/parameters.md', *(f'config/{name}.yaml' for name in PRESETS)
+    }  # fmt: skip
+    for name, text in files.items():
+        assert (REPOSITORY / name).read_text(encoding='utf-8') == text, GENERATE
+    assert {f'config/{path.name}' for path in (REPOSITORY / 'config').glob('*.yaml')} <= set(files)
 
 
-def test_the_table_in_the_readme_is_the_table():
-    readme = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
-    assert README_BEGIN in readme
-    assert README_END in readme
-    section = readme.partition(README_BEGIN)[2].partition(README_END)[0]
-    assert section.strip() == to_markdown_table().strip(), (
-        'run: python -m gp_ground_seg config generate'
-    )
+def rows(table):
+    return [line for line in table.splitlines() if line.startswith('| `')]
+
+
+def test_readme_has_the_basic_parameters_and_the_page_has_all():
+    files = generated_files(f'{README_BEGIN}{README_END}')
+    basic = [f'| `{spec.name}` ' for spec in parameter_specs() if spec.basic]
+    assert [row[: row.index('` ') + 2] for row in rows(files['README.md'])] == basic
+    assert rows(files['docs/parameters.md']) == rows(to_markdown_table())
 
 
 def test_table_has_a_row_for_each_parameter(capsys):
@@ -140,23 +148,23 @@ def test_generate_rewrites_what_is_generated_and_nothing_else(tmp_path, capsys):
     readme = tmp_path / 'README.md'
     head, tail = '# Title — ünïcode\r\n\r\ntext\n', '\n\nmore\n'
     readme.write_bytes(f'{head}{README_BEGIN}\nold\n{README_END}{tail}'.encode())
+    n_files = 2 + len(PRESETS)
     assert run('generate', tmp_path) == 0
-    assert capsys.readouterr().out.count('rewritten') == 1 + len(PRESETS)
+    assert capsys.readouterr().out.count('rewritten') == n_files
     text = readme.read_bytes().decode()
-    assert text.startswith(f'{head}{README_BEGIN}\n')
-    assert text.endswith(f'\n{README_END}{tail}')
-    assert to_markdown_table() in text
-    assert 'old' not in text.partition(README_BEGIN)[2]
-    generated = sorted((tmp_path / 'config').iterdir())
-    assert [path.stem for path in generated] == sorted(PRESETS)
-    for path in generated:
-        assert Config.from_yaml(path) == PRESETS[path.stem].config
+    table = to_markdown_table(basic_only=True)
+    assert text == f'{head}{README_BEGIN}\n\n{table}\n{README_END}{tail}'
+    for name, preset in PRESETS.items():
+        assert Config.from_yaml(tmp_path / 'config' / f'{name}.yaml') == preset.config
 
-    before = [os.stat(path).st_mtime_ns for path in (readme, *generated)]
+    def times():
+        return {path: os.stat(path).st_mtime_ns for path in tmp_path.rglob('*')}
+
+    before = times()
     assert run('generate', tmp_path) == 0
-    assert capsys.readouterr().out.count('unchanged') == 1 + len(PRESETS)
-    assert [os.stat(path).st_mtime_ns for path in (readme, *generated)] == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ['README.md', 'config']
+    assert capsys.readouterr().out.count('unchanged') == n_files
+    assert times() == before
+    assert len([path for path in before if path.is_file()]) == n_files
 
 
 @pytest.mark.parametrize(
@@ -168,19 +176,15 @@ def test_generate_rewrites_what_is_generated_and_nothing_else(tmp_path, capsys):
         f'{README_END}\n{README_BEGIN}',
         f'{README_BEGIN}\n{README_BEGIN}\n{README_END}',
         f'{README_BEGIN}\n{README_END}\n{README_END}',
+        None,
     ],
 )
-def test_a_readme_without_its_markers_is_refused_and_kept(tmp_path, readme):
-    with pytest.raises(DataError, match='once each'):
-        replace_readme_table(readme)
+def test_generate_needs_a_readme_with_its_markers(tmp_path, readme):
     path = tmp_path / 'README.md'
-    path.write_text(readme)
-    with pytest.raises(DataError, match=r'README\.md'):
+    if readme is not None:
+        path.write_text(readme)
+    message = 'root of a checkout' if readme is None else r'README\.md: must hold .* once each'
+    with pytest.raises(DataError, match=message):
         run('generate', tmp_path)
-    assert path.read_text() == readme
-
-
-def test_generate_needs_a_checkout(tmp_path):
-    with pytest.raises(DataError, match='root of a checkout'):
-        run('generate', tmp_path)
-    assert list(tmp_path.iterdir()) == []
+    assert readme is None or path.read_text() == readme
+    assert len(list(tmp_path.iterdir())) == (readme is not None)

@@ -18,12 +18,12 @@ from ros_helpers import PATIENCE
 
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.cli.demo import check_scan, numbered_cloud
-from gp_ground_seg.data.bags import BagWriter, cloud_topic, decode_cloud, encode_cloud, open_bag
-from gp_ground_seg.evaluation.scores import count_confusion
+from gp_ground_seg.data.bags import BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
+from gp_ground_seg.evaluation.metrics import count_confusion
 from gp_ground_seg.ros.lifecycle import large_cloud_transport, ros_session
 from gp_ground_seg.ros.probe import GROUND, INPUT, OBSTACLES, NodeProcess, Probe, private_network
-from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_drive
-from gp_ground_seg.simulation.kinds import semantic_kitti_labels
+from gp_ground_seg.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 
 COMMAND = (sys.executable, '-m', 'gp_ground_seg')
 
@@ -95,7 +95,7 @@ def machine(tmp_path_factory):
 def segment_all(clouds):
     segmenter = GroundSegmenter()
     try:
-        return [segmenter.segment(cloud.xyz()).label for cloud in clouds]
+        return [segmenter.segment(read_xyz(cloud)).label for cloud in clouds]
     finally:
         segmenter.close()
 
@@ -108,11 +108,11 @@ def assert_is_what_the_library_says(machine, sent):
     ):
         assert 0 < np.count_nonzero(label == Label.GROUND) < len(label)
         for value, back in ((Label.GROUND, ground), (Label.OBSTACLE, obstacles)):
-            wanted = cloud.select(label == value)
+            wanted = select_points(cloud, label == value)
             assert bytes(back.data) == bytes(wanted.data)
-            for name in ('stamp', 'frame_id', 'fields', 'point_step', 'height', 'width'):
+            for name in ('header', 'fields', 'point_step', 'height', 'width'):
                 assert getattr(back, name) == getattr(wanted, name), name
-        finite = np.isfinite(cloud.xyz()).all(axis=1)
+        finite = np.isfinite(read_xyz(cloud)).all(axis=1)
         assert ground.width + obstacles.width == np.count_nonzero(finite)
     return labels
 

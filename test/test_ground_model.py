@@ -13,7 +13,6 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.pipeline.tilt import rotation
-from gp_ground_seg.plotting.length_scale_colours import UNKNOWN, length_scale_colours
 
 # No neighbours, so that segments without a model stay without one; r_min of 0 is the hard case.
 CONFIGS = [
@@ -176,42 +175,3 @@ def test_what_is_no_polar_grid_is_refused():
     for small in (points[:0], points[:, :1]):
         with pytest.raises(PointCloudError, match='at least 1 segment and 2 knots'):
             GroundModel.from_knot_points(small, model.knots[:1], *rest)
-
-
-# Brettel-style full loss of one cone, as linear maps in linear RGB (Machado et al. 2009).
-DEFICIENCIES = {
-    'none': np.eye(3),
-    'protanopia': [
-        [0.152286, 1.052583, -0.204868],
-        [0.114503, 0.786281, 0.099216],
-        [-0.003882, -0.048116, 1.051998],
-    ],
-    'deuteranopia': [
-        [0.367322, 0.860646, -0.227968],
-        [0.280085, 0.672501, 0.047413],
-        [-0.011820, 0.042940, 0.968881],
-    ],
-    'tritanopia': [
-        [1.255528, -0.076749, -0.178779],
-        [-0.078411, 0.930809, 0.147602],
-        [0.004733, 0.691367, 0.303900],
-    ],
-}
-
-
-@pytest.mark.parametrize('name', DEFICIENCIES)
-def test_lightness_of_the_colours_rises_for_every_eye(name):
-    colours = length_scale_colours(np.geomspace(1.0, 50.0, 30), 1.0, 50.0)
-    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(linear @ np.transpose(DEFICIENCIES[name]), 0.0, 1.0)
-    lightness = 116.0 * np.cbrt(seen @ [0.2126, 0.7152, 0.0722]) - 16.0
-    assert np.diff(lightness).min() > 1.0
-    assert np.ptp(lightness) > 60.0
-
-
-def test_colours_end_at_the_limits_and_nan_is_grey():
-    ends = length_scale_colours(np.array([1.0, 50.0, 0.01, 500.0, np.inf, np.nan]), 1.0, 50.0)
-    np.testing.assert_array_equal(ends[2], ends[0])
-    np.testing.assert_array_equal(ends[3], ends[1])
-    assert not np.array_equal(ends[0], ends[1])
-    np.testing.assert_array_equal(ends[5], UNKNOWN)

@@ -26,8 +26,6 @@ ROS_MODULES = {
     'tf2_ros',
     'visualization_msgs',
 }
-# What may not be imported from a layer below.
-UPPER_LAYERS = ('cli', 'ros', 'plotting', 'evaluation', 'datasets')
 
 
 def imports(path):
@@ -87,17 +85,6 @@ def test_package_xml_is_accepted_by_the_tools_of_ros():
     assert package.get_build_type() == 'ament_python'
     package.validate(warnings=warnings)
     assert warnings == []
-
-
-@pytest.mark.parametrize('path', SOURCES, ids=lambda path: path.stem)
-def test_only_ros_imports_ros(path):
-    parts = path.relative_to(REPOSITORY / 'gp_ground_seg').parts
-    roots = {name.split('.')[0] for name in imports(path)}
-    if parts[0] != 'ros':
-        assert not roots & ROS_MODULES
-    if parts[0] not in UPPER_LAYERS and parts[0] != '__main__.py':
-        for name in imports(path):
-            assert name.split('.')[:2] not in [['gp_ground_seg', layer] for layer in UPPER_LAYERS]
 
 
 def loaded_by(statement):

@@ -22,7 +22,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from visualization_msgs.msg import Marker, MarkerArray
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.data.cloud_columns import read_columns
+from gp_ground_seg.data.point_cloud2 import read_columns
 from gp_ground_seg.ros import outputs
 from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.node import GroundSegmentationNode
@@ -38,16 +38,7 @@ OPTIONAL = {
 
 
 def columns_of(message, *names):
-    return read_columns(
-        message.height,
-        message.width,
-        message.fields,
-        message.is_bigendian,
-        message.point_step,
-        message.row_step,
-        message.data,
-        names,
-    )
+    return read_columns(message, names)
 
 
 @pytest.fixture(scope='module')

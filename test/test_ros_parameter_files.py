@@ -15,8 +15,8 @@ from rclpy.parameter import parameter_value_to_python
 from ros_helpers import bench, isolated_context, parameter_message, spinning, street, to_message
 
 from gp_ground_seg import Config
-from gp_ground_seg.parameters.check import file_problems
 from gp_ground_seg.parameters.config import parameter_specs
+from gp_ground_seg.parameters.export import file_problems
 from gp_ground_seg.parameters.presets import PRESETS
 from gp_ground_seg.ros.node import GroundSegmentationNode
 

@@ -41,9 +41,9 @@ from gp_ground_seg.simulation import (
     SCENES,
     VLP_16,
     Scene,
-    landforms,
     simulate_scan,
 )
+from gp_ground_seg.simulation import terrain as landforms
 from gp_ground_seg.simulation.objects import floating_box, wall
 
 FIXED = {'learning.mode': 'fixed'}

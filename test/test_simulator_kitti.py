@@ -56,20 +56,19 @@ def test_existing_sequence_is_left_alone(tmp_path):
     assert [path.name for path in mine.parent.iterdir()] == ['notes.txt']
 
 
-def test_broken_drive_leaves_nothing(tmp_path):
-    def broken():
-        yield from drive(1)
-        raise KeyboardInterrupt
+def broken_drive():
+    yield from drive(1)
+    raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        write_semantic_kitti(broken(), tmp_path, '00')
+
+@pytest.mark.parametrize(
+    ('scans', 'kind', 'message'),
+    [(broken_drive(), KeyboardInterrupt, None), (iter(()), DataError, 'no scan')],
+)
+def test_a_drive_that_fails_leaves_nothing(tmp_path, scans, kind, message):
+    with pytest.raises(kind, match=message):
+        write_semantic_kitti(scans, tmp_path, '00')
     assert [path for path in tmp_path.rglob('*') if path.is_file()] == []
-    assert list((tmp_path / 'sequences').iterdir()) == []
-
-
-def test_empty_drive_is_refused(tmp_path):
-    with pytest.raises(DataError, match='no scan'):
-        write_semantic_kitti(iter(()), tmp_path, '00')
     assert list((tmp_path / 'sequences').iterdir()) == []
 
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.simulation import landforms, objects
-from gp_ground_seg.simulation.kinds import Kind
-from gp_ground_seg.simulation.objects import Box, Cylinder, nearest_solid
+from gp_ground_seg.simulation import objects
+from gp_ground_seg.simulation import terrain as landforms
+from gp_ground_seg.simulation.objects import Box, Cylinder, Kind, nearest_solid
 from gp_ground_seg.simulation.scenes import SCENES
 
 SENSOR_POSITION = np.array([0.0, 0.0, 1.73])
@@ -71,10 +71,8 @@ def test_entry_is_where_the_inside_begins(solid, seed):
 
 @given(solid=solids, seed=st.integers(0, 2**32 - 1))
 def test_no_ray_through_the_middle_misses(solid, seed):
-    rng = np.random.default_rng(seed)
-    targets = np.array([solid.x, solid.y, solid.bottom]) + np.column_stack(
-        [np.zeros((20, 2)), rng.uniform(0.01, 0.99, 20) * (solid.top - solid.bottom)]
-    )
+    height = np.random.default_rng(seed).uniform(0.01, 0.99, 20) * (solid.top - solid.bottom)
+    targets = np.column_stack([np.tile([solid.x, solid.y], (20, 1)), solid.bottom + height])
     direction = targets - SENSOR_POSITION
     distance = np.linalg.norm(direction, axis=1, keepdims=True)
     entry = solid.entry(np.tile(SENSOR_POSITION, (20, 1)), direction / distance)
@@ -96,14 +94,8 @@ def test_common_start_gives_what_single_starts_give(seed):
     rng = np.random.default_rng(seed)
     scene = SCENES['urban'](seed)
     around = Cylinder(Kind.POLE, 0.5, 0.0, 2.0, 3.0, 2.0)
-    elevation, azimuth = rng.uniform(-0.5, 0.6, 3000), rng.uniform(-np.pi, np.pi, 3000)
-    direction = np.column_stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    direction = np.column_stack([rng.normal(size=(3000, 2)), rng.uniform(-0.5, 0.6, 3000)])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     solids = (*scene.solids, around)
     fast = nearest_solid(solids, SENSOR_POSITION, direction)
     plain = nearest_solid(solids, np.tile(SENSOR_POSITION, (3000, 1)), direction)

@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.simulation import landforms
-from gp_ground_seg.simulation.landforms import polyline
+from gp_ground_seg.simulation import terrain as landforms
 from gp_ground_seg.simulation.raycast import first_hit
-from gp_ground_seg.simulation.waves import random_waves
+from gp_ground_seg.simulation.terrain import polyline, random_waves
 
 MAX_RANGE = 60.0
 
@@ -41,13 +40,8 @@ def terrain(request):
 
 def random_rays(rng, n, lowest=-0.5, highest=0.1):
     azimuth, elevation = rng.uniform(-np.pi, np.pi, n), rng.uniform(lowest, highest, n)
-    return np.column_stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    flat = np.cos(elevation)
+    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
 
 def clearance(terrain, origin, direction, t):
@@ -164,20 +158,21 @@ def test_polyline_agrees_with_scalar_oracle(gaps, heights, slope_after, elevatio
     assert t <= latest + 1e-6 if latest <= 60.0 - 1e-6 else t <= 60.0 or t == math.inf
 
 
-def test_vertical_kerb_face_is_met_on_the_face():
+@pytest.mark.parametrize(
+    ('elevation', 'y', 'across', 'expected'),
+    [
+        # Onto the face, 7 cm above the road; along the road.
+        (-math.atan2(1.73 - 0.07, 4.0), 0.0, 1.0, [0.0, 4.0, 0.07]),
+        (-0.1, 1.0, 0.0, [1.73 / math.tan(0.1), 1.0, 0.0]),
+    ],
+)
+def test_vertical_kerb_is_exact(elevation, y, across, expected):
     kerb = landforms.kerb(4.0, 0.15, face_width=0.0)
-    elevation = -math.atan2(1.73 - 0.07, 4.0)
-    direction = np.array([[0.0, math.cos(elevation), math.sin(elevation)]])
-    t = first_hit(kerb, np.array([[0.0, 0.0, 1.73]]), direction, 120.0)
-    np.testing.assert_allclose(1.73 + t * direction[:, 2], 0.07, atol=1e-9)
-    np.testing.assert_allclose(t * direction[:, 1], 4.0, atol=1e-9)
-
-
-def test_ray_along_a_kerb_stays_on_the_road():
-    kerb = landforms.kerb(4.0, 0.15, face_width=0.0)
-    direction = np.array([[math.cos(-0.1), 0.0, math.sin(-0.1)]])
-    t = first_hit(kerb, np.array([[0.0, 1.0, 1.73]]), direction, 120.0)
-    np.testing.assert_allclose(t, 1.73 / math.sin(0.1), rtol=1e-12)
+    flat = math.cos(elevation)
+    direction = np.array([[flat * (1.0 - across), flat * across, math.sin(elevation)]])
+    origin = np.array([[0.0, y, 1.73]])
+    t = first_hit(kerb, origin, direction, 120.0)
+    np.testing.assert_allclose((origin + t * direction)[0], expected, atol=1e-9)
 
 
 def test_crest_hides_the_descent():
@@ -224,22 +219,17 @@ def test_sum_adds_heights():
     np.testing.assert_allclose(total.height(x, y), expected, atol=1e-12)
 
 
-def test_landform_heights():
-    kerb = landforms.kerb(4.0, 0.15, face_width=0.1)
-    np.testing.assert_allclose(
-        kerb.height(np.zeros(5), np.array([-9.0, -3.9, 0.0, 4.05, 4.2])), [0.15, 0, 0, 0.075, 0.15]
-    )
-    ditch = landforms.ditch(10.0, 4.0, 2.0, 1.0)
-    np.testing.assert_allclose(
-        ditch.height(np.array([9.0, 10.5, 12.0, 13.5, 15.0]), np.zeros(5)), [0, -0.5, -1, -0.5, 0]
-    )
-    ramp = landforms.ramp(10.0, 0.1)
-    np.testing.assert_allclose(ramp.height(np.array([9.0, 20.0]), np.zeros(2)), [0.0, 1.0])
-    crest = landforms.crest(10.0, 10.0, 0.1, 4.0)
-    np.testing.assert_allclose(
-        crest.height(np.array([10.0, 20.0, 22.0, 24.0, 34.0]), np.zeros(5)), [0, 1, 1.1, 1, 0],
-        atol=1e-12,
-    )  # fmt: skip
+@pytest.mark.parametrize(
+    ('terrain', 'u', 'expected'),
+    [
+        (landforms.kerb(4.0, 0.15, 0.1, 0.0), [-9, -3.9, 0, 4.05, 4.2], [0.15, 0, 0, 0.075, 0.15]),
+        (landforms.ditch(10.0, 4.0, 2.0, 1.0), [9, 10.5, 12, 13.5, 15], [0, -0.5, -1, -0.5, 0]),
+        (landforms.ramp(10.0, 0.1), [9, 20], [0, 1]),
+        (landforms.crest(10.0, 10.0, 0.1, 4.0), [10, 20, 22, 24, 34], [0, 1, 1.1, 1, 0]),
+    ],
+)
+def test_landform_heights(terrain, u, expected):
+    np.testing.assert_allclose(terrain.height(np.array(u), np.zeros(len(u))), expected, atol=1e-12)
 
 
 def test_waves_have_the_rms_asked_for():

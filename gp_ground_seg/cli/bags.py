@@ -12,15 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli.options import count, new_parser, note, note_leftovers, progress_bar
-from gp_ground_seg.data.bags import (
-    BagReader,
-    BagWriter,
-    CloudMessage,
-    cloud_from_columns,
-    cloud_topic,
-    encode_cloud,
-    open_bag,
-)
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError
 from gp_ground_seg.ros.lifecycle import large_cloud_transport, needing_ros, ros_session

@@ -4,35 +4,42 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from tqdm import tqdm
+import numpy as np
+import numpy.typing as npt
 
-from gp_ground_seg.cli.bench_input import load_frames
-from gp_ground_seg.cli.bench_text import bench_text, replace_section
-from gp_ground_seg.cli.notes import note
-from gp_ground_seg.cli.options import add_config_options, config_from_options
-from gp_ground_seg.compiled.cores import usable_cores
+from gp_ground_seg.cli.evaluate import progress, staged_options
+from gp_ground_seg.cli.options import add_config_options, config_from_options, note, positive
+from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.errors import DataError, MissingDependencyError
-from gp_ground_seg.evaluation.bench import bench_cases, run_cases
-from gp_ground_seg.evaluation.bench_report import bench_report
-from gp_ground_seg.evaluation.bench_scaling import time_merged, time_scaling
-from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.methods import PATCHWORKPP, PatchworkppMethod
-from gp_ground_seg.evaluation.report import write_json
+from gp_ground_seg.data.bag_files import is_bag
+from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
+from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.evaluation.benchmark import (
+    MODES,
+    BenchFrame,
+    bench_cases,
+    bench_document,
+    run_cases,
+    spread,
+    time_growth,
+)
+from gp_ground_seg.evaluation.environment import describe_environment, parameters_line
+from gp_ground_seg.evaluation.methods import PATCHWORKPP, TITLES, PatchworkppMethod
+from gp_ground_seg.evaluation.table import Cell, Column, Table, fold, write_json
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.stage_bars import plot_stage_bars
+from gp_ground_seg.plotting.charts import plot_stage_bars
 
 DESCRIPTION = """\
 Time the segmentation on your data: theta fixed and learned in every frame, on one
 thread and on all, by stage; with pypatchworkpp installed beside Patchwork++ on the same
-frames. Each time is taken right before or after the yardstick's on that frame, so that
+frames. Each time is taken right before or after that of Patchwork++ on that frame, so that
 the ratio of the two holds where the speed of the machine drifts. Reading is left out.
 Let nothing else run meanwhile.
 
@@ -47,7 +54,11 @@ examples:
   gp-ground-seg bench --from mine.json --plot stages.png
 """
 
-_Item = TypeVar('_Item')
+DOCS_BEGIN, DOCS_END = '<!-- bench:begin -->', '<!-- bench:end -->'
+RUN_LENGTH = 10
+"""Successive frames that are taken together where there are more than wanted."""
+
+Points = npt.NDArray[np.float32]
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -63,11 +74,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         '--from', metavar='FILE', dest='record', help='show what --json wrote, measure nothing'
     )
     parser.add_argument(
-        '--frames', metavar='N', type=int, default=60,
+        '--frames', metavar='N', type=positive, default=60,
         help='frames, in runs of ten spread over the data (default: %(default)s)',
     )  # fmt: skip
     parser.add_argument(
-        '--passes', metavar='N', type=int, default=1, help='go over the frames so often'
+        '--passes', metavar='N', type=positive, default=1, help='go over the frames so often'
     )
     parser.add_argument(
         '--threads', metavar='LIST', help='numbers of threads, as in 1,4 (default: 1 and all)'
@@ -77,7 +88,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         '--numpy', action='store_true', help='time learning without compiled code as well'
     )
     parser.add_argument(
-        '--quick', action='store_true', help='no merged clouds, no growth with size'
+        '--quick', action='store_true', help='no growth with size, no merged clouds'
     )
     parser.add_argument('--json', metavar='FILE', help='write every number to this file as well')
     parser.add_argument('--plot', metavar='FILE', help='draw the stages as a PNG')
@@ -90,26 +101,37 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure or read a record; write what was asked for, print the tables."""
+    """Measure or read a record; write the files, print the tables."""
     if (arguments.data is None) == (arguments.record is None):
         raise DataError('bench: name either DATA to measure on or --from FILE')
     if arguments.record is not None:
         document = read_record(arguments.record)
     else:
-        with ExitStack() as stack:
-            # Around the measurement: a target that is refused is so before the work.
-            part = None
-            if arguments.json is not None:
-                part = stack.enter_context(staged_file(arguments.json, force=arguments.force))
+        with staged_options(arguments, 'json') as parts:
             document = _measure(arguments)
-            if part is not None:
-                write_json(document, part)
+            if 'json' in parts:
+                write_json(document, parts['json'])
     print(bench_text(document))
     if arguments.plot is not None:
-        plot_stage_bars(document, arguments.plot, force=arguments.force)
+        _plot(document, arguments)
     if arguments.docs is not None:
         _update_docs(Path(arguments.docs), document)
     return 0
+
+
+def _plot(document: dict[str, Any], arguments: argparse.Namespace) -> None:
+    # Without compiled code a frame takes so long that the others would be but slivers.
+    cases = [case for case in document['cases'] if case['backend'] == 'numba']
+    peer = document['baseline_ms']
+    plot_stage_bars(
+        {case['name']: case['stages_ms'] for case in cases or document['cases']},
+        arguments.plot,
+        f'{document["n_frames"]} frames of {document["data"]}, '
+        f'{round(document["n_points"]["median"] / 1000)} 000 points each, '
+        f'{document["environment"]["cpu"]}',
+        (TITLES[document['baseline']], peer['median']) if peer else None,
+        force=arguments.force,
+    )
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
@@ -124,49 +146,44 @@ def read_record(path: str | Path) -> dict[str, Any]:
         document = json.loads(Path(path).read_text(encoding='utf-8'))
     except (OSError, ValueError) as error:
         raise DataError(f'{path}: cannot be read: {error}') from error
-    if not isinstance(document, dict) or not {'cases', 'scaling', 'merged'} <= set(document):
+    if not isinstance(document, dict) or not {'cases', 'growth', 'baseline'} <= set(document):
         raise DataError(f'{path}: not a record of `gp-ground-seg bench --json`')
     return document
 
 
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     config = config_from_options(arguments)
-    if arguments.frames < 1 or arguments.passes < 1:
-        raise DataError('--frames and --passes must be at least 1')
-    cases = bench_cases(config, _threads(arguments.threads, config), with_numpy=arguments.numpy)
-    yardstick = _yardstick()
+    environment = describe_environment('pypatchworkpp')
+    threads = _threads(arguments.threads, config, environment.n_cores)
+    cases = bench_cases(config, threads, with_numpy=arguments.numpy)
+    baseline = _baseline()
     frames = load_frames(Path(arguments.data), arguments.frames, arguments.topic)
-    measured = run_cases(frames, cases, yardstick, arguments.passes, progress=_progress('frames'))
-    merged, scaling = None, {}
+    measured = run_cases(
+        frames, cases, baseline, arguments.passes, progress=progress('frames', 'frame')
+    )
+    growth = []
     if not arguments.quick:
-        merged = time_merged(frames, config)
-        scaling = time_scaling(frames, config, progress=_progress('sizes'))
-    packages = ['pypatchworkpp'] if yardstick else []
-    return bench_report(
-        measured,
-        merged,
-        scaling,
-        config,
-        describe_environment(*packages),
-        PATCHWORKPP if yardstick else None,
-        Path(arguments.data).resolve().name,
+        growth = time_growth(frames, config, progress=progress('sizes', 'size'))
+    name = PATCHWORKPP if baseline else None
+    return bench_document(
+        measured, growth, config, environment, name, Path(arguments.data).resolve().name
     )
 
 
-def _yardstick() -> Callable[[], PatchworkppMethod] | None:
+def _baseline() -> Callable[[Any], PatchworkppMethod] | None:
     try:
         PatchworkppMethod()
     except MissingDependencyError:
-        note('no ratios without a yardstick: pip install pypatchworkpp')
+        note('no ratios without the baseline: pip install pypatchworkpp')
         return None
-    return PatchworkppMethod
+    return lambda _: PatchworkppMethod()
 
 
-def _threads(text: str | None, config: Config) -> list[int]:
+def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
     if not HAVE_NUMBA or config.runtime.backend == 'numpy':
         return [1]
     if text is None:
-        return sorted({1, len(usable_cores())})
+        return sorted({1, n_cores})
     try:
         threads = [int(word) for word in text.split(',')]
     except ValueError:
@@ -176,21 +193,163 @@ def _threads(text: str | None, config: Config) -> list[int]:
     return threads
 
 
-def _progress(title: str) -> Callable[[Sequence[_Item]], Iterable[_Item]]:
-    def wrap(items: Sequence[_Item]) -> Iterable[_Item]:
-        bar: Iterable[_Item] = tqdm(items, desc=title, file=sys.stderr, disable=None, leave=False)
-        return bar
+def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[BenchFrame]:
+    """Read at most about `n_frames` frames into memory, in runs spread over all there are.
 
-    return wrap
+    Parameters
+    ----------
+    source : Path
+        A folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
+    n_frames : int
+        Frames wanted.
+    topic : str, optional
+        Topic of a bag.
+
+    Raises
+    ------
+    DataError
+        If there is nothing to read there, or no point in it.
+    """
+    if not source.exists():
+        raise DataError(f'{source}: no such file or folder')
+    frames = []
+    if is_bag(source):
+        frames = _bag_frames(source, n_frames, topic)
+    elif topic is not None:
+        raise DataError(f'--topic: is for bags, which {source} is not')
+    else:
+        paths = {source.stem: find_scans(source)} if not any(
+            source.glob('sequences/*/velodyne')
+        ) else {
+            name: [frame.points_path for frame in list_frames(source, name)]
+            for name in list_sequences(source)
+        }  # fmt: skip
+        for name, own in paths.items():
+            n_own = max(n_frames // len(paths), 1)
+            frames += [
+                BenchFrame(run_name, own[k].stem, read_points(own[k]))
+                for run_name, k in runs(name, len(own), n_own)
+            ]
+    if not any(len(frame.points) for frame in frames):
+        raise DataError(f'{source}: no point in any of {len(frames)} frames')
+    return frames
+
+
+def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
+    """Name and index of frames in runs of `RUN_LENGTH`, spread evenly; all if no more are there.
+
+    Each run has a name of its own: what is temporal must not reach over the hole before it.
+    """
+    if n_available <= n_wanted:
+        return [(name, k) for k in range(n_available)]
+    length = min(RUN_LENGTH, n_wanted)
+    starts = [length * k for k in spread(n_available // length, n_wanted // length)]
+    return [
+        (name if len(starts) == 1 else f'{name}:{start}', k)
+        for start in starts
+        for k in range(start, start + length)
+    ]
+
+
+def _bag_frames(source: Path, n_frames: int, topic: str | None) -> list[BenchFrame]:
+    frames = []
+    with open_bag(source) as bag:
+        name = bag.pick_point_cloud_topic(topic)
+        wanted = {k: run_name for run_name, k in runs(name, bag.n_messages(name), n_frames)}
+        for k, (_, time, raw) in enumerate(bag.messages([name])):
+            if k in wanted:
+                try:
+                    xyz = read_xyz(decode_cloud(raw))
+                except PointCloudError as error:
+                    raise DataError(f'{source}: message {k} of topic {name}: {error}') from error
+                # With full intensity Patchwork++ drops no point as noise.
+                points = np.ones((len(xyz), 4), dtype=np.float32)
+                points[:, :3] = xyz
+                frames.append(BenchFrame(wanted[k], str(time), points))
+    return frames
+
+
+def bench_text(document: dict[str, Any]) -> str:
+    """Lay out a `gp_ground_seg.evaluation.benchmark.bench_document` for the terminal."""
+    environment = document['environment']
+    versions = ', '.join(f'{k} {v or "absent"}' for k, v in environment['versions'].items())
+    footer = (
+        parameters_line(document['config_changes']),
+        f'machine: {environment["cpu"]}, {environment["n_cores"]} cores for this process',
+        f'versions: Python {environment["python"]}, {versions}',
+        f'commit: {environment["commit"] or "unknown"}',
+    )
+    tables = [_case_table(document), _stage_table(document['cases'])]
+    if document['growth']:
+        tables.append(_growth_table(document['growth']))
+    return '\n\n'.join([*(table.text() for table in tables), '\n'.join(map(fold, footer))])
+
+
+def _case_table(document: dict[str, Any]) -> Table:
+    cases, peer = document['cases'], document['baseline_ms']
+    median, largest = (
+        f'{round(document["n_points"][key]):_d}'.replace('_', ' ') for key in ('median', 'max')
+    )
+    title = (
+        f'{document["n_frames"]} frames of {document["data"]}, {median} points (median), '
+        f'at most {largest}'
+    )
+    rows: list[list[Cell]] = [[c['name'], c['ms']['median'], c['ms']['p99']] for c in cases]
+    columns = [Column('time per frame, reading left out')]
+    columns += [Column('median [ms]', '.2f'), Column('p99 [ms]', '.2f')]
+    if peer:
+        name = TITLES[document['baseline']]
+        columns += [Column(f'/ {name}', '.2f'), Column('p99 / its median', '.2f')]
+        for row, case in zip(rows, cases, strict=True):
+            row += [case['ratio']['median'], case['ratio']['p99']]
+        rows.append([name, peer['median'], peer['p99'], 1.0, peer['p99'] / peer['median']])
+    return Table(columns, rows, title, n_sums=1 if peer else 0)
+
+
+def _stage_table(cases: list[dict[str, Any]]) -> Table:
+    columns = [
+        Column('stage, median [ms]'),
+        *(Column(name, '.2f') for name in cases[0]['stages_ms']),
+    ]
+    return Table(columns, [[case['name'], *case['stages_ms'].values()] for case in cases])
+
+
+def _growth_table(growth: list[dict[str, Any]]) -> Table:
+    columns = [Column('growth with', key='series'), Column('size', '_.0f')]
+    for mode, title in MODES.items():
+        columns.append(Column(f'{title} [ms]', '.2f', f'{mode}_ms'))
+        columns.append(Column('/ default', '.2f', f'{mode}_ratio'))
+    rows = [[row[column.key or column.title] for column in columns] for row in growth]
+    title = (
+        'One thread; times over those of the same frames with the parameters given. More points '
+        'than a frame has are two and four successive frames laid over one another'
+    )
+    return Table(columns, rows, title)
+
+
+def replace_section(text: str, document: dict[str, Any]) -> str:
+    """Put the tables between the markers of a Markdown file.
+
+    Raises
+    ------
+    DataError
+        If the two markers are not there once each, in order.
+    """
+    head, begin, rest = text.partition(DOCS_BEGIN)
+    middle, end, tail = rest.partition(DOCS_END)
+    if not begin or not end or any(m in middle + tail for m in (DOCS_BEGIN, DOCS_END)):
+        raise DataError(
+            f'must hold the lines {DOCS_BEGIN} and {DOCS_END} once each, in this order; '
+            'the tables go between them'
+        )
+    return f'{head}{begin}\n\n```text\n{bench_text(document)}\n```\n\n{end}{tail}'
 
 
 def _update_docs(path: Path, document: dict[str, Any]) -> None:
     try:
-        text = path.read_text(encoding='utf-8')
+        text = replace_section(path.read_text(encoding='utf-8'), document)
     except (OSError, ValueError) as error:
         raise DataError(f'{path}: cannot be read: {error}') from error
-    try:
-        text = replace_section(text, document)
     except DataError as error:
         raise DataError(f'{path}: {error}') from error
     with staged_file(path, force=True) as part:

@@ -1,25 +1,31 @@
-"""``config``: the parameters as a file, as a table."""
+"""``config``: the parameters as a file, as a table; checks and comparison of parameter files."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 
-from gp_ground_seg.cli import config_files
-from gp_ground_seg.cli.options import add_config_options, config_from_options
+from gp_ground_seg.cli.options import add_config_options, config_from_options, new_parser
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.parameters.export import replace_readme_table, to_markdown_table, to_yaml
+from gp_ground_seg.parameters.config import Config, parameter_specs
+from gp_ground_seg.parameters.export import (
+    README_PATH,
+    differences,
+    file_problems,
+    generated_files,
+    to_markdown_table,
+    to_yaml,
+    yaml_scalar,
+)
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
+from gp_ground_seg.parameters.yaml_io import read_parameters
 
-YAML_FOLDER = 'config'
-"""Folder of the generated files, below the root of a checkout: one for each preset."""
-
-README_PATH = 'README.md'
-"""File with a generated section, below the root of a checkout."""
+EXIT_DIFFERENT = 1
+EXIT_WRONG = 2
 
 EXAMPLES = """\
-examples:
   gp-ground-seg config dump > my.yaml            every parameter, explained, with its default
   gp-ground-seg config dump --config my.yaml --set label.ground_tolerance=0.15
   gp-ground-seg config dump --preset vlp16       those for a sensor, with the reasons
@@ -28,79 +34,120 @@ examples:
   gp-ground-seg config table                     every parameter as a Markdown table
 """
 
+CHECK = """\
+Check names, types, ranges and the rules between parameters. A file in the form of
+ROS (/**: ros__parameters:) is held to the types of ROS: 2.0, not 2, for a float.
+Exit code 2 if anything is wrong.
+"""
+
+DIFF = """\
+Print the parameters that differ. A and B are parameter files or names of presets.
+Exit code 1 if any differ, as that of diff(1).
+"""
+
+GENERATE = """\
+Rewrite the files of the presets in config/, docs/parameters.md and the table of README.md
+from gp_ground_seg/parameters.
+"""
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its own commands."""
-    parser = subparsers.add_parser(
-        'config',
-        description='Show the parameters, their units and ranges.',
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    description = 'Show the parameters, their units and ranges.'
+    parser = new_parser(subparsers, 'config', description, EXAMPLES)
     commands = parser.add_subparsers(metavar='WHAT', required=True)
-
-    dump = commands.add_parser(
-        'dump',
-        help='print the effective parameters as a ROS parameter file',
-        description='Print the effective parameters as a ROS parameter file.',
-    )
-    add_config_options(dump)
-    dump.set_defaults(run=run_dump)
-
-    config_files.add_parsers(commands)
-
-    table = commands.add_parser(
-        'table',
-        help='print every parameter as a Markdown table',
-        description='Print every parameter as a Markdown table.',
-    )
-    table.set_defaults(run=run_table)
-
-    generate = commands.add_parser(
-        'generate',
-        help='for developers: rewrite what is generated in a checkout',
-        description='Rewrite the files of the presets in config/ and the parameter table of '
-        'README.md from gp_ground_seg/parameters.',
-    )
-    generate.add_argument(
+    added = {}
+    for name, run, purpose, text in (
+        ('dump', run_dump, 'print the effective parameters as a ROS parameter file', ''),
+        ('check', run_check, 'say everything that is wrong with a parameter file', CHECK),
+        ('diff', run_diff, 'compare two parameter files or presets', DIFF),
+        ('presets', run_presets, 'list the presets and what they are for', ''),
+        ('table', run_table, 'print every parameter as a Markdown table', ''),
+        ('generate', run_generate, 'for developers: rewrite generated files', GENERATE),
+    ):
+        added[name] = commands.add_parser(name, help=purpose, description=text or purpose)
+        added[name].set_defaults(run=run)
+    add_config_options(added['dump'])
+    added['check'].add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
+    for side in 'ab':
+        added['diff'].add_argument(side, metavar=side.upper(), help='parameter file or preset')
+    added['generate'].add_argument(
         'root', metavar='REPO_ROOT', nargs='?', default='.', help='the checkout (default: here)'
     )
-    generate.set_defaults(run=run_generate)
 
 
 def run_dump(arguments: argparse.Namespace) -> int:
-    """Print the YAML, with the reasons of a preset for what it says."""
+    """Print the parameters as YAML, with the preset's reasons for the values it has given."""
     config = config_from_options(arguments)
     preset = find_preset(arguments.preset)
-    is_preset = config == preset.config
+    title = preset.title if config == preset.config else ''
     reasons = {
         name: reason
         for name, reason in preset.reasons.items()
         if config[name] == preset.config[name]
     }
-    print(to_yaml(config, preset.title if is_preset else '', reasons), end='')
+    print(to_yaml(config, title, reasons), end='')
     return 0
 
 
-def run_table(arguments: argparse.Namespace) -> int:
+def run_check(arguments: argparse.Namespace) -> int:
+    """Print the problems of each file, or how much it gives and changes."""
+    code = 0
+    for path in arguments.files:
+        problems = file_problems(path)
+        for problem in problems:
+            print(f'{path}: {problem}', file=sys.stderr)
+        if problems:
+            code = EXIT_WRONG
+        else:
+            n_given = len(read_parameters(path).values)
+            n_changed = len(differences(Config(), Config.from_yaml(path)))
+            print(
+                f'{path}: good; {n_given} of {len(parameter_specs())} parameters given, '
+                f'{n_changed} differ from the defaults'
+            )
+    return code
+
+
+def run_diff(arguments: argparse.Namespace) -> int:
+    """Print the parameters that differ."""
+    first, second = (
+        PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
+        for name in (arguments.a, arguments.b)
+    )
+    different = differences(first, second)
+    for spec, before, after in different:
+        unit = f' {spec.unit}' if spec.unit else ''
+        print(f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)}{unit}')
+    return EXIT_DIFFERENT if different else 0
+
+
+def run_presets(_arguments: argparse.Namespace) -> int:
+    """Print name and purpose of each preset."""
+    width = max(map(len, PRESETS))
+    for preset in PRESETS.values():
+        print(f'{preset.name:<{width}}  {preset.purpose}')
+    return 0
+
+
+def run_table(_arguments: argparse.Namespace) -> int:
     """Print the Markdown table."""
     print(to_markdown_table(), end='')
     return 0
 
 
 def run_generate(arguments: argparse.Namespace) -> int:
-    """Rewrite what is generated and has changed, and name it."""
+    """Rewrite the generated files that have changed, and name all of them."""
     root = Path(arguments.root)
     readme = root / README_PATH
     if not readme.is_file():
         raise DataError(f'{readme}: no such file; name the root of a checkout')
-    for preset in PRESETS.values():
-        text = to_yaml(preset.config, preset.title, preset.reasons)
-        _rewrite(root / YAML_FOLDER / f'{preset.name}.yaml', text)
     try:
-        _rewrite(readme, replace_readme_table(readme.read_bytes().decode('utf-8')))
+        files = generated_files(readme.read_bytes().decode('utf-8'))
     except DataError as error:
         raise DataError(f'{readme}: {error}') from error
+    for name, text in files.items():
+        _rewrite(root / name, text)
     return 0
 
 

@@ -17,19 +17,12 @@ import numpy.typing as npt
 from gp_ground_seg.cli.bags import above_zero, scan_cloud
 from gp_ground_seg.cli.options import count, new_parser, positive, progress_bar
 from gp_ground_seg.data.atomic_output import staged_files
-from gp_ground_seg.data.bags import (
-    BagWriter,
-    CloudMessage,
-    cloud_topic,
-    decode_cloud,
-    encode_cloud,
-    open_bag,
-)
+from gp_ground_seg.data.bags import BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, stamp_of
 from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
-from gp_ground_seg.evaluation.conventions import GROUNDGRID
 from gp_ground_seg.evaluation.evaluate import labelled_frames
-from gp_ground_seg.evaluation.scores import Confusion, count_confusion
+from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confusion
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.birds_eye import plot_birds_eye
 from gp_ground_seg.ros.lifecycle import needing_ros
@@ -42,8 +35,7 @@ from gp_ground_seg.ros.probe import (
     rate_result,
     restamped,
 )
-from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_drive
-from gp_ground_seg.simulation.kinds import semantic_kitti_labels
+from gp_ground_seg.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 
 if TYPE_CHECKING:
     from gp_ground_seg.ros.lifecycle import Session
@@ -218,7 +210,7 @@ def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> ScanChec
 
 
 def _is_alike(sent: CloudMessage, back: CloudMessage) -> bool:
-    names = ('stamp', 'frame_id', 'fields', 'point_step', 'is_bigendian')
+    names = ('header', 'fields', 'point_step', 'is_bigendian')
     return all(getattr(sent, name) == getattr(back, name) for name in names) and (
         len(back.data) == back.height * back.width * back.point_step
     )
@@ -245,7 +237,7 @@ class Tally:
 
     def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
         """Check a scan that came back, and add it; other clouds are trials."""
-        number = self._numbers.get(sent.stamp)
+        number = self._numbers.get(stamp_of(sent))
         if number is None:
             return
         check = check_scan(sent, results)

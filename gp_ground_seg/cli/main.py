@@ -36,6 +36,7 @@ COMMANDS = {
     'segment': Command('segment', 'label scans, or split the clouds of a bag'),
     'evaluate': Command('evaluate', 'score against SemanticKITTI labels'),
     'bench': Command('bench', 'time the segmentation by stage, beside Patchwork++'),
+    'experiment': Command('experiment', 'repeat an experiment of docs/, such as ablation'),
     'plot': Command('plot', 'draw a scan in perspective, or a segment of it from the side'),
     'pose': Command('pose', 'estimate height and tilt of the sensor from scans'),
     'kitti-to-bag': Command('bags', 'write a KITTI sequence as a rosbag2'),
@@ -45,13 +46,6 @@ COMMANDS = {
     'node': Command('node', 'run the ROS 2 node'),
     'node-bench': Command('node', 'latency, losses and memory of the node'),
     'warm-up': Command('node', 'compile beforehand what the first start would compile'),
-    # To come: 'experiment' -> experiment. To go with `experiment`:
-    'pose-check': Command('pose_check', 'what not knowing height and tilt of the sensor costs'),
-    'table1': Command('table1', "the paper's Table I on real frames"),
-    'ablation': Command('ablation', 'compare length-scale models and ways to learn'),
-    'ideas': Command('ideas', 'what each idea is worth: switched off one at a time'),
-    'leave-out': Command('leave_out', 'choose parameters, score them on the sequence left out'),
-    'scenes': Command('scenes', 'score on simulated scenes, flat and rough'),
 }
 
 EXAMPLES = """\
@@ -64,9 +58,8 @@ examples:
   gp-ground-seg bench KITTI_ROOT                 time per frame by stage, beside Patchwork++
   gp-ground-seg plot segment scan.bin --azimuth 0 -o ahead.png
   gp-ground-seg plot scan --simulate urban -o scan.png
-  gp-ground-seg table1 --kitti KITTI_ROOT        the paper's Table I
-  gp-ground-seg ablation KITTI_ROOT              what the model and the learning are worth
-  gp-ground-seg scenes                           simulated scenes, beside Patchwork++
+  gp-ground-seg experiment table1 KITTI_ROOT     the paper's Table I
+  gp-ground-seg experiment scenes                simulated scenes, beside Patchwork++
   gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 00 drive.mcap
   gp-ground-seg play drive.mcap --clock
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud

@@ -18,7 +18,7 @@ from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyErr
 from gp_ground_seg.ros.lifecycle import needing_ros, stop_on_signals
 
 if TYPE_CHECKING:
-    from gp_ground_seg.data.bags import CloudMessage
+    from gp_ground_seg.data.point_cloud2 import CloudMessage
     from gp_ground_seg.ros.probe import NodeProcess, Probe, Trip
 
 N_SIMULATED = 10
@@ -147,8 +147,8 @@ def main() -> int:
 
 def run_warm_up(_arguments: argparse.Namespace) -> int:
     """Compile all code that a frame needs, in this process."""
-    from gp_ground_seg.backend import warm_up
     from gp_ground_seg.jit import HAVE_NUMBA, code_folder
+    from gp_ground_seg.segmenter import warm_up
 
     if not HAVE_NUMBA:
         raise MissingDependencyError(
@@ -203,7 +203,7 @@ def run_bench(arguments: argparse.Namespace) -> int:
 def _load_clouds(arguments: argparse.Namespace) -> list[CloudMessage]:
     """Return the clouds to send, x, y, z and intensity as float32."""
     from gp_ground_seg.cli.bags import scan_cloud
-    from gp_ground_seg.cli.bench_input import load_frames
+    from gp_ground_seg.cli.bench import load_frames
     from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
 
     if arguments.data is not None:

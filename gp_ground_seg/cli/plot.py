@@ -13,9 +13,9 @@ import numpy.typing as npt
 from gp_ground_seg.cli.options import add_config_options, config_from_options, new_parser
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.conventions import GROUNDGRID
-from gp_ground_seg.plotting.scan_view import plot_scan_view
-from gp_ground_seg.plotting.segment_profile import plot_segment, segment_at
+from gp_ground_seg.evaluation.metrics import GROUNDGRID
+from gp_ground_seg.plotting.perspective import plot_scan_view
+from gp_ground_seg.plotting.segment import plot_segment, segment_at
 from gp_ground_seg.segmenter import GroundSegmenter
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 

@@ -8,16 +8,16 @@ import statistics
 from contextlib import closing
 from pathlib import Path
 
-from gp_ground_seg.cli.options import add_config_options, config_from_options
+from gp_ground_seg.cli.options import add_config_options, config_from_options, new_parser
 from gp_ground_seg.cli.segment import find_scans
-from gp_ground_seg.cli.tables import format_table
 from gp_ground_seg.data.semantic_kitti import read_points
-from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.errors import PointCloudError
+from gp_ground_seg.evaluation.table import Cell, Column, Table
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.segmenter import GroundSegmenter
 
 DESCRIPTION = """\
-Find out from scans how high the sensor is and how it is tilted.
+Estimate from scans how high the sensor is and how it is tilted.
 
 INPUT is a .bin scan (float32 x, y, z, intensity), a folder of them, or a sequence
 with velodyne/ in it. Each scan is judged by itself. Support is the share of the
@@ -26,21 +26,25 @@ scans of level ground the medians are values to set: docs/pose.md.
 """
 
 EXAMPLES = """\
-examples:
   gp-ground-seg pose 000000.bin
   gp-ground-seg pose KITTI_ROOT/sequences/00
   gp-ground-seg pose scans --set sensor.height=1.2      does it agree?
 """
 
+COLUMNS = (
+    Column('scan'),
+    Column('height [m]', '.2f'),
+    Column('roll [deg]', '+.2f', scale=math.degrees(1.0)),
+    Column('pitch [deg]', '+.2f', scale=math.degrees(1.0)),
+    Column('support [%]', '.0f', scale=100.0),
+    Column('residual [m]', '.3f'),
+    Column('used as'),
+)
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
-        'pose',
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser(subparsers, 'pose', DESCRIPTION, EXAMPLES)
     parser.add_argument('input', metavar='INPUT', help='scan, or folder of scans')
     add_config_options(parser)
     parser.set_defaults(run=run)
@@ -49,12 +53,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Print a line for each scan, and the medians."""
     config = config_from_options(arguments)
-    source = Path(arguments.input)
-    if not source.exists():
-        raise DataError(f'{source}: no such file or folder')
-    scans = find_scans(source)
-    rows, notes = [], []
-    poses: list[SensorPose] = []
+    poses: dict[str, SensorPose] = {}
+    notes = []
+    scans = find_scans(Path(arguments.input))
     with closing(GroundSegmenter(config)) as segmenter:
         for scan in scans:
             try:
@@ -62,50 +63,39 @@ def run(arguments: argparse.Namespace) -> int:
             except PointCloudError as error:
                 notes.append(f'{scan.name}: refused: {error}')
                 continue
-            poses.append(pose)
-            rows.append([scan.name, *_cells(pose)])
+            poses[scan.name] = pose
             notes += [f'{scan.name}: {line}' for line in pose.contradictions]
-    if rows:
-        header = ['scan', 'height [m]', 'roll [deg]', 'pitch [deg]', 'support', 'residual [m]',
-                  'used as']  # fmt: skip
-        print(format_table(header, rows))
-        print(_summary(poses))
+    if poses:
+        print(Table(COLUMNS, [_row(name, pose) for name, pose in poses.items()]).text())
+        print(_summary(list(poses.values())))
     for line in notes:
         print(line)
     return 0
 
 
-def _cells(pose: SensorPose) -> list[str]:
-    how = [f'height {pose.height:.2f}' if pose.height_estimated else f'height {pose.height:g}']
+def _row(name: str, pose: SensorPose) -> list[Cell]:
+    """Return what was measured, where the scan tells it, and the values used."""
+    used = f'height {pose.height:.2f}'
     if not pose.height_estimated:
-        how[0] += ' (not measured)'
+        used = f'height {pose.height:g} (not measured)'
     if not pose.is_level:
-        how.append(f'roll {math.degrees(pose.roll):.1f} pitch {math.degrees(pose.pitch):.1f}')
-    measured = pose.measured
-    if measured is None or not measured.tells_height:
-        return ['-', '-', '-', '-', '-', ', '.join(how)]
-    tilt = ['-', '-']
-    if measured.tells_tilt:
-        tilt = [f'{math.degrees(angle):+.2f}' for angle in (measured.roll, measured.pitch)]
-    plane = measured.plane
-    return [
-        f'{measured.height:.2f}',
-        *tilt,
-        f'{100.0 * plane.support:.0f} %',
-        f'{plane.residual:.3f}',
-        ', '.join(how),
-    ]
+        used += f', roll {math.degrees(pose.roll):.1f} pitch {math.degrees(pose.pitch):.1f}'
+    found = pose.measured
+    if found is None or not found.tells_height:
+        return [name, None, None, None, None, None, used]
+    roll, pitch = (found.roll, found.pitch) if found.tells_tilt else (None, None)
+    return [name, found.height, roll, pitch, found.plane.support, found.plane.residual, used]
 
 
 def _summary(poses: list[SensorPose]) -> str:
-    """Medians over the scans that tell, as parameters."""
+    """Return the medians over the scans that tell, as parameters."""
     found = [pose.measured for pose in poses if pose.measured is not None]
     heights = [one.height for one in found if one.tells_height]
-    tilts = [one for one in found if one.tells_tilt]
+    tilts = [(one.roll, one.pitch) for one in found if one.tells_tilt]
     if not heights:
         return 'no scan shows enough ground to tell the height: set sensor.height'
     words = f'median of {len(heights)}: sensor.height={statistics.median(heights):.2f}'
     if tilts:
-        roll, pitch = (statistics.median(getattr(t, n) for t in tilts) for n in ('roll', 'pitch'))
+        roll, pitch = (statistics.median(angles) for angles in zip(*tilts, strict=True))
         words += f' sensor.roll={roll:.3f} sensor.pitch={pitch:.3f} [m, rad]'
     return words

@@ -7,7 +7,6 @@ import re
 import statistics
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +21,9 @@ from gp_ground_seg.cli.options import (
     progress_bar,
 )
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
-from gp_ground_seg.data.bags import (
-    BAG_SUFFIXES,
-    BagReader,
-    BagWriter,
-    cloud_topic,
-    decode_cloud,
-    encode_cloud,
-    is_bag,
-    open_bag,
-)
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.frame import Label
@@ -120,34 +112,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
-@dataclass
-class _Tally:
-    """Counts over the frames of a run."""
-
-    n_points: int = 0
-    n_ground: int = 0
-    seconds: list[float] = field(default_factory=list)
-
-    def add(self, result: Segmentation) -> None:
-        self.n_points += len(result.label)
-        self.n_ground += int(np.count_nonzero(result.label == Label.GROUND))
-        self.seconds.append(result.timings['total'])
-
-    def summary(self, target: Path) -> str:
-        share = f'{self.n_ground / self.n_points:.1%} ground' if self.n_points else 'no ground'
-        return (
-            f'{count(len(self.seconds), "frame")}, {count(self.n_points, "point")}, {share}, '
-            f'{1e3 * statistics.median(self.seconds):.1f} ms per frame (median, segmentation '
-            f'only), written to {target}'
-        )
+_Counts = tuple[int, int, float]
+"""Points, those of them that are ground, and seconds of one frame."""
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
     config = config_from_options(arguments)
     source = Path(arguments.input)
-    if not source.exists():
-        raise DataError(f'{source}: no such file or folder')
     holds_bag = is_bag(source) or _holds_bag_files(source)
     scans = [] if holds_bag else find_scans(source)
     kind, foreign = ('scans', FOR_SCANS) if holds_bag else ('bags', FOR_BAGS)
@@ -156,14 +128,25 @@ def run(arguments: argparse.Namespace) -> int:
             option = name.replace('_', '-')
             raise DataError(f'--{option}: is for {kind}, which {source} is not')
     target = Path(arguments.output) if arguments.output else _default_output(source)
-    tally = _Tally()
     with closing(GroundSegmenter(config)) as segmenter:
         if holds_bag:
-            _segment_bag(target, arguments, segmenter, tally)
+            frames = _segment_bag(target, arguments, segmenter)
         else:
-            _segment_scans(scans, target, arguments, segmenter, tally)
-    print(tally.summary(target))
+            frames = _segment_scans(scans, target, arguments, segmenter)
+    all_points, all_ground, seconds = zip(*frames, strict=True)
+    n_points, n_ground = sum(all_points), sum(all_ground)
+    share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
+    time = statistics.median(seconds)
+    print(
+        f'{count(len(frames), "frame")}, {count(n_points, "point")}, {share}, '
+        f'{1e3 * time:.1f} ms per frame (median, segmentation only), written to {target}'
+    )
     return 0
+
+
+def _count(result: Segmentation) -> _Counts:
+    n_ground = int(np.count_nonzero(result.label == Label.GROUND))
+    return len(result.label), n_ground, result.timings['total']
 
 
 def _holds_bag_files(source: Path) -> bool:
@@ -195,6 +178,8 @@ def find_scans(source: Path) -> list[Path]:
     DataError
         If there is none; the message says what was expected.
     """
+    if not source.exists():
+        raise DataError(f'{source}: no such file or folder')
     if source.is_file():
         if source.suffix != '.bin':
             raise DataError(
@@ -219,9 +204,9 @@ def _segment_scans(
     target: Path,
     arguments: argparse.Namespace,
     segmenter: GroundSegmenter,
-    tally: _Tally,
-) -> None:
+) -> list[_Counts]:
     """Write one label file per scan."""
+    frames = []
     code = np.array(
         [label if arguments.raw else SEMANTIC_KITTI_CODE[label] for label in sorted(Label)],
         dtype='<u4',
@@ -238,8 +223,9 @@ def _segment_scans(
             except PointCloudError as error:
                 raise PointCloudError(f'{scan}: {error}') from error
             label_path.write_bytes(code[result.label].tobytes())
-            tally.add(result)
+            frames.append(_count(result))
             bar.update()
+    return frames
 
 
 @contextmanager
@@ -259,23 +245,22 @@ def _label_files(
 
 
 def _segment_bag(
-    target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter, tally: _Tally
-) -> None:
+    target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
+) -> list[_Counts]:
     """Copy a bag, and write the ground and the obstacles of each cloud after it."""
+    frames: list[_Counts] = []
     source = Path(arguments.input)
     here = source.resolve()
     if target.resolve() in (here, *here.parents):
         raise DataError(f'{target}: is the input, or has it in it; name another output')
-    outputs = {
-        arguments.ground_topic or GROUND_TOPIC: Label.GROUND,
-        arguments.obstacles_topic or OBSTACLES_TOPIC: Label.OBSTACLE,
-    }
+    topics = (arguments.ground_topic or GROUND_TOPIC, arguments.obstacles_topic or OBSTACLES_TOPIC)
+    outputs = dict(zip(topics, (Label.GROUND, Label.OBSTACLE), strict=True))
     with open_bag(source) as bag:
         topic = bag.pick_point_cloud_topic(arguments.topic)
         for name in arguments.drop:
             bag.topic(name)  # Raises where there is none.
         copied = [name for name in bag.topics if name not in arguments.drop]
-        _check_output_topics(source, arguments, copied)
+        _check_output_topics(source, topics, copied)
         storage = arguments.format
         if storage is None and target.suffix not in BAG_SUFFIXES and bag.storage != 'ros1':
             storage = bag.storage
@@ -297,22 +282,23 @@ def _segment_bag(
                     continue
                 try:
                     cloud = decode_cloud(raw)
-                    result = segmenter.segment(cloud.xyz())
+                    result = segmenter.segment(read_xyz(cloud))
                 except PointCloudError as error:
                     raise DataError(
-                        f'{source}: message {len(tally.seconds)} of topic {topic}, '
+                        f'{source}: message {len(frames)} of topic {topic}, '
                         f'recorded at {time} ns: {error}'
                     ) from error
                 for part, label in outputs.items():
-                    output.write(part, time, encode_cloud(cloud.select(result.label == label)))
-                tally.add(result)
+                    output.write(
+                        part, time, encode_cloud(select_points(cloud, result.label == label))
+                    )
+                frames.append(_count(result))
                 bar.update()
+    return frames
 
 
-def _check_output_topics(source: Path, arguments: argparse.Namespace, copied: list[str]) -> None:
-    ground = arguments.ground_topic or GROUND_TOPIC
-    obstacles = arguments.obstacles_topic or OBSTACLES_TOPIC
-    for option, name in (('--ground-topic', ground), ('--obstacles-topic', obstacles)):
+def _check_output_topics(source: Path, topics: tuple[str, str], copied: list[str]) -> None:
+    for option, name in zip(('--ground-topic', '--obstacles-topic'), topics, strict=True):
         if not _TOPIC_NAME.fullmatch(name):
             raise DataError(f'{option} {name}: must be a full topic name, as in {GROUND_TOPIC}')
         if name in copied:
@@ -320,8 +306,8 @@ def _check_output_topics(source: Path, arguments: argparse.Namespace, copied: li
                 f'{source}: has a topic {name} already; choose another with {option}, '
                 f'or leave that one out with --drop {name}'
             )
-    if ground == obstacles:
-        raise DataError(f'--obstacles-topic {obstacles}: is the topic of the ground as well')
+    if topics[0] == topics[1]:
+        raise DataError(f'--obstacles-topic {topics[1]}: is the topic of the ground as well')
 
 
 def _note_migrated(bag: BagReader, copied: list[str]) -> None:

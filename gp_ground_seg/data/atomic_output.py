@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import shutil
 import tempfile
@@ -18,7 +19,7 @@ PARTIAL_MARK = '.partial-'
 def leftovers(target: str | Path) -> list[Path]:
     """Unfinished output of other runs for the same target: killed ones, or still going."""
     path = Path(target).resolve()
-    return sorted(path.parent.glob(f'.{_escape(path.name)}{PARTIAL_MARK}*'))
+    return sorted(path.parent.glob(f'.{glob.escape(path.name)}{PARTIAL_MARK}*'))
 
 
 @contextmanager
@@ -38,8 +39,7 @@ def staged_file(target: str | Path, *, force: bool) -> Iterator[Path]:
             raise DataError(f'{target}: is not a file, not replaced')
         _refuse_existing(path, target, force)
 
-    check()
-    with _staging(path, target) as product:
+    with _staging(path, target, check) as product:
         yield product
         check()
         os.replace(product, path)
@@ -47,7 +47,7 @@ def staged_file(target: str | Path, *, force: bool) -> Iterator[Path]:
 
 @contextmanager
 def staged_folder(
-    target: str | Path, *, force: bool, is_ours: Callable[[Path], bool], kind: str
+    target: str | Path, *, force: bool, is_ours: Callable[[Path], bool]
 ) -> Iterator[Path]:
     """Yield a folder to create; it takes the name `target` once the block ends well.
 
@@ -58,10 +58,7 @@ def staged_folder(
     force : bool
         Whether a folder of that name may be replaced.
     is_ours : callable
-        Tells whether an existing folder holds nothing but such output;
-        any other is never replaced.
-    kind : str
-        What `is_ours` accepts, for the message.
+        Whether an existing folder holds nothing but such output; any other is never replaced.
 
     Raises
     ------
@@ -73,22 +70,21 @@ def staged_folder(
     def check() -> None:
         _refuse_existing(path, target, force)
         if path.exists() and not is_ours(path):
-            raise DataError(f'{target}: is not {kind}, not replaced; remove it yourself')
+            raise DataError(f'{target}: is not a rosbag2 folder, not replaced; remove it yourself')
 
-    check()
-    with _staging(path, target) as product:
+    with _staging(path, target, check) as product:
         yield product
         check()
-        if not path.exists():
-            os.rename(product, path)
-            return
-        # A folder cannot be replaced in one step: the old one steps aside, and back if need be.
+        # A folder cannot be replaced in one step: the old one is renamed, and back if need be.
         aside = product.with_name('replaced')
-        os.rename(path, aside)
+        existed = path.exists()
+        if existed:
+            os.rename(path, aside)
         try:
             os.rename(product, path)
         except OSError:
-            os.rename(aside, path)
+            if existed:
+                os.rename(aside, path)
             raise
 
 
@@ -116,8 +112,7 @@ def staged_files(folder: str | Path, names: Sequence[str], *, force: bool) -> It
                 'files to write do); --force replaces them'
             )
 
-    check()
-    with _staging(path, folder) as product:
+    with _staging(path, folder, check) as product:
         product.mkdir()
         yield product
         check()
@@ -134,8 +129,9 @@ def _refuse_existing(path: Path, shown: str | Path, force: bool) -> None:
 
 
 @contextmanager
-def _staging(path: Path, shown: str | Path) -> Iterator[Path]:
+def _staging(path: Path, shown: str | Path, check: Callable[[], None]) -> Iterator[Path]:
     """Path with the final name, in a hidden folder beside it that goes away in the end."""
+    check()
     if not path.parent.is_dir():
         raise DataError(f'{shown}: the folder {path.parent} does not exist')
     folder: Path | None = None
@@ -147,8 +143,3 @@ def _staging(path: Path, shown: str | Path) -> Iterator[Path]:
     finally:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _escape(name: str) -> str:
-    """Take the meaning of wildcards from `name`."""
-    return ''.join(f'[{letter}]' if letter in '*?[' else letter for letter in name)

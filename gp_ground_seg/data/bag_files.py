@@ -1,19 +1,27 @@
-"""What bags look like on disk, and the errors of reading them."""
+"""Bags without reading them: paths, damaged files, topics, the wording of errors."""
 
 from __future__ import annotations
 
+import sqlite3
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.errors import DataError, GroundSegError
 
-BAG_SUFFIXES = ('.bag', '.mcap', '.db3')
+POINT_CLOUD2 = 'sensor_msgs/msg/PointCloud2'
+UNKNOWN_TYPE_HASH = 'RIHS01_' + 64 * '0'
+"""For a type without definition; what rosbag2 stores for it is no valid hash."""
 METADATA_FILE = 'metadata.yaml'
+SUFFIX_OF_STORAGE = {'mcap': '.mcap', 'sqlite3': '.db3'}
+STORAGE_OF_SUFFIX = {suffix: storage for storage, suffix in SUFFIX_OF_STORAGE.items()}
+BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
 
-# What rosbags says -> what to do about it.
+_FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', '.zstd', '.zst')
+# Part of an error of rosbags -> a hint at what to do.
 _NEXT_STEP = {
     'end magic': 'truncated, or still being recorded; `mcap recover` saves what is there',
     'not indexed': 'truncated, or still being recorded; `rosbag reindex` saves what is there',
@@ -22,12 +30,115 @@ _NEXT_STEP = {
 }
 
 
+@dataclass(frozen=True)
+class BagTopic:
+    """A topic in ROS 2 terms.
+
+    Attributes
+    ----------
+    name, msgtype : str
+        As in ``/points``, ``sensor_msgs/msg/PointCloud2``.
+    definition : str
+        Text of the message definition, empty if unknown.
+    type_hash : str
+        RIHS01 hash of the type.
+    encoding : str
+        Serialisation of the messages, ``cdr`` for all ROS 2 writes itself.
+    qos : tuple
+        Profiles offered by the publishers (``rosbags.interfaces.Qos``).
+    n_messages : int
+        Messages in the bag.
+    migrated : bool
+        Whether a ROS 1 type has other fields in ROS 2.
+    problem : str
+        Why messages of ROS 1 cannot be converted, empty if they can.
+    """
+
+    name: str
+    msgtype: str
+    definition: str
+    type_hash: str
+    encoding: str = 'cdr'
+    qos: tuple[Any, ...] = ()
+    n_messages: int = 0
+    migrated: bool = False
+    problem: str = ''
+
+    @property
+    def is_cloud(self) -> bool:
+        """Whether its messages are point clouds that can be read."""
+        return self.msgtype == POINT_CLOUD2 and self.encoding == 'cdr'
+
+
+def find_topic(path: Path, topics: Mapping[str, BagTopic], name: str) -> BagTopic:
+    """Return one of the `topics` of a bag; raises `DataError` if it is not there."""
+    if name not in topics:
+        raise DataError(f'{path}: no topic {name}; topics here: {_list_topics(topics)}')
+    return topics[name]
+
+
+def _list_topics(topics: Mapping[str, BagTopic]) -> str:
+    listed = (f'{name} ({topic.msgtype})' for name, topic in topics.items())
+    return ', '.join(listed) or 'none'
+
+
+def pick_cloud_topic(path: Path, topics: Mapping[str, BagTopic], wanted: str | None) -> str:
+    """Return `wanted` if it is one of point clouds with messages, or the only such topic.
+
+    Raises
+    ------
+    DataError
+        If there is none, or the choice is not clear; the message lists the topics.
+    """
+    clouds = [name for name, topic in topics.items() if topic.is_cloud]
+    if wanted is not None:
+        msgtype = find_topic(path, topics, wanted).msgtype
+        if msgtype != POINT_CLOUD2:
+            raise DataError(
+                f'{path}: topic {wanted} is of type {msgtype}, must be {POINT_CLOUD2}; '
+                f'such topics here: {", ".join(clouds) or "none"}'
+            )
+    candidates = clouds if wanted is None else [wanted]
+    if not candidates:
+        raise DataError(f'{path}: no {POINT_CLOUD2} topic; topics here: {_list_topics(topics)}')
+    recorded = [name for name in candidates if topics[name].n_messages]
+    if not recorded:
+        raise DataError(f'{path}: no message on {", ".join(candidates)}')
+    if len(recorded) > 1:
+        raise DataError(
+            f'{path}: {len(recorded)} {POINT_CLOUD2} topics, choose one with --topic: '
+            f'{", ".join(recorded)}'
+        )
+    return recorded[0]
+
+
 def is_bag(path: str | Path) -> bool:
     """Whether `path` looks like a bag: a folder with metadata.yaml, or by its suffix."""
     candidate = Path(path)
     if candidate.is_dir():
         return (candidate / METADATA_FILE).is_file()
     return candidate.suffix in BAG_SUFFIXES
+
+
+def is_ros1_bag(path: Path) -> bool:
+    """Whether a bag is of ROS 1."""
+    return path.suffix == '.bag' and not path.is_dir()
+
+
+def storage_of(path: Path) -> str:
+    """Storage of a bag: ``ros1``, ``mcap`` or ``sqlite3``."""
+    if is_ros1_bag(path):
+        return 'ros1'
+    files = path.glob('*.db3*') if path.is_dir() else [path]
+    return 'sqlite3' if any('.db3' in file.suffixes for file in files) else 'mcap'
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Whether a folder holds a rosbag2 bag and nothing else."""
+    return (path / METADATA_FILE).is_file() and all(
+        child.is_file() and (child.name == METADATA_FILE or child.suffix in _FOLDER_SUFFIXES)
+        for child in path.iterdir()
+    )
 
 
 def check_is_bag(path: Path) -> None:
@@ -48,11 +159,7 @@ def check_is_bag(path: Path) -> None:
 
 
 def check_sqlite_path(path: Path) -> None:
-    """Raise `DataError` for a sqlite file that would not be found under its name.
-
-    rosbags hands the path to sqlite as a URI, where some letters end or alter
-    it: another file than the one named would be opened.
-    """
+    """Raise `DataError` for a path that rosbags, which gives it to sqlite as a URI, misreads."""
     awkward = sorted(set('?#%') & set(str(path.absolute())))
     if awkward:
         raise DataError(f'{path}: a sqlite3 bag cannot have {" ".join(awkward)} in its path')
@@ -79,10 +186,7 @@ def _check_sqlite_file(path: Path) -> None:
 
 
 def _sqlite_size(header: bytes) -> int:
-    """Size of the file that a sqlite header tells, 0 if it does not.
-
-    Source: the database header in https://www.sqlite.org/fileformat.html
-    """
+    """Size of the file by its header, 0 if not given; https://www.sqlite.org/fileformat.html."""
     if len(header) < 100 or header[24:28] != header[92:96]:
         return 0
     page_size = int.from_bytes(header[16:18], 'big')
@@ -91,36 +195,57 @@ def _sqlite_size(header: bytes) -> int:
     return page_size * int.from_bytes(header[28:32], 'big')
 
 
-def is_ros1_bag(path: Path) -> bool:
-    """Whether a path that `check_is_bag` let pass is of ROS 1."""
-    return path.suffix == '.bag' and not path.is_dir()
+def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
+    """Storage of a new bag: `wanted`, 'mcap' or 'sqlite3', or by default what the suffix says.
 
+    A path that ends in .mcap or .db3 is a single file, any other a folder, of MCAP by default.
 
-def open_reader(path: Path) -> Any:
-    """Open reader of rosbags for a path that `check_is_bag` let pass."""
-    from rosbags import rosbag1, rosbag2
-
-    reader = rosbag1.Reader(path) if is_ros1_bag(path) else rosbag2.Reader(path)
-    reader.open()
-    return reader
+    Raises
+    ------
+    DataError
+        If the two contradict, or the storage cannot hold that path.
+    """
+    suffix = Path(path).suffix
+    if suffix == '.bag':
+        raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder name')
+    implied = STORAGE_OF_SUFFIX.get(suffix)
+    if wanted is not None and implied is not None and wanted != implied:
+        raise DataError(
+            f'{path}: ends in {suffix}, which is not {wanted} ({SUFFIX_OF_STORAGE[wanted]})'
+        )
+    storage = wanted or implied or 'mcap'
+    if storage == 'sqlite3':
+        check_sqlite_path(Path(path))
+    return storage
 
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Name the bag in whatever goes wrong while it is parsed."""
+    """Raise what goes wrong while a bag is parsed as `DataError` with its path.
+
+    The parsers behind rosbags raise errors of many types (struct, apsw, lz4, asserts, ...).
+    """
     try:
         yield
     except GroundSegError:
         raise
     except Exception as error:
-        # rosbags lets the errors of its many parsers through (struct, apsw, lz4, asserts, ...);
-        # whichever it is, these bytes are not a bag it can read.
         said = in_one_line(error)
         step = next((f' ({hint})' for key, hint in _NEXT_STEP.items() if key in said), '')
         raise DataError(f'{path}: cannot be read as a bag: {said}{step}') from error
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Raise what goes wrong while a bag is written, as on a full disk, as `DataError`."""
+    try:
+        yield
+    except (OSError, sqlite3.Error) as error:
+        reason = getattr(error, 'strerror', None) or error
+        raise DataError(f'{path}: cannot be written: {reason}') from error
+
+
 def in_one_line(error: Exception) -> str:
-    """Return what an error says, or its name if it says nothing."""
+    """Text of an error, shortened to one line, or its type if it has none."""
     # Some of rosbags' messages quote a whole message definition.
     return textwrap.shorten(str(error), 200, placeholder=' ...') or type(error).__name__

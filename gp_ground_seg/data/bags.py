@@ -1,31 +1,398 @@
-"""Bags of any kind in, rosbag2 out: the names other modules use."""
+"""Bags: ROS 1, rosbag2 folders, MCAP and sqlite3 files read; rosbag2 written whole or not at all.
 
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
-from gp_ground_seg.data.bag_reader import BagReader, open_bag
-from gp_ground_seg.data.bag_writer import BagWriter, resolve_storage
-from gp_ground_seg.data.cloud_codec import (
-    CloudMessage,
-    PointField,
-    cloud_from_columns,
-    decode_cloud,
-    encode_cloud,
+The one module that imports rosbags, an optional package; only where a bag is used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import os
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+from gp_ground_seg.data.atomic_output import staged_file, staged_folder
+from gp_ground_seg.data.bag_files import (
+    METADATA_FILE,
+    POINT_CLOUD2,
+    STORAGE_OF_SUFFIX,
+    SUFFIX_OF_STORAGE,
+    UNKNOWN_TYPE_HASH,
+    BagTopic,
+    check_is_bag,
+    find_topic,
+    in_one_line,
+    is_bag_folder,
+    is_ros1_bag,
+    pick_cloud_topic,
+    reading,
+    resolve_storage,
+    storage_of,
+    writing,
 )
-from gp_ground_seg.data.rosbags_support import POINT_CLOUD2, BagTopic, cloud_topic, jazzy_topic
+from gp_ground_seg.errors import DataError, MissingDependencyError
 
-__all__ = [
-    'BAG_SUFFIXES',
-    'POINT_CLOUD2',
-    'BagReader',
-    'BagTopic',
-    'BagWriter',
-    'CloudMessage',
-    'PointField',
-    'cloud_from_columns',
-    'cloud_topic',
-    'decode_cloud',
-    'encode_cloud',
-    'is_bag',
-    'jazzy_topic',
-    'open_bag',
-    'resolve_storage',
-]
+FORMAT_VERSION = 9
+"""Of rosbag2's metadata, as Jazzy writes it."""
+
+_HEADER = 'std_msgs/msg/Header'
+_RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
+
+
+def require_rosbags() -> None:
+    """Raise `MissingDependencyError`, with how to install it, unless rosbags can be imported."""
+    try:
+        importlib.import_module('rosbags.highlevel')
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"bags need the package rosbags ({error}): pip install 'gp_ground_seg[bags]'"
+        ) from error
+
+
+@functools.cache
+def jazzy_types() -> Any:
+    """Message types of ROS 2 Jazzy (``rosbags.typesys.store.Typestore``)."""
+    require_rosbags()
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def jazzy_topic(name: str, msgtype: str, qos: tuple[Any, ...] = ()) -> BagTopic:
+    """Topic of a type that is part of ROS 2 Jazzy."""
+    types = jazzy_types()
+    definition, _ = types.generate_msgdef(msgtype, ros_version=2)
+    return BagTopic(name, msgtype, definition, types.hash_rihs01(msgtype), qos=qos)
+
+
+def cloud_topic(name: str) -> BagTopic:
+    """PointCloud2 topic offered reliably; with best effort, large clouds get lost when played."""
+    return jazzy_topic(name, POINT_CLOUD2, (_reliable_qos('VOLATILE'),))
+
+
+def _reliable_qos(durability: str) -> Any:
+    require_rosbags()
+    from rosbags import interfaces as ros
+
+    forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
+    return ros.Qos(
+        ros.QosHistory.KEEP_LAST,
+        10,
+        ros.QosReliability.RELIABLE,
+        ros.QosDurability[durability],
+        forever,
+        forever,
+        ros.QosLiveliness.AUTOMATIC,
+        forever,
+        avoid_ros_namespace_conventions=False,
+    )
+
+
+@functools.cache
+def _parse_definition(text: str, msgtype: str) -> Any:
+    """Types of one definition (.msg or .idl text) in a store of their own, to read only."""
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    types: dict[str, Any] = {}
+    separator = 80 * '=' + '\n'
+    if text.startswith(f'{separator}IDL: '):
+        for part in text.split(separator)[1:]:
+            types.update(get_types_from_idl(part.partition('\n')[2]))
+    else:
+        types.update(get_types_from_msg(text, msgtype))
+    store = get_typestore(Stores.EMPTY)
+    store.register(types)
+    return store
+
+
+def _ros2_topic(connection: Any) -> BagTopic:
+    """Topic of a rosbag2 connection; older bags have neither definition nor hash."""
+    msgtype, text = connection.msgtype, connection.msgdef.data
+    type_hash = connection.digest if text else ''
+    if not text and msgtype in jazzy_types().fielddefs:
+        known = jazzy_topic(connection.topic, msgtype)
+        text, type_hash = known.definition, known.type_hash
+    elif text and not type_hash:
+        with suppress(Exception):  # A definition rosbags cannot parse is copied all the same.
+            type_hash = _parse_definition(text, msgtype).hash_rihs01(msgtype)
+    return BagTopic(
+        name=connection.topic,
+        msgtype=msgtype,
+        definition=text,
+        type_hash=type_hash or UNKNOWN_TYPE_HASH,
+        encoding=connection.ext.serialization_format,
+        qos=tuple(connection.ext.offered_qos_profiles),
+        n_messages=connection.msgcount,
+    )
+
+
+def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
+    """Topic of a ROS 1 connection, and a function that converts its messages to CDR.
+
+    Where ROS 2 Jazzy has the type in the same layout, or not at all, only a header's ``seq``
+    goes. Else the message is migrated: fields of one name keep their value, new ones are zero.
+    """
+    from rosbags.convert.converter import is_same_wireformat, migrate_bytes
+    from rosbags.typesys import Stores, get_typestore
+
+    old = connection.msgtype
+    new = _RENAMED.get(old, old)
+    source, target = _parse_definition(connection.msgdef.data, old), jazzy_types()
+    if new not in target.fielddefs:
+        header = target.fielddefs[_HEADER]
+        target = get_typestore(Stores.EMPTY)
+        target.register({**source.fielddefs, _HEADER: header})
+    convert: Callable[[bytes], Any] = functools.partial(target.ros1_to_cdr, typename=new)
+    migrated = not is_same_wireformat(source, target, old, new)
+    if migrated:
+        convert = functools.partial(
+            migrate_bytes, source, target, old, new, {}, src_is2=False, dst_is2=True
+        )
+    topic = BagTopic(
+        name=connection.topic,
+        msgtype=new,
+        definition=target.generate_msgdef(new, ros_version=2)[0],
+        type_hash=target.hash_rihs01(new),
+        qos=(_reliable_qos('TRANSIENT_LOCAL'),) if connection.ext.latching else (),
+        n_messages=connection.msgcount,
+        migrated=migrated,
+    )
+    return topic, convert
+
+
+def open_bag(path: str | Path) -> BagReader:
+    """Open a ROS 1 ``.bag``, rosbag2 folder, ``.mcap`` or ``.db3``, in a ``with`` statement.
+
+    Raises
+    ------
+    DataError
+        If there is no bag, or it cannot be read.
+    MissingDependencyError
+        If rosbags is not installed.
+    """
+    return BagReader(path)
+
+
+class BagReader:
+    """A bag as ROS 2 topics with CDR messages; ROS 1 messages are converted (see `open_bag`)."""
+
+    def __init__(self, path: str | Path) -> None:
+        require_rosbags()
+        from rosbags import rosbag1, rosbag2
+
+        self.path = Path(path)
+        self._converters: dict[int, Callable[[bytes], Any]] = {}
+        with ExitStack() as stack:
+            with reading(self.path):
+                check_is_bag(self.path)
+                reader: Any = (rosbag1 if is_ros1_bag(self.path) else rosbag2).Reader(self.path)
+                reader.open()
+            stack.callback(reader.close)
+            self._reader = reader
+            self._topics = self._describe_topics()
+            self._open = stack.pop_all()
+
+    def __enter__(self) -> BagReader:
+        """Return the open bag."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close the files; nothing can be read afterwards."""
+        self._open.close()
+
+    @property
+    def storage(self) -> str:
+        """``ros1``, ``mcap`` or ``sqlite3``."""
+        return storage_of(self.path)
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Message type of each topic, as in ``sensor_msgs/msg/PointCloud2``."""
+        return {name: topic.msgtype for name, topic in self._topics.items()}
+
+    @property
+    def point_cloud_topics(self) -> list[str]:
+        """Names of the PointCloud2 topics."""
+        return [name for name, topic in self._topics.items() if topic.is_cloud]
+
+    @property
+    def migrated_topics(self) -> list[str]:
+        """ROS 1 topics whose type has other fields in ROS 2: those of the same name are kept."""
+        return sorted(name for name, topic in self._topics.items() if topic.migrated)
+
+    def topic(self, name: str) -> BagTopic:
+        """Return the description of a topic; raises `DataError` if there is none of that name."""
+        return find_topic(self.path, self._topics, name)
+
+    def n_messages(self, topic: str) -> int:
+        """Messages of one topic; raises as `topic` does."""
+        return self.topic(topic).n_messages
+
+    def pick_point_cloud_topic(self, topic: str | None = None) -> str:
+        """Return `topic` if it can be read as point clouds, or the only one that can.
+
+        Raises `DataError` with the topics if there is none, or the choice is not clear.
+        """
+        return pick_cloud_topic(self.path, self._topics, topic)
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
+        """Messages in order of their recorded time; file after file in a split bag.
+
+        Parameters
+        ----------
+        topics : collection of str, optional
+            Topics wanted; all by default.
+
+        Yields
+        ------
+        (str, int, bytes)
+            Topic, recorded time [ns], message as CDR. `DataError` is raised if the bag is
+            damaged, a topic is unknown, or fewer messages can be read than the bag lists.
+        """
+        wanted = list(self._topics) if topics is None else list(dict.fromkeys(topics))
+        for name in wanted:
+            topic = self.topic(name)
+            if topic.problem:
+                raise DataError(
+                    f'{self.path}: topic {name} ({topic.msgtype}) has a message definition '
+                    f'that cannot be converted from ROS 1: {topic.problem}'
+                )
+        expected = {name: self.n_messages(name) for name in wanted}
+        connections = [c for c in self._reader.connections if c.topic in expected]
+        found: Counter[str] = Counter()
+        with reading(self.path):
+            source = iter(self._reader.messages(connections=connections) if connections else ())
+        while True:
+            # The caller's own errors, raised at the yield, must not pass through here.
+            with reading(self.path):
+                entry = next(source, None)
+                if entry is None:
+                    break
+                connection, time, raw = entry
+                converter = self._converters.get(connection.id)
+                message = bytes(converter(raw) if converter else raw)
+            found[connection.topic] += 1
+            yield connection.topic, time, message
+        for name in wanted:
+            if found[name] != expected[name]:
+                raise DataError(
+                    f'{self.path}: topic {name} lists {expected[name]} messages, '
+                    f'{found[name]} could be read; the bag is damaged, '
+                    f'or its {METADATA_FILE} belongs to another one'
+                )
+
+    def _describe_topics(self) -> dict[str, BagTopic]:
+        topics: dict[str, BagTopic] = {}
+        for connection in self._reader.connections:
+            topic = self._describe(connection)
+            known = topics.setdefault(topic.name, topic)
+            if known.msgtype != topic.msgtype:
+                raise DataError(
+                    f'{self.path}: topic {topic.name} has messages of two types, '
+                    f'{known.msgtype} and {topic.msgtype}; one topic must have one type'
+                )
+            if known is not topic:
+                # Several publishers of one topic.
+                topics[topic.name] = dataclasses.replace(
+                    known,
+                    n_messages=known.n_messages + topic.n_messages,
+                    qos=tuple(dict.fromkeys(known.qos + topic.qos)),
+                    migrated=known.migrated or topic.migrated,
+                    problem=known.problem or topic.problem,
+                )
+        return topics
+
+    def _describe(self, connection: Any) -> BagTopic:
+        if not is_ros1_bag(self.path):
+            return _ros2_topic(connection)
+        try:
+            topic, self._converters[connection.id] = _ros1_topic(connection)
+        except Exception as error:  # Reported when, and only if, the topic is read.
+            return BagTopic(
+                connection.topic, connection.msgtype, '', UNKNOWN_TYPE_HASH,
+                n_messages=connection.msgcount, problem=in_one_line(error),
+            )  # fmt: skip
+        return topic
+
+
+class BagWriter:
+    """A new rosbag2 bag, in a ``with`` statement; written whole or not at all (`staged_file`).
+
+    Parameters
+    ----------
+    path : str or Path
+        A folder as ``ros2 bag record -o`` makes; or a single file, by its suffix.
+    storage : {'mcap', 'sqlite3'}, optional
+        See `resolve_storage`.
+    force : bool
+        Whether a bag of that name is replaced, once the new one is complete.
+
+    Raises
+    ------
+    DataError
+        If the path is taken, or cannot be written.
+    MissingDependencyError
+        If rosbags is not installed.
+    """
+
+    def __init__(
+        self, path: str | Path, *, storage: str | None = None, force: bool = False
+    ) -> None:
+        require_rosbags()
+        self.path = Path(path)
+        self.storage = resolve_storage(path, storage)
+        self._force = force
+        self._connections: dict[str, Any] = {}
+
+    def __enter__(self) -> BagWriter:
+        """Create the hidden bag."""
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        with ExitStack() as stack:
+            if self.path.suffix in STORAGE_OF_SUFFIX:
+                product = stack.enter_context(staged_file(self.path, force=self._force))
+                # rosbags writes folders; the one file in it is named after the folder.
+                folder = product.parent / 'bag' / product.stem
+                file = folder / f'{folder.name}{SUFFIX_OF_STORAGE[self.storage]}'
+                stack.push(lambda kind, *_: os.rename(file, product) if kind is None else None)
+            else:
+                folder = stack.enter_context(
+                    staged_folder(self.path, force=self._force, is_ours=is_bag_folder)
+                )
+            stack.enter_context(writing(self.path))
+            plugin = StoragePlugin[self.storage.upper()]
+            self._writer = stack.enter_context(
+                Writer(folder, version=FORMAT_VERSION, storage_plugin=plugin)
+            )
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        """Give the bag its name, or remove it after an error."""
+        self._open.__exit__(*error)
+
+    def add_topic(self, topic: BagTopic) -> None:
+        """Declare a topic, before its first message; raises `DataError` if it is there."""
+        if topic.name in self._connections:
+            raise DataError(f'{self.path}: topic {topic.name} twice')
+        with writing(self.path):
+            self._connections[topic.name] = self._writer.add_connection(
+                topic.name,
+                topic.msgtype,
+                msgdef=topic.definition,
+                rihs01=topic.type_hash,
+                serialization_format=topic.encoding,
+                offered_qos_profiles=topic.qos,
+            )
+
+    def write(self, topic: str, time: int, raw: bytes | memoryview) -> None:
+        """Append one message, CDR bytes, to a declared topic with its recorded `time` [ns].
+
+        Raises `DataError` if it cannot be written, as when the disk is full.
+        """
+        with writing(self.path):
+            self._writer.write(self._connections[topic], time, raw)

@@ -22,14 +22,10 @@ class Frame:
 
     Attributes
     ----------
-    sequence : str
-        Name of the sequence folder.
-    index : str
-        Name of the file, without its ending.
-    points_path : Path
-        The ``.bin`` file.
-    labels_path : Path or None
-        The ``.label`` file, if there is one.
+    sequence, index : str
+        Names of the sequence folder, and of the file without its ending.
+    points_path, labels_path : Path or None
+        The ``.bin`` file; the ``.label`` file, if there is one.
     time : float
         Time since the start of the sequence [s].
     """
@@ -103,12 +99,7 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
 
 
 def read_points(path: str | Path) -> npt.NDArray[np.float32]:
-    """Points of a KITTI ``.bin`` file.
-
-    Returns
-    -------
-    (N, 4) float32
-        x, y, z [m] and intensity.
+    """Points of a KITTI ``.bin`` file: x, y, z [m] and intensity, (N, 4) float32.
 
     Raises
     ------

@@ -1,7 +1,8 @@
-"""How far a probability of ground can be trusted."""
+"""Reliability of the probabilities of ground."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -9,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation.scores import Confusion
+from gp_ground_seg.evaluation.metrics import Confusion
 from gp_ground_seg.frame import Label
 
 N_BINS = 15
@@ -56,16 +57,8 @@ class Calibration:
 
     def __add__(self, other: Calibration) -> Calibration:
         """Add the sums of both."""
-        return Calibration(
-            self.n_points + other.n_points,
-            self.n_ground + other.n_ground,
-            self.sum_p + other.sum_p,
-            self.sum_squared_error + other.sum_squared_error,
-            self.ground_by_step + other.ground_by_step,
-            self.obstacles_by_step + other.obstacles_by_step,
-            self.ground_without + other.ground_without,
-            self.obstacles_without + other.obstacles_without,
-        )
+        names = [field.name for field in dataclasses.fields(self)]
+        return Calibration(*(getattr(self, name) + getattr(other, name) for name in names))
 
     @property
     def n_total(self) -> int:

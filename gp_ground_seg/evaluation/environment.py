@@ -1,4 +1,4 @@
-"""What a measurement ran on: a number without it cannot be compared."""
+"""What a measurement ran on: machine, versions, commit, parameters."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import gp_ground_seg
+from gp_ground_seg.parameters.config import Config, parameter_specs
+from gp_ground_seg.parameters.schema import ParameterValue
 
 _VERSIONED = ('numpy', 'scipy', 'numba')
 
@@ -39,9 +41,21 @@ class Environment:
     versions: dict[str, str | None]
     commit: str | None
 
+    def machine(self, n_threads: int, backend: str) -> str:
+        """One line on where a measurement ran."""
+        threads = '1 thread' if n_threads == 1 else f'{n_threads} threads'
+        cores = '1 core' if self.n_cores == 1 else f'{self.n_cores} cores'
+        versions = ', '.join(f'{name} {v or "absent"}' for name, v in self.versions.items())
+        commit, _, dirty = (self.commit or 'unknown').partition('-')
+        commit = commit[:12] + (' (changed since)' if dirty else '')
+        return (
+            f'machine: {self.cpu}, {threads} on {cores}, {backend}; Python {self.python}, '
+            f'{versions}, commit {commit}'
+        )
+
 
 def describe_environment(*packages: str) -> Environment:
-    """Describe where we run; `packages` are further ones whose version matters."""
+    """Describe this machine; `packages` are further ones whose version matters."""
     versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
     for package in (*_VERSIONED, *packages):
         try:
@@ -56,6 +70,21 @@ def describe_environment(*packages: str) -> Environment:
         versions=versions,
         commit=_commit(Path(gp_ground_seg.__file__)),
     )
+
+
+def changed_parameters(config: Config) -> dict[str, ParameterValue]:
+    """Parameters that differ from their defaults, by dotted name."""
+    return {
+        spec.name: config[spec.name]
+        for spec in parameter_specs()
+        if config[spec.name] != spec.default
+    }
+
+
+def parameters_line(changes: dict[str, ParameterValue]) -> str:
+    """One line on the parameters of a run."""
+    words = ', '.join(f'{name}={value}' for name, value in changes.items())
+    return f'parameters: {words or "defaults"}'
 
 
 def _cpu_name() -> str:
@@ -73,8 +102,8 @@ def _cpu_name() -> str:
 def _commit(source: Path) -> str | None:
     """Commit that holds the file `source`, None if git does not know the file.
 
-    An installed package may lie inside somebody else's repository, whose
-    commit would say nothing: the file itself has to be tracked.
+    An installed package may lie inside another repository, whose commit would say
+    nothing of it: the file itself has to be tracked.
     """
     if _git(source.parent, 'ls-files', '--error-unmatch', source.name) is None:
         return None

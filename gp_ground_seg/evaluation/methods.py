@@ -1,12 +1,12 @@
-"""Methods that can be evaluated, behind one small interface."""
+"""Methods that can be scored behind one small interface, and how they are run side by side."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -14,13 +14,41 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from gp_ground_seg.errors import MissingDependencyError
-from gp_ground_seg.frame import Label
+from gp_ground_seg.frame import FloatArray, Label
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import FitReport
 from gp_ground_seg.segmenter import GroundSegmenter
 
 OURS = 'gp_ground_seg'
 PATCHWORKPP = 'patchworkpp'
+TITLES = {PATCHWORKPP: 'Patchwork++'}
+"""Names of methods in tables, where they differ from those in files."""
+
+Points = npt.NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """What a method says of a scan of N points.
+
+    Attributes
+    ----------
+    label : (N,) uint8
+        `Label` of each point.
+    p_ground : (N,) float or None
+        Probability of ground; None if the method has none.
+    stages : dict of str to float
+        Seconds by stage; empty if they are not known.
+    pose, fit : SensorPose or None, FitReport or None
+        Of our own method.
+    """
+
+    label: npt.NDArray[np.uint8]
+    p_ground: npt.NDArray[np.floating] | None = None
+    stages: dict[str, float] = field(default_factory=dict)
+    pose: SensorPose | None = None
+    fit: FitReport | None = None
 
 
 class Method(Protocol):
@@ -28,23 +56,20 @@ class Method(Protocol):
 
     name: str
 
-    def start_sequence(self) -> None:
-        """Forget what was learnt from earlier frames."""
+    def reset(self) -> None:
+        """Forget what was learned from earlier scans."""
 
-    def run(self, points: npt.NDArray[np.float32]) -> None:
+    def run(self, points: Points) -> None:
         """Segment a scan of (N, 4) x, y, z, intensity: the part that is timed."""
 
-    def label(self) -> npt.NDArray[np.uint8]:
-        """Labels of the scan last run, (N,)."""
+    def result(self) -> MethodResult:
+        """Return the result of the last scan."""
 
-    def p_ground(self) -> npt.NDArray[np.floating] | None:
-        """Probability of ground of each point of the scan last run, (N,); None if it has none."""
+    def ground_z(self) -> FloatArray:
+        """Height of the ground under each point of the last scan, (N,) [m]; NaN = no model."""
 
-    def stages(self) -> dict[str, float]:
-        """Seconds by stage of the scan last run; empty if it does not tell."""
-
-    def facts(self) -> dict[str, float | str]:
-        """Tell what else is known of the scan last run, by name; empty if nothing."""
+    def close(self) -> None:
+        """End worker threads."""
 
 
 class OurMethod:
@@ -54,65 +79,42 @@ class OurMethod:
     ----------
     config : Config
         Its parameters.
+    name : str
+        Name by which its scores are kept.
     """
 
-    name = OURS
+    def __init__(self, config: Config, name: str = OURS) -> None:
+        self.name = name
+        self._segmenter = GroundSegmenter(config)
 
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._segmenter: GroundSegmenter | None = None
+    def reset(self) -> None:
+        """Forget what was learned."""
+        self._segmenter.reset()
 
-    def start_sequence(self) -> None:
-        """Start a segmenter without a past."""
-        self.close()
-        self._segmenter = GroundSegmenter(self._config)
-
-    def run(self, points: npt.NDArray[np.float32]) -> None:
+    def run(self, points: Points) -> None:
         """Segment a scan."""
-        assert self._segmenter is not None, 'start_sequence comes first'
         self._result = self._segmenter.segment(points)
 
-    def label(self) -> npt.NDArray[np.uint8]:
-        """Labels of the scan last run."""
-        return self._result.label
+    def result(self) -> MethodResult:
+        """Labels, probabilities, stages, pose and fit of the last scan."""
+        last = self._result
+        stages = {stage: seconds for stage, seconds in last.timings.items() if stage != 'total'}
+        return MethodResult(last.label, last.p_ground, stages, last.pose, last.fit)
 
-    def p_ground(self) -> npt.NDArray[np.float32]:
-        """Probability of ground of each point of the scan last run."""
-        return self._result.p_ground
-
-    def stages(self) -> dict[str, float]:
-        """Seconds by stage of the scan last run."""
-        return {stage: s for stage, s in self._result.timings.items() if stage != 'total'}
-
-    def facts(self) -> dict[str, float | str]:
-        """How the learning ended, segments with a ground model, the sensor's pose [m, rad]."""
-        pose = self._result.pose
-        return {
-            'status': self.fit.status,
-            'n_segments': float(self.fit.n_segments),
-            'sensor_height': pose.height,
-            'sensor_height_estimated': 'yes' if pose.height_estimated else 'no',
-            'sensor_roll': pose.roll,
-            'sensor_pitch': pose.pitch,
-        }
-
-    @property
-    def fit(self) -> FitReport:
-        """Fit report of the scan last run: backend and threads are in it."""
-        return self._result.fit
+    def ground_z(self) -> FloatArray:
+        """Height of the surface under each point."""
+        return self._result.ground_z
 
     def close(self) -> None:
         """End the worker threads."""
-        if self._segmenter is not None:
-            self._segmenter.close()
-            self._segmenter = None
+        self._segmenter.close()
 
 
 class PatchworkppMethod:
     """Patchwork++ (Lee, Lim, Myung, IROS 2022) from PyPI, with its published parameters.
 
     Only its estimation is timed, not the fetching of the indices. Its adaptive
-    thresholds are learnt over a sequence, so each sequence gets a new one.
+    thresholds are learned over a sequence.
 
     Parameters
     ----------
@@ -136,68 +138,44 @@ class PatchworkppMethod:
             ) from error
         self._module = pypatchworkpp
         self._sensor_height = sensor_height
-        self.version = importlib.metadata.version('pypatchworkpp')
+        self.reset()
 
-    def start_sequence(self) -> None:
-        """Start with its default thresholds."""
-        with _c_stdout_silenced():  # it greets on standard output, where our tables go
+    def reset(self) -> None:
+        """Start anew with its default thresholds."""
+        with _c_stdout_silenced():  # it greets on standard output, which is for tables
             parameters = self._module.Parameters()
             if self._sensor_height is not None:
                 parameters.sensor_height = self._sensor_height
             self._uprightness = float(parameters.uprightness_thr)
             self._estimator = self._module.patchworkpp(parameters)
 
-    def run(self, points: npt.NDArray[np.float32]) -> None:
+    def run(self, points: Points) -> None:
         """Segment a scan."""
-        self._n_points = len(points)
+        self._points = points
         self._estimator.estimateGround(points)
 
-    def label(self) -> npt.NDArray[np.uint8]:
-        """Labels of the scan last run."""
-        label = np.full(self._n_points, Label.OBSTACLE, dtype=np.uint8)
+    def result(self) -> MethodResult:
+        """Labels of the last scan."""
+        label = np.full(len(self._points), Label.OBSTACLE, dtype=np.uint8)
         label[self._estimator.getGroundIndices()] = Label.GROUND
-        return label
+        return MethodResult(label)
 
-    def ground_z(self, points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-        """Height of its ground under points of the scan last run, as good as can be had.
-
-        It has no surface of its own, but a plane for each patch that it looks at: here
-        the plane of the nearest patch counts, of those it takes for upright.
-
-        Parameters
-        ----------
-        points : (n, >=2) float
-            Where to ask [m].
-
-        Returns
-        -------
-        (n,) float64
-            z in the sensor frame [m]; NaN if it found no plane.
-        """
+    def ground_z(self) -> FloatArray:
+        """Height of the plane of the nearest upright patch: it has no surface of its own."""
         centre = np.asarray(self._estimator.getCenters(), dtype=np.float64).reshape(-1, 3)
         normal = np.asarray(self._estimator.getNormals(), dtype=np.float64).reshape(-1, 3)
         upright = np.abs(normal[:, 2]) > self._uprightness
         centre, normal = centre[upright], normal[upright]
         if not len(centre):
-            return np.full(len(points), np.nan)
-        xy = points[:, :2].astype(np.float64)
+            return np.full(len(self._points), np.nan)
+        xy = self._points[:, :2].astype(np.float64)
         _, nearest = KDTree(centre[:, :2]).query(xy)
         centre, normal = centre[nearest], normal[nearest]
         fall = np.sum((xy - centre[:, :2]) * normal[:, :2], axis=1) / normal[:, 2]
-        ground_z: npt.NDArray[np.float64] = centre[:, 2] - fall
-        return ground_z
+        return np.asarray(centre[:, 2] - fall)
 
-    def p_ground(self) -> None:
-        """Nothing: it decides without."""
-        return None
-
-    def stages(self) -> dict[str, float]:
-        """Nothing: it tells only its total."""
-        return {}
-
-    def facts(self) -> dict[str, float | str]:
-        """Nothing."""
-        return {}
+    def close(self) -> None:
+        """Do nothing: it has no threads."""
 
 
 @contextlib.contextmanager

@@ -118,6 +118,21 @@ class Table:
         ]
 
 
+def percent(title: str, key: str = '', form: str = '.2f') -> Column:
+    """Column of ratios, shown in percent."""
+    return Column(title, form, key, 100.0)
+
+
+def centimetres(title: str, key: str = '') -> Column:
+    """Column of lengths in metres, shown in centimetres."""
+    return Column(title, '.2f', key, 100.0)
+
+
+def milliseconds(title: str, key: str = '') -> Column:
+    """Column of times in seconds, shown in milliseconds."""
+    return Column(title, '.1f', key, 1e3)
+
+
 def fold(line: str) -> str:
     """Fold a line for the terminal."""
     return textwrap.fill(line, WIDTH, subsequent_indent='  ', break_on_hyphens=False)

@@ -1,187 +1,247 @@
-"""What the length-scale model and the learning are worth on labelled frames."""
+"""Ablations: length-scale models, ways to learn, and each departure from the paper undone."""
 
 from __future__ import annotations
 
 import statistics
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.data.semantic_kitti import Frame, read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.conventions import GROUNDGRID
-from gp_ground_seg.evaluation.height_error import HeightError, height_error, pool_height_errors
-from gp_ground_seg.evaluation.scores import Confusion, count_confusion
-from gp_ground_seg.frame import Label
-from gp_ground_seg.parameters.config import Config, find_spec
-from gp_ground_seg.parameters.schema import ParameterValue
-from gp_ground_seg.result import FitReport
-from gp_ground_seg.segmenter import GroundSegmenter
+from gp_ground_seg.evaluation.evaluate import (
+    ALL,
+    KnownScan,
+    MethodScore,
+    Progress,
+    load_kitti,
+)
+from gp_ground_seg.evaluation.table import Cell, Column, Table, centimetres, milliseconds, percent
+from gp_ground_seg.experiments.variants import (
+    Changes,
+    Report,
+    SimulatedFrame,
+    load_simulated,
+    make_report,
+    refuse_changed,
+    score_variants,
+    simulated_frames,
+)
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.simulation import SCENES
 
-_FIXED: dict[str, ParameterValue] = {'learning.mode': 'fixed'}
-_WHOLE_FRAME: dict[str, ParameterValue] = {
-    'learning.mode': 'every_frame',
-    'learning.scope': 'frame',
+_FIXED: Changes = {'learning.mode': 'fixed'}
+_WHOLE_FRAME: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'frame'}
+_PER_SEGMENT: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'segment'}
+_CONSTANT: Changes = {'length_scale.model': 'constant'}
+_GRADIENT: Changes = {'length_scale.model': 'line_gradient'}
+_LATENT: Changes = {'length_scale.model': 'latent'}
+
+MODELS: dict[str, Changes] = {
+    'constant, not learned': {**_CONSTANT, **_FIXED},
+    'constant, learned': {**_CONSTANT, **_WHOLE_FRAME},
+    'Z, not learned': {**_GRADIENT, **_FIXED},
+    'Z, learned': {**_GRADIENT, **_WHOLE_FRAME},
+    'Z-L, not learned': {**_LATENT, **_FIXED},
+    'Z-L, learned per segment': {**_LATENT, **_PER_SEGMENT},
+    'Z-L, learned over the frame': {**_LATENT, **_WHOLE_FRAME},
 }
-_PER_SEGMENT: dict[str, ParameterValue] = {
-    'learning.mode': 'every_frame',
-    'learning.scope': 'segment',
+"""Length-scale models and ways to learn on labelled frames; the last one is the paper's."""
+
+SIMULATED_MODELS: dict[str, Changes] = {
+    **{
+        f'constant, {length:g} m': {**_CONSTANT, 'length_scale.constant': length, **_WHOLE_FRAME}
+        for length in (10.0, 5.0, 2.0, 1.0)
+    },
+    'line gradient': {**_GRADIENT, **_WHOLE_FRAME},
+    'latent, not learned': {**_LATENT, **_FIXED},
+    'latent': {**_LATENT, **_WHOLE_FRAME},
 }
+"""The same on simulated scans. A constant cannot be learned: several are given, so that the
+best of them is known in hindsight."""
 
-METHODS: dict[str, dict[str, ParameterValue]] = {
-    'constant, not learned': {'length_scale.model': 'constant', **_FIXED},
-    'constant, learned': {'length_scale.model': 'constant', **_WHOLE_FRAME},
-    'Z, not learned': {'length_scale.model': 'line_gradient', **_FIXED},
-    'Z, learned': {'length_scale.model': 'line_gradient', **_WHOLE_FRAME},
-    'Z-L, not learned': {'length_scale.model': 'latent', **_FIXED},
-    'Z-L, learned per segment': {'length_scale.model': 'latent', **_PER_SEGMENT},
-    'Z-L, learned over the frame': {'length_scale.model': 'latent', **_WHOLE_FRAME},
-}
-"""Methods by title, as changes of the configuration; the last one is the paper's."""
+SCENE = 'road_then_rubble'
+PLACES = (0.0, 6.0, 12.0)
+"""Where the sensor stands on the road [m]; the rubble begins at 14 to 20 m."""
+STRETCHES = (ALL, 'smooth', 'rubble')
+"""All ground, the road before the rubble begins, and the rubble where it has its full height."""
 
 
-@dataclass(frozen=True)
-class FrameResult:
-    """How one method did on one frame.
+class Departure(NamedTuple):
+    """A departure from the paper, or another choice, and the parameters that undo it.
 
     Attributes
     ----------
-    sequence, index : str
-        Which frame.
-    seconds : float
-        Time of the segmentation alone, without reading.
-    confusion : Confusion
-        In the GroundGrid convention.
-    height : HeightError
-        Of the surface under the points labelled ground.
+    title : str
+        What it is, in a few words.
+    changes : mapping of str to value
+        Parameters, by dotted name, that switch it off; where it is not kept, on.
+    kept : bool
+        Whether the defaults have it.
     """
-
-    sequence: str
-    index: str
-    seconds: float
-    confusion: Confusion
-    height: HeightError
-
-
-@dataclass(frozen=True)
-class MethodResult:
-    """How one method did on all frames; `fit` is the report of its last one."""
 
     title: str
-    frames: tuple[FrameResult, ...]
-    fit: FitReport
-
-    def pooled(self, sequence: str | None = None) -> Confusion:
-        """Sum of the counts over one sequence, or over all."""
-        chosen = (f for f in self.frames if sequence is None or f.sequence == sequence)
-        return sum((frame.confusion for frame in chosen), Confusion())
-
-    @property
-    def worst_sequence(self) -> str:
-        """Name of the sequence with the lowest IoU."""
-        names = dict.fromkeys(frame.sequence for frame in self.frames)
-        return min(names, key=lambda name: self.pooled(name).iou)
-
-    @property
-    def height(self) -> HeightError:
-        """Height error over all frames."""
-        return pool_height_errors([frame.height for frame in self.frames])
-
-    @property
-    def median_seconds(self) -> float:
-        """Median time per frame."""
-        return statistics.median(frame.seconds for frame in self.frames)
+    changes: Changes
+    kept: bool = True
 
 
-@contextmanager
-def open_segmenters(
-    methods: Mapping[str, Mapping[str, ParameterValue]],
-    config: Config,
-    over_defaults: bool = True,
-) -> Iterator[dict[str, GroundSegmenter]]:
-    """Yield a segmenter for each method's changes of `config`; their threads end afterwards.
+_PLAIN_BAND: Changes = {
+    'label.roughness_gain': 0.0,
+    'label.obstacle_roughness_gain': 0.0,
+    'label.ground_tolerance': 0.2,
+}
 
-    Raises
-    ------
-    ConfigError
-        If a change is not accepted, or with `over_defaults` if `config` itself
-        changes what the methods set.
+DEPARTURES: tuple[Departure, ...] = (
+    Departure('latent length-scales (constant instead)', {'length_scale.model': 'constant'}),
+    Departure('learning in every frame', {'learning.mode': 'fixed'}),
+    Departure('objective without the latent terms', {'learning.objective': 'paper'}),
+    Departure('sloping mean', {'observation.slope_std': 0.0}),
+    Departure('neighbouring segments fused', {'surface.n_neighbours': 0}),
+    Departure('asymmetric gate of the growth', {'growth.max_standardised_depth': 2.0}),
+    Departure('vertical faces', {'faces.min_height': 100.0}),
+    Departure('vertical faces with occluded base', {'faces.max_foot_distance': 0.0}),
+    Departure('band that follows the roughness', _PLAIN_BAND),
+    Departure('narrower band beside an obstacle', {'label.obstacle_tolerance': 0.2}),
+    Departure('band open downwards', {'label.below_tolerance': 0.2}),
+    Departure('bins that widen, 80 of them', {'grid.n_bins': 120, 'grid.bin_growth': 1.0}),
+    Departure('lines end at 0.1 rad', {'lines.slope_tolerance': 0.02}),
+    Departure('length-scales of classes learned', {'learning.fixed': 'length_scales'}),
+    Departure('lines continued outside the gate', {'growth.max_line_slope': 0.0}),
+    Departure('lines continued past a slope break', {'growth.min_bend_extent': 1000.0}),
+    Departure('learning from every third segment', {'learning.segment_step': 1}),
+    Departure('one theta for the frame', {'learning.scope': 'segment'}),
+    Departure('240 segments', {'grid.n_segments': 240}, kept=False),
+    Departure('twice the neighbours fused', {'surface.n_neighbours': 4}, kept=False),
+    Departure('a wider gate (3)', {'growth.max_standardised_residual': 3.0}, kept=False),
+    Departure('vertical faces from 0.3 m on', {'faces.min_height': 0.3}, kept=False),
+)
+"""What `departures` measures. A new row here is all that a further one takes."""
+
+AS_GIVEN = 'as given'
+
+
+def compare_models(frames: Sequence[Frame], config: Config, progress: Progress = iter) -> Report:
+    """Score `MODELS` on labelled frames; ConfigError if `config` sets what they set."""
+    refuse_changed(config, {name for changes in MODELS.values() for name in changes})
+    variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
+    scores = score_variants(frames, load_kitti, variants, progress=progress)
+    rows: list[list[Cell]] = []
+    for one in scores:
+        height, worst = one.height(), one.worst_sequence
+        cells = [height.rmse, height.median_absolute, height.smse, one.seconds()]
+        rows.append([one.name, one.iou, one.of(worst).iou, worst, *cells])
+    columns = [
+        Column('method'),
+        percent('IoU [%]', 'iou'),
+        percent('worst [%]', 'worst_iou'),
+        Column('in', '', 'worst_sequence'),
+        centimetres('RMSE [cm]', 'rmse'),
+        centimetres('median [cm]', 'median_absolute'),
+        Column('SMSE', '.5f', 'smse'),
+        milliseconds('ms', 'seconds'),
+    ]
+    title = f'{frames_title(frames)}; heights under points labelled ground'
+    return make_report({'models': Table(columns, rows, title)}, scores, config, changes=MODELS)
+
+
+def compare_models_simulated(n_seeds: int, config: Config, progress: Progress = iter) -> Report:
+    """Score `SIMULATED_MODELS` by exact heights on a smooth road that ends in rubble.
+
+    Each seed is a scene of its own, seen by an HDL-64E from `PLACES`. Raises as `compare_models`.
     """
-    names = {name for changes in methods.values() for name in changes}
-    for name in sorted(names) if over_defaults else ():
-        if config[name] != find_spec(name).default:
-            raise ConfigError(
-                f'{name} = {config[name]}: the methods compared set it, leave it out'
-            )
-    configs = {title: config.replace(**changes) for title, changes in methods.items()}
-    with ExitStack() as stack:
-        yield {
-            title: stack.enter_context(closing(GroundSegmenter(own)))
-            for title, own in configs.items()
-        }
+    refuse_changed(config, {name for changes in SIMULATED_MODELS.values() for name in changes})
+    variants = {name: config.replace(**changes) for name, changes in SIMULATED_MODELS.items()}
+    frames = simulated_frames(['hdl-64e'], [SCENE], n_seeds, PLACES)
+    scores = score_variants(frames, load_stretches, variants, progress=progress)
+    rows: list[list[Cell]] = []
+    for one in scores:
+        heights = [one.height(stretch) for stretch in STRETCHES]
+        errors = [h.rmse for h in heights] + [h.median_absolute for h in heights]
+        rows.append([one.name, *errors, one.seconds()])
+    columns = [Column('length-scale')]
+    for name, key in (('RMSE', 'rmse'), ('median', 'median_absolute')):
+        columns += [centimetres(f'{name}, {s}', f'{key}_{s}') for s in STRETCHES]
+    columns.append(milliseconds('ms', 'seconds'))
+    title = (
+        f'{len(frames)} simulated scans of {n_seeds} scenes, road then rubble, HDL-64E; '
+        'errors against the exact ground [cm]'
+    )
+    tables = {'models': Table(columns, rows, title)}
+    return make_report(tables, scores, config, changes=SIMULATED_MODELS)
 
 
-def ablate(
+def load_stretches(frame: SimulatedFrame) -> KnownScan:
+    """Simulate a scan whose ground has `STRETCHES`: the rubble's break lines lie across x."""
+    scan = load_simulated(frame)
+    begin, full = np.sort(SCENES[frame.scene](frame.seed).terrain.breaks()[:, 2])
+    ground_x, is_ground = scan.points[:, 0] + frame.x, scan.parts[ALL]
+    scan.parts['smooth'] = is_ground & (ground_x < begin)
+    scan.parts['rubble'] = is_ground & (ground_x > full)
+    return scan
+
+
+def compare_departures(
     frames: Sequence[Frame],
-    methods: Mapping[str, Mapping[str, ParameterValue]],
+    departures: Sequence[Departure],
     config: Config,
-    clock: Callable[[], float] = time.perf_counter,
-    progress: Callable[[Sequence[Frame]], Iterable[Frame]] = iter,
-    over_defaults: bool = True,
-) -> list[MethodResult]:
-    """Run methods on the same frames, alternately.
-
-    Parameters
-    ----------
-    frames : sequence of Frame
-        Labelled frames, at least one; each is segmented without a past.
-    methods : mapping of str to mapping
-        Changes of the configuration, by title of the method.
-    config : Config
-        The configuration that they change.
-    clock : callable
-        Source of seconds.
-    progress : callable
-        Wraps the frames to show how far it is, as tqdm does.
-    over_defaults : bool
-        As `open_segmenters`.
+    progress: Progress = iter,
+) -> Report:
+    """Switch one departure after the other, on the same frames in the same run.
 
     Raises
     ------
     ConfigError
-        As `open_segmenters`.
-    DataError
-        If a file cannot be read or does not fit its frame.
+        If two titles are alike, a switch is not accepted or changes nothing.
     """
-    results: dict[str, list[FrameResult]] = {title: [] for title in methods}
-    fits: dict[str, FitReport] = {}
-    with open_segmenters(methods, config, over_defaults) as segmenters:
-        points = read_points(frames[0].points_path)
-        for segmenter in segmenters.values():  # compiling is not their speed
-            segmenter.segment(points)
-        for k, frame in enumerate(progress(frames)):
-            points = read_points(frame.points_path)
-            assert frame.labels_path is not None, 'labelled_frames gives only labelled ones'
-            semantic = read_labels(frame.labels_path, len(points))
-            z = points[:, 2].astype(np.float64)
-            truth = GROUNDGRID.truth(semantic, z)
-            is_ground = truth == Label.GROUND
-            for title in methods if k % 2 == 0 else reversed(list(methods)):
-                segmenters[title].reset()
-                started = clock()
-                result = segmenters[title].segment(points)
-                seconds = clock() - started
-                fits[title] = result.fit
-                results[title].append(
-                    FrameResult(
-                        frame.sequence,
-                        frame.index,
-                        seconds,
-                        count_confusion(result.label, truth),
-                        height_error(z[is_ground], result.ground_z[is_ground]),
-                    )
-                )
-    return [MethodResult(title, tuple(found), fits[title]) for title, found in results.items()]
+    variants = {AS_GIVEN: config}
+    for one in departures:
+        if one.title in variants:
+            raise ConfigError(f'departure {one.title!r}: there is one of that title already')
+        variants[one.title] = config.replace(**one.changes)
+        if variants[one.title] == config:
+            raise ConfigError(f'departure {one.title!r}: its switch changes nothing')
+    given, *switched = score_variants(frames, load_kitti, variants, progress=progress)
+    rows = [_departure_row(AS_GIVEN, None, None, given, given)]
+    found = []
+    for one, score in zip(departures, switched, strict=True):
+        worth = (given.iou - score.iou) * (1.0 if one.kept else -1.0)
+        found.append((worth, one, score))
+    for worth, one, score in sorted(found, key=lambda entry: -entry[0]):
+        rows.append(_departure_row(one.title, 'off' if one.kept else 'on', worth, score, given))
+    columns = [
+        Column('departure', '', 'departure'),
+        Column('switch'),
+        percent('IoU [%]', 'iou'),
+        percent('worth [%]', 'worth', '+.2f'),
+        percent('worst [%]', 'worst_iou'),
+        Column('in', '', 'worst_sequence'),
+        centimetres('RMSE [cm]', 'rmse'),
+        Column('time', '.2f', 'time_ratio'),
+    ]
+    title = (
+        f'{frames_title(frames)}; worth: what having it adds to the IoU; RMSE of the height; '
+        'time: over that as given, median of the frames'
+    )
+    changes = {one.title: one.changes for one in departures}
+    tables = {'departures': Table(columns, rows, title)}
+    return make_report(tables, [given, *switched], config, changes=changes)
+
+
+def _departure_row(
+    title: str, switch: str | None, worth: float | None, score: MethodScore, given: MethodScore
+) -> list[Cell]:
+    pairs = zip(score.scans, given.scans, strict=True)
+    ratio = statistics.median(one.seconds / other.seconds for one, other in pairs)
+    worst = score.worst_sequence
+    cells: list[Cell] = [score.of(worst).iou, worst, score.height().rmse, ratio]
+    return [title, switch, score.iou, worth, *cells]
+
+
+def frames_title(frames: Sequence[Frame]) -> str:
+    """One line on labelled frames."""
+    n = len({frame.sequence for frame in frames})
+    return (
+        f'{len(frames)} labelled frame{"s" * (len(frames) > 1)} of {n} sequence{"s" * (n > 1)}; '
+        'IoU in the GroundGrid convention'
+    )

@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
+import re
 import statistics
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import Frame, list_frames
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.conventions import GROUNDGRID
-from gp_ground_seg.evaluation.height_error import height_error
-from gp_ground_seg.frame import OUTSIDE, FloatArray, Label, PolarGrid
-from gp_ground_seg.gp.objective import N_SCALARS
+from gp_ground_seg.evaluation.environment import changed_parameters
+from gp_ground_seg.evaluation.evaluate import ALL, Progress, load_kitti
+from gp_ground_seg.evaluation.metrics import height_error
+from gp_ground_seg.evaluation.table import Column, Table
+from gp_ground_seg.experiments.variants import (
+    Report,
+)
+from gp_ground_seg.frame import OUTSIDE, BoolArray, FloatArray, PolarGrid
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.result import FitReport, Segmentation
+from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
 
 MODELS = {'Z-L': 'latent', 'Z': 'line_gradient'}
 """The paper's method and the one it is compared with, as values of ``length_scale.model``."""
-
+VARIANCES = ('sigma_f^2', 'sigma_n^2', 'sigma_f_bar^2', 'sigma_l_bar^2', 'sigma_n_bar^2')
+"""Squares of the first entries of theta: in m^2; those of f_bar and n_bar without unit."""
 MIN_GROUND_POINTS = 100
-"""Labelled ground points that a segment must have to be chosen by itself."""
+"""Labelled ground points that a segment must have to be chosen by default."""
+_CHOICE = re.compile(r'(?P<sequence>[^/:]+)/(?P<index>[^/:]+)(:(?P<segments>\d+(,\d+)*))?')
 
 
 @dataclass(frozen=True)
@@ -37,83 +43,25 @@ class Choice:
     index: str
     segments: tuple[int, ...] = ()
 
+    @classmethod
+    def parse(cls, word: str) -> Choice:
+        """Read ``08/000005`` or ``08/000005:151,152``; ValueError if it is of another form."""
+        match = _CHOICE.fullmatch(word)
+        if match is None:
+            raise ValueError(f'{word!r}: must be as in 08/000005 or 08/000005:151,152')
+        segments = match['segments'].split(',') if match['segments'] else []
+        return cls(match['sequence'], match['index'], tuple(map(int, segments)))
 
-DEFAULT_CHOICES = (Choice('10', '000000', (157, 158)), Choice('03', '000006', (147, 148)))
+
+DEFAULT_CHOICES = ('10/000000:157,158', '03/000006:147,148')
 """An adjacent pair that climbs a verge and a hill, 3 m over 30 m, and one on uneven ground."""
 
 
-@dataclass(frozen=True)
-class MethodColumns:
-    """What one of the two methods did in one segment.
-
-    Attributes
-    ----------
-    n_inliers : int
-        Candidates of the segment that the surface rests on.
-    variances : (5,) float64
-        Learned sigma_f^2, sigma_n^2 [m^2], sigma_f_bar^2, sigma_l_bar^2 [m^2], sigma_n_bar^2.
-    smse_in_sample : float
-        Standardised mean squared error at the inliers.
-    smse_held_out : float
-        The same at the points labelled ground that are not candidates.
-    seconds : float
-        Median time for the whole frame.
-    """
-
-    n_inliers: int
-    variances: FloatArray
-    smse_in_sample: float
-    smse_held_out: float
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Row:
-    """A line of the table.
-
-    Attributes
-    ----------
-    frame : Frame
-        Which frame.
-    segment : int
-        Which of its segments.
-    n_candidates, n_pseudo_inputs : int
-        Ground candidates n_PG and pseudo-inputs n_L of the segment.
-    n_held_out : int
-        Points labelled ground in it that are not candidates.
-    methods : dict of str to MethodColumns
-        By key of `MODELS`.
-    """
-
-    frame: Frame
-    segment: int
-    n_candidates: int
-    n_pseudo_inputs: int
-    n_held_out: int
-    methods: dict[str, MethodColumns]
-
-
-@dataclass(frozen=True)
-class Table1:
-    """The rows, and the fit report of the last frame: backend and threads are in it."""
-
-    rows: tuple[Row, ...]
-    fit: FitReport
-
-
 def find_frame(root: str | Path, choice: Choice) -> Frame:
-    """Labelled frame of a choice.
-
-    Raises
-    ------
-    DataError
-        If it is not there or has no labels.
-    """
+    """Frame of a choice; DataError if it is not there."""
     frames = list_frames(root, choice.sequence)
     for frame in frames:
         if frame.index == choice.index:
-            if frame.labels_path is None:
-                raise DataError(f'{frame.points_path}: has no labels')
             return frame
     raise DataError(
         f'{root}: no frame {choice.index} in sequence {choice.sequence}; '
@@ -126,9 +74,8 @@ def table1(
     choices: Sequence[Choice],
     config: Config,
     n_repeats: int,
-    clock: Callable[[], float] = time.perf_counter,
-    progress: Callable[[Sequence[Frame]], Iterable[Frame]] = iter,
-) -> Table1:
+    progress: Progress = iter,
+) -> Report:
     """Measure the table.
 
     Parameters
@@ -141,8 +88,6 @@ def table1(
         Parameters of both methods but for ``length_scale.model``.
     n_repeats : int
         Timed runs of each method on each frame, alternately, after one that does not count.
-    clock : callable
-        Source of seconds.
     progress : callable
         Wraps the frames to show how far it is, as tqdm does.
 
@@ -154,110 +99,116 @@ def table1(
     DataError
         If a frame is missing or unlabelled.
     """
-    if config.length_scale.model != MODELS['Z-L']:
-        raise ConfigError(
-            f'length_scale.model = {config.length_scale.model}: the table compares latent with '
-            'line_gradient, leave it out'
-        )
-    if config.learning.mode == 'fixed':
-        raise ConfigError('learning.mode = fixed: the table is of what is learned, leave it out')
+    for name, refused in (('length_scale.model', config.length_scale.model != MODELS['Z-L']),
+                          ('learning.mode', config.learning.mode == 'fixed')):  # fmt: skip
+        if refused:
+            raise ConfigError(
+                f'{name} = {config[name]}: the table compares what is learned with latent and '
+                'line_gradient, leave it out'
+            )
     last = config.grid.n_segments - 1
-    for choice in choices:
-        for segment in choice.segments:
-            if not 0 <= segment <= last:
-                raise ConfigError(f'segment {segment}: must be in [0, {last}]')
+    for segment in (segment for choice in choices for segment in choice.segments):
+        if not 0 <= segment <= last:
+            raise ConfigError(f'segment {segment}: must be in [0, {last}]')
     frames = [find_frame(root, choice) for choice in choices]
-    rows: list[Row] = []
+    rows: list[dict[str, Any]] = []
     with ExitStack() as stack:
-        segmenters = {}
-        for name, model in MODELS.items():
-            own = GroundSegmenter(config.replace(**{'length_scale.model': model}), clock)
-            segmenters[name] = stack.enter_context(closing(own))
+        segmenters = {
+            name: stack.enter_context(
+                closing(GroundSegmenter(config.replace(**{'length_scale.model': model})))
+            )
+            for name, model in MODELS.items()
+        }
         for frame, choice in zip(progress(frames), choices, strict=True):
-            found, fit = _rows(frame, choice, segmenters, n_repeats)
+            found, result = _rows(frame, choice, segmenters, n_repeats)
             rows += found
-    return Table1(tuple(rows), fit)
+    times = f'times: median of {n_repeats} runs on the whole frame, reading left out'
+    names = ['segment', 'n_PG', 'n_L', *VARIANCES]
+    columns = [Column(name, _format(name)) for name in names]
+    title = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
+    variances = Table(columns, [[row[name] for name in names] for row in rows], title)
+    names = ['segment', *(n for n in rows[0] if n not in names and not n.startswith('inliers'))]
+    columns = [Column(name, _format(name)) for name in names]
+    title = 'SMSE in sample (at the inliers) and held out (labelled ground); seconds per frame'
+    errors = Table(columns, [[row[name] for name in names] for row in rows], title, [times])
+    full = Table([Column(name) for name in rows[0]], [list(row.values()) for row in rows])
+    facts = {'config_changes': changed_parameters(config)}
+    tables = {'variances': variances, 'errors': errors}
+    return Report(tables, full, result.fit, facts, 'by_segment')
+
+
+def _format(name: str) -> str:
+    if name == 'segment':
+        return ''
+    if name.startswith('n_') or name == 'held out':
+        return 'd'
+    return '.4f' if name.startswith('t ') else '#.4g'
 
 
 def _rows(
     frame: Frame, choice: Choice, segmenters: dict[str, GroundSegmenter], n_repeats: int
-) -> tuple[list[Row], FitReport]:
-    points = read_points(frame.points_path)
-    assert frame.labels_path is not None, 'find_frame gives only labelled ones'
-    semantic = read_labels(frame.labels_path, len(points))
-    z = points[:, 2].astype(np.float64)
-    is_ground = GROUNDGRID.truth(semantic, z) == Label.GROUND
+) -> tuple[list[dict[str, Any]], Segmentation]:
+    """Rows of a frame, by title of the column, and a result of the latent model."""
+    scan = load_kitti(frame)
+    z = scan.points[:, 2].astype(np.float64)
+    is_ground = scan.parts[ALL]
     seconds: dict[str, list[float]] = {name: [] for name in segmenters}
     results: dict[str, Segmentation] = {}
     for k in range(n_repeats + 1):
         for name, segmenter in segmenters.items():
             segmenter.reset()
-            results[name] = segmenter.segment(points)
-            if k > 0:  # compiling and first allocations are not its speed
+            results[name] = segmenter.segment(scan.points)
+            if k > 0:  # compilation and first allocations are not its speed
                 seconds[name].append(results[name].timings['total'])
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
     common = results['Z-L']
-    level_z = common.pose.level(points[:, :3])[:, 2].astype(np.float64)
+    level_z = common.pose.level(scan.points[:, :3])[:, 2].astype(np.float64)
     held_out = is_ground & (common.grid.bin != OUTSIDE) & ~is_candidate(common, level_z)
     rows = []
     for segment in choice.segments or _most_varied_pair(frame, common.grid, z, is_ground):
         own = held_out & (common.grid.segment == segment)
+        variances = np.exp(2.0 * common.theta[segment, : len(VARIANCES)])
+        in_sample = {name: _in_sample(result, segment) for name, result in results.items()}
         rows.append(
-            Row(
-                frame,
-                segment,
-                int(np.diff(common.candidates.offsets)[segment]),
-                int(np.diff(common.pseudo.offsets)[segment]),
-                int(own.sum()),
-                {
-                    name: _columns(result, segment, z, own, statistics.median(seconds[name]))
+            {
+                'segment': f'{frame.sequence}/{frame.index}:{segment}',
+                'n_PG': int(np.diff(common.candidates.offsets)[segment]),
+                'n_L': int(np.diff(common.pseudo.offsets)[segment]),
+                **dict(zip(VARIANCES, variances.tolist(), strict=True)),
+                **{f'inliers {name}': n for name, (n, _) in in_sample.items()},
+                **{f'in sample {name}': smse for name, (_, smse) in in_sample.items()},
+                'held out': int(own.sum()),
+                **{
+                    f'held out {name}': height_error(z[own], result.ground_z[own]).smse
                     for name, result in results.items()
                 },
-            )
+                **{f't {name} [s]': statistics.median(own) for name, own in seconds.items()},
+            }
         )
-    return rows, common.fit
+    return rows, common
 
 
-def is_candidate(result: Segmentation, z: FloatArray) -> npt.NDArray[np.bool_]:
-    """Tell which points are ground candidates, (N,) bool; `z` (N,) in the level frame [m]."""
+def is_candidate(result: Segmentation, z: FloatArray) -> BoolArray:
+    """Return which points are ground candidates, (N,) bool; `z` (N,) in the level frame [m]."""
     grid, candidates = result.grid, result.candidates
     n_bins = len(grid.edges) - 1
     lowest = np.full((2, grid.n_segments * n_bins), np.nan)
     lowest[:, candidates.segment * n_bins + candidates.bin] = candidates.r, candidates.z
     cell = np.maximum(grid.cell, 0)
-    found: npt.NDArray[np.bool_] = (
-        grid.inside & (grid.r == lowest[0, cell]) & (z == lowest[1, cell])
-    )
+    found: BoolArray = grid.inside & (grid.r == lowest[0, cell]) & (z == lowest[1, cell])
     return found
 
 
-def _columns(
-    result: Segmentation,
-    segment: int,
-    z: FloatArray,
-    held_out: npt.NDArray[np.bool_],
-    seconds: float,
-) -> MethodColumns:
-    candidates = result.candidates
-    own = result.surface.inlier & (candidates.segment == segment)
-    at_inliers = PolarGrid(
-        (candidates.segment[own] * result.grid.n_bins + candidates.bin[own]).astype(np.int32),
-        candidates.r[own],
-        result.grid.edges,
-        result.grid.n_segments,
-    )
-    estimate, _ = result.surface.at(at_inliers)
-    return MethodColumns(
-        int(own.sum()),
-        np.exp(2.0 * result.theta[segment, :N_SCALARS]),
-        height_error(candidates.z[own], estimate).smse,
-        height_error(z[held_out], result.ground_z[held_out]).smse,
-        seconds,
-    )
+def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:
+    """Inliers of a segment, and the standardised mean squared error of the surface there."""
+    candidates, surface = result.candidates, result.surface
+    own = surface.inlier & (candidates.segment == segment)
+    estimate = np.interp(candidates.r[own], surface.knots, surface.mean[segment])
+    return int(own.sum()), height_error(candidates.z[own], estimate).smse
 
 
 def _most_varied_pair(
-    frame: Frame, grid: PolarGrid, z: FloatArray, is_ground: npt.NDArray[np.bool_]
+    frame: Frame, grid: PolarGrid, z: FloatArray, is_ground: BoolArray
 ) -> tuple[int, int]:
     """Adjacent segments whose labelled ground, in the lesser of the two, varies most in height."""
     seen = is_ground & (grid.bin != OUTSIDE)

@@ -1,4 +1,4 @@
-"""Covariance functions."""
+"""Covariance functions, of many segments at once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from gp_ground_seg.frame import FloatArray
 
 
 def paciorek(
-    r_a: FloatArray, l_a: FloatArray, r_b: FloatArray, l_b: FloatArray, sigma_f: float
+    r_a: FloatArray, l_a: FloatArray, r_b: FloatArray, l_b: FloatArray, sigma_f: FloatArray
 ) -> FloatArray:
     """Non-stationary covariance of Paciorek and Schervish in one dimension (paper, eq. 8).
 
@@ -16,26 +16,33 @@ def paciorek(
 
     Parameters
     ----------
-    r_a, l_a : (A,) float64
+    r_a, l_a : (S, A) float64
         Ranges and length-scales [m].
-    r_b, l_b : (B,) float64
+    r_b, l_b : (S, B) float64
         Ranges and length-scales [m].
-    sigma_f : float
-        Prior standard deviation [m].
+    sigma_f : (S,) float64
+        Prior standard deviation of each segment [m].
 
     Returns
     -------
-    (A, B) float64
+    (S, A, B) float64
         Covariances [m^2].
     """
-    spread = l_a[:, None] ** 2 + l_b[None, :] ** 2
-    ratio = 2.0 * l_a[:, None] * l_b[None, :] / spread
-    distance = r_a[:, None] - r_b[None, :]
-    return sigma_f**2 * np.sqrt(ratio) * np.exp(-(distance**2) / spread)
+    inverse = 1.0 / (l_a[:, :, None] ** 2 + l_b[:, None, :] ** 2)
+    exponent: FloatArray = r_a[:, :, None] - r_b[:, None, :]
+    exponent *= exponent
+    exponent *= inverse
+    np.negative(exponent, out=exponent)
+    result: FloatArray = np.exp(exponent, out=exponent)
+    inverse *= l_a[:, :, None]
+    inverse *= 2.0 * l_b[:, None, :]
+    result *= np.sqrt(inverse, out=inverse)
+    result *= sigma_f[:, None, None] ** 2
+    return result
 
 
 def squared_exponential(
-    r_a: FloatArray, r_b: FloatArray, sigma_f: float, length_scale: float
+    r_a: FloatArray, r_b: FloatArray, sigma_f: FloatArray, length_scale: FloatArray
 ) -> FloatArray:
     """Stationary covariance of the latent process (paper, eq. 12).
 
@@ -43,20 +50,23 @@ def squared_exponential(
 
     Parameters
     ----------
-    r_a : (A,) float64
+    r_a : (S, A) float64
         Ranges [m].
-    r_b : (B,) float64
+    r_b : (S, B) float64
         Ranges [m].
-    sigma_f : float
+    sigma_f : (S,) float64
         Prior standard deviation, in the unit of the process.
-    length_scale : float
+    length_scale : (S,) float64
         Length-scale [m].
 
     Returns
     -------
-    (A, B) float64
+    (S, A, B) float64
         Covariances.
     """
-    distance = r_a[:, None] - r_b[None, :]
-    value: FloatArray = sigma_f**2 * np.exp(-(distance**2) / (2.0 * length_scale**2))
-    return value
+    result: FloatArray = r_a[:, :, None] - r_b[:, None, :]
+    result *= result
+    result *= -0.5 / length_scale[:, None, None] ** 2
+    np.exp(result, out=result)
+    result *= sigma_f[:, None, None] ** 2
+    return result

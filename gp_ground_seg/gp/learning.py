@@ -1,36 +1,117 @@
-"""Learning of the hyper-parameters by maximum a posteriori."""
+"""Stage 5: hyper-parameters by maximum a posteriori over the whole frame (paper, section III-E).
+
+Theta is a vector of logarithms: sigma_f, sigma_n, sigma_f_bar, sigma_l_bar, sigma_n_bar, then the
+length-scale of each surface class. A frame has one row of it per segment; learned over the whole
+frame, the rows are equal.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import minimize
 
-from gp_ground_seg.frame import FloatArray
-from gp_ground_seg.gp.theta import ThetaSpace
+from gp_ground_seg.frame import BoolArray, FloatArray, Frame, GroundSurface, Inliers
+from gp_ground_seg.gp.latent import given_log_length_scales
+from gp_ground_seg.gp.likelihood import N_SCALARS
+from gp_ground_seg.gp.linalg import single_threaded_blas
+from gp_ground_seg.parameters.config import Config
 
+SCALAR_NAMES = ('sigma_f', 'sigma_n', 'sigma_f_bar', 'sigma_l_bar', 'sigma_n_bar')
 Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 
 _AT_BOUND = 1e-6
 
 
-@dataclass(frozen=True)
-class Learned:
+def theta_names(size: int) -> list[str]:
+    """Names of the entries of a theta of the given size."""
+    return [*SCALAR_NAMES, *(f'length_scale_bar_{k}' for k in range(size - N_SCALARS))]
+
+
+class ThetaSpace(NamedTuple):
+    """Bounds and priors of the hyper-parameters, all in log space.
+
+    Attributes
+    ----------
+    centre : (T,) float64
+        Values given by the configuration and the first guess; centres of the priors.
+    lower, upper : (T,) float64
+        Bounds.
+    free : (T,) bool
+        Entries that are learned.
+    prior_std : float
+        Standard deviation of the priors.
+    """
+
+    centre: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    free: BoolArray
+    prior_std: float
+
+
+def theta_centre(config: Config, first_guess: FloatArray) -> FloatArray:
+    """Values given by the configuration and the first guess, (5 + K,), in log space.
+
+    Parameters
+    ----------
+    config : Config
+        Values, and bounds of the length-scale.
+    first_guess : (K,) float64
+        First guess of the surface classes' log length-scales [log m].
+    """
+    observation, latent, limits = config.observation, config.latent, config.length_scale
+    values = (
+        observation.sigma_f,
+        observation.sigma_n,
+        latent.sigma_f_bar,
+        latent.sigma_l_bar,
+        latent.sigma_n_bar,
+    )
+    guessed = np.clip(first_guess, math.log(limits.min), math.log(limits.max))
+    return np.array([*map(math.log, values), *guessed])
+
+
+def theta_space(config: Config, first_guess: FloatArray) -> ThetaSpace:
+    """Space of theta for a frame; parameters are those of `theta_centre`."""
+    learning = config.learning
+    centre = theta_centre(config, first_guess)
+    width = np.log(learning.bound_factor)
+    lower, upper = centre - width, centre + width
+    lower[N_SCALARS:] = np.log(config.length_scale.min)
+    upper[N_SCALARS:] = np.log(config.length_scale.max)
+    free = np.ones(len(centre), dtype=np.bool_)
+    if config.length_scale.model != 'latent' or learning.fixed == 'length_scales':
+        free[2:] = False
+    elif learning.fixed == 'latent':
+        free[2:N_SCALARS] = False
+    elif learning.fixed == 'sigma_f_bar':
+        free[2] = False
+    return ThetaSpace(centre, lower, upper, free, learning.prior_std)
+
+
+def given_theta(frame: Frame, config: Config) -> FloatArray:
+    """Theta before anything is learned, the same in every segment, (M, 5 + K)."""
+    centre = theta_centre(config, frame.pseudo.first_guess)
+    return np.tile(centre, (len(frame.candidates.offsets) - 1, 1))
+
+
+class Learned(NamedTuple):
     """Outcome of one learning.
 
     Attributes
     ----------
     theta : (T,) float64
-        Best hyper-parameters met, log space.
+        Best hyper-parameters evaluated, log space.
     objective : float
         Objective there, with the priors if any.
     n_evaluations : int
         Evaluations of objective and gradient.
     status : str
-        ``converged``, ``budget`` or ``failed`` (no finite objective met).
+        ``converged``, ``budget`` or ``failed`` (no finite objective found).
     at_bound : (T,) bool
         Free entries that ended at a bound.
     """
@@ -39,14 +120,122 @@ class Learned:
     objective: float
     n_evaluations: int
     status: str
-    at_bound: npt.NDArray[np.bool_]
+    at_bound: BoolArray
+
+
+class Model(Protocol):
+    """The part of a backend that learning needs, see `gp_ground_seg.backend.Backend`."""
+
+    def estimate_surface(
+        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
+    ) -> tuple[GroundSurface, FloatArray]:
+        """Inliers under `theta`."""
+
+    def log_likelihood(
+        self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
+    ) -> tuple[float, FloatArray]:
+        """Log marginal likelihood and its gradient."""
+
+
+@single_threaded_blas()
+def learn_frame(
+    frame: Frame,
+    start: FloatArray,
+    config: Config,
+    model: Model,
+    out_of_time: Callable[[], bool],
+) -> tuple[FloatArray, list[Learned]]:
+    """Learn theta on the inliers that grow under it.
+
+    Parameters
+    ----------
+    frame : Frame
+        Candidates and pseudo-inputs.
+    start : (M, 5 + K) float64
+        Where to begin.
+    config : Config
+        Scope, objective, budget, priors.
+    model : Model
+        Backend.
+    out_of_time : callable
+        See `maximise`.
+
+    Returns
+    -------
+    theta : (M, 5 + K) float64
+        Hyper-parameters of each segment.
+    learned : list of Learned
+        One outcome for the frame, or one for each segment.
+    """
+    learning = config.learning
+    by_frame = learning.scope == 'frame'
+    step = learning.segment_step if by_frame else 1
+    no_knots = frame.knots[:0]
+    surface, _ = model.estimate_surface(frame._replace(knots=no_knots), start, config, step)
+    inliers = take_inliers(frame._replace(knots=no_knots), surface.inlier, config)
+    is_map = learning.objective == 'map'
+    space = theta_space(config, frame.pseudo.first_guess)
+
+    def learn(begin: FloatArray, own: Inliers) -> Learned:
+        def objective(theta: FloatArray) -> tuple[float, FloatArray]:
+            return model.log_likelihood(theta, own, config.observation.slope_std, not is_map)
+
+        return maximise(
+            objective,
+            space,
+            begin,
+            len(own.r),
+            use_priors=is_map,
+            max_evaluations=learning.max_evaluations,
+            out_of_time=out_of_time,
+        )
+
+    if by_frame:
+        learned = [learn(start[0], inliers)]
+        return np.tile(learned[0].theta, (len(start), 1)), learned
+    learned = [learn(begin, _one_segment(inliers, m)) for m, begin in enumerate(start)]
+    return np.array([one.theta for one in learned]), learned
+
+
+def take_inliers(frame: Frame, inlier: BoolArray, config: Config) -> Inliers:
+    """Candidates of the mask `inlier` (C,), with the pseudo-inputs of their segments."""
+    candidates, pseudo = frame.candidates, frame.pseudo
+    taken = np.concatenate([[0], np.cumsum(inlier)])
+    if config.length_scale.model == 'latent':
+        u, bar_offsets = np.zeros(int(taken[-1])), pseudo.offsets
+    else:
+        u = given_log_length_scales(frame, config.length_scale)[0][inlier]
+        bar_offsets = np.zeros_like(candidates.offsets)
+    return Inliers(
+        offsets=taken[candidates.offsets],
+        r=candidates.r[inlier],
+        z=candidates.z[inlier] - frame.prior_mean,
+        log_length_scale=u,
+        bar_offsets=bar_offsets,
+        r_bar=pseudo.r_bar,
+        surface_class=pseudo.surface_class,
+    )
+
+
+def _one_segment(inliers: Inliers, m: int) -> Inliers:
+    own = slice(inliers.offsets[m], inliers.offsets[m + 1])
+    bar = slice(inliers.bar_offsets[m], inliers.bar_offsets[m + 1])
+    return Inliers(
+        np.array([0, own.stop - own.start]),
+        inliers.r[own],
+        inliers.z[own],
+        inliers.log_length_scale[own],
+        np.array([0, bar.stop - bar.start]),
+        inliers.r_bar[bar],
+        inliers.surface_class[bar],
+    )
 
 
 class _BudgetSpentError(Exception):
     pass
 
 
-def learn(
+def maximise(
     objective: Objective,
     space: ThetaSpace,
     start: FloatArray,
@@ -77,7 +266,7 @@ def learn(
     max_evaluations : int
         Budget; the best theta so far is returned when it is spent.
     out_of_time : callable
-        Asked before each evaluation after the first; True ends the learning.
+        Called before each evaluation after the first; True ends the learning.
     """
     free, scale = space.free, space.prior_std
     begin = np.clip(start, space.lower, space.upper)
@@ -99,7 +288,7 @@ def learn(
         if value > best_value:
             best_theta, best_value = theta, value
         if not np.isfinite(value):
-            # A step into the void: large and level, so that the line search turns back.
+            # Large and level, so that the line search turns back.
             return 1e10, np.zeros(len(x))
         return -value / n_data, -gradient[free] * scale / n_data
 

@@ -1,20 +1,33 @@
-"""The declared parameters in other forms: ROS parameter file, README table."""
+"""Parameters in other forms: ROS parameter files, tables; and what is wrong with a file."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 
 import yaml
 
-from gp_ground_seg.errors import DataError
+from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue
-from gp_ground_seg.parameters.yaml_io import ROS_NODE_KEY, ROS_PARAMETERS_KEY
+from gp_ground_seg.parameters.presets import PRESETS
+from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue, check_typed
+from gp_ground_seg.parameters.yaml_io import ROS_NODE_KEY, ROS_PARAMETERS_KEY, read_parameters
 
+README_PATH = 'README.md'
 README_BEGIN = '<!-- parameters:begin -->'
 README_END = '<!-- parameters:end -->'
 
+PAGE_PATH = 'docs/parameters.md'
+
+_PAGE_HEAD = """\
+# All parameters
+
+Written by `gp-ground-seg config generate` from gp_ground_seg/parameters/config.py. The basic
+ones, that are set for a robot, are in [README.md](../README.md); the others rarely need another
+value. `gp-ground-seg config dump` prints all with their values and ranges as a parameter file.
+
+"""
 _WIDTH = 99
 _INDENT = '  '
 _NBSP = '\xa0'  # textwrap does not break here
@@ -23,16 +36,8 @@ _NBSP = '\xa0'  # textwrap does not break here
 def to_yaml(config: Config, purpose: str = '', reasons: Mapping[str, str] | None = None) -> str:
     """Write a ROS parameter file with a comment on each parameter.
 
-    ``Config.from_yaml`` of it gives `config` again, and so does a ROS node.
-
-    Parameters
-    ----------
-    config : Config
-        Values to write.
-    purpose : str
-        What the file is for, written at its top.
-    reasons : mapping of str to str, optional
-        Why a parameter has its value, by name, written above it.
+    ``Config.from_yaml`` of it gives `config` again, and so does a ROS node. `purpose`, what the
+    file is for, is written at its top, and the reason of a value, by name, above it.
     """
     reasons = reasons or {}
     lines = [
@@ -79,23 +84,17 @@ def _comment(text: str, depth: int) -> list[str]:
     return [line.replace(_NBSP, ' ') for line in lines]
 
 
-def to_markdown_table() -> str:
-    """Write all parameters as a Markdown table, one row each, in order of declaration."""
+def to_markdown_table(*, basic_only: bool = False) -> str:
+    """Write the parameters as a Markdown table, one row each, in order of declaration."""
     rows = [
         ('Parameter', 'Default', 'Accepted', 'Unit', 'Symbol', 'Meaning'),
         ('---', '---', '---', '---', '---', '---'),
     ]
     for spec in parameter_specs():
-        rows.append(
-            (
-                f'`{spec.name}`',
-                f'`{yaml_scalar(spec.default)}`',
-                _accepted(spec),
-                spec.unit,
-                f'`{spec.symbol}`' if spec.symbol else '',
-                spec.description,
-            )
-        )
+        if spec.basic or not basic_only:
+            name, default = f'`{spec.name}`', f'`{yaml_scalar(spec.default)}`'
+            symbol = f'`{spec.symbol}`' if spec.symbol else ''
+            rows.append((name, default, _accepted(spec), spec.unit, symbol, spec.description))
     lines = ['| ' + ' | '.join(cell.replace('|', r'\|') for cell in row) + ' |' for row in rows]
     return '\n'.join(lines) + '\n'
 
@@ -116,8 +115,13 @@ def _accepted(spec: ParameterSpec) -> str:
     return f'{auto}{spec.minimum:.10g} to {spec.maximum:.10g}'
 
 
-def replace_readme_table(readme: str) -> str:
-    """Put the current parameter table between the markers of a README.
+def generated_files(readme: str) -> dict[str, str]:
+    """Text of every generated file of a checkout, by its path from the root.
+
+    Parameters
+    ----------
+    readme : str
+        Text of README.md; the table of the basic parameters goes between its markers.
 
     Raises
     ------
@@ -132,4 +136,46 @@ def replace_readme_table(readme: str) -> str:
             'the parameter table goes between them'
         )
     head = readme[: begin + len(README_BEGIN)]
-    return f'{head}\n\n{to_markdown_table()}\n{readme[end:]}'
+    files = {
+        f'config/{preset.name}.yaml': to_yaml(preset.config, preset.title, preset.reasons)
+        for preset in PRESETS.values()
+    }
+    files[README_PATH] = f'{head}\n\n{to_markdown_table(basic_only=True)}\n{readme[end:]}'
+    files[PAGE_PATH] = _PAGE_HEAD + to_markdown_table()
+    return files
+
+
+def file_problems(path: str | Path) -> list[str]:
+    """Everything wrong with a parameter file, one line each; none if it can be used.
+
+    A file in the form of ROS is held to the strict types of ROS parameters. Rules between
+    parameters are checked where each value by itself is accepted.
+    """
+    try:
+        file = read_parameters(path)
+    except ConfigError as error:
+        return [str(error)]
+    problems = []
+    for name, value in file.values.items():
+        try:
+            spec = find_spec(name)
+            check_typed(spec, value) if file.is_ros else spec.check(value)
+        except ConfigError as error:
+            problems.append(str(error))
+    if not problems:
+        try:
+            Config().replace(**file.values)
+        except ConfigError as error:
+            problems.append(str(error))
+    return problems
+
+
+def differences(
+    first: Config, second: Config
+) -> list[tuple[ParameterSpec, ParameterValue, ParameterValue]]:
+    """Parameters that differ, with both values, in order of declaration."""
+    return [
+        (spec, first[spec.name], second[spec.name])
+        for spec in parameter_specs()
+        if first[spec.name] != second[spec.name]
+    ]

@@ -1,22 +1,12 @@
-"""Parameters by sensor, each value with its reason; ``config/`` is generated from here."""
+"""Named sets of parameters, with reasons; the files in ``config/`` are generated from here."""
 
 from __future__ import annotations
 
-import difflib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.schema import ParameterValue
-
-
-@dataclass(frozen=True)
-class Override:
-    """A value that differs from the default, and why."""
-
-    name: str
-    value: ParameterValue
-    reason: str
+from gp_ground_seg.parameters.schema import ParameterValue, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -29,18 +19,18 @@ class Preset:
         Name on the command line, and of the file in ``config/``.
     purpose : str
         What it is for.
-    overrides : tuple of Override
-        Where it departs from the defaults.
+    overrides : dict of str to (value, str)
+        Values that differ from the defaults, each with the reason, by name.
     """
 
     name: str
     purpose: str
-    overrides: tuple[Override, ...] = ()
+    overrides: dict[str, tuple[ParameterValue, str]] = field(default_factory=dict)
 
     @property
     def config(self) -> Config:
         """The defaults with the overrides."""
-        return Config().replace(**{one.name: one.value for one in self.overrides})
+        return Config().replace(**{name: value for name, (value, _) in self.overrides.items()})
 
     @property
     def title(self) -> str:
@@ -50,98 +40,84 @@ class Preset:
     @property
     def reasons(self) -> dict[str, str]:
         """Reason of each override by the name of its parameter."""
-        return {one.name: one.reason for one in self.overrides}
+        return {name: reason for name, (_, reason) in self.overrides.items()}
 
 
 _FIRST_RING = (
     'the lowest beam meets level ground at {} m, and {} downhill {} m below the foot of the '
-    'sensor: near the default, and ground beyond the tolerance is not believed'
+    'sensor: near the default, and no seed lies beyond the tolerance'
 )
 _PRESETS = (
     Preset('default', 'Chosen on labelled KITTI frames: HDL-64E on the roof of a car.'),
     Preset(
         'paper',
         'What arXiv 2112.05847 prints, and none of our departures from it '
-        '(docs/deviations.md); what it leaves open is as in the defaults.',
-        (
-            Override('sensor.height', 1.73, "of KITTI's sensor, the paper's data"),
-            Override('sensor.roll', 0.0, 'nothing is levelled'),
-            Override('sensor.pitch', 0.0, 'nothing is levelled'),
-            Override('grid.n_segments', 180, 'M in section IV'),
-            Override('grid.n_bins', 120, 'N in section IV'),
-            Override('grid.bin_growth', 1.0, 'bins of equal width'),
-            Override('lines.slope_tolerance', 0.02, 'zeta_m in section IV'),
-            Override('lines.offset_tolerance', 0.15, 'zeta_b in section IV'),
-            Override('length_scale.model', 'latent', 'section III-B'),
-            Override('observation.slope_std', 0.0, 'the equations have a level mean'),
-            Override('surface.n_neighbours', 0, 'each segment has a surface of its own'),
-            Override('growth.max_standardised_residual', 2.0, 'a gate alike above and below'),
-            Override('growth.max_standardised_depth', 2.0, 'a gate alike above and below'),
-            Override('growth.max_line_slope', 0.0, 'the gate alone decides'),
-            Override('growth.min_bend_extent', 1000.0, 'the gate alone decides'),
-            Override('faces.min_height', 100.0, 'no faces'),
-            Override('faces.max_foot_distance', 0.0, 'no faces'),
-            Override('label.ground_tolerance', 0.2, 'zeta_g, not printed: one for all'),
-            Override('label.roughness_gain', 0.0, 'one zeta_g for all (Algorithm 2)'),
-            Override('label.below_tolerance', 0.2, 'one zeta_g for all (Algorithm 2)'),
-            Override('label.obstacle_tolerance', 0.2, 'one zeta_g for all (Algorithm 2)'),
-            Override('label.obstacle_roughness_gain', 0.0, 'one zeta_g for all (Algorithm 2)'),
-            Override('learning.objective', 'paper', 'section III-E as printed'),
-            Override('learning.scope', 'frame', 'one theta for the whole frame, section III-E'),
-            Override('learning.segment_step', 1, 'every segment speaks, section III-E'),
-        ),
+        '(docs/algorithm.md); what it leaves open is as in the defaults.',
+        {
+            'sensor.height': (1.73, "of KITTI's sensor, the paper's data"),
+            'sensor.roll': (0.0, 'nothing is levelled'),
+            'sensor.pitch': (0.0, 'nothing is levelled'),
+            'grid.n_segments': (180, 'M in section IV'),
+            'grid.n_bins': (120, 'N in section IV'),
+            'grid.bin_growth': (1.0, 'bins of equal width'),
+            'lines.slope_tolerance': (0.02, 'zeta_m in section IV'),
+            'lines.offset_tolerance': (0.15, 'zeta_b in section IV'),
+            'length_scale.model': ('latent', 'section III-B'),
+            'observation.slope_std': (0.0, 'the equations have a level mean'),
+            'surface.n_neighbours': (0, 'each segment has a surface of its own'),
+            'growth.max_standardised_residual': (2.0, 'a gate alike above and below'),
+            'growth.max_standardised_depth': (2.0, 'a gate alike above and below'),
+            'growth.max_line_slope': (0.0, 'the gate alone decides'),
+            'growth.min_bend_extent': (1000.0, 'the gate alone decides'),
+            'faces.min_height': (100.0, 'no faces'),
+            'faces.max_foot_distance': (0.0, 'no faces'),
+            'label.ground_tolerance': (0.2, 'zeta_g, not printed: one for all'),
+            'label.roughness_gain': (0.0, 'one zeta_g for all (Algorithm 2)'),
+            'label.below_tolerance': (0.2, 'one zeta_g for all (Algorithm 2)'),
+            'label.obstacle_tolerance': (0.2, 'one zeta_g for all (Algorithm 2)'),
+            'label.obstacle_roughness_gain': (0.0, 'one zeta_g for all (Algorithm 2)'),
+            'learning.objective': ('paper', 'section III-E as printed'),
+            'learning.scope': ('frame', 'one theta for the whole frame, section III-E'),
+            'learning.segment_step': (1, 'theta is learned from every segment, section III-E'),
+        },
     ),
     Preset('hdl64', 'Velodyne HDL-64E on the roof of a car; the defaults are for this sensor.'),
     Preset(
         'hdl32',
         'Velodyne HDL-32E on the roof of a car.',
-        (
-            Override('grid.r_max', 100.0, "the maker's range"),
-            Override(
-                'growth.seed_height_tolerance', 0.6, _FIRST_RING.format('3.1', '10 %', '0.38')
-            ),
-        ),
+        {
+            'grid.r_max': (100.0, "the maker's range"),
+            'growth.seed_height_tolerance': (0.6, _FIRST_RING.format('3.1', '10 %', '0.38')),
+        },
     ),
     Preset(
         'vlp16',
         'Velodyne VLP-16 on a field robot.',
-        (
-            Override(
-                'grid.n_segments',
-                120,
-                '16 rings leave few points in a segment: 15 firings of each',
-            ),
-            Override(
-                'grid.n_bins', 50, 'level ground has 8 rings, at 3 m to 46 m: finer bins are empty'
-            ),
-            Override('lines.max_gap', 6.0, 'beams 2 degrees apart: 2 m from ring to ring at 7 m'),
-            Override('lines.max_gap_growth', 0.6, 'and 6 m at 9 m, 30 m at 15 m, on level ground'),
-        ),
+        {
+            'grid.n_segments': (120, '16 rings leave few points in a segment: 15 firings of each'),
+            'grid.n_bins': (50, 'level ground has 8 rings, at 3 m to 46 m: finer bins are empty'),
+            'lines.max_gap': (6.0, 'beams 2 degrees apart: 2 m from ring to ring at 7 m'),
+            'lines.max_gap_growth': (0.6, 'and 6 m at 9 m, 30 m at 15 m, on level ground'),
+        },
     ),
     Preset(
         'os1_128',
         'Ouster OS1-128 on the roof of a car.',
-        (
-            Override('grid.r_max', 120.0, "the maker's range; 128 beams hit the ground that far"),
-            Override(
-                'growth.seed_height_tolerance', 0.6, _FIRST_RING.format('4.3', '8 %', '0.43')
-            ),
-        ),
+        {
+            'grid.r_max': (120.0, "the maker's range; 128 beams hit the ground that far"),
+            'growth.seed_height_tolerance': (0.6, _FIRST_RING.format('4.3', '8 %', '0.43')),
+        },
     ),
     Preset(
         'mid360',
         'Livox Mid-360 on a small robot.',
-        (
-            Override(
-                'grid.n_segments', 120, '20 000 points a scan, most of them above the ground'
-            ),
-            Override('grid.n_bins', 40, 'as grid.n_segments'),
-            Override('grid.r_max', 60.0, 'beyond it hardly a return meets the ground at 0.5 m'),
-            Override('surface.n_neighbours', 3, 'what one segment lacks, those beside it have'),
-            Override(
-                'growth.seed_height_tolerance', 0.6, _FIRST_RING.format('4.1', '6 %', '0.48')
-            ),
-        ),
+        {
+            'grid.n_segments': (120, '20 000 points a scan, most of them above the ground'),
+            'grid.n_bins': (40, 'as grid.n_segments'),
+            'grid.r_max': (60.0, 'beyond it hardly a return meets the ground at 0.5 m'),
+            'surface.n_neighbours': (3, 'gaps in one segment are filled from those beside it'),
+            'growth.seed_height_tolerance': (0.6, _FIRST_RING.format('4.1', '6 %', '0.48')),
+        },
     ),
 )
 PRESETS = {preset.name: preset for preset in _PRESETS}
@@ -158,7 +134,6 @@ def find_preset(name: str) -> Preset:
     """
     preset = PRESETS.get(name)
     if preset is None:
-        near = difflib.get_close_matches(name, PRESETS, n=1, cutoff=0.5)
-        hint = f'; did you mean {near[0]}?' if near else ''
+        hint = did_you_mean(name, PRESETS)
         raise ConfigError(f'unknown preset {name!r}{hint} (there are {", ".join(PRESETS)})')
     return preset

@@ -1,18 +1,27 @@
-"""What is declared of a parameter, and the check of a value against it."""
+"""Declarations of parameters: their form, the check of values, groups of them as one object."""
 
 from __future__ import annotations
 
+import dataclasses
+import difflib
+import functools
 import numbers
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.parameters.yaml_io import read_parameters
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 ParameterValue = bool | int | float | str
 
 AUTO: Literal['auto'] = 'auto'
-"""What a number may be instead where its declaration says so: found out from the scan."""
+"""What a number may be instead where its declaration says so: estimated from the scan."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +48,8 @@ class ParameterSpec:
         Accepted values of a string; empty for other types, and for names of the user's.
     auto : bool
         Whether a number may also be `AUTO`.
+    basic : bool
+        Whether it is one of the few that are set for a robot; the others are advanced.
     """
 
     name: str
@@ -50,7 +61,8 @@ class ParameterSpec:
     minimum: float | None
     maximum: float | None
     choices: tuple[str, ...]
-    auto: bool = False
+    auto: bool
+    basic: bool
 
     @property
     def accepted(self) -> str:
@@ -98,25 +110,160 @@ class ParameterSpec:
         raise ConfigError(f'{self.name} = {value!r}: must be {self.accepted}')
 
 
-def parameter(
+def check_typed(spec: ParameterSpec, value: object) -> ParameterValue:
+    """Return `value` as `ParameterSpec.check`, but refuse an integer for a number, as ROS does."""
+    if spec.type is float and isinstance(value, int) and not isinstance(value, bool):
+        raise ConfigError(
+            f'{spec.name} = {value}: must be {spec.accepted}, with a decimal point as in {value}.0'
+        )
+    return spec.check(value)
+
+
+def declare(
     default: ParameterValue,
+    accepted: tuple[Any, ...],
     description: str,
-    *,
     unit: str = '',
     symbol: str = '',
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-    auto: bool = False,
+    *,
+    basic: bool,
 ) -> Any:
-    """Declare a parameter as a dataclass field; the words are those of `ParameterSpec`."""
-    metadata = {
-        'description': description,
-        'unit': unit,
-        'symbol': symbol,
-        'minimum': low,
-        'maximum': high,
-        'choices': choices,
-        'auto': auto,
-    }
-    return field(default=default, metadata=metadata)
+    """Declare a parameter as a field of a frozen dataclass.
+
+    Parameters
+    ----------
+    default : bool, int, float or str
+        The default; `AUTO` where a number may be that too.
+    accepted : tuple
+        Lowest and highest number, or the accepted strings; empty for a bool or any name.
+    description, unit, symbol, basic
+        See `ParameterSpec`.
+    """
+    choices = accepted if accepted and isinstance(accepted[0], str) else ()
+    auto = default == AUTO and not choices
+    low, high = accepted if accepted and not choices else (None, None)
+    kind = float if auto else type(default)
+    spec = ParameterSpec(
+        '', kind, default, description, unit, symbol, low, high, choices, auto, basic
+    )
+    return field(default=default, metadata={'spec': spec})
+
+
+basic = functools.partial(declare, basic=True)
+"""Declares a parameter that is set for a robot."""
+advanced = functools.partial(declare, basic=False)
+"""Declares a parameter that is rarely set."""
+
+
+@dataclass(frozen=True)
+class ParameterGroups:
+    """Base of a frozen dataclass whose fields are groups of declared parameters.
+
+    Values are checked when an instance is made; they are found by dotted names.
+    """
+
+    @classmethod
+    @functools.cache
+    def specs(cls) -> dict[str, ParameterSpec]:
+        """Every declared parameter by its dotted name, in order of declaration."""
+        groups: dict[str, Any] = {group.name: group.default for group in dataclasses.fields(cls)}
+        specs = (
+            dataclasses.replace(entry.metadata['spec'], name=f'{name}.{entry.name}')
+            for name, group in groups.items()
+            for entry in dataclasses.fields(group)
+        )
+        return {spec.name: spec for spec in specs}
+
+    @classmethod
+    def find_spec(cls, name: str) -> ParameterSpec:
+        """Return the declaration of one parameter; raises ConfigError with the nearest name."""
+        specs = cls.specs()
+        if name in specs:
+            return specs[name]
+        members = [known for known in specs if known.startswith(f'{name}.')]
+        if members:
+            raise ConfigError(f'{name!r} is a group of parameters: {", ".join(members)}')
+        raise ConfigError(f'unknown parameter {name!r}{did_you_mean(name, specs)}')
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        checked = {name: spec.check(self[name]) for name, spec in self.specs().items()}
+        for group_name, values in _nest(checked).items():
+            # A whole number given for a float becomes one, in a group of our own.
+            group = dataclasses.replace(getattr(self, group_name), **values)
+            object.__setattr__(self, group_name, group)
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        """Value of the parameter with the dotted `name`."""
+        group_name, field_name = self.find_spec(name).name.split('.')
+        value: ParameterValue = getattr(getattr(self, group_name), field_name)
+        return value
+
+    def require_order(self, lower: str, upper: str) -> None:
+        """Raise ConfigError unless the first parameter is below the second."""
+        low, high = self[lower], self[upper]
+        assert isinstance(low, float)
+        assert isinstance(high, float)
+        if not low < high:
+            raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
+
+    def flat(self) -> dict[str, ParameterValue]:
+        """Every value by its dotted name, in order of declaration."""
+        return {name: self[name] for name in self.specs()}
+
+    def nested(self) -> dict[str, dict[str, ParameterValue]]:
+        """Every value as ``{group: {field: value}}``."""
+        return _nest(self.flat())
+
+    def replace(self, **changes: object) -> Self:
+        """Copy with some values changed.
+
+        Parameters
+        ----------
+        **changes
+            Dotted name -> value, as in
+            ``config.replace(**{'label.ground_tolerance': 0.15})``.
+
+        Raises
+        ------
+        ConfigError
+            If a name is unknown or the changed configuration is invalid.
+        """
+        checked = {name: self.find_spec(name).check(value) for name, value in changes.items()}
+        groups: dict[str, Any] = {
+            group_name: dataclasses.replace(getattr(self, group_name), **values)
+            for group_name, values in _nest(checked).items()
+        }
+        return dataclasses.replace(self, **groups)
+
+    @classmethod
+    def from_yaml(cls, path: str | Path, base: Self | None = None) -> Self:
+        """Read a YAML file: ROS form (``/**: ros__parameters:``) or bare groups.
+
+        Parameters not in the file are as in `base`, by default the defaults.
+
+        Raises
+        ------
+        ConfigError
+            If the file cannot be read or parsed, a name is unknown, or a value
+            is not accepted. The message starts with the path.
+        """
+        try:
+            return (base or cls()).replace(**read_parameters(path).values)
+        except ConfigError as error:
+            raise ConfigError(f'{path}: {error}') from error
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a hint at the known name nearest to `name`, empty if none is near."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f'; did you mean {near[0]}?' if near else ''
+
+
+def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterValue]]:
+    """``{'group.field': value}`` as ``{group: {field: value}}``."""
+    result: dict[str, dict[str, ParameterValue]] = {}
+    for name, value in flat.items():
+        group_name, field_name = name.split('.')
+        result.setdefault(group_name, {})[field_name] = value
+    return result

@@ -15,7 +15,7 @@ from gp_ground_seg.errors import ConfigError
 ROS_NODE_KEY = '/**'
 ROS_PARAMETERS_KEY = 'ros__parameters'
 OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
-"""Parameters that every ROS node has, whatever it does."""
+"""Parameters that every ROS node has."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -38,29 +38,16 @@ _Loader.add_implicit_resolver(
 
 
 def load_yaml(text: str) -> object:
-    """Read YAML, keys given twice refused and 1e-3 a number as it is to ROS.
-
-    Raises
-    ------
-    ConfigError
-        If a key is given twice.
-    yaml.YAMLError
-        If it is not YAML.
-    """
+    """Read YAML, with 1e-3 a number as in ROS; a key given twice raises ConfigError."""
     document: object = yaml.load(text, Loader=_Loader)
     return document
 
 
 @dataclass(frozen=True)
 class ParameterFile:
-    """What a parameter file says, unchecked.
+    """Values of a parameter file by dotted names, unchecked.
 
-    Attributes
-    ----------
-    values : dict of str to object
-        Values by their dotted names.
-    is_ros : bool
-        Whether it is in the form of ROS, where types are strict.
+    `is_ros` says whether it is in the form of ROS, where types are strict.
     """
 
     values: dict[str, object]
@@ -114,7 +101,7 @@ def _unwrap_ros(document: object) -> Mapping[str, object]:
     if not isinstance(node, Mapping) or not isinstance(node.get(ROS_PARAMETERS_KEY), Mapping):
         raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
     parameters: Mapping[str, object] = node[ROS_PARAMETERS_KEY]
-    # Names that every ROS node has; they say nothing of the segmentation.
+    # Names that every ROS node has are no parameters of the segmentation.
     return {
         key: value
         for key, value in parameters.items()

@@ -1,28 +1,43 @@
-"""The plane of the ground around the sensor, from the lowest points of one scan."""
+"""Stage 2a: the plane of the ground around the sensor, from the lowest points of one scan."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from gp_ground_seg.frame import FloatArray, IntArray
-from gp_ground_seg.jit import compiled
-from gp_ground_seg.pipeline.low_cells import N_SECTORS, LowCells
+from gp_ground_seg.frame import Candidates, FloatArray, IntArray
+
+N_SECTORS = 36
+NEAREST, FARTHEST = 0.5, 40.0
+"""Horizontal ranges of the points that the plane is fitted to [m]: nearer there is the vehicle
+itself, farther the ground may curve."""
+RING_RATIO = 1.25
+"""Outer over inner radius of a ring: the weight of a cell does not depend on the height of the
+sensor, and near ground weighs more than far."""
+TOLERANCE, TOLERANCE_GROWTH = 0.08, 0.015
+"""Distance to a plane that a point still supports [m], and its growth with range: noise,
+kerbs and camber bring ground off a plane."""
+MAX_Z = 65.0
+"""Height above or below the sensor from which a point is not the ground near it [m]."""
+
+N_RINGS = math.ceil(math.log(FARTHEST / NEAREST) / math.log(RING_RATIO))
+RING_EDGES = NEAREST * RING_RATIO ** np.arange(N_RINGS + 1.0)
+_NONE = -1
 
 NEAR, ENOUGH_NEAR = 8.0, 12
-"""Range within which the ground tells the height, if it has so many cells [m]: kerbs and verges
+"""Range [m] and least number of the points that the height is measured at: kerbs and verges
 lift or lower the plane as a whole."""
 FAR = 10.0
 """Range that the ground reaches outdoors, and walls and ceilings of rooms seldom [m]."""
 MIN_HEIGHT, MAX_HEIGHT = 0.05, 20.0
 """Heights of the sensor over a plane that can be the ground [m]."""
 CLEARLY_BELOW = 2.0
-"""Distance below the plane, in tolerances, from which a cell speaks against it."""
+"""Distance below the plane, in tolerances, from which a point is evidence against it."""
 PENALTY = 1.0
-"""What a cell clearly below the plane takes from its score: of a street and the roofs of cars,
+"""Loss of score for each point clearly below the plane: of a street and the roofs of cars,
 or of a floor and tables, the ground is the lower one."""
 
 N_TRIPLES = 192
@@ -32,15 +47,88 @@ N_LEVEL = 64
 MIN_AREA = 0.1
 """Twice the area, seen from above, from which three cells make a plane [m^2]."""
 LOOSER = 1.1
-"""How much steeper than what was looked for a refined plane may be."""
+"""Largest slope of a refined plane over that of the hypotheses."""
 RESOLUTION = 4096.0
-"""Score of a cell right on a plane; scores of cells are whole numbers."""
+"""Score of a point exactly on a plane; scores are whole numbers, whose sum is exact."""
 N_REFINEMENTS = 12
 MIN_CELLS = 3
 
 
-@dataclass(frozen=True)
-class GroundPlane:
+class LowestPoints(NamedTuple):
+    """Lowest point of each occupied cell: sectors by rings, rings wider the farther they are.
+
+    Attributes
+    ----------
+    x, y, z : (C,) float64
+        The points [m]; z along the axis that is taken to be up.
+    r : (C,) float64
+        Horizontal range of the points [m].
+    tolerance : (C,) float64
+        Distance of the point to the plane that it still supports [m].
+    sector : (C,) int64
+        Sector of each cell, 0 to `N_SECTORS` - 1.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    r: FloatArray
+    tolerance: FloatArray
+    sector: IntArray
+
+
+@lru_cache(maxsize=4)
+def segment_directions(n_segments: int) -> FloatArray:
+    """Cosine and sine of the azimuth of the middle of each segment, (2, n_segments)."""
+    azimuth = (np.arange(n_segments) + 0.5) * (2.0 * np.pi / n_segments) - np.pi
+    table = np.stack([np.cos(azimuth), np.sin(azimuth)])
+    table.setflags(write=False)
+    return table
+
+
+def lowest_points(candidates: Candidates) -> LowestPoints:
+    """Lowest ground candidate of each cell, in sectors by rings.
+
+    Of equally low ones the nearest counts, then that of the first segment, so that the
+    order of the points does not matter.
+
+    Parameters
+    ----------
+    candidates : Candidates
+        Lowest points of the bins of the polar grid. A point's azimuth is taken to be
+        that of the middle of its segment.
+    """
+    lowest = _lowest(candidates.offsets, candidates.r, candidates.z)
+    cell = np.flatnonzero(lowest != _NONE)
+    index = lowest[cell]
+    segment = np.searchsorted(candidates.offsets, index, side='right') - 1
+    cosine, sine = segment_directions(len(candidates.offsets) - 1)
+    r = candidates.r[index]
+    return LowestPoints(
+        x=r * cosine[segment],
+        y=r * sine[segment],
+        z=candidates.z[index],
+        r=r,
+        tolerance=TOLERANCE + TOLERANCE_GROWTH * r,
+        sector=cell // N_RINGS,
+    )
+
+
+def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> IntArray:
+    """Index of the lowest candidate of each cell, sector by sector, or `_NONE`."""
+    near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
+    n_segments = len(offsets) - 1
+    segment = np.repeat(np.arange(n_segments), np.diff(offsets))[near]
+    ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
+    cell = (segment * N_SECTORS // n_segments) * N_RINGS + ring
+    order = np.lexsort((segment, r[near], z[near], cell))
+    occupied, first = np.unique(cell[order], return_index=True)
+    lowest = np.full(N_SECTORS * N_RINGS, _NONE)
+    lowest[occupied] = near[order[first]]
+    return lowest
+
+
+class GroundPlane(NamedTuple):
     """The plane z = -height + slope_x x + slope_y y.
 
     Attributes
@@ -93,8 +181,8 @@ class GroundPlane:
         return np.array(self.normal)
 
 
-def find_plane(cells: LowCells, max_slope: float) -> GroundPlane | None:
-    """Find the plane that most cells lie on and few below; None if there is none.
+def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
+    """Fit the plane that most of the lowest points lie on and few below; None without one.
 
     Consensus (Fischler & Bolles, CACM 1981) over planes through a fixed, evenly spread
     choice of three cells and level planes through one, then a redescending M-estimator
@@ -102,11 +190,12 @@ def find_plane(cells: LowCells, max_slope: float) -> GroundPlane | None:
 
     Parameters
     ----------
-    cells : LowCells
-        Where the ground may be.
+    candidates : Candidates
+        Lowest points of the cells of the polar grid.
     max_slope : float
         Steepest plane to look for, as rise per metre.
     """
+    cells = lowest_points(candidates)
     if len(cells.z) < MIN_CELLS:
         return None
     hypotheses = _hypotheses(cells, max_slope)
@@ -118,15 +207,15 @@ def find_plane(cells: LowCells, max_slope: float) -> GroundPlane | None:
         MIN_HEIGHT <= height <= MAX_HEIGHT
         and slope_x * slope_x + slope_y * slope_y <= (LOOSER * max_slope) ** 2
     ):
-        # Nothing holds the refined plane: what was found is no ground.
+        # The refinement has drifted off to a plane that cannot be the ground.
         height, slope_x, slope_y = best
     return _describe(cells, float(height), float(slope_x), float(slope_y))
 
 
 def _describe(
-    cells: LowCells, height: float, slope_x: float, slope_y: float
+    cells: LowestPoints, height: float, slope_x: float, slope_y: float
 ) -> GroundPlane | None:
-    """Plane with what speaks for it; None if no cell lies on it."""
+    """Plane with the evidence for it; None if no point lies on it."""
     distance = cells.z - (slope_x * cells.x + slope_y * cells.y - height)
     on_it = np.abs(distance) <= cells.tolerance
     n_on_it = int(np.count_nonzero(on_it))
@@ -171,8 +260,8 @@ SPREAD = _spread(N_TRIPLES)
 """Which three cells, as shares of their number, (N_TRIPLES, 3)."""
 
 
-def _hypotheses(cells: LowCells, max_slope: float) -> FloatArray:
-    """Planes that may be the ground, (H, 3): height, slope_x, slope_y."""
+def _hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
+    """Planes through three points or level through one, (H, 3): height, slope_x, slope_y."""
     n = len(cells.z)
     level = np.zeros((min(n, N_LEVEL), 3))
     level[:, 0] = -cells.z[np.arange(len(level)) * n // len(level)]
@@ -195,48 +284,47 @@ def _hypotheses(cells: LowCells, max_slope: float) -> FloatArray:
     return kept
 
 
-def _score(planes: FloatArray, cells: LowCells) -> npt.NDArray[np.int64]:
+def _score(planes: FloatArray, cells: LowestPoints) -> IntArray:
     """Support less penalty of each plane, (H,); in whole numbers, which add up in any order."""
     height, slope_x, slope_y = (column[:, None] for column in planes.T)
     # Times the inverse, as the twin does it: even the last bit of a score is the same.
     d = (cells.z - (slope_x * cells.x + slope_y * cells.y - height)) * (1.0 / cells.tolerance)
     gain = np.where(np.abs(d) < 1.0, RESOLUTION * (1.0 - d * d), 0.0).astype(np.int64)
     loss = np.where(d < -CLEARLY_BELOW, int(PENALTY * RESOLUTION), 0)
-    total: npt.NDArray[np.int64] = (gain - loss).sum(axis=1)
+    total: IntArray = (gain - loss).sum(axis=1)
     return total
 
 
-def _refine(plane: FloatArray, cells: LowCells) -> tuple[float, float, float]:
+def _refine(plane: FloatArray, points: LowestPoints) -> tuple[float, float, float]:
     """Weighted least squares with Tukey's weights of the plane before, again and again."""
-    height, slope_x, slope_y = plane
-    x, y, z, tolerance = cells.x, cells.y, cells.z, cells.tolerance
+    height, slope_x, slope_y = (float(value) for value in plane)
+    x, y, z, tolerance = points.x, points.y, points.z, points.tolerance
+    columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y, z, x * z, y * z])
     for _ in range(N_REFINEMENTS):
         d = (z - (slope_x * x + slope_y * y - height)) / tolerance
         weight = np.maximum(1.0 - 0.5 * d * d, 0.0) ** 2 / tolerance**2
-        columns = 1.0, x, y, x * x, x * y, y * y, z, x * z, y * z
-        w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = (float(np.sum(weight * v)) for v in columns)
+        w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = (weight * columns).sum(axis=1).tolist()
         height, slope_x, slope_y = solve_plane(
-            w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz, height, slope_x, slope_y
+            (w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz), (height, slope_x, slope_y)
         )
     return height, slope_x, slope_y
 
 
-@compiled
 def solve_plane(
-    w: float,
-    wx: float,
-    wy: float,
-    wxx: float,
-    wxy: float,
-    wyy: float,
-    wz: float,
-    wxz: float,
-    wyz: float,
-    height: float,
-    slope_x: float,
-    slope_y: float,
+    moments: tuple[float, float, float, float, float, float, float, float, float],
+    plane: tuple[float, float, float],
 ) -> tuple[float, float, float]:
-    """Plane of least squares from weighted moments; the one given where they do not fix it."""
+    """Plane of least squares: height, slope_x, slope_y.
+
+    Parameters
+    ----------
+    moments : tuple of float
+        Weighted sums of 1, x, y, x x, x y, y y, z, x z and y z.
+    plane : tuple of float
+        Result where the moments do not determine one.
+    """
+    w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = moments
+    height, slope_x, slope_y = plane
     if w <= 0.0:
         return height, slope_x, slope_y
     mx, my, mz = wx / w, wy / w, wz / w
@@ -246,5 +334,5 @@ def solve_plane(
     if determinant > 1e-3:
         slope_x = (cxz * cyy - cyz * cxy) / determinant
         slope_y = (cyz * cxx - cxz * cxy) / determinant
-    # Too narrow to tell the slopes: the height alone.
+    # The points may be too close together to determine the slopes, but not the height.
     return slope_x * mx + slope_y * my - mz, slope_x, slope_y

@@ -1,22 +1,15 @@
-"""Checks of the points that come in."""
+"""Check of the input points, and the one layout that the stages work on."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import as_strided
 
-from gp_ground_seg.compiled.workspace import Workspace
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.frame import FloatArray, PointArray
+from gp_ground_seg.frame import BoolArray, FloatArray, PointArray
 
 COMPUTED = (np.dtype(np.float32), np.dtype(np.float64))
 """Types that are computed with."""
-
-
-def check_points(points: npt.ArrayLike) -> FloatArray:
-    """Return a copy of x, y, z in double precision; parameters and errors of `take_points`."""
-    return np.array(take_points(points), dtype=np.float64, order='F')
 
 
 def take_points(points: npt.ArrayLike) -> PointArray:
@@ -55,19 +48,28 @@ def take_points(points: npt.ArrayLike) -> PointArray:
         return array[:, :3].astype(dtype, copy=not array.flags.aligned)
 
 
-def in_columns(xyz: PointArray, workspace: Workspace) -> PointArray:
-    """Return points (N, 3) in the one layout that compiled code is compiled for.
+def check_points(points: npt.ArrayLike) -> FloatArray:
+    """Return a copy of x, y, z in double precision; parameters and errors of `take_points`."""
+    return np.array(take_points(points), dtype=np.float64, order='F')
 
-    Each coordinate by itself in a row (Fortran order) and read-only; a copy in
-    `workspace` where they lie otherwise.
+
+def in_columns(xyz: PointArray, columns: PointArray) -> PointArray:
+    """Return points (N, 3) with each coordinate contiguous (Fortran order), read-only.
+
+    Parameters
+    ----------
+    xyz : (N, 3) float32 or float64
+        Points.
+    columns : (3, N) float32 or float64
+        Memory to copy them to. They are always copied: the caller may change its array
+        meanwhile.
     """
-    if xyz.flags.f_contiguous and xyz.flags.aligned:
-        return as_read_only(xyz)
-    columns: PointArray = workspace.take('columns', (3, len(xyz)), xyz.dtype)
     with np.errstate(invalid='ignore'):
-        for k in range(3):
-            columns[k] = xyz[:, k]
-    return as_read_only(columns.T)
+        columns[...] = xyz.T
+    result: PointArray = columns.T
+    # To compiled code, arrays that may be written to are another type.
+    result.flags.writeable = False
+    return result
 
 
 def single_precision(xyz: PointArray) -> PointArray:
@@ -82,52 +84,10 @@ def single_precision(xyz: PointArray) -> PointArray:
     return single
 
 
-def flat_rows(xyz: PointArray) -> tuple[PointArray, int]:
-    """View of the memory from the first x to the last z, and the numbers from row to row.
-
-    Parameters
-    ----------
-    xyz : (N, 3) float32 or float64
-        Points, aligned.
-
-    Returns
-    -------
-    flat : (L,) float32 or float64
-        Read-only; empty where the coordinates of a point do not lie side by side in
-        order, or the points not one behind the other.
-    step : int
-        Coordinate k of point i is ``flat[i * step + k]``.
-    """
-    size = xyz.dtype.itemsize
-    row, column = xyz.strides
-    if len(xyz) == 0 or column != size or row < 3 * size or row % size != 0:
-        return as_read_only(np.empty(0, dtype=xyz.dtype)), 0
-    step = row // size
-    length = (len(xyz) - 1) * step + 3
-    owner = xyz.base
-    if (
-        isinstance(owner, np.ndarray)
-        and owner.flags.c_contiguous
-        and owner.dtype == xyz.dtype
-        and owner.shape == (len(xyz), step)
-        and np.may_share_memory(owner[:1, :1], xyz[:1, :1])
-    ):
-        # The first columns of a table: what `as_strided` gives, in a tenth of the time.
-        return as_read_only(owner.reshape(-1)[:length]), step
-    return as_strided(xyz, (length,), (size,), writeable=False), step
-
-
-def as_read_only(xyz: PointArray) -> PointArray:
-    """View of the same memory; for compiled code what may be written to is another type."""
-    view = xyz.view(np.ndarray)
-    view.flags.writeable = False
-    return view
-
-
-def finite_points(xyz: FloatArray) -> npt.NDArray[np.bool_]:
+def finite_points(xyz: FloatArray) -> BoolArray:
     """Which points (N, 3) have three finite coordinates, (N,) bool."""
     # Column by column: a reduction along rows of three takes ten times as long.
-    finite: npt.NDArray[np.bool_] = np.isfinite(xyz[:, 0])
+    finite: BoolArray = np.isfinite(xyz[:, 0])
     finite &= np.isfinite(xyz[:, 1])
     finite &= np.isfinite(xyz[:, 2])
     return finite

@@ -1,4 +1,4 @@
-"""Height and tilt of the sensor over the ground near it, from one scan (docs/pose.md)."""
+"""Stage 2: height and tilt of the sensor over the ground near it, from one scan (docs/pose.md)."""
 
 from __future__ import annotations
 
@@ -10,31 +10,39 @@ from functools import lru_cache
 
 import numpy as np
 
-from gp_ground_seg.compiled.plane_passes import plane_below
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.frame import Candidates, FloatArray, PointArray
 from gp_ground_seg.parameters.config import SensorConfig
 from gp_ground_seg.parameters.schema import AUTO
 from gp_ground_seg.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.pipeline.tilt import Direction, angles_of, rotation, rounded, turned, vertical
-from gp_ground_seg.pipeline.up_axis import is_suspicious, other_way_up
+from gp_ground_seg.pipeline.tilt import (
+    Direction,
+    angles_of,
+    rotate,
+    rotation,
+    rounded,
+    vertical,
+)
+
+FitPlane = Callable[[Candidates, float], GroundPlane | None]
+CandidatesRotated = Callable[[FloatArray], Candidates]
 
 DEFAULT_HEIGHT = 1.73
-"""Height where `sensor.height` is auto and the scan does not tell: a car's roof (KITTI) [m]."""
+"""Height where `sensor.height` is auto and the scan does not determine it: a car's roof [m]."""
 CLEAR_TILT = 0.05
 """Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
 lean stay below it."""
 MAX_TILT = math.radians(30.0)
-"""Steepest ground that z is still taken to point away from."""
+"""Steepest ground plane that is searched [rad]."""
 
 MIN_SUPPORT = 0.35
-"""Share of the low cells on the plane from which a scan tells the tilt."""
+"""Share of the lowest points on the plane from which a scan determines the tilt."""
 MIN_CELLS = 12
-"""Cells on the plane from which a scan tells anything."""
+"""Points on the plane from which a scan determines the height."""
 MIN_SPREAD = 0.06
-"""Spread of their depression from which it does [rad]: more than one beam."""
+"""Spread of their angles of depression for the same [rad]: more than one beam."""
 MIN_COVERAGE = 0.25
-"""Share of the sectors with ground in them from which a scan tells the tilt."""
+"""Share of the sectors with ground in them from which a scan determines the tilt."""
 MIN_REACH = 5.0
 """Range that the ground must reach for the same [m]."""
 LEAST_COSINE = 0.1
@@ -43,6 +51,38 @@ HEIGHT_CONTRADICTION = 0.3
 """Difference to a given height from which the scan contradicts it [m]."""
 TILT_CONTRADICTION = 0.15
 """Tilt left under given angles from which the scan contradicts them [rad]: no usual slope."""
+
+UP_MAX_TILT = math.radians(46.0)
+"""Angle from each axis within which up is searched; these cones cover all directions."""
+POOR_SUPPORT, GOOD_SUPPORT = 0.35, 0.9
+"""Support of the plane below z under which other axes are tried: near, and `TALL`."""
+TALL = 6.0
+"""Height from which the plane below z may well be a facade [m]."""
+UP_MIN_SUPPORT = 0.5
+"""Support from which a plane shows where the ground is."""
+UP_SUPPORT_RATIO, UP_SUPPORT_RATIO_TALL = 2.0, 0.8
+"""Least support of another plane over that of the plane below z: near, and `TALL`."""
+UP_DISTANCE_RATIO = 3.0
+"""Distance of a `TALL` plane over the largest of another one."""
+UP_FIRST_SUPPORT = 0.15
+"""Support from which a plane is fitted again in its own level frame."""
+UP_CLEAR_TILT = math.radians(25.0)
+"""Tilt below which z counts as up all the same."""
+UP_MIN_CELLS = 60
+"""Lowest points that must exist for another plane to count."""
+UP_MIN_FAR_COVERAGE = 0.5
+"""Share of the sectors in which it must reach far: the ceiling of a room does not."""
+
+_QUARTER = math.pi / 2.0
+_AXES = (
+    (0.0, 0.0),
+    (math.pi, 0.0),
+    (_QUARTER, 0.0),
+    (-_QUARTER, 0.0),
+    (0.0, _QUARTER),
+    (0.0, -_QUARTER),
+)
+"""Roll and pitch that turn each of the six axes up [rad]."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +149,7 @@ class SensorPose:
 
     def level(self, xyz: PointArray) -> PointArray:
         """Points (N, 3) of the sensor frame in the level frame; `xyz` itself without tilt."""
-        return xyz if self.is_level else turned(xyz, self.rotation)
+        return xyz if self.is_level else rotate(xyz, self.rotation)
 
     def ground_z(self, z: PointArray, height: FloatArray) -> FloatArray:
         """Height of the surface along the sensor's z axis, sensor frame [m].
@@ -147,10 +187,10 @@ def given_pose(sensor: SensorConfig) -> SensorPose:
 def estimate_pose(
     candidates: Candidates,
     sensor: SensorConfig,
-    use_compiled: bool,
-    candidates_turned: Callable[[FloatArray], Candidates],
+    fit_plane: FitPlane,
+    candidates_rotated: CandidatesRotated,
 ) -> SensorPose:
-    """Find out what is auto, and whether the scan contradicts what is not.
+    """Estimate what is auto, and check what is not against the scan.
 
     Parameters
     ----------
@@ -158,11 +198,11 @@ def estimate_pose(
         Lowest points of the bins, in the frame levelled by `given_pose`.
     sensor : SensorConfig
         Parameters.
-    use_compiled : bool
-        Compiled code, or its twin in numpy.
-    candidates_turned : callable
-        Returns the candidates of the same scan, turned further by a matrix (3, 3); asked
-        for only where z does not seem to be up.
+    fit_plane : callable
+        See `gp_ground_seg.pipeline.ground_plane.fit_plane`.
+    candidates_rotated : callable
+        Returns the candidates of the same scan, rotated further by a matrix (3, 3);
+        called only where z does not seem to be up.
 
     Raises
     ------
@@ -170,10 +210,10 @@ def estimate_pose(
         If roll or pitch is auto and z is clearly not up.
     """
     given = given_pose(sensor)
-    plane = plane_below(candidates, math.tan(MAX_TILT), use_compiled)
+    plane = fit_plane(candidates, math.tan(MAX_TILT))
     not_up = None
-    if is_suspicious(plane):
-        not_up = other_way_up(given.rotation, plane, use_compiled, candidates_turned)
+    if is_up_axis_doubtful(plane):
+        not_up = find_up_axis(given.rotation, plane, fit_plane, candidates_rotated)
     if not_up is not None and AUTO in (sensor.roll, sensor.pitch):
         raise PointCloudError(not_up)
     contradictions = () if not_up is None else (not_up,)
@@ -252,3 +292,85 @@ def _contradictions(sensor: SensorConfig, measured: MeasuredPose) -> tuple[str, 
                 f'{measured.roll:.3f}, pitch = {measured.pitch:.3f}'
             )
     return tuple(found)
+
+
+def is_up_axis_doubtful(plane: GroundPlane | None) -> bool:
+    """Whether the plane below z is so poor, or so far away, that z may not be up."""
+    return (
+        plane is None
+        or plane.support < POOR_SUPPORT
+        or (_is_tall(plane) and plane.support < GOOD_SUPPORT)
+    )
+
+
+def _is_tall(plane: GroundPlane | None) -> bool:
+    return plane is not None and plane.height > TALL
+
+
+def _is_ground(plane: GroundPlane, support: float) -> bool:
+    return (
+        plane.support >= support
+        and plane.n_cells >= UP_MIN_CELLS
+        and plane.coverage >= MIN_COVERAGE
+        and plane.far_coverage >= UP_MIN_FAR_COVERAGE
+        and plane.spread >= MIN_SPREAD
+    )
+
+
+def find_up_axis(
+    given: FloatArray,
+    plane: GroundPlane | None,
+    fit_plane: FitPlane,
+    candidates_rotated: CandidatesRotated,
+) -> str | None:
+    """Return one line on where the ground clearly lies if not along z; None otherwise.
+
+    Parameters
+    ----------
+    given : (3, 3) float64
+        Rotation from the sensor frame to the frame looked at, in which z should be up.
+    plane : GroundPlane or None
+        Plane that was fitted there.
+    fit_plane, candidates_rotated
+        See `estimate_pose`; a sample of the points is enough.
+
+    Returns
+    -------
+    str or None
+        The axis that seems to be up, and the angles to set.
+    """
+    support = 0.0 if plane is None else plane.support
+    ratio = UP_SUPPORT_RATIO_TALL if _is_tall(plane) else UP_SUPPORT_RATIO
+    needed = max(UP_MIN_SUPPORT, ratio * support)
+    farthest = (
+        plane.height / UP_DISTANCE_RATIO if plane is not None and _is_tall(plane) else math.inf
+    )
+
+    def look(turn: FloatArray) -> GroundPlane | None:
+        return fit_plane(candidates_rotated(turn), math.tan(UP_MAX_TILT))
+
+    best: tuple[float, FloatArray, float] | None = None
+    for angles in _AXES:
+        turn = rotation(*angles)
+        first = look(turn)
+        if first is None or first.support < UP_FIRST_SUPPORT:
+            continue
+        # Fit again with that plane level: lowest points of a tilted frame are not all ground.
+        turn = rotation(*angles_of(turn.T @ first.up))
+        other = look(turn)
+        if other is not None and other.height <= farthest and _is_ground(other, needed):
+            clarity = other.support * other.far_coverage
+            if best is None or clarity > best[0]:
+                up = turn.T @ other.up
+                best = clarity, up, other.height * float(other.up[2])
+    if best is None or best[1][2] > math.cos(UP_CLEAR_TILT):
+        return None
+    _, up, height = best
+    up = given.T @ up
+    roll, pitch = (round(angle, 3) + 0.0 for angle in angles_of(up))
+    largest = int(np.argmax(np.abs(up)))
+    axis = f'{"-" if up[largest] < 0.0 else ""}{"xyz"[largest]}'
+    return (
+        f'z does not point up: the ground seems to be {height:.2f} m away with {axis} up; turn '
+        f'the cloud, or set sensor.roll to {roll:.3f} and sensor.pitch to {pitch:.3f} [rad]'
+    )

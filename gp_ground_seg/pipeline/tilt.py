@@ -40,7 +40,7 @@ def vertical(roll: float, pitch: float) -> Direction:
     return -sp, cp * sr, cp * cr
 
 
-def turned(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
+def rotate(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
     """Points (N, 3) turned by a rotation (3, 3), in their own precision; finite ones stay finite.
 
     It is computed in double precision; rounded to single, a point 100 m away moves by 4 um.
@@ -56,9 +56,9 @@ def turned(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
     return result
 
 
-def turned_sample(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
+def rotate_sample(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
     """Every n-th point turned, about `ENOUGH_POINTS` of them."""
-    return turned(xyz[:: len(xyz) // ENOUGH_POINTS + 1], matrix)
+    return rotate(xyz[:: len(xyz) // ENOUGH_POINTS + 1], matrix)
 
 
 def angles_of(up: FloatArray | Direction) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
-from gp_ground_seg.data.cloud_columns import read_columns
+from gp_ground_seg.data.point_cloud2 import read_columns
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.result import Segmentation
@@ -71,16 +71,7 @@ def read_ground_model(cloud: PointCloud2) -> GroundModel:
     PointCloudError
         If a field is missing, or the points are not such a grid (any more).
     """
-    columns = read_columns(
-        cloud.height,
-        cloud.width,
-        cloud.fields,
-        cloud.is_bigendian,
-        cloud.point_step,
-        cloud.row_step,
-        cloud.data,
-        FIELDS,
-    )
+    columns = read_columns(cloud, FIELDS)
     if columns['x'].size == 0:
         raise PointCloudError('ground model of no points: must have at least 1 segment')
     return GroundModel.from_knot_points(

@@ -20,7 +20,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.data import cloud_layout
+from gp_ground_seg.data.point_cloud2 import read_xyz, select_rows
 from gp_ground_seg.errors import ConfigError
 
 INPUT_DEPTH = 5
@@ -43,33 +43,6 @@ _CHOICES = {
 }
 
 
-def read_xyz(cloud: PointCloud2) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
-    """Return the coordinates of every point, row by row, (height * width, 3) [m].
-
-    Parameters
-    ----------
-    cloud : PointCloud2
-        Any layout: fields in any order, FLOAT32 or FLOAT64, any ``point_step``,
-        padded rows, either byte order, organised or not.
-
-    Raises
-    ------
-    PointCloudError
-        If the message cannot hold what it claims.
-    """
-    # Random bytes may be a signalling NaN; it is one of the values that are not finite.
-    with np.errstate(invalid='ignore'):
-        return cloud_layout.read_xyz(
-            cloud.height,
-            cloud.width,
-            cloud.fields,
-            cloud.is_bigendian,
-            cloud.point_step,
-            cloud.row_step,
-            cloud.data,
-        )
-
-
 def select_points(cloud: PointCloud2, mask: npt.NDArray[np.bool_]) -> PointCloud2:
     """Return the points of `cloud` where `mask` is true, in order, as an unorganised cloud.
 
@@ -81,9 +54,7 @@ def select_points(cloud: PointCloud2, mask: npt.NDArray[np.bool_]) -> PointCloud
     PointCloudError
         If the message cannot hold what it claims, or the mask has another length.
     """
-    kept = cloud_layout.select_rows(
-        cloud.height, cloud.width, cloud.point_step, cloud.row_step, cloud.data, mask
-    )
+    kept = select_rows(cloud, mask)
     n_points = int(np.count_nonzero(mask))
     selection = PointCloud2(
         header=cloud.header,

@@ -15,6 +15,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.backend import NumpyBackend, choose_backend
+from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.errors import GroundSegError, PointCloudError
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.points import single_precision
@@ -25,7 +26,6 @@ from gp_ground_seg.ros.input import (
     CloudSubscription,
     TimeJumps,
     in_words,
-    read_xyz,
 )
 from gp_ground_seg.ros.lifecycle import (
     initialize,

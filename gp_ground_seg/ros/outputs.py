@@ -11,14 +11,14 @@ from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2, PointField
 
-from gp_ground_seg.data.cloud_columns import append_columns
+from gp_ground_seg.data.point_cloud2 import append_columns, read_xyz
 from gp_ground_seg.frame import FloatArray, IntArray, Label
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.length_scale_colours import length_scale_colours
+from gp_ground_seg.plotting.style import length_scale_colours
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.ros.ground_model import ground_model_cloud
-from gp_ground_seg.ros.input import cloud_profile, message_data, read_xyz, select_points
+from gp_ground_seg.ros.input import cloud_profile, message_data, select_points
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
@@ -87,15 +87,7 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
                 values = values.astype(np.float32, copy=False)
             is_dense = is_dense and bool(np.isfinite(values).all())
         columns[name] = values
-    wide = append_columns(
-        cloud.height,
-        cloud.width,
-        cloud.is_bigendian,
-        cloud.point_step,
-        cloud.row_step,
-        cloud.data,
-        columns,
-    )
+    wide = append_columns(cloud, columns)
     added = [
         PointField(name=name, offset=offset, datatype=datatype, count=1)
         for name, offset, datatype in wide.columns

@@ -16,9 +16,8 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 
 from gp_ground_seg.errors import ConfigError, GroundSegError
-from gp_ground_seg.parameters.check import check_typed
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.parameters.schema import ParameterSpec
+from gp_ground_seg.parameters.schema import ParameterSpec, check_typed
 from gp_ground_seg.parameters.yaml_io import OF_EVERY_NODE
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.lifecycle import start_errors
@@ -30,6 +29,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     """Return what ``ros2 param describe`` and rqt_reconfigure show of a parameter."""
     notes = [f'[{spec.unit}]'] if spec.unit else []
     notes += [f'({spec.symbol} in the paper)'] if spec.symbol else []
+    notes += [] if spec.basic else ['(advanced)']
     result = ParameterDescriptor(
         description=' '.join([spec.description, *notes]),
         additional_constraints=f'must be {spec.accepted}',

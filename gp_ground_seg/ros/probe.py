@@ -20,7 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.data.bags import CloudMessage, decode_cloud, encode_cloud
+from gp_ground_seg.data.point_cloud2 import (
+    CloudMessage,
+    cloud_from_columns,
+    decode_cloud,
+    encode_cloud,
+    stamp_of,
+    with_header,
+)
 from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.ros.lifecycle import Session, large_cloud_transport, ros_session
@@ -172,7 +179,7 @@ def restamped(clouds: Iterable[CloudMessage], start: int) -> Iterator[CloudMessa
     """Yield `clouds` over and over, with stamps from the second `start` on."""
     for k, cloud in enumerate(itertools.cycle(clouds)):
         seconds, nanoseconds = divmod(k * PERIOD_NS, 10**9)
-        yield dataclasses.replace(cloud, stamp=(start + seconds, nanoseconds))
+        yield with_header(cloud, (start + seconds, nanoseconds))
 
 
 class Probe:
@@ -222,7 +229,7 @@ class Probe:
         GroundSegError
             If that takes longer than `timeout` [s], or the node ends.
         """
-        empty = CloudMessage((0, 0), _PROBE_FRAME, 1, 0, (), 0, 0, np.empty(0, np.uint8))
+        empty = cloud_from_columns((0, 0), _PROBE_FRAME, {})
         end, next_time, trip = time.monotonic() + timeout, 0.0, Trip(0)
         for cloud in restamped([empty], 1):
             while time.monotonic() < next_time:
@@ -282,7 +289,7 @@ class Probe:
     def _send(self, cloud: CloudMessage, raw: bytes | None = None) -> Trip:
         raw = encode_cloud(cloud) if raw is None else raw
         trip = Trip(time.time_ns())
-        self._waiting[cloud.stamp] = trip, cloud, {}
+        self._waiting[stamp_of(cloud)] = trip, cloud, {}
         self._publisher.publish(raw)
         return trip
 
@@ -300,15 +307,16 @@ class Probe:
 
     def arrived(self, topic: str, cloud: CloudMessage, now: int) -> None:
         """Take a result on `topic` that arrived at the system time `now` [ns]."""
-        if cloud.stamp not in self._waiting or topic in self._waiting[cloud.stamp][2]:
-            self.n_stray += cloud.frame_id != _PROBE_FRAME
+        stamp, is_data = stamp_of(cloud), cloud.header.frame_id != _PROBE_FRAME
+        if stamp not in self._waiting or topic in self._waiting[stamp][2]:
+            self.n_stray += is_data
             return
-        trip, sent, results = self._waiting[cloud.stamp]
+        trip, sent, results = self._waiting[stamp]
         results[topic] = cloud
         if len(results) == 2:
-            del self._waiting[cloud.stamp]
+            del self._waiting[stamp]
             trip.back = now
-            if cloud.frame_id != _PROBE_FRAME:
+            if is_data:
                 self._on_back(sent, results)
 
     def _diagnosed(self, array: Any) -> None:

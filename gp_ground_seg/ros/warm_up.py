@@ -12,9 +12,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from gp_ground_seg.backend import Backend, warm_up
+from gp_ground_seg.backend import Backend
 from gp_ground_seg.jit import code_folder, is_code_kept
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.segmenter import warm_up
 
 FOLLOWS = 'segmenting with numpy until the compiled code is there; to compile takes a minute'
 CHANGED = 'segmenting with numba now'
@@ -28,7 +29,7 @@ import os, threading
 # Standard input ends when the process that has started this one does.
 threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
 os.nice(5)
-from gp_ground_seg.backend import warm_up
+from gp_ground_seg.segmenter import warm_up
 warm_up()
 """
 

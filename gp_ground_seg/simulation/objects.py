@@ -6,13 +6,16 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
+from enum import IntEnum
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.simulation.kinds import Kind
-from gp_ground_seg.simulation.sensor import FloatArray
+from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.simulation.terrain import Terrain
+
+KindArray: TypeAlias = npt.NDArray[np.uint8]
 
 BURIED_DEPTH = 3.0
 """How far standing solids reach below the ground at their centre, so that none hovers [m]."""
@@ -20,6 +23,51 @@ WALL_PANEL = 4.0
 """Longest panel of a wall; each stands on its own piece of ground [m]."""
 SMALLEST_RATE = 1e-12
 """Stands in for a zero component of a unit vector; keeps 0 / 0 out of the slab tests."""
+
+
+class Kind(IntEnum):
+    """What a ray hit."""
+
+    TERRAIN = 0
+    BOX = 1
+    WALL = 2
+    POLE = 3
+    OVERHANG = 4
+    REFLECTION = 5
+    VEGETATION = 6
+
+
+SEMANTIC_KITTI_CLASS: dict[Kind, int] = {
+    Kind.TERRAIN: 40,  # road
+    Kind.BOX: 10,  # car
+    Kind.WALL: 50,  # building
+    Kind.POLE: 80,  # pole
+    Kind.OVERHANG: 52,  # other structure; scored as an obstacle, unlike vegetation
+    Kind.REFLECTION: 1,  # outlier
+    Kind.VEGETATION: 70,  # vegetation
+}
+
+# Share of the light that comes back, for an intensity that is not constant.
+REFLECTANCE: dict[Kind, float] = {
+    Kind.TERRAIN: 0.25,
+    Kind.BOX: 0.5,
+    Kind.WALL: 0.4,
+    Kind.POLE: 0.6,
+    Kind.OVERHANG: 0.35,
+    Kind.REFLECTION: 0.05,
+    Kind.VEGETATION: 0.3,
+}
+
+
+def semantic_kitti_labels(kind: KindArray) -> npt.NDArray[np.uint32]:
+    """Class in SemanticKITTI of each `Kind` code, (N,) uint32, as ``.label`` files hold them."""
+    table = np.array([SEMANTIC_KITTI_CLASS[entry] for entry in Kind], dtype=np.uint32)
+    return table[kind]
+
+
+def reflectance(kind: KindArray) -> npt.NDArray[np.float64]:
+    """Share of the light that each `Kind` code sends back, (N,) float64 in [0, 1]."""
+    return np.array([REFLECTANCE[entry] for entry in Kind])[kind]
 
 
 @dataclass(frozen=True)
@@ -54,17 +102,10 @@ class Solid(ABC):
         """Ranges between which rays are inside its outline, seen from above."""
 
     def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
-        """Range at which rays enter the solid.
+        """Range [m] at which each ray enters the solid, (R,).
 
-        Parameters
-        ----------
-        origin, direction : (R, 3) array
-            Start [m] and unit vector of each ray.
-
-        Returns
-        -------
-        (R,) float64
-            Range [m]; infinite where a ray misses it or starts inside.
+        `origin` [m] and `direction`, unit vectors, are (R, 3). Infinite where a ray misses the
+        solid or starts inside.
         """
         result = np.full(len(direction), np.inf)
         offset = origin - np.array([self.x, self.y, 0.0])
@@ -141,7 +182,7 @@ def _without_zeros(values: FloatArray) -> FloatArray:
 
 def nearest_solid(
     solids: Iterable[Solid], origin: FloatArray, direction: FloatArray
-) -> tuple[FloatArray, npt.NDArray[np.uint8]]:
+) -> tuple[FloatArray, KindArray]:
     """First solid that each ray meets.
 
     Parameters
@@ -155,10 +196,8 @@ def nearest_solid(
 
     Returns
     -------
-    distance : (R,) float64
-        Range [m], infinite where a ray meets none.
-    kind : (R,) uint8
-        `Kind` of the solid.
+    (R,) float64, (R,) uint8
+        Range [m], infinite where a ray meets none, and `Kind` of the solid.
     """
     distance = np.full(len(direction), np.inf)
     kind = np.zeros(len(direction), dtype=np.uint8)
@@ -191,15 +230,12 @@ class _Fan:
         # A hair more than the tangents, for rounding.
         half = math.asin(solid.radius / distance) + 1e-9
         middle = math.atan2(dy, dx)
-        parts = [
-            self._order[
-                slice(
-                    *np.searchsorted(self._azimuth, [middle - half + turn, middle + half + turn])
-                )
-            ]
-            for turn in (-2.0 * math.pi, 0.0, 2.0 * math.pi)
-        ]
-        return np.concatenate(parts)
+        turns = np.array([-2.0 * math.pi, 0.0, 2.0 * math.pi])
+        starts = np.searchsorted(self._azimuth, middle - half + turns)
+        ends = np.searchsorted(self._azimuth, middle + half + turns)
+        return np.concatenate(
+            [self._order[start:end] for start, end in zip(starts, ends, strict=True)]
+        )
 
 
 def standing_box(
@@ -211,8 +247,7 @@ def standing_box(
     kind: Kind = Kind.BOX,
 ) -> Box:
     """Box of a (length, width, height) [m] that stands on the terrain."""
-    ground = float(terrain.height(x, y))
-    length, width, height = size
+    ground, (length, width, height) = float(terrain.height(x, y)), size
     return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, length, width, yaw)
 
 
@@ -222,13 +257,11 @@ def floating_box(
     y: float,
     size: tuple[float, float, float],
     clearance: float,
-    yaw: float = 0.0,
     kind: Kind = Kind.OVERHANG,
 ) -> Box:
     """Box of a (length, width, height) [m] that floats `clearance` [m] over the terrain."""
-    bottom = float(terrain.height(x, y)) + clearance
-    length, width, height = size
-    return Box(kind, x, y, bottom, bottom + height, length, width, yaw)
+    bottom, (length, width, height) = float(terrain.height(x, y)) + clearance, size
+    return Box(kind, x, y, bottom, bottom + height, length, width, yaw=0.0)
 
 
 def pole(

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gp_ground_seg.simulation.sensor import FloatArray
+from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.simulation.terrain import Terrain
 
 CLEARANCE_TOLERANCE = 1e-9
@@ -23,21 +23,9 @@ SHORTEST_PIECE = 1e-9
 def first_hit(
     terrain: Terrain, origin: FloatArray, direction: FloatArray, max_range: float
 ) -> FloatArray:
-    """Range at which each ray first meets the terrain.
+    """Range [m] at which each ray first meets the terrain, (R,), infinite beyond `max_range` [m].
 
-    Parameters
-    ----------
-    terrain : Terrain
-        Surface; the rays start above it.
-    origin, direction : (R, 3) array
-        Start [m] and unit vector of each ray.
-    max_range : float
-        Farthest range of interest [m].
-
-    Returns
-    -------
-    (R,) float64
-        Range [m], infinite where there is no crossing within `max_range`.
+    `origin` [m], above the terrain, and `direction`, unit vectors, are (R, 3).
     """
     entry = np.zeros(len(origin))
     ceiling = terrain.ceiling()

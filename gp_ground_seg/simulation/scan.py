@@ -1,18 +1,27 @@
-"""One turn of the sensor in a scene."""
+"""Scans of a scene: one turn of the sensor, a drive, a SemanticKITTI sequence."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.simulation.kinds import Kind, reflectance
-from gp_ground_seg.simulation.objects import Solid, nearest_solid
+from gp_ground_seg.data.atomic_output import staged_folder
+from gp_ground_seg.errors import ConfigError, DataError
+from gp_ground_seg.frame import FloatArray
+from gp_ground_seg.simulation.objects import (
+    Kind,
+    KindArray,
+    nearest_solid,
+    reflectance,
+    semantic_kitti_labels,
+)
 from gp_ground_seg.simulation.raycast import first_hit
-from gp_ground_seg.simulation.sensor import FloatArray, SensorModel
+from gp_ground_seg.simulation.scenes import Scene
+from gp_ground_seg.simulation.sensor import SensorModel
 from gp_ground_seg.simulation.terrain import Terrain
 
 FRAME_PERIOD = 0.1
@@ -22,34 +31,6 @@ REFLECTION_MIN_DEPTH = 0.1
 INTENSITY_STD = 0.05
 PLUMB_LINE = 200.0
 """How far above a point the search for the ground below it starts, for a tilted sensor [m]."""
-
-
-@dataclass(frozen=True)
-class WetPatch:
-    """A disc of wet road that mirrors.
-
-    Attributes
-    ----------
-    x, y, radius : float
-        Where it is [m].
-    reflectivity : float
-        Probability that a ray is mirrored rather than scattered back, in [0, 1].
-    """
-
-    x: float
-    y: float
-    radius: float
-    reflectivity: float = 0.5
-
-
-@dataclass(frozen=True)
-class Scene:
-    """Terrain, the solids on it, and wet patches of it."""
-
-    name: str
-    terrain: Terrain
-    solids: tuple[Solid, ...] = ()
-    wet_patches: tuple[WetPatch, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -84,7 +65,7 @@ class SimulatedScan:
     ring: npt.NDArray[np.uint16]
     is_ground: npt.NDArray[np.bool_]
     ground_z: FloatArray
-    kind: npt.NDArray[np.uint8]
+    kind: KindArray
     time: float
     position: FloatArray
     rotation: FloatArray
@@ -106,16 +87,12 @@ def simulate_scan(
 
     Parameters
     ----------
-    scene : Scene
-        What there is to see.
-    sensor : SensorModel
-        What looks; it stands `sensor.height` above the ground at x, y.
+    scene, sensor : Scene, SensorModel
+        The sensor is `sensor.height` above the ground at x, y.
     rng : Generator
         Source of azimuth phase, noise, dropouts and reflections.
-    x, y : float
-        Where the sensor is [m].
-    yaw : float
-        Heading of the vehicle [rad].
+    x, y, yaw : float
+        Place [m] and heading [rad] of the vehicle.
     time : float
         Passed on to the scan [s].
     """
@@ -164,12 +141,12 @@ def _mirror(
     origin: FloatArray,
     direction: FloatArray,
     distance: FloatArray,
-    kind: npt.NDArray[np.uint8],
+    kind: KindArray,
     draw: FloatArray,
 ) -> None:
-    """Move hits on wet road to where the sensor believes the mirrored solids to be, in place.
+    """Move hits on wet road to the mirror images of solids, in place.
 
-    The sensor knows the length of the light's way, not its bend: it puts the mirror image
+    The measured range is the length of the whole path of the light, so that the image is
     straight on along the ray, below the ground.
     """
     ray = np.flatnonzero((kind == Kind.TERRAIN) & np.isfinite(distance))
@@ -204,10 +181,8 @@ def ground_below(
         The ground.
     points : (N, >=3) array
         Points in the sensor frame [m].
-    position : (3,) array
-        Position of the sensor in the world [m].
-    rotation : (3, 3) array
-        Turns vectors of the sensor frame into the world's.
+    position, rotation : (3,) and (3, 3) array
+        See `SimulatedScan`.
 
     Returns
     -------
@@ -230,27 +205,11 @@ def ground_below(
 def simulate_drive(
     scene: Scene, sensor: SensorModel, n_frames: int, speed: float, seed: int
 ) -> Iterator[SimulatedScan]:
-    """Drive along x from the origin, ten scans a second.
+    """Drive along x from the origin at `speed` [m/s], ten scans a second.
 
     The sensor stays `sensor.height` above the ground under it and does not follow its slope.
-
-    Parameters
-    ----------
-    scene : Scene
-        Where to drive.
-    sensor : SensorModel
-        What looks.
-    n_frames : int
-        Number of scans.
-    speed : float
-        [m/s].
-    seed : int
-        Seed of all noise; the scene has its own.
-
-    Raises
-    ------
-    ConfigError
-        If a value is out of range.
+    `seed` is that of all noise; the scene has its own. Raises ConfigError if a value is out of
+    range.
     """
     if n_frames < 1 or not np.isfinite(speed):
         raise ConfigError(
@@ -261,3 +220,54 @@ def simulate_drive(
         simulate_scan(scene, sensor, rng, x=speed * k * FRAME_PERIOD, time=k * FRAME_PERIOD)
         for k in range(n_frames)
     )
+
+
+def write_semantic_kitti(scans: Iterable[SimulatedScan], root: str | Path, sequence: str) -> Path:
+    """Write ``root/sequences/<sequence>/{velodyne/*.bin, labels/*.label, times.txt}``.
+
+    The sequence appears whole or not at all: it is written beside its place and moved there.
+
+    Parameters
+    ----------
+    scans : iterable of SimulatedScan
+        Scans in order; a generator is consumed one by one.
+    root : path
+        Folder that holds ``sequences``; made if need be.
+    sequence : str
+        Name of the sequence's folder, which is returned.
+
+    Raises
+    ------
+    DataError
+        If the name is not that of a folder, the sequence exists, there is no scan, or the
+        folder cannot be written.
+    """
+    root = Path(root)
+    if not sequence or sequence in ('.', '..') or Path(sequence).name != sequence:
+        raise DataError(f'sequence {sequence!r}: must be the name of one folder')
+    target = root / 'sequences' / sequence
+    if target.exists() or target.is_symlink():
+        raise DataError(f'{target}: exists; remove it or choose another sequence')
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f'{target}: {error.strerror or error}') from error
+    with staged_folder(target, force=False, is_ours=lambda _: False) as folder:
+        _write(scans, folder)
+    return target
+
+
+def _write(scans: Iterable[SimulatedScan], folder: Path) -> None:
+    (folder / 'velodyne').mkdir(parents=True)
+    (folder / 'labels').mkdir()
+    times = []
+    for k, scan in enumerate(scans):
+        points = scan.points.astype('<f4')
+        labels = semantic_kitti_labels(scan.kind).astype('<u4')
+        (folder / 'velodyne' / f'{k:06d}.bin').write_bytes(points.tobytes())
+        (folder / 'labels' / f'{k:06d}.label').write_bytes(labels.tobytes())
+        times.append(scan.time)
+    if not times:
+        raise DataError(f'sequence {folder.name}: no scan to write')
+    text = ''.join(f'{time:e}\n' for time in times)
+    (folder / 'times.txt').write_text(text, encoding='utf-8')

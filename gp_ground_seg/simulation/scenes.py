@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from gp_ground_seg.simulation import landforms
+from gp_ground_seg.simulation import terrain as landforms
 from gp_ground_seg.simulation.objects import (
     Solid,
     bridge,
@@ -19,7 +21,6 @@ from gp_ground_seg.simulation.objects import (
     truck,
     wall,
 )
-from gp_ground_seg.simulation.scan import Scene, WetPatch
 from gp_ground_seg.simulation.terrain import Terrain
 
 SCATTER_X = (-60.0, 100.0)
@@ -28,6 +29,34 @@ SCATTER_Y = (6.0, 35.0)
 N_SCATTERED = 36
 URBAN_X = (-80.0, 160.0)
 """Where the street of the urban scene begins and ends [m]."""
+
+
+@dataclass(frozen=True)
+class WetPatch:
+    """A disc of wet road that mirrors.
+
+    Attributes
+    ----------
+    x, y, radius : float
+        Where it is [m].
+    reflectivity : float
+        Probability that a ray is mirrored rather than scattered back, in [0, 1].
+    """
+
+    x: float
+    y: float
+    radius: float
+    reflectivity: float = 0.5
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Terrain, the solids on it, and wet patches of it."""
+
+    name: str
+    terrain: Terrain
+    solids: tuple[Solid, ...] = ()
+    wet_patches: tuple[WetPatch, ...] = ()
 
 
 def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
@@ -52,63 +81,43 @@ def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
     return tuple(solids)
 
 
-def _open_scene(name: str, terrain: Terrain, rng: np.random.Generator) -> Scene:
+def _road_then_rubble(rng: np.random.Generator) -> Terrain:
+    return landforms.smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0)
+
+
+def _ditch(rng: np.random.Generator) -> Terrain:
+    heading = rng.uniform(-0.5, 0.5)
+    return landforms.ditch(rng.uniform(10.0, 14.0), 4.0, 1.5, 1.0, heading)
+
+
+_OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
+    # Level ground.
+    'flat': lambda rng: landforms.flat(),
+    # Plane that rises or falls by 8 % in a random direction.
+    'slope': lambda rng: landforms.slope(0.08, rng.uniform(-math.pi, math.pi)),
+    # Level ground, then at once a climb of 12 %.
+    'ramp': lambda rng: landforms.ramp(rng.uniform(12.0, 18.0), 0.12, rng.uniform(-0.3, 0.3)),
+    # Waves of 2 to 20 m, 8 cm rms.
+    'rough': landforms.rough,
+    # Smooth road that ends in rubble: waves of 0.8 to 6 m, 15 cm rms.
+    'road_then_rubble': _road_then_rubble,
+    # Road between sidewalks 15 cm higher.
+    'kerb': lambda rng: landforms.kerb(rng.uniform(3.5, 5.0), 0.15),
+    # Ditch 1 m deep across the drive, at an angle.
+    'ditch': _ditch,
+    # Hill of 8 % slopes with a rounded top that hides what is behind it.
+    'crest': lambda rng: landforms.crest(rng.uniform(8.0, 12.0), 15.0, 0.08, 12.0),
+}
+
+
+def _open_scene(name: str, seed: int) -> Scene:
+    """One of the landforms above with scattered solids."""
+    rng = np.random.default_rng(seed)
+    terrain = _OPEN_COUNTRY[name](rng)
     return Scene(name, terrain, _scattered(terrain, rng))
 
 
-def flat(seed: int) -> Scene:
-    """Level ground."""
-    return _open_scene('flat', landforms.flat(), np.random.default_rng(seed))
-
-
-def slope(seed: int) -> Scene:
-    """Plane that rises or falls by 8 % in a direction of its own."""
-    rng = np.random.default_rng(seed)
-    return _open_scene('slope', landforms.slope(0.08, rng.uniform(-math.pi, math.pi)), rng)
-
-
-def ramp(seed: int) -> Scene:
-    """Level ground, then at once a climb of 12 %."""
-    rng = np.random.default_rng(seed)
-    terrain = landforms.ramp(rng.uniform(12.0, 18.0), 0.12, rng.uniform(-0.3, 0.3))
-    return _open_scene('ramp', terrain, rng)
-
-
-def rough(seed: int) -> Scene:
-    """Open country: waves of 2 to 20 m, 8 cm rms."""
-    rng = np.random.default_rng(seed)
-    return _open_scene('rough', landforms.rough(rng), rng)
-
-
-def road_then_rubble(seed: int) -> Scene:
-    """Smooth road that ends in rubble: waves of 0.8 to 6 m, 15 cm rms."""
-    rng = np.random.default_rng(seed)
-    terrain = landforms.smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0)
-    return _open_scene('road_then_rubble', terrain, rng)
-
-
-def kerb(seed: int) -> Scene:
-    """Road between sidewalks 15 cm higher."""
-    rng = np.random.default_rng(seed)
-    return _open_scene('kerb', landforms.kerb(rng.uniform(3.5, 5.0), 0.15), rng)
-
-
-def ditch(seed: int) -> Scene:
-    """Ditch 1 m deep across the drive, at an angle."""
-    rng = np.random.default_rng(seed)
-    heading = rng.uniform(-0.5, 0.5)
-    terrain = landforms.ditch(rng.uniform(10.0, 14.0), 4.0, 1.5, 1.0, heading)
-    return _open_scene('ditch', terrain, rng)
-
-
-def crest(seed: int) -> Scene:
-    """Hill of 8 % slopes with a rounded top that hides what is behind it."""
-    rng = np.random.default_rng(seed)
-    terrain = landforms.crest(rng.uniform(8.0, 12.0), 15.0, 0.08, 12.0)
-    return _open_scene('crest', terrain, rng)
-
-
-def urban(seed: int) -> Scene:
+def _urban(seed: int) -> Scene:
     """Street: kerbs, parked cars, a truck, houses, awnings, poles, trees, a bridge, puddles."""
     rng = np.random.default_rng(seed)
     road, front = 6.0, 10.0
@@ -140,14 +149,7 @@ def urban(seed: int) -> Scene:
 
 
 SCENES: dict[str, Callable[[int], Scene]] = {
-    'flat': flat,
-    'slope': slope,
-    'ramp': ramp,
-    'rough': rough,
-    'road_then_rubble': road_then_rubble,
-    'kerb': kerb,
-    'ditch': ditch,
-    'crest': crest,
-    'urban': urban,
+    **{name: functools.partial(_open_scene, name) for name in _OPEN_COUNTRY},
+    'urban': _urban,
 }
 """Builders of the named scenes: seed -> scene."""

@@ -1,4 +1,4 @@
-"""Spinning LiDARs: beam directions, range limits, noise."""
+"""LiDARs, spinning or without rings: ray directions, range limits, noise."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.frame import FloatArray
 
-FloatArray = npt.NDArray[np.float64]
+# Multiples of these fill the unit square evenly: the powers of the plastic number, the
+# two-dimensional counterpart of the golden ratio.
+_PLASTIC = 1.32471795724474602596
+_STRIDES = np.array([1.0 / _PLASTIC, 1.0 / _PLASTIC**2])
 
 
 @dataclass(frozen=True)
@@ -58,9 +62,9 @@ class SensorModel:
     def __post_init__(self) -> None:
         """Check every value."""
         beams = np.asarray(self.elevations)
+        in_order = (np.abs(beams) < math.pi / 2).all() and (np.diff(beams) < 0).all()
         self._require(
-            beams.size > 0
-            and bool((np.abs(beams) < math.pi / 2).all() and (np.diff(beams) < 0).all()),
+            beams.size > 0 and bool(in_order),
             'elevations: must be given, within (-pi/2, pi/2) rad, highest first',
         )
         self._require(self.n_columns >= 1, f'n_columns = {self.n_columns}: must be at least 1')
@@ -74,11 +78,9 @@ class SensorModel:
         )
         self._require(0.0 <= self.dropout <= 1.0, f'dropout = {self.dropout}: must be in [0, 1]')
         self._require(0.0 < self.height < math.inf, f'height = {self.height}: must be > 0 m')
-        for name in ('roll', 'pitch'):
-            angle = getattr(self, name)
-            self._require(
-                abs(angle) < math.pi / 2, f'{name} = {angle}: must be within (-pi/2, pi/2) rad'
-            )
+        for name, angle in (('roll', self.roll), ('pitch', self.pitch)):
+            within = abs(angle) < math.pi / 2
+            self._require(within, f'{name} = {angle}: must be within (-pi/2, pi/2) rad')
 
     def _require(self, condition: bool, problem: str) -> None:
         if not condition:
@@ -94,18 +96,10 @@ class SensorModel:
         return np.repeat(np.arange(len(self.elevations), dtype=np.uint16), self.n_columns)
 
     def directions(self, phase: float = 0.0) -> FloatArray:
-        """Return the unit vectors of all rays in the sensor frame.
+        """Return the unit vectors of all rays in the sensor frame, (R, 3).
 
-        Parameters
-        ----------
-        phase : float
-            Azimuth of the first firing [rad].
-
-        Returns
-        -------
-        (R, 3) float64
-            Ring by ring from the highest beam down; within a ring counter-clockwise
-            from straight ahead, as in KITTI's files.
+        Ring by ring from the highest beam down; within a ring counter-clockwise from the
+        azimuth `phase` [rad], 0 = straight ahead, as in KITTI's files.
         """
         azimuth = phase + np.arange(self.n_columns) * (2.0 * math.pi / self.n_columns)
         elevation = np.asarray(self.elevations)[:, None]
@@ -121,6 +115,54 @@ class SensorModel:
         angles = [yaw, self.pitch, self.roll]
         matrix: FloatArray = Rotation.from_euler('ZYX', angles).as_matrix()
         return matrix
+
+
+@dataclass(frozen=True)
+class ScatterModel(SensorModel):
+    """A LiDAR whose rays fill its field of view evenly, in another pattern for each scan.
+
+    Takes the place of the prisms of a Livox: what matters to a segmentation is that
+    there are no rings. `elevations` holds the ends of the field of view, highest first,
+    and `n_columns` is 1.
+
+    Attributes
+    ----------
+    n_points : int
+        Rays of one scan.
+    """
+
+    n_points: int = 20_000
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        super().__post_init__()
+        self._require(len(self.elevations) == 2, 'elevations: must be the two ends')
+        self._require(self.n_columns == 1, f'n_columns = {self.n_columns}: must be 1')
+        self._require(self.n_points >= 1, f'n_points = {self.n_points}: must be at least 1')
+
+    @property
+    def n_rays(self) -> int:
+        """Rays of one scan."""
+        return self.n_points
+
+    def rings(self) -> npt.NDArray[np.uint16]:
+        """Zeros, (n_points,) uint16: there are no rings."""
+        return np.zeros(self.n_points, dtype=np.uint16)
+
+    def directions(self, phase: float = 0.0) -> FloatArray:
+        """Return the unit vectors of all rays in the sensor frame, (n_points, 3).
+
+        The azimuth of the first ray, `phase` [rad], decides on the elevations too.
+        """
+        turns = phase / (2.0 * math.pi)
+        spread = (np.arange(self.n_points)[:, None] * _STRIDES + [turns, 7.0 * turns]) % 1.0
+        azimuth = 2.0 * math.pi * spread[:, 0]
+        high, low = np.sin(self.elevations)
+        # Evenly over the sphere, not over the angle.
+        up = high + (low - high) * spread[:, 1]
+        flat = np.sqrt(1.0 - up**2)
+        rays: FloatArray = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up])
+        return rays
 
 
 def _beams(*blocks: tuple[float, float, int]) -> tuple[float, ...]:
@@ -172,3 +214,19 @@ OS1_128 = SensorModel(
     dropout=0.02,
     height=1.8,
 )
+# Field of view, rate, range and accuracy of the maker's data sheet; on a field robot.
+MID_360 = ScatterModel(
+    name='mid-360',
+    elevations=(math.radians(52.0), math.radians(-7.0)),
+    n_columns=1,
+    min_range=0.1,
+    max_range=40.0,
+    range_std=0.02,
+    dropout=0.02,
+    height=0.5,
+    n_points=20_000,
+)
+SENSORS: dict[str, SensorModel] = {
+    sensor.name: sensor for sensor in (HDL_64E, HDL_32E, VLP_16, OS1_128, MID_360)
+}
+"""The preset sensors by name."""

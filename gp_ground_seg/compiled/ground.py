@@ -1,0 +1,232 @@
+"""Compiled twin of `gp_ground_seg.gp.ground`.
+
+Row k of `whitened` is that of ``L^-1 K(inliers, candidates and knots)``. Adding an
+inlier appends one row, after which means and variances everywhere follow by one
+multiplication: a whole segment costs one factorisation. Inliers join from near to far,
+mostly: columns nearer than the first candidate that is no inlier need no more rows.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.compiled.numerics import LANES, exp_neg
+from gp_ground_seg.compiled.threads import Part
+from gp_ground_seg.frame import BoolArray, FloatArray, Frame, IntArray
+from gp_ground_seg.jit import jit
+from gp_ground_seg.parameters.config import Config
+
+
+class GroundParams(NamedTuple):
+    """Model, gates and seeds, see `gp_ground_seg.parameters.config`."""
+
+    least_gate_noise: float
+    slope_std: float
+    seed_range: float
+    seed_height_tolerance: float
+    segment_step: int
+    max_std: float
+    max_standardised_residual: float
+    max_standardised_depth: float
+    n_neighbours: int
+
+    @classmethod
+    def of(cls, config: Config, segment_step: int) -> GroundParams:
+        """Take the values out of a configuration."""
+        growth = config.growth
+        return cls(
+            config.observation.sigma_n,
+            config.observation.slope_std,
+            growth.seed_range,
+            growth.seed_height_tolerance,
+            segment_step,
+            growth.max_std,
+            growth.max_standardised_residual,
+            growth.max_standardised_depth,
+            config.surface.n_neighbours,
+        )
+
+
+class SegmentSurfaces(NamedTuple):
+    """Each segment's own surface, before neighbours are fused.
+
+    Attributes
+    ----------
+    log_length_scale : (C,) float64
+        At the candidates [log m].
+    knot_log_length_scale : (M, K) float64
+        At the knots [log m]; NaN from the first knot on that is not wanted.
+    inlier : (C,) bool
+        Candidates that the surface rests on.
+    mean, std : (M, K) float64
+        Height about the prior mean and its standard deviation [m].
+    n_knots : (M,) int64
+        Knots up to which there is a surface.
+    """
+
+    log_length_scale: FloatArray
+    knot_log_length_scale: FloatArray
+    inlier: BoolArray
+    mean: FloatArray
+    std: FloatArray
+    n_knots: IntArray
+
+
+@jit(entry=True, fastmath=True)
+def grow_surfaces(
+    part: Part, frame: Frame, theta: FloatArray, params: GroundParams, own: SegmentSurfaces
+) -> None:
+    """Inliers and surface of the segments of a part, into `own`."""
+    candidates, knots = frame.candidates, frame.knots
+    offsets, r = candidates.offsets, candidates.r
+    inlier, mean, std = own.inlier, own.mean, own.std
+    most = 0
+    for m in range(part.first, part.stop):
+        most = max(most, offsets[m + 1] - offsets[m])
+    room = (most + len(knots) + LANES - 1) & -LANES
+    columns, whitened = np.empty((6, room)), np.empty((most, room))
+    # One by one, so that the compiler knows them to be contiguous.
+    all_r, all_l, square = columns[0], columns[1], columns[2]
+    predicted, variance, observed = columns[3], columns[4], columns[5]
+    new = np.empty(most, np.int64)
+    slope = params.slope_std**2
+    for m in range(part.first, part.stop):
+        first = offsets[m]
+        n = offsets[m + 1] - first
+        for j in range(len(knots)):
+            mean[m, j] = std[m, j] = np.nan
+        n_new = 0
+        for i in range(n):
+            inlier[first + i] = False
+            observed[i] = candidates.z[first + i] - frame.prior_mean
+            is_low = abs(observed[i]) <= params.seed_height_tolerance
+            if is_low and r[first + i] <= params.seed_range and m % params.segment_step == 0:
+                new[n_new] = i
+                n_new += 1
+        own.n_knots[m] = 0
+        if n_new == 0:
+            continue
+        n_knots = 0
+        while n_knots < len(knots) and not math.isnan(own.knot_log_length_scale[m, n_knots]):
+            n_knots += 1
+        size = (n + n_knots + LANES - 1) & -LANES
+        # Element by element: assigned slices take as long, and seconds to compile.
+        for i in range(n):
+            all_r[i], all_l[i] = r[first + i], own.log_length_scale[first + i]
+        for j in range(n_knots):
+            all_r[n + j], all_l[n + j] = knots[j], own.knot_log_length_scale[m, j]
+        for j in range(n + n_knots, size):
+            all_r[j] = all_l[j] = 0.0
+        sigma_n = math.exp(theta[m, 1])
+        sill = math.exp(theta[m, 0]) ** 2
+        for j in range(size):
+            all_l[j] = exp_neg(-all_l[j])
+            square[j] = all_l[j] * all_l[j]
+            predicted[j] = 0.0
+            variance[j] = sill + slope * all_r[j] * all_r[j]
+        # Learned on inliers the noise comes out small, which must not close the gate.
+        noise, gate = sigma_n**2, max(sigma_n, params.least_gate_noise) ** 2
+        n_inliers = done = 0
+        # Unsigned, as a signed index could count from the end.
+        end = np.uintp(size)
+        while n_new > 0:
+            for a in range(n_new):
+                i = new[a]
+                inlier[first + i] = True
+                while done < n and inlier[first + done]:
+                    done += 1
+                # The columns before are not needed any more.
+                near = np.uintp(min(i, done) & -LANES)
+                row = whitened[n_inliers]
+                own_r, own_l, own_square = all_r[i], 2.0 * all_l[i], square[i]
+                # Prior covariance of column i with the columns from `near` on (paper, eq. 8).
+                for j in range(near, end):
+                    inverse = 1.0 / (own_square + square[j])
+                    distance = own_r - all_r[j]
+                    root = math.sqrt(own_l * all_l[j] * inverse)
+                    value = sill * root * exp_neg(distance * distance * inverse)
+                    row[j] = value + slope * own_r * all_r[j]
+                # Subtract the projection on the rows before, four rows at a time, so that the
+                # new row is read and written once for all of them.
+                k = 0
+                while k + 4 <= n_inliers:
+                    row_0, row_1 = whitened[k], whitened[k + 1]
+                    row_2, row_3 = whitened[k + 2], whitened[k + 3]
+                    w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
+                    for j in range(near, end):
+                        row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
+                    k += 4
+                while k < n_inliers:
+                    row_0, w_0 = whitened[k], whitened[k, i]
+                    for j in range(near, end):
+                        row[j] -= w_0 * row_0[j]
+                    k += 1
+                scale = 1.0 / math.sqrt(variance[i] + noise)
+                innovation = (observed[i] - predicted[i]) * scale
+                for j in range(near, end):
+                    value = row[j] * scale
+                    row[j] = value
+                    predicted[j] += value * innovation
+                    variance[j] -= value * value
+                n_inliers += 1
+            n_new = 0
+            for i in range(done, n):
+                if inlier[first + i]:
+                    continue
+                residual = observed[i] - predicted[i]
+                limit = params.max_standardised_depth
+                if residual > 0.0:
+                    limit = params.max_standardised_residual
+                spread = max(variance[i], 0.0) + gate
+                if (frame.continues_line[first + i] and inlier[first + i - 1]) or (
+                    variance[i] <= params.max_std**2
+                    and residual * residual <= limit * limit * spread
+                ):
+                    new[n_new] = i
+                    n_new += 1
+        for j in range(n_knots):
+            mean[m, j] = predicted[n + j]
+            std[m, j] = math.sqrt(max(variance[n + j], 0.0))
+        own.n_knots[m] = n_knots
+
+
+@jit(entry=True, fastmath=True)
+def fuse_neighbours(
+    own: SegmentSurfaces,
+    knots: FloatArray,
+    params: GroundParams,
+    prior_mean: float,
+    fused_mean: FloatArray,
+    fused_std: FloatArray,
+) -> None:
+    """Do what the twin does; `own` is about `prior_mean`, and the result is not."""
+    mean, std, n_neighbours = own.mean, own.std, params.n_neighbours
+    n_segments, n_knots = mean.shape
+    aside = params.slope_std * 2.0 * math.pi / n_segments
+    total_weight, weighted = np.empty(n_knots), np.empty(n_knots)
+    for m in range(n_segments):
+        if n_neighbours == 0:
+            for j in range(n_knots):
+                fused_mean[m, j], fused_std[m, j] = mean[m, j] + prior_mean, std[m, j]
+            continue
+        for j in range(n_knots):
+            total_weight[j] = weighted[j] = 0.0
+        n_fused = 0
+        for k in range(-n_neighbours, n_neighbours + 1):
+            other = (m - k) % n_segments
+            n_fused = max(n_fused, own.n_knots[other])
+            slope = k * aside
+            their_mean, their_std = mean[other], std[other]
+            for j in range(own.n_knots[other]):
+                away = slope * knots[j]
+                weight = 1.0 / max(their_std[j] * their_std[j] + away * away, 1e-8)
+                total_weight[j] += weight
+                weighted[j] += weight * their_mean[j]
+        for j in range(n_fused):
+            fused_mean[m, j] = weighted[j] / total_weight[j] + prior_mean
+            fused_std[m, j] = 1.0 / math.sqrt(total_weight[j])
+        for j in range(n_fused, n_knots):
+            fused_mean[m, j] = fused_std[m, j] = math.nan

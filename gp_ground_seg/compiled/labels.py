@@ -1,0 +1,178 @@
+"""Compiled twin of `gp_ground_seg.pipeline.labels`, in four calls.
+
+`fit_pieces` prepares the surface of each cell, `survey` measures the heights of a part of the
+points over it, `set_bands` turns the sums of all parts into bands, `label_part` labels a part.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.compiled.threads import Part
+from gp_ground_seg.frame import (
+    NOT_FINITE,
+    BoolArray,
+    Faces,
+    FloatArray,
+    GroundSurface,
+    IntArray,
+    Label,
+    Labelled,
+    Scan,
+)
+from gp_ground_seg.jit import jit
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.labels import SQUARE_UNITS
+
+# Plain integers, as compiled code has no enumerations.
+_UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
+OBSTACLE_FLAG = 2**32
+"""Added to the number of points for each that shows an obstacle: more than there are points."""
+
+
+class LabelParams(NamedTuple):
+    """Tolerances, see `gp_ground_seg.parameters.config`."""
+
+    ground_tolerance: float
+    roughness_gain: float
+    obstacle_tolerance: float
+    obstacle_roughness_gain: float
+    obstacle_min_height: float
+    obstacle_max_height: float
+    below_tolerance: float
+    face_tolerance: float
+
+    @classmethod
+    def of(cls, config: Config) -> LabelParams:
+        """Take the values out of a configuration."""
+        label = config.label
+        return cls(
+            label.ground_tolerance,
+            label.roughness_gain,
+            label.obstacle_tolerance,
+            label.obstacle_roughness_gain,
+            label.obstacle_min_height,
+            label.obstacle_max_height,
+            label.below_tolerance,
+            config.faces.tolerance,
+        )
+
+
+class LabelRoom(NamedTuple):
+    """Working arrays of the labels; the last row of each is for points in no cell.
+
+    Attributes
+    ----------
+    pieces : (M * n_bins + 1, 2) float64
+        Surface in each cell, level and slope over range.
+    sums : (n_parts, M * n_bins + 1, 2) int64
+        For each cell the number of points near the surface, with `OBSTACLE_FLAG` added for
+        each that shows an obstacle, and the sum of squared heights in whole units. Their
+        order does not matter, nor how the points are split.
+    band : (M * n_bins + 1,) float64
+        Largest height of ground [m].
+    """
+
+    pieces: FloatArray
+    sums: IntArray
+    band: FloatArray
+
+
+@jit(entry=True)
+def fit_pieces(surface: GroundSurface, room: LabelRoom) -> None:
+    """Line of the surface across each cell; NaN in the last row."""
+    knots, mean = surface.knots, surface.mean
+    n_bins = len(knots) - 1
+    for m in range(len(mean)):
+        for n in range(n_bins):
+            slope = (mean[m, n + 1] - mean[m, n]) / (knots[n + 1] - knots[n])
+            room.pieces[m * n_bins + n, 0] = mean[m, n] - slope * knots[n]
+            room.pieces[m * n_bins + n, 1] = slope
+    room.pieces[len(room.pieces) - 1, 0] = room.pieces[len(room.pieces) - 1, 1] = math.nan
+
+
+@jit(entry=True)
+def survey(
+    part: Part,
+    scan: Scan,
+    is_face: BoolArray,
+    params: LabelParams,
+    height: FloatArray,
+    room: LabelRoom,
+) -> None:
+    """Heights of the points of a part over the surface, and the sums for roughness."""
+    z, cell, r, tile = scan.xyz.T[2], scan.grid.cell, scan.grid.r, scan.tiles.tile
+    pieces, sums, nearest = room.pieces, room.sums[part.number], scan.grid.edges[0]
+    min_height, max_height = params.obstacle_min_height, params.obstacle_max_height
+    for k in range(len(sums)):
+        sums[k, 0] = sums[k, 1] = 0
+    for i in range(part.first, part.stop):
+        own = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
+        away = max(np.float64(r[i]), nearest)
+        h = np.float64(z[i]) - (pieces[own, 0] + pieces[own, 1] * away)
+        height[i] = h
+        if h >= min_height:
+            if h <= max_height:
+                sums[own, 0] += OBSTACLE_FLAG
+        elif h >= -min_height and not is_face[np.uintp(tile[i])]:
+            sums[own, 0] += 1
+            sums[own, 1] += int(h * h * SQUARE_UNITS + 0.5)
+
+
+@jit(entry=True)
+def set_bands(n_parts: int, params: LabelParams, room: LabelRoom, roughness: FloatArray) -> None:
+    """Roughness and band of each cell from the sums of all parts."""
+    n_segments, n_bins = roughness.shape
+    # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
+    number = np.empty(n_bins + 2, np.int64)
+    squares = np.empty(n_bins + 2, np.int64)
+    n_obstacles = np.empty(n_bins, np.int64)
+    for m in range(n_segments):
+        for n in range(n_bins + 2):
+            number[n] = squares[n] = 0
+        for n in range(n_bins):
+            n_obstacles[n] = 0
+        for index in range(n_parts):
+            for k in range(-1, 2):
+                first = (m + k + n_segments) % n_segments * n_bins
+                for n in range(n_bins):
+                    number[n + 1] += room.sums[index, first + n, 0] & (OBSTACLE_FLAG - 1)
+                    squares[n + 1] += room.sums[index, first + n, 1]
+            for n in range(n_bins):
+                n_obstacles[n] += room.sums[index, m * n_bins + n, 0] >> 32
+        for n in range(n_bins):
+            count = max(number[n] + number[n + 1] + number[n + 2], 1)
+            total = squares[n] + squares[n + 1] + squares[n + 2]
+            rough = math.sqrt(np.float64(total) / (SQUARE_UNITS * np.float64(count)))
+            free = params.ground_tolerance + params.roughness_gain * rough
+            beside = params.obstacle_tolerance + params.obstacle_roughness_gain * rough
+            own = min(free, beside) if n_obstacles[n] > 0 else free
+            room.band[m * n_bins + n] = min(own, params.obstacle_min_height)
+            roughness[m, n] = rough
+    room.band[n_segments * n_bins] = math.nan
+
+
+@jit(entry=True)
+def label_part(
+    part: Part, scan: Scan, faces: Faces, params: LabelParams, band: FloatArray, result: Labelled
+) -> None:
+    """Label the points of a part from their heights in `result`."""
+    z, cell = scan.xyz.T[2], scan.grid.cell
+    for i in range(part.first, part.stop):
+        n, h = cell[i], result.height[i]
+        margin = min(
+            band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + params.below_tolerance
+        )
+        t = np.uintp(scan.tiles.tile[i] if n >= 0 else 0)
+        if faces.is_face[t]:
+            over_base = max(h, np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0]))
+            limit = params.face_tolerance
+            if faces.has_occluded_base[t]:
+                limit = -limit
+            margin = min(margin, limit - over_base)
+        result.margin[i] = margin
+        own = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
+        result.label[i] = _GROUND if margin >= 0.0 else own

@@ -1,0 +1,261 @@
+"""Compiled twin of `gp_ground_seg.pipeline.lines`: candidates to lines and pseudo-inputs."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.frame import (
+    N_CLASSES,
+    BoolArray,
+    Candidates,
+    FloatArray,
+    Lines,
+    PseudoInputs,
+)
+from gp_ground_seg.jit import jit
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline import lines as plain
+from gp_ground_seg.pipeline.lines import MIN_BREAK_CANDIDATES
+
+_deming_slope = jit()(plain.deming_slope)
+
+
+class LineParams(NamedTuple):
+    """Tolerances of lines and pseudo-inputs, see `gp_ground_seg.parameters.config`."""
+
+    slope_tolerance: float
+    offset_tolerance: float
+    max_line_distance: float
+    max_gap: float
+    max_gap_growth: float
+    max_density_ratio: float
+    error_ratio: float
+    candidates_per_pseudo_input: float
+    medium_extent: float
+    long_extent: float
+    sloped_gradient: float
+    steep_gradient: float
+    shortest: float
+    longest: float
+    min_line_size: int
+    min_bend_extent: float
+    max_line_slope: float
+
+    @classmethod
+    def of(cls, config: Config) -> LineParams:
+        """Take the values out of a configuration."""
+        lines, latent, growth = config.lines, config.latent, config.growth
+        return cls(
+            lines.slope_tolerance,
+            lines.offset_tolerance,
+            lines.max_line_distance,
+            lines.max_gap,
+            lines.max_gap_growth,
+            lines.max_density_ratio,
+            lines.error_ratio,
+            latent.candidates_per_pseudo_input,
+            latent.medium_extent,
+            latent.long_extent,
+            latent.sloped_gradient,
+            latent.steep_gradient,
+            config.length_scale.min,
+            config.length_scale.max,
+            growth.min_line_size,
+            growth.min_bend_extent,
+            growth.max_line_slope,
+        )
+
+
+@jit(entry=True)
+def keep_visible(candidates: Candidates, has_occluded_base: BoolArray) -> Candidates:
+    """Leave out candidates in tiles where the base of a face is occluded."""
+    size = len(candidates.r)
+    r, z, density = np.empty(size), np.empty(size), np.empty(size)
+    own_bin, tile = np.empty(size, np.int64), np.empty(size, np.int32)
+    offsets = np.zeros(len(candidates.offsets), np.int64)
+    n = 0
+    for m in range(len(offsets) - 1):
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            if not has_occluded_base[candidates.tile[c]]:
+                r[n], z[n], density[n] = candidates.r[c], candidates.z[c], candidates.density[c]
+                own_bin[n], tile[n] = candidates.bin[c], candidates.tile[c]
+                n += 1
+        offsets[m + 1] = n
+    return Candidates(r[:n], z[:n], own_bin[:n], density[:n], offsets, tile[:n])
+
+
+@jit(entry=True)
+def extract_lines(candidates: Candidates, params: LineParams) -> Lines:
+    """Do what the twin does."""
+    r, z, density, offsets = candidates.r, candidates.z, candidates.density, candidates.offsets
+    line = np.empty(len(r), np.int64)
+    start = np.empty(len(r) + 1, np.int64)
+    slopes = np.empty(len(r))
+    tangent = math.tan(params.slope_tolerance)
+    square_distance = params.max_line_distance * params.max_line_distance
+    current = 0
+    for m in range(len(offsets) - 1):
+        stop = offsets[m + 1]
+        i = offsets[m]
+        while i < stop:
+            # Sums relative to the first point of the line keep their digits.
+            first_r, first_z = r[i], z[i]
+            sum_r, sum_z, sum_rr, sum_zz, sum_rz = 0.0, 0.0, 0.0, 0.0, 0.0
+            mean_r, mean_z = 0.0, 0.0
+            slope = np.nan
+            start[current] = i
+            line[i] = current
+            n = 1
+            j = i + 1
+            while j < stop:
+                last_density, own_density = density[j - 1], density[j]
+                if (
+                    r[j] - r[j - 1] > params.max_gap + params.max_gap_growth * r[j]
+                    or own_density > params.max_density_ratio * last_density
+                    or last_density > params.max_density_ratio * own_density
+                ):
+                    break
+                dr, dz = r[j] - first_r, z[j] - first_z
+                expected = mean_z + slope * (dr - mean_r)
+                missed = dz - expected
+                if n > 1 and missed * missed > square_distance * (1.0 + slope * slope):
+                    break
+                n += 1
+                sum_r += dr
+                sum_z += dz
+                sum_rr += dr * dr
+                sum_zz += dz * dz
+                sum_rz += dr * dz
+                mean_r, mean_z = sum_r / n, sum_z / n
+                new_slope = _deming_slope(
+                    sum_rr - n * mean_r * mean_r,
+                    sum_zz - n * mean_z * mean_z,
+                    sum_rz - n * mean_r * mean_z,
+                    params.error_ratio,
+                )
+                if n > 2:
+                    moved = mean_z + new_slope * (dr - mean_r) - expected
+                    if abs(moved) > params.offset_tolerance or _differs_in_direction(
+                        slope, new_slope, params.slope_tolerance, tangent
+                    ):
+                        break
+                slope = new_slope
+                line[j] = current
+                j += 1
+            slopes[current] = slope
+            current += 1
+            i = j
+    start[current] = len(r)
+    return Lines(line, slopes[:current], start[: current + 1])
+
+
+@jit()
+def _differs_in_direction(
+    slope: float, new_slope: float, tolerance: float, tangent: float
+) -> bool:
+    """Whether two lines differ in direction by more than `tolerance`, of which `tangent` is."""
+    along = 1.0 + slope * new_slope
+    if math.isfinite(along):
+        return along <= 0.0 or abs(new_slope - slope) > tangent * along
+    return abs(math.atan(new_slope) - math.atan(slope)) > tolerance
+
+
+@jit(entry=True)
+def select_pseudo_inputs(candidates: Candidates, lines: Lines, params: LineParams) -> PseudoInputs:
+    """Do what the twin does."""
+    r, start, slope = candidates.r, lines.start, lines.slope
+    n_lines = len(slope)
+    r_bar, surface_class = np.empty(len(r)), np.empty(len(r), dtype=np.int64)
+    offsets = np.empty(len(candidates.offsets), dtype=np.int64)
+    count, total = np.zeros(N_CLASSES, dtype=np.int64), np.zeros(N_CLASSES)
+    log_shortest = math.log(params.shortest)
+    m = 0
+    p = 0
+    for q in range(n_lines):
+        first = start[q]
+        while candidates.offsets[m] <= first:
+            offsets[m] = p
+            m += 1
+        size = start[q + 1] - first
+        extent = r[first + size - 1] - r[first]
+        steepness = abs(slope[q])
+        own = 0
+        if extent >= params.medium_extent:
+            own += 1
+        if extent >= params.long_extent:
+            own += 1
+        # Negated, so that a line of one point, whose slope is NaN, counts as steep.
+        if not steepness < params.sloped_gradient:
+            own += 3
+        if not steepness < params.steep_gradient:
+            own += 3
+        log_extent = log_shortest
+        if extent > params.shortest:
+            log_extent = math.log(min(extent, params.longest))
+        count[own] += 1
+        total[own] += log_extent
+        number = max(int(np.rint(size / params.candidates_per_pseudo_input)), 1)
+        for rank in range(number):
+            r_bar[p] = r[first + (size * (2 * rank + 1)) // (2 * number)]
+            surface_class[p] = own
+            p += 1
+    for k in range(m, len(offsets)):
+        offsets[k] = p
+    empty = total.sum() / n_lines if n_lines > 0 else log_shortest
+    first_guess = np.empty(N_CLASSES)
+    for k in range(N_CLASSES):
+        first_guess[k] = total[k] / count[k] if count[k] > 0 else empty
+    return PseudoInputs(r_bar[:p], surface_class[:p], offsets, first_guess)
+
+
+@jit(entry=True)
+def candidates_on_lines(candidates: Candidates, lines: Lines, params: LineParams) -> BoolArray:
+    """Do what the twin does."""
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    start, slope = lines.start, lines.slope
+    continues_line = np.empty(len(r), dtype=np.bool_)
+    m = 0
+    for q in range(len(slope)):
+        first, stop = start[q], start[q + 1]
+        while offsets[m] < first:
+            m += 1
+        is_flat = abs(slope[q]) <= params.max_line_slope
+        at_break = False
+        is_long = stop - first >= MIN_BREAK_CANDIDATES
+        is_long = is_long and r[stop - 1] - r[first] >= params.min_bend_extent
+        if is_flat and is_long and offsets[m] != first:
+            at_break = _meets_line_before(first, stop, r, z, slope[q - 1], slope[q], params)
+        continues_line[first] = at_break
+        for c in range(first + 1, stop):
+            continues_line[c] = at_break or (is_flat and stop - first >= params.min_line_size)
+    return continues_line
+
+
+@jit()
+def _meets_line_before(
+    first: int,
+    stop: int,
+    r: FloatArray,
+    z: FloatArray,
+    before: float,
+    slope: float,
+    params: LineParams,
+) -> bool:
+    """Whether the line and that before it intersect between them."""
+    mean_r, mean_z = 0.0, 0.0
+    for c in range(first, stop):
+        mean_r += r[c] / (stop - first)
+        mean_z += z[c] / (stop - first)
+    last = first - 1
+    if not abs(before) <= params.max_line_slope:
+        before = 0.0
+    over_last = mean_z + slope * (r[last] - mean_r) - z[last]
+    over_line = z[first] - (z[last] + before * (r[first] - r[last]))
+    tolerance = params.offset_tolerance
+    upwards = over_last <= tolerance and over_line >= -tolerance
+    downwards = over_last >= -tolerance and over_line <= tolerance
+    meets: bool = upwards or downwards
+    return meets

@@ -1,0 +1,186 @@
+"""Log marginal likelihood of a whole frame and its gradient, in batches of segments."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.frame import FloatArray, Inliers, IntArray
+from gp_ground_seg.gp.kernels import squared_exponential
+from gp_ground_seg.gp.linalg import Padded, add_noise, batches, single_threaded_blas
+
+N_SCALARS = 5
+"""Entries of theta before the log length-scales of the surface classes."""
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+@single_threaded_blas()
+def log_likelihood(
+    theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
+) -> tuple[float, FloatArray]:
+    """Log marginal likelihood of a frame and its gradient (paper, eqs. 19 and 20).
+
+    Parameters
+    ----------
+    theta : (5 + K,) float64
+        Logarithms of sigma_f, sigma_n [m], sigma_f_bar [log m], sigma_l_bar [m],
+        sigma_n_bar [log m], then the log length-scale of each of K surface classes.
+    inliers : Inliers
+        Inliers and pseudo-inputs.
+    slope_std : float
+        Prior standard deviation of the mean line's slope. The line through the sensor's
+        base is marginalised, which adds ``slope_std^2 r r'`` to the kernel (Rasmussen and
+        Williams 2006, section 2.7).
+    latent_terms : bool
+        Whether the terms of the latent process, ``-1/2 log|B_m|``, are in: with
+        them the objective is the printed one, which has no upper bound.
+
+    Returns
+    -------
+    value : float
+        Log marginal likelihood; ``-inf`` where a covariance is not positive definite.
+    gradient : (5 + K,) float64
+        Its gradient in `theta`.
+    """
+    value, gradient = 0.0, np.zeros(len(theta))
+    try:
+        for segments in batches(inliers.offsets):
+            value += _add_batch(theta, gradient, inliers, segments, slope_std, latent_terms)
+    except np.linalg.LinAlgError:
+        value = -math.inf
+    if not math.isfinite(value):
+        return -math.inf, np.zeros(len(theta))
+    return value, gradient
+
+
+def _add_batch(
+    theta: FloatArray,
+    gradient: FloatArray,
+    inliers: Inliers,
+    segments: IntArray,
+    slope_std: float,
+    latent_terms: bool,
+) -> float:
+    """Value of some segments; adds to `gradient`. Letters are those of the paper."""
+    own = Padded.of(segments, inliers.offsets)
+    r, z = own.take(inliers.r), own.take(inliers.z)
+    bar = Padded.of(segments, inliers.bar_offsets)
+    u = own.take(inliers.log_length_scale)
+    has_latent = bar.mask.any(axis=1, keepdims=True)
+    latent = _Latent.of(theta, inliers, bar, r) if has_latent.any() else None
+    if latent is not None:
+        u = np.where(has_latent, latent.u, u)
+
+    sigma_f, sigma_n = np.exp(theta[:2])
+    length_scale = np.where(own.mask, np.exp(u), 1.0)
+    square = length_scale**2
+    inverse_spread = 1.0 / (square[:, :, None] + square[:, None, :])
+    exponent = r[:, :, None] - r[:, None, :]
+    exponent *= exponent
+    exponent *= inverse_spread
+    k = np.exp(-exponent)
+    k *= np.sqrt(inverse_spread * (2.0 * length_scale[:, :, None] * length_scale[:, None, :]))
+    k *= sigma_f**2 * (own.mask[:, :, None] & own.mask[:, None, :])
+    covariance = k + slope_std**2 * r[:, :, None] * r[:, None, :]
+    add_noise(covariance, np.full((1, 1), sigma_n**2), own.mask)
+    factor = np.linalg.cholesky(covariance)
+    a_inverse = np.linalg.inv(covariance)
+    alpha = (a_inverse @ z[:, :, None])[:, :, 0]
+    value = -0.5 * float(
+        np.sum(z * alpha)
+        + 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
+        + own.mask.sum() * _LOG_2PI
+    )
+
+    # G = (alpha alpha^T - A^-1) / 2 is the derivative of the value in A.
+    a_inverse *= -0.5
+    g = a_inverse
+    g += 0.5 * alpha[:, :, None] * alpha[:, None, :]
+    gradient[1] += 2.0 * sigma_n**2 * np.diagonal(g, axis1=1, axis2=2)[own.mask].sum()
+    g *= k
+    row_sum = g.sum(axis=2)
+    gradient[0] += 2.0 * row_sum.sum()
+    if latent is None:
+        return value
+    # dk/du_i = k (1/2 - l_i^2 / s (1 - 2 d^2 / s)), s = l_i^2 + l_j^2, in rows and columns.
+    exponent *= -2.0
+    exponent += 1.0
+    g *= exponent
+    g *= inverse_spread
+    g_u = row_sum - 2.0 * square * g.sum(axis=2)
+    g_u = np.where(own.mask & has_latent, g_u, 0.0)
+    return value + latent.add_gradient(gradient, g_u, latent_terms)
+
+
+class _Latent(NamedTuple):
+    """Latent process of S segments with p pseudo-inputs at the ranges of n inliers."""
+
+    u: FloatArray  # (S, n) log length-scale
+    sigma_l_bar: float
+    sigma_n_bar: float
+    bar: Padded
+    surface_class: IntArray  # (P,)
+    k_bar: FloatArray  # (S, p, p) without noise
+    k_star: FloatArray  # (S, n, p)
+    distance2: FloatArray  # (S, p, p)
+    star_distance2: FloatArray  # (S, n, p)
+    factor: FloatArray  # (S, p, p) Cholesky factor of B
+    inverse: FloatArray  # (S, p, p) of B
+    beta: FloatArray  # (S, p)
+
+    @classmethod
+    def of(cls, theta: FloatArray, inliers: Inliers, bar: Padded, r: FloatArray) -> _Latent:
+        sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[2:N_SCALARS])
+        r_bar = bar.take(inliers.r_bar)
+        l_bar = bar.take(theta[N_SCALARS + inliers.surface_class])
+        mean = l_bar.sum(axis=1, keepdims=True) / np.maximum(bar.mask.sum(axis=1), 1)[:, None]
+        scales = np.full(len(r), sigma_f_bar), np.full(len(r), sigma_l_bar)
+        k_bar = squared_exponential(r_bar, r_bar, *scales)
+        k_bar *= bar.mask[:, :, None] & bar.mask[:, None, :]
+        k_star = squared_exponential(r, r_bar, *scales) * bar.mask[:, None, :]
+        b = add_noise(k_bar.copy(), np.full((1, 1), sigma_n_bar**2), bar.mask)
+        inverse = np.linalg.inv(b).astype(np.float64, copy=False)
+        factor = np.linalg.cholesky(b).astype(np.float64, copy=False)
+        beta: FloatArray = (inverse @ np.where(bar.mask, l_bar - mean, 0.0)[:, :, None])[:, :, 0]
+        return cls(
+            u=mean + (k_star @ beta[:, :, None])[:, :, 0],
+            sigma_l_bar=sigma_l_bar,
+            sigma_n_bar=sigma_n_bar,
+            bar=bar,
+            surface_class=inliers.surface_class,
+            k_bar=k_bar,
+            k_star=k_star,
+            distance2=(r_bar[:, :, None] - r_bar[:, None, :]) ** 2,
+            star_distance2=(r[:, :, None] - r_bar[:, None, :]) ** 2,
+            factor=factor,
+            inverse=inverse,
+            beta=beta,
+        )
+
+    def add_gradient(self, gradient: FloatArray, g_u: FloatArray, latent_terms: bool) -> float:
+        """Propagate the derivatives in u to theta; return the latent terms of the value."""
+        bar, beta = self.bar, self.beta
+        weight = (self.inverse @ (g_u[:, None, :] @ self.k_star).swapaxes(1, 2))[:, :, 0]
+        count = np.maximum(bar.mask.sum(axis=1), 1)
+        shared = (g_u.sum(axis=1) - weight.sum(axis=1)) / count
+        g_l_bar = (weight + shared[:, None])[bar.mask]
+        classes = self.surface_class[bar.place[bar.mask]]
+        gradient[N_SCALARS:] += np.bincount(classes, g_l_bar, len(gradient) - N_SCALARS)
+
+        # Adjoints of k_star and of B: every derivative is contracted with them.
+        star = g_u[:, :, None] * self.k_star * beta[:, None, :]
+        adjoint = -weight[:, :, None] * beta[:, None, :]
+        if latent_terms:
+            adjoint -= 0.5 * self.inverse
+        on_diagonal = np.diagonal(adjoint, axis1=1, axis2=2)[bar.mask].sum()
+        gradient[4] += 2.0 * self.sigma_n_bar**2 * on_diagonal
+        adjoint *= self.k_bar
+        gradient[2] += 2.0 * (star.sum() + adjoint.sum())
+        contracted = np.sum(star * self.star_distance2) + np.sum(adjoint * self.distance2)
+        gradient[3] += contracted / self.sigma_l_bar**2
+        if not latent_terms:
+            return 0.0
+        log_determinant = 2.0 * np.log(np.diagonal(self.factor, axis1=1, axis2=2)).sum()
+        return -0.5 * float(log_determinant + bar.mask.sum() * _LOG_2PI)

@@ -1,0 +1,156 @@
+"""Stage 3: vertical faces (walls, fences, kerbs, sides of cars) by the scatter of their returns.
+
+A band about the ground cannot separate the base of a wall from the ground before it. The
+returns above the base can: together they form a vertical surface. The base of a face is
+occluded where something stands before it, or where the rings of the sensor miss the strip of
+ground in its tile; the lowest return of the tile then belongs to the face.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gp_ground_seg.frame import OUTSIDE, BoolArray, Faces, FloatArray, IntArray, PointArray, Tiles
+from gp_ground_seg.parameters.config import FacesConfig
+
+MIN_RETURNS = 4
+"""Returns that a tile needs to have an orientation."""
+UNITS_PER_METRE = 2.0**16
+"""Coordinates are rounded to units of 15 um: squares and products within a tile, and sums of two
+hundred thousand of them, are then exact, so that their order does not matter."""
+
+
+def find_faces(xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float) -> Faces:
+    """Find the tiles that hold a vertical face.
+
+    A tile is examined if a return lies more than ``faces.min_height`` above the lowest.
+    The scatter of its returns determines their orientation; see `normal_z`.
+
+    Parameters
+    ----------
+    xyz : (N, 3) float32 or float64
+        Points [m].
+    tiles : Tiles
+        Tiles of the points.
+    faces : FacesConfig
+        Thresholds.
+    max_height : float
+        Height above the lowest return up to which returns are used [m]; higher ones
+        may overhang.
+    """
+    inside = tiles.tile != OUTSIDE
+    own, points = tiles.tile[inside], xyz[inside].astype(np.float64)
+    n_tiles = len(tiles.extremes)
+    n_sides = math.isqrt(n_tiles)
+    # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
+    for i, place in enumerate(np.divmod(own, n_sides)):
+        origin = place * faces.cell_size - 0.5 * n_sides * faces.cell_size
+        points[:, i] -= np.rint(origin * UNITS_PER_METRE) / UNITS_PER_METRE
+    above = points[:, 2] - tiles.lowest_z[own]
+    points[:, 2] = above
+    points = np.rint(points * UNITS_PER_METRE) / UNITS_PER_METRE
+    low = above <= max_height
+    is_tall = np.zeros(n_tiles, dtype=np.bool_)
+    is_tall[own[low & (above > faces.min_height)]] = True
+
+    used = low & is_tall[own]
+    tall, row = np.unique(own[used], return_inverse=True)
+    chosen = points[used]
+    count = np.bincount(row, minlength=len(tall)).astype(np.float64)
+    mean = np.empty((len(tall), 3))
+    for i in range(3):
+        mean[:, i] = np.bincount(row, chosen[:, i], minlength=len(tall)) / count
+    centred = chosen - mean[row]
+    scatter = np.empty((len(tall), 3, 3))
+    for i in range(3):
+        for j in range(3):
+            product = centred[:, i] * centred[:, j]
+            scatter[:, i, j] = np.bincount(row, product, minlength=len(tall))
+    is_face = np.zeros(n_tiles, dtype=np.bool_)
+    is_vertical = normal_z(scatter) <= faces.max_normal_z
+    is_face[tall] = is_vertical & (count >= MIN_RETURNS)
+    has_occluded_base = np.zeros(n_tiles, dtype=np.bool_)
+    occluded = is_base_occluded(row, centred, above[used], len(tall), faces)
+    has_occluded_base[tall] = occluded & is_face[tall]
+    return Faces(is_face, has_occluded_base)
+
+
+def normal_z(scatter: FloatArray) -> FloatArray:
+    """Vertical part of the unit normal of points with the given scatter, in closed form.
+
+    The adjugate of the scatter matrix is the sum of the outer products of its
+    eigenvectors, each weighted by the product of the other two eigenvalues: the
+    normal of a plane, the direction of least scatter, has nearly all the weight. The
+    share of the vertical in its trace is the squared vertical part of the normal.
+    Of a pole, both horizontal directions count; of a shapeless cluster, all three.
+
+    Parameters
+    ----------
+    scatter : (T, 3, 3) float64
+        Scatter (or covariance) matrices.
+
+    Returns
+    -------
+    (T,) float64
+        0 for vertical planes and poles, 1 for level planes; 1 where there is no scatter.
+    """
+    xx, yy, zz = scatter[:, 0, 0], scatter[:, 1, 1], scatter[:, 2, 2]
+    xy, xz, yz = scatter[:, 0, 1], scatter[:, 0, 2], scatter[:, 1, 2]
+    vertical = np.maximum(xx * yy - xy * xy, 0.0)
+    trace = vertical + np.maximum(yy * zz - yz * yz, 0.0) + np.maximum(xx * zz - xz * xz, 0.0)
+    known = trace > 0.0
+    result = np.ones(len(scatter))
+    result[known] = np.sqrt(vertical[known] / trace[known])
+    return result
+
+
+def is_base_occluded(
+    row: IntArray, xyz: FloatArray, above: FloatArray, n_rows: int, faces: FacesConfig
+) -> BoolArray:
+    """Whether the lowest returns of each face are its own, not ground before it.
+
+    Ground would lie off the plane of the returns above, and all at one height; returns in
+    the plane that are no denser than those above belong to the face.
+
+    Parameters
+    ----------
+    row : (P,) int64
+        Face of each return.
+    xyz : (P, 3) float64
+        Returns, relative to any point of their tile [m].
+    above : (P,) float64
+        Height above the lowest return of the tile [m].
+    n_rows : int
+        Number of faces T.
+    faces : FacesConfig
+        Thresholds.
+
+    Returns
+    -------
+    (T,) bool
+        False where fewer than two returns are higher than the tolerance.
+    """
+
+    def total(values: FloatArray, chosen: BoolArray) -> FloatArray:
+        return np.bincount(row[chosen], values[chosen], minlength=n_rows).astype(np.float64)
+
+    low = above <= faces.tolerance
+    n_low, n_high = (np.bincount(row[part], minlength=n_rows) for part in (low, ~low))
+    number = np.maximum(n_high, 1)
+    x = xyz[:, 0] - (total(xyz[:, 0], ~low) / number)[row]
+    y = xyz[:, 1] - (total(xyz[:, 1], ~low) / number)[row]
+    along, across = total(x * x - y * y, ~low), 2.0 * total(x * y, ~low)
+    low_along, low_across = total(x * x - y * y, low), 2.0 * total(x * y, low)
+    # Mean square along the direction in which the returns above scatter least.
+    size = np.hypot(along, across)
+    aligned = (low_along * along + low_across * across) / np.where(size > 0.0, size, 1.0)
+    square = 0.5 * (total(x * x + y * y, low) - aligned)
+    top = np.zeros(n_rows)
+    np.maximum.at(top, row, above)
+    is_in_plane = square <= n_low * faces.max_foot_distance**2
+    usual = n_high * faces.tolerance
+    is_sparse = n_low * (top - faces.tolerance) <= faces.max_foot_density * usual
+    result: BoolArray = is_in_plane & is_sparse & (n_high >= 2)
+    return result & (faces.max_foot_distance > 0.0)

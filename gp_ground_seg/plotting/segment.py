@@ -1,0 +1,298 @@
+"""One segment from the side: candidates, lines, surface, length-scale (the paper's Figure 1)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.frame import OUTSIDE, FloatArray, Label
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.points import check_points
+from gp_ground_seg.plotting.style import (
+    BLUE,
+    GREEN,
+    VERMILION,
+    VIOLET,
+    check_lengths,
+    new_figure,
+    save,
+)
+from gp_ground_seg.result import Segmentation
+
+FORMATS = ('.png', '.pdf')
+DPI = 130
+# Inches: the figure, and the part of it that the two panels leave to the legend.
+WIDTH, HEIGHT, LEGEND = 12.2, 7.6, 2.6
+
+# The truth is light, so that what is estimated stands out.
+POINT_COLOUR = '#B4BAC0'
+TRUE_GROUND_COLOUR = '#E8CF9A'
+TRUE_OBSTACLE_COLOUR = '#A9C4DA'
+CANDIDATE_COLOUR = '#56636E'
+INLIER_COLOUR = BLUE
+LINE_COLOUR = GREEN
+SURFACE_COLOUR = VERMILION
+PSEUDO_INPUT_COLOUR = VIOLET
+
+# Metres kept free below and above the ground, and beyond the last candidate; and the distance
+# from the ground up to which a candidate is always in the picture.
+BELOW, ABOVE, BEYOND, NEAR_GROUND = 0.25, 0.9, 2.0, 1.0
+
+
+def segment_at(azimuth: float, n_segments: int) -> int:
+    """Return the segment towards an azimuth [rad], counter-clockwise from x."""
+    return math.floor((azimuth / math.tau + 0.5) * n_segments) % n_segments
+
+
+def plot_segment(
+    result: Segmentation,
+    config: Config,
+    points: npt.ArrayLike,
+    segment: int,
+    path: str | Path,
+    truth: npt.NDArray[np.uint8] | None = None,
+    title: str = '',
+    max_range: float | None = None,
+) -> None:
+    """Draw a segment from the side as PNG or PDF, replacing the file `path`.
+
+    Above: points, ground candidates, the lines through them with their critical
+    points, inliers, and the surface with twice its standard deviation. Below:
+    the length-scale and the pseudo-inputs it follows.
+
+    Parameters
+    ----------
+    result : Segmentation
+        The segmentation of `points`.
+    config : Config
+        The parameters it was segmented with.
+    points : (N, >=3) float array
+        x forward, y left, z up [m].
+    segment : int
+        Number of the segment.
+    path : str or Path
+        File to write, .png or .pdf.
+    truth : (N,) uint8, optional
+        True `Label` of each point, UNKNOWN where it does not count.
+    title : str
+        Line above the panels, before the segment's number.
+    max_range : float, optional
+        Range shown [m]; by default a little more than that of the last candidate.
+
+    Raises
+    ------
+    PointCloudError
+        If the shapes do not fit together.
+    ConfigError
+        If the segment, the range or the ending of the file is not one accepted.
+    """
+    z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
+    check_lengths(len(z), result=result.label, truth=truth)
+    n_segments = result.grid.n_segments
+    if not 0 <= segment < n_segments:
+        raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
+    if max_range is not None and not (max_range > 0.0 and math.isfinite(max_range)):
+        raise ConfigError(f'max_range = {max_range}: must be a positive number of metres')
+    if Path(path).suffix.lower() not in FORMATS:
+        raise ConfigError(f'{path}: must end in {" or ".join(FORMATS)}')
+    figure = new_figure(WIDTH, HEIGHT, DPI)
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    view = SegmentView(result, z, segment, truth)
+    reach = view.reach() if max_range is None else max_range
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
+    figure.subplots_adjust(0.065, 0.075, 1.0 - LEGEND / WIDTH, 0.93, hspace=0.08)
+    above.set_title(view.title(title), fontsize=12, loc='left', parse_math=False)
+    view.draw_heights(above, reach)
+    view.draw_length_scale(below, reach, with_pseudo_inputs=config.length_scale.model == 'latent')
+    below.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    below.yaxis.set_major_formatter('{x:g}')
+    below.yaxis.set_minor_formatter(NullFormatter())
+    below.set_xlabel('horizontal range r [m]')
+    for axes in (above, below):
+        axes.grid(color='#E9ECEE', linewidth=0.7)
+        axes.set_axisbelow(True)
+        axes.legend(
+            loc='upper left', bbox_to_anchor=(1.01, 1.01), frameon=False, fontsize=10,
+            borderaxespad=0.0, labelspacing=0.8, markerscale=1.3,
+        )  # fmt: skip
+    figure.align_ylabels()
+    save(figure, path)
+
+
+class SegmentView:
+    """The parts of the picture; `z` is the height of each point in the level frame, (N,) [m]."""
+
+    def __init__(
+        self,
+        result: Segmentation,
+        z: FloatArray,
+        segment: int,
+        truth: npt.NDArray[np.uint8] | None,
+    ) -> None:
+        self._result = result
+        self._segment = segment
+        own = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
+        self._r, self._z = result.grid.r[own], z[own]
+        self._truth = None if truth is None else truth[own]
+        self._own = slice(*(int(k) for k in result.candidates.offsets[segment : segment + 2]))
+        self._candidate_r = result.candidates.r[self._own]
+        self._candidate_z = result.candidates.z[self._own]
+        self._inlier = result.surface.inlier[self._own]
+        self._knots = result.surface.knots
+        self._mean, self._std = result.surface.mean[segment], result.surface.std[segment]
+
+    def title(self, title: str) -> str:
+        """Return `title` with the segment and its azimuths."""
+        width = 360.0 / self._result.grid.n_segments
+        first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
+        model = '' if np.isfinite(self._mean).any() else ': no ground model'
+        parts = [title] if title else []
+        parts += [f'segment {self._segment}', f'azimuth {first:g}° to {last:g}°{model}']
+        return ', '.join(parts)
+
+    def reach(self) -> float:
+        """Range that holds all candidates, or all points where there are none [m]."""
+        if len(self._candidate_r):
+            return float(self._candidate_r[-1]) + BEYOND
+        return float(self._r.max()) + BEYOND if len(self._r) else self._result.grid.edges[-1]
+
+    def draw_heights(self, axes: Any, reach: float) -> None:
+        """Draw points, candidates, lines and ground over range, up to `reach` [m]."""
+        for title, colour, chosen in self._point_groups():
+            if chosen.any():
+                axes.plot(
+                    self._r[chosen], self._z[chosen], 'o', ms=3.6, mew=0.0, color=colour,
+                    zorder=2, label=f'{title} ({np.count_nonzero(chosen)})',
+                )  # fmt: skip
+        axes.fill_between(
+            self._knots, self._mean - 2.0 * self._std, self._mean + 2.0 * self._std,
+            linewidth=0.0, color=SURFACE_COLOUR, alpha=0.2, zorder=3, label='ground ± 2 std',
+        )  # fmt: skip
+        self._draw_lines(axes)
+        axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='ground')
+        for name, chosen, style in (
+            ('rejected', ~self._inlier, {'mfc': 'white', 'mec': CANDIDATE_COLOUR, 'mew': 1.1,
+                                         'ms': 5.5, 'zorder': 6}),
+            ('inliers', self._inlier, {'color': INLIER_COLOUR, 'mew': 0.0, 'ms': 5, 'zorder': 7}),
+        ):  # fmt: skip
+            axes.plot(
+                self._candidate_r[chosen], self._candidate_z[chosen], 'o',
+                label=f'candidates, {name} ({np.count_nonzero(chosen)})', **style,
+            )  # fmt: skip
+        axes.set_xlim(0.0, reach)
+        low, high = self._heights_shown(reach)
+        axes.set_ylim(low, high)
+        axes.set_ylabel('height z, sensor frame [m]')
+        inside = self._r <= reach
+        counts = {
+            'above': np.count_nonzero(inside & (self._z > high)),
+            'below': np.count_nonzero(inside & (self._z < low)),
+            'beyond': np.count_nonzero(~inside),
+        }
+        outside = ', '.join(f'{n} points {side}' for side, n in counts.items() if n)
+        axes.annotate(
+            f'not shown: {outside}' if outside else '', (1.0, 1.0), (0, 4),
+            xycoords='axes fraction', textcoords='offset points', ha='right', va='bottom',
+            fontsize=8.5, color=CANDIDATE_COLOUR,
+        )  # fmt: skip
+
+    def _point_groups(self) -> list[tuple[str, str, npt.NDArray[np.bool_]]]:
+        if self._truth is None:
+            return [('points', POINT_COLOUR, np.ones(len(self._r), dtype=np.bool_))]
+        return [
+            (f'points, {name}', colour, self._truth == label)
+            for name, colour, label in (
+                ('not scored', POINT_COLOUR, Label.UNKNOWN),
+                ('true obstacle', TRUE_OBSTACLE_COLOUR, Label.OBSTACLE),
+                ('true ground', TRUE_GROUND_COLOUR, Label.GROUND),
+            )
+        ]
+
+    def _heights_shown(self, reach: float) -> tuple[float, float]:
+        """Limits around the ground as far as it rests on inliers, and candidates near it.
+
+        True ground elsewhere is inside the limits as well, but for its outermost percents.
+        """
+        r, z = self._candidate_r, self._candidate_z
+        inlier_r = r[self._inlier & (r <= reach)]
+        if not len(inlier_r):
+            low, high = np.quantile(self._z, (0.0, 0.5)) if len(self._z) else (-2.0, 0.0)
+            return float(low) - BELOW, float(high) + ABOVE
+        supported = (self._knots >= inlier_r[0]) & (self._knots <= inlier_r[-1])
+        height = np.abs(z - np.interp(r, self._knots, self._mean))
+        near = z[(height <= NEAR_GROUND) & (r <= reach)]
+        ground = [near, self._mean[supported]]
+        if self._truth is not None:
+            true_ground = self._z[(self._truth == Label.GROUND) & (self._r <= reach)]
+            if len(true_ground):
+                ground.append(np.quantile(true_ground, (0.01, 0.99)))
+        heights = np.concatenate(ground)
+        return float(heights.min()) - BELOW, float(heights.max()) + ABOVE
+
+    def _draw_lines(self, axes: Any) -> None:
+        """Draw each line over its extent, and the critical points where the next one begins."""
+        candidates, lines = self._result.candidates, self._result.lines
+        ids = np.unique(lines.line[self._own])
+        title: str | None = f'lines ({len(ids)})'
+        for q in ids:
+            own = slice(int(lines.start[q]), int(lines.start[q + 1]))
+            if own.stop - own.start < 2:
+                continue
+            r, z = line_ends(candidates.r[own], candidates.z[own], float(lines.slope[q]))
+            axes.plot(
+                r, z, color=LINE_COLOUR, lw=3.2, alpha=0.75, solid_capstyle='butt', zorder=4,
+                label=title,
+            )  # fmt: skip
+            title = None
+        critical = lines.start[ids[1:]]
+        axes.plot(
+            candidates.r[critical], candidates.z[critical], 'd', ms=9, mfc='none',
+            mec=LINE_COLOUR, mew=1.2, zorder=8, label=f'critical points ({len(critical)})',
+        )  # fmt: skip
+
+    def draw_length_scale(self, axes: Any, reach: float, *, with_pseudo_inputs: bool) -> None:
+        """Draw the length-scale over range, and the pseudo-inputs it follows."""
+        result = self._result
+        length_scale = np.exp(result.log_length_scale[self._segment])
+        axes.plot(self._knots, length_scale, color=SURFACE_COLOUR, lw=1.8, label='length-scale')
+        shown = length_scale[(self._knots <= reach) & np.isfinite(length_scale)]
+        first, last = result.pseudo.offsets[self._segment : self._segment + 2]
+        if with_pseudo_inputs and last > first:
+            r_bar = result.pseudo.r_bar[first:last]
+            n_scalars = list(result.fit.theta).index('length_scale_bar_0')
+            columns = n_scalars + result.pseudo.surface_class[first:last]
+            l_bar = np.exp(result.theta[self._segment, columns])
+            axes.plot(
+                r_bar, l_bar, 's', ms=5, color=PSEUDO_INPUT_COLOUR, mew=0.0,
+                label=f'pseudo-inputs ({last - first})',
+            )  # fmt: skip
+            shown = np.concatenate([shown, l_bar[r_bar <= reach]])
+        # At least a decade: ripples of a constant must not look like mountains. Set before the
+        # scale, since on a log axis matplotlib warns of limits that a constant makes equal.
+        low, high = (shown.min(), shown.max()) if len(shown) else (1.0, 10.0)
+        factor = max(1.2 * math.sqrt(high / low), math.sqrt(10.0))
+        axes.set_ylim(math.sqrt(low * high) / factor, math.sqrt(low * high) * factor)
+        axes.set_yscale('log')
+        axes.set_ylabel('length-scale l [m]')
+
+
+def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, FloatArray]:
+    """Return range and height of the ends of a line, (2,) each [m]: its outermost points on it.
+
+    Parameters
+    ----------
+    r, z : (n,) float64
+        Range and height of its points [m].
+    slope : float
+        Its slope; may be infinite.
+    """
+    angle = math.atan(slope)
+    along = (r - r.mean()) * math.cos(angle) + (z - z.mean()) * math.sin(angle)
+    ends = np.array([along.min(), along.max()])
+    return r.mean() + ends * math.cos(angle), z.mean() + ends * math.sin(angle)

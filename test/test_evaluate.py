@@ -1,0 +1,235 @@
+"""Methods over labelled frames: which frames, in which order, with which scores."""
+
+import itertools
+import math
+import sys
+
+import numpy as np
+import pypatchworkpp
+import pytest
+from evaluation_samples import HeightRule, real_kitti, street, write_frame, write_streets
+
+from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.evaluation.evaluate import (
+    MethodScore,
+    ScanScore,
+    WorstFrames,
+    labelled_frames,
+    load_kitti,
+    pool,
+    score_methods,
+)
+from gp_ground_seg.evaluation.methods import OurMethod, PatchworkppMethod
+from gp_ground_seg.evaluation.metrics import (
+    ClassCount,
+    Confusion,
+    class_errors,
+    count_confusion,
+    height_error,
+)
+from gp_ground_seg.experiments.variants import SimulatedFrame, load_simulated
+
+
+def evaluate(root, *methods, **options):
+    return score_methods(labelled_frames(root), load_kitti, methods, **options)
+
+
+def score_of(sequence, confusion, seconds=0.0, **stages):
+    return ScanScore(
+        sequence, '0', seconds, stages, {'groundgrid': confusion}, classes={40: ClassCount(4, 3)}
+    )
+
+
+def test_pooling_sums_counts_and_does_not_average_ratios():
+    large, small = Confusion(tp=90, fp=10), Confusion(fn=1)
+    score = MethodScore('x', (score_of('08', large), score_of('00', small)))
+    assert score.sequences == ['08', '00']
+    assert score.iou == score.pooled('groundgrid').iou == 90 / 101
+    assert score.of('00').confusion == small
+    assert (score.worst_sequence, score.classes) == ('00', {40: ClassCount(8, 6)})
+    assert pool('y', [score.of('00'), score.of('08')]).confusion == score.confusion
+    assert math.isnan(score.ece)
+
+
+def test_times():
+    frames = (
+        score_of('00', Confusion(), 0.010, grid=0.004, label=0.001),
+        score_of('00', Confusion(), 0.020, grid=0.006),
+        score_of('00', Confusion(), 0.090, grid=0.050),
+    )
+    score = MethodScore('x', frames)
+    assert (score.seconds(), score.seconds(max)) == (0.020, 0.090)
+    assert score.median_stages == {'grid': 0.006, 'label': 0.001}
+    assert math.isnan(MethodScore('x', ()).seconds())
+
+
+def test_labelled_frames_of_all_and_of_some(tmp_path):
+    write_streets(tmp_path, s00=2, s08=1)
+    found = [(f.sequence, f.index) for f in labelled_frames(tmp_path)]
+    assert found == [('00', '000000'), ('00', '000001'), ('08', '000000')]
+    assert [f.sequence for f in labelled_frames(tmp_path, ['08', '00'])] == ['08', '00', '00']
+
+
+@pytest.mark.parametrize(
+    ('sequences', 'message'),
+    [
+        (['00', '4', '99'], 'no sequence 4, 99; sequences here: 00, 08'),
+        ([], 'no sequence asked for; sequences here: 00, 08'),
+        (['00', '08', '00'], 'named twice'),
+        (['../sequences/00'], 'no sequence ../sequences/00'),
+    ],
+)
+def test_sequences_that_cannot_be(tmp_path, sequences, message):
+    write_streets(tmp_path, s00=1, s08=1)
+    with pytest.raises(DataError, match=message):
+        labelled_frames(tmp_path, sequences)
+
+
+def test_frames_without_labels_are_named(tmp_path):
+    write_streets(tmp_path, s00=1, s11=1)
+    write_frame(tmp_path, '11', 5, street()[0])
+    with pytest.raises(DataError, match=r'1 of 2 frames of sequence 11 .*000005.*labelled: 00'):
+        labelled_frames(tmp_path)
+    assert len(labelled_frames(tmp_path, ['00'])) == 1
+
+
+@pytest.mark.parametrize('each_alone', [False, True])
+def test_methods_alternate_after_one_warm_up(tmp_path, each_alone):
+    write_streets(tmp_path, s00=2, s08=1)
+    journal = []
+    methods = [HeightRule(name, -1.5, journal) for name in 'ab']
+    ticks = itertools.count()
+    scores = evaluate(tmp_path, *methods, each_alone=each_alone, clock=lambda: float(next(ticks)))
+    second = ['Rb', 'b', 'Ra', 'a'] if each_alone else ['b', 'a']
+    first = ['Ra', 'a', 'Rb', 'b']
+    assert journal == ['a', 'b', *first, *second, *first]
+    assert [score.name for score in scores] == ['a', 'b']
+    for score in scores:
+        # The clock is read right before and right after.
+        assert [scan.seconds for scan in score.scans] == [1.0] * 3
+        assert [scan.index for scan in score.scans] == ['000000', '000001', '000000']
+
+
+def test_scores_of_a_rule_known_by_hand(tmp_path):
+    write_streets(tmp_path, s00=1)
+    points, semantic = street()
+    low = points[:, 2] < -1.5
+    (score,) = evaluate(tmp_path, HeightRule('rule', -1.5))
+    road, wall, tree = semantic == 40, semantic == 50, semantic == 70
+    n_road, n_false, n_right = (int(x.sum()) for x in (road, wall & low, wall & ~low))
+    assert score.pooled('groundgrid') == Confusion(n_road, n_false, 0, n_right)
+    assert (tree & (points[:, 2] < -1.2975)).sum() == 200
+    assert score.pooled('patchwork') == Confusion(n_road + 200, n_false, 0, n_right + 300)
+    assert (score.classes[0], score.classes[70]) == (ClassCount(50, 50), ClassCount(500, 200))
+    # The rule has a surface at its height.
+    expected = height_error(points[road, 2].astype(float), np.full(n_road, -1.5))
+    assert score.height() == expected
+
+
+def test_errors_of_classes_and_of_rings_are_all_errors(tmp_path):
+    write_streets(tmp_path, s00=2)
+    misses, invents = evaluate(tmp_path, HeightRule('misses', -1.72), HeightRule('invents', -1.0))
+    assert misses.confusion.fn > 0 and invents.confusion.fp > 0
+    for score in (misses, invents):
+        found = class_errors(score.classes)
+        assert sum(one.missed for one in found) == score.confusion.fn
+        assert sum(one.false for one in found) == score.confusion.fp
+        assert sum(score.rings, Confusion()) == score.confusion
+
+
+def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path):
+    points, semantic = street()
+    points[:, 2] *= -1  # upside down
+    write_frame(tmp_path, '00', 3, points, semantic)
+    ours = OurMethod(Config())
+    with pytest.raises(PointCloudError, match='00/000003: gp_ground_seg: '):
+        evaluate(tmp_path, ours)
+    ours.close()
+    path = tmp_path / 'sequences/00/labels/000003.label'
+    path.write_bytes(path.read_bytes()[:-4])
+    with pytest.raises(DataError, match=r'000003\.label'):
+        evaluate(tmp_path, HeightRule('rule', -1.5))
+
+
+def test_ours_is_the_library(tmp_path):
+    write_streets(tmp_path, s00=2)
+    config = Config().replace(**{'runtime.n_threads': 1})
+    ours = OurMethod(config)
+    (score,) = evaluate(tmp_path, ours)
+    ours.close()
+    segmenter = GroundSegmenter(config)
+    for frame, scored in zip(labelled_frames(tmp_path), score.scans, strict=True):
+        scan = load_kitti(frame)
+        result = segmenter.segment(scan.points)
+        for key, truth in scan.truths.items():
+            assert scored.confusions[key] == count_confusion(result.label, truth)
+        ground = scan.truths['groundgrid'] == Label.GROUND
+        error = (result.ground_z - scan.points[:, 2])[ground]
+        error = error[np.isfinite(error)]
+        assert scored.heights['all'].rmse == pytest.approx(np.sqrt(np.mean(error**2)))
+        assert scored.heights['all'].median_absolute == pytest.approx(np.median(np.abs(error)))
+        assert 'total' not in scored.stages
+        assert 0.0 < sum(scored.stages.values()) <= scored.seconds
+        assert scored.pose.height == result.pose.height
+    assert score.fit.n_threads == 1
+
+
+def test_only_the_worst_scans_of_one_method_are_kept():
+    worst = WorstFrames('ours', 2)
+    for k, tp in enumerate((9, 5, 0, 7, 5)):
+        confusion = Confusion(tp=tp, fp=10 - tp) if tp else Confusion()
+        score = ScanScore('00', str(k), 0.1, confusions={'groundgrid': confusion})
+        worst.observe('ours', None, score, np.full(1, k))
+        worst.observe('peer', None, score_of('00', Confusion(fp=1)), np.zeros(1))
+    assert [(kept.score.index, kept.label[0]) for kept in worst.kept] == [('1', 1), ('4', 4)]
+
+
+def test_a_missing_peer_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pypatchworkpp', None)
+    with pytest.raises(MissingDependencyError, match='pip install pypatchworkpp'):
+        PatchworkppMethod()
+
+
+def test_patchworkpp_keeps_standard_output_clean(tmp_path, capfd):
+    write_streets(tmp_path, s00=1)
+    (score,) = evaluate(tmp_path, PatchworkppMethod())
+    assert capfd.readouterr() == ('', '')
+    assert score.confusion.recall > 0.5
+
+
+def run_peer(scene, sensor='vlp-16', **options):
+    scan = load_simulated(SimulatedFrame(sensor, scene, 0, 0.0))
+    method = PatchworkppMethod(**options)
+    method.run(scan.points)
+    return scan, method
+
+
+def test_the_peer_has_the_height_of_its_sensor():
+    """Its own is the published one, and a slope is where it matters."""
+    published = pypatchworkpp.Parameters().sensor_height
+    labels = [
+        run_peer('slope', sensor_height=height)[1].result().label.tolist()
+        for height in (None, published, 0.8)
+    ]
+    assert labels[0] == labels[1] != labels[2]
+
+
+def test_the_surface_of_the_peer_is_that_of_its_planes():
+    scan, method = run_peer('slope', 'hdl-64e')
+    near = scan.parts['all'] & (np.hypot(*scan.points[:, :2].T) < 15.0)
+    error = (method.ground_z() - scan.ground_z)[near]
+    assert np.sqrt(np.mean(error**2)) < 0.02
+    method = PatchworkppMethod()
+    method.run(np.zeros((0, 4), dtype=np.float32))
+    method._points = np.zeros((3, 4))
+    assert np.isnan(method.ground_z()).all()
+
+
+def test_patchworkpp_on_real_frames_scores_as_measured_elsewhere():
+    """A check of our scoring by a number that is not ours: 95.15 % on these 60 frames."""
+    frames = labelled_frames(real_kitti(), ['00', '01', '03', '05', '08', '10'])
+    frames = [frame for frame in frames if int(frame.index) < 10]
+    (score,) = score_methods(frames, load_kitti, [PatchworkppMethod()])
+    assert len(score.scans) == 60
+    assert score.pooled('groundgrid').iou == pytest.approx(0.9515, abs=0.001)

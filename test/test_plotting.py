@@ -1,0 +1,334 @@
+"""The pictures of scans and scores, by their pixels."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from cli_runner import error_line, run
+from conftest import hilly_scan
+from matplotlib.colors import to_rgb
+from matplotlib.image import imread
+
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.errors import ConfigError, DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.plotting import birds_eye, charts, style
+from gp_ground_seg.plotting.birds_eye import SheetPanel, plot_birds_eye, plot_error_sheet
+from gp_ground_seg.plotting.perspective import Camera, plot_scan_view
+
+
+def inches(*lengths):
+    return [round(length * style.DPI) for length in lengths]
+
+
+def close_to(pixels, colour, tolerance=0.005):
+    return np.abs(pixels[..., :3] - np.array(to_rgb(colour))).max(axis=-1) < tolerance
+
+
+# --- from above ---------------------------------------------------------------------------
+
+SQUARE, LEFT, RIGHT, _, TOP, _ = inches(*birds_eye.SINGLE)
+PANEL = LEFT + SQUARE + RIGHT
+
+
+def patch(x, y, half=2.0, n=4000, seed=0):
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform((x - half, y - half, -1.8), (x + half, y + half, -1.7), (n, 3))
+    return xyz.astype(np.float32)
+
+
+def repeat(values, n=4000):
+    return np.repeat(values, n).astype(np.uint8)
+
+
+def where(path, colour, top=TOP, left=LEFT, side=SQUARE):
+    """Centre [m] (x forward, y left) and number of the pixels of a colour in a square."""
+    rows, columns = np.nonzero(
+        close_to(imread(path)[top : top + side, left : left + side], colour)
+    )
+    if not len(rows):
+        return None, 0
+    # The median: here and there an edge of a letter or ring is of nearly the same grey.
+    return 50.0 - np.array([np.median(rows), np.median(columns)]) * 100.0 / side, len(rows)
+
+
+def test_labels_and_errors_are_where_the_points_are(tmp_path):
+    corners = [(25, 25), (25, -25), (-25, 25), (-25, -25), (40, 0)]
+    points = np.concatenate([patch(*corner) for corner in corners])
+    points[-1, 2] = np.nan
+    plot_birds_eye(
+        points, repeat([1, 1, 2, 2, 0]), tmp_path / 'a.png', truth=repeat([1, 2, 1, 0, 1])
+    )
+    assert imread(tmp_path / 'a.png').shape[1] == 2 * PANEL
+    for panel, colour, expected in (
+        (0, birds_eye.GROUND_COLOUR, (25, 0)),
+        (0, birds_eye.OBSTACLE_COLOUR, (-25, 0)),
+        (0, birds_eye.UNKNOWN_COLOUR, (40, 0)),
+        (1, birds_eye.RIGHT_COLOUR, (25, 25)),
+        (1, birds_eye.FALSE_GROUND_COLOUR, (25, -25)),
+        (1, birds_eye.NOT_SCORED_COLOUR, (-25, -25)),
+    ):
+        centre, n = where(tmp_path / 'a.png', colour, left=LEFT + panel * PANEL)
+        assert n > 500
+        # Two patches of one colour lie left and right of the middle.
+        assert centre[0] == pytest.approx(expected[0], abs=0.5)
+        assert expected[1] == 0 or centre[1] == pytest.approx(expected[1], abs=0.5)
+    # Unknown points that are ground are missed, too.
+    missed = where(tmp_path / 'a.png', birds_eye.MISSED_GROUND_COLOUR, left=LEFT + PANEL)
+    assert missed[1] > 1500
+
+
+def test_extent_cuts(tmp_path):
+    for extent, visible in ((50.0, True), (20.0, False)):
+        plot_birds_eye(patch(45, 0), repeat(1), tmp_path / 'a.png', extent=extent)
+        assert (where(tmp_path / 'a.png', birds_eye.GROUND_COLOUR)[1] > 500) == visible
+
+
+def test_counts_are_in_the_titles():
+    label = np.array([0, 1, 1, 2, 2, 2], dtype=np.uint8)
+    truth = np.array([1, 1, 2, 1, 2, 0], dtype=np.uint8)
+    titles = [birds_eye._label_panel(label)[0], birds_eye._label_panel(label[1:])[0]]
+    assert titles == [
+        '6 points: 2 ground, 3 obstacle, 1 unknown',
+        '5 points: 2 ground, 3 obstacle',
+    ]
+    errors = '1 false ground, 2 missed ground, IoU 25.00 %'
+    assert birds_eye._error_panel(label, truth)[0] == errors
+    assert birds_eye._error_panel(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
+
+
+@pytest.mark.parametrize(
+    ('least', 'step'), [(10.0, 10.0), (10.1, 20.0), (0.3, 0.5), (1.0, 1.0), (6.0, 10.0)]
+)
+def test_rings_are_round_numbers(least, step):
+    assert birds_eye._round_step(least) == pytest.approx(step)
+
+
+@pytest.mark.parametrize('points', [np.zeros((0, 3)), np.full((3, 4), np.nan), np.zeros((1, 3))])
+def test_clouds_with_nothing_to_see(tmp_path, points):
+    label = np.zeros(len(points), dtype=np.uint8)
+    (tmp_path / 'a.png').write_text('old')
+    plot_birds_eye(points, label, tmp_path / 'a.png', truth=label, title=r'$\nothing _ %')
+    assert imread(tmp_path / 'a.png').ndim == 3
+    assert list(tmp_path.iterdir()) == [tmp_path / 'a.png']
+
+
+def test_colours_differ_in_grey_too():
+    """Ground and obstacles must be told apart in print and with any colour vision."""
+
+    def grey(colour):
+        return np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))
+
+    assert grey(birds_eye.GROUND_COLOUR) - grey(birds_eye.OBSTACLE_COLOUR) > 0.3
+    for error in (birds_eye.FALSE_GROUND_COLOUR, birds_eye.MISSED_GROUND_COLOUR):
+        assert grey(birds_eye.RIGHT_COLOUR) - grey(error) > 0.25
+
+
+@pytest.mark.parametrize(
+    ('keywords', 'error', 'message'),
+    [
+        ({'label': np.zeros(9, np.uint8)}, PointCloudError, r'label of shape \(9,\) for 4000'),
+        ({'truth': np.zeros(9, np.uint8)}, PointCloudError, r'truth of shape \(9,\) for 4000'),
+        ({'points': np.zeros(5)}, PointCloudError, r'\(5,\)'),
+        ({'extent': 0.0}, ConfigError, 'extent = 0.0'),
+        ({'extent': float('nan')}, ConfigError, 'extent = nan'),
+        ({'path': '/no/such/folder/a.png'}, DataError, '/no/such/folder'),
+        ({'path': '/'}, DataError, 'not a file'),
+    ],
+)
+def test_bad_input_is_said(tmp_path, keywords, error, message):
+    good = {'points': patch(0, 0), 'label': repeat(0), 'path': tmp_path / 'a.png'}
+    with pytest.raises(error, match=message):
+        plot_birds_eye(**{**good, **keywords})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeypatch):
+    script = (
+        'import sys, numpy as np\n'
+        'from gp_ground_seg.plotting import birds_eye, charts, perspective, segment\n'
+        'assert "matplotlib" not in sys.modules\n'
+        'birds_eye.plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
+        'assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules\n'
+    )
+    words = [sys.executable, '-c', script, str(tmp_path / 'a.png')]
+    subprocess.run(words, check=True, timeout=60)
+    monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
+    with pytest.raises(MissingDependencyError, match='matplotlib'):
+        plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), tmp_path / 'b.png')
+    assert not (tmp_path / 'b.png').exists()
+
+
+def test_sheet_shows_each_kind_of_point_where_it_is(tmp_path):
+    corners = {
+        'right ground': (30, 30, 1, 1),
+        'right obstacle': (30, -30, 2, 2),
+        'missed ground': (-10, 30, 2, 1),
+        'false ground': (-30, -32, 1, 2),
+        'not scored': (-40, 10, 1, 0),
+    }
+    points = np.concatenate([patch(x, y, half=4.0) for x, y, *_ in corners.values()])
+    label, truth = (repeat([corner[k] for corner in corners.values()]) for k in (2, 3))
+    panel = SheetPanel('title $x', 'subtitle', points, label, truth)
+    layers = {layer.name: layer for layer in panel.layers()}
+    assert set(layers) == set(corners)
+    assert (sum(layer.chosen.astype(int) for layer in layers.values()) == 1).all()
+    plot_error_sheet([panel] * 4, tmp_path / 'a.png', 'all')
+    # Second row, first column: the fourth scan.
+    side, left, _, below, above, title = birds_eye.SHEET
+    top = title + birds_eye.SHEET_LEGEND + above + side + below + above
+    for name, (x, y, *_) in corners.items():
+        square = dict(zip(('top', 'left', 'side'), inches(top, left, side), strict=True))
+        centre, n = where(tmp_path / 'a.png', layers[name].colour, **square)
+        assert n > 1000, name
+        assert centre == pytest.approx((x, y), abs=1.0), name
+    with pytest.raises(PointCloudError, match=r'truth of shape \(3,\) for 20000 points'):
+        plot_error_sheet([panel._replace(truth=truth[:3])], tmp_path / 'b.png')
+
+
+# --- in perspective -----------------------------------------------------------------------
+
+
+def test_camera_projects_as_a_camera_does():
+    camera = Camera(position=(0.0, 0.0, 0.0), target=(1.0, 0.0, 0.0), zoom=0.5)
+    place, depth = camera.project(
+        np.array([[10.0, 0, 0], [10.0, -2, 0], [10.0, 0, 4], [20.0, 0, 4], [-5.0, 0, 0]])
+    )
+    np.testing.assert_allclose(place[:4], [[0, 0], [0.1, 0], [0, 0.2], [0, 0.1]], atol=1e-12)
+    np.testing.assert_allclose(depth, [10, 10, 10, 20, -5])
+    assert np.isnan(place[4]).all()
+
+
+def test_picture_shows_ground_obstacles_and_model(tmp_path):
+    points = hilly_scan(8000)
+    points[:10] = np.nan
+    config = Config()
+    found = GroundSegmenter(config).segment(points)
+    for title, height in (('title with $ and _', 768), ('', 720)):
+        plot_scan_view(points, found, config, tmp_path / 'scan.png', title)
+        picture = imread(tmp_path / 'scan.png')
+        assert picture.shape[:2] == (height, 1440)
+        colours = (picture[60:650, ..., :3] * 255).round().astype(int).reshape(-1, 3)
+        for wanted in ((185, 191, 198), (213, 94, 0)):
+            assert (colours == wanted).all(axis=1).sum() > 400
+        # Bluish or yellowish lines: neither grey nor orange.
+        assert (colours[:, 2] - colours[:, 0] > 60).sum() > 300
+    with pytest.raises(PointCloudError, match='must be the same scan'):
+        plot_scan_view(points[1:], found, config, tmp_path / 'scan.png')
+
+
+def test_command_draws_a_simulated_scan_and_keeps_what_is_there(tmp_path, capsys):
+    path = tmp_path / 'a.png'
+    words = ['plot', 'scan', '--simulate', 'flat', '--sensor', 'vlp-16', '--preset', 'vlp16', '-o']
+    assert run(*words, path) == 0
+    assert 'points, written to' in capsys.readouterr().out
+    before = path.read_bytes()
+    for wrong, message in (
+        ([path], '--force replaces it'),
+        ([tmp_path / 'a.jpg'], 'must end in .png'),
+        ([path, '--force', '--seed', '-1'], '--seed -1: must not be negative'),
+    ):
+        assert run(*words, *wrong) == 2
+        assert message in error_line(capsys)
+    assert path.read_bytes() == before
+    assert run(*words, path, '--force') == 0
+
+
+def test_command_draws_a_file(tmp_path):
+    points = np.zeros((3000, 4), np.float32)
+    points[:, :3] = hilly_scan(3000)
+    points.tofile(tmp_path / 'x.bin')
+    assert run('plot', 'scan', tmp_path / 'x.bin', '-o', tmp_path / 'x.png') == 0
+    assert (tmp_path / 'x.png').stat().st_size > 10_000
+
+
+# --- charts -------------------------------------------------------------------------------
+
+
+def test_bars_are_as_long_as_the_stages(tmp_path):
+    cases = {f'case {k}': {'first': 10.0 * k, 'second': 30.0} for k in range(1, 5)}
+    path = tmp_path / 'bars.png'
+    charts.plot_stage_bars(cases, path, 'title')
+    image = imread(path)
+
+    def lengths(colour):
+        # The legend's patches are above the bars.
+        return close_to(image[len(image) // 3 :], colour, 0.02).sum(axis=1)
+
+    first, second = (lengths(colour) for colour in charts.STAGE_COLOURS[:2])
+    found = np.unique(first[first > 20])
+    np.testing.assert_allclose(found / found[0], [1, 2, 3, 4], rtol=0.05)
+    assert second.max() == pytest.approx(3 * found[0], rel=0.05)
+    assert lengths(charts.REFERENCE_COLOUR).max() < 3
+    with pytest.raises(DataError, match='exists already'):
+        charts.plot_stage_bars(cases, path)
+    charts.plot_stage_bars(cases, path, baseline=('other', 80.0), force=True)
+    column = close_to(imread(path), charts.REFERENCE_COLOUR, 0.02).sum(axis=0)
+    assert column.max() > 50  # A dashed line from top to bottom.
+
+
+def curve(p, share):
+    edges = np.linspace(0.0, 1.0, len(p) + 1)
+    assert ((edges[:-1] <= p) & (p <= edges[1:])).all()
+    counts = np.full(len(p), 1000)
+    return SimpleNamespace(n_points=counts, mean_p=p, share_ground=share, ece=0.1, brier=0.2)
+
+
+def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
+    """By the pixels of the pooled line: the mean of right minus up in the square."""
+    p = np.linspace(0.0, 1.0, 21)[:-1] + 0.025
+    for power, low, high in ((1.0, -0.02, 0.02), (3.0, 0.15, 0.35)):  # p - p^3: 0.25 on average
+        found = curve(p, p**power)
+        charts.plot_reliability(found, {'00': found, '08': found}, tmp_path / 'a.png', 'title')
+        top, left, side = inches(charts.TITLE, charts.LEFT, charts.SQUARE)
+        square = imread(tmp_path / 'a.png')[top : top + side, left : left + side]
+        line = close_to(square, charts.POOLED_COLOUR, 0.02)
+        line[3 * side // 4 :, 3 * side // 5 :] = False  # the legend
+        rows, columns = np.nonzero(line)
+        assert low < np.mean(rows - (side - columns)) / side < high
+    found.n_points[:] = 0
+    with pytest.raises(PointCloudError, match='no scored point'):
+        charts.plot_reliability(found, {}, tmp_path / 'b.png')
+
+
+# --- colours of length-scales -------------------------------------------------------------
+
+# Brettel-style full loss of one cone, as linear maps in linear RGB (Machado et al. 2009).
+DEFICIENCIES = {
+    'none': np.eye(3),
+    'protanopia': [
+        [0.152286, 1.052583, -0.204868],
+        [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    'deuteranopia': [
+        [0.367322, 0.860646, -0.227968],
+        [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    'tritanopia': [
+        [1.255528, -0.076749, -0.178779],
+        [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
+}
+
+
+@pytest.mark.parametrize('name', DEFICIENCIES)
+def test_lightness_of_the_colours_rises_for_every_eye(name):
+    colours = style.length_scale_colours(np.geomspace(1.0, 50.0, 30), 1.0, 50.0)
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(linear @ np.transpose(DEFICIENCIES[name]), 0.0, 1.0)
+    lightness = 116.0 * np.cbrt(seen @ [0.2126, 0.7152, 0.0722]) - 16.0
+    assert np.diff(lightness).min() > 1.0
+    assert np.ptp(lightness) > 60.0
+
+
+def test_colours_end_at_the_limits_and_nan_is_grey():
+    values = np.array([1.0, 50.0, 0.01, 500.0, np.inf, np.nan])
+    ends = style.length_scale_colours(values, 1.0, 50.0)
+    np.testing.assert_array_equal(ends[2], ends[0])
+    np.testing.assert_array_equal(ends[3], ends[1])
+    assert not np.array_equal(ends[0], ends[1])
+    np.testing.assert_array_equal(ends[5], style.UNKNOWN)

@@ -1,0 +1,349 @@
+"""Byte layout of PointCloud2 against the struct module; messages against ROS itself."""
+
+import array
+import dataclasses
+import importlib.util
+import struct
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import bag_samples as samples
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gp_ground_seg.data.bag_files import POINT_CLOUD2
+from gp_ground_seg.data.point_cloud2 import (
+    append_columns,
+    cloud_from_columns,
+    decode_cloud,
+    encode_cloud,
+    read_columns,
+    read_xyz,
+    select_points,
+    select_rows,
+    stamp_of,
+    with_header,
+)
+from gp_ground_seg.errors import PointCloudError
+
+FLOAT32, FLOAT64, UINT16 = 7, 8, 4
+STRUCT_CODES = {1: 'b', 2: 'B', 3: 'h', 4: 'H', 5: 'i', 6: 'I', 7: 'f', 8: 'd'}
+TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+CONTAINERS = (
+    bytes,
+    bytearray,
+    memoryview,
+    lambda b: array.array('B', b),
+    lambda b: np.array(list(b), np.uint8),
+)
+
+
+@dataclass(frozen=True)
+class Field:
+    name: str
+    offset: int
+    datatype: int
+    count: int = 1
+
+
+@dataclass
+class Layout:
+    """The attributes of a message that are read."""
+
+    height: int
+    width: int
+    fields: list[Field]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: object
+
+
+@st.composite
+def layouts(draw):
+    """Random field order, gaps, row padding, byte order, types and trailing bytes."""
+    height = draw(st.integers(0, 4))
+    width = draw(st.integers(0, 6))
+    fields, offset = [], draw(st.integers(0, 9))
+    for name in draw(st.permutations(['x', 'y', 'z', 'intensity'])):
+        datatype = draw(st.sampled_from([FLOAT32, FLOAT64]))
+        fields.append(Field(name, offset, datatype, draw(st.sampled_from([0, 1]))))
+        offset += struct.calcsize(STRUCT_CODES[datatype]) + draw(st.integers(0, 5))
+    row_step = width * offset + draw(st.integers(0, 7))
+    trailing = draw(st.integers(0, 5))
+    size = height * row_step + trailing
+    raw = draw(st.binary(min_size=size, max_size=size))
+    container = draw(st.sampled_from(CONTAINERS))
+    big = draw(st.booleans())
+    return Layout(height, width, fields, big, offset, row_step, container(raw)), raw
+
+
+def all_points(layout, raw):
+    starts = [
+        row * layout.row_step + column * layout.point_step
+        for row in range(layout.height)
+        for column in range(layout.width)
+    ]
+    return [raw[start : start + layout.point_step] for start in starts]
+
+
+@settings(max_examples=400, deadline=None)
+@given(layouts())
+def test_read_xyz_agrees_with_struct(case):
+    layout, raw = case
+    order = '>' if layout.is_bigendian else '<'
+    where = {field.name: field for field in layout.fields}
+    expected = [
+        [
+            struct.unpack_from(order + STRUCT_CODES[where[a].datatype], point, where[a].offset)[0]
+            for a in 'xyz'
+        ]
+        for point in all_points(layout, raw)
+    ]
+    xyz = read_xyz(layout)
+    assert xyz.dtype.isnative
+    assert xyz.shape == (layout.height * layout.width, 3)
+    with np.errstate(invalid='ignore'):  # signalling NaN
+        xyz = xyz.astype(np.float64)
+    np.testing.assert_array_equal(xyz, np.reshape(expected, (-1, 3)))
+
+
+@settings(max_examples=400, deadline=None)
+@given(layouts(), st.randoms(use_true_random=False))
+def test_select_rows_keeps_every_byte_of_the_kept_points(case, random):
+    layout, raw = case
+    points = all_points(layout, raw)
+    mask = np.array([random.random() < 0.5 for _ in points], dtype=bool)
+    expected = b''.join(point for point, keep in zip(points, mask, strict=True) if keep)
+    selected = select_rows(layout, mask)
+    assert selected.tobytes() == expected
+    # Whatever is not kept is in the complement: nothing is lost or doubled.
+    assert len(selected) + len(select_rows(layout, ~mask)) == len(points) * layout.point_step
+
+
+@st.composite
+def added_columns(draw, size):
+    """Columns of every type, with arbitrary bytes as values."""
+    datatypes = draw(st.lists(st.sampled_from(sorted(TYPES)), max_size=4))
+    raw = draw(st.binary(min_size=8 * size, max_size=8 * size))
+    return {
+        f'c{k}': np.frombuffer(raw, TYPES[datatype], count=size)
+        for k, datatype in enumerate(datatypes)
+    }
+
+
+@given(layouts(), st.data())
+def test_points_stay_and_columns_follow(case, data):
+    layout, raw = case
+    points = all_points(layout, raw)
+    columns = data.draw(added_columns(len(points)))
+    wide = append_columns(layout, columns)
+    assert [column.name for column in wide.columns] == list(columns)
+    assert wide.point_step % 4 == 0
+    assert len(wide.data) == len(points) * wide.point_step
+    order = '>' if layout.is_bigendian else '<'
+    end = layout.point_step
+    for column in wide.columns:
+        size = struct.calcsize(STRUCT_CODES[column.datatype])
+        assert column.offset >= end
+        assert column.offset % size == 0
+        end = column.offset + size
+    assert end <= wide.point_step < end + 12
+    for k, old in enumerate(points):
+        new = bytes(wide.data[k * wide.point_step :][: wide.point_step])
+        assert new[: layout.point_step] == old
+        for name, offset, datatype in wide.columns:
+            (value,) = struct.unpack_from(order + STRUCT_CODES[datatype], new, offset)
+            np.testing.assert_equal(np.array(value, TYPES[datatype]), columns[name][k])
+
+    wider = Layout(
+        layout.height, layout.width, [Field(*column) for column in wide.columns],
+        layout.is_bigendian, wide.point_step, layout.width * wide.point_step, bytes(wide.data),
+    )  # fmt: skip
+    found = read_columns(wider, list(columns))
+    assert list(found) == list(columns)
+    for name, values in columns.items():
+        assert found[name].dtype == values.dtype
+        np.testing.assert_array_equal(found[name], values.reshape(layout.height, layout.width))
+
+
+def kitti_layout(n=5, **changes):
+    rng = np.random.default_rng(0)
+    fields = [Field(name, 4 * k, FLOAT32) for k, name in enumerate(('x', 'y', 'z', 'intensity'))]
+    data = rng.normal(size=(n, 4)).astype('<f4').tobytes()
+    return Layout(**{**vars(Layout(1, n, fields, False, 16, 16 * n, data)), **changes})
+
+
+def replaced(name, /, **changes):
+    return [
+        Field(**{**vars(field), **changes}) if field.name == name else field
+        for field in kitti_layout().fields
+    ]
+
+
+def test_float32_gives_a_float32_copy():
+    data = np.frombuffer(kitti_layout().data, np.uint8).copy()
+    xyz = read_xyz(kitti_layout(data=data))
+    assert xyz.dtype == np.float32
+    before = xyz.copy()
+    data[:] = 0
+    np.testing.assert_array_equal(xyz, before)
+
+
+def test_float64_keeps_its_precision():
+    value = 1.0 + 1e-12
+    fields = [Field(name, 8 * k, FLOAT64) for k, name in enumerate('xyz')]
+    xyz = read_xyz(Layout(1, 1, fields, False, 24, 24, struct.pack('<3d', value, 2.0, 3.0)))
+    assert xyz.dtype == np.float64
+    assert xyz[0, 0] == value
+
+
+def test_empty_cloud_needs_no_layout():
+    empty = Layout(0, 0, [], False, 0, 0, b'')
+    assert read_xyz(empty).shape == (0, 3)
+    assert len(select_rows(empty, np.zeros(0, dtype=bool))) == 0
+
+
+def test_row_step_of_a_single_row_is_not_used():
+    layout = kitti_layout(row_step=0)
+    np.testing.assert_array_equal(read_xyz(layout), read_xyz(kitti_layout()))
+    assert select_rows(layout, np.ones(5, dtype=bool)).tobytes() == kitti_layout().data
+
+
+def in_z(**changes):
+    return {'fields': replaced('z', **changes)}
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'fields': []}, r'no field named x: must have exactly one; fields: none'),
+        (in_z(name='height'), r'no field named z.*x, y, height, intensity'),
+        ({'fields': replaced('intensity', name='y')}, r'2 fields named y: must have exactly one'),
+        (
+            in_z(datatype=UINT16),
+            r'field z has datatype 4 \(UINT16\): must be FLOAT32 \(7\) or FLOAT64 \(8\)',
+        ),
+        (in_z(datatype=77), r'field z has datatype 77 \(unknown\)'),
+        (in_z(count=3), r'field z has count 3: must be 1'),
+        (in_z(offset=13), r'z at offset 13 of 4 bytes.*point_step 16'),
+        (in_z(offset=-4), r'z at offset -4'),
+        ({'point_step': 0}, r'point_step 0: must be at least 1'),
+        ({'width': 6}, r'data of 80 bytes: must be at least 96 \(height 1, width 6'),
+        ({'data': b''}, r'data of 0 bytes: must be at least 80'),
+        ({'height': 5, 'width': 1, 'row_step': 15}, r'row_step 15: must be at least 16 \(width 1'),
+        ({'height': 2, 'row_step': 2**32 - 1}, r'data of 80 bytes: must be at least'),
+    ],
+)
+def test_malformed_layout_says_what_and_where(changes, message):
+    with pytest.raises(PointCloudError, match=message):
+        read_xyz(kitti_layout(**changes))
+
+
+@pytest.mark.parametrize(
+    'changes', [{'name': 'w'}, {'name': 'x'}, {'count': 2}, {'offset': 14}, {'datatype': 9}]
+)
+@pytest.mark.parametrize('n_points', [0, 5])
+def test_a_column_that_is_no_single_number_is_refused(changes, n_points):
+    with pytest.raises(PointCloudError, match=r'point cloud: .*field'):
+        read_columns(kitti_layout(width=n_points, **in_z(**changes)), ['x', 'z'])
+
+
+def test_select_and_append_refuse_what_they_cannot_read():
+    keep, short = np.ones(5, dtype=bool), kitti_layout(data=bytes(70))
+    with pytest.raises(PointCloudError, match=r'data of 70 bytes: must be at least 80'):
+        select_rows(short, keep)
+    with pytest.raises(PointCloudError, match=r'data of 70 bytes: must be at least 80'):
+        append_columns(short, {'a': keep.astype(np.uint8)})
+    with pytest.raises(PointCloudError, match=r'mask of shape \(4,\).*bool of shape \(5,\)'):
+        select_rows(kitti_layout(), keep[:4])
+    with pytest.raises(PointCloudError, match=r'type uint8'):
+        select_rows(kitti_layout(), keep.astype(np.uint8))
+
+
+# --- messages of rosbags --------------------------------------------------------------------
+
+
+def assert_same_cloud(cloud, expected):
+    for field in dataclasses.fields(expected):
+        np.testing.assert_equal(getattr(cloud, field.name), getattr(expected, field.name))
+
+
+ROS_ROUND_TRIP = """
+import sys
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2
+raw = open(sys.argv[1], 'rb').read()
+message = deserialize_message(raw, PointCloud2)
+open(sys.argv[1], 'wb').write(serialize_message(message))
+print(message.header.stamp.sec, message.header.stamp.nanosec, message.header.frame_id)
+print(message.height, message.width, message.point_step, message.row_step)
+print([(f.name, f.offset, f.datatype, f.count) for f in message.fields])
+"""
+
+
+@pytest.mark.skipif(not importlib.util.find_spec('rclpy'), reason='library-only environment')
+def test_ros_itself_reads_the_encoded_cloud(tmp_path):
+    cloud = samples.cloud(1)
+    (tmp_path / 'raw').write_bytes(encode_cloud(cloud))
+    # In a process of its own: importing rclpy may restart the interpreter.
+    done = subprocess.run(
+        [sys.executable, '-c', ROS_ROUND_TRIP, str(tmp_path / 'raw')],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == [
+        '{} {} {}'.format(*stamp_of(cloud), cloud.header.frame_id),
+        f'{cloud.height} {cloud.width} {cloud.point_step} {cloud.row_step}',
+        str([(f.name, f.offset, f.datatype, f.count) for f in cloud.fields]),
+    ]
+    assert_same_cloud(decode_cloud((tmp_path / 'raw').read_bytes()), cloud)
+
+
+def test_selection_keeps_header_fields_and_bytes():
+    cloud = samples.cloud(2)
+    mask = np.isfinite(read_xyz(cloud)).all(axis=1)
+    kept = decode_cloud(encode_cloud(select_points(cloud, mask)))
+    assert (kept.header, kept.fields) == (cloud.header, cloud.fields)
+    assert (kept.height, kept.width, kept.point_step) == (1, mask.sum(), cloud.point_step)
+    np.testing.assert_array_equal(
+        kept.data.reshape(-1, cloud.point_step), cloud.data.reshape(-1, cloud.point_step)[mask]
+    )
+    assert kept.is_dense
+    assert not select_points(cloud, ~mask).is_dense
+
+
+def test_another_header_on_the_same_points():
+    cloud = samples.cloud(3)
+    for frame, expected in ((None, 'velo_link'), ('map', 'map')):
+        moved = decode_cloud(encode_cloud(with_header(cloud, (7, 8), frame)))
+        assert (stamp_of(moved), moved.header.frame_id) == ((7, 8), expected)
+        assert_same_cloud(dataclasses.replace(moved, header=cloud.header), cloud)
+
+
+def test_cloud_from_columns_is_packed_and_typed():
+    points = samples.scan(1)
+    label = np.arange(len(points), dtype=np.uint32)
+    columns = {'x': points[:, 0], 'y': points[:, 1], 'z': points[:, 2], 'label': label}
+    cloud = decode_cloud(encode_cloud(cloud_from_columns((5, 6), 'lidar', columns)))
+    assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
+        ('x', 0, 7, 1), ('y', 4, 7, 1), ('z', 8, 7, 1), ('label', 12, 6, 1),
+    ]  # fmt: skip
+    assert (stamp_of(cloud), cloud.header.frame_id) == ((5, 6), 'lidar')
+    np.testing.assert_array_equal(read_xyz(cloud), points[:, :3])
+    np.testing.assert_array_equal(read_columns(cloud, ['label'])['label'][0], label)
+    assert cloud_from_columns((0, 0), '', {}).width == 0
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 400), st.binary(max_size=8))
+def test_bytes_that_are_no_cloud_are_refused_or_read(length, junk):
+    damaged = encode_cloud(samples.cloud(0, n_ground=5, n_wall=1))[:length] + junk
+    said = ''
+    try:
+        decode_cloud(damaged)
+    except PointCloudError as error:
+        said = str(error)
+    assert not said or f'{len(damaged)} bytes that are no {POINT_CLOUD2}' in said

@@ -1,0 +1,119 @@
+"""Parts of the work: every item once, errors passed on, one thread where none can start."""
+
+import os
+import threading
+import time
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gp_ground_seg.compiled import threads
+from gp_ground_seg.compiled.threads import Workers, equal_parts, parts_of_segments
+
+
+@pytest.fixture
+def workers():
+    with patch.object(threads, 'JIT_ENABLED', True):
+        workers = Workers(3)
+    yield workers
+    workers.close()
+
+
+@given(st.integers(0, 1000), st.integers(1, 9))
+def test_equal_parts_hold_every_point_once(n, n_parts):
+    parts = equal_parts(n, n_parts)
+    assert [p.number for p in parts] == list(range(n_parts))
+    assert [i for p in parts for i in range(p.first, p.stop)] == list(range(n))
+    sizes = [p.stop - p.first for p in parts]
+    assert max(sizes) - min(sizes) <= 1
+
+
+@given(st.lists(st.integers(0, 80), min_size=1, max_size=60), st.integers(1, 9))
+def test_parts_of_segments_hold_every_segment_once(sizes, n_parts):
+    parts = parts_of_segments(np.concatenate([[0], np.cumsum(sizes)]), n_parts)
+    assert len(parts) == n_parts
+    assert [m for p in parts for m in range(p.first, p.stop)] == list(range(len(sizes)))
+
+
+def test_parts_of_segments_cost_alike():
+    sizes = np.tile([10, 80], 90)
+    parts = parts_of_segments(np.concatenate([[0], np.cumsum(sizes)]), 4)
+    costs = [(sizes[p.first : p.stop] ** 2).sum() for p in parts]
+    assert max(costs) <= 1.1 * min(costs)
+
+
+def test_each_part_runs_once_and_in_threads(workers):
+    seen, names = np.zeros(1000), set()
+    barrier = threading.Barrier(3, timeout=30)
+
+    def work(part, seen):
+        barrier.wait()  # only if all three run at the same time
+        seen[part.first : part.stop] += 1
+        names.add(threading.current_thread().name)
+
+    for _ in range(20):
+        workers.run(work, equal_parts(1000, 3), seen)
+    assert (seen == 20).all()
+    assert len(names) == 3
+
+
+@pytest.mark.parametrize('failing', [0, 1, 2])
+def test_an_error_is_raised_after_all_parts_have_ended(workers, failing):
+    ended = []
+
+    def work(part):
+        if part.number == failing:
+            raise ValueError('that part')
+        time.sleep(0.05)
+        ended.append(part.number)
+
+    with pytest.raises(ValueError, match='that part'):
+        workers.run(work, equal_parts(3, 3))
+    assert sorted(ended) == sorted({0, 1, 2} - {failing})
+
+
+def test_small_clouds_are_not_split(workers):
+    assert workers.n_parts(threads.MIN_POINTS_TO_SPLIT) == 3
+    assert workers.n_parts(threads.MIN_POINTS_TO_SPLIT - 1) == 1
+
+
+@pytest.mark.parametrize('n_started', [0, 1])
+def test_one_thread_does_it_where_none_can_be_started(workers, n_started):
+    real, started = threading.Thread.start, []
+
+    def start(thread):
+        if len(started) == n_started:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        real(thread)
+
+    seen = []
+    with patch.object(threading.Thread, 'start', start):
+        workers.run(lambda part: seen.append(part.number), equal_parts(3, 3))
+    assert seen == [0, 1, 2]
+    assert workers.n_threads == 1
+    for thread in started:
+        thread.join(30)
+        assert not thread.is_alive()
+
+
+def test_threads_end_and_start_again(workers):
+    before = threading.active_count()
+    for _ in range(2):
+        workers.run(lambda part: None, equal_parts(3, 3))
+        assert threading.active_count() == before + 2
+        workers.close()
+        assert threading.active_count() == before
+
+
+def test_number_of_threads():
+    with patch.object(threads, 'JIT_ENABLED', True):
+        for n_cores, expected in ((1, 1), (2, 2), (64, threads.DEFAULT_MAX_THREADS)):
+            with patch.object(os, 'sched_getaffinity', lambda pid, n=n_cores: set(range(n))):
+                assert Workers(0).n_threads == expected
+        assert Workers(7).n_threads == 7
+    with patch.object(threads, 'JIT_ENABLED', False):
+        assert Workers(7).n_threads == 1
