@@ -17,20 +17,16 @@ import ros_helpers  # noqa: F401  imports type support without its warnings
 
 from gp_ground_seg.ros.diagnostics import (
     CLOUD_WINDOW,
-    RATE_WINDOW,
     Diagnostics,
-    Hysteresis,
     InputFacts,
     InputTask,
-    Level,
     ModelTask,
     OutputTask,
     ProcessingTask,
-    Rate,
-    Status,
     frame_quality,
 )
 from gp_ground_seg.ros.input import SequenceGaps
+from gp_ground_seg.ros.status import RATE_WINDOW, Hysteresis, Level, Rate, Status
 
 LIMITS = DiagnosticsConfig(stale_after=2.0, max_latency=0.1)
 FACTS = InputFacts('/points', 'reliable, keep_last 5, volatile', n_publishers=1, ros_time=1000.5)
@@ -188,9 +184,10 @@ def test_refusals_are_an_error_above_their_limit(are_refused, max_ratio):
 
 
 def process(statistics, latency, duration=None):
-    stages = {'grid': 0.25 * latency, 'total': latency}
+    duration = latency if duration is None else duration
+    stages = {'queue': latency - duration, 'grid': 0.25 * latency, 'total': latency}
     fit = dataclasses.replace(NO_FIT, backend='numba', n_threads=2)
-    statistics.processed(latency, latency if duration is None else duration, stages, fit)
+    statistics.processed(duration, stages, fit)
 
 
 def test_processing_percentiles_in_milliseconds():

@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -22,79 +21,15 @@ from gp_ground_seg.frame import FloatArray, Label
 from gp_ground_seg.parameters.config import DiagnosticsConfig
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import FitReport, Segmentation
+from gp_ground_seg.ros.status import Hysteresis, Level, Rate, Status
 
-RATE_WINDOW = 10.0
-"""Time over which rates are taken [s]."""
 CLOUD_WINDOW = 100
 """Clouds over which percentiles are taken."""
 MIN_RATE_SPAN = 1.0
 """Shortest time from which the load is computed [s]: a burst is no rate."""
 
 
-class Level(IntEnum):
-    """Severity, with the values of ``diagnostic_msgs/DiagnosticStatus``."""
-
-    OK, WARN, ERROR, STALE = range(4)
-
-
-class Status(NamedTuple):
-    """One judged task: name, level, one line of text, and the values behind it."""
-
-    task: str
-    level: Level
-    message: str
-    values: dict[str, str]
-
-
-class Hysteresis:
-    """Holds the worst level of the latest time, so that a passing fault can be seen.
-
-    STALE ends with the first cloud: it is held as a warning.
-    """
-
-    def __init__(self) -> None:
-        # Levels fall from old to new: a status that is older and no worse than another goes.
-        self._held: deque[tuple[float, Status]] = deque()
-
-    def hold(self, now: float, found: Status, recover_after: float) -> Status:
-        """Return `found` with the worst level and message of the last `recover_after` [s]."""
-        while self._held and now - self._held[0][0] > recover_after:
-            self._held.popleft()
-        level = Level.WARN if found.level == Level.STALE else found.level
-        while self._held and self._held[-1][1].level <= level:
-            self._held.pop()
-        if level > Level.OK:
-            self._held.append((now, found._replace(level=level)))
-        since, worst = self._held[0] if self._held else (now, found)
-        if found.level == Level.STALE or worst.level <= found.level:
-            return found
-        message = f'{found.message}; {now - since:.1f} s ago: {worst.message}'
-        return found._replace(level=worst.level, message=message)
-
-
-class Rate:
-    """Events in all, and in the last `RATE_WINDOW` seconds."""
-
-    def __init__(self) -> None:
-        self.n_total = 0
-        self._events: deque[tuple[float, int]] = deque()
-
-    def count(self, now: float, n: int = 1) -> None:
-        """Count `n` events."""
-        self.n_total += n
-        self._events.append((now, n))
-
-    def window(self, now: float) -> tuple[int, float, float | None]:
-        """Return the events in the window, the time they span [s], and their rate [Hz].
-
-        The rate is None with less than two times.
-        """
-        while self._events and now - self._events[0][0] > RATE_WINDOW:
-            self._events.popleft()
-        n_events = sum(n for _, n in self._events)
-        span = self._events[-1][0] - self._events[0][0] if self._events else 0.0
-        # The first event opens the span over which the others are counted.
-        return n_events, span, (n_events - self._events[0][1]) / span if span > 0.0 else None
+Finding = tuple[Level, str]
 
 
 class InputFacts(NamedTuple):
@@ -165,24 +100,20 @@ class InputTask:
         }
         return Status('input', *self._judge(now, facts, limits), values)
 
-    def _judge(
-        self, now: float, facts: InputFacts, limits: DiagnosticsConfig
-    ) -> tuple[Level, str]:
-        silence = now - self._last_arrival
+    def _judge(self, now: float, facts: InputFacts, limits: DiagnosticsConfig) -> Finding:
+        silence, topic = now - self._last_arrival, facts.topic
         n_received, n_refused = self._n_recent, self._n_refused_recent
         if silence > limits.stale_after:
             source = f'publishers: {facts.n_publishers}' if facts.n_publishers else 'nobody sends'
-            return Level.STALE, f'no cloud on {facts.topic} for {silence:.1f} s ({source})'
+            return Level.STALE, f'no cloud on {topic} for {silence:.1f} s ({source})'
         if n_received == 0:
-            return Level.OK, f'waiting for the first cloud on {facts.topic}'
-        if n_refused == n_received:
-            return Level.ERROR, f'every cloud refused: {self._last_error}'
-        if n_refused:
-            is_too_much = n_refused > limits.max_refused_ratio * n_received
-            message = f'{n_refused} of {n_received} clouds refused: {self._last_error}'
-            return Level.ERROR if is_too_much else Level.WARN, message
+            return Level.OK, f'waiting for the first cloud on {topic}'
         # A stamp may be of any age: a recording is played at any time.
-        return Level.OK, 'receiving'
+        if n_refused == 0:
+            return Level.OK, 'receiving'
+        share = 'every cloud' if n_refused == n_received else f'{n_refused} of {n_received} clouds'
+        is_error = n_refused > min(limits.max_refused_ratio * n_received, n_received - 1)
+        return Level.ERROR if is_error else Level.WARN, f'{share} refused: {self._last_error}'
 
 
 class ProcessingTask:
@@ -204,15 +135,13 @@ class ProcessingTask:
         self._n_dropped += n_lost
         self._n_dropped_recent += n_lost
 
-    def processed(
-        self, latency: float, duration: float, stages: Mapping[str, float], fit: FitReport
-    ) -> None:
-        """Count a cloud that was published `latency` after its arrival [s].
+    def processed(self, duration: float, stages: Mapping[str, float], fit: FitReport) -> None:
+        """Count a cloud whose processing took `duration`, after a wait of ``queue`` [s].
 
-        Of that time `duration` was work, not waiting; `stages` are its steps [s].
+        `stages` are its steps [s], ``queue`` among them.
         """
         self._n_processed += 1
-        self._latencies.append(latency)
+        self._latencies.append(stages['queue'] + duration)
         self._durations.append(duration)
         self._stages.append(stages)
         self._backend, self._n_threads = fit.backend, fit.n_threads
@@ -242,7 +171,7 @@ class ProcessingTask:
         values.update({'Backend': self._backend, 'Threads': str(self._n_threads)})
         return Status('processing', level, message, values)
 
-    def _judge(self, now: float, limits: DiagnosticsConfig) -> tuple[Level, str]:
+    def _judge(self, now: float, limits: DiagnosticsConfig) -> Finding:
         if not self._latencies:
             return Level.OK, 'no cloud processed yet'
         latency = 1e3 * float(np.median(self._latencies))
@@ -265,8 +194,7 @@ def frame_quality(fit: FitReport, n_occupied: int, certainty: float) -> float:
     """Return how reliable a frame is, from 0 to 1.
 
     The product of three shares: segments with a model among the `n_occupied` that hold
-    candidates, candidates that the surface explains, and the mean certainty of the labels
-    (left out if NaN). 0 without any model, and if the learning failed.
+    candidates, inliers among the candidates, certainty of the labels (if not NaN).
     """
     if fit.status == 'failed' or not fit.n_candidates or not n_occupied:
         return 0.0
@@ -334,18 +262,17 @@ class ModelTask:
 
 def _pose_values(pose: SensorPose) -> dict[str, str]:
     names = ('height', 'roll', 'pitch')
-    used = ' '.join(name for name in names if getattr(pose, f'{name}_estimated'))
+    taken = [name for name in names if getattr(pose, f'{name}_estimated')]
     seen = pose.measured
-    tilt = (seen.roll, seen.pitch) if seen and seen.tells_tilt else (None, None)
-    measured = (seen.height if seen and seen.tells_height else None, *tilt)
-    keys = ('height (m)', 'roll (rad)', 'pitch (rad)')
+    has_height, has_tilt = (seen.tells_height, seen.tells_tilt) if seen else (False, False)
     return {
-        **{f'Sensor {key}': f'{getattr(pose, key.split()[0]):.4f}' for key in keys},
-        'Taken from the scan': used or 'nothing',
-        **{
-            f'Estimated {key}': _digits(value, '.4f')
-            for key, value in zip(keys, measured, strict=True)
-        },
+        'Sensor height (m)': f'{pose.height:.4f}',
+        'Sensor roll (rad)': f'{pose.roll:.4f}',
+        'Sensor pitch (rad)': f'{pose.pitch:.4f}',
+        'Taken from the scan': ' '.join(taken) or 'nothing',
+        'Estimated height (m)': _digits(seen.height if seen and has_height else None, '.4f'),
+        'Estimated roll (rad)': _digits(seen.roll if seen and has_tilt else None, '.4f'),
+        'Estimated pitch (rad)': _digits(seen.pitch if seen and has_tilt else None, '.4f'),
     }
 
 
@@ -372,20 +299,18 @@ class OutputTask:
         return Status('output', Level.OK, message, values)
 
 
+State = tuple[InputFacts, Mapping[str, int]]
+"""State of the input, and the number of subscribers of each output topic."""
+
+
 class Diagnostics:
     """The four tasks of `node`, published every ``diagnostics.period`` of a steady clock.
 
     With ``use_sim_time``, a timer on the node's clock would not fire before the first
-    /clock, nor while a bag is paused. `state` returns the state of the input and the
-    number of subscribers of each output topic; `limits` are the parameters ``diagnostics``.
+    /clock, nor while a bag is paused. `limits` are the parameters ``diagnostics``.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        state: Callable[[], tuple[InputFacts, Mapping[str, int]]],
-        limits: DiagnosticsConfig,
-    ) -> None:
+    def __init__(self, node: Node, state: Callable[[], State], limits: DiagnosticsConfig) -> None:
         self.input = InputTask(time.monotonic())
         self.processing, self.model, self.output = ProcessingTask(), ModelTask(), OutputTask()
         self._node, self._state, self._limits = node, state, limits

@@ -178,13 +178,8 @@ class GroundSegmentationNode(ConfiguredNode):
             self._refuse(cloud, f'{type(error).__name__}: {error}')
         else:
             end = time.monotonic()
-            stages = {**segmentation.timings, 'publish': end - segmented}
-            health.processing.processed(
-                arrival.wait + end - start,
-                end - start,
-                {'queue': arrival.wait, **stages},
-                segmentation.fit,
-            )
+            stages = {'queue': arrival.wait, **segmentation.timings, 'publish': end - segmented}
+            health.processing.processed(end - start, stages, segmentation.fit)
             health.model.segmented(segmentation)
             health.output.published(end, topics)
 

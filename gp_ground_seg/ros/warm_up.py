@@ -28,7 +28,6 @@ sys.path[:] = {path!r}
 import os, threading
 # Standard input ends when the process that has started this one does.
 threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
-os.nice(5)
 from gp_ground_seg.segmenter import warm_up
 warm_up()
 """
