@@ -145,18 +145,9 @@ def above_zero(text: str) -> float:
 def scan_cloud(
     points: npt.NDArray[np.float32], stamp: int, frame_id: str, **further: npt.NDArray[Any]
 ) -> CloudMessage:
-    """Return a scan as a cloud.
+    """Return points (N, 4), x y z [m] intensity, and other fields (N,) as a cloud.
 
-    Parameters
-    ----------
-    points : (N, 4) float32
-        x, y, z [m], intensity.
-    stamp : int
-        Time of the header [ns].
-    frame_id : str
-        Frame of the header.
-    **further : (N,) arrays
-        Other fields.
+    `stamp` is the time of the header [ns].
     """
     columns = {name: points[:, k] for k, name in enumerate(('x', 'y', 'z', 'intensity'))}
     return cloud_from_columns(divmod(stamp, 10**9), frame_id, {**columns, **further})

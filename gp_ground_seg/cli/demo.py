@@ -100,23 +100,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
-class Drive(NamedTuple):
-    """Labelled scans, made one by one.
+Scan = tuple[npt.NDArray[np.float32], npt.NDArray[np.integer], float]
+"""Points (N, 4), SemanticKITTI class of each (N,), time since the start of the drive [s]."""
 
-    Attributes
-    ----------
-    name, truth : str
-        What it is, and whose labels it has.
-    n_frames : int
-        Number of scans.
-    scans : iterator
-        Points (N, 4) float32, SemanticKITTI class of each (N,), time since the start [s].
-    """
+
+class Drive(NamedTuple):
+    """Labelled scans, made one by one: what they are, and whose labels they have."""
 
     name: str
     truth: str
     n_frames: int
-    scans: Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.integer], float]]
+    scans: Iterator[Scan]
 
 
 def simulated_drive(n_frames: int) -> Drive:
@@ -130,7 +124,7 @@ def kitti_drive(root: str | Path, sequence: str, n_frames: int) -> Drive:
     """Return the first labelled scans of a KITTI sequence; raise a DataError if it has none."""
     frames = labelled_frames(root, [sequence])[:n_frames]
 
-    def scans() -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.integer], float]]:
+    def scans() -> Iterator[Scan]:
         for frame in frames:
             points = read_points(frame.points_path)
             assert frame.labels_path is not None, 'labelled_frames gives only labelled ones'
@@ -154,20 +148,10 @@ def numbered_cloud(
 class ScanCheck(NamedTuple):
     """A scan that went through the node.
 
-    Attributes
-    ----------
-    n_points : int
-        Finite points sent: each must come back once, in one of the two clouds.
-    n_missing, n_repeated : int
-        Points that came back in neither, and more than once.
-    n_altered : int
-        Points that came back but were not sent: with another byte, not finite, or in a cloud
-        of another header or layout.
-    label, truth : (N,) uint8
-        `Label` of each point sent, from the cloud it came back in, and the true one in the
-        GroundGrid convention.
-    points : (N, 4) float32
-        x, y, z [m] and intensity of each point sent.
+    Of the `n_points` finite points sent each must come back once, in one of the two clouds.
+    `n_altered` came back but were not sent: with another byte, not finite, or in a cloud of
+    another header or layout. `label` (N,) is the `Label` by the cloud a point came back in,
+    `truth` (N,) that of the GroundGrid convention; `points` (N, 4) are x, y, z [m], intensity.
     """
 
     n_points: int
@@ -223,10 +207,9 @@ def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
 
 
 class Tally:
-    """Sums over the scans that came back, of those with the given `stamps`.
+    """Sums over the scans of the given `stamps` that came back.
 
-    `picture` is the check of the middle scan, or of the nearest one before it that came
-    back, and its number.
+    `picture` is the check, and the number, of the middle scan or the nearest before it.
     """
 
     def __init__(self, stamps: Sequence[tuple[int, int]]) -> None:

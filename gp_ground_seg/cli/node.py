@@ -122,13 +122,7 @@ def _rates(text: str) -> list[float]:
 
 
 def start(words: Sequence[str]) -> int:
-    """Run the node until it is told to stop; return its exit code.
-
-    Raises
-    ------
-    MissingDependencyError
-        If rclpy or a message package is not installed.
-    """
+    """Run the node until a signal; return its exit code, or raise where there is no ROS."""
     # Importing ROS takes most of a second; a signal within it is obeyed as well.
     with stop_on_signals() as stop:
         with needing_ros('the node'):

@@ -47,12 +47,7 @@ def select_points(cloud: PointCloud2, mask: npt.NDArray[np.bool_]) -> PointCloud
     """Return the points of `cloud` where `mask` is true, in order, as an unorganised cloud.
 
     Header, fields, byte order, ``point_step`` and every byte of the points are those of the
-    input; ``is_dense`` tells whether all coordinates are finite.
-
-    Raises
-    ------
-    PointCloudError
-        If the message cannot hold what it claims, or the mask has another length.
+    input; ``is_dense`` tells whether all coordinates are finite. Raises as `select_rows`.
     """
     kept = select_rows(cloud, mask)
     n_points = int(np.count_nonzero(mask))
@@ -146,18 +141,8 @@ class CloudSubscription:
 
     Large clouds need reliable delivery: a best-effort reader loses most of a replayed KITTI
     bag with stock Fast DDS. A reliable reader gets nothing from a best-effort LiDAR driver.
-    Reliability given in ``qos_overrides`` is kept for any publisher.
-
-    Parameters
-    ----------
-    node : Node
-        Node that subscribes.
-    topic : str
-        Name of the topic, before remapping.
-    is_given : callable
-        Whether the user gave the parameter of this name.
-    callback : callable
-        Takes each cloud and its `Arrival`, in the executor of the node.
+    Reliability given in ``qos_overrides``, by `is_given`, is kept for any publisher.
+    `callback` takes each cloud and its `Arrival`, in the executor of the node.
     """
 
     def __init__(

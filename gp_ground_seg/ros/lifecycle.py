@@ -25,21 +25,12 @@ from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyE
 from gp_ground_seg.parameters.yaml_io import load_yaml
 
 HIGHEST_DOMAIN = 232
-USAGE = """\
-examples:
-  %(prog)s --ros-args -r points:=/kitti/velo/pointcloud
-  %(prog)s --ros-args -p label.ground_tolerance:=0.15
-  %(prog)s --ros-args --params-file config/vlp16.yaml
-"""
 
 
 def initialize(words: Sequence[str]) -> None:
     """Initialise rclpy with a command line, the program's name first; no signal handlers.
 
-    Raises
-    ------
-    ConfigError
-        If the ROS arguments or a parameter file cannot be read.
+    Raises a ConfigError if the ROS arguments or a parameter file cannot be read.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
@@ -52,8 +43,7 @@ def initialize(words: Sequence[str]) -> None:
         prog=words[0],
         usage='%(prog)s [--ros-args ...]',
         description='Split the clouds of a topic into ground and obstacles.',
-        epilog=USAGE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog='example: %(prog)s --ros-args -r points:=/lidar --params-file vlp16.yaml',
     )
     parser.parse_args(other_words)
     with start_errors():
@@ -294,21 +284,10 @@ class Session:
 
 @contextmanager
 def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
-    """Yield a `Session` in a context of its own; signals interrupt the block.
+    """Yield a `Session` whose node is called `name`, in a context of its own.
 
-    These are SIGINT, SIGTERM and SIGHUP, unless they are ignored.
-
-    Parameters
-    ----------
-    name : str
-        Name of the node.
-    ros_args : sequence of str
-        ``--ros-args`` and what follows it, or nothing.
-
-    Raises
-    ------
-    ConfigError
-        If the ROS arguments cannot be read.
+    SIGINT, SIGTERM and SIGHUP, unless ignored, interrupt the block. `ros_args` is
+    ``--ros-args`` and what follows it; raises a ConfigError if that cannot be read.
     """
     import rclpy
     from rclpy.context import Context

@@ -58,16 +58,8 @@ class GroundSegmentationNode(ConfiguredNode):
     Latency is the time between the arrival of a cloud in this process and the publication of
     the results, its wait in the queue included. Clouds are counted as dropped where the
     publisher's own numbering has a hole, see `SequenceGaps`.
-
-    Parameters
-    ----------
-    **options
-        Those of `rclpy.node.Node`.
-
-    Raises
-    ------
-    ConfigError
-        If a given parameter is not accepted.
+    Options are those of `rclpy.node.Node`. Raises a ConfigError if a given parameter is not
+    accepted.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -212,18 +204,10 @@ class GroundSegmentationNode(ConfiguredNode):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT, SIGTERM or a shutdown of its context.
+    """Run the node until SIGINT, SIGTERM or a shutdown of its context; return an exit code.
 
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Words after the program's name, ``--ros-args`` among them; those of the
-        process by default.
-
-    Returns
-    -------
-    int
-        Exit code: 0, or 2 for an error at start, reported in one line.
+    `args` are the words after the program's name, those of the process by default. The code
+    is 0, or 2 for an error at start, reported in one line.
     """
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None

@@ -35,18 +35,9 @@ BAND_COLOUR = (0.75, 0.75, 0.75, 0.35)
 
 
 class Output(NamedTuple):
-    """One output topic.
+    """One output topic, relative; an optional one is built only while it has a subscriber.
 
-    Attributes
-    ----------
-    topic : str
-        Relative name.
-    message_type : type
-        Type of the message.
-    build : callable
-        Makes the message from the input cloud, its segmentation and the parameters.
-    is_optional : bool
-        Whether it is built only while there is a subscriber.
+    `build` makes the message from the input cloud, its segmentation and the parameters.
     """
 
     topic: str

@@ -52,10 +52,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
     """Return `config` with those of the `parameters` that it declares.
 
-    Raises
-    ------
-    ConfigError
-        If a value has another type, is out of range or contradicts another.
+    Raises a ConfigError if a value has another type, is out of range or contradicts another.
     """
     return config.replace(
         **{
@@ -118,22 +115,11 @@ def set_in_any_order(
 
 
 class ConfiguredNode(Node):  # type: ignore[misc]
-    """A node whose ROS parameters are a `Config`.
+    """A node, with the options of `rclpy.node.Node`, whose ROS parameters are a `Config`.
 
-    Values set at run time are checked as a whole before anything changes, then
-    given to `apply_config` between two callbacks.
-
-    Parameters
-    ----------
-    name : str
-        Name of the node.
-    **options
-        Those of `rclpy.node.Node`.
-
-    Raises
-    ------
-    ConfigError
-        If a parameter file or ``-p`` gives a value that is not accepted.
+    Values set at run time are checked as a whole before anything changes, then given to
+    `apply_config` between two callbacks. Raises a ConfigError if a parameter file or ``-p``
+    gives a value that is not accepted.
     """
 
     def __init__(self, name: str, **options: Any) -> None:

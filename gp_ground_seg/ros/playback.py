@@ -35,13 +35,10 @@ LONE_PERIOD = 0.1
 class TrackedPublisher:
     """Publisher of serialised clouds that counts those that were not delivered.
 
-    A cloud is delivered when every reliable subscriber has acknowledged it: its middleware
-    has it. What a slow subscriber then pushes out of its own queue, or what a best-effort
-    one receives, is not known here.
-
-    The middleware tells only whether *all* clouds sent so far are acknowledged. Those of
-    which this was never seen are counted as undelivered once newer ones take their place,
-    their subscribers are gone, or the counting ends.
+    A cloud is delivered when every reliable subscriber has acknowledged it. What a slow
+    subscriber then pushes out of its own queue, or a best-effort one receives, is not known.
+    The middleware tells only whether *all* clouds sent so far are acknowledged. Others count
+    as undelivered once newer ones take their place or their subscribers are gone.
     """
 
     def __init__(self, node: Node, topic: str) -> None:
@@ -104,20 +101,9 @@ class PlayOptions(NamedTuple):
 
 
 class Player:
-    """Publishes clouds of a bag, reliably, as the bytes that were recorded.
+    """Publishes the PointCloud2 `topics` of a bag, reliably, as the bytes that were recorded.
 
-    Parameters
-    ----------
-    node : Node
-        Node that publishes.
-    bag : BagReader
-        Open bag.
-    topics : sequence of str
-        Topics of the bag to play, all PointCloud2.
-    pause : callable
-        Waits for at most the given time [s]; called whenever there is nothing to send.
-    options : PlayOptions
-        What to play, and how.
+    `pause` waits for at most the given time [s]; it is called when there is nothing to send.
     """
 
     def __init__(

@@ -185,17 +185,8 @@ def restamped(clouds: Iterable[CloudMessage], start: int) -> Iterator[CloudMessa
 class Probe:
     """Sends clouds to a node, receives its results reliably, and matches them by stamp.
 
-    Parameters
-    ----------
-    session : Session
-        Session that sends and receives, while it spins.
-    on_back : callable
-        Called with a cloud that was sent and its results, when both are back.
-
-    Attributes
-    ----------
-    n_stray : int
-        Results that belong to no cloud sent, or came a second time.
+    `on_back` is called with a cloud that was sent and its results, when both are back;
+    `n_stray` counts the results that belong to no cloud sent, or came a second time.
     """
 
     def __init__(
@@ -221,13 +212,8 @@ class Probe:
     def connect(self, node: NodeProcess, timeout: float = START_TIMEOUT) -> None:
         """Send empty clouds until both topics have answered and the node is settled.
 
-        Discovery takes its time, each way on its own: only a result proves that no cloud
-        will be lost for want of a connection.
-
-        Raises
-        ------
-        GroundSegError
-            If that takes longer than `timeout` [s], or the node ends.
+        Discovery takes its time, each way on its own: only a result proves the connection.
+        Raises a GroundSegError if that takes longer than `timeout` [s], or the node ends.
         """
         empty = cloud_from_columns((0, 0), _PROBE_FRAME, {})
         end, next_time, trip = time.monotonic() + timeout, 0.0, Trip(0)

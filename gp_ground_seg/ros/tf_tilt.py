@@ -30,10 +30,7 @@ def require_tf2() -> Any:
 def tilt_of(rotation: Quaternion) -> tuple[float, float]:
     """Return roll and pitch [rad] of a sensor frame that `rotation` turns into a level one.
 
-    Raises
-    ------
-    PointCloudError
-        If it is no rotation.
+    Raises a PointCloudError if it is no rotation.
     """
     x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
     square = x * x + y * y + z * z + w * w
@@ -60,12 +57,8 @@ class TfTilt:
         """Return roll and pitch [rad] of the frame `frame` in the frame `base`.
 
         The transform is that of the time `stamp`, or the newest if there is none for it: a
-        sensor is fixed to its vehicle, and waiting for TF would delay every cloud.
-
-        Raises
-        ------
-        PointCloudError
-            If TF does not connect the two.
+        sensor is fixed to its vehicle, and waiting for TF would delay every cloud. Raises a
+        PointCloudError if TF does not connect the two.
         """
         try:
             try:

@@ -37,12 +37,8 @@ class BackendLoader:
     """Makes the compiled backend in a thread, while frames are segmented without it.
 
     Code that is not kept on disk is compiled by a child process, whose memory is free
-    again after it: the compiler leaves twice as much behind as the node needs.
-
-    Parameters
-    ----------
-    on_done : callable
-        Called in the thread when the backend is there or cannot be made; not after `stop`.
+    again after it: the compiler leaves twice as much behind as the node needs. `on_done` is
+    called in the thread when the backend is there or cannot be made; not after `stop`.
     """
 
     def __init__(self, on_done: Callable[[], None]) -> None:
