@@ -21,13 +21,12 @@ from ros_helpers import BEST_EFFORT, ISOLATION, PATIENCE, isolated_context, spin
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.cli import notes
-from gp_ground_seg.cli import play as cli_play
+from gp_ground_seg.cli import bags, options
 from gp_ground_seg.cli.main import main
 from gp_ground_seg.data.bags import open_bag
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
-from gp_ground_seg.ros import delivery, player, transport
-from gp_ground_seg.ros.session import ros_session
+from gp_ground_seg.ros import lifecycle, playback
+from gp_ground_seg.ros.lifecycle import ros_session
 
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 SUMMARY = re.compile(
@@ -40,7 +39,7 @@ WAITING = 'gp-ground-seg: note: waiting for a subscriber of /points'
 @pytest.fixture(autouse=True)
 def stock_transport(monkeypatch):
     """Fast DDS would keep a profile for all that follows in this process."""
-    monkeypatch.setattr(transport, 'segment_size', lambda: 0)
+    monkeypatch.setattr(lifecycle, '_free_shared_memory', lambda: 0)
 
 
 class Listener:
@@ -93,9 +92,9 @@ def test_every_byte_at_the_recorded_times(tmp_path, capsys, monkeypatch):
     bag = tmp_path / 'drive.mcap'
     write_ros2_bag(bag, 8)
     told = []
-    tell = player._BagClock.publish
+    tell = playback.Player._publish_time
     monkeypatch.setattr(
-        player._BagClock, 'publish', lambda clock, now: [told.append(now), tell(clock, now)]
+        playback.Player, '_publish_time', lambda p, now: [told.append(now), tell(p, now)]
     )
     end = START + 7 * PERIOD
     with listening('/points') as listener:
@@ -199,11 +198,11 @@ def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
     is_said = threading.Event()
 
     def note(text):
-        notes.note(text)
+        options.note(text)
         if text.startswith('waiting'):
             is_said.set()
 
-    monkeypatch.setattr(cli_play, 'note', note)
+    monkeypatch.setattr(bags, 'note', note)
     with isolated_context() as context:
         node = Node('late', context=context)
         clouds = []
@@ -337,9 +336,9 @@ rclpy.spin(node)
 
 def test_subscriber_that_is_killed(tmp_path, capsys, monkeypatch):
     """It cannot say goodbye: the middleware believes in it, but no longer hears of it."""
-    monkeypatch.setattr(player, 'DELIVERY_TIMEOUT', 0.5)
+    monkeypatch.setattr(playback, 'DELIVERY_TIMEOUT', 0.5)
     bag = tmp_path / 'drive.mcap'
-    n_clouds = delivery.DEPTH + 50
+    n_clouds = playback.DEPTH + 50
     write_ros2_bag(bag, n_clouds)
     with Program(code=('-c', SUBSCRIBER)) as subscriber, isolated_context():
         assert play(bag, '--quiet', '--rate', 10, '--wait', PATIENCE) == 1
@@ -347,7 +346,7 @@ def test_subscriber_that_is_killed(tmp_path, capsys, monkeypatch):
     n_sent, *_, n_undelivered = summary(capsys)
     assert n_sent == n_clouds
     # More than still wait in the queue: those that were pushed out of it count as well.
-    assert delivery.DEPTH < n_undelivered <= n_clouds
+    assert playback.DEPTH < n_undelivered <= n_clouds
 
 
 def test_without_ros(tmp_path):

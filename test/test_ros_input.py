@@ -1,4 +1,4 @@
-"""PointCloud2 messages of any layout, against the struct module."""
+"""Input of the node: messages of any layout, against the struct module; stamps that jump."""
 
 import copy
 import struct
@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.ros.point_cloud2 import read_xyz, select_points
+from gp_ground_seg.ros.input import JUMP_TOLERANCE, StampWatch, read_xyz, select_points
 
 STRUCT_CODE = {
     PointField.INT8: 'b',
@@ -142,3 +142,30 @@ def test_malformed_message_says_what_and_where(attribute, value, reason):
     setattr(message, attribute, value)
     with pytest.raises(PointCloudError, match=reason):
         read_xyz(message)
+
+
+@given(st.lists(st.floats(0.0, 5.0)))
+def test_a_stamp_far_behind_the_newest_is_a_jump(stamps):
+    watch, newest = StampWatch(), None
+    for stamp in stamps:
+        behind = 0.0 if newest is None else newest - stamp
+        jump = watch.note(stamp)
+        if behind > JUMP_TOLERANCE:
+            assert jump == behind
+            newest = stamp
+        else:
+            assert jump == 0.0
+            newest = stamp if newest is None else max(newest, stamp)
+
+
+def test_a_bag_played_in_a_loop_jumps_once_a_round():
+    watch = StampWatch()
+    rounds = [[1317383.0 + 0.1 * k for k in range(20)]] * 3
+    assert [sum(watch.note(s) > 0.0 for s in stamps) for stamps in rounds] == [0, 1, 1]
+
+
+def test_after_a_reset_any_stamp_is_the_first():
+    watch = StampWatch()
+    watch.note(100.0)
+    watch.reset()
+    assert watch.note(1.0) == 0.0
