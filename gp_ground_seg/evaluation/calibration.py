@@ -88,7 +88,7 @@ class Calibration:
         return ratio(self.sum_squared_error, self.n_total)
 
     def confusion_at(self, step: int) -> Confusion:
-        """Return the counts if ground were what reaches the threshold ``THRESHOLDS[step]``."""
+        """Return the counts if ground were what reaches ``THRESHOLDS[step]``."""
         tp = int(self.ground_by_step[step:].sum())
         fp = int(self.obstacles_by_step[step:].sum())
         n_ground = int(self.ground_by_step.sum()) + self.ground_without

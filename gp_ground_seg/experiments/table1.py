@@ -17,7 +17,7 @@ from gp_ground_seg.evaluation.environment import changed_parameters
 from gp_ground_seg.evaluation.evaluate import ALL, Progress, load_kitti
 from gp_ground_seg.evaluation.metrics import height_error
 from gp_ground_seg.evaluation.table import Column, Table
-from gp_ground_seg.experiments.variants import Report
+from gp_ground_seg.experiments.variants import Report, refuse_changed
 from gp_ground_seg.frame import OUTSIDE, BoolArray, FloatArray
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.result import Segmentation
@@ -53,14 +53,13 @@ DEFAULT_CHOICES = ('10/000000:157,158', '03/000006:147,148')
 
 def find_frame(root: str | Path, choice: Choice) -> Frame:
     """Frame of a choice; DataError if it is not there."""
-    frames = list_frames(root, choice.sequence)
-    for frame in frames:
-        if frame.index == choice.frame:
-            return frame
-    raise DataError(
-        f'{root}: no frame {choice.frame} in sequence {choice.sequence}; '
-        f'there are {frames[0].index} to {frames[-1].index}'
-    )
+    frames = {frame.index: frame for frame in list_frames(root, choice.sequence)}
+    if choice.frame not in frames:
+        raise DataError(
+            f'{root}: no frame {choice.frame} in sequence {choice.sequence}; '
+            f'there are {min(frames)} to {max(frames)}'
+        )
+    return frames[choice.frame]
 
 
 def table1(
@@ -82,13 +81,9 @@ def table1(
     DataError
         If a frame is missing or unlabelled.
     """
-    for name, refused in (('length_scale.model', config.length_scale.model != MODELS['Z-L']),
-                          ('learning.mode', config.learning.mode == 'fixed')):  # fmt: skip
-        if refused:
-            raise ConfigError(
-                f'{name} = {config[name]}: the table compares what is learned with latent and '
-                'line_gradient, leave it out'
-            )
+    refuse_changed(config, ['length_scale.model'])
+    if config.learning.mode == 'fixed':
+        raise ConfigError('learning.mode = fixed: the table is of what is learned, leave it out')
     last = config.grid.n_segments - 1
     for segment in (segment for choice in choices for segment in choice.segments):
         if not 0 <= segment <= last:
