@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gp_ground_seg.data.atomic_output import leftovers, staged_files
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
-from gp_ground_seg.data.bags import BagWriter, cloud_topic, jazzy_topic, open_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, jazzy_topic
 from gp_ground_seg.data.point_cloud2 import encode_cloud
 from gp_ground_seg.errors import DataError
 
@@ -25,7 +25,7 @@ SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive
 
 
 def read_all(path):
-    with open_bag(path) as bag:
+    with BagReader(path) as bag:
         return list(bag.messages())
 
 
@@ -54,7 +54,7 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
     path = tmp_path / name
     written = samples.write_ros2_bag(path, storage=storage)
     assert is_bag(path)
-    with open_bag(path) as bag:
+    with BagReader(path) as bag:
         assert bag.topics == {'/points': POINT_CLOUD2, '/note': 'std_msgs/msg/String'}
         assert bag.n_messages('/points') == 3
         assert bag.pick_point_cloud_topic() == '/points'
@@ -79,7 +79,7 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
 
 def copy_bag(source, target):
     """Copy all messages; returns the topics of the source."""
-    with open_bag(source) as old, BagWriter(target) as new:
+    with BagReader(source) as old, BagWriter(target) as new:
         topics = [old.topic(name) for name in old.topics]
         for topic in topics:
             new.add_topic(topic)
@@ -91,7 +91,7 @@ def copy_bag(source, target):
 def test_topics_copied_from_bag_to_bag_keep_definition_and_qos(tmp_path):
     written = samples.write_ros2_bag(tmp_path / 'a.mcap')
     originals = copy_bag(tmp_path / 'a.mcap', tmp_path / 'b.db3')
-    with open_bag(tmp_path / 'b.db3') as bag:
+    with BagReader(tmp_path / 'b.db3') as bag:
         assert [bag.topic(name) for name in bag.topics] == originals
         assert list(bag.messages()) == written
 
@@ -133,7 +133,7 @@ def ros1_bag(tmp_path_factory):
 
 
 def test_ros1_clouds_are_the_same_in_ros2(ros1_bag):
-    with open_bag(ros1_bag) as bag:
+    with BagReader(ros1_bag) as bag:
         assert bag.storage == 'ros1'
         topic = bag.pick_point_cloud_topic()
         assert topic == '/kitti/velo/pointcloud'
@@ -146,7 +146,7 @@ def test_ros1_clouds_are_the_same_in_ros2(ros1_bag):
 
 
 def test_ros1_order_and_merged_publishers(ros1_bag):
-    with open_bag(ros1_bag) as bag:
+    with BagReader(ros1_bag) as bag:
         messages = list(bag.messages())
         assert bag.n_messages('/text') == 6
         # One of the two publishers latches.
@@ -158,7 +158,7 @@ def test_ros1_order_and_merged_publishers(ros1_bag):
 
 
 def test_ros1_types_unknown_to_ros2_are_carried_over(ros1_bag):
-    with open_bag(ros1_bag) as bag:
+    with BagReader(ros1_bag) as bag:
         topic = bag.topic('/odd')
         messages = [raw for _, _, raw in bag.messages(['/odd'])]
     types = get_typestore(Stores.EMPTY)
@@ -174,7 +174,7 @@ def test_ros1_types_unknown_to_ros2_are_carried_over(ros1_bag):
 
 def test_ros1_type_that_ros2_changed_is_migrated_and_said(ros1_bag):
     types = get_typestore(Stores.ROS2_JAZZY)
-    with open_bag(ros1_bag) as bag:
+    with BagReader(ros1_bag) as bag:
         assert bag.migrated_topics == ['/range']
         for k, (_, _, raw) in enumerate(bag.messages(['/range'])):
             message = types.deserialize_cdr(raw, 'sensor_msgs/msg/Range')
@@ -186,7 +186,7 @@ def test_ros1_definition_that_cannot_be_parsed_concerns_its_topic_only(tmp_path,
     assert text.count(b'float64 value') >= 1
     broken = tmp_path / 'broken.bag'
     broken.write_bytes(text.replace(b'float64 value', b'float64 **** '))
-    with open_bag(broken) as bag:
+    with BagReader(broken) as bag:
         assert len(list(bag.messages(['/kitti/velo/pointcloud', '/range']))) == 6
     assert re.search('topic /odd .*cannot be converted from ROS 1', problem_of(broken))
 
@@ -196,7 +196,7 @@ def test_ros1_definition_that_cannot_be_parsed_concerns_its_topic_only(tmp_path,
 
 def test_several_cloud_topics_are_listed(tmp_path):
     samples.write_ros2_bag(tmp_path / 'two', topics=('/front', '/rear'))
-    with open_bag(tmp_path / 'two') as bag:
+    with BagReader(tmp_path / 'two') as bag:
         assert bag.point_cloud_topics == ['/front', '/rear']
         with pytest.raises(DataError, match=r'2 .*PointCloud2 topics, choose one.*/front, /rear'):
             bag.pick_point_cloud_topic()
@@ -212,7 +212,7 @@ def test_several_cloud_topics_are_listed(tmp_path):
 def test_bag_without_clouds(tmp_path):
     write_note(tmp_path / 'none.mcap', 5, 'hello')
     expected = rf'no {POINT_CLOUD2} topic; topics here: /note \(std_msgs/msg/String\)'
-    with open_bag(tmp_path / 'none.mcap') as bag, pytest.raises(DataError, match=expected):
+    with BagReader(tmp_path / 'none.mcap') as bag, pytest.raises(DataError, match=expected):
         bag.pick_point_cloud_topic()
 
 
@@ -222,7 +222,7 @@ def test_topic_without_messages(tmp_path, name, storage):
         bag.add_topic(cloud_topic('/silent'))
         bag.add_topic(cloud_topic('/points'))
         bag.write('/points', 5, encode_cloud(samples.cloud()))
-    with open_bag(tmp_path / name) as bag:
+    with BagReader(tmp_path / name) as bag:
         # A topic that was never published on does not make the choice unclear.
         assert bag.pick_point_cloud_topic() == '/points'
         with pytest.raises(DataError, match='no message on /silent'):
@@ -320,7 +320,7 @@ def test_errors_of_the_caller_pass_unchanged(tmp_path):
     samples.write_ros2_bag(tmp_path / 'drive')
 
     def fail_on_first_message():
-        with open_bag(tmp_path / 'drive') as bag:
+        with BagReader(tmp_path / 'drive') as bag:
             for _ in bag.messages():
                 raise KeyError('mine')
 
@@ -434,7 +434,7 @@ def test_sqlite_bag_whose_path_is_no_uri_is_not_mixed_up(tmp_path):
     samples.write_ros2_bag(tmp_path / 'a.db3')
     shutil.copy(tmp_path / 'a.db3', tmp_path / 'a.db3#2.db3')
     with pytest.raises(DataError, match='cannot have # in its path'):
-        open_bag(tmp_path / 'a.db3#2.db3')
+        BagReader(tmp_path / 'a.db3#2.db3')
 
 
 @pytest.mark.parametrize('name', ['a#1?.mcap', 'a [x]', 'ä ö'])
@@ -462,7 +462,7 @@ def test_two_types_on_one_topic_are_refused(tmp_path):
     content = (tmp_path / 'x.mcap').read_bytes()
     (tmp_path / 'y.mcap').write_bytes(content.replace(b'/diff', b'/same'))
     with pytest.raises(DataError, match='topic /same has messages of two types'):
-        open_bag(tmp_path / 'y.mcap')
+        BagReader(tmp_path / 'y.mcap')
 
 
 def test_files_into_an_existing_folder_leave_the_others(tmp_path):
@@ -492,7 +492,7 @@ def test_without_rosbags_the_error_says_what_to_install(tmp_path):
         'from gp_ground_seg.data import bags\n'
         'from gp_ground_seg.data.point_cloud2 import decode_cloud\n'
         'from gp_ground_seg.errors import MissingDependencyError\n'
-        'for call in (bags.open_bag, bags.BagWriter, decode_cloud):\n'
+        'for call in (bags.BagReader, bags.BagWriter, decode_cloud):\n'
         '    try:\n'
         '        call(sys.argv[1])\n'
         '    except MissingDependencyError as error:\n'

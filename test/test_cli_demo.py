@@ -20,7 +20,7 @@ from gp_ground_seg.cli.demo_node import NodeProcess, private_network
 from gp_ground_seg.cli.demo_tally import BACKLOG, GROUND, OBSTACLES, Tally
 from gp_ground_seg.cli.demo_text import result_text
 from gp_ground_seg.cli.main import main
-from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import (
     decode_cloud,
     encode_cloud,
@@ -258,7 +258,7 @@ def test_demo_without_data(rclpy, tmp_path):
         'birds_eye.png', 'drive.mcap', 'node.log'
     ]  # fmt: skip
     assert (folder / 'birds_eye.png').read_bytes().startswith(b'\x89PNG')
-    with open_bag(folder / 'drive.mcap') as bag:
+    with BagReader(folder / 'drive.mcap') as bag:
         n_points = sum(decode_cloud(raw).width for _, _, raw in bag.messages([TOPIC]))
     assert f'{n_points:,}'.replace(',', ' ') + ' of these scans' in result.stdout
 

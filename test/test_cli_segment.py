@@ -17,7 +17,7 @@ import pytest
 from cli_runner import error_line, run, start
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.data.bags import BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 
 BAGS = ['drive', 'drive.mcap', 'drive.db3', 'drive.bag']
@@ -57,7 +57,7 @@ def write_scans(folder, n_scans=3):
 
 
 def read_messages(path):
-    with open_bag(path) as bag:
+    with BagReader(path) as bag:
         return list(bag.messages())
 
 
@@ -129,7 +129,7 @@ def test_format_of_the_output(segment, tmp_path, output, options, storage):
     source = tmp_path / 'drive'
     samples.write_ros2_bag(source, storage='sqlite3')
     assert segment(source, '-o', tmp_path / output, *options) == 0
-    with open_bag(tmp_path / output) as bag:
+    with BagReader(tmp_path / output) as bag:
         assert bag.storage == storage
 
 
@@ -190,7 +190,7 @@ def test_topics_can_be_chosen_renamed_and_dropped(segment, segmenter, tmp_path, 
     # Dropping a topic frees its name, and the segmented one may be dropped as well.
     words = ['--topic', '/front', '--drop', '/ground', '--drop', '/front', '--force']
     assert segment(source, *words) == 0
-    with open_bag(result) as bag:
+    with BagReader(result) as bag:
         assert list(bag.topics) == ['/note', '/ground', '/obstacles']
         assert [bag.n_messages(topic) for topic in bag.topics] == [3, 3, 3]
 

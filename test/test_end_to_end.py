@@ -22,7 +22,7 @@ from gp_ground_seg.cli.demo_check import check_scan
 from gp_ground_seg.cli.demo_frames import numbered_cloud
 from gp_ground_seg.cli.demo_node import NodeProcess, private_network
 from gp_ground_seg.cli.demo_tally import GROUND, OBSTACLES, OUTPUTS
-from gp_ground_seg.data.bags import BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.ros.receiver import OutputReceiver
 from gp_ground_seg.ros.session import ros_session
@@ -128,7 +128,7 @@ def assert_is_what_the_library_says(machine, sent):
 
 
 def read_clouds(bag, topic):
-    with open_bag(bag) as reader:
+    with BagReader(bag) as reader:
         return [decode_cloud(raw) for _, _, raw in reader.messages([topic])]
 
 

@@ -16,7 +16,7 @@ from gp_ground_seg.cli.options import add_config_options, config_from_options, n
 from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.bag_files import is_bag
-from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
@@ -253,7 +253,7 @@ def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
 
 def _bag_frames(source: Path, n_frames: int, topic: str | None) -> list[BenchFrame]:
     frames = []
-    with open_bag(source) as bag:
+    with BagReader(source) as bag:
         name = bag.pick_point_cloud_topic(topic)
         wanted = {k: run_name for run_name, k in runs(name, bag.n_messages(name), n_frames)}
         for k, (_, time, raw) in enumerate(bag.messages([name])):

@@ -23,7 +23,7 @@ from gp_ground_seg.cli.demo_text import result_text, thousands
 from gp_ground_seg.cli.output import count, progress_bar
 from gp_ground_seg.cli.play import needing_ros, positive, summary
 from gp_ground_seg.data.atomic_output import staged_files
-from gp_ground_seg.data.bags import BagReader, open_bag
+from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud
 from gp_ground_seg.data.semantic_kitti import list_sequences
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
@@ -135,7 +135,7 @@ def run(arguments: argparse.Namespace) -> int:
         written = _write(drive, part / BAG, session)
         tally = Tally(shown=drive.n_frames // 2)
         receiver = _connect(session, node, tally)
-        with open_bag(part / BAG) as bag:
+        with BagReader(part / BAG) as bag:
             rate = arguments.rate or _sustainable_rate(bag, receiver)
             _play(bag, rate, written.period, session, tally)
         node.check()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from gp_ground_seg.cli.notes import note
 from gp_ground_seg.cli.output import count, progress_bar
-from gp_ground_seg.data.bags import BagReader, open_bag
+from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.errors import GroundSegError, MissingDependencyError
 from gp_ground_seg.ros.transport import large_cloud_transport
 
@@ -144,7 +144,7 @@ def run(arguments: argparse.Namespace) -> int:
         loop=arguments.loop,
         clock=arguments.clock,
     )
-    with open_bag(arguments.bag) as bag:
+    with BagReader(arguments.bag) as bag:
         topics = _choose_topics(bag, arguments)
         if not arguments.quiet:
             _note_what_is_not_played(bag, topics)

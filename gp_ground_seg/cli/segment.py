@@ -22,7 +22,7 @@ from gp_ground_seg.cli.options import (
 )
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
@@ -150,7 +150,7 @@ def _count(result: Segmentation) -> _Counts:
 
 
 def _holds_bag_files(source: Path) -> bool:
-    """Whether a folder holds bag files and no scans: `open_bag` says what is missing there."""
+    """Whether a folder holds bag files and no scans: `BagReader` says what is missing there."""
     if not source.is_dir() or any(source.glob('*.bin')):
         return False
     return any(child.suffix in BAG_SUFFIXES for child in source.iterdir())
@@ -255,7 +255,7 @@ def _segment_bag(
         raise DataError(f'{target}: is the input, or has it in it; name another output')
     topics = (arguments.ground_topic or GROUND_TOPIC, arguments.obstacles_topic or OBSTACLES_TOPIC)
     outputs = dict(zip(topics, (Label.GROUND, Label.OBSTACLE), strict=True))
-    with open_bag(source) as bag:
+    with BagReader(source) as bag:
         topic = bag.pick_point_cloud_topic(arguments.topic)
         for name in arguments.drop:
             bag.topic(name)  # Raises where there is none.
