@@ -106,7 +106,13 @@ def _check_sqlite_file(path: Path) -> None:
     check_sqlite_path(path)
     with path.open('rb') as file:
         header = file.read(100)
-    size, wanted = path.stat().st_size, _sqlite_size(header)
+    size, wanted = path.stat().st_size, 0
+    # The format is that of https://www.sqlite.org/fileformat.html.
+    if len(header) == 100 and header[24:28] == header[92:96]:
+        page_size = int.from_bytes(header[16:18], 'big')
+        # 65536 does not fit into the two bytes.
+        page_size = 65536 if page_size == 1 else page_size
+        wanted = page_size * int.from_bytes(header[28:32], 'big')
     if size < wanted:
         raise DataError(f'{path}: truncated, {size} bytes where its header says {wanted}')
     for ending in ('-wal', '-journal'):
@@ -116,16 +122,6 @@ def _check_sqlite_file(path: Path) -> None:
                 f'{path}: was not closed, some of it is in {journal.name}; '
                 f'`sqlite3 {path.name} vacuum` completes it'
             )
-
-
-def _sqlite_size(header: bytes) -> int:
-    """Size of the file by its header, 0 if not given; https://www.sqlite.org/fileformat.html."""
-    if len(header) < 100 or header[24:28] != header[92:96]:
-        return 0
-    page_size = int.from_bytes(header[16:18], 'big')
-    # 65536 does not fit into the two bytes.
-    page_size = 65536 if page_size == 1 else page_size
-    return page_size * int.from_bytes(header[28:32], 'big')
 
 
 def resolve_storage(path: str | Path, wanted: str | None = None) -> str:

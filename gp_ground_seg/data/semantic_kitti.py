@@ -61,9 +61,7 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
     if not path.exists():
         return [FRAME_PERIOD * k for k in range(len(frames))]
     try:
-        lines = [float(word) for word in path.read_text(encoding='utf-8').split()]
-    except OSError as error:
-        raise DataError(f'{path}: {error.strerror or error}') from error
+        lines = [float(word) for word in _read_bytes(path).split()]
     except ValueError as error:
         raise DataError(f'{path}: {error}') from error
     times: list[float] = []
