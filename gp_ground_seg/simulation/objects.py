@@ -17,6 +17,8 @@ from gp_ground_seg.simulation.terrain import Terrain
 
 KindArray: TypeAlias = npt.NDArray[np.uint8]
 Interval: TypeAlias = tuple[FloatArray, FloatArray]
+Size: TypeAlias = tuple[float, float, float]
+"""Length, width and height [m]."""
 
 BURIED_DEPTH = 3.0
 """How far standing solids reach below the ground at their centre, so that none hovers [m]."""
@@ -199,10 +201,6 @@ class _Fan:
         return np.concatenate(
             [self._order[start:end] for start, end in zip(starts, ends, strict=True)]
         )
-
-
-Size: TypeAlias = tuple[float, float, float]
-"""Length, width and height [m]."""
 
 
 def standing_box(
