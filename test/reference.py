@@ -25,6 +25,7 @@ from gp_ground_seg.frame import (
 )
 
 LOG_2PI = math.log(2.0 * math.pi)
+N_SLICES = 3
 
 
 class Reference(NumpyBackend):
@@ -64,14 +65,19 @@ def place_of(x, y, grid):
     steps = np.arange(grid.n_bins + 1) / grid.n_bins
     edges = grid.r_min + (grid.r_max - grid.r_min) * steps**grid.bin_growth
     # The origin counts as lying on +x, also where its x is -0.
-    turn = (math.atan2(y, x if r > 0.0 else 1.0) / (2.0 * math.pi) + 0.5) * grid.n_segments
+    turn = (
+        math.atan2(y, x if x != 0.0 or y != 0.0 else 1.0) / (2.0 * math.pi) + 0.5
+    ) * grid.n_segments
     if not r < edges[-1]:
         return None, turn
     return next(n for n in range(grid.n_bins) if r < edges[n + 1]), turn
 
 
 def lowest_of_cells(scan: Scan, config) -> Candidates:
-    """Lowest point of each cell; of equally low ones the nearest, then the first tile."""
+    """Lowest point of each cell; of equally low ones the nearest, then the first tile.
+
+    The density is the mean over slices of equal height of points over area.
+    """
     members = {}
     for i in np.flatnonzero(scan.grid.cell >= 0):
         members.setdefault(int(scan.grid.cell[i]), []).append(i)
@@ -81,8 +87,10 @@ def lowest_of_cells(scan: Scan, config) -> Candidates:
         low, r, tile = min(zip(z, scan.grid.r[own], scan.tiles.tile[own], strict=True))
         segment, n = divmod(cell, scan.grid.n_bins)
         extent = max(max(z) - low, config.lines.min_density_extent)
-        width = scan.grid.edges[n + 1] - scan.grid.edges[n]
-        rows.append((r, low, n, len(own) / (width * extent), tile))
+        piece = np.minimum((z - low) / extent * N_SLICES, N_SLICES - 1).astype(int)
+        number = np.bincount(piece, minlength=N_SLICES)
+        area = np.diff(scan.grid.edges)[n] * extent / N_SLICES
+        rows.append((r, low, n, np.mean(number / area), tile))
         counts[segment] += 1
     r, z, own_bin, density, tile = np.array(rows, dtype=np.float64).reshape(-1, 5).T
     offsets = np.concatenate([[0], np.cumsum(counts)])
@@ -190,7 +198,7 @@ def pseudo_inputs(candidates: Candidates, lines: Lines, config) -> PseudoInputs:
             r_bar.append(candidates.r[place])
             classes.append(3 * tilt + length)
             places.append(place)
-    everything = sum(extents, []) or [math.log(limits.min)]
+    everything = [value for own in extents for value in own] or [math.log(limits.min)]
     return PseudoInputs(
         np.array(r_bar),
         np.array(classes, np.int64),
@@ -232,10 +240,10 @@ def continues_line(candidates: Candidates, lines: Lines, config):
 
 
 def paciorek(r_a, l_a, r_b, l_b, sigma_f):
-    """Equation 8, (A, B) [m^2]; ranges and length-scales [m]."""
-    spread = l_a[:, None] ** 2 + l_b**2
-    ratio = 2.0 * l_a[:, None] * l_b / spread
-    return sigma_f**2 * np.sqrt(ratio) * np.exp(-((r_a[:, None] - r_b) ** 2) / spread)
+    """Equation 8 as printed, (A, B) [m^2]; ranges and length-scales [m]."""
+    a, b = l_a[:, None] ** 2, l_b**2
+    root = a**0.25 * b**0.25 * ((a + b) / 2.0) ** -0.5
+    return sigma_f**2 * root * np.exp(-((r_a[:, None] - r_b) ** 2) / (a + b))
 
 
 def squared_exponential(r_a, r_b, sigma_f, length_scale):
@@ -336,109 +344,84 @@ def fuse(mean, std, knots, n_neighbours, slope_std):
 
 
 def log_likelihood(theta, inliers, slope_std, latent_terms):
-    """Equations 19 and 20; the gradient matrix by matrix, one hyper-parameter at a time."""
-    value, gradient = 0.0, np.zeros(len(theta))
-    for m in range(len(inliers.offsets) - 1):
-        own = slice(*inliers.offsets[m : m + 2])
-        bar = slice(*inliers.bar_offsets[m : m + 2])
-        data = inliers.r[own], inliers.z[own], inliers.log_length_scale[own]
-        latent = inliers.r_bar[bar], inliers.surface_class[bar]
-        if len(data[0]) > 0:
-            try:
-                value += _add_segment(theta, gradient, data, latent, slope_std, latent_terms)
-            except (LinAlgError, ValueError):  # not positive definite, or not finite
-                return -math.inf, np.zeros(len(theta))
+    """Equation 19, and its gradient (equation 20) by central differences.
+
+    Richardson's extrapolation: the error is of sixth order in the steps.
+    """
+    value = _log_likelihood(theta, inliers, slope_std, latent_terms)
+    gradient = np.zeros(len(theta))
+    for i in range(len(theta) if math.isfinite(value) else 0):
+        for step, weight in ((2e-3, 64 / 45), (4e-3, -20 / 45), (8e-3, 1 / 45)):
+            for sign in (-1.0, 1.0):
+                aside = theta + sign * step * (np.arange(len(theta)) == i)
+                other = _log_likelihood(aside, inliers, slope_std, latent_terms)
+                gradient[i] += sign * weight * other / (2.0 * step)
     return value, gradient
 
 
-def _log_density(covariance, z):
-    """log N(z | 0, covariance), its gradient in the covariance, and the Cholesky factor."""
-    factor = cho_factor(covariance, lower=True)
-    alpha = cho_solve(factor, z)
-    log_determinant = 2.0 * np.log(np.diagonal(factor[0])).sum()
-    g = 0.5 * (np.outer(alpha, alpha) - cho_solve(factor, np.eye(len(z))))
-    return -0.5 * (z @ alpha + log_determinant + len(z) * LOG_2PI), g, factor
-
-
-def _add_segment(theta, gradient, data, latent, slope_std, latent_terms):
-    """Value of one segment; adds to `gradient`. Letters are those of the paper."""
-    (r, z, u), (r_bar, surface_class) = data, latent
-    sigma_f, sigma_n, sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[:5])
+def _log_likelihood(theta, inliers, slope_std, latent_terms):
+    """Sum over the segments; letters are those of the paper."""
+    sigma_f, sigma_n, *latent = np.exp(theta[:5])
     value = 0.0
-    if len(r_bar):
-        l_bar, one = theta[5 + surface_class], np.eye(len(r_bar))
-        k_bar = squared_exponential(r_bar, r_bar, sigma_f_bar, sigma_l_bar)
-        k_star = squared_exponential(r, r_bar, sigma_f_bar, sigma_l_bar)
-        # The density of the pseudo-inputs at their mean: the quadratic term is left out.
-        printed, g_b, factor = _log_density(k_bar + sigma_n_bar**2 * one, 0.0 * l_bar)
-        beta = cho_solve(factor, l_bar - l_bar.mean())
-        u, value = l_bar.mean() + k_star @ beta, printed if latent_terms else 0.0
-    length = np.exp(u)
-    k = paciorek(r, length, r, length, sigma_f)
-    density, g, _ = _log_density(
-        k + slope_std**2 * np.outer(r, r) + sigma_n**2 * np.eye(len(r)), z
-    )
-    gradient[0] += np.sum(g * 2.0 * k)
-    gradient[1] += 2.0 * sigma_n**2 * np.trace(g)
-    if len(r_bar):
-        spread = length[:, None] ** 2 + length**2
-        share = length[:, None] ** 2 / spread
-        distance2 = (r[:, None] - r) ** 2
-        g_u = 2.0 * np.sum(g * k * (0.5 - share + 2.0 * share * distance2 / spread), axis=1)
-        weight = cho_solve(factor, k_star.T @ g_u)
-        np.add.at(gradient, 5 + surface_class, weight + (g_u.sum() - weight.sum()) / len(r_bar))
-        for q, dk_star, db in (
-            (2, 2.0 * k_star, 2.0 * k_bar),
-            (
-                3,
-                k_star * (r[:, None] - r_bar) ** 2 / sigma_l_bar**2,
-                k_bar * (r_bar[:, None] - r_bar) ** 2 / sigma_l_bar**2,
-            ),
-            (4, 0.0 * k_star, 2.0 * sigma_n_bar**2 * one),
-        ):
-            gradient[q] += g_u @ dk_star @ beta - weight @ db @ beta
-            gradient[q] += np.sum(g_b * db) if latent_terms else 0.0
-    return value + density
+    for m in range(len(inliers.offsets) - 1):
+        own, bar = (slice(*o[m : m + 2]) for o in (inliers.offsets, inliers.bar_offsets))
+        r, u, r_bar = inliers.r[own], inliers.log_length_scale[own], inliers.r_bar[bar]
+        if len(r) == 0:
+            continue
+        try:
+            if len(r_bar):
+                l_bar = theta[5 + inliers.surface_class[bar]]
+                u = log_length_scale(r_bar, l_bar, r, *latent)
+            if len(r_bar) and latent_terms:
+                # The density of the pseudo-inputs at their mean.
+                value += _log_density(squared_exponential(r_bar, r_bar, *latent[:2]), latent[2])
+            k = paciorek(r, np.exp(u), r, np.exp(u), sigma_f) + slope_std**2 * np.outer(r, r)
+            value += _log_density(k, sigma_n, inliers.z[own])
+        except (LinAlgError, ValueError):  # not positive definite, or not finite
+            return -math.inf
+    return value
+
+
+def _log_density(k, sigma, z=0.0):
+    """log N(z | 0, k + sigma^2 I)."""
+    factor, z = cho_factor(k + sigma**2 * np.eye(len(k))), z + np.zeros(len(k))
+    log_determinant = 2.0 * np.log(np.diagonal(factor[0])).sum()
+    return -0.5 * (z @ cho_solve(factor, z) + log_determinant + len(z) * LOG_2PI)
 
 
 # Labels (Algorithm 2, line 14)
 
 
-def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config) -> Labelled:
+def label_points(scan, faces, surface, config):
     """Label each point by its height over the surface, against the band of its cell."""
-    grid, label, n = scan.grid, config.label, len(scan.xyz)
-    height, margin = np.full((2, n), np.nan)
+    grid, label, n_points = scan.grid, config.label, len(scan.xyz)
+    height, margin = np.full((2, n_points), np.nan)
     roughness = np.zeros((grid.n_segments, grid.n_bins))
-    result = np.full(n, Label.OBSTACLE, np.uint8)
-    for i in range(n):
-        if grid.inside[i]:
-            r = max(float(grid.r[i]), grid.edges[0])
-            mean = surface.mean[grid.segment[i], grid.bin[i] : grid.bin[i] + 2]
-            share = (r - grid.edges[grid.bin[i]]) / np.diff(grid.edges)[grid.bin[i]]
-            height[i] = scan.xyz[i, 2] - (mean[0] + share * (mean[1] - mean[0]))
-    in_face = np.array([grid.inside[i] and faces.is_face[scan.tiles.tile[i]] for i in range(n)])
-    near = np.abs(height) < label.obstacle_min_height
-    stands = (height >= label.obstacle_min_height) & (height <= label.obstacle_max_height)
-    for m in range(grid.n_segments):
-        for k in range(grid.n_bins):
-            aside = np.isin(grid.segment, [(m + s) % grid.n_segments for s in (-1, 0, 1)])
-            about = near & ~in_face.astype(bool) & aside & (abs(grid.bin - k) <= 1) & grid.inside
-            if about.any():
-                roughness[m, k] = math.sqrt(np.mean(height[about] ** 2))
-    for i in np.flatnonzero(grid.inside):
-        rough = roughness[grid.segment[i], grid.bin[i]]
+    result = np.full(n_points, Label.OBSTACLE, np.uint8)
+    result[grid.cell == NOT_FINITE] = Label.UNKNOWN
+    is_face, is_occluded = (mask[scan.tiles.tile] & grid.inside for mask in faces)
+    places = [(i, grid.segment[i], grid.bin[i]) for i in np.flatnonzero(grid.inside)]
+    for i, m, n in places:
+        r = max(float(grid.r[i]), grid.edges[0])
+        ends = slice(n, n + 2)
+        height[i] = scan.xyz[i, 2] - np.interp(r, surface.knots[ends], surface.mean[m, ends])
+    near = grid.inside & ~is_face & (abs(height) < label.obstacle_min_height)
+    shows = (height >= label.obstacle_min_height) & (height <= label.obstacle_max_height)
+    for i, m, n in places:
+        # The cell and the eight around it; segments form a ring.
+        aside = np.isin(grid.segment, [(m + k) % grid.n_segments for k in (-1, 0, 1)])
+        about = height[near & aside & (abs(grid.bin - n) <= 1)]
+        rough = roughness[m, n] = math.sqrt(np.mean(about**2)) if len(about) else 0.0
         band = label.ground_tolerance + label.roughness_gain * rough
-        if stands[grid.cell == grid.cell[i]].any():
+        if shows[grid.cell == grid.cell[i]].any():
             strict = label.obstacle_tolerance + label.obstacle_roughness_gain * rough
             band = min(band, strict)
         band = min(band, label.obstacle_min_height)
         margin[i] = min(band - height[i], height[i] + label.below_tolerance)
-        t = scan.tiles.tile[i]
-        if in_face[i]:
-            sign = -1.0 if faces.has_occluded_base[t] else 1.0
-            over_base = max(height[i], float(scan.xyz[i, 2]) - float(scan.tiles.lowest_z[t]))
-            margin[i] = min(margin[i], sign * config.faces.tolerance - over_base)
+        if is_face[i]:
+            limit = config.faces.tolerance * (-1.0 if is_occluded[i] else 1.0)
+            lowest = float(scan.tiles.lowest_z[scan.tiles.tile[i]])
+            margin[i] = min(margin[i], limit - max(height[i], float(scan.xyz[i, 2]) - lowest))
         if margin[i] >= 0.0:
             result[i] = Label.GROUND
-    result[grid.cell == NOT_FINITE] = Label.UNKNOWN
     return Labelled(result, height, margin, roughness)

@@ -50,26 +50,6 @@ def label(backend, ranges, z, surface=None, faces=None, angle=0.1, **changes):
     return found, scan.grid
 
 
-def test_surface_is_linear_between_knots_and_constant_before_the_first(backend):
-    surface, ranges = surface_of([0.0, 2.0, 2.0, 1.0, 0.0]), [0.5, 2.0, 3.0, 4.0, 9.5]
-    found, grid = label(backend, ranges, 0.0, surface)
-    np.testing.assert_allclose(found.height, [0.0, 0.0, -1.0, -2.0, -0.25], atol=1e-12)
-    heights, stds = surface.at(grid)
-    np.testing.assert_allclose(heights, [0.0, 0.0, 1.0, 2.0, 0.25])
-    np.testing.assert_allclose(stds, 0.1)
-
-
-def test_no_surface_beyond_the_last_knot_or_without_a_model(backend):
-    surface = surface_of()
-    surface.mean[label(backend, 5.0, [0.0])[1].segment[0]] = np.nan
-    for ranges, values, expected in (
-        ([10.0, 1e6, np.nan], surface_of(), [O, O, U]), ([5.0, 5.0, 5.0], surface, [O, O, O]),
-    ):  # fmt: skip
-        found, grid = label(backend, ranges, 0.0, values)
-        assert np.isnan(found.height).all() and np.isnan(values.at(grid)[0]).all()
-        assert list(found.label) == expected
-
-
 def test_labels_by_height(backend):
     heights = [0.0, 0.09, 0.11, -0.99, -1.01, np.nan]
     found, _ = label(backend, 3.0, heights)
@@ -105,19 +85,6 @@ def test_of_a_face_only_the_base_is_ground_and_nothing_where_it_is_occluded(back
         assert list(label(backend, ranges, riser, surface, faces)[0].label) == expected
 
 
-def test_roughness_is_the_root_mean_square_of_a_bin_and_its_neighbours(backend):
-    # Bins 0, 0, 2 of one segment; the last two are no roughness: an obstacle, and a face.
-    ranges, heights = [3.0, 3.5, 7.0, 3.0, 9.5], [0.1, -0.2, 0.3, 0.6, 0.2]
-    found, grid = label(backend, ranges, heights, faces={4: False})
-    own, rough = grid.segment[0], found.roughness
-    np.testing.assert_allclose(rough[own, 0], np.sqrt((0.1**2 + 0.2**2) / 2))
-    np.testing.assert_allclose(rough[own, 1], np.sqrt((0.1**2 + 0.2**2 + 0.3**2) / 3))
-    np.testing.assert_allclose(rough[own, 3], 0.3)
-    # The segments are a ring of four: the opposite one is not a neighbour.
-    assert rough[(own + 1) % 4, 0] == rough[(own - 1) % 4, 0] == rough[own, 0]
-    assert (rough[(own + 2) % 4] == 0.0).all()
-
-
 def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():
     margin = np.array([0.0, 0.1, 0.1, -0.1, np.nan])
     std = np.array([0.1, 0.01, 0.3, 0.01, np.nan])
@@ -145,6 +112,7 @@ def test_labels_are_the_reference(backend, seed, dtype):
     faces = backend.find_faces(scan, CONFIG)
     assert faces.is_face.any()
     found = backend.label_points(scan, faces, surface, CONFIG)
+    np.testing.assert_allclose(found.height, scan.xyz[:, 2] - surface.at(scan.grid)[0], atol=1e-12)
     expected = reference.label_points(scan, faces, surface, CONFIG)
     np.testing.assert_array_equal(found.label, expected.label)
     for name in ('height', 'margin', 'roughness'):

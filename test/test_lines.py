@@ -1,11 +1,10 @@
 """Lines, slope breaks and pseudo-inputs: both backends against loops, and one by one."""
 
 import math
-import warnings
 
 import numpy as np
 import pytest
-from conftest import fewer, hilly_scan
+from conftest import fewer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import Reference
@@ -13,7 +12,7 @@ from scipy.optimize import minimize
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.experiments.scene_scores import SceneScan
-from gp_ground_seg.frame import N_CLASSES, Candidates, Faces
+from gp_ground_seg.frame import Candidates, Faces
 from gp_ground_seg.parameters.config import LatentConfig
 from gp_ground_seg.parameters.presets import find_preset
 from gp_ground_seg.pipeline.lines import classify_lines, deming_slope, differs_in_direction
@@ -62,19 +61,6 @@ def test_deming_is_the_maximum_likelihood_line():
         for ratio in (0.25, 1.0, 9.0):
             ml = minimize(negative, [true_slope, 0.0], (r, z, ratio), tol=1e-12)
             assert deming_slope(*moments(r, z), ratio) == pytest.approx(ml.x[0], abs=1e-4)
-
-
-def test_deming_agrees_with_odrpack():
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore', DeprecationWarning)  # SciPy hands it over to odrpack
-        odr = pytest.importorskip('scipy.odr', reason='SciPy 1.19 and later have no odr')
-    rng = np.random.default_rng(5)
-    r = np.linspace(0.0, 10.0, 40) + rng.normal(0, 0.1, 40)
-    z = 0.4 * r + rng.normal(0, 0.1, 40)
-    for ratio in (0.25, 1.0, 9.0):
-        data = odr.RealData(r, z, sx=1.0, sy=math.sqrt(ratio))
-        fitted = odr.ODR(data, odr.unilinear, beta0=[0.4, 0.0]).run()
-        assert deming_slope(*moments(r, z), ratio) == pytest.approx(fitted.beta[0], abs=1e-5)
 
 
 def test_deming_at_its_limits():
@@ -157,37 +143,34 @@ def test_the_candidates_drawn_hold_every_case():
     assert min(at_break, continued, alone) > 20
 
 
-@settings(max_examples=20)
-@given(st.floats(-0.4, 0.4), st.floats(0.45, 0.8), st.booleans())
-def test_a_change_of_slope_is_a_critical_point(backend, angle, turn, up):
-    slope, new_slope = math.tan(angle), math.tan(angle + (turn if up else -turn))
-    r = np.arange(3.0, 23.0)
-    z = np.where(r <= 12.0, slope * r, slope * 12.0 + new_slope * (r - 12.0))
-    lines, _ = extract(backend, candidates_of(r, z), lines__max_gap=5.0)
-    assert list(lines.line) == [0] * 10 + [1] * 10
-    np.testing.assert_allclose(lines.slope, [slope, new_slope], atol=1e-9)
+KINK = np.arange(3.0, 23.0)
+CRITICAL = {
+    'gap': (candidates_of([3, 4, 6, 50, 55], np.zeros(5)), [0, 0, 1, 2, 2]),
+    'density': (
+        candidates_of([3, 4, 5, 6, 7], np.zeros(5), [10, 20, 2.4, 2.4, 30]),
+        [0, 0, 1, 1, 2],
+    ),
+    'segment': (candidates_of([3, 4, 5], np.zeros(3), offsets=[0, 2, 2, 3]), [0, 0, 1]),
+    'up': (candidates_of(KINK, 0.5 * np.maximum(KINK - 12.0, 0.0)), [0] * 10 + [1] * 10),
+    'down': (candidates_of(KINK, -0.5 * np.maximum(KINK - 12.0, 0.0)), [0] * 10 + [1] * 10),
+    'nothing': (candidates_of([], []), []),
+}
 
 
-def test_a_gap_ends_a_line_and_may_be_wider_far_away(backend):
-    candidates = candidates_of([3.0, 4.0, 6.0, 50.0, 55.0], np.zeros(5))
-    lines, _ = extract(backend, candidates, lines__max_gap=1.0, lines__max_gap_growth=0.1)
-    assert list(lines.line) == [0, 0, 1, 2, 2]
-    np.testing.assert_array_equal(lines.extent(candidates), [1.0, 0.0, 5.0])
-
-
-def test_a_sharp_change_of_density_ends_a_line(backend):
-    candidates = candidates_of([3, 4, 5, 6, 7], np.zeros(5), [10.0, 20.0, 2.4, 2.4, 30.0])
-    lines, _ = extract(backend, candidates, lines__max_density_ratio=8.0)
-    assert list(lines.line) == [0, 0, 1, 1, 2]
-
-
-def test_lines_do_not_cross_segments_and_single_points_have_no_slope(backend):
-    lines, _ = extract(backend, candidates_of([3, 4, 5], np.zeros(3), offsets=[0, 2, 2, 3]))
-    assert list(lines.line) == [0, 0, 1]
-    assert lines.slope[0] == 0.0
-    assert np.isnan(lines.slope[1])
-    lines, continues = extract(backend, candidates_of([], []))
-    assert len(lines.line) == len(lines.slope) == len(continues) == 0
+@pytest.mark.parametrize('name', CRITICAL)
+def test_critical_points(backend, name):
+    candidates, expected = CRITICAL[name]
+    lines, _ = extract(
+        backend,
+        candidates,
+        lines__max_gap=1.0,
+        lines__max_gap_growth=0.1,
+        lines__max_density_ratio=8.0,
+    )
+    assert list(lines.line) == expected
+    np.testing.assert_array_equal(np.isnan(lines.slope), np.diff(lines.start) == 1)
+    for q, extent in enumerate(lines.extent(candidates)):
+        assert extent == np.ptp(candidates.r[lines.line == q])
 
 
 # Candidates that continue a line
@@ -269,34 +252,3 @@ def test_classes_by_slope_and_extent():
     slopes = np.array([0.0, -0.05, 0.05, 0.1, -0.3, 0.3, 0.4, -2.0, np.inf, np.nan])
     extents = np.array([1.0, 1.5, 5.0, 1.0, 2.0, 9.0, 0.5, 3.0, 6.0, 0.0])
     assert list(classify_lines(slopes, extents, latent)) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 6]
-
-
-@pytest.mark.parametrize('per', [1.0, 3.0, 10.0])
-def test_pseudo_inputs_of_a_frame(backend, per):
-    config = Config().replace(**{'latent.candidates_per_pseudo_input': per})
-    scan = backend.build_grid(hilly_scan(fewer(6000, 2000)), config)
-    faces = backend.find_faces(scan, config)
-    candidates, lines, pseudo, _ = backend.extract_lines(scan.candidates, faces, config)
-    sizes = np.diff(lines.start)
-    assert len(pseudo.r_bar) == np.maximum(np.rint(sizes / per), 1).sum()
-    if per == 1.0:
-        np.testing.assert_array_equal(pseudo.r_bar, candidates.r)
-    for m in range(len(candidates.offsets) - 1):
-        own = range(candidates.offsets[m], candidates.offsets[m + 1])
-        r_bar = pseudo.r_bar[pseudo.offsets[m] : pseudo.offsets[m + 1]]
-        assert (np.diff(r_bar) > 0).all()
-        at = [i for i in own if candidates.r[i] in r_bar]
-        assert len(at) == len(r_bar)
-        assert {lines.line[i] for i in at} == {lines.line[i] for i in own}
-    extent = lines.extent(candidates)
-    classes = classify_lines(lines.slope, extent, config.latent)
-    bounded = np.log(np.clip(extent, config.length_scale.min, config.length_scale.max))
-    for k in range(N_CLASSES):
-        members = bounded[classes == k] if (classes == k).any() else bounded
-        assert pseudo.first_guess[k] == pytest.approx(members.mean())
-
-
-def test_no_candidates_no_pseudo_inputs(backend):
-    pseudo = backend.extract_lines(candidates_of([], []), NO_FACES, Config())[2]
-    assert len(pseudo.r_bar) == 0
-    assert np.isfinite(pseudo.first_guess).all()

@@ -1,6 +1,5 @@
 """The segmenter: properties of its results, history, threads, forks, change of backend."""
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -78,13 +77,11 @@ def test_odd_clouds_work(backend, points):
     unknown = ~np.isfinite(points[:, :3]).all(axis=1)
     np.testing.assert_array_equal(result.label == Label.UNKNOWN, unknown)
     np.testing.assert_array_equal(np.isnan(result.p_ground), unknown)
-
-
-def test_one_low_point_is_ground_and_a_high_one_is_not():
-    assert SEGMENTER.segment(np.array([[10.0, 0.0, -1.7]])).label[0] == Label.GROUND
-    high = SEGMENTER.segment(np.array([[10.0, 0.0, 1.0]]))
-    assert high.label[0] == Label.OBSTACLE
-    assert np.isnan(high.ground_z[0])
+    if len(points) == 1:
+        # One low point is ground, and a high one is not.
+        is_low = points[0, 2] < 0.0
+        assert result.label[0] == (Label.GROUND if is_low else Label.OBSTACLE)
+        assert np.isnan(result.ground_z[0]) == (not is_low)
 
 
 @pytest.mark.parametrize(
@@ -173,17 +170,6 @@ def test_the_input_is_not_written_to_and_may_change_afterwards(backend, scan, ti
         same(result, expected)
 
 
-def test_backends_agree(backend, scan):
-    result = GroundSegmenter(Config(), backend=backend).segment(scan)
-    assert result.fit.backend == backend.name
-    expected = segmenter_of(**{'runtime.backend': 'numpy'}).segment(scan)
-    np.testing.assert_array_equal(result.label, expected.label)
-    for name in VALUES:
-        np.testing.assert_allclose(
-            getattr(result, name), getattr(expected, name), atol=1e-6, err_msg=name
-        )
-
-
 @pytest.mark.parametrize('model', ['latent', 'line_gradient', 'constant'])
 @pytest.mark.parametrize('scope', ['frame', 'segment'])
 @pytest.mark.parametrize('objective', ['map', 'paper'])
@@ -204,14 +190,6 @@ def test_frames_are_labelled_as_by_the_loops(backend, model, scope, objective):
     assert found.fit.n_evaluations == expected.fit.n_evaluations > 0
 
 
-def test_a_wider_tolerance_takes_more_ground(scan):
-    counts = []
-    for tolerance in (0.01, 0.03, 0.3):
-        changes = {'label.ground_tolerance': tolerance, 'label.roughness_gain': 0.0}
-        counts.append((segmenter_of(**changes).segment(scan).label == Label.GROUND).sum())
-    assert counts[0] < counts[1] < counts[2]
-
-
 def test_times_come_from_the_clock_given(scan):
     ticks = iter(range(100))
     result = GroundSegmenter(Config(), clock=lambda: float(next(ticks))).segment(scan)
@@ -223,20 +201,13 @@ def test_times_come_from_the_clock_given(scan):
 
 def test_fit_report_counts(scan):
     fit = SEGMENTER.segment(scan).fit
-    assert fit.mode == 'every_frame'
+    assert (fit.mode, fit.backend) == ('every_frame', SEGMENTER.backend_name)
     assert 1 <= fit.n_evaluations <= Config().learning.max_evaluations
-    assert fit.theta['sigma_n'] > 0
+    assert fit.theta['sigma_n'] > 0 and np.isfinite(fit.objective)
     assert fit.status in ('converged', 'budget')
     assert 0 < fit.n_inliers <= fit.n_candidates <= len(scan)
     assert 0 < fit.n_segments <= 180
     assert 0 < fit.n_lines <= fit.n_pseudo_inputs
-    assert fit.n_threads == SEGMENTER._backend.n_threads
-    assert np.isfinite(fit.objective)
-
-
-def test_neighbours_must_fit_round_the_sensor():
-    with pytest.raises(ConfigError, match=r'surface\.n_neighbours = 2'):
-        Config().replace(**{'grid.n_segments': 4})
 
 
 # One scan after the other
@@ -271,36 +242,28 @@ def test_threads_and_history_do_not_change_a_bit(scan, mode):
     np.testing.assert_array_equal(result.theta, expected.theta)
 
 
-def test_configure_takes_effect_on_the_next_scan(scan):
-    segmenter = GroundSegmenter()
-    before = segmenter.segment(scan)
+def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
+    with pytest.raises(ConfigError, match=r'surface\.n_neighbours = 2'):
+        Config().replace(**{'grid.n_segments': 4})
+    segmenter, own = GroundSegmenter(), SEGMENTER.backend_name
     segmenter.configure(Config().replace(**{'grid.n_segments': 90, 'runtime.n_threads': 1}))
     after = segmenter.segment(scan)
     assert len(after.surface.mean) == segmenter.config.grid.n_segments == 90
     assert after.fit.n_threads == 1
-    segmenter.configure(Config())
-    same(before, segmenter.segment(scan))
-
-
-def test_backends_are_changed_between_scans(scan):
-    compiled = 'numba' if HAVE_NUMBA else 'auto'
-    expected, numpy = SEGMENTER.segment(scan), {'runtime.backend': 'numpy'}
-    segmenter = GroundSegmenter(Config())
-    names, is_closed = [], []
-    for config in (
-        Config().replace(**numpy),
-        Config().replace(**numpy, **{'learning.period': 3}),
-        Config().replace(**{'runtime.backend': compiled}),
-        Config().replace(**numpy),
-        Config(),
+    expected, is_closed = SEGMENTER.segment(scan), []
+    for changes in (
+        {'runtime.backend': 'numpy'},
+        {'runtime.backend': 'numpy', 'learning.period': 3},
+        {'runtime.backend': 'numba' if HAVE_NUMBA else 'auto'},
+        {'runtime.backend': 'numpy'},
+        {},
     ):
-        segmenter.configure(config)
+        segmenter.configure(Config().replace(**changes))
         result = segmenter.segment(scan)
-        names.append(result.fit.backend)
-        assert segmenter.backend_name == names[-1]
+        name = 'numpy' if changes.get('runtime.backend') == 'numpy' else own
+        assert result.fit.backend == segmenter.backend_name == name
         np.testing.assert_array_equal(result.label, expected.label)
-    own = SEGMENTER.backend_name
-    assert names == ['numpy', 'numpy', own, 'numpy', own]
+    same(result, expected)
 
     class Closing(NumpyBackend):
         def close(self):
@@ -439,4 +402,3 @@ def test_an_error_in_a_scan_leaves_the_segmenter_usable(scan):
         with pytest.raises(PointCloudError):
             segmenter.segment(scan[:, :2])
         same(segmenter.segment(scan), expected)
-        assert dataclasses.asdict(segmenter.segment(scan).fit) == dataclasses.asdict(expected.fit)

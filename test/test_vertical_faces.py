@@ -7,7 +7,6 @@ from reference import find_faces
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.frame import OUTSIDE
-from gp_ground_seg.pipeline.vertical_faces import normal_z
 
 BASE = Config().replace(**{'grid.r_max': 30.0})
 CORNER = np.array([10.0, 5.0, 0.0])
@@ -31,6 +30,26 @@ def test_faces_are_recognised_by_their_normal(backend, slope_z, is_face):
     assert found.all() if is_face else not found.any()
 
 
+X, Y = np.sort(np.random.default_rng(3).uniform(0.01, 0.49, (2, 60)))
+POST = np.outer(np.arange(4), [0.01, 0.0, 0.5]) + [0.2, 0.2, 0.0] + np.eye(4, 3) * 0.01
+CLOUDS = {
+    'low': (np.column_stack([X, Y, np.linspace(0.0, 0.49, 60)]), False),
+    'flat': (np.column_stack([X, Y, np.zeros(60)]), False),
+    'branch over flat ground': (np.column_stack([X, Y, np.where(X > 0.25, 3.0, 0.0)]), False),
+    'post': (POST, True),
+    'three returns': (POST[:3], False),
+    'beyond the grid': (np.add(POST, [50.0, 0.0, 0.0]), False),
+    'a vertical line': (POST * [0.0, 0.0, 1.0], False),
+    'not finite': (POST * np.nan, False),
+}
+
+
+@pytest.mark.parametrize('name', CLOUDS)
+def test_what_is_a_face(backend, name):
+    xyz, is_face = CLOUDS[name]
+    assert (faces_of(backend, CORNER + xyz)[0] == is_face).all()
+
+
 def test_a_wall_of_any_direction_is_a_face(backend):
     rng = np.random.default_rng(2)
     for turn in np.linspace(0.0, np.pi, 9):
@@ -39,43 +58,6 @@ def test_a_wall_of_any_direction_is_a_face(backend):
         found, _, scan = faces_of(backend, wall)
         assert found.all()
         assert list(scan.tiles.extremes[scan.tiles.tile[0]]) == [z.min(), z.max()]
-
-
-@pytest.mark.parametrize(
-    'height',
-    [
-        np.linspace(0.0, 0.49, 60),  # low
-        np.zeros(60),
-        np.where(np.arange(60) > 30, 3.0, 0.0),  # overhanging, as a branch over flat ground
-    ],
-)
-def test_low_flat_and_overhanging_returns_are_no_faces(backend, height):
-    x, y = np.random.default_rng(3).uniform(10.0, 10.5, (2, 60))
-    assert not faces_of(backend, np.column_stack([np.sort(x), y, height]))[0].any()
-
-
-def test_three_returns_have_no_orientation(backend):
-    post = np.array([[10.2, 5.2, z] for z in (0.0, 0.5, 1.0, 1.5)]) + np.eye(4, 3) * 0.01
-    assert faces_of(backend, post)[0].all()
-    assert not faces_of(backend, post[:3])[0].any()
-
-
-def test_points_outside_the_grid_belong_to_no_tile(backend):
-    found, _, scan = faces_of(backend, [[50.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [5.0, 5.0, 0.0]])
-    assert list(scan.tiles.tile[:2]) == [OUTSIDE, OUTSIDE]
-    assert not found.any()
-
-
-@given(st.integers(0, 100_000))
-def test_normal_z_is_the_weighted_normal_of_the_eigenvectors(seed):
-    rng = np.random.default_rng(seed)
-    points = rng.normal(size=(6, 8, 3)) * rng.uniform(0.01, 1.0, 3)
-    scatter = np.array([np.cov(cloud.T) * 7 for cloud in points])
-    value, vector = np.linalg.eigh(scatter)
-    weight = 1.0 / value
-    expected = np.sqrt((weight * vector[:, 2, :] ** 2).sum(axis=1) / weight.sum(axis=1))
-    np.testing.assert_allclose(normal_z(scatter), expected, rtol=1e-6)
-    np.testing.assert_array_equal(normal_z(np.zeros((2, 3, 3))), 1.0)
 
 
 def wall(low=0.0, high=1.5, turn=0.3):
