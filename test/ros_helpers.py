@@ -38,7 +38,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2, PointField
 
-from gp_ground_seg.ros.node import GroundSegmentationNode
+from gp_ground_seg.backend import choose_backend
+from gp_ground_seg.ros.node import GroundSegmentationNode, main
+from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS
 
 PATIENCE = 120.0
 """Time to wait for what has to happen [s]; only a failure takes that long."""
@@ -237,8 +239,17 @@ class Process:
         return self._log.read_text()
 
     def wait_until_ready(self) -> None:
+        self._wait_for_log('listening to')
+
+    def wait_until_settled(self) -> None:
+        """Wait until it has the backend that it keeps: labels may differ by one or two."""
+        self.wait_until_ready()
+        if FOLLOWS in self.log:
+            self._wait_for_log(CHANGED)
+
+    def _wait_for_log(self, text: str) -> None:
         wait_for(
-            lambda: 'listening to' in self.log or self.popen.poll() is not None, 'node listening'
+            lambda: text in self.log or self.popen.poll() is not None, f'{text!r} of the node'
         )
         assert self.popen.poll() is None, self.log
 
@@ -335,6 +346,9 @@ class Bench:
         wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription')
         for collector in (self.ground, self.obstacles, self.diagnostics):
             wait_for(lambda c=collector: c.n_publishers == 1, f'publisher of {collector.topic}')
+        # With the backend that it keeps: labels may differ by one or two.
+        has_to_load = choose_backend(self.node.config.runtime.backend) == 'numba'
+        wait_for(lambda: self.node._is_compiled or not has_to_load, 'compiled backend')
 
     def in_executor(self, function: Callable[..., object], *arguments: object) -> object:
         """Result of a call made between two waits, where entities may safely go."""
@@ -379,3 +393,17 @@ def bench(*words: str) -> Iterator[Bench]:
         with spinning(context, result.node, result.probe):
             result.wait_until_connected()
             yield result
+
+
+def start_error(capfd: pytest.CaptureFixture[str], *words: str) -> str:
+    """Line that the node ends with when it refuses to start with ``--ros-args words``."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in ISOLATION.items():
+            patch.setenv(name, os.environ.get(name, value) if name == 'ROS_DOMAIN_ID' else value)
+        assert main(['--ros-args', *words]) == 2
+    said = capfd.readouterr()
+    assert said.out == ''
+    assert 'Traceback' not in said.err
+    line = said.err.splitlines()[-1]
+    assert line.startswith('ground_segmentation_node: error: ')
+    return line

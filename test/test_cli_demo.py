@@ -7,32 +7,36 @@ import signal
 import subprocess
 import sys
 import time
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gp_ground_seg.cli import demo
-from gp_ground_seg.cli.demo_check import check_scan
-from gp_ground_seg.cli.demo_frames import TOPIC, numbered_cloud
-from gp_ground_seg.cli.demo_node import NodeProcess, private_network
-from gp_ground_seg.cli.demo_tally import BACKLOG, GROUND, OBSTACLES, Tally
-from gp_ground_seg.cli.demo_text import result_text
+from gp_ground_seg.cli.demo import Tally, check_scan, numbered_cloud, result_text
 from gp_ground_seg.cli.main import main
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import (
     decode_cloud,
-    encode_cloud,
     read_xyz,
     select_points,
+    stamp_of,
     with_header,
 )
-from gp_ground_seg.errors import GroundSegError, PointCloudError
+from gp_ground_seg.errors import GroundSegError
+from gp_ground_seg.evaluation.metrics import count_confusion
 from gp_ground_seg.frame import Label
-from gp_ground_seg.ros import transport
+from gp_ground_seg.ros import lifecycle
+from gp_ground_seg.ros.probe import (
+    GROUND,
+    INPUT,
+    OBSTACLES,
+    NodeProcess,
+    Trip,
+    private_network,
+    rate_result,
+)
 
-REPOSITORY = Path(__file__).parents[1]
 COMMAND = (sys.executable, '-m', 'gp_ground_seg', 'demo')
 PATIENCE = 120.0
 
@@ -53,32 +57,35 @@ def sent_cloud(n=40, seed=0, stamp=5_000_000_007):
 def split(cloud, is_ground):
     """What a right node makes of a scan: NaN in neither."""
     finite = np.isfinite(read_xyz(cloud)).all(axis=1)
-    return select_points(cloud, is_ground & finite), select_points(cloud, ~is_ground & finite)
+    return {
+        GROUND: select_points(cloud, is_ground & finite),
+        OBSTACLES: select_points(cloud, ~is_ground & finite),
+    }
 
 
 def perfect(n=40):
     return np.arange(n) % 2 == 0
 
 
-def test_perfect_answer():
-    cloud = sent_cloud()
-    check = check_scan(cloud, *split(cloud, perfect()))
-    assert check.is_exact
+def faults_of(check):
+    return check.n_missing, check.n_repeated, check.n_altered
+
+
+def test_labels_are_scored():
+    is_ground, cloud = perfect(), sent_cloud()
+    check = check_scan(cloud, split(cloud, is_ground))
+    assert faults_of(check) == (0, 0, 0)
     assert check.n_points == 39
     # The outlier does not count.
-    assert (check.confusion.tp, check.confusion.tn) == (20, 19)
-    assert check.confusion.errors == 0
+    confusion = count_confusion(check.label, check.truth)
+    assert (confusion.tp, confusion.tn, confusion.errors) == (20, 19, 0)
     assert check.label[3] == Label.UNKNOWN
     np.testing.assert_array_equal(check.points[:, :3], read_xyz(cloud))
-
-
-def test_wrong_labels_are_scored():
-    is_ground = perfect()
     is_ground[[0, 2, 5]] ^= True
-    cloud = sent_cloud()
-    check = check_scan(cloud, *split(cloud, is_ground))
-    assert check.is_exact
-    assert (check.confusion.fn, check.confusion.fp) == (2, 1)
+    check = check_scan(cloud, split(cloud, is_ground))
+    assert faults_of(check) == (0, 0, 0)
+    confusion = count_confusion(check.label, check.truth)
+    assert (confusion.fn, confusion.fp) == (2, 1)
 
 
 def chosen(n, *where):
@@ -105,115 +112,83 @@ def flipped(cloud, byte):
 
 def test_every_fault_is_found():
     cloud = sent_cloud()
-    ground, obstacles = split(cloud, perfect())
+    ground, obstacles = split(cloud, perfect()).values()
 
     def faults(ground, obstacles):
-        check = check_scan(cloud, ground, obstacles)
-        assert not check.is_exact
-        return check.n_missing, check.n_repeated, check.n_altered, check.n_foreign
+        return faults_of(check_scan(cloud, {GROUND: ground, OBSTACLES: obstacles}))
 
-    assert faults(select_points(ground, ~chosen(20, 4)), obstacles) == (1, 0, 0, 0)
+    assert faults(select_points(ground, ~chosen(20, 4)), obstacles) == (1, 0, 0)
     in_both = joined(obstacles, select_points(cloud, chosen(40, 8)))
-    assert faults(ground, in_both) == (0, 1, 0, 0)
+    assert faults(ground, in_both) == (0, 1, 0)
     twice_in_one = joined(ground, select_points(cloud, chosen(40, 8)))
-    assert faults(twice_in_one, obstacles) == (0, 1, 0, 0)
+    assert faults(twice_in_one, obstacles) == (0, 1, 0)
     not_finite = joined(obstacles, select_points(cloud, chosen(40, 3)))
-    assert faults(ground, not_finite) == (0, 0, 0, 1)
-    # Each byte counts: of coordinates, intensity, label. One of the index makes it another point.
-    for byte in range(20):
-        assert faults(flipped(ground, 24 * 7 + byte), obstacles) == (0, 0, 1, 0)
-    assert faults(flipped(ground, 24 * 7 + 20), obstacles) == (1, 1, 1, 0)
-    assert faults(flipped(ground, 24 * 7 + 23), obstacles) == (1, 0, 0, 1)
-    for change in ({'header': with_header(cloud, (5, 8)).header}, {'fields': cloud.fields[:-1]}):
-        changed = dataclasses.replace(ground, **change)
-        assert faults(changed, obstacles) == (20, 0, 20, 0)
-    assert faults(dataclasses.replace(ground, data=ground.data[:-1]), obstacles) == (20, 0, 20, 0)
-
-
-def test_a_cloud_without_numbers_is_refused():
-    cloud = sent_cloud()
-    fields = tuple(field for field in cloud.fields if field.name != 'index')
-    bare = dataclasses.replace(cloud, fields=fields)
-    with pytest.raises(PointCloudError, match='x y z intensity label'):
-        check_scan(bare, bare, bare)
+    assert faults(ground, not_finite) == (0, 0, 1)
+    # Each byte counts: of coordinates, intensity, label and number.
+    for byte in range(24):
+        assert faults(flipped(ground, 24 * 7 + byte), obstacles) == (1, 0, 1)
+    for change in (
+        {'header': with_header(cloud, (5, 8)).header},
+        {'header': with_header(ground, (5, 7), 'map').header},
+        {'fields': cloud.fields[:-1]},
+        {'data': ground.data[:-1]},
+    ):
+        assert faults(dataclasses.replace(ground, **change), obstacles) == (20, 0, 20)
 
 
 # --- counts over a drive
 
 
-def test_tally():
-    tally = Tally(shown=2)
+def trips(*latencies, period=0.1):
+    """Trips of scans, None = lost."""
+    sent = [1000 + round(1e9 * period * k) for k in range(len(latencies))]
+    return [
+        Trip(t, None if latency is None else t + round(1e9 * latency))
+        for t, latency in zip(sent, latencies, strict=True)
+    ]
+
+
+def test_counts_and_words():
     clouds = [sent_cloud(seed=k, stamp=k * 10**8) for k in range(5)]
-    for k, cloud in enumerate(clouds):
-        tally.sent(TOPIC, encode_cloud(cloud), 1000 + k * 10**8)
-    # 0 comes back whole, 1 by half, 2 not at all, 3 in the other order, 4 with a fault.
-    ground, obstacles = split(clouds[0], perfect())
-    tally.arrived(GROUND, ground, 1000 + 30_000_000)
-    tally.arrived(OBSTACLES, obstacles, 1000 + 50_000_000)
-    tally.arrived(GROUND, split(clouds[1], perfect())[0], 10**9)
-    ground, obstacles = split(clouds[3], ~perfect())
-    tally.arrived(OBSTACLES, obstacles, 1000 + 3 * 10**8 + 70_000_000)
-    tally.arrived(GROUND, ground, 1000 + 3 * 10**8 + 60_000_000)
-    assert tally.is_partition_exact
-    ground, obstacles = split(clouds[4], perfect())
-    tally.arrived(GROUND, select_points(ground, ~chosen(20, 1, 2)), 1000 + 4 * 10**8 + 10_000_000)
-    tally.arrived(OBSTACLES, obstacles, 1000 + 4 * 10**8 + 20_000_000)
-    tally.look()
-
-    assert (tally.n_sent, tally.n_back, tally.n_lost) == (5, 3, 2)
-    assert tally.latencies == pytest.approx([0.05, 0.07, 0.02])
-    assert tally.latency(50) == pytest.approx(0.05)
-    assert tally.rate == pytest.approx(2 / 0.37)
-    assert (tally.n_points, tally.n_missing, tally.n_stray) == (3 * 39, 2, 0)
-    assert not tally.is_partition_exact
-    assert tally.confusion.tp == 20 + 0 + 18
-    # The one to show was lost: the one before it that came back.
-    assert tally.picture_number == 0
-    text = result_text(tally, 10.0, 'the truth')
+    tally = Tally([stamp_of(cloud) for cloud in clouds])
+    # 0 comes back whole, 1 and 2 not, 3 with other labels, 4 with a fault; and a trial.
+    tally.add(clouds[0], split(clouds[0], perfect()))
+    tally.add(clouds[3], split(clouds[3], ~perfect()))
+    tally.add(sent_cloud(stamp=77), {})
+    result = rate_result(10.0, trips(0.05, None, None, 0.07, 0.02), 0)
+    text, is_good = result_text(tally, result, 0, 'the truth')
+    assert not is_good
+    assert 'each is in exactly one of the two clouds, not a byte changed' in text
     assert '5 sent, 3 back, 2 lost' in text
-    assert 'FAILED: 2 of 5 scans were lost\n' in text
-    assert 'FAILED: the two clouds are not the scan that was sent' in text
+    assert 'median 50.0 ms' in text
+    assert text.endswith('FAILED: 2 of 5 scans were lost')
+    results = split(clouds[4], perfect())
+    results[GROUND] = select_points(results[GROUND], ~chosen(20, 1, 2))
+    tally.add(clouds[4], results)
+    assert tally.counts == {'n_points': 117, 'n_missing': 2, 'n_repeated': 0, 'n_altered': 0}
+    assert tally.confusion.tp == 20 + 0 + 18
+    # The middle one was lost: the one before it that came back.
+    assert tally.picture[1] == 0
+    assert 'FAILED: the two clouds are not the scan' in result_text(tally, result, 0, '')[0]
 
 
-def test_strangers_and_copies_are_noticed():
-    tally = Tally(shown=0)
+@pytest.mark.parametrize(
+    ('rate', 'n_stray', 'is_good', 'words'),
+    [
+        (10.0, 0, True, 'rate     10.0 scans per second sent, 10 were wanted'),
+        (10.0, 1, False, '1 clouds too many'),
+        (5.0, 0, False, 'FAILED: 1 of 3 scans were lost'),
+        (50.0, 0, False, 'too slow for that rate, try a lower --rate'),
+    ],
+)
+def test_what_failed_is_said(rate, n_stray, is_good, words):
     cloud = sent_cloud()
-    ground, obstacles = split(cloud, perfect())
-    tally.arrived(GROUND, ground, 5)
-    assert tally.n_stray == 1
-    tally.sent(TOPIC, encode_cloud(cloud), 10)
-    tally.arrived(GROUND, ground, 20)
-    tally.arrived(GROUND, ground, 21)
-    assert tally.n_stray == 2
-    tally.arrived(OBSTACLES, obstacles, 22)
-    tally.arrived(OBSTACLES, obstacles, 23)
-    assert tally.n_stray == 3
-    tally.look()
-    assert (tally.n_back, tally.n_lost) == (1, 0)
-    assert not tally.is_partition_exact
-
-
-def test_long_drives_do_not_pile_up():
-    tally = Tally(shown=0)
-    for k in range(BACKLOG + 10):
-        cloud = sent_cloud(seed=k, stamp=k)
-        tally.sent(TOPIC, encode_cloud(cloud), k)
-        for topic, back in zip((GROUND, OBSTACLES), split(cloud, perfect()), strict=True):
-            tally.arrived(topic, back, k)
-    assert tally.n_points == 10 * 39
-    tally.look()
-    assert tally.n_points == (BACKLOG + 10) * 39
-
-
-def test_a_drive_that_is_too_fast_is_told_so():
-    tally = Tally(shown=0)
-    for k in range(2):
-        cloud = sent_cloud(stamp=k)
-        tally.sent(TOPIC, encode_cloud(cloud), 0)
-    for topic, back in zip((GROUND, OBSTACLES), split(cloud, perfect()), strict=True):
-        tally.arrived(topic, back, 150_000_000)
-    assert 'too slow for that rate, try a lower --rate' in result_text(tally, 10.0, 'the truth')
-    assert 'too slow' not in result_text(tally, 5.0, 'the truth')
+    tally = Tally([stamp_of(cloud)])
+    tally.add(cloud, split(cloud, perfect()))
+    latencies = (0.15, 0.15, 0.15) if rate == 10.0 else (0.15, 0.15, None)
+    result = rate_result(rate, trips(*latencies), 0)
+    text, found = result_text(tally, result, n_stray, 'the truth')
+    assert (found, words in text) == (is_good, True)
 
 
 # --- the whole command
@@ -259,7 +234,7 @@ def test_demo_without_data(rclpy, tmp_path):
     ]  # fmt: skip
     assert (folder / 'birds_eye.png').read_bytes().startswith(b'\x89PNG')
     with BagReader(folder / 'drive.mcap') as bag:
-        n_points = sum(decode_cloud(raw).width for _, _, raw in bag.messages([TOPIC]))
+        n_points = sum(decode_cloud(raw).width for _, _, raw in bag.messages([INPUT]))
     assert f'{n_points:,}'.replace(',', ' ') + ' of these scans' in result.stdout
 
     again = run_demo(tmp_path, '--frames', 4)
@@ -322,16 +297,13 @@ def test_refused_options(words, capsys):
     [(0.05, 10.0), (0.08, 10.0), (0.095, 7.0), (0.2, 3.0), (0.7, 1.0), (1.0, 0.7), (30.0, 0.02)],
 )
 def test_rate_that_a_machine_can_do(seconds, rate, capsys):
-    class Receiver:
-        def time_answer(self, _topic, cloud, n_times, _timeout):
-            assert (cloud.width, n_times) == (40, demo.N_TRIALS)
-            return seconds
+    class StandInProbe:
+        def one_by_one(self, clouds, silence):
+            stamps = [stamp_of(cloud) for cloud in clouds]
+            assert len(set(stamps)) == demo.N_TRIALS
+            return trips(*[seconds] * len(stamps))
 
-    class Bag:
-        def messages(self, _topics):
-            yield TOPIC, 0, encode_cloud(sent_cloud())
-
-    assert demo._sustainable_rate(Bag(), Receiver()) == pytest.approx(rate)
+    assert demo.sustainable_rate(sent_cloud(), StandInProbe()) == pytest.approx(rate)
     assert ('instead of 10' in capsys.readouterr().out) == (rate < 10.0)
 
 
@@ -377,46 +349,40 @@ def test_private_network(monkeypatch):
     assert dict(os.environ) == before
 
 
-def test_transport_profile_is_the_one_in_config(monkeypatch):
-    """What the commands generate and what is shipped for LiDAR drivers say the same."""
-    for name in transport._USERS_CHOICE:
+@pytest.fixture
+def no_profile(monkeypatch):
+    """A machine with plenty of shared memory, where the user has chosen no transport."""
+    for name in lifecycle._TRANSPORT_VARIABLES:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(transport, 'segment_size', lambda: transport.SEGMENT_SIZE)
-    with transport.large_cloud_transport():
-        file = Path(os.environ[transport.PROFILES_FILE])
-        generated = file.read_text()
-    assert transport.PROFILES_FILE not in os.environ
-    assert not file.exists()
-    shipped = (REPOSITORY / 'config' / 'fastdds_large_clouds.xml').read_text()
-
-    def elements(text):
-        return [
-            (element.tag, element.attrib, (element.text or '').strip())
-            for element in ElementTree.fromstring(text).iter()
-        ]
-
-    assert elements(generated) == elements(shipped)
+    monkeypatch.setattr(lifecycle, '_free_shared_memory', lambda: 1 << 30)
 
 
-def test_transport_of_the_user_is_kept(monkeypatch):
-    for name in transport._USERS_CHOICE:
-        monkeypatch.delenv(name, raising=False)
-    for name in transport._USERS_CHOICE:
-        with monkeypatch.context() as patch:
-            patch.setenv(name, 'mine')
-            before = dict(os.environ)
-            with transport.large_cloud_transport():
-                assert dict(os.environ) == before
-    # A container with 4 MB of shared memory: an eighth is not more than the stock size.
-    monkeypatch.setattr(transport, 'segment_size', lambda: transport.MEGABYTE // 2)
+def profile_in_use():
     before = dict(os.environ)
-    with transport.large_cloud_transport():
-        assert dict(os.environ) == before
+    with lifecycle.large_cloud_transport():
+        (found,) = {*os.environ.items()} - {*before.items()} or {(None, None)}
+    assert dict(os.environ) == before
+    return found[1]
 
 
-def test_share_of_shared_memory(tmp_path, monkeypatch):
-    monkeypatch.setattr(transport, 'SHARED_MEMORY', tmp_path / 'missing')
-    assert transport.segment_size() == 0
-    monkeypatch.setattr(transport, 'SHARED_MEMORY', tmp_path)
-    free = os.statvfs(tmp_path).f_bavail * os.statvfs(tmp_path).f_frsize
-    assert transport.segment_size() == pytest.approx(min(32 << 20, free / 8), rel=0.1)
+def test_profile_of_a_checkout_and_of_an_installation(no_profile, monkeypatch, tmp_path):
+    shipped = Path(__file__).parents[1] / 'config' / 'fastdds_large_clouds.xml'
+    assert Path(profile_in_use()) == shipped
+    module = tmp_path / 'lib/python3.12/site-packages/gp_ground_seg/ros/lifecycle.py'
+    monkeypatch.setattr(lifecycle, '__file__', str(module))
+    assert profile_in_use() is None
+    installed = tmp_path / 'share/gp_ground_seg/config/fastdds_large_clouds.xml'
+    installed.parent.mkdir(parents=True)
+    installed.touch()
+    assert Path(profile_in_use()) == installed
+
+
+@pytest.mark.parametrize('name', lifecycle._TRANSPORT_VARIABLES)
+def test_transport_of_the_user_is_kept(no_profile, monkeypatch, name):
+    monkeypatch.setenv(name, 'mine')
+    assert profile_in_use() is None
+
+
+def test_no_profile_where_shared_memory_is_short(no_profile, monkeypatch):
+    monkeypatch.setattr(lifecycle, '_free_shared_memory', lambda: 64 << 20)
+    assert profile_in_use() is None

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rosbags.interfaces import QosReliability
 
-from gp_ground_seg.cli.kitti_to_bag import EPOCH
+from gp_ground_seg.cli.bags import EPOCH
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of

@@ -13,8 +13,8 @@ import ros_helpers  # noqa: F401  imports type support, which warns
 from conftest import hilly_scan
 
 from gp_ground_seg.cli import main as cli
-from gp_ground_seg.cli.process_memory import peak_memory, resident_memory
 from gp_ground_seg.errors import GroundSegError
+from gp_ground_seg.ros.probe import memory
 
 
 @pytest.fixture
@@ -101,6 +101,7 @@ def test_numbers_out_of_range_are_refused(words, capsys):
 
 
 def test_memory_of_this_process():
-    assert 1e6 < resident_memory(os.getpid()) <= peak_memory(os.getpid())
+    now, peak = memory(os.getpid())
+    assert 1e6 < now <= peak
     with pytest.raises(GroundSegError, match='/proc/0/status'):
-        resident_memory(0)
+        memory(0)

@@ -14,41 +14,35 @@ from bag_samples import write_ros2_bag
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
-from diagnostic_msgs.msg import DiagnosticArray
 from ros_helpers import PATIENCE
 
 from gp_ground_seg import GroundSegmenter, Label
-from gp_ground_seg.cli.demo_check import check_scan
-from gp_ground_seg.cli.demo_frames import numbered_cloud
-from gp_ground_seg.cli.demo_node import NodeProcess, private_network
-from gp_ground_seg.cli.demo_tally import GROUND, OBSTACLES, OUTPUTS
+from gp_ground_seg.cli.demo import check_scan, numbered_cloud
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
-from gp_ground_seg.ros.receiver import OutputReceiver
-from gp_ground_seg.ros.session import ros_session
-from gp_ground_seg.ros.transport import large_cloud_transport
+from gp_ground_seg.evaluation.metrics import count_confusion
+from gp_ground_seg.ros.lifecycle import large_cloud_transport, ros_session
+from gp_ground_seg.ros.probe import GROUND, INPUT, OBSTACLES, NodeProcess, Probe, private_network
 from gp_ground_seg.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 
-INPUT = '/points'
 COMMAND = (sys.executable, '-m', 'gp_ground_seg')
 
 
-class Machine:
+class Machine(Probe):
     """A running node, and what comes out of it."""
 
     def __init__(self, node, session):
+        super().__init__(session, lambda *_: None)
         self._node = node
         self._session = session
-        self.back = {topic: [] for topic in OUTPUTS}
-        self._receiver = OutputReceiver(session, OUTPUTS, self._receive)
-        self._diagnostics = []
-        session.node.create_subscription(
-            DiagnosticArray, '/diagnostics', self._diagnostics.append, 10
-        )
-        self._receiver.connect(INPUT, PATIENCE, node.check)
+        self.back = {GROUND: [], OBSTACLES: []}
+        self.connect(node, PATIENCE)
 
-    def _receive(self, topic, cloud, _now):
-        self.back[topic].append(cloud)
+    def arrived(self, topic, cloud, now):
+        super().arrived(topic, cloud, now)
+        # Not the empty ones that test the connection.
+        if cloud.width:
+            self.back[topic].append(cloud)
 
     def _spin_until(self, condition, what):
         end = time.monotonic() + PATIENCE
@@ -83,11 +77,7 @@ class Machine:
 
     def n_dropped(self):
         """What the node itself says that it lost."""
-        self._diagnostics.clear()
-        self._spin_until(lambda: self._diagnostics, 'diagnostics')
-        (status,) = (s for s in self._diagnostics[0].status if s.name.endswith(': processing'))
-        values = {entry.key: entry.value for entry in status.values}
-        return int(values['Dropped since startup'])
+        return self.counters(PATIENCE)[1]
 
 
 @pytest.fixture(scope='module')
@@ -158,11 +148,11 @@ def test_simulated_street(machine, tmp_path):
     for cloud, label, ground, obstacles in zip(
         sent, labels, machine.back[GROUND], machine.back[OBSTACLES], strict=True
     ):
-        check = check_scan(cloud, ground, obstacles)
-        assert check.is_exact
+        check = check_scan(cloud, {GROUND: ground, OBSTACLES: obstacles})
+        assert (check.n_missing, check.n_repeated, check.n_altered) == (0, 0, 0)
         assert check.n_points == cloud.width - n_invalid
         np.testing.assert_array_equal(check.label, label)
-        assert check.confusion.iou > 0.9
+        assert count_confusion(check.label, check.truth).iou > 0.9
 
 
 def test_kitti(machine, kitti, tmp_path):

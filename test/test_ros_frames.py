@@ -18,6 +18,7 @@ from ros_helpers import (
     Collector,
     bench,
     rows_of,
+    start_error,
     street,
     to_message,
     wait_for,
@@ -25,7 +26,6 @@ from ros_helpers import (
 )
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
-from test_ros_parameters import one_line_error
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.errors import PointCloudError
@@ -72,7 +72,7 @@ def test_what_is_no_rotation_is_refused(values):
 
 @pytest.mark.skipif(HAS_TF2, reason='tf2_ros is installed')
 def test_without_tf2_the_node_says_what_to_do_and_exits_2(capfd):
-    error = one_line_error(capfd, ['--ros-args', '-p', 'frame.level:=tf'])
+    error = start_error(capfd, '-p', 'frame.level:=tf')
     assert 'frame.level = tf: needs tf2_ros' in error
     assert 'apt install ros-jazzy-tf2-ros-py' in error
     assert 'sensor.roll' in error

@@ -16,7 +16,8 @@ from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.pipeline.points import single_precision
-from gp_ground_seg.ros.labelled import FIELDS, free_names
+from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
+from gp_ground_seg.ros.outputs import labelled_names
 
 HAS_ORACLE = importlib.util.find_spec('sensor_msgs_py') is not None
 CODES = ('i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8')
@@ -150,7 +151,7 @@ def test_every_layout_comes_through(tested, case):
     assert (whole.height, whole.width) == (message.height, message.width)
     assert whole.is_bigendian == message.is_bigendian
     assert whole.fields[: len(message.fields)] == message.fields
-    names = list(free_names(field.name for field in message.fields).values())
+    names = list(labelled_names(field.name for field in message.fields).values())
     added = whole.fields[len(message.fields) :]
     assert [field.name for field in added] == names
     raw = np.frombuffer(whole.data, np.uint8).reshape(len(rows), whole.point_step)

@@ -29,7 +29,6 @@ from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.ros.node import GroundSegmentationNode
-from gp_ground_seg.ros.warm_up import warm_up
 
 OFTEN = ('-p', 'diagnostics.period:=0.1', '-p', 'diagnostics.recover_after:=0.3')
 
@@ -245,17 +244,6 @@ def test_drops_are_counted_exactly():
         assert int(values['Clouds since startup']) == len(b.ground.wait(2))
 
 
-def test_warm_up_leaves_no_trace():
-    xyz = xyz_of(street(5000))
-    config = Config().replace(**{'learning.mode': 'first_frame'})
-    segmenter = GroundSegmenter(config)
-    assert warm_up(segmenter) > 0.0
-    expected = GroundSegmenter(config).segment(xyz)
-    found = segmenter.segment(xyz)
-    np.testing.assert_array_equal(found.ground_z, expected.ground_z)
-    assert found.fit == expected.fit
-
-
 def publish_until(publisher, message, condition, what):
     def publish_once():
         publisher.publish(message)
@@ -323,3 +311,58 @@ def test_two_nodes_side_by_side():
             assert len(floor.messages) == 1
         assert b.node.config.label.ground_tolerance == 0.5
         assert rear.config.label == Config().label
+
+
+def test_names_of_the_diagnostics():
+    """Dashboards read them: tasks, keys and their order are part of the interface."""
+    times = [
+        f'{name} p{percent} (ms)'
+        for name in ('Latency', *(f'Stage {stage}' for stage in STAGES))
+        for percent in (50, 95, 99)
+    ]
+    with bench(*OFTEN) as b:
+        b.segment(to_message(street(3000)))
+        tasks = {
+            task: b.wait_for_status(task, lambda v, _, key=key: v.get(key) not in (None, '0'))
+            for task, key in FIRST_COUNTERS.items()
+        }
+        node_name = b.node.get_fully_qualified_name()
+    keys = {task: [entry.key for entry in status.values] for task, status in tasks.items()}
+    assert {status.hardware_id for status in tasks.values()} == {'none'}
+    assert keys['input'] == INPUT_KEYS.split('; ')
+    assert sorted(keys['processing']) == sorted([*PROCESSING_KEYS.split('; '), *times])
+    model = [key for key in keys['model'] if not key.startswith('theta ')]
+    assert model == MODEL_KEYS.split('; ')
+    assert len(keys['model']) > len(model)
+    topics = [f'{NAMESPACE}/ground', f'{NAMESPACE}/obstacles'] + [
+        f'{node_name}/{name}' for name in ('labeled', 'ground_model', 'markers')
+    ]
+    facts = ('subscribers', 'rate (Hz)', 'since startup')
+    assert keys['output'] == [f'{topic} {fact}' for topic in topics for fact in facts]
+
+
+FIRST_COUNTERS = {
+    'input': 'Events since startup',
+    'processing': 'Clouds since startup',
+    'model': 'Candidates',
+    'output': f'{NAMESPACE}/ground since startup',
+}
+STAGES = (
+    'queue', 'grid', 'pose', 'faces', 'lines', 'learning', 'surface', 'label', 'total', 'publish',
+)  # fmt: skip
+INPUT_KEYS = (
+    'Topic; Publishers; QoS; Events since startup; Events in window; Duration of window (s); '
+    'Actual frequency (Hz); Time since last cloud (s); Age of last stamp (s); Clock; '
+    'Time jumps since startup; Frame; Fields; Refused since startup; Last error'
+)
+PROCESSING_KEYS = (
+    'Clouds since startup; Clouds in window; Dropped since startup; Load (%); Backend; Threads'
+)
+MODEL_KEYS = (
+    'frame_quality; Segments with a model; Segments with candidates; Ground fraction; '
+    'Unknown fraction; Fraction without model; Label certainty; Candidates; Inliers; '
+    'Sensor height (m); Sensor roll (rad); Sensor pitch (rad); Taken from the scan; '
+    'Estimated height (m); Estimated roll (rad); Estimated pitch (rad); Noise (m); '
+    'Learning mode; Learned since startup; Optimiser status; Evaluations; At bound; '
+    'Objective per candidate'
+)

@@ -1,6 +1,5 @@
 """The optional topics: what is in them, and that nobody pays for them unasked."""
 
-import dataclasses
 import sys
 
 import numpy as np
@@ -26,8 +25,9 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.data.point_cloud2 import read_columns
 from gp_ground_seg.ros import outputs
 from gp_ground_seg.ros.ground_model import read_ground_model
-from gp_ground_seg.ros.labelled import FIELDS, free_names
 from gp_ground_seg.ros.node import GroundSegmentationNode
+from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
+from gp_ground_seg.ros.outputs import labelled_names
 
 NODE = 'ground_segmentation_node'
 OPTIONAL = {
@@ -135,7 +135,7 @@ def test_names_that_the_input_has_already_stay_its_own(shared_bench, capfd):
 def test_names_are_free_however_often_a_cloud_comes_round():
     taken = ['x', 'y', 'z']
     for _ in range(3):
-        names = free_names(taken)
+        names = labelled_names(taken)
         assert list(names) == list(FIELDS)
         assert not set(names.values()) & set(taken)
         assert len(set(names.values())) == len(FIELDS)
@@ -214,7 +214,7 @@ def test_nothing_is_built_that_nobody_subscribes_to(shared_bench, monkeypatch):
             built.append(output.topic)
             return output.build(*arguments)
 
-        return dataclasses.replace(output, build=build)
+        return output._replace(build=build)
 
     # The label output is told from the others by identity; see that the count is right anyway.
     rows = [(counted(output), publisher) for output, publisher in b.node._outputs._publishers]
@@ -251,7 +251,7 @@ def test_quality_of_service_of_every_output_can_be_overridden():
 
 def test_without_visualization_msgs_the_node_says_so_and_works(monkeypatch, capfd):
     for name in list(sys.modules):
-        if name == 'gp_ground_seg.ros.markers' or name.split('.')[0] == 'visualization_msgs':
+        if name.split('.')[0] == 'visualization_msgs':
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'visualization_msgs', None)
     with isolated_context() as context:

@@ -10,7 +10,6 @@ from rcl_interfaces.msg import ParameterType
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
 from ros_helpers import (
-    ISOLATION,
     bench,
     isolated_context,
     parameter_message,
@@ -23,7 +22,7 @@ from ros_helpers import (
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
 from gp_ground_seg.parameters.config import find_spec, parameter_specs
-from gp_ground_seg.ros.node import GroundSegmentationNode, main
+from gp_ground_seg.ros.node import GroundSegmentationNode
 
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL,
@@ -231,81 +230,6 @@ def test_hundred_changes_during_playback_lose_no_frame(shared_bench):
     assert b.node.config.label.ground_tolerance == tolerances[98]
     for name in ('learning.mode', 'label.ground_tolerance'):
         assert b.set(name, Config()[name]).successful
-
-
-START_CASES = [
-    ('label: {ground_tolerance: 9.0}', 'label.ground_tolerance = 9.0: must be a number in [0.001'),
-    (
-        'label: {ground_tolerance: abc}',
-        "label.ground_tolerance = 'abc': must be a number in",
-    ),
-    ('sensor: {roll: sideways}', "sensor.roll = 'sideways': must be auto or a number in"),
-    (
-        'sensor: {height: 2}',
-        'sensor.height = 2: must be auto or a number in [0.05, 20] m, with a decimal',
-    ),
-    ('grid: {n_segments: 1.5}', 'grid.n_segments = 1.5: must be an integer in [4, 2048]'),
-    ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
-    ('runtime: {backend: [a, b]}', 'runtime.backend = '),
-    ('runtime: {backend: }', 'No value at line'),
-    ('use_sim_time: 3', 'use_sim_time = 3: must be true or false'),
-]
-
-
-def one_line_error(capfd, words):
-    """What `main` writes when it refuses to start."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in ISOLATION.items():
-            patch.setenv(name, value)
-        assert main(words) == 2
-    lines = [line for line in capfd.readouterr().err.splitlines() if 'INFO' not in line]
-    errors = [line for line in lines if line.startswith('ground_segmentation_node: error: ')]
-    assert len(errors) == 1, lines
-    assert 'Traceback' not in '\n'.join(lines)
-    assert '/project/src' not in errors[0]
-    return errors[0]
-
-
-@pytest.mark.parametrize(('body', 'reason'), START_CASES)
-def test_bad_parameter_file_is_one_line(tmp_path, capfd, body, reason):
-    path = tmp_path / 'bad.yaml'
-    path.write_text(f'/**:\n  ros__parameters:\n    {body}\n')
-    assert reason in one_line_error(capfd, ['--ros-args', '--params-file', str(path)])
-
-
-@pytest.mark.parametrize(
-    ('text', 'reason'),
-    [
-        ('/**:\n  label: {ground_tolerance: 0.3}\n', 'no ros__parameters'),
-        ('/**: [\n', 'not valid YAML'),
-        (None, 'no such file'),
-    ],
-)
-def test_unreadable_parameter_file_is_one_line(tmp_path, capfd, text, reason):
-    path = tmp_path / 'bad.yaml'
-    if text is not None:
-        path.write_text(text)
-    error = one_line_error(capfd, ['--ros-args', '--params-file', str(path)])
-    assert reason in error
-    assert str(path) in error
-
-
-@pytest.mark.parametrize(
-    ('words', 'reason'),
-    [
-        (['-p', 'label.ground_tolerance:=9.0'], 'label.ground_tolerance = 9.0: must be a number'),
-        (['-p', 'label.ground_tolerance'], 'must be -p NAME:=VALUE'),
-        (['--frobnicate'], "unknown ROS arguments ['--frobnicate']"),
-        (['-r', '__node:=a b'], 'a b'),
-        (
-            ['-p', 'qos_overrides./points.subscription.reliability:=maybe'],
-            "= 'maybe': must be one of reliable",
-        ),
-        (['-p', 'qos_overrides./points.subscription.depth:=deep'], 'depth'),
-    ],
-)
-def test_bad_ros_argument_is_one_line(capfd, words, reason):
-    assert reason in one_line_error(capfd, ['--ros-args', *words])
 
 
 def test_unknown_names_are_reported_and_not_declared(capfd):

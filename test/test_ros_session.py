@@ -9,7 +9,7 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 
 from ros_helpers import ISOLATION
 
-from gp_ground_seg.ros.session import ros_session
+from gp_ground_seg.ros.lifecycle import ros_session
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 

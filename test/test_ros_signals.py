@@ -65,6 +65,15 @@ def children(pid):
     return [one for one in found if is_running(one) and int(stat_words(one)[1]) == pid]
 
 
+def wait_for_compiler(node):
+    """Return the number of the process that compiles for a node, once it works."""
+    node.wait_until_ready()
+    wait_for(lambda: len(children(node.popen.pid)) == 1, 'compiler')
+    (compiler,) = children(node.popen.pid)
+    wait_for(lambda: cpu_seconds(compiler) > 2.0, 'work')
+    return compiler
+
+
 def assert_good_end(node, number, words=()):
     code, duration = node.stop(number)
     assert code == 0, node.log
@@ -87,14 +96,9 @@ def test_while_compiling(tmp_path):
     cache = tmp_path / 'cache'
     cache.mkdir()
     with Process(*IN_NAMESPACE, folder=tmp_path, NUMBA_CACHE_DIR=str(cache)) as node:
-        wait_for(lambda: 'compiling' in node.log, 'start')
-        wait_for(lambda: len(children(node.popen.pid)) == 2, 'two compilers')
-        compilers = children(node.popen.pid)
-        wait_for(lambda: all(cpu_seconds(pid) > 2.0 for pid in compilers), 'work')
-        assert 'listening' not in node.log
+        compiler = wait_for_compiler(node)
         assert_good_end(node, signal.SIGTERM)
-    # Who compiled for it does not go on without it.
-    wait_for(lambda: not any(is_running(pid) for pid in compilers), 'end of the compilers')
+    wait_for(lambda: not is_running(compiler), 'end of the compiler')
 
 
 @pytest.mark.parametrize(
@@ -122,7 +126,7 @@ def test_within_a_long_segmentation(tmp_path, backend, number):
     for name, value in settings.items():
         words += ['-p', f'{name}:={value}']
     with Process(*words, folder=tmp_path) as node, isolated_context() as context:
-        node.wait_until_ready()
+        node.wait_until_settled()
         link = Link(context)
         with spinning(context, link.probe):
             link.wait_until_connected()
@@ -162,7 +166,7 @@ def test_a_second_signal_does_not_break_the_end(tmp_path):
 
 DEAF = """
 import hashlib
-from gp_ground_seg.ros.signals import stop_on_signals
+from gp_ground_seg.ros.lifecycle import stop_on_signals
 
 with stop_on_signals():
     print('ready', flush=True)
@@ -186,7 +190,7 @@ def test_a_thread_ends_what_does_not_end_itself():
 def test_without_a_signal_all_is_as_before():
     script = (
         'import signal\n'
-        'from gp_ground_seg.ros.signals import stop_on_signals\n'
+        'from gp_ground_seg.ros.lifecycle import stop_on_signals\n'
         'before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)\n'
         'with stop_on_signals() as outer:\n'
         '    with stop_on_signals() as stop:\n'

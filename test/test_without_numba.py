@@ -11,19 +11,22 @@ from conftest import hilly_scan
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.jit import HAVE_NUMBA
 
-needs_numba = pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
-
 SCRIPT = """
 import sys
 import numpy as np
 if sys.argv[1] == 'blocked':
     sys.modules['numba'] = None  # import numba raises ImportError
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import Config, GroundSegmenter, GroundSegError
 points = np.load(sys.argv[2])
 for _ in range(2):
     result = GroundSegmenter(Config()).segment(points)
 np.savez(sys.argv[3], label=result.label, ground_z=result.ground_z)
 print(result.fit.backend)
+if sys.argv[1] == 'blocked':
+    try:
+        GroundSegmenter(Config().replace(**{'runtime.backend': 'numba'}))
+    except GroundSegError as error:
+        print(error)
 """
 
 
@@ -38,33 +41,20 @@ def run(tmp_path, mode, **environment):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return points, np.load(tmp_path / 'result.npz'), done
-
-
-def test_without_numba_labels_are_the_same_and_it_says_so_once(tmp_path):
-    points, result, done = run(tmp_path, 'blocked')
-    assert done.stdout.strip() == 'numpy'
-    assert done.stderr.count('numba is not installed') == 1
-    expected = GroundSegmenter().segment(points)
+    result, expected = np.load(tmp_path / 'result.npz'), GroundSegmenter().segment(points)
     np.testing.assert_array_equal(result['label'], expected.label)
     np.testing.assert_allclose(result['ground_z'], expected.ground_z, atol=1e-6)
+    return done.stdout.splitlines(), done.stderr
 
 
-def test_numba_asked_for_by_name_but_missing_is_an_error():
-    script = (
-        "import sys; sys.modules['numba'] = None\n"
-        'from gp_ground_seg import Config, GroundSegmenter, GroundSegError\n'
-        "try:\n    GroundSegmenter(Config().replace(**{'runtime.backend': 'numba'}))\n"
-        'except GroundSegError as error:\n    print(error)'
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', script], capture_output=True, text=True, check=True
-    )
-    assert 'pip install numba' in done.stdout
+def test_without_numba_labels_are_the_same_and_one_line_says_so(tmp_path):
+    lines, errors = run(tmp_path, 'blocked')
+    assert lines[0] == 'numpy'
+    assert errors.count('numba is not installed') == 1
+    # By name it is an error.
+    assert 'pip install numba' in lines[1]
 
 
-@needs_numba
+@pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
 def test_the_compiled_code_is_right_as_plain_python_too(tmp_path):
-    points, result, done = run(tmp_path, 'open', NUMBA_DISABLE_JIT='1')
-    assert done.stdout.strip() == 'numba'
-    np.testing.assert_array_equal(result['label'], GroundSegmenter().segment(points).label)
+    assert run(tmp_path, 'open', NUMBA_DISABLE_JIT='1')[0] == ['numba']

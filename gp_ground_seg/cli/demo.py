@@ -1,66 +1,71 @@
-"""``demo``: see it work, with no data at hand."""
+"""``demo``: the node at work, with no data at hand."""
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
+import itertools
 import math
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gp_ground_seg.cli.demo_frames import (
-    TOPIC,
-    Drive,
-    WrittenDrive,
-    kitti_drive,
-    simulated_drive,
-    write_drive,
-)
-from gp_ground_seg.cli.demo_node import NodeProcess, private_network
-from gp_ground_seg.cli.demo_tally import OUTPUTS, Tally
-from gp_ground_seg.cli.demo_text import result_text, thousands
-from gp_ground_seg.cli.output import count, progress_bar
-from gp_ground_seg.cli.play import needing_ros, positive, summary
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.cli.bags import above_zero, scan_cloud
+from gp_ground_seg.cli.options import count, new_parser, positive, progress_bar
 from gp_ground_seg.data.atomic_output import staged_files
-from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.data.point_cloud2 import decode_cloud
-from gp_ground_seg.data.semantic_kitti import list_sequences
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, stamp_of
+from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
+from gp_ground_seg.evaluation.evaluate import labelled_frames
+from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confusion
+from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.birds_eye import plot_birds_eye
-from gp_ground_seg.ros.transport import large_cloud_transport
+from gp_ground_seg.ros.lifecycle import needing_ros
+from gp_ground_seg.ros.probe import (
+    GROUND,
+    INPUT,
+    OBSTACLES,
+    Probe,
+    probed_node,
+    rate_result,
+    restamped,
+)
+from gp_ground_seg.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 
 if TYPE_CHECKING:
-    from gp_ground_seg.ros.receiver import OutputReceiver
-    from gp_ground_seg.ros.session import Session
+    from gp_ground_seg.ros.lifecycle import Session
 
 BAG, PICTURE, LOG = 'drive.mcap', 'birds_eye.png', 'node.log'
-DEFAULT_FRAMES = 30
+FRAME_ID = 'lidar'
+EPOCH = 1_700_000_000
+"""Second at which every drive starts: the same drive gives the same bag."""
 SEED = 3
+SPEED = 8.0
+"""Of the simulated drive [m/s]."""
+DEFAULT_FRAMES = 30
 RATE = 10.0
 """Scans per second [Hz]."""
 MAX_LOAD, COMFORTABLE_LOAD = 0.9, 0.7
-"""Share of the time that the node may need: above the first it is given more."""
+"""Share of the time that the node may need: above the first the rate is lowered."""
 N_TRIALS = 5
 TRIAL_TIMEOUT = 60.0
 """Longest time one scan may take [s]."""
 EXIT_FAILED = 1
-START_TIMEOUT = 300.0
-"""Time the node has to start; where it compiles on a slow machine that is minutes [s]."""
-SILENCE = 5.0
-"""Time without a cloud after which what is still missing is lost [s]."""
 
 DESCRIPTION = """\
 See it work, with no data at hand: simulate a short drive along a street, write it
-as a bag, start the node in a second process, play the bag to it through ROS, receive
-both clouds, check that every point came back exactly once, score the labels against
+as a bag, start the node in a second process, send the scans of the bag to it through ROS,
+receive both clouds, check that every point came back exactly once, score the labels against
 the truth, and draw one scan from above. With --kitti the same on real, labelled scans.
 
 Nothing leaves this machine: the demo has a ROS domain of its own.
 """
-
 EXAMPLES = f"""\
-examples:
   gp-ground-seg demo
   gp-ground-seg demo --frames 100 --rate 20 --output big_demo
   gp-ground-seg demo --kitti KITTI_ROOT --sequence 08
@@ -73,44 +78,192 @@ error, 130 when interrupted
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
-        'demo',
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser(subparsers, 'demo', DESCRIPTION, EXAMPLES)
     parser.add_argument('--kitti', metavar='ROOT', help='folder in SemanticKITTI layout')
     parser.add_argument(
         '--sequence', metavar='S', help='sequence of it, as in 00 (default: the first)'
     )
     parser.add_argument(
-        '--frames',
-        metavar='N',
-        type=_positive_integer,
-        default=DEFAULT_FRAMES,
+        '--frames', metavar='N', type=positive, default=DEFAULT_FRAMES,
         help=f'scans to play, at most (default: {DEFAULT_FRAMES})',
-    )
+    )  # fmt: skip
     parser.add_argument(
-        '--rate',
-        metavar='HZ',
-        type=positive,
+        '--rate', metavar='HZ', type=above_zero,
         help=f'scans per second (default: {RATE:g}, as most LiDARs; less if this machine is '
         'too slow for that)',
-    )
+    )  # fmt: skip
     parser.add_argument(
-        '--output',
-        metavar='DIR',
-        default='demo_output',
+        '--output', metavar='DIR', default='demo_output',
         help='folder for what is written (default: demo_output)',
-    )
+    )  # fmt: skip
     parser.add_argument('--force', action='store_true', help='replace the files of another demo')
     parser.set_defaults(run=run)
 
 
-def _positive_integer(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f'{text!r}: must be a whole number, at least 1')
-    return int(text)
+Scan = tuple[npt.NDArray[np.float32], npt.NDArray[np.integer], float]
+"""Points (N, 4), SemanticKITTI class of each (N,), time since the start of the drive [s]."""
+
+
+class Drive(NamedTuple):
+    """Labelled scans, made one by one: what they are, and whose labels they have."""
+
+    name: str
+    truth: str
+    n_frames: int
+    scans: Iterator[Scan]
+
+
+def simulated_drive(n_frames: int) -> Drive:
+    """Return a drive along a street that an HDL-64E sees."""
+    scans = simulate_drive(SCENES['urban'](SEED), HDL_64E, n_frames, SPEED, SEED)
+    labelled = ((scan.points, semantic_kitti_labels(scan.kind), scan.time) for scan in scans)
+    return Drive('Simulated street', 'the truth, which the simulator knows', n_frames, labelled)
+
+
+def kitti_drive(root: str | Path, sequence: str, n_frames: int) -> Drive:
+    """Return the first labelled scans of a KITTI sequence; raise a DataError if it has none."""
+    frames = labelled_frames(root, [sequence])[:n_frames]
+
+    def scans() -> Iterator[Scan]:
+        for frame in frames:
+            points = read_points(frame.points_path)
+            assert frame.labels_path is not None, 'labelled_frames gives only labelled ones'
+            yield points, read_labels(frame.labels_path, len(points)), frame.time
+
+    return Drive(f'KITTI sequence {sequence}', 'the labels of SemanticKITTI', len(frames), scans())
+
+
+def numbered_cloud(
+    points: npt.NDArray[np.float32], semantic: npt.NDArray[np.integer], stamp: int
+) -> CloudMessage:
+    """Return a cloud whose points carry their class (``label``) and their number (``index``).
+
+    The node keeps every field: they come back with each point.
+    """
+    index = np.arange(len(points), dtype=np.uint32)
+    label = semantic.astype(np.uint32)
+    return scan_cloud(points, stamp, FRAME_ID, label=label, index=index)
+
+
+class ScanCheck(NamedTuple):
+    """A scan that went through the node.
+
+    Of the `n_points` finite points sent each must come back once, in one of the two clouds.
+    `n_altered` came back but were not sent: with another byte, not finite, or in a cloud of
+    another header or layout. `label` (N,) is the `Label` by the cloud a point came back in,
+    `truth` (N,) that of the GroundGrid convention; `points` (N, 4) are x, y, z [m], intensity.
+    """
+
+    n_points: int
+    n_missing: int
+    n_repeated: int
+    n_altered: int
+    label: npt.NDArray[np.uint8]
+    truth: npt.NDArray[np.uint8]
+    points: npt.NDArray[np.float32]
+
+
+def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> ScanCheck:
+    """Compare a `numbered_cloud` with the clouds on `GROUND` and `OBSTACLES` that came back."""
+    points = _records(sent)
+    n = len(points)
+    xyz = np.stack([points['x'], points['y'], points['z']], axis=1)
+    finite = np.isfinite(xyz).all(axis=1)
+    times_back = np.zeros(n, dtype=np.int64)
+    label = np.full(n, Label.UNKNOWN, dtype=np.uint8)
+    n_altered = 0
+    for value, topic in ((Label.GROUND, GROUND), (Label.OBSTACLE, OBSTACLES)):
+        cloud = results[topic]
+        back = _records(cloud) if _is_alike(sent, cloud) else points[:0]
+        index = np.minimum(back['index'].astype(np.int64), n - 1)
+        # Opaque bytes: NaN equals NaN.
+        kind = f'V{points.itemsize}'
+        is_good = (back.view(kind) == points[index].view(kind)) & finite[index]
+        n_altered += cloud.height * cloud.width - int(np.count_nonzero(is_good))
+        times_back += np.bincount(index[is_good], minlength=n)
+        label[index[is_good]] = value
+    return ScanCheck(
+        n_points=int(np.count_nonzero(finite)),
+        n_missing=int(np.count_nonzero(finite & (times_back == 0))),
+        n_repeated=int(np.count_nonzero(times_back > 1)),
+        n_altered=n_altered,
+        label=label,
+        truth=GROUNDGRID.truth(points['label'], xyz[:, 2]),
+        points=np.column_stack([xyz, points['intensity']]),
+    )
+
+
+def _is_alike(sent: CloudMessage, back: CloudMessage) -> bool:
+    names = ('header', 'fields', 'point_step', 'is_bigendian')
+    return all(getattr(sent, name) == getattr(back, name) for name in names) and (
+        len(back.data) == back.height * back.width * back.point_step
+    )
+
+
+def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
+    """Return the points of a `numbered_cloud` as a structured array, (N,)."""
+    names = ('x', 'y', 'z', 'intensity', 'label', 'index')
+    return np.frombuffer(cloud.data, [(n, '<f4' if k < 4 else '<u4') for k, n in enumerate(names)])
+
+
+class Tally:
+    """Sums over the scans of the given `stamps` that came back.
+
+    `picture` is the check, and the number, of the middle scan or the nearest before it.
+    """
+
+    def __init__(self, stamps: Sequence[tuple[int, int]]) -> None:
+        self._numbers = {stamp: k for k, stamp in enumerate(stamps)}
+        self.counts = dict.fromkeys(('n_points', 'n_missing', 'n_repeated', 'n_altered'), 0)
+        self.confusion = Confusion()
+        self.picture: tuple[ScanCheck, int] | None = None
+
+    def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
+        """Check a scan that came back, and add it; other clouds are trials."""
+        number = self._numbers.get(stamp_of(sent))
+        if number is None:
+            return
+        check = check_scan(sent, results)
+        for name in self.counts:
+            self.counts[name] += getattr(check, name)
+        self.confusion += count_confusion(check.label, check.truth)
+        if self.picture is None or number <= len(self._numbers) // 2:
+            self.picture = check, number
+
+
+def result_text(
+    tally: Tally, result: dict[str, Any], n_stray: int, truth: str
+) -> tuple[str, bool]:
+    """Return the result in plain words, and whether all scans came back as they should."""
+    counts, wanted = tally.counts, result['asked']
+    is_exact = not (any(list(counts.values())[1:]) or n_stray)
+    missing, repeated, altered = (_thousands(n) for n in list(counts.values())[1:])
+    partition = (
+        'each is in exactly one of the two clouds, not a byte changed'
+        if is_exact
+        else f'{missing} missing, {repeated} more than once, {altered} changed or never sent; '
+        f'{n_stray} clouds too many'
+    )
+    scores = tally.confusion
+    iou, precision, recall = (
+        f'{100.0 * value:.2f} %' for value in (scores.iou, scores.precision, scores.recall)
+    )
+    lines = [
+        f'scans    {result["n_sent"]} sent, {result["n_back"]} back, {result["n_lost"]} lost',
+        f'points   {_thousands(counts["n_points"])} of these scans: {partition}',
+        f'labels   ground IoU {iou}, precision {precision}, recall {recall} (against {truth})',
+        f'latency  median {1e3 * result["p50"]:.1f} ms, 99 % within {1e3 * result["p99"]:.1f} ms, '
+        'from sending a scan to having both clouds',
+        f'rate     {result["sent"]:.1f} scans per second sent, {wanted:g} were wanted',
+    ]
+    if result['n_lost']:
+        line = f'FAILED: {result["n_lost"]} of {result["n_sent"]} scans were lost'
+        if result['p50'] > 1.0 / wanted:
+            line += '; this machine is too slow for that rate, try a lower --rate'
+        lines.append(line)
+    if not is_exact:
+        lines.append('FAILED: the two clouds are not the scan that was sent; this is a bug')
+    return '\n'.join(lines), is_exact and not result['n_lost']
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -120,42 +273,34 @@ def run(arguments: argparse.Namespace) -> int:
         raise MissingDependencyError(
             "the demo draws with matplotlib: pip install 'gp_ground_seg[plot]'"
         )
-    with needing_ros('the demo'):
-        from gp_ground_seg.ros.session import ros_session
-
     drive = _choose_drive(arguments)
     folder = Path(arguments.output)
     with (
         staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
-        private_network(),
-        large_cloud_transport(),
-        ros_session('demo') as session,
-        NodeProcess(part / LOG, ('-r', f'points:={TOPIC}'), session.holding_back) as node,
+        needing_ros('the demo'),
+        probed_node(part / LOG, 'demo') as (node, session),
     ):
-        written = _write(drive, part / BAG, session)
-        tally = Tally(shown=drive.n_frames // 2)
-        receiver = _connect(session, node, tally)
-        with BagReader(part / BAG) as bag:
-            rate = arguments.rate or _sustainable_rate(bag, receiver)
-            _play(bag, rate, written.period, session, tally)
+        tally = Tally(_write(drive, part / BAG, session))
+        print('[2/3] connecting to the node, a second process', flush=True)
+        start = time.monotonic()
+        probe = Probe(session, tally.add)
+        probe.connect(node)
+        _detail(f'its compiled code was there after {time.monotonic() - start:.1f} s more')
+        result = _play(part / BAG, drive.n_frames, arguments.rate, probe)
         node.check()
-        tally.look()
         if tally.picture is None:
             raise GroundSegError(
-                f'none of {count(tally.n_sent, "scan")} came back; the last words of the node:\n'
-                f'{node.log_tail()}'
+                f'none of {count(drive.n_frames, "scan")} came back; the last words of the '
+                f'node:\n{node.log_tail()}'
             )
-        plot_birds_eye(
-            tally.picture.points,
-            tally.picture.label,
-            part / PICTURE,
-            truth=tally.picture.truth,
-            title=f'{drive.name}, scan {tally.picture_number + 1} of {drive.n_frames}',
-        )
-    print(f'\n{result_text(tally, rate, drive.truth)}\n')
+        check, number = tally.picture
+        title = f'{drive.name}, scan {number + 1} of {drive.n_frames}'
+        plot_birds_eye(check.points, check.label, part / PICTURE, truth=check.truth, title=title)
+    text, is_good = result_text(tally, result, probe.n_stray, drive.truth)
+    print(f'\n{text}\n')
     print(f'picture  {folder / PICTURE}  one of the scans from above, and the errors in it')
     print(f'bag      {folder / BAG}  what was played; `gp-ground-seg play` plays it again')
-    return 0 if tally.n_lost == 0 and tally.is_partition_exact else EXIT_FAILED
+    return 0 if is_good else EXIT_FAILED
 
 
 def _choose_drive(arguments: argparse.Namespace) -> Drive:
@@ -163,46 +308,60 @@ def _choose_drive(arguments: argparse.Namespace) -> Drive:
     if arguments.kitti is None:
         if sequence is not None:
             raise DataError(f'--sequence {sequence}: goes with --kitti ROOT')
-        return simulated_drive(arguments.frames, SEED)
+        return simulated_drive(arguments.frames)
     if sequence is None:
         sequence = list_sequences(arguments.kitti)[0]
     return kitti_drive(arguments.kitti, sequence, arguments.frames)
 
 
-def _write(drive: Drive, path: Path, session: Session) -> WrittenDrive:
+def _write(drive: Drive, path: Path, session: Session) -> list[tuple[int, int]]:
+    """Write the drive as a bag; return the stamps of its scans."""
     scans = count(drive.n_frames, 'scan')
-    _step(1, f'writing {scans} as a bag: {drive.description}; meanwhile the node starts')
+    print(f'[1/3] writing {scans} as a bag: {drive.name}; meanwhile the node starts', flush=True)
     start = time.monotonic()
-    with progress_bar(drive.n_frames, quiet=False, title='scans') as bar:
-
-        def progress() -> None:
+    stamps, n_points = [], 0
+    with (
+        progress_bar(drive.n_frames, quiet=False, title='scans') as bar,
+        BagWriter(path) as bag,
+    ):
+        bag.add_topic(cloud_topic(INPUT))
+        for points, semantic, seconds in drive.scans:
+            stamp = EPOCH * 10**9 + round(seconds * 1e9)
+            bag.write(INPUT, stamp, encode_cloud(numbered_cloud(points, semantic, stamp)))
+            n_points += len(points)
+            stamps.append(divmod(stamp, 10**9))
             session.check()
             bar.update()
-
-        written = write_drive(drive, path, progress)
-    seconds = time.monotonic() - start
-    points, size = thousands(written.n_points), written.n_bytes / 1e6
-    _detail(f'{points} points, {size:.0f} MB, took {seconds:.1f} s')
-    return written
+    seconds, size = time.monotonic() - start, path.stat().st_size / 1e6
+    _detail(f'{_thousands(n_points)} points, {size:.0f} MB, took {seconds:.1f} s')
+    return stamps
 
 
-def _connect(session: Session, node: NodeProcess, tally: Tally) -> OutputReceiver:
-    from gp_ground_seg.ros.receiver import OutputReceiver
+def _play(path: Path, n_frames: int, wanted: float | None, probe: Probe) -> dict[str, Any]:
+    """Send the scans of a bag to the node; return the statistics of `rate_result`."""
+    with BagReader(path) as bag:
+        rate = wanted or sustainable_rate(
+            next(decode_cloud(raw) for _, _, raw in bag.messages([INPUT])), probe
+        )
+        print(
+            f'[3/3] playing the bag to the node, {rate:g} scans per second, and receiving both '
+            'clouds',
+            flush=True,
+        )
+        with progress_bar(n_frames, quiet=False, title='scans') as bar:
+            clouds = (decode_cloud(raw) for _, _, raw in bag.messages([INPUT]))
+            return rate_result(rate, probe.paced(clouds, rate, bar.update), 0)
 
-    _step(2, 'connecting to the node, a second process (it compiles when it runs the first time)')
-    start = time.monotonic()
-    receiver = OutputReceiver(session, OUTPUTS, tally.arrived)
-    receiver.connect(TOPIC, START_TIMEOUT, node.check)
-    _detail(f'it answered after {time.monotonic() - start:.1f} s')
-    return receiver
 
-
-def _sustainable_rate(bag: BagReader, receiver: OutputReceiver) -> float:
+def sustainable_rate(cloud: CloudMessage, probe: Probe) -> float:
     """Return the usual rate [Hz], or what this machine can do if that is less."""
-    _, _, first = next(bag.messages([TOPIC]))
-    seconds = receiver.time_answer(TOPIC, decode_cloud(first), N_TRIALS, TRIAL_TIMEOUT)
+    trials = itertools.islice(restamped([cloud], 1000), N_TRIALS)
+    trips = probe.one_by_one(trials, silence=TRIAL_TIMEOUT)
+    seconds = float(np.median([trip.latency for trip in trips]))
     if seconds < MAX_LOAD / RATE:
         return RATE
+    if math.isnan(seconds):
+        raise GroundSegError(f'no answer to a scan within {TRIAL_TIMEOUT:g} s')
     # Of the next lower numbers of one digit.
     rate = COMFORTABLE_LOAD / seconds
     unit = 10.0 ** math.floor(math.log10(rate))
@@ -214,31 +373,9 @@ def _sustainable_rate(bag: BagReader, receiver: OutputReceiver) -> float:
     return rate
 
 
-def _play(bag: BagReader, rate: float, period: float, session: Session, tally: Tally) -> None:
-    """Play scans that are `period` apart [s] at `rate` [Hz]; receive until all are back."""
-    from gp_ground_seg.ros.player import Player, PlayOptions
-
-    _step(3, f'playing the bag to the node, {rate:g} scans per second, and receiving both clouds')
-    with progress_bar(bag.n_messages(TOPIC), quiet=False, title='scans') as bar:
-
-        def spin(seconds: float) -> None:
-            session.spin(seconds)
-            bar.update(tally.n_back - bar.n)
-
-        player = Player(session.node, bag, [TOPIC], spin, PlayOptions(rate=rate * period))
-        player.wait_for_subscribers(SILENCE)
-        player.play(tally.sent)
-        n_back, last_news = tally.n_back, time.monotonic()
-        while tally.n_lost and time.monotonic() < last_news + SILENCE:
-            spin(SILENCE / 100.0)
-            if tally.n_back > n_back:
-                n_back, last_news = tally.n_back, time.monotonic()
-    _detail(summary(player.report()))
-
-
-def _step(number: int, text: str) -> None:
-    print(f'[{number}/3] {text}', flush=True)
-
-
 def _detail(text: str) -> None:
     print(f'      {text}', flush=True)
+
+
+def _thousands(number: int) -> str:
+    return f'{number:_}'.replace('_', ' ')

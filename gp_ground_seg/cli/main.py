@@ -39,12 +39,13 @@ COMMANDS = {
     'experiment': Command('experiment', 'repeat an experiment of docs/, such as ablation'),
     'plot': Command('plot', 'draw a scan in perspective, or a segment of it from the side'),
     'pose': Command('pose', 'estimate height and tilt of the sensor from scans'),
-    'kitti-to-bag': Command('kitti_to_bag', 'write a KITTI sequence as a rosbag2'),  # -> bags
-    'play': Command('play', "publish a bag's clouds as they were recorded"),  # -> bags
+    'kitti-to-bag': Command('bags', 'write a KITTI sequence as a rosbag2'),
+    'play': Command('bags', "publish a bag's clouds as they were recorded"),
     'demo': Command('demo', 'see it work, no data needed'),
     'config': Command('config', 'write, check and compare parameter files'),
     'node': Command('node', 'run the ROS 2 node'),
-    'node-bench': Command('node_bench', 'latency, losses and memory of the node'),  # -> node
+    'node-bench': Command('node', 'latency, losses and memory of the node'),
+    'warm-up': Command('node', 'compile beforehand what the first start would compile'),
 }
 
 EXAMPLES = """\

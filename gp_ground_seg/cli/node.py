@@ -1,66 +1,327 @@
-"""``gp-ground-seg node``: the ROS 2 node, where there is no ``ros2 run``."""
+"""``node``: the ROS 2 node; ``node-bench``: its latency, losses, memory; ``warm-up``."""
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
+import tempfile
+import time
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from gp_ground_seg.errors import GroundSegError, MissingDependencyError
-from gp_ground_seg.ros.signals import stop_on_signals
+from gp_ground_seg.cli.options import count, new_parser, note, progress_bar
+from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
+from gp_ground_seg.ros.lifecycle import needing_ros, stop_on_signals
 
-OWN_PACKAGE = 'gp_ground_seg'
-EXAMPLES = """\
-examples:
+if TYPE_CHECKING:
+    from gp_ground_seg.data.point_cloud2 import CloudMessage
+    from gp_ground_seg.ros.probe import NodeProcess, Probe, Trip
+
+N_SIMULATED = 10
+RATES = '10,20,50'
+FEWEST = 10
+EXIT_MISSED = 1
+
+LOSSLESS_RATE = 20.0
+"""Up to this rate nothing may be lost [Hz]."""
+PUNCTUAL_RATE = 10.0
+"""Up to this rate the 99th percentile of latency has a limit [Hz]."""
+MAX_P99 = 0.1
+"""That limit [s]."""
+MAX_PEAK = 350e6
+"""Limit of memory [bytes]."""
+MAX_GROWTH = 0.02
+"""Limit of its growth [1]."""
+
+NODE_EXAMPLES = """\
   gp-ground-seg node
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud
   gp-ground-seg node --ros-args -p label.ground_tolerance:=0.15 --params-file my.yaml
 """
+BENCH_DESCRIPTION = """\
+Start the node in a second process and send it clouds through ROS: at several rates, to
+see what is lost and how late the results are back, then one by one, to see what memory it
+takes and whether that grows. Both processes have a ROS domain of their own. Let nothing
+else run meanwhile: sender and receiver share the machine with the node.
+
+DATA is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag;
+without it, simulated scans of an HDL-64E. What follows --ros-args goes to the node.
+"""
+BENCH_EXAMPLES = f"""\
+  gp-ground-seg node-bench
+  gp-ground-seg node-bench KITTI_ROOT --json node.json
+  gp-ground-seg node-bench drive.mcap --rates 10 --frames 100 --memory-frames 0
+  gp-ground-seg node-bench KITTI_ROOT --ros-args -p learning.mode:=fixed
+
+exit code: 0, {EXIT_MISSED} if a goal of the table is missed, 2 for an error, 130 when interrupted
+"""
+WARM_UP_DESCRIPTION = """\
+Compile beforehand what a robot, or an image for one, would compile at its first start: the
+node then has its compiled code after a second instead of a minute. The code is kept on disk,
+for this version, this processor and this user.
+"""
+WARM_UP_EXAMPLES = """\
+  gp-ground-seg warm-up
+  NUMBA_CACHE_DIR=/opt/robot/numba gp-ground-seg warm-up
+"""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the command; what follows ``--ros-args`` is left to ROS."""
-    parser = subparsers.add_parser(
-        'node',
-        usage='gp-ground-seg node [--ros-args ...]',
-        description='Run the ROS 2 node: points in, ground and obstacles out.',
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(run=run, accepts_ros_args=True)
+    """Declare the commands; what follows ``--ros-args`` is left to ROS or the node."""
+    description = 'Run the ROS 2 node: points in, ground and obstacles out.'
+    parser = new_parser(subparsers, 'node', description, NODE_EXAMPLES)
+    parser.usage = 'gp-ground-seg node [--ros-args ...]'
+    parser.set_defaults(run=lambda a: start(a.ros_args), accepts_ros_args=True)
+
+    parser = new_parser(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES)
+    parser.set_defaults(run=run_warm_up)
+
+    parser = new_parser(subparsers, 'node-bench', BENCH_DESCRIPTION, BENCH_EXAMPLES)
+    parser.add_argument('data', metavar='DATA', nargs='?', help='scans or a bag')
+    parser.add_argument('--topic', metavar='T', help='PointCloud2 topic of a bag')
+    parser.add_argument(
+        '--clouds', metavar='N', type=_number, default=30,
+        help='different clouds, sent over and over (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--rates', metavar='LIST', type=_rates, default=RATES,
+        help='clouds per second, one after the other (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--frames', metavar='N', type=_number, default=600,
+        help='clouds sent at each rate (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--memory-frames', metavar='N', type=int, default=2000,
+        help='clouds sent one by one; 0 = leave memory out (default: %(default)s)',
+    )  # fmt: skip
+    parser.add_argument('--json', metavar='FILE', help='write every number to this file as well')
+    parser.add_argument('--force', action='store_true', help='overwrite the JSON file')
+    parser.add_argument('--quiet', action='store_true', help='no progress')
+    parser.set_defaults(run=run_bench, accepts_ros_args=True)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the node with ``arguments.ros_args``."""
-    return start(arguments.ros_args)
+def _number(text: str) -> int:
+    if not text.isdecimal() or int(text) < FEWEST:
+        raise argparse.ArgumentTypeError(f'{text!r}: must be a whole number, at least {FEWEST}')
+    return int(text)
+
+
+def _rates(text: str) -> list[float]:
+    try:
+        rates = [float(word) for word in text.split(',')]
+    except ValueError:
+        rates = []
+    if not rates or not all(0.1 <= rate <= 1000.0 for rate in rates):
+        raise argparse.ArgumentTypeError(f'{text!r}: must be numbers from 0.1 to 1000, as {RATES}')
+    return rates
 
 
 def start(words: Sequence[str]) -> int:
-    """Run the node until it is told to stop; return its exit code.
-
-    Raises
-    ------
-    MissingDependencyError
-        If rclpy or a message package is not installed.
-    """
+    """Run the node until a signal; return its exit code, or raise where there is no ROS."""
     # Importing ROS takes most of a second; a signal within it is obeyed as well.
     with stop_on_signals() as stop:
-        try:
+        with needing_ros('the node'):
             from gp_ground_seg.ros.node import main as run_node
-        except ImportError as error:
-            if (error.name or '').startswith(OWN_PACKAGE):
-                raise
-            raise MissingDependencyError(
-                f'the node needs ROS 2, which cannot be imported ({error}): source the setup '
-                "file of a ROS 2 installation, or pip install 'gp_ground_seg[ros]'"
-            ) from error
         return 0 if stop.made else run_node(words)
 
 
 def main() -> int:
-    """Entry point ``ground_segmentation_node``: says what is missing where there is no ROS."""
+    """Entry point ``ground_segmentation_node``; says what is missing where there is no ROS."""
     try:
         return start(sys.argv[1:])
     except GroundSegError as error:
         print(f'ground_segmentation_node: error: {error}', file=sys.stderr)
         return 2
+
+
+def run_warm_up(_arguments: argparse.Namespace) -> int:
+    """Compile all code that a frame needs, in this process."""
+    from gp_ground_seg.jit import HAVE_NUMBA, code_folder
+    from gp_ground_seg.segmenter import warm_up
+
+    if not HAVE_NUMBA:
+        raise MissingDependencyError(
+            'numba is not installed, nothing to compile: pip install numba'
+        )
+    begin = time.monotonic()
+    warm_up().close()
+    seconds, folder = time.monotonic() - begin, code_folder()
+    if folder is None:
+        raise GroundSegError('compiled code is not kept on disk, see the note above')
+    print(f'compiled code is kept in {folder}; it was there after {seconds:.1f} s')
+    return 0
+
+
+def run_bench(arguments: argparse.Namespace) -> int:
+    """Measure, print the table."""
+    from gp_ground_seg.data.atomic_output import staged_file
+    from gp_ground_seg.evaluation.environment import describe_environment
+    from gp_ground_seg.evaluation.table import write_json
+
+    if arguments.memory_frames and arguments.memory_frames < FEWEST:
+        raise DataError(
+            f'--memory-frames {arguments.memory_frames}: must be 0 or at least {FEWEST}'
+        )
+    clouds = _load_clouds(arguments)
+    with ExitStack() as stack:
+        part = None
+        if arguments.json is not None:
+            # Around the measurement: a target that is refused is so before the work.
+            part = stack.enter_context(staged_file(arguments.json, force=arguments.force))
+        rates, memory = _measure(arguments, clouds)
+        document = {
+            'source': {
+                'data': arguments.data or 'simulated HDL-64E',
+                'n_clouds': len(clouds),
+                'mean_points': sum(cloud.width for cloud in clouds) / len(clouds),
+                'mean_bytes': sum(len(cloud.data) for cloud in clouds) / len(clouds),
+                'node_arguments': list(itertools.islice(arguments.ros_args, 1, None)),
+                'title': count(len(clouds), 'cloud'),
+            },
+            'rates': [{**rate, 'goals': _rate_goals(rate)} for rate in rates],
+            'memory': {**memory, 'goals': _memory_goals(memory)} if memory else None,
+            'environment': asdict(describe_environment()),
+        }
+        if part is not None:
+            write_json(document, part)
+    missed = _goals_missed(document)
+    print(_text(document, missed))
+    return EXIT_MISSED if missed else 0
+
+
+def _load_clouds(arguments: argparse.Namespace) -> list[CloudMessage]:
+    """Return the clouds to send, x, y, z and intensity as float32."""
+    from gp_ground_seg.cli.bags import scan_cloud
+    from gp_ground_seg.cli.bench import load_frames
+    from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
+
+    if arguments.data is not None:
+        frames = load_frames(Path(arguments.data), arguments.clouds, arguments.topic)
+        points = [frame.points for frame in frames]
+    elif arguments.topic is not None:
+        raise DataError(f'--topic {arguments.topic}: goes with a bag')
+    else:
+        points = [scan for scan, _, _ in simulated_drive(min(arguments.clouds, N_SIMULATED)).scans]
+    return [scan_cloud(scan, 0, FRAME_ID) for scan in points]
+
+
+def _measure(
+    arguments: argparse.Namespace, clouds: Sequence[CloudMessage]
+) -> tuple[list[dict[str, Any]], dict[str, float]]:
+    """Return the results at each rate, and those of memory, if wanted."""
+    from gp_ground_seg.ros.probe import Probe, probed_node, restamped
+
+    stamped = restamped(clouds, 1_700_000_000)
+    with (
+        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
+        needing_ros('node-bench'),
+        probed_node(Path(folder, 'log'), 'node_bench', arguments.ros_args[1:]) as (node, session),
+    ):
+        probe = Probe(session, lambda *_: None)
+        if not arguments.quiet:
+            note('waiting for the node; it compiles when it runs the first time')
+        probe.connect(node)
+        rates = [_at_rate(probe, stamped, rate, arguments) for rate in arguments.rates]
+        node.check()
+        memory = _memory(probe, stamped, node, arguments) if arguments.memory_frames else {}
+    return rates, memory
+
+
+def _at_rate(
+    probe: Probe, clouds: Any, rate: float, arguments: argparse.Namespace
+) -> dict[str, Any]:
+    from gp_ground_seg.ros.probe import rate_result
+
+    n = arguments.frames
+    with progress_bar(n, quiet=arguments.quiet, title=f'{rate:g} Hz') as bar:
+        _, dropped_before = probe.counters()
+        trips = probe.paced(itertools.islice(clouds, n), rate, bar.update)
+        _, dropped = probe.counters()
+    return rate_result(rate, trips, dropped - dropped_before)
+
+
+def _memory(
+    probe: Probe, clouds: Any, node: NodeProcess, arguments: argparse.Namespace
+) -> dict[str, float]:
+    from gp_ground_seg.ros.probe import memory, memory_result
+
+    n = arguments.memory_frames
+    resident: list[int] = []
+    with progress_bar(n, quiet=arguments.quiet, title='memory') as bar:
+
+        def watch(trip: Trip) -> None:
+            if trip.back is None:
+                node.check()
+                raise GroundSegError(
+                    f'no answer to a cloud; the last words of the node:\n{node.log_tail()}'
+                )
+            resident.append(memory(node.pid)[0])
+            bar.update()
+
+        probe.one_by_one(itertools.islice(clouds, n), watch)
+    return memory_result(resident, memory(node.pid)[1])
+
+
+def _rate_goals(rate: dict[str, Any]) -> dict[str, bool]:
+    goals = {
+        'newest cloud back': rate['is_newest_back'],
+        'losses reported': rate['is_accounted'],
+        'latency bounded': rate['is_bounded'],
+    }
+    if rate['asked'] <= LOSSLESS_RATE:
+        goals['nothing lost'] = rate['n_lost'] == 0
+    if rate['asked'] <= PUNCTUAL_RATE:
+        goals[f'p99 at most {1e3 * MAX_P99:.0f} ms'] = rate['p99'] <= MAX_P99
+    return goals
+
+
+def _memory_goals(memory: dict[str, float]) -> dict[str, bool]:
+    return {
+        f'peak below {MAX_PEAK / 1e6:.0f} MB': memory['peak'] < MAX_PEAK,
+        f'growth at most {MAX_GROWTH:.0%}': memory['growth'] <= MAX_GROWTH,
+    }
+
+
+def _goals_missed(document: dict[str, Any]) -> list[str]:
+    goals = [(f'{rate["asked"]:g} Hz', rate['goals']) for rate in document['rates']]
+    if document['memory']:
+        goals.append(('memory', document['memory']['goals']))
+    return [f'{where}: {goal}' for where, row in goals for goal, met in row.items() if not met]
+
+
+def _text(document: dict[str, Any], missed: Sequence[str]) -> str:
+    from gp_ground_seg.evaluation.table import Column, Table
+
+    columns = {
+        'asked': Column('Rate [Hz]', 'g'),
+        'sent': Column('sent [Hz]', '.2f'),
+        'n_sent': Column('sent', 'd'),
+        'n_back': Column('back', 'd'),
+        'n_lost': Column('lost', 'd'),
+        'n_dropped': Column('reported', 'd'),
+        'p50': Column('p50 [ms]', '.1f', scale=1e3),
+        'p95': Column('p95', '.1f', scale=1e3),
+        'p99': Column('p99', '.1f', scale=1e3),
+        'worst': Column('worst', '.1f', scale=1e3),
+    }
+    rows = [[rate[key] for key in columns] for rate in document['rates']]
+    source, environment, memory = (document[k] for k in ('source', 'environment', 'memory'))
+    parts = [
+        f'{source["data"]}: {source["title"]} of {source["mean_points"]:.0f} points, '
+        f'{source["mean_bytes"] / 1e6:.2f} MB, on average\n'
+        f'{environment["cpu"]}, {environment["n_cores"]} cores',
+        Table(list(columns.values()), rows).text(),
+    ]
+    if memory:
+        parts.append(
+            f'Memory over {memory["n_clouds"]} clouds: {memory["start"] / 1e6:.1f} MB near the '
+            f'start, {memory["end"] / 1e6:.1f} MB at the end ({memory["growth"]:+.2%}); '
+            f'peak {memory["peak"] / 1e6:.1f} MB'
+        )
+    parts.append('Goals missed: ' + '; '.join(missed) if missed else 'All goals met.')
+    return '\n\n'.join(parts)

@@ -169,7 +169,7 @@ class ParameterGroups:
         return _nest(self.flat())
 
     def replace(self, **changes: object) -> Self:
-        """Copy with values changed by name: ``replace(**{'label.ground_tolerance': 0.15})``.
+        """Copy with some values changed, given by dotted names (``**{'grid.r_max': 60.0}``).
 
         Raises ConfigError if a name is unknown or the changed configuration is invalid.
         """

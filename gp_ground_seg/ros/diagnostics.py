@@ -1,69 +1,368 @@
-"""Judged tasks as ``diagnostic_msgs/DiagnosticArray`` on /diagnostics."""
+"""What the node reports on /diagnostics: four tasks, each held at its worst level for a while.
+
+Times ``now`` are those of a steady clock [s].
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from gp_ground_seg.ros.health.status import Level, Status
+from gp_ground_seg.frame import FloatArray, Label
+from gp_ground_seg.parameters.config import DiagnosticsConfig
+from gp_ground_seg.pipeline.sensor_pose import SensorPose
+from gp_ground_seg.result import FitReport, Segmentation
+from gp_ground_seg.ros.status import Hysteresis, Level, Rate, Status
 
-TOPIC = '/diagnostics'
-NANOSECONDS = 1_000_000_000
+CLOUD_WINDOW = 100
+"""Clouds over which percentiles are taken."""
+MIN_RATE_SPAN = 1.0
+"""Shortest time from which the load is computed [s]: a burst is no rate."""
 
 
-class DiagnosticsPublisher:
-    """Publishes what `report` returns, periodically.
+Finding = tuple[Level, str]
 
-    The period is that of a steady clock: with ``use_sim_time`` a timer on the
-    node's clock would not fire before the first /clock, nor while a bag is paused.
 
-    Parameters
-    ----------
-    node : Node
-        Node that publishes.
-    report : callable
-        Returns the statuses; called in the executor of the node.
-    period : float
-        Time between two reports [s].
+class InputFacts(NamedTuple):
+    """State of the input at the time of a report; `ros_time` is the node's clock [s]."""
+
+    topic: str
+    qos: str
+    n_publishers: int
+    ros_time: float
+    is_simulated: bool = False
+
+
+class InputTask:
+    """Clouds that arrived, and those that were refused."""
+
+    def __init__(self, now: float) -> None:
+        self._last_arrival = now
+        self._arrivals = Rate()
+        self._n_refused = self._n_time_jumps = 0
+        # Clouds of the newest reporting period that had any.
+        self._n_recent = self._n_refused_recent = 0
+        self._is_reported = True
+        self._frame = self._fields = self._last_error = ''
+        self._stamp: float | None = None
+
+    def arrived(self, now: float, stamp: float, frame: str, fields: Sequence[str]) -> None:
+        """Count a cloud; `stamp` is the time in its header [s]."""
+        if self._is_reported:
+            self._n_recent = self._n_refused_recent = 0
+            self._is_reported = False
+        self._n_recent += 1
+        self._last_arrival = now
+        self._arrivals.count(now)
+        self._stamp, self._frame, self._fields = stamp, frame, ' '.join(fields)
+
+    def refused(self, reason: str) -> None:
+        """Count the cloud that arrived last as one that could not be processed."""
+        self._n_refused_recent += 1
+        self._n_refused += 1
+        self._last_error = reason
+
+    def time_jumped(self) -> None:
+        """Count a jump back in time; the age of earlier stamps has no meaning after it."""
+        self._n_time_jumps += 1
+        self._stamp = None
+
+    def report(self, now: float, facts: InputFacts, limits: DiagnosticsConfig) -> Status:
+        """Judge the time since the last report."""
+        self._is_reported = True
+        n_events, span, rate = self._arrivals.window(now)
+        age = None if self._stamp is None else facts.ros_time - self._stamp
+        values = {
+            'Topic': facts.topic,
+            'Publishers': str(facts.n_publishers),
+            'QoS': facts.qos,
+            'Events since startup': str(self._arrivals.n_total),
+            'Events in window': str(n_events),
+            'Duration of window (s)': f'{span:.3f}',
+            'Actual frequency (Hz)': _digits(rate, '.2f'),
+            'Time since last cloud (s)': f'{now - self._last_arrival:.3f}',
+            'Age of last stamp (s)': _digits(age, '.3f'),
+            'Clock': 'simulated, from /clock' if facts.is_simulated else 'system time',
+            'Time jumps since startup': str(self._n_time_jumps),
+            'Frame': self._frame,
+            'Fields': self._fields,
+            'Refused since startup': str(self._n_refused),
+            'Last error': self._last_error,
+        }
+        return Status('input', *self._judge(now, facts, limits), values)
+
+    def _judge(self, now: float, facts: InputFacts, limits: DiagnosticsConfig) -> Finding:
+        silence, topic = now - self._last_arrival, facts.topic
+        n_received, n_refused = self._n_recent, self._n_refused_recent
+        if silence > limits.stale_after:
+            source = f'publishers: {facts.n_publishers}' if facts.n_publishers else 'nobody sends'
+            return Level.STALE, f'no cloud on {topic} for {silence:.1f} s ({source})'
+        if n_received == 0:
+            return Level.OK, f'waiting for the first cloud on {topic}'
+        # A stamp may be of any age: a recording is played at any time.
+        if n_refused == 0:
+            return Level.OK, 'receiving'
+        share = 'every cloud' if n_refused == n_received else f'{n_refused} of {n_received} clouds'
+        is_error = n_refused > min(limits.max_refused_ratio * n_received, n_received - 1)
+        return Level.ERROR if is_error else Level.WARN, f'{share} refused: {self._last_error}'
+
+
+class ProcessingTask:
+    """Latencies, load and losses."""
+
+    def __init__(self) -> None:
+        self._latencies: deque[float] = deque(maxlen=CLOUD_WINDOW)
+        self._durations: deque[float] = deque(maxlen=CLOUD_WINDOW)
+        self._stages: deque[Mapping[str, float]] = deque(maxlen=CLOUD_WINDOW)
+        self._sent = Rate()
+        self._n_processed = self._n_dropped = 0
+        self._n_sent_recent = self._n_dropped_recent = 0
+        self._backend, self._n_threads = '', 0
+
+    def arrived(self, now: float, n_lost: int) -> None:
+        """Count a cloud that arrived, and `n_lost` sent just before it that did not."""
+        self._sent.count(now, 1 + n_lost)
+        self._n_sent_recent += 1 + n_lost
+        self._n_dropped += n_lost
+        self._n_dropped_recent += n_lost
+
+    def processed(self, duration: float, stages: Mapping[str, float], fit: FitReport) -> None:
+        """Count a cloud whose processing took `duration`, after a wait of ``queue`` [s].
+
+        `stages` are its steps [s], ``queue`` among them.
+        """
+        self._n_processed += 1
+        self._latencies.append(stages['queue'] + duration)
+        self._durations.append(duration)
+        self._stages.append(stages)
+        self._backend, self._n_threads = fit.backend, fit.n_threads
+
+    def load(self, now: float) -> float | None:
+        """Time that the clouds sent in a second take to process [s/s]; None if unknown."""
+        _, span, rate = self._sent.window(now)
+        if rate is None or not self._durations or span < MIN_RATE_SPAN:
+            return None
+        return rate * float(np.median(self._durations))
+
+    def report(self, now: float, limits: DiagnosticsConfig) -> Status:
+        """Judge the latest clouds, and the losses since the last report."""
+        level, message = self._judge(now, limits)
+        self._n_sent_recent = self._n_dropped_recent = 0
+        load = self.load(now)
+        values = {
+            'Clouds since startup': str(self._n_processed),
+            'Clouds in window': str(len(self._latencies)),
+            'Dropped since startup': str(self._n_dropped),
+            'Load (%)': _digits(None if load is None else 100.0 * load, '.1f'),
+            **_percentiles('Latency', self._latencies),
+        }
+        for stage in self._stages[-1] if self._stages else ():
+            times = [stages[stage] for stages in self._stages if stage in stages]
+            values.update(_percentiles(f'Stage {stage}', times))
+        values.update({'Backend': self._backend, 'Threads': str(self._n_threads)})
+        return Status('processing', level, message, values)
+
+    def _judge(self, now: float, limits: DiagnosticsConfig) -> Finding:
+        if not self._latencies:
+            return Level.OK, 'no cloud processed yet'
+        latency = 1e3 * float(np.median(self._latencies))
+        duration, max_latency = 1e3 * float(np.median(self._durations)), 1e3 * limits.max_latency
+        load = self.load(now)
+        n_dropped, n_sent = self._n_dropped_recent, self._n_sent_recent
+        faults = []
+        if latency > max_latency:
+            faults.append(f'median latency {latency:.0f} ms, above {max_latency:g} ms')
+        if load is not None and load > limits.max_load:
+            faults.append(f'{duration:.0f} ms per cloud at {1e3 * load / duration:.1f} Hz')
+        if n_dropped > limits.max_drop_ratio * n_sent:
+            faults.append(f'{n_dropped} of {n_sent} clouds dropped since the last report')
+        if faults:
+            return Level.WARN, f'too slow for the input: {"; ".join(faults)}'
+        return Level.OK, f'median latency {latency:.1f} ms'
+
+
+def frame_quality(fit: FitReport, n_occupied: int, certainty: float) -> float:
+    """Return how reliable a frame is, from 0 to 1.
+
+    The product of three shares: segments with a model among the `n_occupied` that hold
+    candidates, inliers among the candidates, certainty of the labels (if not NaN).
+    """
+    if fit.status == 'failed' or not fit.n_candidates or not n_occupied:
+        return 0.0
+    shares = min(1.0, fit.n_segments / n_occupied), fit.n_inliers / fit.n_candidates
+    return shares[0] * shares[1] * (1.0 if np.isnan(certainty) else certainty)
+
+
+class ModelTask:
+    """The newest scan; its statistics are computed for a report only."""
+
+    def __init__(self) -> None:
+        self._newest: Segmentation | None = None
+        self._n_learned = 0
+
+    def segmented(self, segmentation: Segmentation) -> None:
+        """Keep a scan."""
+        self._newest = segmentation
+        self._n_learned += segmentation.fit.n_evaluations > 0
+
+    def report(self, limits: DiagnosticsConfig) -> Status:
+        """Judge the newest scan."""
+        scan = self._newest
+        if scan is None:
+            return Status('model', Level.OK, 'no cloud segmented yet', {})
+        fit, label = scan.fit, scan.label
+        n_occupied = int(np.count_nonzero(np.diff(scan.candidates.offsets)))
+        has_model = np.isfinite(scan.ground_z)
+        certainty = _mean(np.abs(2.0 * scan.p_ground[has_model] - 1.0))
+        quality = frame_quality(fit, n_occupied, certainty)
+        without_model = _mean(~has_model & (label != Label.UNKNOWN))
+        per_candidate = fit.n_inliers / fit.n_candidates if fit.n_candidates else np.nan
+        values = {
+            'frame_quality': f'{quality:.3f}',
+            'Segments with a model': f'{fit.n_segments} of {len(scan.surface.mean)}',
+            'Segments with candidates': str(n_occupied),
+            'Ground fraction': _digits(_mean(label == Label.GROUND), '.4f'),
+            'Unknown fraction': _digits(_mean(label == Label.UNKNOWN), '.4f'),
+            'Fraction without model': _digits(without_model, '.4f'),
+            'Label certainty': _digits(certainty, '.3f'),
+            'Candidates': str(fit.n_candidates),
+            'Inliers': str(fit.n_inliers),
+            **_pose_values(scan.pose),
+            'Noise (m)': _digits(fit.theta.get('sigma_n'), '.4g'),
+            'Learning mode': fit.mode,
+            'Learned since startup': str(self._n_learned),
+            'Optimiser status': fit.status,
+            'Evaluations': str(fit.n_evaluations),
+            'At bound': ' '.join(fit.at_bound) or 'none',
+            'Objective per candidate': _digits(fit.objective * per_candidate, '.4f'),
+            **{f'theta {name}': f'{value:.4g}' for name, value in fit.theta.items()},
+        }
+        level, message = Level.WARN, f'frame quality {quality:.2f}'
+        if scan.pose.contradictions:
+            message = '; '.join(scan.pose.contradictions)
+        elif not fit.n_segments:
+            message = 'no ground found in the newest cloud'
+        elif fit.status == 'failed':
+            message = 'the hyper-parameters could not be learned'
+        elif quality < limits.min_quality:
+            message += f', below {limits.min_quality:g}'
+        else:
+            level = Level.OK
+        return Status('model', level, message, values)
+
+
+def _pose_values(pose: SensorPose) -> dict[str, str]:
+    names = ('height', 'roll', 'pitch')
+    taken = [name for name in names if getattr(pose, f'{name}_estimated')]
+    seen = pose.measured
+    has_height, has_tilt = (seen.tells_height, seen.tells_tilt) if seen else (False, False)
+    return {
+        'Sensor height (m)': f'{pose.height:.4f}',
+        'Sensor roll (rad)': f'{pose.roll:.4f}',
+        'Sensor pitch (rad)': f'{pose.pitch:.4f}',
+        'Taken from the scan': ' '.join(taken) or 'nothing',
+        'Estimated height (m)': _digits(seen.height if seen and has_height else None, '.4f'),
+        'Estimated roll (rad)': _digits(seen.roll if seen and has_tilt else None, '.4f'),
+        'Estimated pitch (rad)': _digits(seen.pitch if seen and has_tilt else None, '.4f'),
+    }
+
+
+class OutputTask:
+    """Messages per topic."""
+
+    def __init__(self) -> None:
+        self._rates: defaultdict[str, Rate] = defaultdict(Rate)
+
+    def published(self, now: float, topics: Sequence[str]) -> None:
+        """Count one message on each of the `topics`."""
+        for topic in topics:
+            self._rates[topic].count(now)
+
+    def report(self, now: float, n_subscribers: Mapping[str, int]) -> Status:
+        """List all topics, with their subscribers."""
+        values = {}
+        for topic, n in n_subscribers.items():
+            values[f'{topic} subscribers'] = str(n)
+            values[f'{topic} rate (Hz)'] = _digits(self._rates[topic].window(now)[2], '.2f')
+            values[f'{topic} since startup'] = str(self._rates[topic].n_total)
+        heard = [topic for topic, n in n_subscribers.items() if n]
+        message = f'subscribed to: {", ".join(heard)}' if heard else 'nobody subscribes'
+        return Status('output', Level.OK, message, values)
+
+
+State = tuple[InputFacts, Mapping[str, int]]
+"""State of the input, and the number of subscribers of each output topic."""
+
+
+class Diagnostics:
+    """The four tasks of `node`, published every ``diagnostics.period`` of a steady clock.
+
+    With ``use_sim_time``, a timer on the node's clock would not fire before the first
+    /clock, nor while a bag is paused. `limits` are the parameters ``diagnostics``.
     """
 
-    def __init__(self, node: Node, report: Callable[[], Iterable[Status]], period: float) -> None:
-        self._node = node
-        self._report = report
-        self._publisher = node.create_publisher(DiagnosticArray, TOPIC, 10)
+    def __init__(self, node: Node, state: Callable[[], State], limits: DiagnosticsConfig) -> None:
+        self.input = InputTask(time.monotonic())
+        self.processing, self.model, self.output = ProcessingTask(), ModelTask(), OutputTask()
+        self._node, self._state, self._limits = node, state, limits
+        self._hysteresis: defaultdict[str, Hysteresis] = defaultdict(Hysteresis)
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(period, self._publish, clock=steady)
+        self._timer = node.create_timer(limits.period, self._publish, clock=steady)
 
-    def set_period(self, period: float) -> None:
-        """Change the time between two reports [s]; the next one comes that much from now."""
-        period_ns = round(period * NANOSECONDS)
-        if period_ns != self._timer.timer_period_ns:
-            self._timer.timer_period_ns = period_ns
+    def configure(self, limits: DiagnosticsConfig) -> None:
+        """Use `limits` from now on; with another period, the next report comes after it."""
+        if limits.period != self._limits.period:
+            self._timer.timer_period_ns = round(1e9 * limits.period)
             self._timer.reset()
+        self._limits = limits
+
+    def report(self, now: float) -> list[Status]:
+        """Return the status of each task."""
+        facts, n_subscribers = self._state()
+        found = (
+            self.input.report(now, facts, self._limits),
+            self.processing.report(now, self._limits),
+            self.model.report(self._limits),
+            self.output.report(now, n_subscribers),
+        )
+        recover_after = self._limits.recover_after
+        return [self._hysteresis[s.task].hold(now, s, recover_after) for s in found]
 
     def _publish(self) -> None:
         array = DiagnosticArray()
         array.header.stamp = self._node.get_clock().now().to_msg()
         node_name = self._node.get_fully_qualified_name().lstrip('/')
         try:
-            statuses = list(self._report())
+            statuses = self.report(time.monotonic())
         except Exception as error:
-            # Out of here it would end the node, for the sake of a report.
+            # Raised from a timer, it would end the node.
             statuses = [Status('diagnostics', Level.ERROR, f'{type(error).__name__}: {error}', {})]
-        array.status = [to_message(status, node_name) for status in statuses]
+        for status in statuses:
+            message = DiagnosticStatus(level=bytes([status.level]), message=status.message)
+            message.name, message.hardware_id = f'{node_name}: {status.task}', 'none'
+            message.values = [KeyValue(key=k, value=v) for k, v in status.values.items()]
+            array.status.append(message)
         self._publisher.publish(array)
 
 
-def to_message(status: Status, node_name: str) -> DiagnosticStatus:
-    """Return `status` as a message named ``node: task``."""
-    return DiagnosticStatus(
-        level=bytes([status.level]),
-        name=f'{node_name}: {status.task}',
-        message=status.message,
-        hardware_id='none',
-        values=[KeyValue(key=key, value=value) for key, value in status.values.items()],
-    )
+def _digits(value: float | None, form: str) -> str:
+    return 'unknown' if value is None or np.isnan(value) else format(value, form)
+
+
+def _mean(values: npt.NDArray[np.bool_] | FloatArray) -> float:
+    return float(np.mean(values)) if len(values) else np.nan
+
+
+def _percentiles(name: str, seconds: Sequence[float]) -> dict[str, str]:
+    percents = (50, 95, 99) if seconds else ()
+    return {f'{name} p{q} (ms)': f'{1e3 * np.percentile(seconds, q):.2f}' for q in percents}

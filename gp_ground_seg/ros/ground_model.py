@@ -1,6 +1,6 @@
 """``~/ground_model``: the estimated surface as a cloud, and back.
 
-In a node of yours::
+In another node::
 
     from gp_ground_seg.ros.ground_model import read_ground_model
 
@@ -10,8 +10,6 @@ In a node of yours::
 
 from __future__ import annotations
 
-from array import array
-
 import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
@@ -19,15 +17,16 @@ from gp_ground_seg.data.point_cloud2 import read_columns
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.result import Segmentation
+from gp_ground_seg.ros.input import message_data
 
 FIELDS = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
-"""Fields of the cloud, all float32 [m, rad]. The last three are what it takes to find a place in
-the grid: the horizontal range of the knot in the level frame, and the same angles in each
-point, which turn the cloud's frame into the level one."""
+"""Fields of the cloud, all float32 [m, rad]. The last three locate a place in the grid: the
+horizontal range of the knot in the level frame, and the angles, equal in all points, that turn
+the cloud's frame into the level one."""
 
 
 def ground_model_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud2:
-    """Surface of a segmented `cloud` as an organised cloud with the header of `cloud`.
+    """Return the surface of a segmented `cloud` as an organised cloud with its header.
 
     Row m is segment m, counter-clockwise from -x of the level frame; column k is the k-th
     range. The coordinates and std are NaN where there is no model, length_scale in
@@ -42,8 +41,6 @@ def ground_model_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointC
         points[..., 4] = model.length_scale
         points[..., 5] = model.knots
         points[..., 6:] = model.roll, model.pitch
-    data = array('B')
-    data.frombytes(points.tobytes())
     message = PointCloud2(
         header=cloud.header,
         height=n_segments,
@@ -57,7 +54,7 @@ def ground_model_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointC
         row_step=4 * len(FIELDS) * n_knots,
         is_dense=bool(np.isfinite(points).all()),
     )
-    message.data = data
+    message.data = message_data(points)
     return message
 
 

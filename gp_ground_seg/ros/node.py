@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from collections.abc import Sequence
@@ -13,32 +14,33 @@ from rclpy.clock_type import ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.backend import choose_backend
+from gp_ground_seg.backend import NumpyBackend, choose_backend
+from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.errors import GroundSegError, PointCloudError
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.points import single_precision
-from gp_ground_seg.ros.cloud_subscription import Arrival, CloudSubscription
-from gp_ground_seg.ros.diagnostics import DiagnosticsPublisher
-from gp_ground_seg.ros.health.health import Health
-from gp_ground_seg.ros.health.input import InputFacts
-from gp_ground_seg.ros.health.status import Status
-from gp_ground_seg.ros.library_log import LibraryLog
+from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
+from gp_ground_seg.ros.input import (
+    LOG_PERIOD,
+    Arrival,
+    CloudSubscription,
+    TimeJumps,
+    in_words,
+)
+from gp_ground_seg.ros.lifecycle import (
+    initialize,
+    large_cloud_transport,
+    start_errors,
+    stop_on_signals,
+)
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
-from gp_ground_seg.ros.point_cloud2 import read_xyz
-from gp_ground_seg.ros.qos import in_words
-from gp_ground_seg.ros.signals import stop_on_signals
-from gp_ground_seg.ros.startup import initialize, start_errors
 from gp_ground_seg.ros.tf_tilt import TfTilt, require_tf2
-from gp_ground_seg.ros.time_jumps import TimeJumps
-from gp_ground_seg.ros.transport import large_cloud_transport
-from gp_ground_seg.ros.warm_up import warm_up
+from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader, LibraryLog
 from gp_ground_seg.segmenter import GroundSegmenter
 
 NODE_NAME = 'ground_segmentation_node'
 INPUT_TOPIC = 'points'
-LOG_PERIOD = 5.0
-"""Shortest time between two messages about bad clouds [s]."""
 LONGEST_WAIT = 0.1
 """Time after which a signal is seen at the latest [s]."""
 
@@ -46,33 +48,31 @@ LONGEST_WAIT = 0.1
 class GroundSegmentationNode(ConfiguredNode):
     """Subscribes to ``points``, publishes ``ground``, ``obstacles`` and /diagnostics.
 
-    Each output keeps the header and every field of the input, bit for bit; a
-    finite point is in exactly one of the two clouds, another one in neither.
-    Parameters are those of `gp_ground_seg.parameters.config` and may change at any time;
-    a change takes effect with the next cloud.
+    Each output keeps the header and every field of the input, bit for bit; a finite point
+    is in exactly one of the two clouds, another one in neither. Parameters are those of
+    `gp_ground_seg.parameters.config`; a change takes effect with the next cloud.
 
-    Latency is the time between the arrival of a cloud in this process and the
-    publication of the results, its wait in the queue included. Clouds are counted
-    as dropped where the publisher's own numbering has a hole, see `SequenceGaps`.
+    The first clouds are segmented with numpy. The compiled backend, if the parameters ask
+    for it, is made meanwhile, and takes over between two clouds.
 
-    Parameters
-    ----------
-    **options
-        Those of `rclpy.node.Node`.
-
-    Raises
-    ------
-    ConfigError
-        If a given parameter is not accepted.
+    Latency is the time between the arrival of a cloud in this process and the publication of
+    the results, its wait in the queue included. Clouds are counted as dropped where the
+    publisher's own numbering has a hole, see `SequenceGaps`.
+    Options are those of `rclpy.node.Node`. Raises a ConfigError if a given parameter is not
+    accepted.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
         self._library_log = LibraryLog(self.get_logger())
-        self._segmenter = GroundSegmenter(self.config)
+        self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
+        self._is_compiled = False
         self._tf: TfTilt | None = None
         # For throttled messages; the default system clock may jump.
         self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        # A guard condition runs in the executor, between two callbacks.
+        self._loaded = self.create_guard_condition(self._change_backend)
+        self._loader = BackendLoader(self._loaded.trigger)
         try:
             self._start()
         except BaseException:
@@ -84,17 +84,12 @@ class GroundSegmentationNode(ConfiguredNode):
         logger.info(f'effective configuration:\n{describe(self.config)}')
         with start_errors():
             self._outputs = OutputPublishers(self)
-        logger.info(f'ready to segment after {warm_up(self._segmenter):.1f} s')
-        # Only now: a cloud that came earlier would have waited for the compiler.
-        self._health = Health(time.monotonic())
+            self._input = CloudSubscription(self, INPUT_TOPIC, self.is_given, self._on_cloud)
         self._follow_tf(self.config)
         self._time_jumps = TimeJumps(self, self._on_time_jump)
-        with start_errors():
-            self._input = CloudSubscription(self, INPUT_TOPIC, self.is_given, self._on_cloud)
-        self._diagnostics = DiagnosticsPublisher(
-            self, self._report, self.config.diagnostics.period
-        )
+        self._diagnostics = Diagnostics(self, self._state, self.config.diagnostics)
         self.warn_of_unused_parameters()
+        self._load_backend(self.config)
         logger.info(f'listening to {self._input.topic} ({in_words(self._input.qos)})')
 
     def check_config(self, config: Config) -> None:
@@ -104,10 +99,32 @@ class GroundSegmentationNode(ConfiguredNode):
             require_tf2()
 
     def apply_config(self, config: Config) -> None:
-        """Use `config` from the next cloud on."""
-        self._segmenter.configure(config)
+        """Use `config` from the next cloud on; its compiled backend once that is there."""
+        self._load_backend(config)
+        runtime = config.runtime if self._is_compiled else self._segmenter.config.runtime
+        self._segmenter.configure(dataclasses.replace(config, runtime=runtime))
         self._follow_tf(config)
-        self._diagnostics.set_period(config.diagnostics.period)
+        self._diagnostics.configure(config.diagnostics)
+
+    def _load_backend(self, config: Config) -> None:
+        if not self._loader.is_started and choose_backend(config.runtime.backend) == 'numba':
+            self.get_logger().info(FOLLOWS)
+            self._loader.start(config)
+
+    def _change_backend(self) -> None:
+        """Use the compiled backend from the next cloud on, if the parameters still say so."""
+        backend = self._loader.take_backend()
+        if backend is None:
+            self.get_logger().warning(f'{STAYS}: {self._loader.error}')
+            return
+        self._is_compiled = True
+        if choose_backend(self.config.runtime.backend) == 'numba':
+            self._segmenter.use_backend(backend)
+            self.get_logger().info(f'{CHANGED}, after {self._loader.seconds:.1f} s')
+        else:
+            backend.close()
+        # Where `runtime` has changed meanwhile, this makes another one.
+        self._segmenter.configure(self.config)
 
     def _follow_tf(self, config: Config) -> None:
         """Listen to TF while the parameters ask for it."""
@@ -118,15 +135,17 @@ class GroundSegmentationNode(ConfiguredNode):
             self._tf = None
 
     def _tilt(self, cloud: PointCloud2) -> tuple[float, float] | None:
-        """Roll and pitch of the frame of `cloud` by TF; None where they are parameters."""
+        """Return roll and pitch of the frame of `cloud` by TF; None if they are parameters."""
         if self._tf is None:
             return None
         return self._tf.tilt(cloud.header.frame_id, cloud.header.stamp, self.config.frame.base)
 
     def destroy_node(self) -> None:
         """Free what the node holds, the worker threads too."""
-        # The network first: worker threads may be compiling, and then end late.
+        self._loader.stop()
+        # The network before the threads: they may end late.
         super().destroy_node()
+        self._loader.close()
         self._segmenter.close()
         self._library_log.close()
 
@@ -134,9 +153,10 @@ class GroundSegmentationNode(ConfiguredNode):
         start = time.monotonic()
         stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
         fields = [field.name for field in cloud.fields]
+        health = self._diagnostics
         self._time_jumps.note(stamp)
-        self._health.input.arrived(start, stamp, cloud.header.frame_id, fields)
-        self._health.processing.arrived(start, arrival.n_lost)
+        health.input.arrived(start, stamp, cloud.header.frame_id, fields)
+        health.processing.arrived(start, arrival.n_lost)
         try:
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
@@ -146,42 +166,32 @@ class GroundSegmentationNode(ConfiguredNode):
         except PointCloudError as error:
             self._refuse(cloud, str(error))
         except Exception as error:
-            # Whatever one cloud brings about, the next one may be good.
+            # The next cloud may be good.
             self._refuse(cloud, f'{type(error).__name__}: {error}')
         else:
             end = time.monotonic()
-            fit = segmentation.fit
-            self._health.processing.processed(
-                latency=arrival.wait + end - start,
-                duration=end - start,
-                stages={
-                    'queue': arrival.wait,
-                    **segmentation.timings,
-                    'publish': end - segmented,
-                },
-                backend=fit.backend,
-                n_threads=fit.n_threads,
-            )
-            self._health.model.segmented(segmentation)
-            self._health.output.published(end, topics)
+            stages = {'queue': arrival.wait, **segmentation.timings, 'publish': end - segmented}
+            health.processing.processed(end - start, stages, segmentation.fit)
+            health.model.segmented(segmentation)
+            health.output.published(end, topics)
 
     def _on_time_jump(self) -> None:
         self._segmenter.reset()
         if self._tf is not None:
             self._tf.reset()
-        self._health.input.time_jumped()
+        self._diagnostics.input.time_jumped()
 
     def _refuse(self, cloud: PointCloud2, reason: str) -> None:
         if not self.context.ok():
             return  # publishing failed because the process ends
-        self._health.input.refused(reason)
+        self._diagnostics.input.refused(reason)
         self.get_logger().error(
             f'cloud on {self._input.topic} in frame {cloud.header.frame_id!r} refused: {reason}',
             throttle_duration_sec=LOG_PERIOD,
             throttle_time_source_type=self._steady_clock,
         )
 
-    def _report(self) -> list[Status]:
+    def _state(self) -> tuple[InputFacts, dict[str, int]]:
         clock = self.get_clock()
         facts = InputFacts(
             topic=self._input.topic,
@@ -190,24 +200,14 @@ class GroundSegmentationNode(ConfiguredNode):
             ros_time=1e-9 * clock.now().nanoseconds,
             is_simulated=clock.ros_time_is_active,
         )
-        return self._health.report(
-            time.monotonic(), facts, self._outputs.n_subscribers(), self.config.diagnostics
-        )
+        return facts, self._outputs.n_subscribers()
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT, SIGTERM or a shutdown of its context.
+    """Run the node until SIGINT, SIGTERM or a shutdown of its context; return an exit code.
 
-    Parameters
-    ----------
-    args : sequence of str, optional
-        Words after the program's name, ``--ros-args`` among them; those of the
-        process by default.
-
-    Returns
-    -------
-    int
-        Exit code: 0, or 2 for an error at start, said in one line.
+    `args` are the words after the program's name, those of the process by default. The code
+    is 0, or 2 for an error at start, reported in one line.
     """
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None

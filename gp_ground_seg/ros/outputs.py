@@ -1,39 +1,43 @@
-"""What the node publishes of a segmented cloud: one row per topic."""
+"""What the node publishes of a segmented cloud: one `Output` per topic."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import PointCloud2, PointField
 
-from gp_ground_seg.frame import Label
+from gp_ground_seg.data.point_cloud2 import append_columns, read_xyz
+from gp_ground_seg.frame import FloatArray, IntArray, Label
+from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.plotting.style import length_scale_colours
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.ros.ground_model import ground_model_cloud
-from gp_ground_seg.ros.labelled import FIELDS, free_names, labelled_cloud
-from gp_ground_seg.ros.point_cloud2 import select_points
-from gp_ground_seg.ros.qos import cloud_profile
+from gp_ground_seg.ros.input import cloud_profile, message_data, select_points
+
+LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'p_ground')
+"""Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
+
+# rclpy takes some microseconds for each vertex: the markers are thinned to what can be told
+# apart by eye, so that a viewer costs the node less than the segmentation itself.
+MAX_PROFILES = 60
+MAX_KNOTS = 24
+N_STD = 2.0
+"""Half width of the band in standard deviations."""
+LINE_WIDTH = 0.04
+"""[m]."""
+BAND_COLOUR = (0.75, 0.75, 0.75, 0.35)
 
 
-@dataclass(frozen=True)
-class Output:
-    """One output topic.
+class Output(NamedTuple):
+    """One output topic, relative; an optional one is built only while it has a subscriber.
 
-    Attributes
-    ----------
-    topic : str
-        Relative name.
-    message_type : type
-        Type of the message.
-    build : callable
-        Makes the message from the cloud that came in, its segmentation and the
-        parameters it was made with.
-    is_optional : bool
-        Whether it is built only while somebody subscribes.
+    `build` makes the message from the input cloud, its segmentation and the parameters.
     """
 
     topic: str
@@ -42,53 +46,150 @@ class Output:
     is_optional: bool
 
 
+def labelled_names(taken: Iterable[str]) -> dict[str, str]:
+    """Return the name of each of `LABELLED_FIELDS` in a cloud whose fields are `taken`.
+
+    A field of the input keeps its name; ours gets ``gp_`` in front, as often as needed.
+    """
+    used = set(taken)
+    names = {}
+    for field in LABELLED_FIELDS:
+        name = field
+        while name in used:
+            name = f'gp_{name}'
+        used.add(name)
+        names[field] = name
+    return names
+
+
+def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud2:
+    """Return `cloud` with `LABELLED_FIELDS` added to every point.
+
+    Header, order, shape and every byte of every point are the input's; padding of the rows is
+    left out. ``is_dense`` tells whether the coordinates and all added values are finite.
+    """
+    names = labelled_names(field.name for field in cloud.fields)
+    columns: dict[str, npt.NDArray[np.uint8] | npt.NDArray[np.float32]] = {}
+    is_dense = bool(np.isfinite(read_xyz(cloud)).all())
+    for field, name in names.items():
+        values = getattr(segmentation, field)
+        if field != 'label':
+            with np.errstate(over='ignore'):
+                values = values.astype(np.float32, copy=False)
+            is_dense = is_dense and bool(np.isfinite(values).all())
+        columns[name] = values
+    wide = append_columns(cloud, columns)
+    added = [
+        PointField(name=name, offset=offset, datatype=datatype, count=1)
+        for name, offset, datatype in wide.columns
+    ]
+    message = PointCloud2(
+        header=cloud.header,
+        height=cloud.height,
+        width=cloud.width,
+        fields=[*cloud.fields, *added],
+        is_bigendian=cloud.is_bigendian,
+        point_step=wide.point_step,
+        row_step=cloud.width * wide.point_step,
+        is_dense=is_dense,
+    )
+    message.data = message_data(wide.data)
+    return message
+
+
+def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> Any:
+    """Return the ground model as a MarkerArray in the frame of `cloud`.
+
+    ``profiles``: ground height over range, coloured by length-scale from
+    ``length_scale.min`` (dark blue) to ``length_scale.max`` (pale yellow), grey where
+    there is none. ``band``: two standard deviations about it, vertical. Neither is drawn
+    where the standard deviation is above ``label.ground_tolerance``.
+    """
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    model = GroundModel.of(segmentation)
+    grid = np.ix_(_thin(len(model.height), MAX_PROFILES), _thin(len(model.knots), MAX_KNOTS))
+    points, std = model.knot_points()[grid], model.std[grid]
+    known = np.isfinite(points).all(axis=-1) & (std <= config.label.ground_tolerance)
+    # Left ends of the pieces between two knots that are both known.
+    left = np.flatnonzero(np.pad(known[:, :-1] & known[:, 1:], ((0, 0), (0, 1))))
+
+    ends = np.stack([left, left + 1], axis=-1).ravel()
+    profiles = _marker(cloud, 'profiles', Marker.LINE_LIST, points.reshape(-1, 3), ends)
+    profiles.scale.x = LINE_WIDTH
+    rgb = length_scale_colours(
+        model.length_scale[grid], config.length_scale.min, config.length_scale.max
+    )
+    profiles.colors = _colours(rgb.reshape(-1, 3)[ends])
+
+    upper = points.size // 3
+    corners = [left, left + 1, left + upper, left + 1, left + 1 + upper, left + upper]
+    edges = [model.knot_points(sign * N_STD)[grid].reshape(-1, 3) for sign in (-1.0, 1.0)]
+    index = np.stack(corners, axis=-1).ravel()
+    band = _marker(cloud, 'band', Marker.TRIANGLE_LIST, np.concatenate(edges), index)
+    band.scale.x = band.scale.y = band.scale.z = 1.0
+    band.color.r, band.color.g, band.color.b, band.color.a = BAND_COLOUR
+    return MarkerArray(markers=[profiles, band])
+
+
+def _thin(count: int, most: int) -> IntArray:
+    """Return up to `most` indices below `count`, evenly spread, with the first and the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+
+
+def _marker(
+    cloud: PointCloud2, name: str, kind: int, vertices: FloatArray, index: IntArray
+) -> Any:
+    from geometry_msgs.msg import Point
+    from visualization_msgs.msg import Marker
+
+    # Viewers warn of a marker without vertices: it is deleted.
+    action = Marker.ADD if len(index) else Marker.DELETE
+    marker = Marker(header=cloud.header, ns=name, id=0, type=kind, action=action)
+    marker.pose.orientation.w = 1.0
+    # Pieces share the messages of their vertices: making them takes most of the time.
+    used = {}
+    for k in np.unique(index).tolist():
+        x, y, z = vertices[k].tolist()
+        used[k] = Point(x=x, y=y, z=z)
+    marker.points = [used[k] for k in index.tolist()]
+    return marker
+
+
+def _colours(rgb: FloatArray) -> list[Any]:
+    """Return the message of each colour (N, 3); similar ones share one."""
+    from std_msgs.msg import ColorRGBA
+
+    keys = [tuple(row) for row in np.rint(rgb * 50.0).astype(int).tolist()]
+    shared = {
+        (r, g, b): ColorRGBA(r=r / 50.0, g=g / 50.0, b=b / 50.0, a=1.0) for r, g, b in set(keys)
+    }
+    return [shared[key] for key in keys]
+
+
 def _points_with(label: Label) -> Callable[[PointCloud2, Segmentation, Config], PointCloud2]:
-    def build(cloud: PointCloud2, segmentation: Segmentation, _config: Config) -> PointCloud2:
-        return select_points(cloud, segmentation.label == label)
-
-    return build
+    return lambda cloud, segmentation, _config: select_points(cloud, segmentation.label == label)
 
 
-def _labelled(cloud: PointCloud2, segmentation: Segmentation, _config: Config) -> PointCloud2:
-    return labelled_cloud(cloud, segmentation)
-
-
-def _ground_model(cloud: PointCloud2, segmentation: Segmentation, _config: Config) -> PointCloud2:
-    return ground_model_cloud(cloud, segmentation)
-
-
-LABELLED = Output('~/labeled', PointCloud2, _labelled, is_optional=True)
+LABELLED = Output('~/labeled', PointCloud2, lambda c, s, _: labelled_cloud(c, s), True)
 CLOUD_OUTPUTS = (
-    Output('ground', PointCloud2, _points_with(Label.GROUND), is_optional=False),
-    Output('obstacles', PointCloud2, _points_with(Label.OBSTACLE), is_optional=False),
+    Output('ground', PointCloud2, _points_with(Label.GROUND), False),
+    Output('obstacles', PointCloud2, _points_with(Label.OBSTACLE), False),
     LABELLED,
-    Output('~/ground_model', PointCloud2, _ground_model, is_optional=True),
+    Output('~/ground_model', PointCloud2, lambda c, s, _: ground_model_cloud(c, s), True),
 )
 
 
 def marker_outputs() -> tuple[Output, ...]:
-    """Return the output of ``~/markers``.
-
-    Raises
-    ------
-    ImportError
-        If visualization_msgs or geometry_msgs is not installed.
-    """
+    """Return the output of ``~/markers``; raise an ImportError without visualization_msgs."""
+    import geometry_msgs.msg  # noqa: F401
     from visualization_msgs.msg import MarkerArray
 
-    from gp_ground_seg.ros.markers import markers
-
-    return (Output('~/markers', MarkerArray, markers, is_optional=True),)
+    return (Output('~/markers', MarkerArray, markers, True),)
 
 
 class OutputPublishers:
-    """Publishers of all outputs.
-
-    Parameters
-    ----------
-    node : Node
-        Node that publishes.
-    """
+    """Publishers of all outputs of `node`."""
 
     def __init__(self, node: Node) -> None:
         self._logger = node.get_logger()
@@ -115,19 +216,13 @@ class OutputPublishers:
         ]
 
     def n_subscribers(self) -> dict[str, int]:
-        """Return how many subscribe to each topic."""
-        return {
-            publisher.topic_name: publisher.get_subscription_count()
-            for _, publisher in self._publishers
-        }
+        """Return the number of subscribers of each topic."""
+        return {p.topic_name: p.get_subscription_count() for _, p in self._publishers}
 
     def publish(self, cloud: PointCloud2, segmentation: Segmentation, config: Config) -> list[str]:
-        """Publish all outputs of one cloud; nothing, if one of them cannot be built.
+        """Publish all outputs of one cloud, or none if one of them cannot be built.
 
-        Returns
-        -------
-        list of str
-            Topics published to.
+        Returns the topics published to.
         """
         wanted = [
             (output, publisher)
@@ -138,14 +233,14 @@ class OutputPublishers:
             (publisher, output.build(cloud, segmentation, config)) for output, publisher in wanted
         ]
         if any(output is LABELLED for output, _ in wanted):
-            self._say_what_is_renamed(cloud)
+            self._warn_of_renamed(cloud)
         for publisher, message in messages:
             publisher.publish(message)
         return [publisher.topic_name for publisher, _ in messages]
 
-    def _say_what_is_renamed(self, cloud: PointCloud2) -> None:
-        names = free_names(field.name for field in cloud.fields)
-        renamed = {field: names[field] for field in FIELDS if names[field] != field}
+    def _warn_of_renamed(self, cloud: PointCloud2) -> None:
+        names = labelled_names(field.name for field in cloud.fields)
+        renamed = {field: name for field, name in names.items() if name != field}
         if renamed != self._renamed:
             self._renamed = renamed
             for field, name in renamed.items():

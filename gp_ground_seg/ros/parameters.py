@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -13,14 +13,14 @@ from rcl_interfaces.msg import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.parameter_service import ParameterService
 
 from gp_ground_seg.errors import ConfigError, GroundSegError
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.parameters.schema import ParameterSpec, check_typed
 from gp_ground_seg.parameters.yaml_io import OF_EVERY_NODE
-from gp_ground_seg.ros.parameter_service import OrderFreeParameterService
-from gp_ground_seg.ros.qos import QOS_OVERRIDES, check_overrides
-from gp_ground_seg.ros.startup import start_errors
+from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
+from gp_ground_seg.ros.lifecycle import start_errors
 
 _OWN_NAMES = frozenset(spec.name for spec in parameter_specs())
 
@@ -29,10 +29,11 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     """Return what ``ros2 param describe`` and rqt_reconfigure show of a parameter."""
     notes = [f'[{spec.unit}]'] if spec.unit else []
     notes += [f'({spec.symbol} in the paper)'] if spec.symbol else []
+    notes += [] if spec.basic else ['(advanced)']
     result = ParameterDescriptor(
         description=' '.join([spec.description, *notes]),
         additional_constraints=f'must be {spec.accepted}',
-        # ROS has no type for a number or a word; `changed` holds the value to the declaration.
+        # ROS has no type for a number or a word; `changed` checks the value.
         dynamic_typing=spec.auto,
     )
     # No step: rclpy would refuse every value off the grid.
@@ -51,10 +52,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
     """Return `config` with those of the `parameters` that it declares.
 
-    Raises
-    ------
-    ConfigError
-        If a value has another type, is out of range or contradicts another.
+    Raises a ConfigError if a value has another type, is out of range or contradicts another.
     """
     return config.replace(
         **{
@@ -66,7 +64,7 @@ def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
 
 
 def describe(config: Config) -> str:
-    """One line per parameter: name, value, unit, and the default where it differs."""
+    """Return one line per parameter: name, value, unit, and the default if it differs."""
     lines = []
     for spec in parameter_specs():
         value = config[spec.name]
@@ -76,28 +74,55 @@ def describe(config: Config) -> str:
     return '\n'.join(lines)
 
 
-class ConfiguredNode(Node):  # type: ignore[misc]
-    """A node whose ROS parameters are a `Config`.
+class _ParameterService(ParameterService):  # type: ignore[misc]
+    """rclpy's parameter services, of which ``set_parameters`` works in any order.
 
-    Values set at run time are checked as a whole before anything changes, then
-    handed to `apply_config` between two callbacks.
-
-    Parameters
-    ----------
-    name : str
-        Name of the node.
-    **options
-        Those of `rclpy.node.Node`.
-
-    Raises
-    ------
-    ConfigError
-        If a parameter file or ``-p`` gives a value that is not accepted.
+    If another rclpy calls its method by another name, its own order is back.
     """
 
-    def __init__(
-        self, name: str, *, start_parameter_services: bool = True, **options: Any
-    ) -> None:
+    def __init__(self, node: Node) -> None:
+        self._set_atomically = node.set_parameters_atomically
+        super().__init__(node)
+
+    def _set_parameters_callback(self, request: Any, response: Any) -> Any:
+        parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
+        response.results = set_in_any_order(parameters, self._set_atomically)
+        return response
+
+
+def set_in_any_order(
+    parameters: Sequence[Parameter],
+    set_atomically: Callable[[list[Parameter]], SetParametersResult],
+) -> list[SetParametersResult]:
+    """Set as many parameters as can be set; return the result of each.
+
+    ``ros2 param load`` sends a whole file at once, and rclpy sets its values one by one: one
+    that contradicts a value still to come would be refused. Here all are tried together; if
+    that fails, one by one, and the refused ones again after every round that set any.
+    """
+    together = set_atomically(list(parameters))
+    if together.successful:
+        return [together] * len(parameters)
+    results: dict[int, SetParametersResult] = {}
+    pending = list(range(len(parameters)))
+    while pending:
+        results.update({k: set_atomically([parameters[k]]) for k in pending})
+        refused = [k for k in pending if not results[k].successful]
+        if len(refused) == len(pending):
+            break
+        pending = refused
+    return [results[k] for k in range(len(parameters))]
+
+
+class ConfiguredNode(Node):  # type: ignore[misc]
+    """A node, with the options of `rclpy.node.Node`, whose ROS parameters are a `Config`.
+
+    Values set at run time are checked as a whole before anything changes, then given to
+    `apply_config` between two callbacks. Raises a ConfigError if a parameter file or ``-p``
+    gives a value that is not accepted.
+    """
+
+    def __init__(self, name: str, **options: Any) -> None:
         # Declared from the overrides to learn which names were given; then again, typed.
         with start_errors():
             super().__init__(
@@ -111,6 +136,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
             for parameter_name, parameter in self.get_parameters_by_prefix('').items()
             if parameter_name not in OF_EVERY_NODE
         }
+        # rclpy logs the error and goes on.
         use_sim_time = self.get_parameter('use_sim_time').value
         if not isinstance(use_sim_time, bool):
             raise ConfigError(f'use_sim_time = {use_sim_time!r}: must be true or false')
@@ -125,16 +151,15 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         self._given_names = frozenset(given)
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
-        if start_parameter_services:
-            self._parameter_service = OrderFreeParameterService(self)
+        self._parameter_service = _ParameterService(self)
 
     @property
     def config(self) -> Config:
-        """Parameters in force."""
+        """Parameters in use."""
         return self._config
 
     def is_given(self, name: str) -> bool:
-        """Whether a parameter file or ``-p`` gave the parameter `name`."""
+        """Return whether a parameter file or ``-p`` gave the parameter `name`."""
         return name in self._given_names
 
     def check_config(self, config: Config) -> None:
@@ -144,21 +169,19 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         """Use `config`, which `check_config` has accepted, from now on."""
 
     def warn_of_unused_parameters(self) -> None:
-        """Log the given names that nobody declared; call it when all topics are there."""
+        """Log the given names that are not declared; call it after all topics are made."""
         for name in sorted(self._given_names):
             if self.has_parameter(name):
                 continue
-            if name.startswith(QOS_OVERRIDES):
-                reason = 'no such topic or policy here'
-            else:
-                reason = _unknown(name)
+            is_override = name.startswith(QOS_OVERRIDES)
+            reason = 'no such topic or policy here' if is_override else _unknown(name)
             self.get_logger().warning(f'parameter {name} is not used: {reason}')
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set all or none, as the services do.
 
-        Checks before rclpy does, whose reasons for a wrong type or an unknown
-        name do not say which parameter is meant.
+        Checked before rclpy does, whose reasons for a wrong type or an unknown name do not
+        contain the name.
         """
         for parameter in parameter_list:
             if parameter.name not in _OWN_NAMES and not self.has_parameter(parameter.name):

@@ -16,13 +16,7 @@ from gp_ground_seg.pipeline.tilt import angles_of
 
 
 def require_tf2() -> Any:
-    """Return the module tf2_ros.
-
-    Raises
-    ------
-    MissingDependencyError
-        If it is not installed.
-    """
+    """Return the module tf2_ros; raise a MissingDependencyError if it is not installed."""
     try:
         return importlib.import_module('tf2_ros')
     except ImportError as error:
@@ -34,12 +28,9 @@ def require_tf2() -> Any:
 
 
 def tilt_of(rotation: Quaternion) -> tuple[float, float]:
-    """Roll and pitch [rad] of a sensor whose frame is turned by `rotation` into a level one.
+    """Return roll and pitch [rad] of a sensor frame that `rotation` turns into a level one.
 
-    Raises
-    ------
-    PointCloudError
-        If it is no rotation.
+    Raises a PointCloudError if it is no rotation.
     """
     x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
     square = x * x + y * y + z * z + w * w
@@ -47,42 +38,27 @@ def tilt_of(rotation: Quaternion) -> tuple[float, float]:
         raise PointCloudError(
             f'quaternion ({x:g}, {y:g}, {z:g}, {w:g}) of length {square**0.5:g}: must be 1'
         )
-    # Third row of its matrix: the level frame's z axis in the sensor's.
+    # Third row of its matrix: the level frame's z axis in the sensor frame.
     up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), square - 2.0 * (x * x + y * y)])
     return angles_of(up / np.linalg.norm(up))
 
 
 class TfTilt:
-    """Listens to TF.
-
-    Parameters
-    ----------
-    node : Node
-        Node that subscribes.
-
-    Raises
-    ------
-    MissingDependencyError
-        If tf2_ros is not installed.
-    """
+    """Listens to TF in the executor of `node`."""
 
     def __init__(self, node: Node) -> None:
         self._tf2_ros = require_tf2()
-        # Not told of the node: it would clear itself at jumps of the node's clock, and in
-        # some releases raises an error there that would end the executor; `reset` does it.
+        # Without the node: given one, the buffer clears itself at jumps of the node's clock,
+        # and in some releases raises an error there that ends the executor. See `reset`.
         self._buffer = self._tf2_ros.Buffer()
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
     def tilt(self, frame: str, stamp: TimeMessage, base: str) -> tuple[float, float]:
-        """Roll and pitch [rad] of the frame `frame` in the frame `base`.
+        """Return roll and pitch [rad] of the frame `frame` in the frame `base`.
 
-        At the time `stamp`, or the newest there is where that is not known (yet): a sensor
-        is fixed to its vehicle, and to wait for TF would delay every cloud.
-
-        Raises
-        ------
-        PointCloudError
-            If TF does not connect the two.
+        The transform is that of the time `stamp`, or the newest if there is none for it: a
+        sensor is fixed to its vehicle, and waiting for TF would delay every cloud. Raises a
+        PointCloudError if TF does not connect the two.
         """
         try:
             try:
@@ -96,7 +72,7 @@ class TfTilt:
         return tilt_of(found.transform.rotation)
 
     def reset(self) -> None:
-        """Forget what moves, as after a jump in time."""
+        """Forget all transforms, as after a jump in time."""
         self._buffer.clear()
 
     def close(self) -> None:

@@ -1,145 +1,147 @@
-"""A first frame that costs nobody anything."""
+"""The compiled backend, made beside the running node; and what the library logs meanwhile."""
 
 from __future__ import annotations
 
-import gc
-import math
+import importlib
+import logging
 import os
-import pickle
 import subprocess
 import sys
+import threading
 import time
-from contextlib import ExitStack, suppress
-from threading import Thread
-
-import numpy as np
+from collections.abc import Callable
+from typing import Any
 
 from gp_ground_seg.backend import Backend
-from gp_ground_seg.frame import PointArray
-from gp_ground_seg.gp.numpy_backend import NumpyBackend
+from gp_ground_seg.jit import code_folder, is_code_kept
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.pipeline.sensor_pose import given_pose
-from gp_ground_seg.segmenter import GroundSegmenter
+from gp_ground_seg.segmenter import warm_up
 
-_RINGS = 24
-_DIRECTIONS = 64
-_PARTS = {
-    'points': ('sort_points', 'find_lines'),
-    'processes': ('grow', 'grow_on_latent', 'objective', 'label_points'),
-}
-"""Methods of the backend whose code is compiled side by side."""
-_LOOK_AROUND = 0.2
-"""Seconds after which the compiling process looks whether it is still asked for."""
+FOLLOWS = 'segmenting with numpy until the compiled code is there; to compile takes a minute'
+CHANGED = 'segmenting with numba now'
+STAYS = 'segmenting with numpy from now on'
+_LIBRARY = logging.getLogger('gp_ground_seg')
+
+_COMPILE = """\
+import sys
+sys.path[:] = {path!r}
+import os, threading
+# Standard input ends when the process that has started this one does.
+threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
+from gp_ground_seg.segmenter import warm_up
+warm_up()
+"""
 
 
-def warm_up(segmenter: GroundSegmenter) -> float:
-    """Segment a small made-up frame, so that all code is there before a cloud waits for it.
+class BackendLoader:
+    """Makes the compiled backend in a thread, while frames are segmented without it.
 
-    Code that is not kept on disk is compiled by other processes, whose memory goes when
-    they end: the compiler leaves twice as much behind as the node needs. What was learned
-    from the frame is forgotten.
-
-    Returns
-    -------
-    float
-        Time it took [s].
+    Code that is not kept on disk is compiled by a child process, whose memory is free
+    again after it: the compiler leaves twice as much behind as the node needs. `on_done` is
+    called in the thread when the backend is there or cannot be made; not after `stop`.
     """
-    start = time.monotonic()
-    points = _flat_ground(segmenter.config)
-    if segmenter.backend_name == 'numba':
-        _compile_elsewhere(segmenter, points)
-    segmenter.segment(points)
-    segmenter.reset()
-    return time.monotonic() - start
 
+    def __init__(self, on_done: Callable[[], None]) -> None:
+        self.error = ''
+        self.seconds = 0.0
+        self._on_done = on_done
+        self._backend: Backend | None = None
+        self._lock = threading.Lock()
+        self._is_stopped = False
+        self._compiler: subprocess.Popen[bytes] | None = None
+        self._thread: threading.Thread | None = None
 
-def _compile_elsewhere(segmenter: GroundSegmenter, points: PointArray) -> None:
-    """Have other processes put on disk what is not there, if they can."""
-    from gp_ground_seg.compiled.compile_cache import (
-        CodeNotKeptError,
-        refusing,
-        say_that_it_compiles,
-    )
+    @property
+    def is_started(self) -> bool:
+        """Whether `start` has been called."""
+        return self._thread is not None
 
-    try:
-        with refusing('compilation'):
-            segmenter.segment(points)
-    except CodeNotKeptError:
-        say_that_it_compiles()
-        # What they do not manage is compiled here.
-        _run_compilers(segmenter.config)
+    def start(self, config: Config) -> None:
+        """Begin to make the backend for `config`."""
+        self._thread = threading.Thread(target=self._run, args=(config,), daemon=True)
+        self._thread.start()
 
+    def take_backend(self) -> Backend | None:
+        """Return the backend, once; None if it cannot be made, and `error` says why."""
+        backend, self._backend = self._backend, None
+        return backend
 
-def _run_compilers(config: Config) -> None:
-    program = f'import sys; from {__name__} import compile_part; compile_part(sys.argv[1])'
-    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(path for path in sys.path if path)}
-    with ExitStack() as stack:
-        compilers = []
-        for part in _PARTS:
-            words = [sys.executable, '-c', program, part]
-            compiler = subprocess.Popen(
-                words,
+    def stop(self) -> None:
+        """End the compiling process; `on_done` is not called from now on."""
+        with self._lock:
+            self._is_stopped = True
+            if self._compiler is not None:
+                self._compiler.kill()
+
+    def close(self) -> None:
+        """Wait for the thread; free a backend that was not taken."""
+        self.stop()
+        if self._thread is not None:
+            self._thread.join()
+        backend = self.take_backend()
+        if backend is not None:
+            backend.close()
+
+    def _run(self, config: Config) -> None:
+        start = time.monotonic()
+        try:
+            # What is kept is known once the compiled functions are declared.
+            importlib.import_module('gp_ground_seg.compiled.backend')
+            if code_folder() is not None and not is_code_kept():
+                self._compile()
+            if not self._is_stopped:
+                self._backend = warm_up(config)
+        except Exception as error:
+            self.error = f'{type(error).__name__}: {error}'
+        self.seconds = time.monotonic() - start
+        with self._lock:
+            if not self._is_stopped:
+                self._on_done()
+
+    def _compile(self) -> None:
+        """Compile in a child process; raise a RuntimeError if that fails."""
+        environment = dict(os.environ)
+        if 'NUMBA_CACHE_DIR' in environment:
+            environment['NUMBA_CACHE_DIR'] = os.path.abspath(environment['NUMBA_CACHE_DIR'])
+        # Nothing is imported from the current folder, which may be any.
+        path = [entry for entry in sys.path if os.path.isabs(entry)]
+        with self._lock:
+            if self._is_stopped:
+                return
+            self._compiler = subprocess.Popen(
+                [sys.executable, '-c', _COMPILE.format(path=path)],
+                cwd='/',
                 env=environment,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
             )
-            stack.callback(compiler.wait)
-            stack.callback(compiler.kill)
-            compilers.append(compiler)
-            assert compiler.stdin is not None
-            with suppress(BrokenPipeError), compiler.stdin as stdin:
-                stdin.write(pickle.dumps(config))
-        for compiler in compilers:
-            compiler.wait()
+        with self._compiler:
+            assert self._compiler.stderr is not None
+            said = self._compiler.stderr.read().decode(errors='replace').strip()
+            code = self._compiler.wait()
+        if code and not self._is_stopped:
+            reason = said.splitlines()[-1] if said else f'exit code {code}'
+            raise RuntimeError(f'the compiling process failed: {reason}')
 
 
-def _half_compiled(part: str) -> Backend:
-    """Backend with the methods of a part in compiled code, the others in numpy."""
-    from gp_ground_seg.compiled.backend import CompiledBackend
+class LibraryLog(logging.Handler):
+    """Passes the library's messages on to the logger of a node, until `close`."""
 
-    # Two threads, for there is code for the other one.
-    compiled, plain = CompiledBackend(2), NumpyBackend()
-    # What else is compiled, about the candidates, goes by the name.
-    half: Backend = CompiledBackend(1) if part == 'points' else NumpyBackend()
-    for other, methods in _PARTS.items():
-        for method in methods:
-            setattr(half, method, getattr(compiled if other == part else plain, method))
-    return half
+    def __init__(self, logger: Any) -> None:
+        super().__init__()
+        self._logger = logger
+        _LIBRARY.setLevel(logging.INFO)
+        _LIBRARY.addHandler(self)
 
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log one message; rclpy wants a line of code for each severity."""
+        if record.levelno >= logging.WARNING:
+            self._logger.warning(record.getMessage())
+        else:
+            self._logger.info(record.getMessage())
 
-def compile_part(part: str) -> None:
-    """Compile the code of a part for a configuration, which comes pickled by standard input.
-
-    Ends when the process that asked for it has ended, and where nothing can be kept.
-    """
-    from gp_ground_seg.compiled.compile_cache import CodeNotKeptError, refusing
-
-    # The compiler makes objects by the million that stay: looked through less often.
-    gc.set_threshold(20_000, 20, 50)
-    asked_by = os.getppid()
-    config: Config = pickle.load(sys.stdin.buffer)
-    Thread(target=_end_without, args=(asked_by,), daemon=True).start()
-    segmenter = GroundSegmenter(config, backend=_half_compiled(part))
-    with suppress(CodeNotKeptError), refusing('loss'):
-        segmenter.segment(_flat_ground(config))
-
-
-def _end_without(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_LOOK_AROUND)
-    os._exit(1)
-
-
-def _flat_ground(config: Config) -> PointArray:
-    """Rings on level ground as the sensor would see them, (N, 3) float32 [m]."""
-    nearest = config.grid.r_min
-    radius, azimuth = np.meshgrid(
-        np.linspace(nearest, min(nearest + 30.0, config.grid.r_max), _RINGS),
-        np.linspace(-math.pi, math.pi, _DIRECTIONS, endpoint=False),
-    )
-    pose = given_pose(config.sensor)
-    height = np.full(radius.shape, -pose.height)
-    level = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=-1)
-    turned: PointArray = (level.reshape(-1, 3) @ pose.rotation).astype(np.float32)
-    return turned
+    def close(self) -> None:
+        """Pass no more messages on."""
+        _LIBRARY.removeHandler(self)
+        super().close()

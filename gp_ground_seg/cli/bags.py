@@ -1,0 +1,267 @@
+"""``kitti-to-bag``: a KITTI sequence as a rosbag2; ``play``: the clouds of a bag, published."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.cli.options import count, new_parser, note, note_leftovers, progress_bar
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
+from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
+from gp_ground_seg.errors import DataError, GroundSegError
+from gp_ground_seg.ros.lifecycle import large_cloud_transport, needing_ros, ros_session
+
+if TYPE_CHECKING:
+    from gp_ground_seg.ros.playback import Player
+
+TOPIC = '/kitti/velo/pointcloud'
+FRAME_ID = 'velo_link'
+EPOCH = 1_316_995_200
+"""Seconds of 2011-09-26 00:00 UTC, the day of KITTI's first drives; times.txt starts at 0."""
+_LAST_SECOND = 2**31 - 1
+EXIT_UNDELIVERED = 1
+SILENT_WAIT = 1.0
+"""Time without a subscriber after which a note says so [s]."""
+
+CONVERT_DESCRIPTION = """\
+Write the scans of a SemanticKITTI sequence as a rosbag2.
+
+Topic /kitti/velo/pointcloud (sensor_msgs/PointCloud2, offered reliably), frame
+velo_link, fields x y z intensity (FLOAT32) and, for scans that have labels,
+label (UINT32, the SemanticKITTI class, as PCL's PointXYZL has it).
+
+Stamps are times.txt (10 Hz where there is none) counted from 2011-09-26 00:00 UTC;
+the recorded time of a message is its stamp.
+
+OUT is a folder, as `ros2 bag record -o` makes. If it ends in .mcap or .db3 it is
+that single file, which `ros2 bag play` and Foxglove open as well.
+"""
+CONVERT_EXAMPLES = """\
+  gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 00 drive
+  gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 08 drive.mcap --start 100 --count 50
+"""
+PLAY_DESCRIPTION = """\
+Publish the point clouds of a bag (ROS 1 .bag, rosbag2 folder, .mcap, .db3) on
+their topic, byte for byte, at the times they were recorded.
+
+Offered reliably: a reliable subscriber gets every cloud. Waits for a subscriber
+before it starts. Only PointCloud2 topics are played; for TF and the rest use
+`ros2 bag play`.
+
+In the end one line tells
+  late         clouds sent more than 20 ms after their time
+  undelivered  clouds without a subscriber, or not acknowledged by every reliable one.
+               A subscriber too slow to process what its middleware acknowledged
+               loses it all the same: that is in its own /diagnostics.
+"""
+PLAY_EXAMPLES = """\
+  gp-ground-seg play drive.mcap
+  gp-ground-seg play drive.mcap --clock --rate 0.5 --start 10 --duration 5
+  gp-ground-seg play drive.mcap --loop --ros-args -r /kitti/velo/pointcloud:=/points
+
+exit code: 0, 1 if clouds were not delivered (always 0 with --no-wait), 2 for an error,
+130 when interrupted
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the commands."""
+    parser = new_parser(subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES)
+    parser.add_argument('root', metavar='ROOT', help='folder with sequences/ in it')
+    parser.add_argument('output', metavar='OUT', help='folder, .mcap or .db3 file to write')
+    parser.add_argument('--sequence', metavar='S', required=True, help='sequence, as in 00')
+    parser.add_argument(
+        '--format',
+        choices=('mcap', 'sqlite3'),
+        help='storage (default: by the name of OUT, else mcap)',
+    )
+    parser.add_argument(
+        '--start', metavar='N', type=int, default=0, help='scans to skip (default: 0)'
+    )
+    parser.add_argument('--count', metavar='N', type=int, help='scans to write (default: all)')
+    parser.add_argument('--force', action='store_true', help='replace a bag that exists')
+    parser.add_argument('--quiet', action='store_true', help='no progress bar, no notes')
+    parser.set_defaults(run=run_convert)
+
+    parser = new_parser(subparsers, 'play', PLAY_DESCRIPTION, PLAY_EXAMPLES)
+    parser.add_argument('bag', metavar='BAG', help='bag to play')
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        '--topic', metavar='T', action='append',
+        help='PointCloud2 topic to play (may be repeated; default: the only one)',
+    )  # fmt: skip
+    which.add_argument('--all', action='store_true', help='play all PointCloud2 topics')
+    parser.add_argument(
+        '--rate', metavar='R', type=above_zero, default=1.0,
+        help='speed, 2 = twice as fast as recorded (default: 1)',
+    )  # fmt: skip
+    parser.add_argument('--loop', action='store_true', help='begin again at the end, until Ctrl-C')
+    parser.add_argument(
+        '--clock', action='store_true',
+        help="publish the bag's time on /clock, 50 times a second (for use_sim_time)",
+    )  # fmt: skip
+    parser.add_argument(
+        '--start', metavar='S', type=not_negative, default=0.0, help='skip the first S seconds'
+    )
+    parser.add_argument('--duration', metavar='S', type=above_zero, help='play S seconds only')
+    waiting = parser.add_mutually_exclusive_group()
+    waiting.add_argument(
+        '--wait', metavar='S', type=not_negative,
+        help='give up without a subscriber within S seconds (default: wait until there is one)',
+    )  # fmt: skip
+    waiting.add_argument(
+        '--no-wait', action='store_true', help='start at once, with or without a subscriber'
+    )
+    parser.add_argument('--quiet', action='store_true', help='no progress bar, no notes')
+    parser.set_defaults(run=run_play, accepts_ros_args=True)
+
+
+def not_negative(text: str) -> float:
+    """Read a number of at least 0."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and number >= 0.0):
+        raise argparse.ArgumentTypeError(f'{text!r}: must be a number, at least 0')
+    return number
+
+
+def above_zero(text: str) -> float:
+    """Read a number above 0."""
+    number = not_negative(text)
+    if number == 0.0:
+        raise argparse.ArgumentTypeError(f'{text}: must be above 0')
+    return number
+
+
+def scan_cloud(
+    points: npt.NDArray[np.float32], stamp: int, frame_id: str, **further: npt.NDArray[Any]
+) -> CloudMessage:
+    """Return points (N, 4), x y z [m] intensity, and other fields (N,) as a cloud.
+
+    `stamp` is the time of the header [ns].
+    """
+    columns = {name: points[:, k] for k, name in enumerate(('x', 'y', 'z', 'intensity'))}
+    return cloud_from_columns(divmod(stamp, 10**9), frame_id, {**columns, **further})
+
+
+def run_convert(arguments: argparse.Namespace) -> int:
+    """Write the bag."""
+    frames = _choose(list_frames(arguments.root, arguments.sequence), arguments)
+    stamps = [_nanoseconds(frame) for frame in frames]
+    target = Path(arguments.output)
+    if not arguments.quiet:
+        note_leftovers(target)
+    n_points = 0
+    with (
+        BagWriter(target, storage=arguments.format, force=arguments.force) as bag,
+        progress_bar(len(frames), quiet=arguments.quiet, title='kitti-to-bag') as bar,
+    ):
+        bag.add_topic(cloud_topic(TOPIC))
+        for frame, stamp in zip(frames, stamps, strict=True):
+            points = read_points(frame.points_path)
+            labels = {}
+            if frame.labels_path is not None:
+                labels['label'] = read_labels(frame.labels_path, len(points)).astype(np.uint32)
+            bag.write(TOPIC, stamp, encode_cloud(scan_cloud(points, stamp, FRAME_ID, **labels)))
+            n_points += len(points)
+            bar.update()
+    n_labelled = sum(frame.labels_path is not None for frame in frames)
+    print(
+        f'{count(len(frames), "frame")} ({n_labelled} with labels), {count(n_points, "point")}, '
+        f'{1e-9 * (stamps[-1] - stamps[0]):.1f} s, written to {target}'
+    )
+    return 0
+
+
+def _choose(frames: Sequence[Frame], arguments: argparse.Namespace) -> Sequence[Frame]:
+    start, wanted = arguments.start, arguments.count
+    where = f'sequence {arguments.sequence}: {count(len(frames), "scan")} there'
+    if not 0 <= start < len(frames):
+        raise DataError(f'--start {start}: must be in [0, {len(frames) - 1}]; {where}')
+    left = len(frames) - start
+    if wanted is None:
+        return frames[start:]
+    if not 1 <= wanted <= left:
+        raise DataError(f'--count {wanted}: must be in [1, {left}] from scan {start} on; {where}')
+    return frames[start : start + wanted]
+
+
+def _nanoseconds(frame: Frame) -> int:
+    """Return the stamp of a frame [ns]."""
+    if not 0 <= frame.time <= _LAST_SECOND - EPOCH:
+        raise DataError(
+            f'times.txt of sequence {frame.sequence}: time {frame.time:g} s of frame '
+            f'{frame.index}: must be in [0, {_LAST_SECOND - EPOCH}] s'
+        )
+    return EPOCH * 10**9 + round(frame.time * 1e9)
+
+
+def run_play(arguments: argparse.Namespace) -> int:
+    """Play the bag."""
+    with needing_ros('play'):
+        from gp_ground_seg.ros.playback import Player, PlayOptions
+
+    options = PlayOptions(
+        arguments.rate, arguments.start, arguments.duration, arguments.loop, arguments.clock
+    )
+    with BagReader(arguments.bag) as bag:
+        topics = _choose_topics(bag, arguments)
+        others = [f'{name} ({kind})' for name, kind in bag.topics.items() if name not in topics]
+        if others and not arguments.quiet:
+            note(f'not played: {", ".join(others)}')
+        n_clouds = sum(bag.n_messages(topic) for topic in topics)
+        with large_cloud_transport(), ros_session('bag_player', arguments.ros_args) as session:
+            player = Player(session.node, bag, topics, session.sleep, options)
+            if not arguments.no_wait:
+                _wait_for_subscribers(player, arguments)
+            try:
+                # With --loop there is no end to show progress towards, only a count.
+                with progress_bar(
+                    0 if arguments.loop else n_clouds, quiet=arguments.quiet, title='play'
+                ) as bar:
+                    player.play(bar.update)
+            finally:
+                # After an interrupt, too: with --loop it is the only end.
+                _print_summary(player, arguments)
+    return EXIT_UNDELIVERED if player.n_undelivered and not arguments.no_wait else 0
+
+
+def _choose_topics(bag: BagReader, arguments: argparse.Namespace) -> list[str]:
+    if arguments.all:
+        topics = [name for name in bag.point_cloud_topics if bag.n_messages(name)]
+        return topics or [bag.pick_point_cloud_topic()]
+    if arguments.topic:
+        return [bag.pick_point_cloud_topic(name) for name in dict.fromkeys(arguments.topic)]
+    return [bag.pick_point_cloud_topic()]
+
+
+def _wait_for_subscribers(player: Player, arguments: argparse.Namespace) -> None:
+    limit: float | None = arguments.wait
+    if player.wait_for_subscribers(SILENT_WAIT if limit is None else min(limit, SILENT_WAIT)):
+        return
+    lonely = ', '.join(player.topics_without_subscriber())
+    if limit is None or limit > SILENT_WAIT:
+        if not arguments.quiet:
+            note(f'waiting for a subscriber of {lonely}')
+        if player.wait_for_subscribers(None if limit is None else limit - SILENT_WAIT):
+            return
+    raise GroundSegError(
+        f'no subscriber of {lonely} within {limit:g} s; --no-wait plays without one'
+    )
+
+
+def _print_summary(player: Player, arguments: argparse.Namespace) -> None:
+    summary = player.summary()
+    if summary:
+        print(summary, flush=True)
+        for topic in player.best_effort_topics() if not arguments.quiet else ():
+            note(f'{topic} has a best-effort subscriber; clouds it lost are not counted')

@@ -1,0 +1,294 @@
+"""The input topic: clouds in any layout, losses, QoS that follows the publishers, time jumps."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Callable, Mapping
+from copy import copy
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from rclpy.clock import Clock, JumpThreshold, TimeJump
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import PointCloud2
+
+from gp_ground_seg.data.point_cloud2 import read_xyz, select_rows
+from gp_ground_seg.errors import ConfigError
+
+INPUT_DEPTH = 5
+"""Clouds that may wait to be processed: half a second of a LiDAR at 10 Hz."""
+OUTPUT_DEPTH = 20
+"""Clouds kept for repair: with stock Fast DDS, a lost fragment of a large cloud is sent again
+after up to 0.7 s on a busy machine; what is overwritten by then is lost."""
+MAX_DEPTH = 10_000
+QOS_OVERRIDES = 'qos_overrides.'
+REVIEW_PERIOD = 1.0
+"""Time between two looks at the publishers [s]."""
+JUMP_TOLERANCE = 0.5
+"""Stamps may be that much out of order [s]: several sensors on one topic are no jump."""
+LOG_PERIOD = 5.0
+"""Shortest time between two messages of the same kind [s]."""
+
+_CHOICES = {
+    'reliability': ('reliable', 'best_effort', 'best_available', 'system_default'),
+    'history': ('keep_last', 'keep_all', 'system_default'),
+}
+
+
+def select_points(cloud: PointCloud2, mask: npt.NDArray[np.bool_]) -> PointCloud2:
+    """Return the points of `cloud` where `mask` is true, in order, as an unorganised cloud.
+
+    Header, fields, byte order, ``point_step`` and every byte of the points are those of the
+    input; ``is_dense`` tells whether all coordinates are finite. Raises as `select_rows`.
+    """
+    kept = select_rows(cloud, mask)
+    n_points = int(np.count_nonzero(mask))
+    selection = PointCloud2(
+        header=cloud.header,
+        height=1,
+        width=n_points,
+        fields=cloud.fields,
+        is_bigendian=cloud.is_bigendian,
+        point_step=cloud.point_step,
+        row_step=n_points * cloud.point_step,
+    )
+    selection.data = message_data(kept)
+    selection.is_dense = bool(np.isfinite(read_xyz(selection)).all())
+    return selection
+
+
+def message_data(values: npt.NDArray[Any]) -> array[int]:
+    """Return the bytes of an array as the one type that rclpy takes without a look at each."""
+    data = array('B')
+    data.frombytes(np.ascontiguousarray(values).data.cast('B') if values.size else b'')
+    return data
+
+
+def check_overrides(given: Mapping[str, object]) -> None:
+    """Raise a ConfigError if a ``qos_overrides`` parameter, of any topic, is not accepted."""
+    for name, value in given.items():
+        policy = name.rpartition('.')[2]
+        if not name.startswith(QOS_OVERRIDES):
+            continue
+        if policy == 'depth' and not (type(value) is int and 1 <= value <= MAX_DEPTH):
+            raise ConfigError(f'{name} = {value!r}: must be an integer in [1, {MAX_DEPTH}]')
+        if policy in _CHOICES and value not in _CHOICES[policy]:
+            choices = ', '.join(_CHOICES[policy])
+            raise ConfigError(f'{name} = {value!r}: must be one of {choices}')
+
+
+def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
+    """Return the default of a cloud topic: reliable, volatile, the newest `depth` clouds."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
+def in_words(profile: QoSProfile) -> str:
+    """Return `profile` as in ``reliable, keep_last 5, volatile``."""
+    names = [
+        policy.name.lower()
+        for policy in (profile.reliability, profile.history, profile.durability)
+    ]
+    return f'{names[0]}, {names[1]} {profile.depth}, {names[2]}'
+
+
+class SequenceGaps:
+    """Counts messages of one publisher that did not arrive.
+
+    The middleware numbers a publisher's messages 1, 2, 3 ...: a hole is a message that was
+    lost on the way, or overwritten in a full queue while the node was busy.
+    """
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+
+    def reset(self) -> None:
+        """Forget the last number: another publisher has its own count."""
+        self._last = None
+
+    def note(self, number: int | None) -> int:
+        """Return how many messages are missing before the one with this `number`."""
+        last, self._last = self._last, number
+        if last is None or number is None or number <= last:
+            return 0
+        return number - last - 1
+
+
+class Arrival(NamedTuple):
+    """Time a cloud waited in this process [s], and clouds lost just before it.
+
+    The losses are 0 with several publishers, whose numbers cannot be told apart.
+    """
+
+    wait: float
+    n_lost: int
+
+
+class CloudSubscription:
+    """Subscription that is best-effort if a publisher is, and reliable otherwise.
+
+    Large clouds need reliable delivery: a best-effort reader loses most of a replayed KITTI
+    bag with stock Fast DDS. A reliable reader gets nothing from a best-effort LiDAR driver.
+    Reliability given in ``qos_overrides``, by `is_given`, is kept for any publisher.
+    `callback` takes each cloud and its `Arrival`, in the executor of the node.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        is_given: Callable[[str], bool],
+        callback: Callable[[PointCloud2, Arrival], None],
+    ) -> None:
+        self._node = node
+        self._unresolved_topic = topic
+        self._callback = callback
+        self._gaps = SequenceGaps()
+        self._offered: dict[bytes, ReliabilityPolicy] = {}
+        self.topic: str = node.resolve_topic_name(topic)
+        self._is_pinned = is_given(f'qos_overrides.{self.topic}.subscription.reliability')
+        # A subscription destroyed within its own event is still used by the executor; a guard
+        # condition runs after all that became ready with the event.
+        self._review_soon = node.create_guard_condition(self._review)
+        self._subscription = self._create(
+            cloud_profile(INPUT_DEPTH), QoSOverridingOptions.with_default_policies()
+        )
+        # The event can come before the publisher is listed, and there is no event for the end
+        # of the last best-effort publisher.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(REVIEW_PERIOD, self._review_soon.trigger, clock=steady)
+
+    @property
+    def qos(self) -> QoSProfile:
+        """Quality of service in use."""
+        return self._subscription.qos_profile
+
+    @property
+    def n_publishers(self) -> int:
+        """Publishers of the topic, as of the last look."""
+        return len(self._offered)
+
+    def _create(self, profile: QoSProfile, overrides: QoSOverridingOptions | None) -> Subscription:
+        return self._node.create_subscription(
+            PointCloud2,
+            self._unresolved_topic,
+            self._receive,
+            profile,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible),
+            qos_overriding_options=overrides,
+        )
+
+    def _receive(self, message: PointCloud2, info: dict[str, Any]) -> None:
+        # Both are stamps of the system clock; 0 where the middleware gives none.
+        received = info.get('received_timestamp') or 0
+        wait = max(0.0, 1e-9 * (time.time_ns() - received)) if received > 0 else 0.0
+        if not self._offered:
+            self._look_at_publishers()
+        n_lost = self._gaps.note(info.get('publication_sequence_number'))
+        if n_lost and (self._look_at_publishers() or self.n_publishers != 1):
+            n_lost = 0
+        self._callback(message, Arrival(wait, n_lost))
+
+    def _on_incompatible(self, _event: object) -> None:
+        if self._is_pinned:
+            self._node.get_logger().error(
+                f'a publisher of {self.topic} does not offer what qos_overrides asks for '
+                f'({in_words(self.qos)}): nothing will arrive from it'
+            )
+        self._review_soon.trigger()
+
+    def _look_at_publishers(self) -> bool:
+        """Return whether the publishers have changed since the last look."""
+        offered = {
+            bytes(entry.endpoint_gid): entry.qos_profile.reliability
+            for entry in self._node.get_publishers_info_by_topic(self.topic)
+        }
+        has_changed = offered.keys() != self._offered.keys()
+        self._offered = offered
+        if has_changed:
+            self._gaps.reset()
+        return has_changed
+
+    def _review(self) -> None:
+        self._look_at_publishers()
+        if not self._offered or self._is_pinned:
+            return
+        is_best_effort = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
+        profile = copy(self.qos)
+        profile.reliability = (
+            ReliabilityPolicy.BEST_EFFORT if is_best_effort else ReliabilityPolicy.RELIABLE
+        )
+        if profile.reliability == self.qos.reliability:
+            return
+        self._node.get_logger().info(
+            f'subscribing {in_words(profile)} to {self.topic}, as its publishers offer'
+        )
+        self._node.destroy_subscription(self._subscription)
+        self._gaps.reset()
+        self._subscription = self._create(profile, None)
+
+
+class StampWatch:
+    """Detects from the stamps of clouds that time has jumped back."""
+
+    def __init__(self) -> None:
+        self._newest: float | None = None
+
+    def reset(self) -> None:
+        """Forget the newest stamp."""
+        self._newest = None
+
+    def note(self, stamp: float) -> float:
+        """Return how far `stamp` lies before the newest one; 0 if that is no jump [s]."""
+        newest = self._newest if self._newest is not None else stamp
+        jump = newest - stamp if newest - stamp > JUMP_TOLERANCE else 0.0
+        self._newest = stamp if jump else max(newest, stamp)
+        return jump
+
+
+class TimeJumps:
+    """Calls `on_jump` when the stamps of clouds, or the clock of `node`, jump back."""
+
+    def __init__(self, node: Node, on_jump: Callable[[], None]) -> None:
+        self._node = node
+        self._on_jump = on_jump
+        self._stamps = StampWatch()
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        threshold = JumpThreshold(
+            min_forward=None, min_backward=Duration(seconds=-JUMP_TOLERANCE), on_clock_change=False
+        )
+        # The callback lives as long as its handle.
+        self._handle = node.get_clock().create_jump_callback(
+            threshold, post_callback=self._clock_jumped
+        )
+
+    def note(self, stamp: float) -> None:
+        """Take the `stamp` of a cloud [s]."""
+        jump = self._stamps.note(stamp)
+        if jump:
+            self._jumped(jump)
+
+    def _clock_jumped(self, jump: TimeJump) -> None:
+        # The stamps that follow are part of the same jump.
+        self._stamps.reset()
+        self._jumped(-1e-9 * jump.delta.nanoseconds)
+
+    def _jumped(self, seconds: float) -> None:
+        self._on_jump()
+        self._node.get_logger().info(
+            f'time jumped back by {seconds:.1f} s: what earlier clouds taught is forgotten',
+            throttle_duration_sec=LOG_PERIOD,
+            throttle_time_source_type=self._steady,
+        )

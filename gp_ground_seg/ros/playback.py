@@ -1,0 +1,262 @@
+"""Plays the clouds of a bag at the times they were recorded.
+
+Written here because ``ros2 bag play`` does not come with the wheels of ROS.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+
+from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.errors import DataError
+from gp_ground_seg.ros.input import cloud_profile
+
+DEPTH = 100
+"""Clouds kept until they are acknowledged: small ones are so a few at a time, and lost pieces of
+large ones can take 3 s with stock Fast DDS."""
+LATE = 0.02
+"""A cloud that is sent more than this after its time is late [s]."""
+SLICE = 0.02
+"""Longest wait in one piece [s]: /clock and acknowledgements are served in between."""
+DELIVERY_TIMEOUT = 5.0
+"""How long the last clouds may take to be acknowledged [s]; Fast DDS asks every 3 s."""
+LONE_PERIOD = 0.1
+"""Pause before a bag of a single cloud is played again [s]."""
+
+
+class TrackedPublisher:
+    """Publisher of serialised clouds that counts those that were not delivered.
+
+    A cloud is delivered when every reliable subscriber has acknowledged it. What a slow
+    subscriber then pushes out of its own queue, or a best-effort one receives, is not known.
+    The middleware tells only whether *all* clouds sent so far are acknowledged. Others count
+    as undelivered once newer ones take their place or their subscribers are gone.
+    """
+
+    def __init__(self, node: Node, topic: str) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(PointCloud2, topic, cloud_profile(DEPTH))
+        self.topic: str = self._publisher.topic_name
+        self.n_sent = 0
+        self.n_pending = 0
+        self.has_best_effort_subscriber = False
+        self._n_missed = 0
+
+    @property
+    def n_subscribers(self) -> int:
+        """Subscribers that can receive."""
+        n: int = self._publisher.get_subscription_count()
+        return n
+
+    @property
+    def n_undelivered(self) -> int:
+        """Clouds without a subscriber, or not acknowledged by every reliable one."""
+        return self._n_missed + self.n_pending
+
+    def publish(self, raw: bytes) -> None:
+        """Send one cloud of CDR bytes."""
+        self.update()
+        if self.n_subscribers == 0 or self.n_pending == DEPTH:
+            # Not received by any; or it takes the place of the oldest in a full queue.
+            self._n_missed += 1
+        else:
+            self.n_pending += 1
+        self._publisher.publish(raw)
+        self.n_sent += 1
+
+    def update(self) -> None:
+        """Take note of what has been acknowledged since the last time."""
+        if self.n_pending == 0:
+            return
+        # First: without subscribers everything is "acknowledged".
+        if self.n_subscribers == 0:
+            self._n_missed += self.n_pending
+            self.n_pending = 0
+        elif self._publisher.wait_for_all_acked(Duration(seconds=0)):
+            self.n_pending = 0
+
+    def look_at_subscribers(self) -> None:
+        """Note whether there is a best-effort one, whose losses stay unknown."""
+        for entry in self._node.get_subscriptions_info_by_topic(self.topic):
+            if entry.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT:
+                self.has_best_effort_subscriber = True
+
+
+class PlayOptions(NamedTuple):
+    """Speed (1 = as recorded), what is left out and what is played [s], and how."""
+
+    rate: float = 1.0
+    start: float = 0.0
+    duration: float | None = None
+    loop: bool = False
+    clock: bool = False
+
+
+class Player:
+    """Publishes the PointCloud2 `topics` of a bag, reliably, as the bytes that were recorded.
+
+    `pause` waits for at most the given time [s]; it is called when there is nothing to send.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        bag: BagReader,
+        topics: Sequence[str],
+        pause: Callable[[float], None],
+        options: PlayOptions,
+    ) -> None:
+        self._bag = bag
+        self._options = options
+        self._pause = pause
+        self._publishers = {topic: TrackedPublisher(node, topic) for topic in topics}
+        # Reliable serves both kinds of subscribers.
+        profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+        self._clock = node.create_publisher(Clock, '/clock', profile) if options.clock else None
+        self._first_sent: float | None = None
+        self._last_sent = 0.0
+        self._n_late = 0
+        self._worst_delay = 0.0
+
+    def topics_without_subscriber(self) -> list[str]:
+        """Return the topics, as remapped, that have no subscriber."""
+        return [p.topic for p in self._publishers.values() if p.n_subscribers == 0]
+
+    def wait_for_subscribers(self, limit: float | None = None) -> bool:
+        """Return whether all topics have a subscriber within `limit` [s]; None = no limit."""
+        end = None if limit is None else time.monotonic() + limit
+        while self.topics_without_subscriber():
+            left = SLICE if end is None else end - time.monotonic()
+            if left <= 0.0:
+                return False
+            self._pause(min(SLICE, left))
+        return True
+
+    def play(self, on_cloud: Callable[[], object] = lambda: None) -> None:
+        """Play, and call `on_cloud` before each cloud is sent; see `summary`.
+
+        Raises
+        ------
+        DataError
+            If the bag is damaged, or has no cloud in the time given.
+        """
+        start = self._play_once(time.monotonic(), on_cloud)
+        while self._options.loop:
+            start = self._play_once(start, on_cloud)
+        self._wait_for_delivery()
+
+    @property
+    def n_undelivered(self) -> int:
+        """Clouds not delivered up to now, see `TrackedPublisher`."""
+        return sum(p.n_undelivered for p in self._publishers.values())
+
+    def best_effort_topics(self) -> list[str]:
+        """Return the topics with subscribers that may have lost clouds unnoticed."""
+        return [p.topic for p in self._publishers.values() if p.has_best_effort_subscriber]
+
+    def summary(self) -> str:
+        """Return one line on what was played up to now; nothing if no cloud was sent."""
+        publishers = self._publishers.values()
+        for publisher in publishers:
+            publisher.update()
+        n_sent = sum(p.n_sent for p in publishers)
+        if self._first_sent is None:
+            return ''
+        n_topics = sum(p.n_sent > 0 for p in publishers)
+        seconds = self._last_sent - self._first_sent
+        rate = f' ({(n_sent / n_topics - 1) / seconds:.2f} Hz)' if seconds > 0.0 else ''
+        return (
+            f'{n_sent} cloud{"s" if n_sent != 1 else ""} sent in {seconds:.1f} s{rate}, '
+            f'{self._n_late} more than {1e3 * LATE:.0f} ms late (worst '
+            f'{1e3 * self._worst_delay:.1f} ms), {self.n_undelivered} undelivered'
+        )
+
+    def _play_once(self, start: float, on_cloud: Callable[[], object]) -> float:
+        """Play from the monotonic time `start` on; return when the next round has to start."""
+        rate = self._options.rate
+        first = last = None
+        n_clouds = dict.fromkeys(self._publishers, 0)
+        # The next cloud is read right after one was sent: there is time for it then.
+        for topic, recorded, raw in self._clouds():
+            if first is None or last is None:
+                first = last = recorded
+                start = max(start, time.monotonic())
+            # The parts of a split bag may overlap.
+            last = max(last, recorded)
+            due = start + 1e-9 * (last - first) / rate
+            self._wait_until(due, last)
+            on_cloud()
+            self._send(topic, raw, due)
+            n_clouds[topic] += 1
+        if first is None or last is None:
+            raise DataError(f'{self._bag.path}: {self._nothing_to_play()}')
+        n_periods = max(n_clouds.values()) - 1
+        span = 1e-9 * (last - first)
+        return start + (span + (span / n_periods if n_periods else LONE_PERIOD)) / rate
+
+    def _clouds(self) -> Iterator[tuple[str, int, bytes]]:
+        options = self._options
+        origin = None
+        for topic, recorded, raw in self._bag.messages(list(self._publishers)):
+            origin = recorded if origin is None else origin
+            offset = 1e-9 * (recorded - origin)
+            if offset < options.start:
+                continue
+            if options.duration is not None and offset >= options.start + options.duration:
+                return
+            yield topic, recorded, raw
+
+    def _nothing_to_play(self) -> str:
+        times = [recorded for _, recorded, _ in self._bag.messages(list(self._publishers))]
+        span = 1e-9 * (max(times) - min(times)) if times else 0.0
+        return (
+            f'no cloud in the time asked for (from {self._options.start:g} s on); '
+            f'the last of its {len(times)} clouds is at {span:.3f} s'
+        )
+
+    def _wait_until(self, due: float, recorded: int) -> None:
+        """Wait until a monotonic time [s]; at it, the time of the bag is `recorded` [ns]."""
+        while True:
+            left = due - time.monotonic()
+            self._publish_time(recorded - round(1e9 * max(left, 0.0) * self._options.rate))
+            if left <= 0.0:
+                return
+            self._pause(min(SLICE, left))
+            for publisher in self._publishers.values():
+                publisher.update()
+
+    def _publish_time(self, nanoseconds: int) -> None:
+        if self._clock is not None:
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 10**9)
+            self._clock.publish(message)
+
+    def _send(self, topic: str, raw: bytes, due: float) -> None:
+        publisher = self._publishers[topic]
+        if publisher.n_sent == 0:
+            publisher.look_at_subscribers()
+        now = time.monotonic()
+        publisher.publish(raw)
+        if self._first_sent is None:
+            self._first_sent = now
+        self._last_sent = now
+        self._n_late += now - due > LATE
+        self._worst_delay = max(self._worst_delay, now - due)
+
+    def _wait_for_delivery(self) -> None:
+        """Wait until the last clouds are acknowledged: they go with their publisher."""
+        end = time.monotonic() + DELIVERY_TIMEOUT
+        for publisher in self._publishers.values():
+            publisher.look_at_subscribers()
+            publisher.update()
+            while publisher.n_pending and time.monotonic() < end:
+                self._pause(SLICE)
+                publisher.update()

@@ -1,0 +1,358 @@
+"""A node in a second process, clouds sent to it, and what comes back: losses, latency, memory.
+
+ROS is imported by what needs it: commands import this module where there is no ROS.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gp_ground_seg.data.point_cloud2 import (
+    CloudMessage,
+    cloud_from_columns,
+    decode_cloud,
+    encode_cloud,
+    stamp_of,
+    with_header,
+)
+from gp_ground_seg.errors import GroundSegError
+from gp_ground_seg.frame import FloatArray
+from gp_ground_seg.ros.lifecycle import Session, large_cloud_transport, ros_session
+
+INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'
+"""Topics of the node, without any remapping."""
+START_TIMEOUT = 300.0
+"""Time the node has to start, and to compile on a slow machine [s]."""
+SILENCE = 2.0
+"""Time without a cloud after which what is still missing is lost [s]."""
+PERIOD_NS = 100_000_000
+"""Between the stamps of `restamped` clouds, at any rate [ns]."""
+STEADY_FACTOR, STEADY_MARGIN = 1.5, 0.02
+"""By how much the latency of the last quarter may exceed that of the second one, in which the
+queue of the node has filled [1, s]."""
+
+_PROBE_FRAME = 'gp_ground_seg_probe'
+_PROBE_PERIOD = 0.2
+_COUNTERS = ('Clouds since startup', 'Dropped since startup')
+_STOP_TIMEOUT = 5.0
+_HIGHEST_DOMAIN = 101  # ports above meet those that Linux hands out
+_NETWORK_VARIABLES = ('ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY')
+_NETWORK = (*_NETWORK_VARIABLES, 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')
+
+
+@contextlib.contextmanager
+def private_network() -> Iterator[None]:
+    """Keep this process and its children to this machine, on a ROS domain of their own."""
+    kept = {name: os.environ.pop(name, None) for name in _NETWORK}
+    domain = 1 + os.getpid() % _HIGHEST_DOMAIN
+    if str(domain) == kept['ROS_DOMAIN_ID']:
+        domain = 1 + domain % _HIGHEST_DOMAIN
+    os.environ['ROS_DOMAIN_ID'] = str(domain)
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    try:
+        yield
+    finally:
+        for name, value in kept.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+class NodeProcess:
+    """``python -m gp_ground_seg node`` in a second process, for a ``with`` statement.
+
+    `log` is the file for its output, `ros_args` follows ``--ros-args``, and a signal raises
+    no exception within ``uninterrupted()``.
+    """
+
+    def __init__(
+        self,
+        log: Path,
+        ros_args: Sequence[str] = (),
+        uninterrupted: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
+    ) -> None:
+        self._log = log
+        self._uninterrupted = uninterrupted
+        self._command = [sys.executable, '-m', 'gp_ground_seg', 'node', '--ros-args', *ros_args]
+
+    def __enter__(self) -> NodeProcess:
+        """Start it."""
+        # An interrupt between the start and the assignment would leave it running.
+        with self._log.open('wb') as log, self._uninterrupted():
+            self._process = subprocess.Popen(
+                self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+            )
+        self.pid = self._process.pid
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        """Stop it."""
+        self._process.terminate()
+        try:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_STOP_TIMEOUT)
+        finally:
+            # Also when interrupted while waiting; does nothing to a process that has ended.
+            self._process.kill()
+            self._process.wait()
+
+    def log_tail(self, n_lines: int = 20) -> str:
+        """Return the last lines of its output."""
+        text = self._log.read_text(encoding='utf-8', errors='replace')
+        return '\n'.join(text.splitlines()[-n_lines:])
+
+    def is_settled(self) -> bool:
+        """Return whether it has the backend that it keeps."""
+        from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS
+
+        said = self._log.read_text(encoding='utf-8', errors='replace')
+        return FOLLOWS not in said or CHANGED in said or STAYS in said
+
+    def check(self) -> None:
+        """Raise a GroundSegError if it has ended."""
+        code = self._process.poll()
+        if code is not None:
+            ended = f'was killed by signal {-code}' if code < 0 else f'ended with code {code}'
+            raise GroundSegError(f'the node {ended}; its last words:\n{self.log_tail()}')
+
+
+@contextlib.contextmanager
+def probed_node(
+    log: Path, name: str, ros_args: Sequence[str] = ()
+) -> Iterator[tuple[NodeProcess, Session]]:
+    """Yield a node on a network of its own, and a session named `name` to talk to it."""
+    words = ('-r', f'points:={INPUT}', *ros_args)
+    with (
+        private_network(),
+        large_cloud_transport(),
+        ros_session(name) as session,
+        NodeProcess(log, words, session.holding_back) as node,
+    ):
+        yield node, session
+
+
+def memory(pid: int) -> tuple[int, int]:
+    """Return the memory that a process holds now, and the most it ever held [bytes]."""
+    path = Path('/proc', str(pid), 'status')
+    try:
+        lines = path.read_text(encoding='ascii', errors='replace').splitlines()
+    except OSError as error:
+        raise GroundSegError(
+            f'{path}: {error.strerror}; memory is measured on Linux only'
+        ) from None
+    values = dict(line.partition(':')[::2] for line in lines)
+    now, peak = (1024 * int(values[key].split()[0]) for key in ('VmRSS', 'VmHWM'))
+    return now, peak
+
+
+@dataclasses.dataclass
+class Trip:
+    """A cloud: when it was sent, when the last of its results was back; system time [ns]."""
+
+    sent: int
+    back: int | None = None
+
+    @property
+    def latency(self) -> float:
+        """Time in between [s]; NaN if it did not come back."""
+        return np.nan if self.back is None else 1e-9 * (self.back - self.sent)
+
+
+Results = dict[str, CloudMessage]
+"""What came back of a cloud, by topic."""
+
+
+def restamped(clouds: Iterable[CloudMessage], start: int) -> Iterator[CloudMessage]:
+    """Yield `clouds` over and over, with stamps from the second `start` on."""
+    for k, cloud in enumerate(itertools.cycle(clouds)):
+        seconds, nanoseconds = divmod(k * PERIOD_NS, 10**9)
+        yield with_header(cloud, (start + seconds, nanoseconds))
+
+
+class Probe:
+    """Sends clouds to a node, receives its results reliably, and matches them by stamp.
+
+    `on_back` is called with a cloud that was sent and its results, when both are back;
+    `n_stray` counts the results that belong to no cloud sent, or came a second time.
+    """
+
+    def __init__(
+        self, session: Session, on_back: Callable[[CloudMessage, Results], object]
+    ) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from sensor_msgs.msg import PointCloud2
+
+        from gp_ground_seg.ros.input import cloud_profile
+
+        self.n_stray = 0
+        self._session = session
+        self._on_back = on_back
+        self._waiting: dict[tuple[int, int], tuple[Trip, CloudMessage, Results]] = {}
+        self._counts: dict[str, int] = {}
+        self._publisher = session.node.create_publisher(PointCloud2, INPUT, cloud_profile(10))
+        for topic in (GROUND, OBSTACLES):
+            session.node.create_subscription(
+                PointCloud2, topic, partial(self._receive, topic), cloud_profile(50), raw=True
+            )
+        session.node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnosed, 10)
+
+    def connect(self, node: NodeProcess, timeout: float = START_TIMEOUT) -> None:
+        """Send empty clouds until both topics have answered and the node is settled.
+
+        Discovery takes its time, each way on its own: only a result proves the connection.
+        Raises a GroundSegError if that takes longer than `timeout` [s], or the node ends.
+        """
+        empty = cloud_from_columns((0, 0), _PROBE_FRAME, {})
+        end, next_time, trip = time.monotonic() + timeout, 0.0, Trip(0)
+        for cloud in restamped([empty], 1):
+            while time.monotonic() < next_time:
+                self._session.spin(0.02)
+            node.check()
+            if trip.back is not None and self._counts and node.is_settled():
+                break
+            if time.monotonic() > end:
+                raise GroundSegError(
+                    f'no answer on {GROUND} and {OBSTACLES} within {timeout:g} s; '
+                    f'the last words of the node:\n{node.log_tail()}'
+                )
+            self._waiting.clear()
+            trip = self._send(cloud)
+            next_time = time.monotonic() + _PROBE_PERIOD
+        self._waiting.clear()
+
+    def paced(
+        self, clouds: Iterable[CloudMessage], rate: float, on_sent: Callable[[], object]
+    ) -> list[Trip]:
+        """Send `clouds` at `rate` [Hz], whether or not results come back; return their trips."""
+        trips = []
+        due = time.monotonic()
+        for cloud in clouds:
+            raw = encode_cloud(cloud)
+            while (left := due - time.monotonic()) > 0.0:
+                self._session.spin(left)
+            trips.append(self._send(cloud, raw))
+            on_sent()
+            due += 1.0 / rate
+        self._wait(SILENCE)
+        return trips
+
+    def one_by_one(
+        self,
+        clouds: Iterable[CloudMessage],
+        on_trip: Callable[[Trip], object] = lambda _: None,
+        silence: float = SILENCE,
+    ) -> list[Trip]:
+        """Send each cloud when the one before is back, or lost; return their trips."""
+        trips = []
+        for cloud in clouds:
+            trips.append(self._send(cloud))
+            self._wait(silence)
+            on_trip(trips[-1])
+        return trips
+
+    def counters(self, timeout: float = 5.0) -> tuple[int, int]:
+        """Return the clouds that the node has processed and dropped, by its next report."""
+        self._counts.clear()
+        end = time.monotonic() + timeout
+        while not self._counts and time.monotonic() < end:
+            self._session.spin(0.05)
+        processed, dropped = (self._counts.get(name, -1) for name in _COUNTERS)
+        return processed, dropped
+
+    def _send(self, cloud: CloudMessage, raw: bytes | None = None) -> Trip:
+        raw = encode_cloud(cloud) if raw is None else raw
+        trip = Trip(time.time_ns())
+        self._waiting[stamp_of(cloud)] = trip, cloud, {}
+        self._publisher.publish(raw)
+        return trip
+
+    def _wait(self, silence: float) -> None:
+        """Receive until all is back, or nothing for `silence` [s]; the rest is lost then."""
+        n_waiting, last_news = len(self._waiting), time.monotonic()
+        while self._waiting and time.monotonic() < last_news + silence:
+            self._session.spin(0.02)
+            if len(self._waiting) < n_waiting:
+                n_waiting, last_news = len(self._waiting), time.monotonic()
+        self._waiting.clear()
+
+    def _receive(self, topic: str, raw: bytes, info: dict[str, Any]) -> None:
+        self.arrived(topic, decode_cloud(raw), info.get('received_timestamp') or time.time_ns())
+
+    def arrived(self, topic: str, cloud: CloudMessage, now: int) -> None:
+        """Take a result on `topic` that arrived at the system time `now` [ns]."""
+        stamp, is_data = stamp_of(cloud), cloud.header.frame_id != _PROBE_FRAME
+        if stamp not in self._waiting or topic in self._waiting[stamp][2]:
+            self.n_stray += is_data
+            return
+        trip, sent, results = self._waiting[stamp]
+        results[topic] = cloud
+        if len(results) == 2:
+            del self._waiting[stamp]
+            trip.back = now
+            if is_data:
+                self._on_back(sent, results)
+
+    def _diagnosed(self, array: Any) -> None:
+        for status in array.status:
+            if status.name.endswith(': processing'):
+                values = {entry.key: entry.value for entry in status.values}
+                self._counts.update({name: int(values[name]) for name in _COUNTERS})
+
+
+def rate_result(asked: float, trips: Sequence[Trip], n_dropped: int) -> dict[str, Any]:
+    """Return the statistics of clouds sent at a rate of `asked` [Hz], times in seconds.
+
+    ``sent`` is the rate that was reached; ``is_accounted`` whether the node reported as
+    dropped, `n_dropped`, what did not come back; ``is_bounded`` whether the latency did not
+    grow from the second quarter to the last. NaN if nothing came back.
+    """
+    latency = np.array([trip.latency for trip in trips])
+    quarter = len(trips) // 4
+    early = _percentile(latency[quarter : 2 * quarter], 50)
+    late = _percentile(latency[3 * quarter :], 50)
+    seconds = 1e-9 * (trips[-1].sent - trips[0].sent)
+    n_back = int(np.count_nonzero(np.isfinite(latency)))
+    percents = {'p50': 50, 'p95': 95, 'p99': 99, 'worst': 100}
+    return {
+        'asked': asked,
+        'sent': (len(trips) - 1) / seconds if seconds > 0.0 else np.nan,
+        'n_sent': len(trips),
+        'n_back': n_back,
+        'n_lost': len(trips) - n_back,
+        'n_dropped': n_dropped,
+        **{name: _percentile(latency, q) for name, q in percents.items()},
+        'is_newest_back': trips[-1].back is not None,
+        'is_bounded': bool(late <= STEADY_FACTOR * early + STEADY_MARGIN),
+        'is_accounted': n_dropped == len(trips) - n_back,
+    }
+
+
+def _percentile(latency: FloatArray, q: float) -> float:
+    known = latency[np.isfinite(latency)]
+    return float(np.percentile(known, q)) if len(known) else np.nan
+
+
+def memory_result(resident: Sequence[int], peak: int) -> dict[str, float]:
+    """Return the growth of the memory after each cloud, from at least ten values [bytes].
+
+    ``start`` and ``end`` are the medians of the tenth after the first one and of the last.
+    """
+    share = len(resident) // 10
+    start = float(np.median(resident[share : 2 * share]))
+    end = float(np.median(resident[-share:]))
+    n_clouds = len(resident)
+    growth = end / start - 1.0
+    return {'n_clouds': n_clouds, 'start': start, 'end': end, 'peak': peak, 'growth': growth}

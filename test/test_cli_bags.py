@@ -1,0 +1,394 @@
+"""The command `play`, by what a subscriber gets of it and by what it says."""
+
+import contextlib
+import itertools
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from bag_samples import PERIOD, START, write_ros1_bag, write_ros2_bag
+
+pytest.importorskip('rclpy', reason='ROS is not installed')
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_helpers import BEST_EFFORT, ISOLATION, PATIENCE, isolated_context, spinning, wait_for
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+
+from gp_ground_seg.cli import bags, options
+from gp_ground_seg.cli.main import main
+from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
+from gp_ground_seg.ros import lifecycle, playback
+from gp_ground_seg.ros.lifecycle import ros_session
+
+RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+SUMMARY = re.compile(
+    r'(\d+) clouds? sent in ([\d.]+) s(?: \(([\d.]+) Hz\))?, (\d+) more than 20 ms late '
+    r'\(worst ([\d.]+) ms\), (\d+) undelivered\n'
+)
+WAITING = 'gp-ground-seg: note: waiting for a subscriber of /points'
+
+
+@pytest.fixture(autouse=True)
+def stock_transport(monkeypatch):
+    """Fast DDS would keep a profile for all that follows in this process."""
+    monkeypatch.setattr(lifecycle, '_free_shared_memory', lambda: 0)
+
+
+class Listener:
+    """Subscribes to clouds and /clock; keeps the bytes, and when they were sent [ns]."""
+
+    def __init__(self, context, topics, qos):
+        self.node = Node('listener', context=context)
+        self.clouds = {topic: [] for topic in topics}
+        self.times = {topic: [] for topic in topics}
+        self.clock = []
+        self.subscriptions = [self._subscribe(topic, qos) for topic in topics]
+        self.node.create_subscription(Clock, '/clock', self._tick, RELIABLE)
+
+    def _subscribe(self, topic, qos):
+        def receive(raw, info):
+            self.times[topic].append(info['source_timestamp'])
+            self.clouds[topic].append(raw)
+
+        return self.node.create_subscription(PointCloud2, topic, receive, qos, raw=True)
+
+    def _tick(self, message):
+        self.clock.append(message.clock.sec * 10**9 + message.clock.nanosec)
+
+
+@contextlib.contextmanager
+def listening(*topics, qos=RELIABLE):
+    with isolated_context() as context:
+        listener = Listener(context, topics, qos)
+        with spinning(context, listener.node):
+            yield listener
+
+
+def play(*words):
+    return main(['play', *(str(word) for word in words)])
+
+
+def summary(capsys):
+    """Numbers of the one line it prints: clouds, seconds, Hz, late, worst ms, undelivered."""
+    return [
+        float(number or 'nan') for number in SUMMARY.fullmatch(capsys.readouterr().out).groups()
+    ]
+
+
+def recorded(bag, topic):
+    with BagReader(bag) as reader:
+        return [raw for _, _, raw in reader.messages([topic])]
+
+
+def test_every_byte_at_the_recorded_times(tmp_path, capsys, monkeypatch):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 8)
+    told = []
+    tell = playback.Player._publish_time
+    monkeypatch.setattr(
+        playback.Player, '_publish_time', lambda p, now: [told.append(now), tell(p, now)]
+    )
+    end = START + 7 * PERIOD
+    with listening('/points') as listener:
+        assert play(bag, '--clock', '--rate', 2) == 0
+        wait_for(lambda: len(listener.clouds['/points']) == 8, 'last cloud')
+        wait_for(lambda: listener.clock[-1:] == [end], 'end of /clock')
+    assert listener.clouds['/points'] == recorded(bag, '/points')
+    captured = capsys.readouterr()
+    note, *waiting = captured.err.splitlines()
+    assert note == 'gp-ground-seg: note: not played: /note (std_msgs/msg/String)'
+    assert set(waiting) <= {WAITING}
+    numbers = SUMMARY.fullmatch(captured.out).groups()
+    assert (numbers[0], numbers[5]) == ('8', '0')
+    # How late a cloud is the machine decides, not we; the summary tells.
+    delay = 1e-3 * float(numbers[4])
+    assert float(numbers[1]) == pytest.approx(7 * 0.05, abs=0.06 + delay)
+
+    # No cloud before its time, counted from the first, which may be late itself.
+    times = np.array(listener.times['/points'])
+    due = np.arange(8) * PERIOD / 2
+    assert (times - times[0] - due > -1e9 * (0.02 + delay)).all()
+
+    # A newer time may take the place of one not sent yet.
+    assert set(listener.clock) <= set(told)
+    assert listener.clock == sorted(listener.clock)
+    assert told == sorted(told)
+    assert (told[0], told[-1]) == (START, end)
+    assert set(START + np.arange(8) * PERIOD) <= set(told)
+    # 50 times a second, of which each lasts two of the bag's.
+    assert np.median(np.diff(told)) <= 2 * 0.03e9 + 2e9 * delay
+
+
+def test_part_of_a_bag(tmp_path, capsys):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 10)
+    with listening('/points') as listener:
+        assert play(bag, '--start', 0.25, '--duration', 0.3, '--rate', 5, '--quiet') == 0
+        wait_for(lambda: len(listener.clouds['/points']) == 3, 'last cloud')
+    assert listener.clouds['/points'] == recorded(bag, '/points')[3:6]
+    assert summary(capsys)[0] == 3
+
+    with isolated_context():
+        assert play(bag, '--start', 5, '--no-wait', '--quiet') == 2
+    assert capsys.readouterr().err == (
+        f'gp-ground-seg: error: {bag}: no cloud in the time asked for (from 5 s on); '
+        'the last of its 10 clouds is at 0.900 s\n'
+    )
+
+
+def test_which_topics(tmp_path, capsys):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 2, topics=('/front', '/rear'))
+    with listening('/front', '/rear') as listener:
+        assert play(bag, '--quiet') == 2
+        assert 'choose one with --topic: /front, /rear' in capsys.readouterr().err
+        assert play(bag, '--topic', '/note') == 2
+        assert 'is of type std_msgs/msg/String' in capsys.readouterr().err
+
+        assert play(bag, '--topic', '/rear', '--quiet') == 0
+        wait_for(lambda: len(listener.clouds['/rear']) == 2, 'last cloud')
+        assert listener.clouds['/front'] == []
+        assert summary(capsys)[0] == 2
+
+        assert play(bag, '--all', '--quiet', '--rate', 0.5) == 0
+        wait_for(lambda: [len(c) for c in listener.clouds.values()] == [2, 4], 'last cloud')
+        numbers = summary(capsys)
+    assert numbers[0] == 4
+    # Two clouds on each topic, 0.2 s apart but for what one of them is late.
+    assert 1.0 / numbers[2] == pytest.approx(0.2, abs=0.01 + 1e-3 * numbers[4])
+
+
+def test_bag_of_ros_1_on_another_topic(tmp_path, capsys):
+    bag = tmp_path / 'kitti.bag'
+    write_ros1_bag(bag, 2)
+    with listening('/points') as listener:
+        remap = '/kitti/velo/pointcloud:=/points'
+        assert play(bag, '--quiet', '--ros-args', '-r', remap) == 0
+        wait_for(lambda: len(listener.clouds['/points']) == 2, 'last cloud')
+    (first, _) = recorded(bag, '/kitti/velo/pointcloud')
+    assert listener.clouds['/points'][0] == first
+    assert decode_cloud(first).header.frame_id == 'velo_link'
+
+
+def test_nobody_listens(tmp_path, capsys):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 3)
+    with isolated_context():
+        assert play(bag, '--wait', 0.2, '--quiet') == 2
+        assert capsys.readouterr().err == (
+            'gp-ground-seg: error: no subscriber of /points within 0.2 s; '
+            '--no-wait plays without one\n'
+        )
+        assert play(bag, '--no-wait', '--quiet', '--rate', 10) == 0
+    numbers = summary(capsys)
+    assert (numbers[0], numbers[5]) == (3, 3)
+
+
+def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 2)
+    is_said = threading.Event()
+
+    def note(text):
+        options.note(text)
+        if text.startswith('waiting'):
+            is_said.set()
+
+    monkeypatch.setattr(bags, 'note', note)
+    with isolated_context() as context:
+        node = Node('late', context=context)
+        clouds = []
+
+        def come_late():
+            is_said.wait(PATIENCE)
+            node.create_subscription(PointCloud2, '/points', clouds.append, RELIABLE)
+
+        thread = threading.Thread(target=come_late)
+        thread.start()
+        assert play(bag) == 0
+        thread.join()
+        with spinning(context, node):
+            wait_for(lambda: len(clouds) == 2, 'last cloud')
+    assert WAITING in capsys.readouterr().err.splitlines()
+
+
+def test_subscriber_that_leaves(tmp_path, capsys):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 20)
+    with listening('/points') as listener:
+
+        def leave():
+            wait_for(lambda: len(listener.clouds['/points']) >= 8, 'eighth cloud')
+            listener.node.executor.create_task(
+                listener.node.destroy_subscription, listener.subscriptions[0]
+            )
+
+        thread = threading.Thread(target=leave)
+        thread.start()
+        assert play(bag, '--quiet') == 1
+        thread.join()
+    n_sent, *_, n_undelivered = summary(capsys)
+    assert n_sent == 20
+    # Of the latest it got, the player may not have heard yet.
+    assert 20 - len(listener.clouds['/points']) <= n_undelivered < 20
+
+
+def test_best_effort_subscriber(tmp_path, capsys):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 2)
+    with listening('/points', qos=BEST_EFFORT) as listener:
+        assert play(bag) == 0
+        wait_for(lambda: len(listener.clouds['/points']) == 2, 'last cloud')
+    assert '/points has a best-effort subscriber' in capsys.readouterr().err
+
+
+class Program:
+    """The command in a process of its own, `lines` of its output as they come."""
+
+    def __init__(self, *words, code=('-m', 'gp_ground_seg', 'play')):
+        self.popen = subprocess.Popen(
+            [sys.executable, *code, *map(str, words)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **ISOLATION},
+        )
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_error):
+        self.popen.kill()
+        self.popen.communicate()
+
+    def end(self, number):
+        """Send a signal; return exit code, output, errors."""
+        self.popen.send_signal(number)
+        output, errors = self.popen.communicate(timeout=PATIENCE)
+        return self.popen.returncode, output, errors
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_loop_until_interrupted(tmp_path, number):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 3)
+    with (
+        listening('/points') as listener,
+        Program(bag, '--loop', '--rate', 2, '--clock') as program,
+    ):
+        wait_for(lambda: len(listener.clouds['/points']) >= 7, 'third round')
+        code, output, errors = program.end(number)
+        wait_for(lambda: listener.subscriptions[0].get_publisher_count() == 0, 'farewell')
+    assert code == 130
+    assert errors.splitlines()[-1] == 'gp-ground-seg: interrupted'
+    assert 'Traceback' not in errors
+    numbers = SUMMARY.fullmatch(output).groups()
+    assert int(numbers[0]) >= 7
+    stamps = [stamp_of(decode_cloud(raw)) for raw in listener.clouds['/points']]
+    assert stamps == list(itertools.islice(itertools.cycle(stamps[:3]), len(stamps)))
+    # A period between the last of a round and the first of the next, as between the others.
+    steps = np.diff(listener.times['/points'])
+    assert steps.min() > 0.5 * PERIOD / 2 - 1e6 * float(numbers[4])
+
+
+def test_signals_of_a_session():
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    nohup = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with isolated_context(), ros_session('any') as running:
+            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+            # Python swallows what a signal raises within a destructor: it comes again.
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGTERM)
+            for wait in (running.sleep, running.spin):
+                with pytest.raises(KeyboardInterrupt):
+                    wait(0.001)
+    finally:
+        signal.signal(signal.SIGHUP, nohup)
+    assert {number: signal.getsignal(number) for number in numbers} == before
+
+
+SUBSCRIBER = """
+import os, rclpy, signal
+from sensor_msgs.msg import PointCloud2
+rclpy.init()
+node = rclpy.create_node('doomed')
+seen = []
+
+def receive(cloud):
+    seen.append(cloud)
+    if len(seen) == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+node.create_subscription(PointCloud2, '/points', receive, 10)
+rclpy.spin(node)
+"""
+
+
+def test_subscriber_that_is_killed(tmp_path, capsys, monkeypatch):
+    """It cannot say goodbye: the middleware believes in it, but no longer hears of it."""
+    monkeypatch.setattr(playback, 'DELIVERY_TIMEOUT', 0.5)
+    bag = tmp_path / 'drive.mcap'
+    n_clouds = playback.DEPTH + 50
+    write_ros2_bag(bag, n_clouds)
+    with Program(code=('-c', SUBSCRIBER)) as subscriber, isolated_context():
+        assert play(bag, '--quiet', '--rate', 10, '--wait', PATIENCE) == 1
+        assert subscriber.popen.wait(PATIENCE) == -signal.SIGKILL
+    n_sent, *_, n_undelivered = summary(capsys)
+    assert n_sent == n_clouds
+    # More than still wait in the queue: those that were pushed out of it count as well.
+    assert playback.DEPTH < n_undelivered <= n_clouds
+
+
+def test_without_ros(tmp_path):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 1)
+    code = (
+        'import sys; sys.modules["rclpy"] = None; from gp_ground_seg.cli.main import main; '
+        'sys.exit(main(sys.argv[1:]))'
+    )
+    result = subprocess.run(
+        [sys.executable, '-c', code, 'play', str(bag)], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 2
+    (line,) = result.stderr.splitlines()
+    assert line.startswith('gp-ground-seg: error: play needs ROS 2, which cannot be imported')
+    assert "pip install 'gp_ground_seg[ros]'" in line
+
+
+@pytest.mark.parametrize(
+    'words',
+    [
+        ('--rate', '0'),
+        ('--rate', '-1'),
+        ('--rate', 'nan'),
+        ('--start', '-1'),
+        ('--duration', 'inf'),
+        ('--wait', 'soon'),
+        ('--wait', '1', '--no-wait'),
+        ('--all', '--topic', '/points'),
+    ],
+)
+def test_refused_options(words, tmp_path, capsys):
+    with pytest.raises(SystemExit, match='2'):
+        play(tmp_path / 'drive.mcap', *words)
+    assert words[0] in capsys.readouterr().err
+
+
+def test_no_bag(tmp_path, capsys):
+    assert play(tmp_path / 'none.mcap') == 2
+    assert capsys.readouterr().err == (
+        f'gp-ground-seg: error: {tmp_path / "none.mcap"}: no such file or folder\n'
+    )
+    write_ros2_bag(tmp_path / 'drive.mcap', 1)
+    assert play(tmp_path / 'drive.mcap', '--quiet', '--ros-args', '-r', 'nonsense') == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1

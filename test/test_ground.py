@@ -1,0 +1,237 @@
+"""Length-scales, inlier growth and the fused surface: both backends against loops."""
+
+import numpy as np
+import pytest
+import reference
+from conftest import fewer, hilly_scan, sharing
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gp_ground_seg import Config
+from gp_ground_seg.backend import NumpyBackend
+from gp_ground_seg.compiled import ground as compiled_ground
+from gp_ground_seg.frame import Frame
+from gp_ground_seg.gp.ground import fuse_neighbours
+from gp_ground_seg.gp.learning import given_theta
+
+
+def frame_of(xyz, config):
+    scan = NumpyBackend().build_grid(np.asarray(xyz, dtype=float), config)
+    faces = NumpyBackend().find_faces(scan, config)
+    found = NumpyBackend().extract_lines(scan.candidates, faces, config)
+    return Frame(*found, scan.grid.edges, prior_mean=-1.73)
+
+
+def config_of(model='latent', slope_std=0.05, n_neighbours=0, **growth):
+    values = {f'growth.{name}': value for name, value in growth.items()}
+    return Config().replace(
+        **values,
+        **{
+            'length_scale.model': model,
+            'length_scale.constant': 8.0,
+            'observation.sigma_f': 0.2,
+            'observation.sigma_n': 0.07,
+            'observation.slope_std': slope_std,
+            'surface.n_neighbours': n_neighbours,
+        },
+    )
+
+
+@pytest.mark.parametrize('seed', range(fewer(40, 6)))
+def test_surfaces_are_the_reference(backend, seed):
+    rng = np.random.default_rng(seed)
+    model = rng.choice(['latent', 'latent', 'line_gradient', 'constant'])
+    # Fewer segments than fit into one batch, or more; some of them empty.
+    config = config_of(model, rng.choice([0.0, 0.05]), int(rng.integers(0, 3))).replace(
+        **{'grid.n_segments': int(rng.choice([5, 7, 35, fewer(96, 12)])), 'grid.n_bins': 80}
+    )
+    xyz = hilly_scan(int(rng.choice([0, 30, 900])), seed)
+    frame = frame_of(xyz[rng.random() * xyz[:, 1] > -5.0], config)
+    scatter = np.where(np.arange(14) < 5, 0.3, 1.0)
+    theta = given_theta(frame, config) + scatter * rng.normal(size=(config.grid.n_segments, 14))
+    if rng.random() < 0.3:
+        frame = frame._replace(knots=frame.knots[:0])
+    step = int(rng.choice([1, 3]))
+    found, knot_u = backend.estimate_surface(frame, theta, config, step)
+    expected, expected_u = reference.estimate_surface(frame, theta, config, step)
+    np.testing.assert_array_equal(found.inlier, expected.inlier)
+    assert not found.inlier[frame.candidates.segment % step > 0].any()
+    np.testing.assert_allclose(knot_u, expected_u, atol=1e-9)
+    np.testing.assert_allclose(found.mean, expected.mean, atol=1e-7)
+    np.testing.assert_allclose(found.std, expected.std, atol=1e-5)
+
+
+def test_threads_do_not_change_a_bit():
+    config, results = config_of(n_neighbours=2), []
+    frame = frame_of(hilly_scan(fewer(4000, 400)), config)
+    theta = given_theta(frame, config)
+    for n_threads in (1, 2, 3, 7):
+        with sharing(n_threads) as backend:
+            surface, u = backend.estimate_surface(frame, theta, config)
+            results.append((surface.mean, surface.std, surface.inlier, u.copy()))
+    for other in results[1:]:
+        for a, b in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+# Length-scales
+
+
+def test_latent_mean_is_the_conditional_of_the_joint_gaussian():
+    rng = np.random.default_rng(2)
+    r_bar, r = np.sort(rng.uniform(3, 40, 6)), rng.uniform(3, 60, 9)
+    l_bar = rng.normal(1.0, 0.5, 6)
+    b = reference.squared_exponential(r_bar, r_bar, 0.8, 4.0) + 0.3**2 * np.eye(6)
+    gain = reference.squared_exponential(r, r_bar, 0.8, 4.0) @ np.linalg.inv(b)
+    expected = l_bar.mean() + gain @ (l_bar - l_bar.mean())
+    found = reference.log_length_scale(r_bar, l_bar, r, 0.8, 4.0, 0.3)
+    np.testing.assert_allclose(found, expected)
+
+
+def test_equal_pseudo_inputs_give_that_length_scale_everywhere(backend):
+    frame = frame_of(hilly_scan(400), config_of())
+    theta = given_theta(frame, config_of())
+    theta[:, 5:] = 1.3
+    u = backend.estimate_surface(frame, theta, config_of())[1]
+    assert np.isfinite(u).any()
+    np.testing.assert_allclose(u[np.isfinite(u)], 1.3, rtol=1e-13)
+
+
+# Posterior
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10_000), st.integers(1, 15), st.floats(0.0, 0.2))
+def test_posterior_is_the_conditional_of_the_joint_gaussian(seed, n, slope_std):
+    """Against the textbook form: invert the joint covariance, read off the block."""
+    rng = np.random.default_rng(seed)
+    r, length_scale = rng.uniform(2, 60, n + 4), rng.uniform(0.5, 30, n + 4)
+    z = np.sin(r[:n])
+    joint = reference.paciorek(r, length_scale, r, length_scale, 0.6)
+    joint += slope_std**2 * np.outer(r, r)
+    joint[:n, :n] += 0.1**2 * np.eye(n)
+    gain = np.linalg.solve(joint[:n, :n], joint[:n, n:]).T
+    data, at = (r[:n], z, length_scale[:n]), (r[n:], length_scale[n:])
+    mean, variance = reference.posterior(*data, *at, 0.6, 0.1, slope_std)
+    np.testing.assert_allclose(mean, gain @ z, atol=1e-9)
+    np.testing.assert_allclose(variance, np.diag(joint[n:, n:] - gain @ joint[:n, n:]), atol=1e-9)
+
+
+# Growth
+
+
+def grow_line(backend, z, r=None, continues=(), slope_std=0.05, **bounds):
+    """Inliers, knots, mean and std of one segment; up to 5.5 m low candidates are seeds."""
+    r = np.arange(3.0, 3.0 + len(z)) if r is None else np.asarray(r, dtype=float)
+    seeds = {'seed_range': 5.5, 'seed_height_tolerance': 0.25}
+    config = config_of('constant', slope_std, **{**seeds, **bounds})
+    frame = frame_of(np.column_stack([r, 0.01 * r, np.asarray(z) - 1.73]), config)
+    frame = frame._replace(continues_line=np.isin(np.arange(len(z)), continues))
+    surface, _ = backend.estimate_surface(frame, given_theta(frame, config), config)
+    m, known = frame.candidates.segment[0], np.isfinite(surface.mean[frame.candidates.segment[0]])
+    values = frame.knots[known], surface.mean[m, known] + 1.73, surface.std[m, known]
+    return list(np.flatnonzero(surface.inlier)), *values
+
+
+def test_growth_follows_ground_and_leaves_obstacles_out(backend):
+    z = np.zeros(20)
+    z[8:11] = 1.0
+    inlier, knots, mean, _ = grow_line(backend, z)
+    assert inlier == [*range(8), *range(11, 20)]
+    assert np.max(np.abs(mean[knots < 20])) < 0.02
+
+
+def test_growth_stops_where_the_surface_is_uncertain(backend):
+    inlier, _, _, std = grow_line(backend, np.zeros(8), r=[*range(3, 10), 60.0])
+    assert inlier == list(range(7))
+    assert std.max() > Config().growth.max_std
+    # Far from data the mean follows the slope, and is the less certain for it.
+    z, r = 0.05 * np.array([*range(3, 10), 60.0]), [*range(3, 10), 60.0]
+    (knots, mean, std), (_, level, level_std) = (
+        grow_line(backend, z, r, slope_std=s, seed_range=20.0)[1:] for s in (0.1, 0.0)
+    )
+    assert mean[-1] == pytest.approx(0.05 * knots[-1], abs=0.5)
+    assert level[-1] == pytest.approx(0.0, abs=1e-3)
+    assert std[-1] > level_std[-1]
+
+
+def test_no_seed_no_model(backend):
+    inlier, knots, _, _ = grow_line(backend, np.full(5, 5.0))
+    assert inlier == [] and len(knots) == 0
+
+
+def test_looser_bounds_take_more(backend):
+    z = np.where(np.arange(20) % 4 == 3, 0.35, 0.0)
+    strict, loose = (
+        len(grow_line(backend, z, max_standardised_residual=limit)[0]) for limit in (1.0, 8.0)
+    )
+    assert strict < loose == 20
+
+
+def test_below_the_prediction_the_gate_is_wider_than_above(backend):
+    z = np.zeros(12)
+    # Beside the seeds, where the surface is certain.
+    z[3] = 0.3
+    without = [0, 1, 2, *range(4, 12)]
+    assert grow_line(backend, z)[0] == without
+    assert len(grow_line(backend, -z)[0]) == 12
+    assert grow_line(backend, -z, max_standardised_depth=2.0)[0] == without
+
+
+def test_a_line_is_followed_from_inliers_on(backend):
+    z = np.concatenate([np.zeros(6), 0.8 * np.arange(1.0, 9.0)])
+    assert grow_line(backend, z)[0] == list(range(6))
+    # The line begins at 6, which is no inlier: nothing to continue.
+    assert grow_line(backend, z, continues=range(7, 14))[0] == list(range(6))
+    inlier, knots, mean, _ = grow_line(backend, z, continues=range(5, 14))
+    assert inlier == list(range(14))
+    assert mean[np.searchsorted(knots, 14.0)] > 1.0
+
+
+# Fusion of neighbours
+
+
+@pytest.fixture(params=['numpy', 'numba'])
+def fuse(request):
+    """Compute mean and std of fused surfaces."""
+
+    def compiled(mean, std, knots, n_neighbours, slope_std):
+        changes = {'surface.n_neighbours': n_neighbours, 'observation.slope_std': slope_std}
+        params = compiled_ground.GroundParams.of(Config().replace(**changes), 1)
+        n_knots = np.isfinite(mean).sum(axis=1)
+        own = compiled_ground.SegmentSurfaces(
+            np.empty(0), mean, np.empty(0, dtype=bool), mean, std, n_knots
+        )
+        fused = np.empty((2, *mean.shape))
+        compiled_ground.fuse_neighbours(own, knots, params, -1.7, *fused)
+        return fused[0] + 1.7, fused[1]
+
+    return fuse_neighbours if request.param == 'numpy' else compiled
+
+
+RANGES = np.array([2.0, 4.0, 6.0, 8.0, 10.0])
+RANGES.setflags(write=False)
+
+
+def test_a_segment_without_a_model_gets_its_neighbours(fuse):
+    mean, std = np.full((8, 5), 0.4), np.full((8, 5), 0.1)
+    mean[:4] = std[:4] = np.nan
+    fused, fused_std = fuse(mean, std, RANGES, 1, 0.05)
+    np.testing.assert_allclose(fused[[0, 3]], 0.4)
+    assert (fused_std[[0, 3]] > 0.1).all()
+    assert np.isnan(fused[1:3]).all()
+    np.testing.assert_allclose(fuse(mean, std, RANGES, 0, 0.05)[0], mean, rtol=1e-12)
+
+
+@pytest.mark.parametrize('seed', range(12))
+@pytest.mark.parametrize('n_neighbours', [0, 1, 3])
+def test_fusing_is_the_reference(fuse, seed, n_neighbours):
+    rng = np.random.default_rng(seed)
+    mean, std = rng.normal(0, 0.3, (9, 5)), rng.uniform(0, 0.5, (9, 5))
+    std[:, 2] = 0.0
+    # Some segments have no model at all, some up to a knot.
+    for m, n in enumerate(rng.integers(0, 6, 9) * rng.integers(0, 2, 9)):
+        mean[m, n:] = std[m, n:] = np.nan
+    found = fuse(mean, std, RANGES, n_neighbours, 0.05)
+    for a, b in zip(found, reference.fuse(mean, std, RANGES, n_neighbours, 0.05), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)

@@ -1,0 +1,57 @@
+"""Losses, latency and growth, from times."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gp_ground_seg.ros.probe import Trip, memory_result, rate_result
+
+
+def trips_of(latencies, period=0.1):
+    """Trips of clouds sent every `period`, None = lost."""
+    start = 1_700_000_000 * 10**9
+    sent = [start + round(1e9 * period * k) for k in range(len(latencies))]
+    return [
+        Trip(t, None if latency is None else t + round(1e9 * latency))
+        for t, latency in zip(sent, latencies, strict=True)
+    ]
+
+
+@given(st.lists(st.none() | st.floats(0.0, 5.0), min_size=2), st.integers(0, 50))
+def test_counts_and_percentiles(latencies, n_dropped):
+    result = rate_result(10.0, trips_of(latencies), n_dropped)
+    back = [latency for latency in latencies if latency is not None]
+    assert (result['n_sent'], result['n_back']) == (len(latencies), len(back))
+    assert result['n_lost'] == latencies.count(None)
+    assert result['is_accounted'] == (n_dropped == latencies.count(None))
+    assert result['is_newest_back'] == (latencies[-1] is not None)
+    assert result['sent'] == pytest.approx(10.0)
+    if back:
+        expected = np.percentile(back, [50, 95, 99, 100])
+        found = [result['p50'], result['p95'], result['p99'], result['worst']]
+        np.testing.assert_allclose(found, expected, atol=1e-8)
+    else:
+        assert math.isnan(result['p50'])
+        assert not result['is_bounded']
+
+
+@given(st.floats(0.001, 0.3), st.integers(20, 600))
+def test_latency_of_a_queue_that_ever_grows_is_not_bounded(latency, n):
+    level = [min(k + 1, 5) * latency for k in range(n)]
+    assert rate_result(50.0, trips_of(level, 0.02), 0)['is_bounded']
+    growing = [0.1 + 0.02 * k for k in range(n)]
+    assert not rate_result(50.0, trips_of(growing, 0.02), 0)['is_bounded']
+
+
+@given(st.integers(10, 3000), st.floats(-0.1, 0.5))
+def test_growth_is_that_after_the_start(n, growth):
+    resident = [300e6] * n
+    share = n // 10
+    resident[:share] = [100e6] * share  # buffers that are taken once
+    resident[-share:] = [300e6 * (1.0 + growth)] * share
+    result = memory_result(resident, peak=10**9)
+    assert result['growth'] == pytest.approx(growth, abs=1e-9)
+    assert (result['n_clouds'], result['peak']) == (n, 1e9)
