@@ -12,19 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config
-from gp_ground_seg.cli.bench import (
-    DOCS_BEGIN,
-    DOCS_END,
-    RUN_LENGTH,
-    read_record,
-    replace_section,
-    runs,
-)
-from gp_ground_seg.errors import DataError
+from gp_ground_seg.cli.bench import RUN_LENGTH, bench_text, read_record, runs
 from gp_ground_seg.evaluation.benchmark import (
-    BenchCase,
     BenchFrame,
-    CaseTimes,
     FrameTime,
     bench_cases,
     bench_document,
@@ -81,7 +71,7 @@ def with_intensity(points):
 def test_every_case_runs_on_every_frame_beside_its_own_baseline():
     rulers = []
 
-    def make(case):
+    def make(_):
         rulers.append(Ruler(clock))
         rulers[-1].journal = []
         return rulers[-1]
@@ -89,28 +79,28 @@ def test_every_case_runs_on_every_frame_beside_its_own_baseline():
     clock = Clock()
     frames = frames_of(('a', 3), ('b', 2))
     cases = bench_cases(NUMPY, [1, 2], with_numpy=True)
-    assert [case.name for case in cases] == [
+    assert list(cases) == [
         'theta fixed, 1 thread', 'theta fixed, 2 threads',
         'learning, 1 thread', 'learning, 2 threads', 'learning, numpy',
     ]  # fmt: skip
     measured = run_cases(frames, cases, make, n_passes=2, clock=clock)
-    for ruler, found in zip(rulers, measured, strict=True):
-        assert [one.frame for one in found.times] == frames * 2
+    assert list(measured) == list(cases)
+    for ruler, times in zip(rulers, measured.values(), strict=True):
+        assert [one.frame for one in times] == frames * 2
         # Its reading of the clock, and seven ticks within.
-        assert {one.baseline for one in found.times} == {8.0}
-        assert all(one.seconds >= 1.0 for one in found.times)
-        assert found.ratios == [one.seconds / 8.0 for one in found.times]
+        assert {one.baseline for one in times} == {8.0}
+        assert all(one.seconds >= 1.0 and one.ratio == one.seconds / 8.0 for one in times)
         # Once to warm up, then on each frame; forgotten at each change of sequence.
         assert (ruler.journal.count('b'), ruler.journal.count('Rb')) == (1 + 10, 4)
-    modes = [found.times[-1].fit.mode for found in measured]
+    modes = [times[-1].fit.mode for times in measured.values()]
     assert modes == ['fixed'] * 2 + ['every_frame'] * 3
 
 
 def test_half_of_the_time_the_baseline_goes_first():
     journal = []
     clock = Clock(journal)
-    case = BenchCase('only', NUMPY.replace(**{'learning.mode': 'fixed'}))
-    run_cases(frames_of(('a', 4)), [case], lambda _: Ruler(clock), clock=clock)
+    cases = {'only': NUMPY.replace(**{'learning.mode': 'fixed'})}
+    run_cases(frames_of(('a', 4)), cases, lambda _: Ruler(clock), clock=clock)
     warm_up, letters = journal[:7], ''.join(journal[7:]).replace('Rb', '')
     assert warm_up == ['t'] * 5 + ['b', 't']
     baseline, ours = 'tbt', 'tt'
@@ -120,10 +110,10 @@ def test_half_of_the_time_the_baseline_goes_first():
 def test_a_new_sequence_forgets_the_one_before():
     config = NUMPY.replace(**{'learning.mode': 'first_frame'})
     frames = frames_of(('a', 2), ('b', 2))
-    (measured,) = run_cases(frames, [BenchCase('only', config)], clock=Clock())
-    status = [one.fit.status == 'kept' for one in measured.times]
+    measured = run_cases(frames, {'only': config}, clock=Clock())['only']
+    status = [one.fit.status == 'kept' for one in measured]
     assert status == [False, True, False, True]
-    assert all(math.isnan(one.baseline) for one in measured.times)
+    assert all(math.isnan(one.baseline) for one in measured)
 
 
 @given(st.integers(1, 500), st.integers(1, 100))
@@ -168,14 +158,13 @@ def test_series_grow_in_what_they_are_named_after(n_frames, n_most):
 
 def recorded(ours, peers):
     frames = frames_of(('a', len(ours)), n_points=50)
-    case = BenchCase('only', NUMPY)
-    fit = run_cases(frames[:1], [case])[0].times[0].fit
+    fit = run_cases(frames[:1], {'only': NUMPY})['only'][0].fit
     times = [
         FrameTime(frame, a, {'grid': 0.25 * a, 'label': 0.5 * a}, b, fit)
         for frame, a, b in zip(frames, ours, peers, strict=True)
     ]
     return bench_document(
-        [CaseTimes(case, times)], [], NUMPY, describe_environment(), PATCHWORKPP, 'frames'
+        {'only': times}, [], NUMPY, describe_environment(), PATCHWORKPP, 'frames'
     )
 
 
@@ -192,20 +181,7 @@ def test_ratios_pair_each_frame_with_its_baseline():
     assert json.loads(json.dumps(document, allow_nan=False)) == document
 
 
-def test_section_is_replaced_and_only_it():
-    document = recorded([0.01], [0.02])
-    text = f'before\n{DOCS_BEGIN}\nold\n{DOCS_END}\nafter\n'
-    once = replace_section(text, document)
-    assert once.startswith(f'before\n{DOCS_BEGIN}\n')
-    assert once.endswith(f'{DOCS_END}\nafter\n')
-    assert 'old' not in once
-    assert replace_section(once, document) == once
-    for broken in ('no marks', f'{DOCS_END}{DOCS_BEGIN}', text + text):
-        with pytest.raises(DataError, match='once each'):
-            replace_section(broken, document)
-
-
 def test_docs_show_the_record():
     docs = REPOSITORY / 'docs'
     text = (docs / 'performance.md').read_text(encoding='utf-8')
-    assert text == replace_section(text, read_record(docs / 'performance.json'))
+    assert f'```text\n{bench_text(read_record(docs / "performance.json"))}\n```' in text

@@ -4,12 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from cli_runner import run
 from evaluation_samples import HeightRule, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from matplotlib.image import imread
 from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss
 
@@ -142,10 +140,3 @@ def test_sequences_are_pooled_by_their_points(tmp_path):
     )
     assert score.ece == pooled.ece
     assert none.calibration is None
-
-
-def test_picture_of_the_command(tmp_path):
-    root = write_streets(tmp_path / 'kitti', s00=1, s08=1)
-    picture = tmp_path / 'a.png'
-    assert run('evaluate', root, '--reliability', picture) == 0
-    assert imread(picture).shape[0] > 500

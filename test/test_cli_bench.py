@@ -71,30 +71,31 @@ def test_a_record_shows_what_measuring_showed(record, scans, capsys, tmp_path):
     assert max(len(line) for line in shown.splitlines()) <= 100
 
 
-@pytest.mark.parametrize('kind', ['mcap', 'ros1', 'scan', 'sequences'])
-def test_frames_come_from_whatever_holds_scans(kind, tmp_path):
-    if kind == 'mcap':
-        source = tmp_path / 'drive.mcap'
-        write_ros2_bag(source, n_clouds=3)
-    elif kind == 'ros1':
-        source = tmp_path / 'drive.bag'
-        write_ros1_bag(source, n_clouds=3)
-    elif kind == 'scan':
-        source = tmp_path / 'scan.bin'
-        scan(0).tofile(source)
-    else:
-        source = tmp_path
-        for name in ('00', '01'):
-            (tmp_path / 'sequences' / name / 'velodyne').mkdir(parents=True)
-            for k in range(2):
-                scan(k).tofile(tmp_path / 'sequences' / name / 'velodyne' / f'{k:06d}.bin')
-    frames = load_frames(source, 60)
-    expected = {'mcap': [0, 1, 2], 'ros1': [0, 1, 2], 'scan': [0], 'sequences': [0, 1, 0, 1]}[kind]
+def write_sequences(root):
+    for name in ('00', '01'):
+        folder = root / 'sequences' / name / 'velodyne'
+        folder.mkdir(parents=True)
+        for k in range(2):
+            scan(k).tofile(folder / f'{k:06d}.bin')
+
+
+@pytest.mark.parametrize(
+    ('name', 'write', 'expected'),
+    [
+        ('drive.mcap', lambda path: write_ros2_bag(path, n_clouds=3), [0, 1, 2]),
+        ('drive.bag', lambda path: write_ros1_bag(path, n_clouds=3), [0, 1, 2]),
+        ('scan.bin', lambda path: scan(0).tofile(path), [0]),
+        ('root', write_sequences, [0, 1, 0, 1]),
+    ],
+)
+def test_frames_come_from_whatever_holds_scans(name, write, expected, tmp_path):
+    write(tmp_path / name)
+    frames = load_frames(tmp_path / name, 60)
     assert len(frames) == len(expected)
     for frame, k in zip(frames, expected, strict=True):
         assert frame.points.dtype == np.float32
         np.testing.assert_array_equal(frame.points[:, :3], scan(k)[:, :3])
-    assert len({frame.sequence for frame in frames}) == (2 if kind == 'sequences' else 1)
+    assert len({frame.sequence for frame in frames}) == (2 if name == 'root' else 1)
 
 
 def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
@@ -121,26 +122,16 @@ def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
         (('--from', 'OTHER'), 'not a record'),
         (('DATA', '--quick', '--json', 'OTHER'), 'exists already'),
         (('EMPTY',), 'no point'),
-        (('--from', 'RECORD', '--docs', 'OTHER'), 'once each'),
-        (('--from', 'RECORD', '--docs', 'nowhere.md'), 'nowhere.md: cannot be read'),
     ],
 )
-def test_what_is_wrong_is_said(scans, record, words, says, tmp_path, capsys):
+def test_what_is_wrong_is_said(scans, words, says, tmp_path, capsys):
     other, empty = tmp_path / 'other.json', tmp_path / 'empty.bin'
     other.write_text('{"cases": []}')
     empty.touch()
-    named = {'DATA': scans, 'OTHER': other, 'EMPTY': empty, 'RECORD': record}
+    named = {'DATA': scans, 'OTHER': other, 'EMPTY': empty}
     assert bench(*(named.get(word, word) for word in words)) == 2
     assert says in capsys.readouterr().err
     assert other.read_text() == '{"cases": []}'
-
-
-def test_tables_go_between_the_marks(record, tmp_path, capsys):
-    page = tmp_path / 'page.md'
-    page.write_text('a\n<!-- bench:begin --><!-- bench:end -->\nb\n')
-    assert bench('--from', record, '--docs', page, '--plot', tmp_path / 'a.png') == 0
-    assert capsys.readouterr().out in page.read_text()
-    assert imread(tmp_path / 'a.png').shape[2] == 4
 
 
 def test_a_broken_cloud_of_a_bag_is_named(tmp_path, monkeypatch):
@@ -163,6 +154,8 @@ def test_without_the_baseline_there_are_no_ratios(scans, monkeypatch, tmp_path, 
 
 
 def test_the_picture_leaves_out_cases_without_compiled_code(record, tmp_path, monkeypatch):
+    assert bench('--from', record, '--plot', tmp_path / 'a.png') == 0
+    assert imread(tmp_path / 'a.png').shape[2] == 4
     drawn = []
     monkeypatch.setattr(command, 'plot_stage_bars', lambda cases, *_, force: drawn.append(cases))
     assert bench('--from', record, '--plot', tmp_path / 'bars.png') == 0

@@ -1,6 +1,5 @@
 """The command `experiment`: tables, files, options, and the commands of the docs."""
 
-import csv
 import json
 import re
 import shlex
@@ -9,16 +8,14 @@ import pytest
 from cli_runner import error_line, run
 from conftest import REPOSITORY
 from evaluation_samples import write_streets
-from test_cli_evaluate import rows_of
 
 from gp_ground_seg import Config
-from gp_ground_seg.cli import experiment as command
 from gp_ground_seg.cli.experiment import EXPERIMENTS, parse_departure, split_settings
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import config_from_options
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import evaluate as runner
-from gp_ground_seg.experiments import ablation, simulated_scenes
+from gp_ground_seg.experiments import ablation, sensor_pose, simulated_scenes
 from gp_ground_seg.experiments.simulated_scenes import PRESET_OF
 from gp_ground_seg.parameters.presets import PRESETS
 
@@ -40,7 +37,7 @@ CASES = {
     'ablation': (['ROOT', '--frame-step', '2', *SMALL], 'models', 7 * 3),
     'ablation --simulated': (['--seeds', '1', *SMALL], 'models', 7),
     'departures': (
-        ['ROOT', '--only-given', '--switch', 'small: grid.n_bins=79', '--switch',
+        ['ROOT', '--switch', 'small: grid.n_bins=79', '--switch',
          'near: grid.r_max=15', *SMALL],
         'departures', 3 * 4,
     ),
@@ -60,48 +57,37 @@ CASES = {
 
 
 @pytest.mark.parametrize('case', CASES)
-def test_files_and_terminal_say_the_same(case, root, tmp_path, capsys):
+def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys):
     words, name, n_rows = CASES[case]
     words = ['experiment', *case.split(), *(root if word == 'ROOT' else word for word in words)]
-    files = [tmp_path / f'a.{ending}' for ending in ('json', 'csv', 'md')]
-    outputs = zip(('--json', '--csv', '--markdown'), files, strict=True)
-    assert run(*words, *(word for pair in outputs for word in pair)) == 0
-    said = capsys.readouterr().out
-    document = json.loads(files[0].read_text())
-    markdown = files[2].read_text()
-    typed = [str(word).replace(str(root), 'KITTI_ROOT') for word in words]
-    assert sorted(shlex.split(document['command'])[1:]) == sorted(typed)
-    assert markdown.startswith(f'`{document["command"]}`\n')
-    # Every cell of Markdown is on the terminal, row by row.
-    lines = said.splitlines()
-    rows = re.findall(r'^\| (?!---)(.*) \|$', markdown, re.MULTILINE)
-    for row in rows:
-        cells = [cell.strip() for cell in row.split(' | ')]
-        assert any(re.split(r'  +', line.strip()) == cells for line in lines), row
+    assert run(*words, '--json', tmp_path / 'a.json') == 0
+    lines = capsys.readouterr().out.splitlines()
+    document = json.loads((tmp_path / 'a.json').read_text())
+    assert document['experiment'] == words[1]
+    assert document['options'].get('root') == (str(root) if root in words else None)
     tables = {key: found for key, found in document.items() if isinstance(found, list)}
-    full = tables.pop('by_segment' if 'table1' in case else 'by_scan')
-    assert len(full) == len(list(csv.DictReader(files[1].read_text().splitlines()))) == n_rows
-    assert len(rows) == sum(len(found) + 1 for found in tables.values())
+    assert len(tables.pop('rows')) == n_rows
     assert tables[name]
-    width = max(len(line) for line in lines if not line.startswith('written'))
+    # Cells stand two blanks apart, so that rows of text and of JSON have equally many.
+    for row in (row for table in tables.values() for row in table):
+        first = next(str(cell) for cell in row.values() if cell is not None)
+        rows = [re.split(r'  +', line.strip()) for line in lines if line.startswith(first)]
+        assert len(row) in map(len, rows), row
+    width = max(map(len, lines))
     assert width <= (110 if case == 'ablation --simulated' else 100)
     assert document['n_threads'] >= 1 and document['environment']['cpu']
     if case != 'scenes' and 'grid.n_bins=40' in words:
         assert document['config_changes']['grid.n_bins'] == 40
 
 
-def test_choices_and_scores_of_cross_validation(root, tmp_path, capsys):
-    target = tmp_path / 'a.json'
-    words = ['--set', 'grid.r_max=5,20.0,60', *SMALL, '--json', target]
-    assert run('experiment', 'cross-validation', root, *words) == 0
-    document = json.loads(target.read_text())
-    (choice,) = document['choices']
-    assert (choice['parameter'], choice['given']) == ('grid.r_max', '90')
-    pooled = document['scores'][-1]
-    assert pooled['iou tuned'] >= pooled['iou given']
-    assert document['n_configurations'] == 4
-    rows = rows_of(capsys.readouterr().out, 'sequence')
-    assert rows['all'][0] == f'{100 * pooled["iou given"]:.2f}'
+def test_tables_as_markdown(capsys):
+    words = ['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', 1, '--no-peer', '--markdown']
+    assert run('experiment', 'scenes', *words) == 0
+    _title, table, machine = capsys.readouterr().out.strip().split('\n\n')
+    header, rule, row = table.splitlines()
+    assert header == '| sensor | scene | IoU | RMSE | median | no model |'
+    assert rule == '| --- | --- | --: | --: | --: | --: |'
+    assert row.startswith('| vlp-16 | kerb | ') and machine.startswith('machine: ')
 
 
 def test_scenes_have_the_presets_of_their_sensors(monkeypatch):
@@ -111,7 +97,7 @@ def test_scenes_have_the_presets_of_their_sensors(monkeypatch):
         found.update(configs)
         raise DataError('enough')
 
-    monkeypatch.setattr(command, 'score_scenes', note)
+    monkeypatch.setattr(simulated_scenes, 'score_scenes', note)
     words = ['--sensors', ','.join(PRESET_OF)]
     for extra, expected in (
         ([], {sensor: PRESETS[preset].config for sensor, preset in PRESET_OF.items()}),
@@ -128,7 +114,7 @@ def test_simulated_poses_have_their_own_options(monkeypatch, capsys):
         found.append((n_seeds, config.grid.n_bins, scenes))
         raise DataError('enough')
 
-    monkeypatch.setattr(command, 'score_simulated_poses', note)
+    monkeypatch.setattr(sensor_pose, 'score_simulated_poses', note)
     words = ['--simulated', '--seeds', 2, '--scenes', 'flat,kerb', *SMALL]
     assert run('experiment', 'sensor-pose', *words) == 2
     assert error_line(capsys) == 'enough'
@@ -155,7 +141,7 @@ def test_a_departure_in_words():
         (['ablation', 'ROOT', '--sequences', '07'], 'no sequence 07; sequences here: 00, 08'),
         (['ablation', 'ROOT', '--set', 'learning.mode=fixed'], 'leave it out'),
         (['ablation', '--simulated', '--set', 'length_scale.constant=3'], 'leave it out'),
-        (['departures', 'ROOT', '--only-given'], 'none given'),
+        (['departures', 'ROOT', '--switch', 'a: '], 'must be TITLE'),
         (['cross-validation', 'ROOT', '--set', 'grid.r_max=50,0.001'], 'grid.r_max'),
         (['cross-validation', 'ROOT', '--set', 'grid.rmax=50,60'], 'grid.rmax'),
         (['cross-validation', 'ROOT', '--set', 'grid.r_max=50'], 'nothing to choose'),

@@ -70,18 +70,6 @@ def frames(tmp_path_factory):
 # Variants.
 
 
-def test_variants_are_scored_as_by_themselves(frames):
-    configs = {'given': FAR, 'near': FAR.replace(**NEAR)}
-    for score in score_variants(frames, load_kitti, configs):
-        segmenter = GroundSegmenter(configs[score.name])
-        for frame, found in zip(frames, score.scans, strict=True):
-            scan = load_kitti(frame)
-            segmenter.reset()
-            expected = segmenter.segment(scan.points)
-            assert found.confusion == count_confusion(expected.label, scan.truths['groundgrid'])
-        assert score.fit.n_threads >= 1
-
-
 def test_only_what_the_ray_hit_of_the_terrain_is_ground():
     scan = load_simulated(SimulatedFrame('hdl-64e', 'urban', 0, 0.0))
     made = simulate_scan(SCENES['urban'](0), HDL_64E, np.random.default_rng(0))
@@ -107,7 +95,7 @@ def test_models_are_what_their_names_say():
 def test_each_way_to_learn_gives_a_theta_of_its_own(frames):
     configs = {name: Config().replace(**changes) for name, changes in MODELS.items()}
     scores = score_variants(frames[:1], load_kitti, configs)
-    theta = {score.name: tuple(score.fit.theta.values()) for score in scores}
+    theta = {score.name: tuple(score.scans[-1].fit.theta.values()) for score in scores}
     assert len(set(theta.values())) == len(MODELS) - 2
     assert len({values for name, values in theta.items() if 'not learned' in name}) == 1
 
@@ -159,8 +147,8 @@ def test_worth_is_what_having_it_adds(frames):
     assert [row['switch'] for row in rows.values()] == [None, 'off', 'on']
     assert rows['far grid']['iou'] == near.iou
     assert rows['far grid']['worst_iou'] == min(near.of(name).iou for name in ('00', '08'))
-    scans = report.rows.json()
-    seconds = {name: [row['seconds'] for row in scans if row['variant'] == name] for name in rows}
+    scans = report.rows
+    seconds = {name: [row['seconds'] for row in scans if row['method'] == name] for name in rows}
     ratios = sorted(a / b for a, b in zip(seconds['far grid'], seconds['as given'], strict=True))
     assert rows['far grid']['time_ratio'] == ratios[1]
     assert rows['as given']['time_ratio'] == 1.0
@@ -330,7 +318,7 @@ def test_frames_turned(streets):
     assert by_angle['roll +3° pitch -3°']['levelled'] == 2
     refused = {row['up']: (row['scans'], row['refused']) for row in report.tables['axes'].json()}
     assert refused == {'z': (2, 0), **dict.fromkeys(AXES_UP, (2, 2))}
-    assert len(report.rows.rows) == 2 * 3 * len(TURNS)
+    assert len(report.rows) == 2 * 3 * len(TURNS)
 
 
 def test_poses_of_simulated_scans(monkeypatch):

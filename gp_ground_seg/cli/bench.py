@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gp_ground_seg.cli.evaluate import progress, staged_options
-from gp_ground_seg.cli.options import add_config_options, config_from_options, note, positive
+from gp_ground_seg.cli.evaluate import add_json_options, progress, staged_options
+from gp_ground_seg.cli.options import (
+    add_config_options,
+    config_from_options,
+    new_parser,
+    note,
+    positive,
+)
 from gp_ground_seg.cli.segment import find_scans
-from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.bag_files import is_bag
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
@@ -47,32 +50,20 @@ DATA is a folder with sequences/*/velodyne below it, a scan, a folder of scans, 
 """
 
 EXAMPLES = """\
-examples:
   gp-ground-seg bench KITTI_ROOT
   gp-ground-seg bench drive.mcap --frames 20 --quick
   gp-ground-seg bench KITTI_ROOT --set grid.n_segments=120 --json mine.json
   gp-ground-seg bench --from mine.json --plot stages.png
 """
 
-DOCS_BEGIN, DOCS_END = '<!-- bench:begin -->', '<!-- bench:end -->'
 RUN_LENGTH = 10
 """Successive frames that are taken together where there are more than wanted."""
-
-Points = npt.NDArray[np.float32]
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = subparsers.add_parser(
-        'bench',
-        description=DESCRIPTION,
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = new_parser(subparsers, 'bench', DESCRIPTION, EXAMPLES)
     parser.add_argument('data', metavar='DATA', nargs='?', help='scans or a bag')
-    parser.add_argument(
-        '--from', metavar='FILE', dest='record', help='show what --json wrote, measure nothing'
-    )
     parser.add_argument(
         '--frames', metavar='N', type=positive, default=60,
         help='frames, in runs of ten spread over the data (default: %(default)s)',
@@ -80,22 +71,20 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         '--passes', metavar='N', type=positive, default=1, help='go over the frames so often'
     )
-    parser.add_argument(
-        '--threads', metavar='LIST', help='numbers of threads, as in 1,4 (default: 1 and all)'
-    )
-    parser.add_argument('--topic', metavar='T', help='PointCloud2 topic of a bag')
-    parser.add_argument(
-        '--numpy', action='store_true', help='time learning without compiled code as well'
-    )
-    parser.add_argument(
-        '--quick', action='store_true', help='no growth with size, no merged clouds'
-    )
-    parser.add_argument('--json', metavar='FILE', help='write every number to this file as well')
-    parser.add_argument('--plot', metavar='FILE', help='draw the stages as a PNG')
-    parser.add_argument(
-        '--docs', metavar='FILE', help='for developers: put the tables between the marks of FILE'
-    )
-    parser.add_argument('--force', action='store_true', help='overwrite JSON and PNG')
+    for name, metavar, what in (
+        ('--from', 'FILE', 'show what --json wrote, measure nothing'),
+        ('--threads', 'LIST', 'numbers of threads, as in 1,4 (default: 1 and all)'),
+        ('--topic', 'T', 'PointCloud2 topic of a bag'),
+        ('--plot', 'FILE', 'draw the stages as a PNG'),
+    ):
+        dest = 'record' if name == '--from' else None
+        parser.add_argument(name, metavar=metavar, help=what, dest=dest)
+    for name, what in (
+        ('--numpy', 'time learning without compiled code as well'),
+        ('--quick', 'no growth with size, no merged clouds'),
+    ):
+        parser.add_argument(name, action='store_true', help=what)
+    add_json_options(parser)
     add_config_options(parser)
     parser.set_defaults(run=run)
 
@@ -114,8 +103,6 @@ def run(arguments: argparse.Namespace) -> int:
     print(bench_text(document))
     if arguments.plot is not None:
         _plot(document, arguments)
-    if arguments.docs is not None:
-        _update_docs(Path(arguments.docs), document)
     return 0
 
 
@@ -123,25 +110,18 @@ def _plot(document: dict[str, Any], arguments: argparse.Namespace) -> None:
     # Without compiled code a frame takes so long that the others would be but slivers.
     cases = [case for case in document['cases'] if case['backend'] == 'numba']
     peer = document['baseline_ms']
-    plot_stage_bars(
-        {case['name']: case['stages_ms'] for case in cases or document['cases']},
-        arguments.plot,
+    title = (
         f'{document["n_frames"]} frames of {document["data"]}, '
         f'{round(document["n_points"]["median"] / 1000)} 000 points each, '
-        f'{document["environment"]["cpu"]}',
-        (TITLES[document['baseline']], peer['median']) if peer else None,
-        force=arguments.force,
+        f'{document["environment"]["cpu"]}'
     )
+    bars = {case['name']: case['stages_ms'] for case in cases or document['cases']}
+    line = (TITLES[document['baseline']], peer['median']) if peer else None
+    plot_stage_bars(bars, arguments.plot, title, line, force=arguments.force)
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
-    """Read what ``--json`` wrote.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read or is something else.
-    """
+    """Read what ``--json`` wrote; DataError if it cannot be read or is something else."""
     try:
         document = json.loads(Path(path).read_text(encoding='utf-8'))
     except (OSError, ValueError) as error:
@@ -156,27 +136,22 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     environment = describe_environment('pypatchworkpp')
     threads = _threads(arguments.threads, config, environment.n_cores)
     cases = bench_cases(config, threads, with_numpy=arguments.numpy)
-    baseline = _baseline()
+    try:
+        PatchworkppMethod()
+        baseline = PATCHWORKPP
+    except MissingDependencyError:
+        note('no ratios without the baseline: pip install pypatchworkpp')
+        baseline = None
     frames = load_frames(Path(arguments.data), arguments.frames, arguments.topic)
     measured = run_cases(
-        frames, cases, baseline, arguments.passes, progress=progress('frames', 'frame')
-    )
+        frames, cases, (lambda _: PatchworkppMethod()) if baseline else None, arguments.passes,
+        progress=progress('frames'),
+    )  # fmt: skip
     growth = []
     if not arguments.quick:
         growth = time_growth(frames, config, progress=progress('sizes', 'size'))
-    name = PATCHWORKPP if baseline else None
-    return bench_document(
-        measured, growth, config, environment, name, Path(arguments.data).resolve().name
-    )
-
-
-def _baseline() -> Callable[[Any], PatchworkppMethod] | None:
-    try:
-        PatchworkppMethod()
-    except MissingDependencyError:
-        note('no ratios without the baseline: pip install pypatchworkpp')
-        return None
-    return lambda _: PatchworkppMethod()
+    data = Path(arguments.data).resolve().name
+    return bench_document(measured, growth, config, environment, baseline, data)
 
 
 def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
@@ -196,59 +171,31 @@ def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
 def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[BenchFrame]:
     """Read at most about `n_frames` frames into memory, in runs spread over all there are.
 
-    Parameters
-    ----------
-    source : Path
-        A folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
-    n_frames : int
-        Frames wanted.
-    topic : str, optional
-        Topic of a bag.
-
-    Raises
-    ------
-    DataError
-        If there is nothing to read there, or no point in it.
+    `source` is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
+    Raises DataError if there is nothing to read there, or no point in it.
     """
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
-    frames = []
     if is_bag(source):
         frames = _bag_frames(source, n_frames, topic)
     elif topic is not None:
         raise DataError(f'--topic: is for bags, which {source} is not')
     else:
-        paths = {source.stem: find_scans(source)} if not any(
-            source.glob('sequences/*/velodyne')
-        ) else {
-            name: [frame.points_path for frame in list_frames(source, name)]
-            for name in list_sequences(source)
-        }  # fmt: skip
-        for name, own in paths.items():
-            n_own = max(n_frames // len(paths), 1)
-            frames += [
-                BenchFrame(run_name, own[k].stem, read_points(own[k]))
-                for run_name, k in runs(name, len(own), n_own)
-            ]
+        if any(source.glob('sequences/*/velodyne')):
+            names = list_sequences(source)
+            paths = {
+                name: [one.points_path for one in list_frames(source, name)] for name in names
+            }
+        else:
+            paths = {source.stem: find_scans(source)}
+        frames = [
+            BenchFrame(run_name, own[k].stem, read_points(own[k]))
+            for name, own in paths.items()
+            for run_name, k in runs(name, len(own), max(n_frames // len(paths), 1))
+        ]
     if not any(len(frame.points) for frame in frames):
         raise DataError(f'{source}: no point in any of {len(frames)} frames')
     return frames
-
-
-def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
-    """Name and index of frames in runs of `RUN_LENGTH`, spread evenly; all if no more are there.
-
-    Each run has a name of its own: what is temporal must not reach over the hole before it.
-    """
-    if n_available <= n_wanted:
-        return [(name, k) for k in range(n_available)]
-    length = min(RUN_LENGTH, n_wanted)
-    starts = [length * k for k in spread(n_available // length, n_wanted // length)]
-    return [
-        (name if len(starts) == 1 else f'{name}:{start}', k)
-        for start in starts
-        for k in range(start, start + length)
-    ]
 
 
 def _bag_frames(source: Path, n_frames: int, topic: str | None) -> list[BenchFrame]:
@@ -269,15 +216,31 @@ def _bag_frames(source: Path, n_frames: int, topic: str | None) -> list[BenchFra
     return frames
 
 
+def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
+    """Name and index of frames in runs of `RUN_LENGTH`, spread evenly; all if no more are there.
+
+    Each run has a name of its own: what is temporal must not reach over the hole before it.
+    """
+    if n_available <= n_wanted:
+        return [(name, k) for k in range(n_available)]
+    length = min(RUN_LENGTH, n_wanted)
+    starts = [length * k for k in spread(n_available // length, n_wanted // length)]
+    return [
+        (name if len(starts) == 1 else f'{name}:{start}', k)
+        for start in starts
+        for k in range(start, start + length)
+    ]
+
+
 def bench_text(document: dict[str, Any]) -> str:
     """Lay out a `gp_ground_seg.evaluation.benchmark.bench_document` for the terminal."""
-    environment = document['environment']
-    versions = ', '.join(f'{k} {v or "absent"}' for k, v in environment['versions'].items())
+    run = document['environment']
+    versions = ', '.join(f'{name} {v or "absent"}' for name, v in run['versions'].items())
     footer = (
         parameters_line(document['config_changes']),
-        f'machine: {environment["cpu"]}, {environment["n_cores"]} cores for this process',
-        f'versions: Python {environment["python"]}, {versions}',
-        f'commit: {environment["commit"] or "unknown"}',
+        f'machine: {run["cpu"]}, {run["n_cores"]} cores for this process',
+        f'versions: Python {run["python"]}, {versions}',
+        f'commit: {run["commit"] or "unknown"}',
     )
     tables = [_case_table(document), _stage_table(document['cases'])]
     if document['growth']:
@@ -287,13 +250,8 @@ def bench_text(document: dict[str, Any]) -> str:
 
 def _case_table(document: dict[str, Any]) -> Table:
     cases, peer = document['cases'], document['baseline_ms']
-    median, largest = (
-        f'{round(document["n_points"][key]):_d}'.replace('_', ' ') for key in ('median', 'max')
-    )
-    title = (
-        f'{document["n_frames"]} frames of {document["data"]}, {median} points (median), '
-        f'at most {largest}'
-    )
+    n_points = document['n_points']
+    median, largest = (f'{round(n_points[key]):_d}'.replace('_', ' ') for key in ('median', 'max'))
     rows: list[list[Cell]] = [[c['name'], c['ms']['median'], c['ms']['p99']] for c in cases]
     columns = [Column('time per frame, reading left out')]
     columns += [Column('median [ms]', '.2f'), Column('p99 [ms]', '.2f')]
@@ -301,56 +259,28 @@ def _case_table(document: dict[str, Any]) -> Table:
         name = TITLES[document['baseline']]
         columns += [Column(f'/ {name}', '.2f'), Column('p99 / its median', '.2f')]
         for row, case in zip(rows, cases, strict=True):
-            row += [case['ratio']['median'], case['ratio']['p99']]
+            row += case['ratio'].values()
         rows.append([name, peer['median'], peer['p99'], 1.0, peer['p99'] / peer['median']])
+    title = (
+        f'{document["n_frames"]} frames of {document["data"]}, {median} points (median), '
+        f'at most {largest}'
+    )
     return Table(columns, rows, title, n_sums=1 if peer else 0)
 
 
 def _stage_table(cases: list[dict[str, Any]]) -> Table:
-    columns = [
-        Column('stage, median [ms]'),
-        *(Column(name, '.2f') for name in cases[0]['stages_ms']),
-    ]
-    return Table(columns, [[case['name'], *case['stages_ms'].values()] for case in cases])
+    stages = [Column(name, '.2f') for name in cases[0]['stages_ms']]
+    rows = [[case['name'], *case['stages_ms'].values()] for case in cases]
+    return Table([Column('stage, median [ms]'), *stages], rows)
 
 
 def _growth_table(growth: list[dict[str, Any]]) -> Table:
-    columns = [Column('growth with', key='series'), Column('size', '_.0f')]
+    columns = {'series': Column('growth with'), 'size': Column('size', '_.0f')}
     for mode, title in MODES.items():
-        columns.append(Column(f'{title} [ms]', '.2f', f'{mode}_ms'))
-        columns.append(Column('/ default', '.2f', f'{mode}_ratio'))
-    rows = [[row[column.key or column.title] for column in columns] for row in growth]
+        columns[f'{mode}_ms'] = Column(f'{title} [ms]', '.2f')
+        columns[f'{mode}_ratio'] = Column('/ default', '.2f')
     title = (
         'One thread; times over those of the same frames with the parameters given. More points '
         'than a frame has are two and four successive frames laid over one another'
     )
-    return Table(columns, rows, title)
-
-
-def replace_section(text: str, document: dict[str, Any]) -> str:
-    """Put the tables between the markers of a Markdown file.
-
-    Raises
-    ------
-    DataError
-        If the two markers are not there once each, in order.
-    """
-    head, begin, rest = text.partition(DOCS_BEGIN)
-    middle, end, tail = rest.partition(DOCS_END)
-    if not begin or not end or any(m in middle + tail for m in (DOCS_BEGIN, DOCS_END)):
-        raise DataError(
-            f'must hold the lines {DOCS_BEGIN} and {DOCS_END} once each, in this order; '
-            'the tables go between them'
-        )
-    return f'{head}{begin}\n\n```text\n{bench_text(document)}\n```\n\n{end}{tail}'
-
-
-def _update_docs(path: Path, document: dict[str, Any]) -> None:
-    try:
-        text = replace_section(path.read_text(encoding='utf-8'), document)
-    except (OSError, ValueError) as error:
-        raise DataError(f'{path}: cannot be read: {error}') from error
-    except DataError as error:
-        raise DataError(f'{path}: {error}') from error
-    with staged_file(path, force=True) as part:
-        part.write_text(text, encoding='utf-8')
+    return Table([*columns.values()], [[row[key] for key in columns] for row in growth], title)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import shlex
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from gp_ground_seg.cli.evaluate import frames_from_options, progress, staged_options
+from gp_ground_seg.cli.evaluate import (
+    FRAME_OPTIONS,
+    add_json_options,
+    frames_from_options,
+    progress,
+    staged_options,
+)
 from gp_ground_seg.cli.options import (
-    DEFAULT_PRESET,
     add_config_options,
     config_from_options,
     parse_setting,
@@ -19,17 +22,9 @@ from gp_ground_seg.cli.options import (
 )
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.table import fold, write_json
-from gp_ground_seg.experiments.ablation import (
-    DEPARTURES,
-    Departure,
-    compare_departures,
-    compare_models,
-    compare_models_simulated,
-)
+from gp_ground_seg.evaluation.table import fold
+from gp_ground_seg.experiments import ablation, sensor_pose, simulated_scenes
 from gp_ground_seg.experiments.cross_validation import cross_validate
-from gp_ground_seg.experiments.sensor_pose import score_poses, score_simulated_poses
-from gp_ground_seg.experiments.simulated_scenes import PRESET_OF, score_scenes
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import Report
 from gp_ground_seg.parameters.schema import ParameterValue
@@ -37,14 +32,11 @@ from gp_ground_seg.simulation import SCENES, SENSORS
 
 DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 
-OF_FRAMES, OF_SIMULATED = ('sequences', 'frame_step'), ('seeds', 'scenes')
+OF_FRAMES, OF_SIMULATED = tuple(FRAME_OPTIONS), ('seeds', 'scenes')
 OPTIONS: dict[str, dict[str, Any]] = {
     'root': {'metavar': 'ROOT', 'help': 'folder in SemanticKITTI layout'},
     'simulated': {'action': 'store_true', 'help': 'simulated scans instead of ROOT'},
-    'sequences': {'metavar': 'LIST', 'help': 'sequences, as in 00,08 (default: all there are)'},
-    'frame_step': {
-        'metavar': 'N', 'type': positive, 'help': 'every Nth frame of a sequence only'
-    },
+    **FRAME_OPTIONS,
     'seeds': {'metavar': 'N', 'type': positive, 'help': 'simulated scenes of each kind'},
     'scenes': {
         'metavar': 'LIST', 'type': some_of(SCENES),
@@ -57,11 +49,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     'no_peer': {'action': 'store_true', 'help': 'leave Patchwork++ out'},
     'switch': {
         'metavar': 'TITLE: NAME=VALUE ...', 'action': 'append',
-        'help': 'a further departure and the parameters that switch it off (may be repeated)',
+        'help': 'measure this departure instead, and the parameters that switch it off '
+                '(may be repeated)',
     },
-    'only_given': {'action': 'store_true', 'help': 'those of --switch only, not the list'},
     'frames': {
-        'metavar': 'SEQ/IDX[:SEG,SEG]', 'nargs': '+',
+        'metavar': 'SEQ/IDX:SEG,SEG', 'nargs': '+',
         'help': f'frames and segments (default: {" ".join(DEFAULT_CHOICES)})',
     },
     'repeats': {
@@ -99,10 +91,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                 own.add_argument('root', nargs='?' if is_optional else None, **OPTIONS[option])
             else:
                 own.add_argument(_flag(option), **OPTIONS[option])
-        own.add_argument('--json', metavar='FILE', help='write every number to this file')
-        own.add_argument('--csv', metavar='FILE', help='write a line for each scan or segment')
-        own.add_argument('--markdown', metavar='FILE', help='write the tables to this file')
-        own.add_argument('--force', action='store_true', help='overwrite these files')
+        own.add_argument('--markdown', action='store_true', help='print the tables as Markdown')
+        add_json_options(own)
         add_config_options(own)
         own.set_defaults(run=run)
         if name == 'scenes':
@@ -110,37 +100,22 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, write the files, print the tables."""
+    """Measure, write the file, print the tables."""
     experiment = EXPERIMENTS[arguments.experiment]
     if 'simulated' in experiment.options:
         _check_source(arguments)
-    with staged_options(arguments, 'json', 'csv', 'markdown') as parts:
+    with staged_options(arguments, 'json') as parts:
         report = experiment.run(arguments)
         has_peer = not getattr(arguments, 'no_peer', True)
         environment = describe_environment(*(['pypatchworkpp'] if has_peer else []))
-        machine = environment.machine(report.fit.n_threads, report.fit.backend)
-        command = _command(arguments)
         if 'json' in parts:
-            document = {
-                'command': command,
-                'n_threads': report.fit.n_threads,
-                'backend': report.fit.backend,
-                'environment': dataclasses.asdict(environment),
-                **report.facts,
-                **{name: table.json() for name, table in report.tables.items()},
-                report.rows_name: report.rows.json(),
-            }
-            write_json(document, parts['json'])
-        if 'csv' in parts:
-            parts['csv'].write_text(report.rows.csv(), encoding='utf-8')
-        if 'markdown' in parts:
-            tables = [table.markdown() for table in report.tables.values()]
-            text = '\n\n'.join([f'`{command}`', *tables, machine]) + '\n'
-            parts['markdown'].write_text(text, encoding='utf-8')
-    print('\n\n'.join(table.text() for table in report.tables.values()))
-    print(f'\n{fold(machine)}')
-    for name in parts:
-        print(f'written: {getattr(arguments, name)}')
+            options = {name: getattr(arguments, name) for name in experiment.options}
+            report.facts.update(experiment=arguments.experiment, options=options)
+            report.write(parts['json'], environment)
+    tables = report.tables.values()
+    print('\n\n'.join(t.markdown() if arguments.markdown else t.text() for t in tables))
+    machine = environment.machine(report.fit.n_threads, report.fit.backend)
+    print(f'\n{machine if arguments.markdown else fold(machine)}')
     return 0
 
 
@@ -158,68 +133,40 @@ def _check_source(arguments: argparse.Namespace) -> None:
             raise DataError(f'{_flag(name)}: is for {kind} only')
 
 
-def _command(arguments: argparse.Namespace) -> str:
-    """Command line that measures the same, without names of files."""
-    words = ['gp-ground-seg', 'experiment', arguments.experiment]
-    for option in EXPERIMENTS[arguments.experiment].options:
-        value = getattr(arguments, option)
-        if option == 'root':
-            words += ['KITTI_ROOT'] if value is not None else []
-        elif value is True:
-            words.append(_flag(option))
-        elif isinstance(value, list) and option == 'switch':
-            words += [word for one in value for word in (_flag(option), one)]
-        elif isinstance(value, list):
-            words += [_flag(option), *(value if option == 'frames' else [','.join(value)])]
-        elif value:
-            words += [_flag(option), str(value)]
-    if arguments.preset not in (None, DEFAULT_PRESET):
-        words += ['--preset', arguments.preset]
-    words += ['--config', arguments.config] if arguments.config else []
-    words += [word for setting in arguments.settings for word in ('--set', setting)]
-    return shlex.join(words)
-
-
 def _ablation(arguments: argparse.Namespace) -> Report:
     config = config_from_options(arguments)
     if arguments.simulated:
-        return compare_models_simulated(
-            arguments.seeds or 10, config, progress('ablation', 'scan')
-        )
-    return compare_models(frames_from_options(arguments), config, progress('ablation'))
+        bar = progress('ablation', 'scan')
+        return ablation.compare_models_simulated(arguments.seeds or 10, config, bar)
+    return ablation.compare_models(frames_from_options(arguments), config, progress('ablation'))
 
 
 def _departures(arguments: argparse.Namespace) -> Report:
     config = config_from_options(arguments)
-    departures = [] if arguments.only_given else [*DEPARTURES]
-    departures += map(parse_departure, arguments.switch or [])
-    if not departures:
-        raise ConfigError('--only-given: none given, give --switch TITLE: NAME=VALUE')
-    frames = frames_from_options(arguments)
-    return compare_departures(frames, departures, config, progress('departures'))
+    departures = [parse_departure(text) for text in arguments.switch or []]
+    return ablation.compare_departures(
+        frames_from_options(arguments), departures or ablation.DEPARTURES, config,
+        progress('departures'),
+    )  # fmt: skip
 
 
-def parse_departure(text: str) -> Departure:
-    """Read ``TITLE: NAME=VALUE NAME=VALUE``.
-
-    Raises
-    ------
-    ConfigError
-        If it is not of that form.
-    """
+def parse_departure(text: str) -> ablation.Departure:
+    """Read ``TITLE: NAME=VALUE NAME=VALUE``; ConfigError if it is not of that form."""
     title, _, switch = text.rpartition(': ')
     settings = switch.split()
     if not title.strip() or not settings:
         raise ConfigError(f'--switch {text!r}: must be TITLE: NAME=VALUE ...')
-    return Departure(title.strip(), dict(map(parse_setting, settings)))
+    return ablation.Departure(title.strip(), dict(map(parse_setting, settings)))
 
 
 def _scenes(arguments: argparse.Namespace) -> Report:
     configs = {}
     for sensor in arguments.sensors or DEFAULT_SENSORS:
-        options = {**vars(arguments), 'preset': arguments.preset or PRESET_OF[sensor]}
-        configs[sensor] = config_from_options(argparse.Namespace(**options))
-    return score_scenes(
+        preset = arguments.preset or simulated_scenes.PRESET_OF[sensor]
+        configs[sensor] = config_from_options(
+            argparse.Namespace(**{**vars(arguments), 'preset': preset})
+        )
+    return simulated_scenes.score_scenes(
         configs, arguments.scenes or list(SCENES), arguments.seeds or 3,
         not arguments.no_peer, progress('scenes', 'scan'),
     )  # fmt: skip
@@ -228,18 +175,14 @@ def _scenes(arguments: argparse.Namespace) -> Report:
 def _cross_validation(arguments: argparse.Namespace) -> Report:
     grid, fixed = split_settings(arguments.settings)
     config = config_from_options(argparse.Namespace(**{**vars(arguments), 'settings': fixed}))
-    return cross_validate(
-        frames_from_options(arguments), config, grid, progress('cross-validation')
-    )
+    bar = progress('cross-validation')
+    return cross_validate(frames_from_options(arguments), config, grid, bar)
 
 
 def split_settings(settings: Sequence[str]) -> tuple[dict[str, list[ParameterValue]], list[str]]:
     """Parameters to search with their values, and the settings of one value.
 
-    Raises
-    ------
-    ConfigError
-        If nothing is to be searched, or something twice.
+    Raises ConfigError if nothing is to be searched, or something twice.
     """
     grid: dict[str, list[ParameterValue]] = {}
     fixed = []
@@ -260,10 +203,11 @@ def split_settings(settings: Sequence[str]) -> tuple[dict[str, list[ParameterVal
 def _sensor_pose(arguments: argparse.Namespace) -> Report:
     config = config_from_options(arguments)
     if arguments.simulated:
-        scenes = arguments.scenes or list(SCENES)
-        bar = progress('sensor-pose', 'scan')
-        return score_simulated_poses(arguments.seeds or 1, config, scenes, progress=bar)
-    return score_poses(frames_from_options(arguments), config, progress('sensor-pose'))
+        scenes, bar = arguments.scenes or list(SCENES), progress('sensor-pose', 'scan')
+        return sensor_pose.score_simulated_poses(
+            arguments.seeds or 1, config, scenes, progress=bar
+        )
+    return sensor_pose.score_poses(frames_from_options(arguments), config, progress('sensor-pose'))
 
 
 def _table1(arguments: argparse.Namespace) -> Report:
@@ -288,10 +232,10 @@ road that ends in rubble, by exact heights.
     'departures': Experiment(
         """\
 Undo one departure from the paper after the other. They are the rows of
-gp_ground_seg/experiments/ablation.py; --switch measures others without touching it:
-  --only-given --switch 'tight gate: growth.max_std=1'
+gp_ground_seg/experiments/ablation.py; --switch measures another without touching it:
+  --switch 'tight gate: growth.max_std=1'
 """,
-        ('root', *OF_FRAMES, 'switch', 'only_given'),
+        ('root', *OF_FRAMES, 'switch'),
         _departures,
     ),
     'scenes': Experiment(
@@ -323,8 +267,7 @@ from three sensors at four heights.
     ),
     'table1': Experiment(
         """\
-Measure the paper's Table I on segments of labelled frames. A frame without segments gives
-the adjacent pair whose labelled ground varies most in height.
+Measure the paper's Table I on segments of labelled frames.
 """,
         ('root', 'frames', 'repeats'),
         _table1,

@@ -6,7 +6,7 @@ import dataclasses
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import groupby
@@ -25,8 +25,6 @@ from gp_ground_seg.result import FitReport
 
 Points = npt.NDArray[np.float32]
 
-REST = 'rest'
-"""Stage that stands for what the stages leave of the time of a frame."""
 MODES = {'fixed': 'theta fixed', 'every_frame': 'learning'}
 """Values of ``learning.mode`` that are timed, and their titles."""
 N_MERGED = 4
@@ -36,29 +34,16 @@ N_GROWTH_FRAMES, N_GROWTH_RUNS = 6, 3
 
 @dataclass(frozen=True)
 class BenchFrame:
-    """A cloud in memory.
+    """A cloud in memory, (N, 4) x, y, z [m] and intensity.
 
-    Attributes
-    ----------
-    sequence, index : str
-        Where it is from; what is temporal starts anew with each sequence.
-    points : (N, 4) float32
-        x, y, z [m] and intensity.
-    baseline_points : (M, 4) float32 or None
-        Points that the baseline runs on, if others.
+    What is temporal starts anew with each sequence. The baseline runs on `baseline_points`
+    where there are some.
     """
 
     sequence: str
     index: str
     points: Points
     baseline_points: Points | None = None
-
-
-class BenchCase(NamedTuple):
-    """A way to run the segmentation: a title, such as ``learning, 1 thread``, and parameters."""
-
-    name: str
-    config: Config
 
 
 class FrameTime(NamedTuple):
@@ -70,57 +55,43 @@ class FrameTime(NamedTuple):
     baseline: float
     fit: FitReport
 
-
-class CaseTimes(NamedTuple):
-    """The measurements of one case, in the order of the frames."""
-
-    case: BenchCase
-    times: list[FrameTime]
-
     @property
-    def seconds(self) -> list[float]:
-        """Seconds by frame."""
-        return [one.seconds for one in self.times]
-
-    @property
-    def ratios(self) -> list[float]:
-        """Time over that of the baseline by frame."""
-        return [one.seconds / one.baseline for one in self.times]
+    def ratio(self) -> float:
+        """Time over that of the baseline."""
+        return self.seconds / self.baseline
 
 
 class Growth(NamedTuple):
-    """A size of the problem: parameters changed, or a share of the points of a frame.
-
-    A share above 1 is so many successive frames laid over one another, unregistered.
-    """
+    """Parameters changed, or a share of the points of a frame; above 1, of successive ones."""
 
     series: str
     changes: dict[str, ParameterValue]
     share: float = 1.0
 
 
-def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> list[BenchCase]:
+def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> dict[str, Config]:
     """Theta fixed and learned in every frame, on each number of threads; learning with numpy."""
-    cases = []
-    for mode, title in MODES.items():
-        for n in threads:
-            name = f'{title}, {n} thread{"s" if n > 1 else ""}'
-            changes = {'learning.mode': mode, 'runtime.n_threads': n}
-            cases.append(BenchCase(name, config.replace(**changes)))
+    cases = {
+        f'{title}, {n} thread{"s" if n > 1 else ""}': config.replace(
+            **{'learning.mode': mode, 'runtime.n_threads': n}
+        )
+        for mode, title in MODES.items()
+        for n in threads
+    }
     if with_numpy:
         changes = {'learning.mode': 'every_frame', 'runtime.backend': 'numpy'}
-        cases.append(BenchCase('learning, numpy', config.replace(**changes)))
+        cases['learning, numpy'] = config.replace(**changes)
     return cases
 
 
 def run_cases(
     frames: Sequence[BenchFrame],
-    cases: Sequence[BenchCase],
-    make_baseline: Callable[[BenchCase], Method] | None = None,
+    cases: Mapping[str, Config],
+    make_baseline: Callable[[str], Method] | None = None,
     n_passes: int = 1,
     clock: Callable[[], float] = time.perf_counter,
     progress: Progress = iter,
-) -> list[CaseTimes]:
+) -> dict[str, list[FrameTime]]:
     """Time every case on every frame, each time beside the baseline on that frame.
 
     The speed of a machine drifts over seconds; a case and its baseline follow one
@@ -132,46 +103,39 @@ def run_cases(
     ----------
     frames : sequence of BenchFrame
         At least one, grouped by sequence.
-    cases : sequence of BenchCase
-        What to time.
+    cases : mapping of str to Config
+        What to time, by title, such as ``learning, 1 thread``.
     make_baseline : callable, optional
         Makes the baseline of a case, which sees every frame as often as the case does.
-    n_passes : int
-        How often to go over the frames.
-    clock, progress : callable
-        Source of seconds; wraps the frames, as tqdm does.
     """
+    names = list(cases)
     with ExitStack() as stack:
         pairs: list[tuple[OurMethod, Method | None]] = []
-        for case in cases:
-            ours = stack.enter_context(closing(OurMethod(case.config)))
-            baseline = make_baseline(case) if make_baseline is not None else None
+        for name in names:
+            ours = stack.enter_context(closing(OurMethod(cases[name])))
+            baseline = make_baseline(name) if make_baseline is not None else None
             if baseline is not None:
                 stack.enter_context(closing(baseline))
             pairs.append((ours, baseline))
             for method in (ours, ours, baseline):  # does not count
                 _time(method, frames[0], clock, method is baseline)
-        times: list[list[FrameTime]] = [[] for _ in cases]
+        times: dict[str, list[FrameTime]] = {name: [] for name in names}
         sequence = None
         for k, frame in enumerate(progress([*frames] * n_passes)):
-            for j in range(k, k + len(cases)):
-                ours, baseline = pairs[j % len(cases)]
-                if frame.sequence != sequence:
-                    for method in (ours, baseline):
-                        if method is not None:
-                            method.reset()
-                if goes_first := k // len(cases) % 2 == 0:
-                    other = _time(baseline, frame, clock, True)
-                seconds = _time(ours, frame, clock, False)
-                if not goes_first:
-                    other = _time(baseline, frame, clock, True)
+            for j in range(k, k + len(names)):
+                ours, baseline = pairs[j % len(names)]
+                order = (baseline, ours) if k // len(names) % 2 == 0 else (ours, baseline)
+                for method in order:
+                    if method is not None and frame.sequence != sequence:
+                        method.reset()
+                seconds = [_time(method, frame, clock, method is baseline) for method in order]
                 result = ours.result()
                 assert result.fit is not None
-                times[j % len(cases)].append(
-                    FrameTime(frame, seconds, result.stages, other, result.fit)
-                )
+                own, other = seconds[order.index(ours)], seconds[order.index(baseline)]
+                found = FrameTime(frame, own, result.stages, other, result.fit)
+                times[names[j % len(names)]].append(found)
             sequence = frame.sequence
-    return [CaseTimes(case, found) for case, found in zip(cases, times, strict=True)]
+    return times
 
 
 def _time(
@@ -231,14 +195,9 @@ def time_growth(
 ) -> list[dict[str, Any]]:
     """Time one size after the other, each beside one frame under `config`, on one thread.
 
-    Up to six groups of successive frames are used, spread evenly; sizes that need more
-    frames than there are are left out.
-
-    Returns
-    -------
-    list of dict
-        For each size its series and size, and by mode the median time [ms] and the median
-        ratio to the time of the frame as it is.
+    Up to six groups of successive frames are used, spread evenly; sizes that need more frames
+    than there are are left out. A row has series and size, and by mode the median time [ms] and
+    the median ratio to the time of the frame as it is.
     """
     groups = merged_groups(frames) or [[frame] for frame in frames]
     chosen = [groups[k] for k in spread(len(groups), N_GROWTH_FRAMES)]
@@ -250,31 +209,28 @@ def time_growth(
         if size.share > min(map(len, chosen)):
             continue
         clouds = [
-            dataclasses.replace(
-                group[0], points=_share_of(group, size.share), baseline_points=group[0].points
-            )
+            BenchFrame(group[0].sequence, group[0].index, _share_of(group, size.share),
+                       baseline_points=group[0].points)
             for group in chosen
-        ]
-        cases = [BenchCase(mode, one.replace(**size.changes)) for mode, one in given.items()]
-        found = run_cases(
-            clouds, cases, lambda case: OurMethod(given[case.name]), N_GROWTH_RUNS, clock
-        )
+        ]  # fmt: skip
+        cases = {mode: one.replace(**size.changes) for mode, one in given.items()}
+        found = run_cases(clouds, cases, lambda mode: OurMethod(given[mode]), N_GROWTH_RUNS, clock)
         counts = {
             'points': statistics.median(len(cloud.points) for cloud in clouds),
-            'pseudo-inputs': statistics.median(t.fit.n_pseudo_inputs for t in found[0].times),
+            'pseudo-inputs': statistics.median(t.fit.n_pseudo_inputs for t in found['fixed']),
             **size.changes,
         }
         row: dict[str, Any] = {'series': size.series, 'size': counts[size.series]}
-        for mode, one in zip(MODES, found, strict=True):
-            row[f'{mode}_ms'] = _ms(statistics.median(one.seconds))
-            row[f'{mode}_ratio'] = round(statistics.median(one.ratios), 4)
+        for mode, times in found.items():
+            row[f'{mode}_ms'] = _ms(statistics.median(one.seconds for one in times))
+            row[f'{mode}_ratio'] = round(statistics.median(one.ratio for one in times), 4)
         rows.append(row)
     return rows
 
 
 def _share_of(group: Sequence[BenchFrame], share: float) -> Points:
     """So many times the points of the first frame, by random rows or further frames."""
-    if share >= 1.0:
+    if share >= 1.0:  # unregistered
         return np.concatenate([frame.points for frame in group[: round(share)]])
     points = group[0].points
     rows = np.random.default_rng(0).permutation(len(points))[: round(share * len(points))]
@@ -282,7 +238,7 @@ def _share_of(group: Sequence[BenchFrame], share: float) -> Points:
 
 
 def bench_document(
-    cases: Sequence[CaseTimes],
+    cases: Mapping[str, Sequence[FrameTime]],
     growth: list[dict[str, Any]],
     config: Config,
     environment: Environment,
@@ -294,9 +250,9 @@ def bench_document(
     Ratios are to the baseline on the same frame, measured right before or after: their
     median, and the 99th percentile of our times over the median of those of the baseline.
     """
-    times = cases[0].times
+    times = next(iter(cases.values()))
     points = [len(one.frame.points) for one in times]
-    peer = [one.baseline for case in cases for one in case.times]
+    peer = [one.baseline for own in cases.values() for one in own]
     return {
         'data': data,
         'n_frames': len({(one.frame.sequence, one.frame.index) for one in times}),
@@ -305,23 +261,23 @@ def bench_document(
         'environment': dataclasses.asdict(environment),
         'baseline': baseline,
         'baseline_ms': _spread(peer) if baseline else None,
-        'cases': [_case(case, baseline is not None) for case in cases],
+        'cases': [_case(name, own, baseline is not None) for name, own in cases.items()],
         'growth': growth,
     }
 
 
-def _case(case: CaseTimes, with_baseline: bool) -> dict[str, Any]:
+def _case(name: str, times: Sequence[FrameTime], with_baseline: bool) -> dict[str, Any]:
     # Where a mode skips a stage in some frames it is still timed: close to zero.
-    stages = {name: [one.stages[name] for one in case.times] for name in case.times[0].stages}
-    stages[REST] = [one.seconds - sum(one.stages.values()) for one in case.times]
-    last = case.times[-1].fit
+    stages = {stage: [one.stages[stage] for one in times] for stage in times[0].stages}
+    stages['rest'] = [one.seconds - sum(one.stages.values()) for one in times]
+    seconds, last = [one.seconds for one in times], times[-1].fit
     result = {
-        'name': case.case.name,
+        'name': name,
         'mode': last.mode,
         'backend': last.backend,
         'n_threads': last.n_threads,
-        'ms': _spread(case.seconds),
-        'stages_ms': {name: _ms(statistics.median(found)) for name, found in stages.items()},
+        'ms': _spread(seconds),
+        'stages_ms': {stage: _ms(statistics.median(own)) for stage, own in stages.items()},
         'frames': [
             {
                 'sequence': one.frame.sequence,
@@ -330,14 +286,14 @@ def _case(case: CaseTimes, with_baseline: bool) -> dict[str, Any]:
                 'ms': _ms(one.seconds),
                 'baseline_ms': _ms(one.baseline) if with_baseline else None,
             }
-            for one in case.times
+            for one in times
         ],
     }
     if with_baseline:
-        median = statistics.median(one.baseline for one in case.times)
+        median = statistics.median(one.baseline for one in times)
         result['ratio'] = {
-            'median': round(statistics.median(case.ratios), 4),
-            'p99': round(float(np.percentile(case.seconds, 99)) / median, 4),
+            'median': round(statistics.median(one.ratio for one in times), 4),
+            'p99': round(float(np.percentile(seconds, 99)) / median, 4),
         }
     return result
 

@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation.metrics import Confusion
-from gp_ground_seg.frame import Label
+from gp_ground_seg.evaluation.metrics import Confusion, Labels, ratio
+from gp_ground_seg.frame import FloatArray, Label
 
-N_BINS = 15
-"""Bins of equal width in the expected calibration error."""
+BIN_EDGES = np.linspace(0.0, 1.0, 16)
+"""Edges of the bins of probability in the expected calibration error."""
+N_BINS = len(BIN_EDGES) - 1
 N_STEPS = 1000
-"""Thresholds tried are the multiples of 1 / N_STEPS from 0 to 1."""
-
-BIN_EDGES = np.linspace(0.0, 1.0, N_BINS + 1)
 THRESHOLDS = np.arange(N_STEPS + 1) / N_STEPS
+"""Probabilities that are tried as the least one of ground."""
 
-IntArray = npt.NDArray[np.int64]
-FloatArray = npt.NDArray[np.float64]
+Counts = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Probabilities of ground against the truth, as sums: those of frames add up.
-
-    A ratio over no points is NaN.
+    """Probabilities of ground against the truth, as sums; ratios over nothing are NaN.
 
     Attributes
     ----------
@@ -46,12 +41,12 @@ class Calibration:
         Points without a probability: in no bin, and never labelled ground.
     """
 
-    n_points: IntArray
-    n_ground: IntArray
+    n_points: Counts
+    n_ground: Counts
     sum_p: FloatArray
     sum_squared_error: float
-    ground_by_step: IntArray
-    obstacles_by_step: IntArray
+    ground_by_step: Counts
+    obstacles_by_step: Counts
     ground_without: int
     obstacles_without: int
 
@@ -67,13 +62,16 @@ class Calibration:
 
     @property
     def mean_p(self) -> FloatArray:
-        """Mean probability in each bin, (N_BINS,); NaN where it is empty."""
-        return _ratio(self.sum_p, self.n_points)
+        """Mean probability in each bin, (N_BINS,)."""
+        return self._by_bin(self.sum_p)
 
     @property
     def share_ground(self) -> FloatArray:
-        """Share of ground in each bin, (N_BINS,); NaN where it is empty."""
-        return _ratio(self.n_ground, self.n_points)
+        """Share of ground in each bin, (N_BINS,)."""
+        return self._by_bin(self.n_ground)
+
+    def _by_bin(self, sums: Counts | FloatArray) -> FloatArray:
+        return np.where(self.n_points > 0, sums, np.nan) / np.maximum(self.n_points, 1)
 
     @property
     def ece(self) -> float:
@@ -82,14 +80,12 @@ class Calibration:
         Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, for the
         probability of one class of two.
         """
-        if not self.n_total:
-            return math.nan
-        return float(np.abs(self.n_ground - self.sum_p).sum() / self.n_total)
+        return ratio(float(np.abs(self.n_ground - self.sum_p).sum()), self.n_total)
 
     @property
     def brier(self) -> float:
         """Brier score, the mean of (p - truth)^2."""
-        return self.sum_squared_error / self.n_total if self.n_total else math.nan
+        return ratio(self.sum_squared_error, self.n_total)
 
     def confusion_at(self, step: int) -> Confusion:
         """Return the counts if ground were what reaches the threshold ``THRESHOLDS[step]``."""
@@ -108,41 +104,22 @@ class Calibration:
         return int(np.argmax(tp / np.maximum(n_ground + fp, 1)))
 
 
-def _ratio(part: IntArray | FloatArray, whole: IntArray) -> FloatArray:
-    ratio = np.full(len(whole), np.nan)
-    np.divide(part, whole, out=ratio, where=whole > 0)
-    return ratio
+def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Calibration:
+    """Compare probabilities of ground, (N,), NaN where unknown, with true labels, (N,).
 
-
-def count_calibration(
-    p_ground: npt.NDArray[np.floating], truth: npt.NDArray[np.uint8]
-) -> Calibration:
-    """Compare probabilities with the truth.
-
-    Parameters
-    ----------
-    p_ground : (N,) float
-        Probability that each point is ground; NaN = not known.
-    truth : (N,) uint8
-        True `Label` of each point; where it is UNKNOWN the point does not count.
-
-    Raises
-    ------
-    PointCloudError
-        If the lengths differ or a probability is outside [0, 1].
+    Where the truth is UNKNOWN the point does not count. Raises PointCloudError if the lengths
+    differ or a probability is outside [0, 1].
     """
     if p_ground.shape != truth.shape:
         raise PointCloudError(
             f'p_ground of shape {p_ground.shape} for {len(truth)} points: must be ({len(truth)},)'
         )
-    scored = (truth == Label.GROUND) | (truth == Label.OBSTACLE)
-    ground = truth[scored] == Label.GROUND
-    p = p_ground[scored].astype(np.float64)
-    known = np.isfinite(p)
-    without = ground[~known]
-    ground, p = ground[known], p[known]
-    if np.isinf(p_ground).any() or (len(p) and not (p.min() >= 0.0 and p.max() <= 1.0)):
+    if not (np.isnan(p_ground) | ((p_ground >= 0.0) & (p_ground <= 1.0))).all():
         raise PointCloudError('p_ground: a probability is outside [0, 1]')
+    scored = (truth == Label.GROUND) | (truth == Label.OBSTACLE)
+    ground, p = truth[scored] == Label.GROUND, p_ground[scored].astype(np.float64)
+    known = ~np.isnan(p)
+    without, ground, p = ground[~known], ground[known], p[known]
     bin_of = np.searchsorted(BIN_EDGES[1:-1], p, side='right')
     step = np.searchsorted(THRESHOLDS, p, side='right') - 1
     return Calibration(

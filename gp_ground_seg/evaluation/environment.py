@@ -13,8 +13,6 @@ import gp_ground_seg
 from gp_ground_seg.parameters.config import Config, parameter_specs
 from gp_ground_seg.parameters.schema import ParameterValue
 
-_VERSIONED = ('numpy', 'scipy', 'numba')
-
 
 @dataclass(frozen=True)
 class Environment:
@@ -22,21 +20,16 @@ class Environment:
 
     Attributes
     ----------
-    cpu : str
-        Name of the processor.
-    n_cores : int
-        Cores this process may use.
-    platform, python : str
-        Operating system, and version of Python.
-    versions : dict of str to str or None
-        Version of this package and of those it computes with; None = not installed.
+    cpu, n_cores : str, int
+        Name of the processor, and the cores this process may use.
+    python, versions : str, dict of str to str or None
+        Versions of Python, of this package and of those it computes with; None = not installed.
     commit : str or None
         Commit of the source, with ``-dirty`` if changed since; None outside git.
     """
 
     cpu: str
     n_cores: int
-    platform: str
     python: str
     versions: dict[str, str | None]
     commit: str | None
@@ -57,7 +50,7 @@ class Environment:
 def describe_environment(*packages: str) -> Environment:
     """Describe this machine; `packages` are further ones whose version matters."""
     versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
-    for package in (*_VERSIONED, *packages):
+    for package in ('numpy', 'scipy', 'numba', *packages):
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
@@ -65,7 +58,6 @@ def describe_environment(*packages: str) -> Environment:
     return Environment(
         cpu=_cpu_name(),
         n_cores=len(os.sched_getaffinity(0)),
-        platform=platform.platform(),
         python=platform.python_version(),
         versions=versions,
         commit=_commit(Path(gp_ground_seg.__file__)),
@@ -75,9 +67,9 @@ def describe_environment(*packages: str) -> Environment:
 def changed_parameters(config: Config) -> dict[str, ParameterValue]:
     """Parameters that differ from their defaults, by dotted name."""
     return {
-        spec.name: config[spec.name]
+        spec.name: value
         for spec in parameter_specs()
-        if config[spec.name] != spec.default
+        if (value := config[spec.name]) != spec.default
     }
 
 
@@ -92,18 +84,14 @@ def _cpu_name() -> str:
         lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
     except OSError:
         lines = []
-    for line in lines:
-        key, _, value = line.partition(':')
-        if key.strip() == 'model name':
-            return value.strip()
-    return platform.processor() or platform.machine()
+    names = (line.partition(':')[2].strip() for line in lines if line.startswith('model name'))
+    return next(names, platform.processor() or platform.machine())
 
 
 def _commit(source: Path) -> str | None:
     """Commit that holds the file `source`, None if git does not know the file.
 
-    An installed package may lie inside another repository, whose commit would say
-    nothing of it: the file itself has to be tracked.
+    An installed package may lie inside another repository, whose commit says nothing of it.
     """
     if _git(source.parent, 'ls-files', '--error-unmatch', source.name) is None:
         return None

@@ -60,10 +60,8 @@ class KnownScan:
     truths : dict of str to (N,) uint8
         True `Label` by key of the convention, the one that counts first; UNKNOWN where a
         point does not count.
-    semantic : (N,) int or None
-        Semantic classes, if known.
-    ground_z : (N,) float or None
-        True height of the ground [m], at least where `parts` has the point.
+    semantic, ground_z : (N,) int or None, (N,) float or None
+        Semantic classes and true height of the ground [m], if known.
     parts : dict of str to (N,) bool
         Points under which the surface is compared with `ground_z`, by name of the part.
     """
@@ -83,24 +81,16 @@ class ScanScore:
 
     Attributes
     ----------
-    sequence, index : str
-        Which scan.
-    seconds : float
-        Time of the segmentation alone, without reading.
-    stages : dict of str to float
-        Seconds by stage, empty if the method does not tell.
+    seconds, stages : float, dict of str to float
+        Time of the segmentation without reading, and by stage if the method measures it.
     confusions : dict of str to Confusion
         By key of the convention, the one that counts first.
-    heights : dict of str to HeightError
-        Of the surface, by part of the ground.
-    classes : dict of int to ClassCount
-        By number of the semantic class, where they are known.
+    heights, classes : dict of str to HeightError, dict of int to ClassCount
+        By part of the ground, and by number of the semantic class, as far as they are known.
     rings : tuple of Confusion
         By `RING_TITLES`.
-    calibration : Calibration or None
-        Of the probabilities, if there are any.
-    pose, fit : SensorPose or None, FitReport or None
-        Of our own method.
+    calibration, pose, fit : Calibration, SensorPose, FitReport or None
+        Where the method has probabilities; of our own method.
     """
 
     sequence: str
@@ -138,16 +128,15 @@ class MethodScore:
         """Names of the sequences, in order."""
         return list(dict.fromkeys(scan.sequence for scan in self.scans))
 
-    @property
-    def fit(self) -> FitReport | None:
-        """Fit report of the last scan: backend and threads are in it."""
-        return self.scans[-1].fit
-
     def of(self, *sequences: str | None) -> MethodScore:
         """Return the part of some sequences; None stands for all."""
         if None in sequences:
             return self
         return MethodScore(self.name, tuple(s for s in self.scans if s.sequence in sequences))
+
+    def by_sequence(self) -> list[tuple[str, MethodScore]]:
+        """Return the parts of the sequences by name, and the whole as `ALL`."""
+        return [*((name, self.of(name)) for name in self.sequences), (ALL, self)]
 
     def pooled(self, convention: str) -> Confusion:
         """Sum of the counts in a convention."""
@@ -170,19 +159,11 @@ class MethodScore:
         return math.nan if calibration is None else calibration.ece
 
     @property
-    def worst_sequence(self) -> str:
-        """Name of the sequence with the lowest IoU."""
-        return min(self.sequences, key=lambda name: self.of(name).iou)
-
-    @property
     def classes(self) -> dict[int, ClassCount]:
         """Sum of the counts by class, by ascending class number."""
-        total: dict[int, ClassCount] = {}
-        for scan in self.scans:
-            for number, count in scan.classes.items():
-                before = total.get(number, ClassCount(0, 0))
-                total[number] = ClassCount(*map(operator.add, before, count))
-        return dict(sorted(total.items()))
+        numbers = sorted({number for scan in self.scans for number in scan.classes})
+        counts = {n: [s.classes[n] for s in self.scans if n in s.classes] for n in numbers}
+        return {n: ClassCount(*map(sum, zip(*own, strict=True))) for n, own in counts.items()}
 
     @property
     def rings(self) -> tuple[Confusion, ...]:
@@ -194,9 +175,8 @@ class MethodScore:
     def calibration(self) -> Calibration | None:
         """Sum over the scans; None unless every scan has one."""
         found = [scan.calibration for scan in self.scans if scan.calibration is not None]
-        if not found or len(found) < len(self.scans):
-            return None
-        return functools.reduce(operator.add, found)
+        complete = found and len(found) == len(self.scans)
+        return functools.reduce(operator.add, found) if complete else None
 
     def height(self, part: str = ALL) -> HeightError:
         """Pooled height error of a part of the ground."""
@@ -209,11 +189,8 @@ class MethodScore:
     @property
     def median_stages(self) -> dict[str, float]:
         """Median seconds of each stage."""
-        names = dict.fromkeys(stage for scan in self.scans for stage in scan.stages)
-        return {
-            name: statistics.median(s.stages[name] for s in self.scans if name in s.stages)
-            for name in names
-        }
+        names = self.scans[0].stages
+        return {name: statistics.median(s.stages[name] for s in self.scans) for name in names}
 
 
 def pool(name: str, scores: Iterable[MethodScore]) -> MethodScore:
@@ -222,12 +199,9 @@ def pool(name: str, scores: Iterable[MethodScore]) -> MethodScore:
 
 
 def labelled_frames(root: str | Path, sequences: Sequence[str] | None = None) -> list[Frame]:
-    """Frames of the named sequences, or of all, in order; each has labels.
+    """Frames of the named sequences, or of all, in order.
 
-    Raises
-    ------
-    DataError
-        If a sequence is not there or named twice, or a frame has no labels.
+    Raises DataError if a sequence is not there or named twice, or a frame has no labels.
     """
     known = list_sequences(root)
     chosen = known if sequences is None else list(sequences)
@@ -239,24 +213,20 @@ def labelled_frames(root: str | Path, sequences: Sequence[str] | None = None) ->
         raise DataError(f'sequences {", ".join(chosen)}: one is named twice')
     frames = {name: list_frames(root, name) for name in chosen}
     bare = {name: [f for f in found if f.labels_path is None] for name, found in frames.items()}
+    labelled = ','.join(name for name in chosen if not bare[name])
     for name, missing in bare.items():
         if missing:
-            labelled = [other for other in chosen if not bare[other]]
-            hint = f'; wholly labelled: {",".join(labelled)}' if labelled else ''
             raise DataError(
-                f'{root}: {len(missing)} of {len(frames[name])} frames of sequence {name} have '
-                f'no labels, the first is {missing[0].index}{hint}'
+                f'{root}: {len(missing)} of {len(frames[name])} frames of sequence {name} have no '
+                f'labels, the first is {missing[0].index}; wholly labelled: {labelled or "none"}'
             )
-    return [frame for name in chosen for frame in frames[name]]
+    return [frame for found in frames.values() for frame in found]
 
 
 def load_kitti(frame: Frame) -> KnownScan:
     """Read a labelled frame; the ground whose height counts is what is labelled ground.
 
-    Raises
-    ------
-    DataError
-        If it has no labels, or a file cannot be read or does not fit.
+    Raises DataError if it has no labels, or a file cannot be read or does not fit.
     """
     if frame.labels_path is None:
         raise DataError(f'{frame.points_path}: has no labels')
@@ -282,47 +252,33 @@ def score_methods(
     clock: Callable[[], float] = time.perf_counter,
     progress: Progress = iter,
 ) -> list[MethodScore]:
-    """Run methods alternately on the same scans and score each run.
+    """Run methods alternately on the same scans and score each run, in the order of `methods`.
 
     Which method goes first changes from scan to scan. Before the first scan counts, each method
     has run on it once: compilation and first allocations are not its speed. One scan at a time
-    is in memory.
+    is in memory. Methods are reset before each sequence, or with `each_alone` before each scan.
 
     Parameters
     ----------
-    items : sequence
-        What is loaded, such as frames, grouped by sequence.
-    load : callable
-        Loads an item.
+    items, load : sequence, callable
+        What is loaded, such as frames, grouped by sequence, and by what.
     methods : sequence of Method
         Each with a name of its own.
-    each_alone : bool
-        Whether methods forget before every scan, not only before every sequence.
-    observe : callable, optional
-        Called as soon as a scan is scored: scores alone are kept.
-    clock, progress : callable
-        Source of seconds; wraps the items.
-
-    Returns
-    -------
-    list of MethodScore
-        In the order of `methods`.
+    observe, clock, progress : callable
+        Sees each scan as it is scored; source of seconds; wraps the items.
 
     Raises
     ------
-    DataError
-        If a scan cannot be loaded.
     PointCloudError
-        If a method refuses a scan.
+        If a method refuses a scan; what `load` raises is passed on.
     """
     scores: dict[str, list[ScanScore]] = {method.name: [] for method in methods}
-    if items:
-        first = load(items[0])
-        for method in methods:
-            _run(method, first)
     sequence = None
     for k, item in enumerate(progress(items)):
         scan = load(item)
+        if k == 0:
+            for method in methods:
+                _run(method, scan)
         forgets = each_alone or scan.sequence != sequence
         sequence = scan.sequence
         for method in methods if k % 2 == 0 else reversed(methods):
@@ -367,28 +323,3 @@ def _score(scan: KnownScan, method: Method, seconds: float) -> tuple[ScanScore, 
         result.fit,
     )
     return score, label
-
-
-@dataclass(frozen=True)
-class KeptScan:
-    """A scan, its score and the labels it got, (N,) uint8."""
-
-    scan: KnownScan
-    score: ScanScore
-    label: Labels
-
-
-class WorstFrames:
-    """Keeps the `n` scans on which `method` has the lowest IoU, the worst first."""
-
-    def __init__(self, method: str, n: int) -> None:
-        self.kept: list[KeptScan] = []
-        self._method = method
-        self._n = n
-
-    def observe(self, method: str, scan: KnownScan, score: ScanScore, label: Labels) -> None:
-        """Take a scan just scored; one without a defined IoU is passed over."""
-        if method == self._method and not math.isnan(score.confusion.iou):
-            self.kept.append(KeptScan(scan, score, label))
-            self.kept.sort(key=lambda one: one.score.confusion.iou)
-            del self.kept[self._n :]

@@ -1,4 +1,4 @@
-"""Methods that can be scored behind one small interface, and how they are run side by side."""
+"""Methods that can be scored, behind one small interface."""
 
 from __future__ import annotations
 
@@ -30,19 +30,7 @@ Points = npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class MethodResult:
-    """What a method says of a scan of N points.
-
-    Attributes
-    ----------
-    label : (N,) uint8
-        `Label` of each point.
-    p_ground : (N,) float or None
-        Probability of ground; None if the method has none.
-    stages : dict of str to float
-        Seconds by stage; empty if they are not known.
-    pose, fit : SensorPose or None, FitReport or None
-        Of our own method.
-    """
+    """Labels (N,) and, where the method has them, probabilities (N,) and seconds by stage."""
 
     label: npt.NDArray[np.uint8]
     p_ground: npt.NDArray[np.floating] | None = None
@@ -73,15 +61,7 @@ class Method(Protocol):
 
 
 class OurMethod:
-    """`GroundSegmenter` as a method.
-
-    Parameters
-    ----------
-    config : Config
-        Its parameters.
-    name : str
-        Name by which its scores are kept.
-    """
+    """`GroundSegmenter` as a method."""
 
     def __init__(self, config: Config, name: str = OURS) -> None:
         self.name = name
@@ -113,18 +93,9 @@ class OurMethod:
 class PatchworkppMethod:
     """Patchwork++ (Lee, Lim, Myung, IROS 2022) from PyPI, with its published parameters.
 
-    Only its estimation is timed, not the fetching of the indices. Its adaptive
-    thresholds are learned over a sequence.
-
-    Parameters
-    ----------
-    sensor_height : float, optional
-        Height of the sensor [m]; its published one, that of KITTI, by default.
-
-    Raises
-    ------
-    MissingDependencyError
-        If pypatchworkpp is not installed.
+    Only its estimation is timed, not the fetching of the indices. Its adaptive thresholds are
+    learned over a sequence. The published sensor height [m], that of KITTI, is its default.
+    Raises MissingDependencyError if pypatchworkpp is not installed.
     """
 
     name = PATCHWORKPP

@@ -29,7 +29,6 @@ RING_TITLES = tuple(
 SENSOR_HEIGHT = 1.73
 """Height of the sensor [m] in SemanticKITTI. The truth is a property of the data:
 it must not move with ``sensor.height``, which is a parameter of the method."""
-
 LOW_VEGETATION_Z = -0.75 * SENSOR_HEIGHT
 """Height [m, sensor frame] below which Patchwork's evaluation counts vegetation as ground."""
 
@@ -101,7 +100,7 @@ class Convention:
         Name in files, name in tables, and what it does, in a few words.
     left_out : tuple of int
         Classes whose points do not count.
-    low_vegetation_z : float or None
+    low_vegetation_z : float
         Vegetation below this height [m, sensor frame] is ground.
     """
 
@@ -109,35 +108,18 @@ class Convention:
     title: str
     rule: str
     left_out: tuple[int, ...]
-    low_vegetation_z: float | None = None
+    low_vegetation_z: float = -math.inf
 
     def truth(self, semantic: npt.NDArray[np.integer], z: npt.NDArray[np.floating]) -> Labels:
-        """Return the true label of each point.
+        """Return the true `Label` of each point, UNKNOWN where it does not count, (N,) uint8.
 
-        Parameters
-        ----------
-        semantic : (N,) int
-            Classes.
-        z : (N,) float
-            Heights in the sensor frame [m].
-
-        Returns
-        -------
-        (N,) uint8
-            ``Label.GROUND``, ``Label.OBSTACLE``, or ``Label.UNKNOWN`` where the
-            point does not count.
+        `semantic` (N,) are classes, `z` (N,) heights in the sensor frame [m].
         """
         ground = np.isin(semantic, GROUND_CLASSES)
-        if self.low_vegetation_z is not None:
-            ground |= (semantic == SemanticClass.VEGETATION) & (z < self.low_vegetation_z)
+        ground |= (semantic == SemanticClass.VEGETATION) & (z < self.low_vegetation_z)
         truth = np.where(ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
         truth[np.isin(semantic, self.left_out)] = Label.UNKNOWN
         return truth
-
-    def truth_of_class(self, number: int) -> Label:
-        """Return the true label of a class, of its high points if that depends on height."""
-        (truth,) = self.truth(np.array([number]), np.array([np.inf]))
-        return Label(truth)
 
 
 GROUNDGRID = Convention(
@@ -165,16 +147,7 @@ CONVENTIONS = (GROUNDGRID, PATCHWORK)
 
 @dataclass(frozen=True)
 class Confusion:
-    """Points by true and given label; ground is the positive class.
-
-    A ratio with nothing in its denominator is NaN.
-
-    Attributes
-    ----------
-    tp, fp, fn, tn : int
-        Ground labelled ground, other points labelled ground, ground not
-        labelled ground, other points not labelled ground.
-    """
+    """Points by true and given label, ground being positive; ratios over nothing are NaN."""
 
     tp: int = 0
     fp: int = 0
@@ -229,36 +202,20 @@ def ratio(part: float, whole: float) -> float:
 
 
 def count_confusion(label: Labels, truth: Labels) -> Confusion:
-    """Compare given with true labels.
+    """Compare given with true labels, (N,) each.
 
-    Parameters
-    ----------
-    label : (N,) uint8
-        Given `Label` of each point; UNKNOWN counts as not ground.
-    truth : (N,) uint8
-        True `Label` of each point; where it is UNKNOWN the point does not count.
+    A given UNKNOWN counts as not ground; where the truth is UNKNOWN the point does not count.
     """
-    given = label == Label.GROUND
-    ground, obstacle = truth == Label.GROUND, truth == Label.OBSTACLE
-    return Confusion(
-        tp=int(np.count_nonzero(given & ground)),
-        fp=int(np.count_nonzero(given & obstacle)),
-        fn=int(np.count_nonzero(~given & ground)),
-        tn=int(np.count_nonzero(~given & obstacle)),
-    )
+    return count_rings(label, truth, np.zeros((len(label), 2)))[0]
 
 
 def count_rings(
     label: Labels, truth: Labels, points: npt.NDArray[np.floating]
 ) -> tuple[Confusion, ...]:
-    """Compare given with true labels by horizontal range, one `Confusion` for each ring.
+    """Compare as `count_confusion` by horizontal range, one `Confusion` for each ring.
 
-    Parameters
-    ----------
-    label, truth : (N,) uint8
-        As `count_confusion`.
-    points : (N, >=2) float
-        x, y, ... in the sensor frame [m]. A point without a finite range is in no ring.
+    `points` (N, >=2) are x, y, ... in the sensor frame [m]; one without a finite range is in
+    no ring.
     """
     x, y = points[:, :2].astype(np.float64).T
     reach = np.hypot(x, y)
@@ -303,13 +260,11 @@ class ClassErrors(NamedTuple):
         return self.missed + self.false
 
 
-def class_errors(
-    classes: Mapping[int, ClassCount], convention: Convention = GROUNDGRID
-) -> list[ClassErrors]:
-    """Errors by class, the largest first; vegetation only as a whole (`truth_of_class`)."""
+def class_errors(classes: Mapping[int, ClassCount]) -> list[ClassErrors]:
+    """Errors by class in the GroundGrid convention, the largest first."""
     found = []
     for number, (n_points, n_ground) in classes.items():
-        truth = convention.truth_of_class(number)
+        truth = Label(int(GROUNDGRID.truth(np.array([number]), np.zeros(1))[0]))
         missed = n_points - n_ground if truth is Label.GROUND else 0
         false = n_ground if truth is Label.OBSTACLE else 0
         found.append(ClassErrors(number, truth, n_points, n_ground, missed, false))
@@ -318,9 +273,7 @@ def class_errors(
 
 @dataclass(frozen=True)
 class HeightError:
-    """Errors of the surface under points whose ground height is known.
-
-    A ratio or mean over no points is NaN.
+    """Errors of the surface under points whose ground height is known; over no points NaN.
 
     Attributes
     ----------
@@ -329,11 +282,9 @@ class HeightError:
     sum_error, sum_squared_error : float
         Sum of estimate minus truth [m], and of its squares [m^2].
     sum_squared_deviation : float
-        Sum of the squared deviations of the true heights from their mean [m^2];
-        pooled, from the mean of each frame.
+        Of the true heights from their mean [m^2]; pooled, from the mean of each frame.
     median_absolute : float
-        Median distance of the estimate from the truth [m]; pooled, the median
-        over the frames of theirs.
+        Median distance of the estimate from the truth [m]; pooled, the median over the frames.
     """
 
     n_points: int

@@ -1,9 +1,7 @@
-"""Results as a table: for the terminal, as Markdown, CSV and JSON."""
+"""Results as a table: for the terminal, as Markdown and JSON."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import textwrap
@@ -31,7 +29,7 @@ class Column:
         Format of its numbers, such as ``.2f`` or ``+.1f``; ``_d`` separates thousands by
         spaces. Without one the column holds text and is aligned left.
     key : str
-        Name in CSV and JSON; the title by default.
+        Name in JSON; the title by default.
     scale : float
         Factor between what a row holds and what is shown: 100 for a ratio in percent.
     """
@@ -50,22 +48,30 @@ class Column:
         return format(self.scale * value, self.format).replace('_', ' ')
 
 
+def percent(title: str, key: str = '', form: str = '.2f') -> Column:
+    """Column of ratios, shown in percent."""
+    return Column(title, form, key, 100.0)
+
+
+def centimetres(title: str, key: str = '') -> Column:
+    """Column of lengths in metres, shown in centimetres."""
+    return Column(title, '.2f', key, 100.0)
+
+
+def milliseconds(title: str, key: str = '') -> Column:
+    """Column of times in seconds, shown in milliseconds."""
+    return Column(title, '.1f', key, 1e3)
+
+
+Row = list[tuple[Column, Cell]]
+"""A row that names the column of each cell."""
+
+
 @dataclass(frozen=True)
 class Table:
-    """Rows of numbers and text below titles.
+    """Rows of unscaled numbers and text, as many cells in each as there are columns.
 
-    Attributes
-    ----------
-    columns : sequence of Column
-        Columns from left to right.
-    rows : sequence of sequence of Cell
-        As many cells in each as there are columns, unscaled.
-    title : str
-        What is in the table, above it.
-    notes : sequence of str
-        Lines below it.
-    n_sums : int
-        Rows at the end that a rule sets apart from the others in `text`.
+    The title stands above it, notes below; `n_sums` rows at the end are set apart in `text`.
     """
 
     columns: Sequence[Column]
@@ -74,9 +80,15 @@ class Table:
     notes: Sequence[str] = ()
     n_sums: int = 0
 
+    @classmethod
+    def of(cls, rows: Sequence[Row], **options: Any) -> Table:
+        """Make a table of at least one row."""
+        columns = [column for column, _ in rows[0]]
+        return cls(columns, [[cell for _, cell in row] for row in rows], **options)
+
     def text(self) -> str:
         """Return aligned text, columns two spaces apart."""
-        lines = [[column.title for column in self.columns], *self._shown()]
+        lines = self._shown()
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         text = []
         for line in lines:
@@ -93,18 +105,10 @@ class Table:
 
     def markdown(self) -> str:
         """Return a Markdown table, title and notes as paragraphs."""
+        titles, *rows = self._shown()
         rule = ['--:' if column.format else '---' for column in self.columns]
-        lines = [[column.title for column in self.columns], rule, *self._shown()]
-        table = '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+        table = '\n'.join(f'| {" | ".join(line)} |' for line in [titles, rule, *rows])
         return '\n\n'.join([*([self.title] if self.title else []), table, *self.notes])
-
-    def csv(self) -> str:
-        """Return comma-separated values, unscaled; what is undefined is empty."""
-        file = io.StringIO()
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(column.key or column.title for column in self.columns)
-        writer.writerows(map(plain, self.rows))
-        return file.getvalue()
 
     def json(self) -> list[dict[str, Any]]:
         """Return one object per row, unscaled, NaN as None."""
@@ -112,25 +116,12 @@ class Table:
         return [dict(zip(keys, plain(row), strict=True)) for row in self.rows]
 
     def _shown(self) -> list[list[str]]:
-        return [
+        """Titles and rows, every cell as it is shown."""
+        rows = [
             [column.show(cell) for column, cell in zip(self.columns, row, strict=True)]
             for row in self.rows
         ]
-
-
-def percent(title: str, key: str = '', form: str = '.2f') -> Column:
-    """Column of ratios, shown in percent."""
-    return Column(title, form, key, 100.0)
-
-
-def centimetres(title: str, key: str = '') -> Column:
-    """Column of lengths in metres, shown in centimetres."""
-    return Column(title, '.2f', key, 100.0)
-
-
-def milliseconds(title: str, key: str = '') -> Column:
-    """Column of times in seconds, shown in milliseconds."""
-    return Column(title, '.1f', key, 1e3)
+        return [[column.title for column in self.columns], *rows]
 
 
 def fold(line: str) -> str:

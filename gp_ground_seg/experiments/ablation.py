@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.evaluate import (
-    ALL,
-    KnownScan,
-    MethodScore,
-    Progress,
-    load_kitti,
-)
-from gp_ground_seg.evaluation.table import Cell, Column, Table, centimetres, milliseconds, percent
+from gp_ground_seg.evaluation.evaluate import ALL, KnownScan, MethodScore, Progress, load_kitti
+from gp_ground_seg.evaluation.table import Column, Row, Table, centimetres, milliseconds, percent
 from gp_ground_seg.experiments.variants import (
     Changes,
     Report,
@@ -69,16 +63,9 @@ STRETCHES = (ALL, 'smooth', 'rubble')
 
 
 class Departure(NamedTuple):
-    """A departure from the paper, or another choice, and the parameters that undo it.
+    """A departure from the paper, or another choice; `kept` if the defaults have it.
 
-    Attributes
-    ----------
-    title : str
-        What it is, in a few words.
-    changes : mapping of str to value
-        Parameters, by dotted name, that switch it off; where it is not kept, on.
-    kept : bool
-        Whether the defaults have it.
+    `changes` are the parameters that switch it off; where it is not kept, on.
     """
 
     title: str
@@ -123,26 +110,21 @@ AS_GIVEN = 'as given'
 
 def compare_models(frames: Sequence[Frame], config: Config, progress: Progress = iter) -> Report:
     """Score `MODELS` on labelled frames; ConfigError if `config` sets what they set."""
-    refuse_changed(config, {name for changes in MODELS.values() for name in changes})
-    variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
-    scores = score_variants(frames, load_kitti, variants, progress=progress)
-    rows: list[list[Cell]] = []
-    for one in scores:
-        height, worst = one.height(), one.worst_sequence
-        cells = [height.rmse, height.median_absolute, height.smse, one.seconds()]
-        rows.append([one.name, one.iou, one.of(worst).iou, worst, *cells])
-    columns = [
-        Column('method'),
-        percent('IoU [%]', 'iou'),
-        percent('worst [%]', 'worst_iou'),
-        Column('in', '', 'worst_sequence'),
-        centimetres('RMSE [cm]', 'rmse'),
-        centimetres('median [cm]', 'median_absolute'),
-        Column('SMSE', '.5f', 'smse'),
-        milliseconds('ms', 'seconds'),
+    scores = _score_models(MODELS, frames, load_kitti, config, progress)
+    rows: list[Row] = [
+        [
+            (Column('method'), one.name),
+            (percent('IoU [%]', 'iou'), one.iou),
+            *_worst(one),
+            (centimetres('RMSE [cm]', 'rmse'), one.height().rmse),
+            (centimetres('median [cm]', 'median_absolute'), one.height().median_absolute),
+            (Column('SMSE', '.5f', 'smse'), one.height().smse),
+            (milliseconds('ms', 'seconds'), one.seconds()),
+        ]
+        for one in scores
     ]
-    title = f'{frames_title(frames)}; heights under points labelled ground'
-    return make_report({'models': Table(columns, rows, title)}, scores, config, changes=MODELS)
+    title = f'{_frames_title(frames)}; heights under points labelled ground'
+    return make_report({'models': Table.of(rows, title=title)}, scores, config, changes=MODELS)
 
 
 def compare_models_simulated(n_seeds: int, config: Config, progress: Progress = iter) -> Report:
@@ -150,25 +132,38 @@ def compare_models_simulated(n_seeds: int, config: Config, progress: Progress = 
 
     Each seed is a scene of its own, seen by an HDL-64E from `PLACES`. Raises as `compare_models`.
     """
-    refuse_changed(config, {name for changes in SIMULATED_MODELS.values() for name in changes})
-    variants = {name: config.replace(**changes) for name, changes in SIMULATED_MODELS.items()}
     frames = simulated_frames(['hdl-64e'], [SCENE], n_seeds, PLACES)
-    scores = score_variants(frames, load_stretches, variants, progress=progress)
-    rows: list[list[Cell]] = []
-    for one in scores:
-        heights = [one.height(stretch) for stretch in STRETCHES]
-        errors = [h.rmse for h in heights] + [h.median_absolute for h in heights]
-        rows.append([one.name, *errors, one.seconds()])
-    columns = [Column('length-scale')]
-    for name, key in (('RMSE', 'rmse'), ('median', 'median_absolute')):
-        columns += [centimetres(f'{name}, {s}', f'{key}_{s}') for s in STRETCHES]
-    columns.append(milliseconds('ms', 'seconds'))
+    scores = _score_models(SIMULATED_MODELS, frames, load_stretches, config, progress)
+    rows: list[Row] = [
+        [
+            (Column('length-scale'), one.name),
+            *(
+                (centimetres(f'{title}, {part}', f'{key}_{part}'), getattr(one.height(part), key))
+                for title, key in (('RMSE', 'rmse'), ('median', 'median_absolute'))
+                for part in STRETCHES
+            ),
+            (milliseconds('ms', 'seconds'), one.seconds()),
+        ]
+        for one in scores
+    ]
     title = (
         f'{len(frames)} simulated scans of {n_seeds} scenes, road then rubble, HDL-64E; '
         'errors against the exact ground [cm]'
     )
-    tables = {'models': Table(columns, rows, title)}
+    tables = {'models': Table.of(rows, title=title)}
     return make_report(tables, scores, config, changes=SIMULATED_MODELS)
+
+
+def _score_models(
+    models: Mapping[str, Changes],
+    items: Sequence[Any],
+    load: Callable[[Any], KnownScan],
+    config: Config,
+    progress: Progress,
+) -> list[MethodScore]:
+    refuse_changed(config, {name for changes in models.values() for name in changes})
+    variants = {name: config.replace(**changes) for name, changes in models.items()}
+    return score_variants(items, load, variants, progress=progress)
 
 
 def load_stretches(frame: SimulatedFrame) -> KnownScan:
@@ -189,10 +184,7 @@ def compare_departures(
 ) -> Report:
     """Switch one departure after the other, on the same frames in the same run.
 
-    Raises
-    ------
-    ConfigError
-        If two titles are alike, a switch is not accepted or changes nothing.
+    Raises ConfigError if two titles are alike, a switch is not accepted or changes nothing.
     """
     variants = {AS_GIVEN: config}
     for one in departures:
@@ -201,45 +193,43 @@ def compare_departures(
         variants[one.title] = config.replace(**one.changes)
         if variants[one.title] == config:
             raise ConfigError(f'departure {one.title!r}: its switch changes nothing')
-    given, *switched = score_variants(frames, load_kitti, variants, progress=progress)
-    rows = [_departure_row(AS_GIVEN, None, None, given, given)]
-    found = []
+    scores = score_variants(frames, load_kitti, variants, progress=progress)
+    given, *switched = scores
+
+    def row(score: MethodScore, switch: str | None = None, worth: float | None = None) -> Row:
+        pairs = zip(score.scans, given.scans, strict=True)
+        time_ratio = statistics.median(one.seconds / other.seconds for one, other in pairs)
+        return [
+            (Column('departure'), score.name),
+            (Column('switch'), switch),
+            (percent('IoU [%]', 'iou'), score.iou),
+            (percent('worth [%]', 'worth', '+.2f'), worth),
+            *_worst(score),
+            (centimetres('RMSE [cm]', 'rmse'), score.height().rmse),
+            (Column('time', '.2f', 'time_ratio'), time_ratio),
+        ]
+
+    switches = []
     for one, score in zip(departures, switched, strict=True):
-        worth = (given.iou - score.iou) * (1.0 if one.kept else -1.0)
-        found.append((worth, one, score))
-    for worth, one, score in sorted(found, key=lambda entry: -entry[0]):
-        rows.append(_departure_row(one.title, 'off' if one.kept else 'on', worth, score, given))
-    columns = [
-        Column('departure', '', 'departure'),
-        Column('switch'),
-        percent('IoU [%]', 'iou'),
-        percent('worth [%]', 'worth', '+.2f'),
-        percent('worst [%]', 'worst_iou'),
-        Column('in', '', 'worst_sequence'),
-        centimetres('RMSE [cm]', 'rmse'),
-        Column('time', '.2f', 'time_ratio'),
-    ]
+        gain = given.iou - score.iou
+        switches.append((score, 'off', gain) if one.kept else (score, 'on', -gain))
+    rows = [row(given), *(row(*one) for one in sorted(switches, key=lambda one: -one[2]))]
     title = (
-        f'{frames_title(frames)}; worth: what having it adds to the IoU; RMSE of the height; '
+        f'{_frames_title(frames)}; worth: what having it adds to the IoU; RMSE of the height; '
         'time: over that as given, median of the frames'
     )
     changes = {one.title: one.changes for one in departures}
-    tables = {'departures': Table(columns, rows, title)}
-    return make_report(tables, [given, *switched], config, changes=changes)
+    tables = {'departures': Table.of(rows, title=title)}
+    return make_report(tables, scores, config, changes=changes)
 
 
-def _departure_row(
-    title: str, switch: str | None, worth: float | None, score: MethodScore, given: MethodScore
-) -> list[Cell]:
-    pairs = zip(score.scans, given.scans, strict=True)
-    ratio = statistics.median(one.seconds / other.seconds for one, other in pairs)
-    worst = score.worst_sequence
-    cells: list[Cell] = [score.of(worst).iou, worst, score.height().rmse, ratio]
-    return [title, switch, score.iou, worth, *cells]
+def _worst(score: MethodScore) -> Row:
+    """Cells of the sequence with the lowest IoU."""
+    iou, name = min((score.of(name).iou, name) for name in score.sequences)
+    return [(percent('worst [%]', 'worst_iou'), iou), (Column('in', '', 'worst_sequence'), name)]
 
 
-def frames_title(frames: Sequence[Frame]) -> str:
-    """One line on labelled frames."""
+def _frames_title(frames: Sequence[Frame]) -> str:
     n = len({frame.sequence for frame in frames})
     return (
         f'{len(frames)} labelled frame{"s" * (len(frames) > 1)} of {n} sequence{"s" * (n > 1)}; '

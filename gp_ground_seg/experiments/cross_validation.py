@@ -6,19 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.evaluate import (
-    ALL,
-    MethodScore,
-    Progress,
-    load_kitti,
-    pool,
-)
-from gp_ground_seg.evaluation.table import Cell, Column, Table, percent
-from gp_ground_seg.experiments.variants import (
-    Report,
-    make_report,
-    score_variants,
-)
+from gp_ground_seg.evaluation.evaluate import ALL, MethodScore, Progress, load_kitti, pool
+from gp_ground_seg.evaluation.table import Column, Row, Table, percent
+from gp_ground_seg.experiments.variants import Report, make_report, score_variants
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
 
@@ -30,14 +20,7 @@ Grid = Mapping[str, Sequence[ParameterValue]]
 def coordinate_search(grid: Grid, start: Choice, worth: Callable[[Choice], float]) -> Choice:
     """Improve one parameter after the other until none can be.
 
-    Parameters
-    ----------
-    grid : mapping of str to sequence
-        Values to try, by name of the parameter.
-    start : dict
-        First choice.
-    worth : callable
-        What is maximised; of equal choices the earlier one stays.
+    `grid` has the values to try; `worth` is maximised, of equal choices the earlier one stays.
     """
     best, highest = dict(start), worth(start)
     better = True
@@ -56,18 +39,8 @@ def cross_validate(
 ) -> Report:
     """Choose values by pooled IoU, once on all sequences and once without each.
 
-    Each configuration segments every frame once, however many searches need it.
-
-    Parameters
-    ----------
-    frames : sequence of Frame
-        Labelled frames of at least two sequences.
-    base : Config
-        Where each search starts.
-    grid : mapping of str to sequence
-        Values to try beside those of `base`, by name of the parameter.
-    progress : callable
-        Wraps the frames of each configuration, as tqdm does.
+    Each configuration segments every frame once, however many searches need it. `grid` has the
+    values to try beside those of `base`, where each search starts.
 
     Raises
     ------
@@ -75,7 +48,7 @@ def cross_validate(
         If a value is not accepted; before any frame is read, unless it takes two
         parameters to see.
     DataError
-        If there are too few sequences or a file cannot be read.
+        If there are fewer than two sequences or a file cannot be read.
     """
     sequences = list(dict.fromkeys(frame.sequence for frame in frames))
     if len(sequences) < 2:
@@ -98,43 +71,38 @@ def cross_validate(
     choices = {'given': start, 'tuned': choose(sequences)}
     for left_out in sequences:
         choices[f'- {left_out}'] = choose([name for name in sequences if name != left_out])
-    scores = {'given': score(start), 'tuned': score(choices['tuned'])}
-    scores['left out'] = pool(
-        'left out', (score(choices[f'- {name}']).of(name) for name in sequences)
-    )
+    scores = [pool(name, [score(choices[name])]) for name in ('given', 'tuned')]
+    own = (score(choices[f'- {name}']).of(name) for name in sequences)
+    scores.append(pool('left out', own))
     tables = {
-        'scores': _score_table(scores, sequences, len(known)),
+        'scores': _score_table(scores, len(known)),
         'choices': _choice_table(choices),
     }
-    named = [MethodScore(name, one.scans) for name, one in scores.items()]
-    return make_report(tables, named, base, n_configurations=len(known), tried=tried)
+    return make_report(tables, scores, base, n_configurations=len(known), tried=tried)
 
 
-def _score_table(
-    scores: dict[str, MethodScore], sequences: Sequence[str], n_configurations: int
-) -> Table:
-    columns = [Column('sequence')]
-    columns += [percent(f'IoU {name} [%]', f'iou {name}') for name in scores]
-    columns += [Column(f'ECE {name}', '.4f') for name in scores]
-    rows: list[list[Cell]] = []
-    for name in (*sequences, ALL):
-        own = [one if name == ALL else one.of(name) for one in scores.values()]
-        rows.append([name, *(one.iou for one in own), *(one.ece for one in own)])
+def _score_table(scores: Sequence[MethodScore], n_configurations: int) -> Table:
+    rows: list[Row] = []
+    for name in (*scores[0].sequences, None):
+        own = [one.of(name) for one in scores]
+        rows.append([(Column('sequence'), name or ALL)])
+        rows[-1] += [(percent(f'IoU {o.name} [%]', f'iou {o.name}'), o.iou) for o in own]
+        rows[-1] += [(Column(f'ECE {o.name}', '.4f'), o.ece) for o in own]
     title = (
         'IoU and expected calibration error, GroundGrid convention: as given; with the values '
-        f'best on all {len(sequences)} sequences (tuned); each sequence with the values best on '
+        f'best on all {len(rows) - 1} sequences (tuned); each sequence with the values best on '
         f'the others (left out). {n_configurations} configurations scored.'
     )
-    return Table(columns, rows, title, n_sums=1)
+    return Table.of(rows, title=title, n_sums=1)
 
 
 def _choice_table(choices: dict[str, Choice]) -> Table:
     """Values chosen: a row for each parameter, a column for each search."""
-    rows = [
-        [name, *(_shown(choice[name]) for choice in choices.values())] for name in choices['given']
-    ]
-    columns = [Column('parameter'), *(Column(name, 's') for name in choices)]
-    return Table(columns, rows, 'Values chosen; - 00: without sequence 00')
+    rows: list[Row] = []
+    for name in choices['given']:
+        rows.append([(Column('parameter'), name)])
+        rows[-1] += [(Column(title, 's'), _shown(own[name])) for title, own in choices.items()]
+    return Table.of(rows, title='Values chosen; - 00: without sequence 00')
 
 
 def _shown(value: ParameterValue) -> str:

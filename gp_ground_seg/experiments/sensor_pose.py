@@ -6,9 +6,8 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from gp_ground_seg.evaluation.evaluate import (
 )
 from gp_ground_seg.evaluation.methods import MethodResult, OurMethod, Points
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, SENSOR_HEIGHT
-from gp_ground_seg.evaluation.table import Cell, Column, Table, percent
+from gp_ground_seg.evaluation.table import Cell, Column, Row, Table, percent
 from gp_ground_seg.experiments.variants import (
     Report,
     SimulatedFrame,
@@ -63,8 +62,7 @@ SIMULATED_TURNS = ((0, 0), (1, -1))
 Turn = tuple[int, int]
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """Scans from one true height [m] under one turn (in units of `TILT`).
 
     `scores` are by way to run; where the turn is none, also by axis that is up.
@@ -83,14 +81,14 @@ class TurnedMethod(OurMethod):
 
     def __init__(self, config: Config, name: str) -> None:
         super().__init__(config, name)
-        self._rotation = rotation(AXES_UP[name]) if name in AXES_UP else None
+        self._rotation = rotation(AXES_UP.get(name, (0.0, 0.0)))
         self._n_refused: int | None = None
 
     def run(self, points: Points) -> None:
         """Segment a scan."""
         self._n_refused = None
         try:
-            super().run(points if self._rotation is None else points @ self._rotation)
+            super().run(points @ self._rotation)
         except PointCloudError:
             self._n_refused = len(points)
 
@@ -100,27 +98,14 @@ class TurnedMethod(OurMethod):
             return super().result()
         return MethodResult(np.full(self._n_refused, Label.UNKNOWN, dtype=np.uint8))
 
-    def ground_z(self) -> FloatArray:
-        """Height of the surface; NaN in a scan that was refused."""
-        n = self._n_refused
-        return super().ground_z() if n is None else np.full(n, np.nan)
-
 
 def score_poses(frames: Sequence[Frame], config: Config, progress: Progress = iter) -> Report:
     """Run labelled frames of KITTI's car, as they are and turned by `TURNS` and `AXES_UP`.
 
-    Raises
-    ------
-    ConfigError
-        If `config` sets the pose itself.
-    DataError
-        If a file cannot be read or does not fit its frame.
+    Raises ConfigError if `config` sets the pose itself.
     """
-    trials = []
-    for turn in TURNS:
-        load = partial(load_turned, turn=turn)
-        trials.append(_trial(frames, load, SENSOR_HEIGHT, turn, config, progress))
-    return pose_report(trials, config)
+    mounts = [(SENSOR_HEIGHT, turn) for turn in TURNS]
+    return _report(frames, load_turned, mounts, config, progress)
 
 
 def score_simulated_poses(
@@ -132,11 +117,8 @@ def score_simulated_poses(
 ) -> Report:
     """Run simulated scans from sensors at `HEIGHTS`, level and tilted; raises as `score_poses`."""
     frames = simulated_frames(sensors, scenes, n_seeds, (0.0,))
-    trials = []
-    for height, turn in itertools.product(HEIGHTS, SIMULATED_TURNS):
-        load = partial(load_mounted, height=height, turn=turn)
-        trials.append(_trial(frames, load, height, turn, config, progress))
-    return pose_report(trials, config)
+    mounts = list(itertools.product(HEIGHTS, SIMULATED_TURNS))
+    return _report(frames, load_mounted, mounts, config, progress)
 
 
 def angles(turn: Turn) -> tuple[float, float]:
@@ -150,14 +132,14 @@ def rotation(degrees: tuple[float, float]) -> FloatArray:
     return SensorPose(0.0, roll, pitch).rotation
 
 
-def load_turned(frame: Frame, turn: Turn) -> KnownScan:
-    """Read a labelled frame as a turned sensor would see it."""
+def load_turned(_height: float, turn: Turn, frame: Frame) -> KnownScan:
+    """Read a labelled frame as a turned sensor would see it; its height is what it is."""
     scan = load_kitti(frame)
     points = scan.points[:, :3].astype(np.float64) @ rotation(angles(turn))
     return dataclasses.replace(scan, points=points, semantic=None, parts={})
 
 
-def load_mounted(frame: SimulatedFrame, height: float, turn: Turn) -> KnownScan:
+def load_mounted(height: float, turn: Turn, frame: SimulatedFrame) -> KnownScan:
     """Simulate a scan from a height [m] under a turn."""
     roll, pitch = map(math.radians, angles(turn))
     sensor = dataclasses.replace(SENSORS[frame.sensor], height=height, roll=roll, pitch=pitch)
@@ -170,50 +152,49 @@ def load_mounted(frame: SimulatedFrame, height: float, turn: Turn) -> KnownScan:
     return KnownScan(group, str(frame.seed), points, {GROUNDGRID.key: truth})
 
 
-def _trial(
+def _report(
     frames: Sequence[Any],
-    load: Callable[[Any], KnownScan],
-    height: float,
-    turn: Turn,
+    load: Callable[[float, Turn, Any], KnownScan],
+    mounts: Sequence[tuple[float, Turn]],
     config: Config,
     progress: Progress,
-) -> Trial:
+) -> Report:
+    """Run frames from each height under each turn."""
     names = ('sensor.height', 'sensor.roll', 'sensor.pitch')
     refuse_changed(config, names)
-    tilt = map(math.radians, angles(turn))
-    poses = {TOLD: (height, *tilt), LEVEL: (height, 0.0, 0.0), FOUND: (AUTO, AUTO, AUTO)}
-    variants = {
-        way: config.replace(**dict(zip(names, pose, strict=True))) for way, pose in poses.items()
-    }
-    if turn == (0, 0):
-        variants |= dict.fromkeys(AXES_UP, config)
-    scores = score_variants(frames, load, variants, make=TurnedMethod, progress=progress)
-    return Trial(height, turn, {score.name: score for score in scores})
-
-
-def pose_report(trials: Sequence[Trial], config: Config) -> Report:
-    """All tables of one kind of data."""
+    trials, named = [], []
+    for height, turn in mounts:
+        tilt = map(math.radians, angles(turn))
+        poses = {TOLD: (height, *tilt), LEVEL: (height, 0.0, 0.0), FOUND: (AUTO, AUTO, AUTO)}
+        variants = {
+            way: config.replace(**dict(zip(names, pose, strict=True)))
+            for way, pose in poses.items()
+        }
+        if turn == (0, 0):
+            variants |= dict.fromkeys(AXES_UP, config)
+        found = score_variants(
+            frames, partial(load, height, turn), variants, make=TurnedMethod, progress=progress
+        )  # fmt: skip
+        trials.append(Trial(height, turn, {score.name: score for score in found}))
+        named += [
+            pool(f'{score.name} {height:g} m {turn_text(turn)}', [score])
+            for score in found[: len(poses)]
+        ]
     level = [trial for trial in trials if trial.turn == (0, 0)]
-    tables = {'heights': height_table(level)}
-    if turned := [trial for trial in trials if trial.turn != (0, 0)]:
-        tables['turns'] = turn_table(turned)
-    tables['axes'] = axis_table(level)
-    named = [
-        dataclasses.replace(score, name=f'{way} {trial.height:g} m {turn_text(trial.turn)}')
-        for trial in trials
-        for way, score in trial.scores.items()
-        if way not in AXES_UP
-    ]
+    turned = [trial for trial in trials if trial.turn != (0, 0)]
+    tables = {
+        'heights': height_table(level), 'turns': turn_table(turned), 'axes': axis_table(level),
+    }  # fmt: skip
     return make_report(tables, named, config)
 
 
-def _pooled(trials: Sequence[Trial], way: str, group: str | None) -> MethodScore:
-    scores = (trial.scores[way] for trial in trials)
-    return pool(way, (one if group is None else one.of(group) for one in scores))
+def _pooled(trials: Sequence[Trial], way: str, group: str | None = None) -> MethodScore:
+    return pool(way, (trial.scores[way].of(group) for trial in trials))
 
 
-def _groups(trials: Sequence[Trial]) -> list[str]:
-    return trials[0].scores[TOLD].sequences
+def _change(trials: Sequence[Trial], group: str | None) -> float:
+    """IoU with the pose estimated over that with the pose told."""
+    return _pooled(trials, FOUND, group).iou - _pooled(trials, TOLD, group).iou
 
 
 def _n_levelled(found: MethodScore) -> int:
@@ -230,67 +211,77 @@ def _lean(pose: SensorPose | None) -> float:
 
 def height_table(trials: Sequence[Trial]) -> Table:
     """Return the scores of scans as they are, by group, and over several groups."""
-    groups = _groups(trials)
-    rows: list[list[Cell]] = []
+    groups = trials[0].scores[TOLD].sequences
+    rows: list[Row] = []
     for group in (*groups, *([None] if len(groups) > 1 else [])):
         told, found = (_pooled(trials, way, group) for way in (TOLD, FOUND))
         errors = [
             scan.pose.height - trial.height
             for trial in trials
-            for scan in _pooled([trial], FOUND, group).scans
+            for scan in trial.scores[FOUND].of(group).scans
             if scan.pose is not None
         ]
-        drops = [
-            _pooled([trial], FOUND, one).iou - _pooled([trial], TOLD, one).iou
-            for trial in trials
-            for one in (groups if group is None else [group])
-        ]
+        changes = [_change([t], g) for t in trials for g in ([group] if group else groups)]
         poses = [scan.pose for scan in found.scans]
         n_silent = sum(pose is None or not pose.height_estimated for pose in poses)
-        row: list[Cell] = [group or ALL, len(poses), told.iou, found.iou, found.iou - told.iou]
-        row += [min(drops), min(errors, default=None), max(errors, default=None)]
-        rows.append([*row, max(map(_lean, poses)), _n_levelled(found), n_silent])
-    columns = [Column('scans of'), Column('scans', 'd'), percent(TOLD), percent(FOUND)]
-    columns += [percent('change', form='+.2f'), percent('worst', form='+.2f')]
-    columns += [Column('low', '+.2f'), Column('high', '+.2f'), Column('tilt', '.1f')]
-    columns += [Column('levelled', 'd'), Column('silent', 'd')]
+        rows.append(
+            [
+                (Column('scans of'), group or ALL),
+                (Column('scans', 'd'), len(poses)),
+                (percent(TOLD), told.iou),
+                (percent(FOUND), found.iou),
+                (percent('change', form='+.2f'), found.iou - told.iou),
+                (percent('worst', form='+.2f'), min(changes)),
+                (Column('low', '+.2f'), min(errors, default=None)),
+                (Column('high', '+.2f'), max(errors, default=None)),
+                (Column('tilt', '.1f'), max(map(_lean, poses))),
+                (Column('levelled', 'd'), _n_levelled(found)),
+                (Column('silent', 'd'), n_silent),
+            ]
+        )
     title = (
         'Scans as they are: ground IoU [%] with the pose told and estimated (auto); the '
         'worst change of a sequence or height; lowest and highest error of the height [m]; the '
         'largest tilt measured [degrees]; how many were levelled, and how many do not show '
         'their height'
     )
-    return Table(columns, rows, title)
+    return Table.of(rows, title=title)
 
 
 def turn_table(trials: Sequence[Trial]) -> Table:
     """Return the scores of turned scans, by turn where there are several, else by group."""
-    groups, turns = _groups(trials), list(dict.fromkeys(trial.turn for trial in trials))
-    parts: list[tuple[str, Sequence[Trial], str | None]] = (
-        [(turn_text(turn), [t for t in trials if t.turn == turn], None) for turn in turns]
-        if len(turns) > 1
-        else [(group, trials, group) for group in groups]
-    )
-    rows: list[list[Cell]] = []
+    groups = trials[0].scores[TOLD].sequences
+    turns = list(dict.fromkeys(trial.turn for trial in trials))
+    parts: list[tuple[str, Sequence[Trial], str | None]]
+    if len(turns) > 1:
+        first, what = 'turned by', ''
+        parts = [(turn_text(turn), [t for t in trials if t.turn == turn], None) for turn in turns]
+    else:
+        first, what = 'scans of', f' by {turn_text(turns[0])}'
+        parts = [(group, trials, group) for group in groups]
+    rows: list[Row] = []
     for name, own, group in [*parts, (ALL, trials, None)]:
         told, level, found = (_pooled(own, way, group) for way in (TOLD, LEVEL, FOUND))
-        drops = [
-            _pooled(own, FOUND, one).iou - _pooled(own, TOLD, one).iou
-            for one in (groups if group is None else [group])
-        ]
-        row: list[Cell] = [name, len(told.scans), told.iou, level.iou, level.iou - told.iou]
-        rows.append([*row, found.iou, found.iou - told.iou, min(drops), _n_levelled(found)])
-    columns = [Column('turned by' if len(turns) > 1 else 'scans of'), Column('scans', 'd')]
-    columns += [percent(TOLD), percent(LEVEL), percent('change', 'change_level', '+.2f')]
-    columns += [percent(FOUND), percent('change', 'change_auto', '+.2f')]
-    columns += [percent('worst', form='+.2f'), Column('levelled', 'd')]
-    what = '' if len(turns) > 1 else f' by {turn_text(turns[0])}'
+        changes = [_change(own, one) for one in ([group] if group else groups)]
+        rows.append(
+            [
+                (Column(first), name),
+                (Column('scans', 'd'), len(told.scans)),
+                (percent(TOLD), told.iou),
+                (percent(LEVEL), level.iou),
+                (percent('change', 'change_level', '+.2f'), level.iou - told.iou),
+                (percent(FOUND), found.iou),
+                (percent('change', 'change_auto', '+.2f'), found.iou - told.iou),
+                (percent('worst', form='+.2f'), min(changes)),
+                (Column('levelled', 'd'), _n_levelled(found)),
+            ]
+        )
     title = (
         f'Scans turned{what}: ground IoU [%] with the turn told; with only the height '
         'told, taken to be level; and with all estimated (auto). Each with its change against '
         'told, the worst one that of a group; how many scans were levelled'
     )
-    return Table(columns, rows, title)
+    return Table.of(rows, title=title)
 
 
 def turn_text(turn: Turn) -> str:
@@ -303,7 +294,7 @@ def axis_table(trials: Sequence[Trial]) -> Table:
     """How many scans were refused, by the axis that is up."""
     rows: list[list[Cell]] = []
     for up, way in (('z', FOUND), *zip(AXES_UP, AXES_UP, strict=True)):
-        scans = _pooled(trials, way, None).scans
+        scans = _pooled(trials, way).scans
         rows.append([up, len(scans), sum(scan.pose is None for scan in scans)])
     columns = [Column('up'), Column('scans', 'd'), Column('refused', 'd')]
     return Table(columns, rows, 'Scans turned over: refused because z is not up')

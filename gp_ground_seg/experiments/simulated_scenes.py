@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from gp_ground_seg.evaluation.environment import changed_parameters
-from gp_ground_seg.evaluation.evaluate import (
-    MethodScore,
-    Progress,
-    pool,
-)
-from gp_ground_seg.evaluation.methods import OURS, TITLES, Method, PatchworkppMethod
+from gp_ground_seg.evaluation.evaluate import MethodScore, Progress, pool
+from gp_ground_seg.evaluation.methods import OURS, PATCHWORKPP, TITLES, PatchworkppMethod
 from gp_ground_seg.evaluation.metrics import ratio
-from gp_ground_seg.evaluation.table import Cell, Column, Table, centimetres, percent
+from gp_ground_seg.evaluation.table import Column, Row, Table, centimetres, percent
 from gp_ground_seg.experiments.variants import (
     Report,
     load_simulated,
@@ -33,7 +29,7 @@ PRESET_OF = {
 """Preset that goes with each simulated sensor."""
 PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
-PEER = TITLES[PatchworkppMethod.name]
+PEER = TITLES[PATCHWORKPP]
 
 
 def score_scenes(
@@ -43,65 +39,55 @@ def score_scenes(
     with_peer: bool,
     progress: Progress = iter,
 ) -> Report:
-    """Segment simulated scans and compare with the truth.
+    """Segment `n_seeds` simulated scenes of each name, seen from `PLACES`, by each sensor.
 
-    Parameters
-    ----------
-    configs : mapping of str to Config
-        Our parameters by name of the sensor.
-    scenes : sequence of str
-        Names of scenes.
-    n_seeds : int
-        Scenes of each name, each seen from `PLACES`.
-    with_peer : bool
-        Whether Patchwork++ runs on the same clouds, with the true height of the sensor.
-    progress : callable
-        Wraps the scans of each sensor, as tqdm does.
-
-    Raises
-    ------
-    MissingDependencyError
-        If the peer is not installed.
+    `configs` are our parameters by name of the sensor; the peer, Patchwork++, runs on the same
+    clouds with the true height of the sensor.
     """
     ours, theirs = [], []
     for sensor, config in configs.items():
         frames = simulated_frames([sensor], scenes, n_seeds, PLACES)
-        peers: list[Method] = [PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
+        peers = [PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
         own, *other = score_variants(
             frames, load_simulated, {OURS: config}, peers, progress=progress
         )
         ours.append(own)
         theirs += other
-    scores = [pool(OURS, ours), *([pool(PatchworkppMethod.name, theirs)] if theirs else [])]
+    scores = [pool(OURS, ours), *([pool(PATCHWORKPP, theirs)] if theirs else [])]
     report = make_report({'scenes': scene_table(*scores)}, scores, Config())
-    report.facts['config_changes'] = {s: changed_parameters(c) for s, c in configs.items()}
+    for name, of in (('config_changes', changed_parameters), ('config', Config.nested)):
+        report.facts[name] = {sensor: of(config) for sensor, config in configs.items()}
     return report
 
 
 def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
     """One row for each sensor and scene; the note says where the peer is ahead in IoU."""
-    rows: list[list[Cell]] = []
+    rows: list[Row] = []
     behind = []
     for group in ours.sequences:
         own = ours.of(group)
-        height = own.height()
-        n_ground = height.n_points + height.n_without_model
-        row: list[Cell] = [*group.split(), own.iou, height.rmse, height.median_absolute]
-        row.append(ratio(height.n_without_model, n_ground))
+        height, (sensor, scene) = own.height(), group.split()
+        share = ratio(height.n_without_model, height.n_points + height.n_without_model)
+        rows.append(
+            [
+                (Column('sensor'), sensor),
+                (Column('scene'), scene),
+                (percent('IoU', 'iou'), own.iou),
+                (centimetres('RMSE', 'rmse'), height.rmse),
+                (centimetres('median', 'median_absolute'), height.median_absolute),
+                (percent('no model', 'share_without_model'), share),
+            ]
+        )
         if peer is not None:
             its = peer.of(group)
-            row += [its.iou, own.iou - its.iou, its.height().rmse, its.height().median_absolute]
+            rows[-1] += [
+                (percent(PEER, 'peer_iou'), its.iou),
+                (percent('difference', 'difference', '+.2f'), own.iou - its.iou),
+                (centimetres('its RMSE', 'peer_rmse'), its.height().rmse),
+                (centimetres('its median', 'peer_median_absolute'), its.height().median_absolute),
+            ]
             if not own.iou > its.iou:
                 behind.append(group)
-        rows.append(row)
-    columns = [
-        Column('sensor'),
-        Column('scene'),
-        percent('IoU', 'iou'),
-        centimetres('RMSE', 'rmse'),
-        centimetres('median', 'median_absolute'),
-        percent('no model', 'share_without_model'),
-    ]
     n_scans = len(ours.of(ours.sequences[0]).scans)
     title = (
         f'{n_scans} simulated scans per row; IoU against exact labels [%], every point counts; '
@@ -109,13 +95,7 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
     )
     notes = []
     if peer is not None:
-        columns += [
-            percent(PEER, 'peer_iou'),
-            percent('difference', 'difference', '+.2f'),
-            centimetres('its RMSE', 'peer_rmse'),
-            centimetres('its median', 'peer_median_absolute'),
-        ]
         title += f'; {PEER} has the true sensor height, its surface is that of its nearest patch'
         where = f'; behind on {", ".join(behind)}' if behind else ''
         notes = [f'ahead of {PEER} on {len(rows) - len(behind)} of {len(rows)} rows{where}']
-    return Table(columns, rows, title, notes)
+    return Table.of(rows, title=title, notes=notes)

@@ -6,9 +6,8 @@ import re
 import statistics
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,10 +17,8 @@ from gp_ground_seg.evaluation.environment import changed_parameters
 from gp_ground_seg.evaluation.evaluate import ALL, Progress, load_kitti
 from gp_ground_seg.evaluation.metrics import height_error
 from gp_ground_seg.evaluation.table import Column, Table
-from gp_ground_seg.experiments.variants import (
-    Report,
-)
-from gp_ground_seg.frame import OUTSIDE, BoolArray, FloatArray, PolarGrid
+from gp_ground_seg.experiments.variants import Report
+from gp_ground_seg.frame import OUTSIDE, BoolArray, FloatArray
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
@@ -30,27 +27,24 @@ MODELS = {'Z-L': 'latent', 'Z': 'line_gradient'}
 """The paper's method and the one it is compared with, as values of ``length_scale.model``."""
 VARIANCES = ('sigma_f^2', 'sigma_n^2', 'sigma_f_bar^2', 'sigma_l_bar^2', 'sigma_n_bar^2')
 """Squares of the first entries of theta: in m^2; those of f_bar and n_bar without unit."""
-MIN_GROUND_POINTS = 100
-"""Labelled ground points that a segment must have to be chosen by default."""
-_CHOICE = re.compile(r'(?P<sequence>[^/:]+)/(?P<index>[^/:]+)(:(?P<segments>\d+(,\d+)*))?')
+_CHOICE = re.compile(r'([^/:]+)/([^/:]+):(\d+(?:,\d+)*)')
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Segments of a frame; none named = the adjacent pair whose ground varies most in height."""
+class Choice(NamedTuple):
+    """Segments of a frame."""
 
     sequence: str
-    index: str
-    segments: tuple[int, ...] = ()
+    frame: str
+    segments: tuple[int, ...]
 
     @classmethod
     def parse(cls, word: str) -> Choice:
-        """Read ``08/000005`` or ``08/000005:151,152``; ValueError if it is of another form."""
+        """Read ``08/000005:151,152``; ValueError if it is of another form."""
         match = _CHOICE.fullmatch(word)
         if match is None:
-            raise ValueError(f'{word!r}: must be as in 08/000005 or 08/000005:151,152')
-        segments = match['segments'].split(',') if match['segments'] else []
-        return cls(match['sequence'], match['index'], tuple(map(int, segments)))
+            raise ValueError(f'{word!r}: must be as in 08/000005:151,152')
+        sequence, frame, segments = match.groups()
+        return cls(sequence, frame, tuple(map(int, segments.split(','))))
 
 
 DEFAULT_CHOICES = ('10/000000:157,158', '03/000006:147,148')
@@ -61,10 +55,10 @@ def find_frame(root: str | Path, choice: Choice) -> Frame:
     """Frame of a choice; DataError if it is not there."""
     frames = list_frames(root, choice.sequence)
     for frame in frames:
-        if frame.index == choice.index:
+        if frame.index == choice.frame:
             return frame
     raise DataError(
-        f'{root}: no frame {choice.index} in sequence {choice.sequence}; '
+        f'{root}: no frame {choice.frame} in sequence {choice.sequence}; '
         f'there are {frames[0].index} to {frames[-1].index}'
     )
 
@@ -76,20 +70,9 @@ def table1(
     n_repeats: int,
     progress: Progress = iter,
 ) -> Report:
-    """Measure the table.
+    """Measure the table on the chosen segments, at least one choice.
 
-    Parameters
-    ----------
-    root : str or Path
-        Folder in SemanticKITTI layout.
-    choices : sequence of Choice
-        Which segments; at least one choice.
-    config : Config
-        Parameters of both methods but for ``length_scale.model``.
-    n_repeats : int
-        Timed runs of each method on each frame, alternately, after one that does not count.
-    progress : callable
-        Wraps the frames to show how far it is, as tqdm does.
+    Each method runs on each frame once without counting, then `n_repeats` times, alternately.
 
     Raises
     ------
@@ -122,24 +105,25 @@ def table1(
         for frame, choice in zip(progress(frames), choices, strict=True):
             found, result = _rows(frame, choice, segmenters, n_repeats)
             rows += found
-    times = f'times: median of {n_repeats} runs on the whole frame, reading left out'
-    names = ['segment', 'n_PG', 'n_L', *VARIANCES]
-    columns = [Column(name, _format(name)) for name in names]
     title = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
-    variances = Table(columns, [[row[name] for name in names] for row in rows], title)
-    names = ['segment', *(n for n in rows[0] if n not in names and not n.startswith('inliers'))]
-    columns = [Column(name, _format(name)) for name in names]
+    names = ['n_PG', 'n_L', *VARIANCES]
+    tables = {'variances': _table(rows, names, title)}
     title = 'SMSE in sample (at the inliers) and held out (labelled ground); seconds per frame'
-    errors = Table(columns, [[row[name] for name in names] for row in rows], title, [times])
-    full = Table([Column(name) for name in rows[0]], [list(row.values()) for row in rows])
-    facts = {'config_changes': changed_parameters(config)}
-    tables = {'variances': variances, 'errors': errors}
-    return Report(tables, full, result.fit, facts, 'by_segment')
+    times = f'times: median of {n_repeats} runs on the whole frame, reading left out'
+    names = [n for n in rows[0] if n not in ('segment', *names) and not n.startswith('inliers')]
+    tables['errors'] = _table(rows, names, title, notes=[times])
+    facts = {'config_changes': changed_parameters(config), 'config': config.nested()}
+    return Report(tables, rows, result.fit, facts)
+
+
+def _table(
+    rows: Sequence[dict[str, Any]], names: Sequence[str], title: str, notes: Sequence[str] = ()
+) -> Table:
+    columns = [Column('segment'), *(Column(name, _format(name)) for name in names)]
+    return Table(columns, [[row[c.title] for c in columns] for row in rows], title, notes)
 
 
 def _format(name: str) -> str:
-    if name == 'segment':
-        return ''
     if name.startswith('n_') or name == 'held out':
         return 'd'
     return '.4f' if name.startswith('t ') else '#.4g'
@@ -165,7 +149,7 @@ def _rows(
     level_z = common.pose.level(scan.points[:, :3])[:, 2].astype(np.float64)
     held_out = is_ground & (common.grid.bin != OUTSIDE) & ~is_candidate(common, level_z)
     rows = []
-    for segment in choice.segments or _most_varied_pair(frame, common.grid, z, is_ground):
+    for segment in choice.segments:
         own = held_out & (common.grid.segment == segment)
         variances = np.exp(2.0 * common.theta[segment, : len(VARIANCES)])
         in_sample = {name: _in_sample(result, segment) for name, result in results.items()}
@@ -205,23 +189,3 @@ def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:
     own = surface.inlier & (candidates.segment == segment)
     estimate = np.interp(candidates.r[own], surface.knots, surface.mean[segment])
     return int(own.sum()), height_error(candidates.z[own], estimate).smse
-
-
-def _most_varied_pair(
-    frame: Frame, grid: PolarGrid, z: FloatArray, is_ground: BoolArray
-) -> tuple[int, int]:
-    """Adjacent segments whose labelled ground, in the lesser of the two, varies most in height."""
-    seen = is_ground & (grid.bin != OUTSIDE)
-    std = np.zeros(grid.n_segments)
-    for segment in range(grid.n_segments):
-        own = z[seen & (grid.segment == segment)]
-        if len(own) >= MIN_GROUND_POINTS:
-            std[segment] = own.std()
-    lesser = np.minimum(std, np.roll(std, -1))
-    first = int(lesser.argmax())
-    if lesser[first] == 0.0:
-        raise DataError(
-            f'{frame.points_path}: no two adjacent segments with {MIN_GROUND_POINTS} points '
-            'labelled ground; name segments'
-        )
-    return first, (first + 1) % grid.n_segments

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.environment import changed_parameters
-from gp_ground_seg.evaluation.evaluate import (
-    ALL,
-    KnownScan,
-    MethodScore,
-    Progress,
-    score_methods,
-)
+from gp_ground_seg.evaluation.environment import Environment, changed_parameters
+from gp_ground_seg.evaluation.evaluate import ALL, KnownScan, MethodScore, Progress, score_methods
 from gp_ground_seg.evaluation.methods import Method, OurMethod
-from gp_ground_seg.evaluation.table import Cell, Column, Table
+from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name
+from gp_ground_seg.evaluation.table import Table, write_json
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
@@ -31,8 +27,7 @@ Changes = Mapping[str, ParameterValue]
 """Values of parameters, by dotted name."""
 
 
-@dataclass(frozen=True)
-class SimulatedFrame:
+class SimulatedFrame(NamedTuple):
     """A scan to simulate: `seed` is that of the scene and of the noise, `x` a place [m]."""
 
     sensor: str
@@ -64,41 +59,6 @@ def simulated_frames(
     return [SimulatedFrame(*case) for case in cases]
 
 
-@dataclass(frozen=True)
-class Report:
-    """Outcome of an experiment.
-
-    Attributes
-    ----------
-    tables : dict of str to Table
-        What is shown, by name in JSON.
-    rows : Table
-        Every number, one row for each scan of each variant or the like: for CSV and JSON.
-    fit : FitReport
-        Of some frame: backend and threads are in it.
-    facts : dict
-        What else is written to JSON: parameters changed from their defaults, by variant.
-    rows_name : str
-        Name of `rows` in JSON.
-    """
-
-    tables: dict[str, Table]
-    rows: Table
-    fit: FitReport
-    facts: dict[str, Any] = field(default_factory=dict)
-    rows_name: str = 'by_scan'
-
-
-def make_report(
-    tables: dict[str, Table], scores: Sequence[MethodScore], config: Config, **facts: Any
-) -> Report:
-    """Report of scored variants; `config` is what they change, the first has a fit report."""
-    fit = scores[0].fit
-    assert fit is not None
-    facts['config_changes'] = changed_parameters(config)
-    return Report(tables, scan_table(scores), fit, facts)
-
-
 def refuse_changed(config: Config, names: Iterable[str]) -> None:
     """Raise ConfigError if `config` changes what an experiment compares."""
     for name in sorted(names):
@@ -117,43 +77,68 @@ def score_variants(
 ) -> list[MethodScore]:
     """Run every variant once on every scan, alternately, each scan without a past.
 
-    Parameters
-    ----------
-    items : sequence
-        What is loaded, at least one.
-    load : callable
-        Loads or simulates an item.
-    variants : mapping of str to Config
-        Configurations by name.
-    peers : sequence of Method
-        Other methods to run on the same scans.
-    make : type
-        Makes the method of a configuration.
-    progress : callable
-        Wraps the items, as tqdm does.
-
-    Returns
-    -------
-    list of MethodScore
-        In the order of `variants` and `peers`; errors as `score_methods`.
+    `items` are loaded one by one, as by `score_methods`; `peers` are other methods to run on
+    the same scans, whose scores come last; `make` makes the method of a configuration.
     """
     with ExitStack() as stack:
         ours = [stack.enter_context(closing(make(c, name))) for name, c in variants.items()]
         return score_methods(items, load, [*ours, *peers], each_alone=True, progress=progress)
 
 
-def scan_table(scores: Sequence[MethodScore]) -> Table:
-    """Every number: one row for each scan of each variant; heights in metres."""
-    parts = list(scores[0].scans[0].heights)
-    names = ['variant', 'sequence', 'index', 'seconds', 'tp', 'fp', 'fn', 'tn', 'ece']
+class Report(NamedTuple):
+    """Tables to show, every number by scan or segment, a fit (of any frame), further facts."""
+
+    tables: dict[str, Table]
+    rows: list[dict[str, Any]]
+    fit: FitReport
+    facts: dict[str, Any]
+
+    def write(self, path: Path, environment: Environment) -> None:
+        """Write every number as JSON."""
+        document = {
+            **self.facts,
+            'n_threads': self.fit.n_threads,
+            'backend': self.fit.backend,
+            'environment': dataclasses.asdict(environment),
+            **{name: table.json() for name, table in self.tables.items()},
+            'rows': self.rows,
+        }
+        write_json(document, path)
+
+
+def make_report(
+    tables: dict[str, Table], scores: Sequence[MethodScore], config: Config, **facts: Any
+) -> Report:
+    """Report of scored variants; `config` is what they change, the first is of our method."""
+    fit = scores[0].scans[-1].fit
+    assert fit is not None
+    facts = {'config_changes': changed_parameters(config), 'config': config.nested(), **facts}
+    return Report(tables, scan_rows(scores), fit, facts)
+
+
+def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
+    """Every number of each scan of each method; heights in metres, angles in radians."""
+    rows = []
+    scans = [(score.name, scan) for score in scores for scan in score.scans]
     of_height = ('n_points', 'n_without_model', 'rmse', 'median_absolute', 'bias', 'smse')
-    names += [f'{name}_{part}' for part in parts for name in of_height]
-    rows: list[list[Cell]] = []
-    for score in scores:
-        for one in score.scans:
-            row: list[Cell] = [score.name, one.sequence, one.index, one.seconds]
-            row += [getattr(one.confusion, name) for name in ('tp', 'fp', 'fn', 'tn')]
-            row.append(None if one.calibration is None else one.calibration.ece)
-            row += [getattr(one.heights[part], name) for part in parts for name in of_height]
-            rows.append(row)
-    return Table([Column(name) for name in names], rows)
+    for method, scan in scans:
+        row: dict[str, Any] = {'method': method, 'sequence': scan.sequence}
+        row |= {'index': scan.index, 'seconds': scan.seconds}
+        for key, confusion in scan.confusions.items():
+            for name in ('tp', 'fp', 'fn', 'tn', *RATIOS):
+                row[f'{key}_{name}'] = getattr(confusion, name)
+        for part, height in scan.heights.items():
+            row |= {f'{name}_{part}': getattr(height, name) for name in of_height}
+        if scan.calibration is not None:
+            row['ece'] = scan.calibration.ece
+        if scan.classes:
+            main = class_errors(scan.classes)[0]
+            row['points'] = sum(count.n_points for count in scan.classes.values())
+            row['main_error_class'] = class_name(main.number) if main.errors else ''
+        if scan.fit is not None and scan.pose is not None:
+            pose = scan.pose
+            row |= {'status': scan.fit.status, 'n_segments': scan.fit.n_segments}
+            row |= {'sensor_height': pose.height, 'sensor_height_estimated': pose.height_estimated}
+            row |= {'sensor_roll': pose.roll, 'sensor_pitch': pose.pitch}
+        rows.append(row)
+    return rows
