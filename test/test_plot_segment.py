@@ -21,6 +21,7 @@ from gp_ground_seg.plotting.segment import SegmentView, line_ends, plot_segment,
 
 SEGMENT = 90
 ROAD, BUILDING, UNLABELLED = 40, 50, 0
+TRUE_GROUND_COLOUR = colours.TRUTH_COLOURS['true ground'][1]
 
 
 def ahead(n_points=1500, seed=0):
@@ -96,8 +97,8 @@ def test_line_ends_by_hand(slope, ends):
 def test_everything_is_drawn(draw, scan, tmp_path, capsys):
     upper, lower = draw('--labels', scan.with_suffix('.label'))
     for colour in (
-        colours.TRUE_GROUND_COLOUR,
-        colours.TRUE_OBSTACLE_COLOUR,
+        TRUE_GROUND_COLOUR,
+        colours.TRUTH_COLOURS['true obstacle'][1],
         colours.POINT_COLOUR,
         colours.INLIER_COLOUR,
         colours.SURFACE_COLOUR,
@@ -117,7 +118,7 @@ def test_everything_is_drawn(draw, scan, tmp_path, capsys):
 def test_without_labels_the_truth_is_not_coloured(draw):
     upper, _ = draw()
     assert count(upper, colours.POINT_COLOUR) > 100
-    assert count(upper, colours.TRUE_GROUND_COLOUR) == 0
+    assert count(upper, TRUE_GROUND_COLOUR) == 0
 
 
 @pytest.mark.parametrize('model', ['line_gradient', 'constant'])
