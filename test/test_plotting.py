@@ -208,7 +208,7 @@ def test_picture_shows_ground_obstacles_and_model(tmp_path):
         plot_scan_view(points[1:], found, config, tmp_path / 'scan.png')
 
 
-def test_command_draws_a_simulated_scan_and_keeps_what_is_there(tmp_path, capsys):
+def test_command_draws_a_scan_and_keeps_what_is_there(tmp_path, capsys):
     path = tmp_path / 'a.png'
     words = ['plot', 'scan', '--simulate', 'flat', '--sensor', 'vlp-16', '--preset', 'vlp16', '-o']
     assert run(*words, path) == 0
@@ -222,7 +222,9 @@ def test_command_draws_a_simulated_scan_and_keeps_what_is_there(tmp_path, capsys
         assert run(*words, *wrong) == 2
         assert message in error_line(capsys)
     assert path.read_bytes() == before
-    assert run(*words, path, '--force') == 0
+    np.zeros((9, 4), '<f4').tofile(tmp_path / 'x.bin')
+    assert run('plot', 'scan', tmp_path / 'x.bin', '-o', path, '--force') == 0
+    assert path.read_bytes() != before
 
 
 # --- charts -------------------------------------------------------------------------------
