@@ -47,7 +47,7 @@ class _Decorator(Protocol):
     def __call__(self, function: _Function) -> _Function: ...
 
 
-def jit(*, fastmath: bool = False, inline: bool = False, entry: bool = False) -> _Decorator:
+def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
     """Return a decorator that compiles a function where numba is installed.
 
     Compiled functions release the interpreter's lock.
@@ -57,8 +57,6 @@ def jit(*, fastmath: bool = False, inline: bool = False, entry: bool = False) ->
     fastmath : bool
         Let sums be taken in any order, so that they use vector instructions. The compiler
         fixes the order, not the number of threads; NaN and infinity keep their meaning.
-    inline : bool
-        Make the function a part of those that call it, which saves compiling it twice.
     entry : bool
         Whether it is called from Python: its code, with all that it calls, is kept on disk.
     """
@@ -69,8 +67,6 @@ def jit(*, fastmath: bool = False, inline: bool = False, entry: bool = False) ->
         options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
         if fastmath:
             options['fastmath'] = {'reassoc', 'contract', 'nsz'}
-        if inline:
-            options['inline'] = 'always'
         if not entry:
             part: _Function = numba.njit(**options)(function)
             return part

@@ -1,9 +1,9 @@
-"""What several test modules use: labelled frames where they are at hand, small scans."""
+"""Shared by test modules: labelled frames where they are at hand, small scans, both backends."""
 
 import os
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from unittest.mock import patch
 
@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from gp_ground_seg.backend import Backend, NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
+from gp_ground_seg.jit import JIT_ENABLED
 
-# How long an example takes says more of the machine than of the code.
+# The duration of an example depends on the machine more than on the code.
 settings.register_profile('default', deadline=None)
 settings.load_profile('default')
 
@@ -47,13 +49,27 @@ def hilly_scan(n_points: int = 4000, seed: int = 0, sensor_height: float = 1.73)
     return np.column_stack([x, y, z])
 
 
+def fewer(n: int, n_plain: int) -> int:
+    """Return `n`, or `n_plain` where the compiled twins run as plain Python, 100 times slower."""
+    return n if JIT_ENABLED else n_plain
+
+
 @contextmanager
 def sharing(n_threads: int) -> Iterator[NumbaBackend]:
-    """Backend whose threads share out even the smallest clouds."""
-    backend = NumbaBackend(n_threads)
-    with patch('gp_ground_seg.compiled.threads.MIN_POINTS_TO_SPLIT', 1):
+    """Backend that splits even the smallest clouds, in threads also without compiled code."""
+    threads = 'gp_ground_seg.compiled.threads'
+    with patch(f'{threads}.MIN_POINTS_TO_SPLIT', 1), patch(f'{threads}.JIT_ENABLED', True):
+        backend = NumbaBackend(n_threads)
         yield backend
-    backend.close()
+        backend.close()
+
+
+@pytest.fixture(scope='module', params=['numpy', 'numba', 'numba, 3 threads'])
+def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
+    """Each backend in turn; its buffers hold what the tests before left in them."""
+    plain = nullcontext(NumpyBackend())
+    with plain if request.param == 'numpy' else sharing(3 if '3' in request.param else 1) as one:
+        yield one
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from matplotlib.image import imread
 
 from gp_ground_seg.cli import bench as command
 from gp_ground_seg.cli.bench import load_frames
+from gp_ground_seg.errors import DataError, PointCloudError
 
 QUICK = ('--quick', '--threads', '1', '--set', 'grid.n_segments=24')
 
@@ -140,6 +141,16 @@ def test_tables_go_between_the_marks(record, tmp_path, capsys):
     assert bench('--from', record, '--docs', page, '--plot', tmp_path / 'a.png') == 0
     assert capsys.readouterr().out in page.read_text()
     assert imread(tmp_path / 'a.png').shape[2] == 4
+
+
+def test_a_broken_cloud_of_a_bag_is_named(tmp_path, monkeypatch):
+    def refuse(_):
+        raise PointCloudError('no field x')
+
+    monkeypatch.setattr('gp_ground_seg.cli.bench.decode_cloud', refuse)
+    write_ros2_bag(tmp_path / 'drive.mcap', n_clouds=2)
+    with pytest.raises(DataError, match=r'drive\.mcap: message 0 of topic .*: no field x'):
+        load_frames(tmp_path / 'drive.mcap', 60)
 
 
 def test_without_the_baseline_there_are_no_ratios(scans, monkeypatch, tmp_path, capsys):

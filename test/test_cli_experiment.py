@@ -121,6 +121,20 @@ def test_scenes_have_the_presets_of_their_sensors(monkeypatch):
         assert found == expected
 
 
+def test_simulated_poses_have_their_own_options(monkeypatch, capsys):
+    found = []
+
+    def note(n_seeds, config, scenes, progress):
+        found.append((n_seeds, config.grid.n_bins, scenes))
+        raise DataError('enough')
+
+    monkeypatch.setattr(command, 'score_simulated_poses', note)
+    words = ['--simulated', '--seeds', 2, '--scenes', 'flat,kerb', *SMALL]
+    assert run('experiment', 'sensor-pose', *words) == 2
+    assert error_line(capsys) == 'enough'
+    assert found == [(2, 40, ['flat', 'kerb'])]
+
+
 def test_a_departure_in_words():
     found = parse_departure('gate: at all: growth.max_std=1 learning.mode=fixed')
     assert found.title == 'gate: at all'

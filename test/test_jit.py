@@ -193,7 +193,7 @@ def test_of_groups_only_the_users_own_may_write(tmp_path):
 
 
 def test_options_of_compiled_functions():
-    @jit(fastmath=True, inline=True)
+    @jit(fastmath=True)
     def part(x):
         return x + 1.0
 

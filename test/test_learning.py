@@ -2,48 +2,45 @@
 
 import numpy as np
 import pytest
-from conftest import hilly_scan
+import reference
+from conftest import fewer, hilly_scan
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.compiled.backend import CompiledBackend
-from gp_ground_seg.gp.kernels import paciorek
-from gp_ground_seg.gp.latent import log_length_scale
-from gp_ground_seg.gp.learning import learn
-from gp_ground_seg.gp.objective import TrainingFrame
-from gp_ground_seg.gp.theta import ThetaSpace, theta_names, theta_space
+from gp_ground_seg.backend import NumpyBackend
+from gp_ground_seg.compiled.backend import NumbaBackend
+from gp_ground_seg.frame import Inliers
+from gp_ground_seg.gp.learning import ThetaSpace, maximise, theta_names, theta_space
+from gp_ground_seg.jit import JIT_ENABLED
+
+MODEL = NumbaBackend(1) if JIT_ENABLED else NumpyBackend()
 
 
-def never():
-    return False
+def draw_inliers(seed, n_segments=120, n=50, sigma_f=0.3, sigma_n=0.05):
+    """Inliers drawn from the model: smooth road to 25 m, rubble beyond.
 
-
-def draw_frame(seed, n_segments=120, n=50, sigma_f=0.3, sigma_n=0.05):
-    """Frame drawn from the model: smooth road to 25 m, rubble beyond.
-
-    Returns the frame, and theta with the log length-scales of two classes.
+    Returns them, and theta with the log length-scales of two classes.
     """
     rng = np.random.default_rng(seed)
     truth = np.log([sigma_f, sigma_n, 0.9, 3.0, 0.25, 10.0, 1.5])
     r_bar = np.arange(4.0, 50.0, 3.0)
     surface_class = (r_bar > 25.0).astype(np.int64)
-    l_bar = truth[5 + surface_class]
     r, z = [], []
     for _ in range(n_segments):
         own = np.sort(rng.uniform(3, 50, n))
-        length = np.exp(log_length_scale(r_bar, l_bar, own, *np.exp(truth[2:5])))
-        a = paciorek(own, length, own, length, sigma_f) + sigma_n**2 * np.eye(n)
+        length = np.exp(profile(truth, r_bar, surface_class, own))
+        a = reference.paciorek(own, length, own, length, sigma_f) + sigma_n**2 * np.eye(n)
         r.append(own)
         z.append(np.linalg.cholesky(a) @ rng.standard_normal(n))
-    frame = TrainingFrame(
-        np.arange(n_segments + 1) * n,
-        np.concatenate(r),
-        np.concatenate(z),
-        np.zeros(n_segments * n),
-        np.arange(n_segments + 1) * len(r_bar),
-        np.tile(r_bar, n_segments),
-        np.tile(surface_class, n_segments),
+    number = np.arange(n_segments + 1)
+    bars = number * len(r_bar), np.tile(r_bar, n_segments), np.tile(surface_class, n_segments)
+    inliers = Inliers(
+        number * n, np.concatenate(r), np.concatenate(z), np.zeros(n_segments * n), *bars
     )
-    return frame, truth
+    return inliers, truth
+
+
+def profile(theta, r_bar, surface_class, r):
+    return reference.log_length_scale(r_bar, theta[5 + surface_class], r, *np.exp(theta[2:5]))
 
 
 def space_about(centre, free=None, factor=20.0):
@@ -52,57 +49,62 @@ def space_about(centre, free=None, factor=20.0):
     return ThetaSpace(centre, centre - width, centre + width, free, 1.0)
 
 
-def learn_frame(frame, space, start, use_priors=True, max_evaluations=200):
-    backend = CompiledBackend(1)
-    return learn(
-        lambda theta: backend.objective(theta, frame, 0.0, not use_priors),
+def learn(inliers, space, start, use_priors=True, max_evaluations=200, out_of_time=False):
+    """Outcome, and the values of the objective without priors."""
+    values = []
+
+    def objective(theta):
+        value, gradient = MODEL.log_likelihood(theta, inliers, 0.0, not use_priors)
+        values.append(value)
+        return value, gradient
+
+    learned = maximise(
+        objective,
         space,
         start,
-        len(frame.r),
+        len(inliers.r),
         use_priors=use_priors,
         max_evaluations=max_evaluations,
-        out_of_time=never,
+        out_of_time=lambda: out_of_time,
     )
+    assert learned.n_evaluations == len(values)
+    return learned, values
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2])
 def test_noise_and_length_scales_of_a_drawn_frame_are_recovered(seed):
-    frame, truth = draw_frame(seed)
+    inliers, truth = draw_inliers(seed)
     # Far off: half the amplitude, twice the noise, one length-scale for all.
     start = truth + np.log([0.5, 2.0, 1.3, 0.7, 1.5, 0.4, 2.7])
-    learned = learn_frame(frame, space_about(start), start)
-    found = np.exp(learned.theta)
-    assert found[1] == pytest.approx(0.05, rel=0.1)
-    assert found[0] == pytest.approx(0.3, rel=0.15)
-    r = np.linspace(4, 48, 100)
-    r_bar = frame.r_bar[: frame.bar_offsets[1]]
-    classes = frame.surface_class[: frame.bar_offsets[1]]
-    profile = log_length_scale(r_bar, learned.theta[5 + classes], r, *found[2:5])
-    true_profile = log_length_scale(r_bar, truth[5 + classes], r, *np.exp(truth[2:5]))
-    assert np.corrcoef(profile, true_profile)[0, 1] >= 0.9
+    theta = learn(inliers, space_about(start), start)[0].theta
+    assert np.exp(theta[1]) == pytest.approx(0.05, rel=0.1)
+    assert np.exp(theta[0]) == pytest.approx(0.3, rel=0.15)
+    first = slice(0, inliers.bar_offsets[1])
+    at = inliers.r_bar[first], inliers.surface_class[first], np.linspace(4, 48, 100)
+    assert np.corrcoef(profile(theta, *at), profile(truth, *at))[0, 1] >= 0.9
 
 
-def gradient_per_datum(frame, space, theta):
-    _, gradient = CompiledBackend(1).objective(theta, frame, 0.0, False)
-    return np.abs(gradient - (theta - space.centre)) / len(frame.r)
+def gradient_per_datum(inliers, space, theta):
+    _, gradient = MODEL.log_likelihood(theta, inliers, 0.0, False)
+    return np.abs(gradient - (theta - space.centre)) / len(inliers.r)
 
 
 def test_the_end_is_level():
-    frame, truth = draw_frame(3, n_segments=30)
+    inliers, truth = draw_inliers(3, n_segments=30)
     space, start = space_about(truth, factor=1.5), truth + 0.3
-    learned = learn_frame(frame, space, start)
+    learned, _ = learn(inliers, space, start)
     assert learned.status == 'converged'
     assert not learned.at_bound.any()
-    assert gradient_per_datum(frame, space, start).max() > 0.1
-    assert gradient_per_datum(frame, space, learned.theta).max() < 1e-3
+    assert gradient_per_datum(inliers, space, start).max() > 0.1
+    assert gradient_per_datum(inliers, space, learned.theta).max() < 1e-3
 
 
 def test_an_end_that_is_not_level_is_at_a_bound_and_said_to_be():
-    frame, truth = draw_frame(3, n_segments=30)
+    inliers, truth = draw_inliers(3, n_segments=30)
     # The box leaves the true noise out.
     space = space_about(truth + np.log([1, 3, 1, 1, 1, 1, 1]), factor=1.5)
-    learned = learn_frame(frame, space, space.centre)
-    level = gradient_per_datum(frame, space, learned.theta) < 1e-3
+    learned, _ = learn(inliers, space, space.centre)
+    level = gradient_per_datum(inliers, space, learned.theta) < 1e-3
     assert learned.at_bound[1]
     assert learned.theta[1] == space.lower[1]
     assert not level[1]
@@ -112,142 +114,118 @@ def test_an_end_that_is_not_level_is_at_a_bound_and_said_to_be():
 
 
 def test_fixed_entries_stay():
-    frame, truth = draw_frame(4, n_segments=20)
+    inliers, truth = draw_inliers(4, n_segments=20)
     free = np.array([True, True, False, False, False, True, True])
     start = truth + 0.3
-    learned = learn_frame(frame, space_about(start, free), start)
-    np.testing.assert_array_equal(learned.theta[~free], start[~free])
-    assert (learned.theta[free] != start[free]).all()
+    theta = learn(inliers, space_about(start, free), start)[0].theta
+    np.testing.assert_array_equal(theta[~free], start[~free])
+    assert (theta[free] != start[free]).all()
 
 
 @pytest.mark.parametrize('budget', [1, 3, 6])
 def test_budget_is_kept_and_the_best_so_far_is_used(budget):
-    frame, truth = draw_frame(5, n_segments=20)
+    inliers, truth = draw_inliers(5, n_segments=20)
     start = truth + np.log(3.0)
-    values = []
-    backend = CompiledBackend(1)
-
-    def objective(theta):
-        value, gradient = backend.objective(theta, frame, 0.0, False)
-        values.append(value)
-        return value, gradient
-
-    learned = learn(
-        objective,
-        space_about(start),
-        start,
-        len(frame.r),
-        use_priors=False,
-        max_evaluations=budget,
-        out_of_time=never,
-    )
-    assert learned.n_evaluations == len(values) == budget
+    learned, values = learn(inliers, space_about(start), start, False, budget)
+    assert len(values) == budget
     assert learned.status == 'budget'
     assert learned.objective == max(values)
-    assert backend.objective(learned.theta, frame, 0.0, False)[0] == max(values)
+    assert MODEL.log_likelihood(learned.theta, inliers, 0.0, True)[0] == max(values)
 
 
 def test_no_time_means_one_evaluation():
-    frame, truth = draw_frame(6, n_segments=5)
-    backend = CompiledBackend(1)
-    learned = learn(
-        lambda theta: backend.objective(theta, frame, 0.0, False),
-        space_about(truth),
-        truth,
-        len(frame.r),
-        use_priors=True,
-        max_evaluations=50,
-        out_of_time=lambda: True,
-    )
-    assert learned.n_evaluations == 1
+    inliers, truth = draw_inliers(6, n_segments=5)
+    assert len(learn(inliers, space_about(truth), truth, out_of_time=True)[1]) == 1
 
 
 def test_an_objective_that_is_nowhere_finite_fails_without_an_exception():
-    theta = np.zeros(7)
-    learned = learn(
-        lambda theta: (-np.inf, np.zeros(7)),
-        space_about(theta),
-        theta,
-        10,
-        use_priors=True,
-        max_evaluations=20,
-        out_of_time=never,
-    )
+    inliers, truth = draw_inliers(6, n_segments=2)
+    hopeless = inliers._replace(z=np.full_like(inliers.z, np.nan))
+    learned, _ = learn(hopeless, space_about(truth), truth, max_evaluations=20)
     assert learned.status == 'failed'
-    np.testing.assert_array_equal(learned.theta, theta)
+    np.testing.assert_array_equal(learned.theta, truth)
 
 
 def test_printed_objective_runs_to_the_bounds_and_map_does_not():
-    frame, truth = draw_frame(7, n_segments=30)
+    inliers, truth = draw_inliers(7, n_segments=30)
     space = space_about(truth, factor=1000.0)
-    printed = np.exp(learn_frame(frame, space, truth, use_priors=False).theta - truth)
-    ours = np.exp(learn_frame(frame, space, truth).theta - truth)
+    printed, ours = (
+        np.exp(learn(inliers, space, truth, use_priors)[0].theta - truth)
+        for use_priors in (False, True)
+    )
     assert printed[2] < 0.05
     assert (ours > 0.3).all()
     assert (ours < 3.0).all()
 
 
-def test_space_follows_the_configuration():
-    guess = np.log([1.0, 3.0])
-    config = Config().replace(**{'learning.fixed': 'latent', 'observation.sigma_n': 0.1})
-    space = theta_space(config, guess)
-    assert list(space.free) == [True, True, False, False, False, True, True]
+@pytest.mark.parametrize(
+    ('changes', 'n_free'),
+    [
+        ({}, [0, 1, 2, 3, 4, 5, 6]),
+        ({'learning.fixed': 'latent'}, [0, 1, 5, 6]),
+        ({'learning.fixed': 'sigma_f_bar'}, [0, 1, 3, 4, 5, 6]),
+        ({'learning.fixed': 'length_scales'}, [0, 1]),
+        ({'length_scale.model': 'line_gradient'}, [0, 1]),
+        ({'length_scale.model': 'constant'}, [0, 1]),
+    ],
+)
+def test_space_follows_the_configuration(changes, n_free):
+    config = Config().replace(**{'learning.fixed': 'none', 'observation.sigma_n': 0.1, **changes})
+    space = theta_space(config, np.log([1.0, 3.0]))
+    assert list(np.flatnonzero(space.free)) == n_free
     assert np.exp(space.centre[1]) == pytest.approx(0.1)
     assert np.exp(space.upper[1]) == pytest.approx(0.1 * config.learning.bound_factor)
     np.testing.assert_allclose(np.exp(space.lower[5:]), config.length_scale.min)
-    for model in ('line_gradient', 'constant'):
-        config = Config().replace(**{'length_scale.model': model})
-        assert theta_space(config, guess).free.sum() == 2
     assert theta_names(7)[5:] == ['length_scale_bar_0', 'length_scale_bar_1']
 
 
-def segment_twice(**changes):
-    segmenter = GroundSegmenter(Config().replace(**changes))
-    return segmenter, [segmenter.segment(hilly_scan(seed=s)) for s in (1, 2)]
+# Learning in the segmenter
+
+N_POINTS = fewer(4000, 400)
+
+
+def segmenter_of(**changes):
+    return GroundSegmenter(Config().replace(**changes), backend=MODEL)
 
 
 def test_modes():
-    _, results = segment_twice()
-    assert [r.fit.status != 'kept' for r in results] == [True, True]
-    _, results = segment_twice(**{'learning.mode': 'first_frame'})
-    assert [r.fit.status != 'kept' for r in results] == [True, False]
-    assert results[0].fit.theta == results[1].fit.theta
-    _, results = segment_twice(**{'learning.mode': 'fixed'})
-    assert results[1].fit.n_evaluations == 0
-    assert results[1].fit.theta['sigma_n'] == pytest.approx(Config().observation.sigma_n)
-    segmenter, results = segment_twice(**{'learning.mode': 'every_k', 'learning.period': 3})
-    statuses = [r.fit.status for r in results]
-    statuses += [segmenter.segment(hilly_scan(seed=s)).fit.status for s in (3, 4, 5)]
-    assert [s == 'kept' for s in statuses] == [False, True, True, False, True]
-    segmenter.reset()
-    assert segmenter.segment(hilly_scan(seed=6)).fit.status != 'kept'
+    def learned(seeds, segmenter):
+        fits = [segmenter.segment(hilly_scan(N_POINTS, seed=s)).fit for s in seeds]
+        return [fit.status != 'kept' for fit in fits], fits
+
+    assert learned((1, 2), segmenter_of())[0] == [True, True]
+    first = segmenter_of(**{'learning.mode': 'first_frame'})
+    flags, fits = learned((1, 2), first)
+    assert flags == [True, False]
+    assert fits[0].theta == fits[1].theta
+    flags, fits = learned((1, 2), segmenter_of(**{'learning.mode': 'fixed'}))
+    assert flags == [False, False]
+    assert fits[1].n_evaluations == 0
+    assert fits[1].theta['sigma_n'] == pytest.approx(Config().observation.sigma_n)
+    every_k = segmenter_of(**{'learning.mode': 'every_k', 'learning.period': 3})
+    assert learned(range(1, 6), every_k)[0] == [True, False, False, True, False]
+    every_k.reset()
+    assert learned((6, 7), every_k)[0] == [True, False]
+    # Another configuration forgets what was learned, other diagnostics do not.
+    first.configure(first.config.replace(**{'diagnostics.period': 2.0}))
+    assert learned((3,), first)[0] == [False]
+    first.configure(first.config.replace(**{'label.ground_tolerance': 0.2}))
+    assert learned((3, 4), first)[0] == [True, False]
 
 
 def test_a_warm_start_needs_fewer_evaluations_on_the_same_scan():
     changes = {'learning.max_evaluations': 200}
-    cold = GroundSegmenter(Config().replace(**changes))
-    warm = GroundSegmenter(Config().replace(**changes, **{'learning.warm_start': True}))
-    scan = hilly_scan(8000)
-    first = [s.segment(scan).fit.n_evaluations for s in (cold, warm)]
-    again = [s.segment(scan).fit.n_evaluations for s in (cold, warm)]
+    cold, warm = segmenter_of(**changes), segmenter_of(**changes, **{'learning.warm_start': True})
+    scan = hilly_scan(2 * N_POINTS)
+    first, again = (
+        [s.segment(scan).fit.n_evaluations for s in (cold, warm)] for _ in ('first', 'again')
+    )
     assert first[0] == first[1] == again[0]
     assert again[1] < again[0]
 
 
-@pytest.mark.parametrize('model', ['latent', 'line_gradient', 'constant'])
-@pytest.mark.parametrize('scope', ['frame', 'segment'])
-def test_every_model_learns_in_both_scopes_and_backends_agree(model, scope):
-    changes = {
-        'length_scale.model': model,
-        'learning.scope': scope,
-        'learning.max_evaluations': 3,
-        'grid.n_segments': 12,
-    }
-    scan = hilly_scan(1500)
-    results = [
-        GroundSegmenter(Config().replace(**changes, **{'runtime.backend': backend})).segment(scan)
-        for backend in ('numba', 'numpy')
-    ]
-    np.testing.assert_array_equal(results[0].label, results[1].label)
-    np.testing.assert_allclose(results[0].ground_z, results[1].ground_z, atol=1e-5)
-    assert results[0].fit.n_evaluations == results[1].fit.n_evaluations > 0
+def test_learning_ends_when_its_time_is_up():
+    ticks = iter(range(10_000))
+    config = Config().replace(**{'learning.max_time': 1.0, 'learning.max_evaluations': 200})
+    segmenter = GroundSegmenter(config, clock=lambda: 0.4 * next(ticks), backend=MODEL)
+    assert segmenter.segment(hilly_scan(N_POINTS)).fit.n_evaluations == 3

@@ -1,34 +1,62 @@
+"""The segmenter: properties of its results, history, threads, forks, change of backend."""
+
 import dataclasses
+import os
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from conftest import hilly_scan
+from conftest import fewer, hilly_scan, sharing
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference import Reference
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg.backend import NumpyBackend
+from gp_ground_seg.compiled.backend import NumbaBackend
+from gp_ground_seg.jit import HAVE_NUMBA
 
 SEGMENTER = GroundSegmenter(Config())
+VALUES = 'label', 'height', 'margin', 'ground_z', 'ground_std', 'p_ground'
+N_POINTS = fewer(4000, 800)
+
+
+@pytest.fixture
+def scan():
+    return hilly_scan(N_POINTS)
 
 
 def same(a, b):
-    np.testing.assert_array_equal(a.label, b.label)
-    np.testing.assert_array_equal(a.ground_z, b.ground_z)
-    np.testing.assert_array_equal(a.ground_std, b.ground_std)
+    for name in VALUES:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
 
 
-def test_ground_and_boxes_are_told_apart(scan):
-    result = SEGMENTER.segment(scan)
-    ground = scan[:, 2] < -1.73 + 0.02 * scan[:, 0] + 0.1 * np.sin(0.3 * scan[:, 0]) + 0.2
+def segmenter_of(backend=None, **changes):
+    return GroundSegmenter(Config().replace(**changes), backend=backend)
+
+
+# One scan
+
+
+def test_ground_and_boxes_are_told_apart(backend):
+    scan = hilly_scan(4000)
+    result = GroundSegmenter(Config(), backend=backend).segment(scan)
+    truth = -1.73 + 0.02 * scan[:, 0] + 0.1 * np.sin(0.3 * scan[:, 0])
+    ground = scan[:, 2] < truth + 0.2
     assert result.label.dtype == np.uint8
     assert (result.label[ground] == Label.GROUND).mean() > 0.97
     assert (result.label[~ground] == Label.OBSTACLE).mean() > 0.97
     near = np.hypot(scan[:, 0], scan[:, 1]) < 20
-    truth = -1.73 + 0.02 * scan[:, 0] + 0.1 * np.sin(0.3 * scan[:, 0])
     assert np.nanmedian(np.abs(result.ground_z - truth)[near]) < 0.05
     assert np.nanmedian(result.ground_std[near]) < 0.1
+    is_ground = result.label == Label.GROUND
+    assert (result.p_ground[is_ground] >= 0.5).all() and (result.p_ground[~is_ground] < 0.5).all()
 
 
+@pytest.mark.filterwarnings('ignore:overflow')
 @pytest.mark.parametrize(
     'points',
     [
@@ -43,12 +71,13 @@ def test_ground_and_boxes_are_told_apart(scan):
         np.tile([[4.0, 1.0, -1.7]], (100, 1)),
     ],
 )
-def test_odd_clouds_work(points):
-    result = SEGMENTER.segment(points)
-    for values in (result.label, result.ground_z, result.ground_std):
-        assert values.shape == (len(points),)
+def test_odd_clouds_work(backend, points):
+    result = GroundSegmenter(Config(), backend=backend).segment(points)
+    for name in VALUES:
+        assert getattr(result, name).shape == (len(points),)
     unknown = ~np.isfinite(points[:, :3]).all(axis=1)
     np.testing.assert_array_equal(result.label == Label.UNKNOWN, unknown)
+    np.testing.assert_array_equal(np.isnan(result.p_ground), unknown)
 
 
 def test_one_low_point_is_ground_and_a_high_one_is_not():
@@ -74,105 +103,135 @@ def test_wrong_shapes_and_types_are_refused_with_the_shape(points, words):
         SEGMENTER.segment(points)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=fewer(25, 3))
 @given(st.integers(0, 2**32 - 1))
-def test_permuting_points_permutes_the_result(seed):
+def test_permuting_points_permutes_the_result(backend, seed):
     points = hilly_scan(600, seed=seed)
     points[::50] = np.nan
     order = np.random.default_rng(seed).permutation(len(points))
-    straight, shuffled = SEGMENTER.segment(points), SEGMENTER.segment(points[order])
+    segmenter = GroundSegmenter(Config(), backend=backend)
+    straight, shuffled = segmenter.segment(points), segmenter.segment(points[order])
     np.testing.assert_array_equal(shuffled.label, straight.label[order])
     np.testing.assert_array_equal(shuffled.ground_z, straight.ground_z[order])
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=fewer(25, 3))
 @given(st.integers(0, 2**32 - 1), st.floats(-1.0, 5.0))
-def test_raising_sensor_and_points_together_shifts_heights_only(seed, lift):
+def test_raising_sensor_and_points_together_shifts_heights_only(backend, seed, lift):
     points = hilly_scan(600, seed=seed)
-    raised = points - [0.0, 0.0, lift]
-    low, high = (
-        GroundSegmenter(Config().replace(**{'sensor.height': height}))
-        for height in (1.73, 1.73 + lift)
-    )
-    a, b = low.segment(points), high.segment(raised)
+    a = segmenter_of(backend, **{'sensor.height': 1.73}).segment(points)
+    b = segmenter_of(backend, **{'sensor.height': 1.73 + lift}).segment(points - [0, 0, lift])
     # Heights that sit on a threshold may fall to either side by rounding.
     assert (a.label != b.label).sum() <= 1
     np.testing.assert_allclose(b.ground_z, a.ground_z - lift, atol=1e-6)
 
 
-def test_turning_by_a_segment_turns_the_surface(scan):
+def test_rotating_by_a_segment_shifts_the_surface(backend, scan):
     angle = 2 * np.pi / Config().grid.n_segments
     c, s = np.cos(angle), np.sin(angle)
     turned = scan @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
-    # Which segments teach is fixed; all of them do not change when the scan is turned.
-    settings = {'sensor.height': 1.73, 'learning.segment_step': 1}
-    given = GroundSegmenter(Config().replace(**settings))
-    a, b = given.segment(scan), given.segment(turned)
+    # The segments that are learned from are fixed; here all are.
+    segmenter = segmenter_of(backend, **{'sensor.height': 1.73, 'learning.segment_step': 1})
+    a, b = segmenter.segment(scan), segmenter.segment(turned)
     np.testing.assert_allclose(b.surface.mean, np.roll(a.surface.mean, 1, axis=0), atol=1e-6)
 
 
-def test_input_is_never_written_to_nor_kept(scan):
-    points = scan.astype(np.float32)
-    points.flags.writeable = False
-    result = SEGMENTER.segment(points)
-    assert not any(
-        np.shares_memory(points, value)
-        for value in [*vars(result).values(), *vars(result.labelled).values()]
-        if isinstance(value, np.ndarray)
-    )
-
-
-def test_layouts_of_the_same_points_give_the_same(scan):
+def test_layouts_of_the_same_points_give_the_same(backend, scan):
+    segmenter = GroundSegmenter(Config(), backend=backend)
     points = scan.astype(np.float32)
     wide = np.full((len(points), 7), np.nan, dtype=np.float32)
     wide[:, :3] = points
-    base = SEGMENTER.segment(points)
-    same(base, SEGMENTER.segment(wide))
-    same(base, SEGMENTER.segment(np.asfortranarray(points)))
-    same(base, SEGMENTER.segment(points.astype('>f4')))
+    base = segmenter.segment(points)
+    same(base, segmenter.segment(wide))
+    same(base, segmenter.segment(np.asfortranarray(points)))
+    same(base, segmenter.segment(points.astype('>f4')))
+    backwards = segmenter.segment(points[::-1])
+    np.testing.assert_array_equal(backwards.label[::-1], base.label)
     # Ranges are computed in the precision of the points.
-    double = SEGMENTER.segment(points.astype(np.float64))
+    double = segmenter.segment(points.astype(np.float64))
     np.testing.assert_array_equal(base.label, double.label)
     np.testing.assert_allclose(base.ground_z, double.ground_z, rtol=0, atol=5e-6)
-    same(double, SEGMENTER.segment(points.tolist()))
+    same(double, segmenter.segment(points.tolist()))
 
 
-@pytest.mark.parametrize('n_threads', [1, 2, 5])
-def test_threads_and_history_do_not_change_a_bit(scan, n_threads):
-    other = GroundSegmenter(Config().replace(**{'runtime.n_threads': n_threads}))
-    other.segment(hilly_scan(seed=9))
-    same(SEGMENTER.segment(scan), other.segment(scan))
-    other.close()
+@pytest.mark.parametrize('tilt', [None, (0.05, -0.04)])
+def test_the_input_is_not_written_to_and_may_change_afterwards(backend, scan, tilt):
+    segmenter = GroundSegmenter(Config(), backend=backend)
+    for points in (scan.astype(np.float32), np.asfortranarray(scan)):
+        expected = segmenter.segment(points.copy(order='K'), tilt)
+        for name in VALUES:
+            getattr(expected, name)
+        points.flags.writeable = False
+        result = segmenter.segment(points, tilt)
+        arrays = [*vars(result).values(), *result.labelled, *result.grid]
+        arrays = [value for value in arrays if isinstance(value, np.ndarray)]
+        assert len(arrays) > 6
+        assert not any(np.shares_memory(points, value) for value in arrays)
+        points.flags.writeable = True
+        points[:] = 7.0
+        # Values that are computed when they are first asked for are the same too.
+        same(result, expected)
 
 
-def test_backends_agree(scan):
-    slow = GroundSegmenter(Config().replace(**{'runtime.backend': 'numpy'}))
-    a, b = SEGMENTER.segment(scan), slow.segment(scan)
-    assert b.fit.backend == 'numpy'
-    np.testing.assert_array_equal(a.label, b.label)
-    np.testing.assert_allclose(a.ground_z, b.ground_z, atol=1e-6)
-    np.testing.assert_allclose(a.ground_std, b.ground_std, atol=1e-6)
+def test_backends_agree(backend, scan):
+    result = GroundSegmenter(Config(), backend=backend).segment(scan)
+    assert result.fit.backend == backend.name
+    expected = segmenter_of(**{'runtime.backend': 'numpy'}).segment(scan)
+    np.testing.assert_array_equal(result.label, expected.label)
+    for name in VALUES:
+        np.testing.assert_allclose(
+            getattr(result, name), getattr(expected, name), atol=1e-6, err_msg=name
+        )
+
+
+@pytest.mark.parametrize('model', ['latent', 'line_gradient', 'constant'])
+@pytest.mark.parametrize('scope', ['frame', 'segment'])
+@pytest.mark.parametrize('objective', ['map', 'paper'])
+def test_frames_are_labelled_as_by_the_loops(backend, model, scope, objective):
+    changes = {
+        'length_scale.model': model,
+        'learning.scope': scope,
+        'learning.objective': objective,
+        'learning.max_evaluations': 3,
+        'grid.n_segments': 12,
+        'grid.n_bins': 60,
+    }
+    scan = hilly_scan(700)
+    found, expected = (segmenter_of(b, **changes).segment(scan) for b in (backend, Reference()))
+    np.testing.assert_array_equal(found.label, expected.label)
+    np.testing.assert_allclose(found.ground_z, expected.ground_z, atol=1e-5)
+    np.testing.assert_allclose(found.theta, expected.theta, atol=1e-5)
+    assert found.fit.n_evaluations == expected.fit.n_evaluations > 0
 
 
 def test_a_wider_tolerance_takes_more_ground(scan):
     counts = []
     for tolerance in (0.01, 0.03, 0.3):
-        config = Config().replace(
-            **{'label.ground_tolerance': tolerance, 'label.roughness_gain': 0.0}
-        )
-        counts.append((GroundSegmenter(config).segment(scan).label == Label.GROUND).sum())
+        changes = {'label.ground_tolerance': tolerance, 'label.roughness_gain': 0.0}
+        counts.append((segmenter_of(**changes).segment(scan).label == Label.GROUND).sum())
     assert counts[0] < counts[1] < counts[2]
 
 
-def test_configure_takes_effect_on_the_next_scan(scan):
-    segmenter = GroundSegmenter()
-    before = segmenter.segment(scan)
-    segmenter.configure(Config().replace(**{'grid.n_segments': 90, 'runtime.n_threads': 1}))
-    after = segmenter.segment(scan)
-    assert len(after.surface.mean) == 90
-    assert after.fit.n_threads == 1
-    segmenter.configure(Config())
-    same(before, segmenter.segment(scan))
+def test_times_come_from_the_clock_given(scan):
+    ticks = iter(range(100))
+    result = GroundSegmenter(Config(), clock=lambda: float(next(ticks))).segment(scan)
+    total = result.timings.pop('total')
+    stages = ['grid', 'pose', 'faces', 'lines', 'learning', 'surface', 'label']
+    assert result.timings == dict.fromkeys(stages, 1.0)
+    assert total == len(stages)
+
+
+def test_fit_report_counts(scan):
+    fit = SEGMENTER.segment(scan).fit
+    assert fit.mode == 'every_frame'
+    assert 1 <= fit.n_evaluations <= Config().learning.max_evaluations
+    assert fit.theta['sigma_n'] > 0
+    assert fit.status in ('converged', 'budget')
+    assert 0 < fit.n_inliers <= fit.n_candidates <= len(scan)
+    assert 0 < fit.n_segments <= 180
+    assert 0 < fit.n_lines <= fit.n_pseudo_inputs
+    assert fit.n_threads == SEGMENTER._backend.n_threads
+    assert np.isfinite(fit.objective)
 
 
 def test_neighbours_must_fit_round_the_sensor():
@@ -180,38 +239,204 @@ def test_neighbours_must_fit_round_the_sensor():
         Config().replace(**{'grid.n_segments': 4})
 
 
-def test_times_come_from_the_clock_given(scan):
-    ticks = iter(range(100))
-    result = GroundSegmenter(Config(), clock=lambda: float(next(ticks))).segment(scan)
-    stages = {name: value for name, value in result.timings.items() if name != 'total'}
-    assert set(stages.values()) == {1.0}
-    assert result.timings['total'] == sum(stages.values())
+# One scan after the other
 
 
-def test_fit_report_counts(scan):
-    fit = SEGMENTER.segment(scan).fit
-    values = dataclasses.asdict(fit)
-    assert values['mode'] == 'every_frame'
-    assert 1 <= fit.n_evaluations <= Config().learning.max_evaluations
-    assert fit.theta['sigma_n'] > 0
-    assert fit.status in ('converged', 'budget')
-    assert 0 < fit.n_inliers <= fit.n_candidates <= len(scan)
-    assert 0 < fit.n_segments <= 180
-    assert fit.n_lines > 0
-
-
-def test_a_result_is_not_changed_by_the_next_scan(scan):
-    segmenter = GroundSegmenter()
+def test_a_result_is_not_changed_by_the_next_scan(backend, scan):
+    segmenter = GroundSegmenter(Config(), backend=backend)
     result = segmenter.segment(scan)
-    kept = {
-        name: getattr(result, name).copy()
-        for name in ('label', 'height', 'margin', 'ground_z', 'ground_std', 'p_ground')
-    }
-    cell, r = result.grid.cell.copy(), result.grid.r.copy()
+    kept = {name: getattr(result, name).copy() for name in VALUES}
+    groups = result.grid, result.candidates, result.lines, result.pseudo, result.surface
+    before = [[np.copy(a) for a in group] for group in groups]
     segmenter.segment(hilly_scan(len(scan) + 100, seed=8))
-    again = segmenter.segment(scan[::2])
-    assert len(again.label) == len(scan[::2])
+    assert len(segmenter.segment(scan[::2]).label) == len(scan[::2])
     for name, value in kept.items():
         np.testing.assert_array_equal(getattr(result, name), value)
-    np.testing.assert_array_equal(result.grid.cell, cell)
-    np.testing.assert_array_equal(result.grid.r, r)
+    for group, copies in zip(groups, before, strict=True):
+        for a, b in zip(group, copies, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize('mode', ['fixed', 'every_frame'])
+def test_threads_and_history_do_not_change_a_bit(scan, mode):
+    config = Config().replace(**{'learning.mode': mode})
+    expected = GroundSegmenter(config, backend=NumbaBackend(1)).segment(scan)
+    for n_threads in (1, 2, 3, 5):
+        with sharing(n_threads) as backend:
+            other = GroundSegmenter(config, backend=backend)
+            other.segment(hilly_scan(N_POINTS, seed=9))
+            result = other.segment(scan)
+            same(result, expected)
+            assert result.fit.n_threads == n_threads
+    np.testing.assert_array_equal(result.theta, expected.theta)
+
+
+def test_configure_takes_effect_on_the_next_scan(scan):
+    segmenter = GroundSegmenter()
+    before = segmenter.segment(scan)
+    segmenter.configure(Config().replace(**{'grid.n_segments': 90, 'runtime.n_threads': 1}))
+    after = segmenter.segment(scan)
+    assert len(after.surface.mean) == segmenter.config.grid.n_segments == 90
+    assert after.fit.n_threads == 1
+    segmenter.configure(Config())
+    same(before, segmenter.segment(scan))
+
+
+def test_backends_are_changed_between_scans(scan):
+    compiled = 'numba' if HAVE_NUMBA else 'auto'
+    expected, numpy = SEGMENTER.segment(scan), {'runtime.backend': 'numpy'}
+    segmenter = GroundSegmenter(Config())
+    names, is_closed = [], []
+    for config in (
+        Config().replace(**numpy),
+        Config().replace(**numpy, **{'learning.period': 3}),
+        Config().replace(**{'runtime.backend': compiled}),
+        Config().replace(**numpy),
+        Config(),
+    ):
+        segmenter.configure(config)
+        result = segmenter.segment(scan)
+        names.append(result.fit.backend)
+        assert segmenter.backend_name == names[-1]
+        np.testing.assert_array_equal(result.label, expected.label)
+    own = SEGMENTER.backend_name
+    assert names == ['numpy', 'numpy', own, 'numpy', own]
+
+    class Closing(NumpyBackend):
+        def close(self):
+            is_closed.append(True)
+
+    # A backend that was handed over stays until the parameters of the runtime change.
+    segmenter.use_backend(Closing())
+    segmenter.configure(Config().replace(**{'label.ground_tolerance': 0.2}))
+    assert (segmenter.backend_name, is_closed) == ('numpy', [])
+    segmenter.configure(Config().replace(**{'runtime.n_threads': 1}))
+    assert (segmenter.backend_name, is_closed) == (own, [True])
+
+
+def test_the_pose_alone_is_that_of_the_segmentation(backend, scan):
+    segmenter = GroundSegmenter(Config(), backend=backend)
+    assert segmenter.estimate_pose(scan) == segmenter.segment(scan).pose
+
+
+# Several callers
+
+
+def test_python_threads_take_turns():
+    scans = [hilly_scan(fewer(n, n // 8), seed=n) for n in (3000, 4000, 5000, 6000)]
+    with sharing(2) as backend:
+        segmenter = GroundSegmenter(Config(), backend=backend)
+        expected = [segmenter.segment(scan) for scan in scans]
+        with ThreadPoolExecutor(4) as callers:
+            results = list(callers.map(segmenter.segment, scans * fewer(10, 1)))
+    for k, result in enumerate(results):
+        same(result, expected[k % len(scans)])
+
+
+def test_a_segmenter_may_be_closed_and_configured_while_it_segments(scan):
+    before = set(threading.enumerate())
+    with sharing(3) as backend:
+        segmenter = GroundSegmenter(Config(), backend=backend)
+        expected, results, done = segmenter.segment(scan), [], threading.Event()
+
+        def work():
+            while not done.is_set() or not results:
+                results.append(segmenter.segment(scan))
+
+        callers = [threading.Thread(target=work) for _ in range(2)]
+        for caller in callers:
+            caller.start()
+        for _ in range(fewer(50, 2)):
+            segmenter.close()
+            segmenter.configure(Config().replace(**{'diagnostics.period': 2.0}))
+            segmenter.estimate_pose(scan[:100])
+        done.set()
+        for caller in callers:
+            caller.join(60.0)
+            assert not caller.is_alive()
+        segmenter.close()
+        assert set(threading.enumerate()) <= before
+    for result in results:
+        same(result, expected)
+
+
+FORK = """
+import os, sys, threading, warnings
+warnings.simplefilter('ignore')  # newer Pythons warn of a fork beside threads
+import numpy as np
+from conftest import hilly_scan, sharing
+from gp_ground_seg import Config, GroundSegmenter
+scan, is_busy = hilly_scan(int(sys.argv[1])), True
+with sharing(3) as backend:
+    segmenter = GroundSegmenter(Config(), backend=backend)
+    expected = segmenter.segment(scan).label
+    def work():
+        while is_busy:
+            assert (segmenter.segment(scan).label == expected).all()
+    caller = threading.Thread(target=work)
+    caller.start()
+    codes = []
+    for k in range(int(sys.argv[2])):
+        # Sometimes in the middle of a hand-over to the workers.
+        lock = backend._workers._pool._shutdown_lock if k % 4 == 1 else threading.Lock()
+        lock.acquire()
+        child = os.fork()
+        if child == 0:
+            is_busy = False
+            if k % 2:
+                segmenter.close()
+            assert segmenter.segment(scan).fit.n_threads == 3
+            segmenter.configure(Config().replace(**{'runtime.n_threads': 2}))
+            assert (segmenter.segment(scan).label == expected).all()
+            sys.exit(7)
+        lock.release()
+        codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+    is_busy = False
+    caller.join()
+    print(codes)
+"""
+
+
+def test_a_process_forked_while_another_thread_segments_segments_and_ends():
+    n_points, n_children = fewer(4000, 300), fewer(10, 2)
+    done = subprocess.run(
+        [sys.executable, '-c', FORK, str(n_points), str(n_children)],
+        capture_output=True,
+        text=True,
+        timeout=240.0,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
+        check=False,
+    )
+    assert done.stdout == f'{[7] * n_children}\n', done.stderr
+
+
+@pytest.mark.parametrize('n_startable', [0, 1])
+def test_where_no_thread_can_be_started_one_segments(monkeypatch, scan, n_startable):
+    expected = GroundSegmenter(Config(), backend=NumbaBackend(1)).segment(scan)
+    start, started = threading.Thread.start, []
+
+    def refuse(thread):
+        if len(started) == n_startable:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    with sharing(3) as backend:
+        monkeypatch.setattr(threading.Thread, 'start', refuse)
+        segmenter = GroundSegmenter(Config(), backend=backend)
+        for _ in range(2):
+            result = segmenter.segment(scan)
+            same(result, expected)
+        assert len(started) == n_startable
+        assert not any(thread.is_alive() for thread in started)
+    assert result.fit.n_threads == 1
+
+
+def test_an_error_in_a_scan_leaves_the_segmenter_usable(scan):
+    with sharing(3) as backend:
+        segmenter = GroundSegmenter(Config(), backend=backend)
+        expected = segmenter.segment(scan)
+        with pytest.raises(PointCloudError):
+            segmenter.segment(scan[:, :2])
+        same(segmenter.segment(scan), expected)
+        assert dataclasses.asdict(segmenter.segment(scan).fit) == dataclasses.asdict(expected.fit)

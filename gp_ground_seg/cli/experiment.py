@@ -278,67 +278,53 @@ def _table1(arguments: argparse.Namespace) -> Report:
 EXPERIMENTS = {
     'ablation': Experiment(
         """\
-Compare length-scale models and ways to learn. On labelled frames: a constant
-length-scale, the gradients of the lines (Z), and the latent process (Z-L), without and
-with learning over the whole frame, Z-L also in each segment alone. Height errors are
-those of the surface under points labelled ground: root mean square (RMSE), median over
-the frames of the median distance, standardised mean squared error (SMSE). With
---simulated: a smooth road that ends in rubble, height errors against the exact ground.
+Compare length-scale models and ways to learn. On labelled frames: a constant length-scale,
+the gradients of the lines (Z), and the latent process (Z-L); with --simulated on a smooth
+road that ends in rubble, by exact heights.
 """,
         ('root', 'simulated', *OF_FRAMES, 'seeds'),
         _ablation,
     ),
     'departures': Experiment(
         """\
-Undo one departure from the paper after the other. The departures are the rows of
+Undo one departure from the paper after the other. They are the rows of
 gp_ground_seg/experiments/ablation.py; --switch measures others without touching it:
-  gp-ground-seg experiment departures KITTI_ROOT --only-given \\
-      --switch 'tight gate: growth.max_std=1'
+  --only-given --switch 'tight gate: growth.max_std=1'
 """,
         ('root', *OF_FRAMES, 'switch', 'only_given'),
         _departures,
     ),
     'scenes': Experiment(
         """\
-Score simulated scans of flat and rough ground by exact labels and heights, beside
-Patchwork++ on the same clouds. Each sensor has the parameters of its preset unless
---preset names one for all; Patchwork++ has its published parameters and the true height
-of the sensor.
+Score simulated scans by exact labels and heights, beside Patchwork++. Each sensor has the
+parameters of its preset unless --preset names one for all; Patchwork++ has its published
+parameters and the true height of the sensor.
 """,
         ('sensors', 'scenes', 'seeds', 'no_peer'),
         _scenes,
     ),
     'cross-validation': Experiment(
         """\
-Choose parameters on all sequences but one, and score them on that one. So for every
-sequence, by pooled IoU (GroundGrid convention). A parameter set to several values is
-searched, one after the other until no change of one is better, from the values given
-otherwise; a parameter set to one value is just set:
-  gp-ground-seg experiment cross-validation KITTI_ROOT --set label.ground_tolerance=0.05,0.1
+Choose parameters on all sequences but one, and score them on that one. Parameters with
+several values are searched by pooled IoU, one after the other until no change of one is
+better: --set label.ground_tolerance=0.05,0.1
 """,
         ('root', *OF_FRAMES),
         _cross_validation,
     ),
     'sensor-pose': Experiment(
         """\
-Compare the segmentation with height and tilt of the sensor told and estimated. On
-labelled frames of KITTI's car: as they are, and turned by 3 degrees about every
-horizontal axis. With --simulated: scenes seen by an HDL-64E, a VLP-16 and an OS1-128
-from 0.4, 1.2, 1.73 and 2.5 m, level and tilted. Then all of them turned over, which
-should be refused.
+Compare the segmentation with height and tilt of the sensor told and estimated. On labelled
+frames of KITTI's car as they are, turned by 3 degrees, and turned over; with --simulated
+from three sensors at four heights.
 """,
         ('root', 'simulated', *OF_FRAMES, *OF_SIMULATED),
         _sensor_pose,
     ),
     'table1': Experiment(
         """\
-The paper's Table I on segments of labelled frames. Numbers of ground candidates and
-pseudo-inputs, the variances learned over the frame by the paper's method Z-L (latent
-length-scales), and standardised mean squared error (SMSE) and time per frame of Z-L and
-of Z (length-scales from the gradients of the lines). SMSE is given at the inliers that the
-surface was made from, as the paper seems to do, and at the points labelled ground that
-are not candidates. A frame without segments gives the adjacent pair whose labelled
-ground varies most in height.
+Measure the paper's Table I on segments of labelled frames. A frame without segments gives
+the adjacent pair whose labelled ground varies most in height.
 """,
         ('root', 'frames', 'repeats'),
         _table1,

@@ -221,4 +221,7 @@ class NumbaBackend:
 
     def close(self) -> None:
         """End the threads."""
+        if self._pid != os.getpid():
+            # The pool is that of the parent process, and its lock perhaps held for ever.
+            self._renew()
         self._workers.close()

@@ -67,14 +67,7 @@ class BinLookup(NamedTuple):
     def of(cls, edges: FloatArray, fineness: int, dtype: np.dtype[np.floating]) -> BinLookup:
         """Table for values of type `dtype` in the bins between `edges` (n + 1,).
 
-        Parameters
-        ----------
-        edges : (n + 1,) float64
-            Edges of the bins.
-        fineness : int
-            Entries in the narrowest bin, as far as `LARGEST_TABLE` allows.
-        dtype : dtype
-            Precision of the values.
+        The narrowest bin has `fineness` entries, as far as `LARGEST_TABLE` allows.
         """
         extent, narrowest = float(edges[-1] - edges[0]), float(np.diff(edges).min())
         scale = min(fineness / narrowest, LARGEST_TABLE / extent)
@@ -349,20 +342,10 @@ def merge_parts(
     min_extent: float,
     candidates: Candidates,
 ) -> int:
-    """Candidates, into arrays with room for all cells, and their number; merges the tiles too.
+    """Reduce the tables of all parts: candidates, into arrays with room for all cells.
 
-    Parameters
-    ----------
-    n_parts : int
-        Parts that `sort_points` was called for.
-    cells, tiles
-        Their tables; the first table of the tiles becomes that of all points.
-    edges : (n_bins + 1,) float64
-        Ranges of the bin edges [m].
-    min_extent : float
-        See `gp_ground_seg.pipeline.polar_grid.ground_candidates` [m].
-    candidates : Candidates
-        Result; only `offsets` has its final size.
+    Returns the number of candidates. `edges` and `min_extent` are those of `ground_candidates`
+    of the twin. The first table of the tiles becomes that of all points.
     """
     _merge_tiles(n_parts, tiles.extremes, tiles.occupied)
     extremes, numbers, n_bins = cells.extremes, cells.numbers, len(edges) - 1

@@ -1,0 +1,76 @@
+"""Covariance functions, and the padding of many segments into batches."""
+
+import numpy as np
+import pytest
+import reference
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gp_ground_seg.gp.kernels import paciorek, squared_exponential
+from gp_ground_seg.gp.linalg import SEGMENTS_PER_BATCH, Padded, batches
+
+
+def kernels(r_a, l_a, r_b, l_b, sigma_f):
+    """Of one segment by `gp.kernels`, and by the reference."""
+    batched = (a[None] for a in (r_a, l_a, r_b, l_b))
+    return paciorek(*batched, np.array([sigma_f]))[0], reference.paciorek(
+        r_a, l_a, r_b, l_b, sigma_f
+    )
+
+
+def random_inputs(seed, n):
+    rng = np.random.default_rng(seed)
+    return np.sort(rng.uniform(2, 60, n)), rng.uniform(0.5, 30, n)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 25), st.floats(0.05, 3.0))
+def test_kernel_contract(seed, n, sigma_f):
+    r, length_scale = random_inputs(seed, n)
+    k, expected = kernels(r, length_scale, r, length_scale, sigma_f)
+    np.testing.assert_allclose(k, expected, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(k, k.T)
+    np.testing.assert_allclose(np.diag(k), sigma_f**2)
+    assert np.linalg.eigvalsh(k).min() > -1e-9 * sigma_f**2 * n
+
+
+def test_kernel_is_the_printed_formula():
+    for r_a, l_a, r_b, l_b in [(3.0, 2.0, 7.5, 9.0), (10.0, 1.0, 10.5, 0.5)]:
+        printed = (
+            0.7**2
+            * (l_a**2) ** 0.25
+            * (l_b**2) ** 0.25
+            * ((l_a**2 + l_b**2) / 2) ** -0.5
+            * np.exp(-((r_a - r_b) ** 2) / (l_a**2 + l_b**2))
+        )
+        for value in kernels(*(np.array([v]) for v in (r_a, l_a, r_b, l_b)), 0.7):
+            assert value[0, 0] == pytest.approx(printed, rel=1e-14)
+
+
+def test_constant_length_scale_is_the_squared_exponential():
+    r, _ = random_inputs(0, 20)
+    same = np.full(20, 4.0)
+    expected = np.exp(-((r[:, None] - r) ** 2) / (2 * 4.0**2))
+    stationary = squared_exponential(r[None], r[None], np.ones(1), np.full(1, 4.0))[0]
+    for k in (*kernels(r, same, r, same, 1.0), stationary):
+        np.testing.assert_allclose(k, expected, rtol=1e-13)
+    np.testing.assert_allclose(reference.squared_exponential(r, r, 1.0, 4.0), expected)
+
+
+@given(st.lists(st.integers(0, 20), max_size=100))
+def test_batches_hold_every_segment_once_and_similar_sizes_together(counts):
+    offsets = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    values = np.arange(offsets[-1]) + 0.5
+    found = batches(offsets)
+    taken = np.sort(np.concatenate([np.empty(0, dtype=int), *found]))
+    np.testing.assert_array_equal(taken, np.flatnonzero(counts))
+    longest = 0
+    for segments in found:
+        assert len(segments) <= SEGMENTS_PER_BATCH
+        padded = Padded.of(segments, offsets)
+        assert padded.mask.sum(axis=1).min() >= longest
+        longest = padded.mask.shape[1]
+        for row, mask, m in zip(padded.take(values, -1.0), padded.mask, segments, strict=True):
+            np.testing.assert_array_equal(row[mask], values[offsets[m] : offsets[m + 1]])
+            assert (row[~mask] == -1.0).all()
+    nothing = Padded.of(np.array([0]), np.array([0, 0]))
+    assert nothing.take(values).shape == (1, 0)

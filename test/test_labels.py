@@ -1,0 +1,153 @@
+import numpy as np
+import pytest
+import reference
+import scipy.stats
+from conftest import fewer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gp_ground_seg import Config, Label
+from gp_ground_seg.frame import Faces, GroundSurface, Scan
+from gp_ground_seg.pipeline.labels import ground_probability
+
+CONFIG = Config().replace(
+    **{
+        'grid.n_segments': 4,
+        'grid.n_bins': 4,
+        'grid.r_min': 2.0,
+        'grid.r_max': 10.0,
+        'grid.bin_growth': 1.0,
+        'surface.n_neighbours': 1,
+    }
+)
+KNOTS = np.array([2.0, 4.0, 6.0, 8.0, 10.0])
+KNOTS.setflags(write=False)
+G, O, U = Label.GROUND, Label.OBSTACLE, Label.UNKNOWN  # noqa: E741
+
+
+def surface_of(heights=(0.0,) * 5):
+    mean = np.tile(np.asarray(heights, dtype=float), (4, 1))
+    return GroundSurface(KNOTS, mean, np.full((4, 5), 0.1), np.ones(0, dtype=bool))
+
+
+def label(backend, ranges, z, surface=None, faces=None, angle=0.1, **changes):
+    """Labels and cells of points in one direction, without roughness in the bands.
+
+    `faces` names points whose tile is a face, and whether its base is occluded.
+    """
+    changes = {'roughness_gain': 0.0, 'obstacle_roughness_gain': 0.0, **changes}
+    config = CONFIG.replace(**{f'label.{name}': value for name, value in changes.items()})
+    r, z = np.broadcast_arrays(np.asarray(ranges, dtype=float), np.asarray(z, dtype=float))
+    scan = backend.build_grid(np.column_stack([r * np.cos(angle), r * np.sin(angle), z]), config)
+    marks = Faces(*np.zeros((2, len(scan.tiles.extremes)), dtype=bool))
+    for i, occluded in (faces or {}).items():
+        marks.is_face[scan.tiles.tile[i]] = True
+        marks.has_occluded_base[scan.tiles.tile[i]] = occluded
+    found = backend.label_points(scan, marks, surface or surface_of(), config)
+    assert found.label.dtype == np.uint8
+    ground = np.nan_to_num(found.margin, nan=-1.0) >= 0.0
+    np.testing.assert_array_equal(found.label == Label.GROUND, ground)
+    return found, scan.grid
+
+
+def test_surface_is_linear_between_knots_and_constant_before_the_first(backend):
+    surface, ranges = surface_of([0.0, 2.0, 2.0, 1.0, 0.0]), [0.5, 2.0, 3.0, 4.0, 9.5]
+    found, grid = label(backend, ranges, 0.0, surface)
+    np.testing.assert_allclose(found.height, [0.0, 0.0, -1.0, -2.0, -0.25], atol=1e-12)
+    heights, stds = surface.at(grid)
+    np.testing.assert_allclose(heights, [0.0, 0.0, 1.0, 2.0, 0.25])
+    np.testing.assert_allclose(stds, 0.1)
+
+
+def test_no_surface_beyond_the_last_knot_or_without_a_model(backend):
+    surface = surface_of()
+    surface.mean[label(backend, 5.0, [0.0])[1].segment[0]] = np.nan
+    for ranges, values, expected in (
+        ([10.0, 1e6, np.nan], surface_of(), [O, O, U]), ([5.0, 5.0, 5.0], surface, [O, O, O]),
+    ):  # fmt: skip
+        found, grid = label(backend, ranges, 0.0, values)
+        assert np.isnan(found.height).all() and np.isnan(values.at(grid)[0]).all()
+        assert list(found.label) == expected
+
+
+def test_labels_by_height(backend):
+    heights = [0.0, 0.09, 0.11, -0.99, -1.01, np.nan]
+    found, _ = label(backend, 3.0, heights)
+    assert list(found.label) == [G, G, O, G, O, U]
+    np.testing.assert_allclose(found.margin[:5], [0.1, 0.01, -0.01, 0.01, -0.01], atol=1e-12)
+    assert np.isnan(found.margin[5])
+
+
+@pytest.mark.parametrize(('other', 'expected'), [(1.0, O), (0.3, G), (2.5, G), (np.nan, G)])
+def test_the_base_of_an_obstacle_is_judged_more_strictly(backend, other, expected):
+    found, _ = label(backend, [3.0, 3.5, 3.2, 3.9], [0.08, other, 0.04, -0.15])
+    assert list(found.label[[0, 2, 3]]) == [expected, G, G]
+    # Obstacles in the next bin, or outside, do not count.
+    assert label(backend, [3.0, 5.0, 1e3], [0.08, 1.0, 1.0])[0].label[0] == G
+
+
+@pytest.mark.parametrize(('rough', 'expected'), [(0.0, 'OOO'), (0.08, 'GOO'), (0.4, 'GGO')])
+def test_the_band_follows_the_roughness_up_to_the_height_of_an_obstacle(backend, rough, expected):
+    # Beside the points, as many below the surface as make that roughness.
+    ranges = np.concatenate([[3.0, 5.0, 7.0], np.tile([3.0, 5.0, 7.0], 3000)])
+    heights = np.concatenate([[0.3, 0.45, 0.51], np.full(9000, -rough)])
+    gain = CONFIG.label.roughness_gain
+    found, _ = label(backend, ranges, heights, roughness_gain=gain)
+    assert [Label(value).name[0] for value in found.label[:3]] == list(expected)
+    assert list(label(backend, ranges, heights)[0].label[:3]) == [O, O, O]
+
+
+def test_of_a_face_only_the_base_is_ground_and_nothing_where_it_is_occluded(backend):
+    # The surface climbs a step, and its riser lies on it.
+    ranges, riser = [5.0, 5.001, 5.002], np.array([0.0, 0.06, 0.14])
+    surface = surface_of([0.1] * 5)
+    for faces, expected in ((None, [G, G, G]), ({0: False}, [G, G, O]), ({0: True}, [O, O, O])):
+        assert list(label(backend, ranges, riser, surface, faces)[0].label) == expected
+
+
+def test_roughness_is_the_root_mean_square_of_a_bin_and_its_neighbours(backend):
+    # Bins 0, 0, 2 of one segment; the last two are no roughness: an obstacle, and a face.
+    ranges, heights = [3.0, 3.5, 7.0, 3.0, 9.5], [0.1, -0.2, 0.3, 0.6, 0.2]
+    found, grid = label(backend, ranges, heights, faces={4: False})
+    own, rough = grid.segment[0], found.roughness
+    np.testing.assert_allclose(rough[own, 0], np.sqrt((0.1**2 + 0.2**2) / 2))
+    np.testing.assert_allclose(rough[own, 1], np.sqrt((0.1**2 + 0.2**2 + 0.3**2) / 3))
+    np.testing.assert_allclose(rough[own, 3], 0.3)
+    # The segments are a ring of four: the opposite one is not a neighbour.
+    assert rough[(own + 1) % 4, 0] == rough[(own - 1) % 4, 0] == rough[own, 0]
+    assert (rough[(own + 2) % 4] == 0.0).all()
+
+
+def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():
+    margin = np.array([0.0, 0.1, 0.1, -0.1, np.nan])
+    std = np.array([0.1, 0.01, 0.3, 0.01, np.nan])
+    found = ground_probability(margin, std, np.full(5, 0.02), 0.03)
+    expected = scipy.stats.norm.cdf(margin / np.sqrt(std**2 + 0.02**2 + 0.03**2))
+    np.testing.assert_allclose(found[:4], expected[:4], rtol=1e-6)
+    assert found[0] == 0.5
+    assert found[1] > found[2] > 0.5
+    assert found[4] == 0.0
+
+
+@settings(max_examples=fewer(60, 10))
+@given(st.integers(0, 10_000), st.sampled_from([np.float32, np.float64]))
+def test_labels_are_the_reference(backend, seed, dtype):
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(-12, 12, (300, 3)).astype(dtype)
+    xyz[:, 2] *= 0.1
+    # Posts, so that there are faces.
+    xyz[100:200, :2] = np.repeat(xyz[100:120, :2], 5, axis=0) + rng.normal(0, 0.02, (100, 2))
+    xyz[::20] = np.nan
+    mean, std = rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5))
+    mean[seed % 4] = std[seed % 4] = np.nan
+    surface = GroundSurface(KNOTS, mean, std, np.ones(0, dtype=bool))
+    scan: Scan = backend.build_grid(xyz, CONFIG)
+    faces = backend.find_faces(scan, CONFIG)
+    assert faces.is_face.any()
+    found = backend.label_points(scan, faces, surface, CONFIG)
+    expected = reference.label_points(scan, faces, surface, CONFIG)
+    np.testing.assert_array_equal(found.label, expected.label)
+    for name in ('height', 'margin', 'roughness'):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected, name), atol=1e-9, err_msg=name
+        )

@@ -1,0 +1,225 @@
+"""Log marginal likelihood of a frame: gradient, reference, densities by others' code."""
+
+import functools
+import math
+
+import numpy as np
+import pytest
+import reference
+from conftest import fewer, sharing
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import multivariate_normal
+
+from gp_ground_seg.frame import Inliers
+
+TYPICAL = np.log([0.3, 0.05, 0.9, 3.0, 0.25, 1.5, 3.0, 6.0, 10.0])
+
+
+def scaled(*factors):
+    return TYPICAL + np.log(np.append(factors, np.ones(len(TYPICAL) - len(factors))))
+
+
+# Typical, and near either bound in every coordinate (factors of 20 about the centre).
+THETAS = {
+    'typical': TYPICAL,
+    'small sigma_f': scaled(1 / 18),
+    'large sigma_f': scaled(18),
+    'small sigma_n': scaled(1, 1 / 10),
+    'large sigma_n': scaled(1, 18),
+    'short latent': scaled(1, 1, 1, 1 / 18),
+    'long latent': scaled(1, 1, 1, 18),
+    'stiff latent': scaled(1, 1, 1 / 18, 1, 18),
+    'loose latent': scaled(1, 1, 4, 1, 1 / 10),
+    'bounds of length-scale': np.append(TYPICAL[:5], np.log([1.0, 50.0, 1.01, 49.0])),
+}
+
+
+def random_inliers(seed, n_segments=6, bars='all'):
+    """Ragged: some segments have no inliers, some one; `bars` says which have pseudo-inputs."""
+    rng = np.random.default_rng(seed)
+    counts = rng.integers(0, 25, n_segments)
+    counts[0] = 0
+    bar_counts = rng.integers(1, 9, n_segments)
+    bar_counts *= {'all': 1, 'none': 0, 'some': np.arange(n_segments) % 3 > 0}[bars]
+    r, r_bar = (
+        np.concatenate([np.sort(rng.uniform(3, 50, n)) for n in own])
+        for own in (counts, bar_counts)
+    )
+    return Inliers(
+        np.concatenate([[0], np.cumsum(counts)]),
+        r,
+        rng.normal(0, 0.2, len(r)),
+        rng.normal(1.0, 0.5, len(r)),
+        np.concatenate([[0], np.cumsum(bar_counts)]),
+        r_bar,
+        rng.integers(0, len(TYPICAL) - 5, len(r_bar)),
+    )
+
+
+@functools.cache
+def central_differences(name, latent_terms, bars):
+    """Richardson's extrapolation of central differences: error of sixth order."""
+    theta, inliers, gradient = THETAS[name], random_inliers(7, bars=bars), np.zeros(len(TYPICAL))
+
+    def function(theta):
+        return reference.log_likelihood(theta, inliers, 0.05, latent_terms)[0]
+
+    for i in range(len(theta)):
+
+        def slope(step, i=i):
+            aside = step * (np.arange(len(theta)) == i)
+            return (function(theta + aside) - function(theta - aside)) / (2 * step)
+
+        gradient[i] = (64 * slope(2e-3) - 20 * slope(4e-3) + slope(8e-3)) / 45
+    return gradient
+
+
+@pytest.mark.parametrize('latent_terms', [False, True])
+@pytest.mark.parametrize('name', THETAS)
+@pytest.mark.parametrize('bars', ['all', 'none'])
+def test_gradient_is_that_of_central_differences(backend, name, latent_terms, bars):
+    inliers = random_inliers(7, bars=bars)
+    gradient = backend.log_likelihood(THETAS[name], inliers, 0.05, latent_terms)[1]
+    numeric = central_differences(name, latent_terms, bars)
+    # A component far smaller than the others is only as exact as their rounding.
+    floor = 1e-4 * np.abs(numeric).max()
+    error = np.abs(gradient - numeric) / np.maximum(np.abs(numeric), floor)
+    assert error.max() <= 1e-6
+    assert bars == 'all' or not gradient[2:].any()
+
+
+@settings(max_examples=fewer(60, 5))
+@given(
+    st.integers(0, 100_000),
+    st.sampled_from([1, 2, 7, 35, 96]),
+    st.sampled_from(['all', 'none', 'some']),
+    st.booleans(),
+    st.sampled_from([0.0, 0.05]),
+    st.sampled_from(sorted(THETAS)),
+)
+def test_value_and_gradient_are_the_reference(
+    backend, seed, n_segments, bars, latent_terms, slope_std, name
+):
+    inliers = random_inliers(seed, min(n_segments, fewer(96, 7)), bars)
+    arguments = THETAS[name], inliers, slope_std, latent_terms
+    expected, found = reference.log_likelihood(*arguments), backend.log_likelihood(*arguments)
+    assert found[0] == pytest.approx(expected[0], rel=1e-8, abs=1e-6)
+    scale = np.abs(expected[1]).max() + 1.0
+    np.testing.assert_allclose(found[1] / scale, expected[1] / scale, atol=1e-7)
+
+
+def test_threads_do_not_change_a_bit():
+    inliers, results = random_inliers(3, n_segments=40), []
+    for n_threads in (1, 2, 3):
+        with sharing(n_threads) as backend:
+            results.append(backend.log_likelihood(TYPICAL, inliers, 0.05, True))
+    for value, gradient in results[1:]:
+        assert value == results[0][0]
+        np.testing.assert_array_equal(gradient, results[0][1])
+
+
+def test_value_is_the_density_of_the_printed_model(backend):
+    """Sum over segments of log N(z | 0, A), and -1/2 log|2 pi B|, by scipy.stats."""
+    inliers = random_inliers(5)
+    sigma_f, sigma_n, *latent = np.exp(TYPICAL[:5])
+    expected = printed = 0.0
+    for m in range(len(inliers.offsets) - 1):
+        own = slice(*inliers.offsets[m : m + 2])
+        bar = slice(*inliers.bar_offsets[m : m + 2])
+        r, r_bar = inliers.r[own], inliers.r_bar[bar]
+        if len(r) == 0:
+            continue
+        l_bar = TYPICAL[5 + inliers.surface_class[bar]]
+        length = np.exp(reference.log_length_scale(r_bar, l_bar, r, *latent))
+        a = reference.paciorek(r, length, r, length, sigma_f) + 0.05**2 * np.outer(r, r)
+        a += sigma_n**2 * np.eye(len(r))
+        expected += multivariate_normal(np.zeros(len(r)), a).logpdf(inliers.z[own])
+        b = reference.squared_exponential(r_bar, r_bar, *latent[:2])
+        b += latent[2] ** 2 * np.eye(len(r_bar))
+        # The density at its mean: the quadratic term, which the paper leaves out, is zero.
+        printed += multivariate_normal(np.zeros(len(r_bar)), b).logpdf(np.zeros(len(r_bar)))
+    ours, whole = (backend.log_likelihood(TYPICAL, inliers, 0.05, t)[0] for t in (False, True))
+    assert ours == pytest.approx(expected)
+    assert whole == pytest.approx(expected + printed)
+
+
+def test_the_printed_objective_has_no_upper_bound_and_ours_does_not_move(backend):
+    """Scaling the latent process changes no prediction, yet the printed objective grows."""
+    inliers = random_inliers(6)
+    printed, ours = (
+        [
+            backend.log_likelihood(scaled(1, 1, shrink, 1, shrink), inliers, 0.05, terms)[0]
+            for shrink in (1.0, 1e-1, 1e-2, 1e-3)
+        ]
+        for terms in (True, False)
+    )
+    n_bar = np.diff(inliers.bar_offsets)[np.diff(inliers.offsets) > 0].sum()
+    np.testing.assert_allclose(np.diff(printed), n_bar * np.log(10.0), rtol=1e-6)
+    np.testing.assert_allclose(ours, ours[0], rtol=1e-6)
+
+
+NOISELESS, NOISELESS_LATENT = TYPICAL.copy(), TYPICAL.copy()
+NOISELESS[:2], NOISELESS_LATENT[4] = np.log([1e8, 1e-9]), -400.0
+
+
+@pytest.mark.parametrize(
+    ('theta', 'changes'),
+    [
+        (NOISELESS, {}),
+        (TYPICAL, {'z': math.nan}),
+        (NOISELESS_LATENT, {'r_bar': 5.0}),
+    ],
+    ids=['no noise', 'not finite', 'no latent noise'],
+)
+def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
+    backend, theta, changes
+):
+    inliers = random_inliers(4)
+    inliers = inliers._replace(**{k: np.full_like(inliers.z, v) for k, v in changes.items()})
+    for model in (backend, reference):
+        value, gradient = model.log_likelihood(theta, inliers, 0.0, False)
+        assert value == -np.inf
+        assert not gradient.any()
+
+
+def test_equal_pseudo_inputs_give_the_stationary_objective(backend):
+    inliers = random_inliers(9)
+    theta = TYPICAL.copy()
+    theta[5:] = 1.3
+    stationary = inliers._replace(
+        log_length_scale=np.full(len(inliers.r), 1.3),
+        bar_offsets=np.zeros_like(inliers.offsets),
+    )
+    a, b = (backend.log_likelihood(theta, i, 0.05, False)[0] for i in (inliers, stationary))
+    assert a == pytest.approx(b, rel=1e-12)
+
+
+def test_with_one_length_scale_it_is_scikit_learns_regression(backend):
+    """Posterior and log marginal likelihood of the stationary case, by another's code."""
+    gaussian_process = pytest.importorskip('sklearn.gaussian_process')
+    kernels = gaussian_process.kernels
+    rng = np.random.default_rng(4)
+    r, r_star = np.sort(rng.uniform(2, 40, 25)), np.linspace(0, 50, 30)
+    z = 0.2 * np.sin(0.3 * r) + rng.normal(0, 0.05, 25)
+    sigma_f, sigma_n, length = 0.4, 0.05, 3.0
+    kernel = kernels.ConstantKernel(sigma_f**2) * kernels.RBF(length)
+    theirs = gaussian_process.GaussianProcessRegressor(kernel, alpha=sigma_n**2, optimizer=None)
+    theirs.fit(r[:, None], z)
+    their_mean, their_std = theirs.predict(r_star[:, None], return_std=True)
+    at = r_star, np.full(30, length)
+    mean, variance = reference.posterior(r, z, np.full(25, length), *at, sigma_f, sigma_n)
+    np.testing.assert_allclose(mean, their_mean, atol=1e-10)
+    np.testing.assert_allclose(np.sqrt(variance), their_std, atol=1e-7)
+    # The objective of that one segment, its latent process constant.
+    theta = np.log([sigma_f, sigma_n, 0.9, 2.0, 0.3, length])
+    bars = np.array([0, 3]), np.array([5.0, 15.0, 30.0]), np.zeros(3, dtype=np.int64)
+    inliers = Inliers(np.array([0, 25]), r, z, np.zeros(25), *bars)
+    value, gradient = backend.log_likelihood(theta, inliers, 0.0, False)
+    their_value, their_gradient = theirs.log_marginal_likelihood(
+        theirs.kernel_.theta, eval_gradient=True
+    )
+    assert value == pytest.approx(their_value, rel=1e-12)
+    # Theirs is in log sigma_f^2 and log length-scale.
+    assert gradient[0] == pytest.approx(2.0 * their_gradient[0], rel=1e-9)
+    assert gradient[5] == pytest.approx(their_gradient[1], rel=1e-9)

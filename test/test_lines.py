@@ -1,0 +1,302 @@
+"""Lines, slope breaks and pseudo-inputs: both backends against loops, and one by one."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+from conftest import fewer, hilly_scan
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import Reference
+from scipy.optimize import minimize
+
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.experiments.scene_scores import SceneScan
+from gp_ground_seg.frame import N_CLASSES, Candidates, Faces
+from gp_ground_seg.parameters.config import LatentConfig
+from gp_ground_seg.parameters.presets import find_preset
+from gp_ground_seg.pipeline.lines import classify_lines, deming_slope, differs_in_direction
+
+N_TILES = 50
+NO_FACES = Faces(*np.zeros((2, N_TILES), dtype=bool))
+
+
+def candidates_of(r, z, density=None, offsets=None):
+    n = len(r)
+    return Candidates(
+        np.asarray(r, dtype=float),
+        np.asarray(z, dtype=float),
+        np.arange(n),
+        np.ones(n) if density is None else np.asarray(density, dtype=float),
+        np.array([0, n] if offsets is None else offsets),
+        np.zeros(n, dtype=np.int32),
+    )
+
+
+def extract(backend, candidates, **changes):
+    """Lines, and candidates that continue one."""
+    config = Config().replace(**{name.replace('__', '.'): v for name, v in changes.items()})
+    _, lines, _, continues_line = backend.extract_lines(candidates, NO_FACES, config)
+    return lines, continues_line
+
+
+# Regression
+
+
+def moments(r, z):
+    r, z = r - r.mean(), z - z.mean()
+    return float(r @ r), float(z @ z), float(r @ z)
+
+
+def test_deming_is_the_maximum_likelihood_line():
+    def negative(line, r, z, ratio):
+        """Sum of squared distances with the true ranges profiled out."""
+        return np.sum((z - line[1] - line[0] * r) ** 2) / (ratio + line[0] ** 2)
+
+    rng = np.random.default_rng(0)
+    for true_slope in (-2.0, -0.1, 0.0, 0.5, 8.0):
+        r = np.linspace(0.0, 10.0, 40)
+        z = true_slope * r + rng.normal(0, 0.1, 40)
+        r = r + rng.normal(0, 0.1, 40)
+        for ratio in (0.25, 1.0, 9.0):
+            ml = minimize(negative, [true_slope, 0.0], (r, z, ratio), tol=1e-12)
+            assert deming_slope(*moments(r, z), ratio) == pytest.approx(ml.x[0], abs=1e-4)
+
+
+def test_deming_agrees_with_odrpack():
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', DeprecationWarning)  # SciPy hands it over to odrpack
+        odr = pytest.importorskip('scipy.odr', reason='SciPy 1.19 and later have no odr')
+    rng = np.random.default_rng(5)
+    r = np.linspace(0.0, 10.0, 40) + rng.normal(0, 0.1, 40)
+    z = 0.4 * r + rng.normal(0, 0.1, 40)
+    for ratio in (0.25, 1.0, 9.0):
+        data = odr.RealData(r, z, sx=1.0, sy=math.sqrt(ratio))
+        fitted = odr.ODR(data, odr.unilinear, beta0=[0.4, 0.0]).run()
+        assert deming_slope(*moments(r, z), ratio) == pytest.approx(fitted.beta[0], abs=1e-5)
+
+
+def test_deming_at_its_limits():
+    rng = np.random.default_rng(1)
+    r = np.linspace(0.0, 5.0, 30)
+    z = 0.3 * r + rng.normal(0, 0.2, 30)
+    least_squares = np.polyfit(r, z, 1)[0]
+    assert deming_slope(*moments(r, z), 1e9) == pytest.approx(least_squares, rel=1e-6)
+    assert deming_slope(0.0, 4.0, 0.0, 1.0) == math.inf
+    assert deming_slope(0.0, 0.0, 0.0, 1.0) == deming_slope(4.0, 0.0, 0.0, 1.0) == 0.0
+
+
+SLOPES = st.floats(allow_nan=False) | st.floats(-1.57, 1.57).map(math.tan)
+
+
+@settings(max_examples=500)
+@given(SLOPES, SLOPES, st.floats(0.001, 1.0))
+def test_difference_in_direction(slope, new_slope, tolerance):
+    difference = abs(math.atan(new_slope) - math.atan(slope))
+    if abs(difference - tolerance) > 1e-9:
+        assert differs_in_direction(slope, new_slope, tolerance) == (difference > tolerance)
+
+
+# Lines
+
+
+def draw_candidates(seed, n_segments=8, most=30):
+    """Segments of none to `most` candidates on level, sloped and broken ground."""
+    rng = np.random.default_rng(seed)
+    number = rng.integers(0, most, n_segments) * rng.integers(0, 2, n_segments)
+    r, z = [np.empty(0)], [np.empty(0)]
+    for n in number:
+        step = rng.uniform(0.3, 1.5, n)
+        slope = np.repeat(rng.normal(0.0, 0.3, n), rng.integers(3, 9, n))[:n]
+        jump = rng.normal(0.0, 1.0, n) * (rng.uniform(size=n) < 0.1)
+        r.append(3.0 + np.cumsum(step))
+        z.append(np.cumsum(slope * step + jump) + rng.normal(0.0, 0.01, n))
+    r, z, density = np.concatenate(r), np.concatenate(z), rng.normal(0.0, 0.5, number.sum())
+    offsets = np.concatenate([[0], np.cumsum(number)])
+    tile = rng.integers(0, N_TILES, len(r)).astype(np.int32)
+    return candidates_of(r, z, np.exp(density), offsets)._replace(tile=tile)
+
+
+def draw_faces(seed):
+    return Faces(*(np.random.default_rng(seed).uniform(size=(2, N_TILES)) < 0.2))
+
+
+@settings(max_examples=fewer(100, 20))
+@given(st.integers(0, 10_000), st.sampled_from([1.0, 2.5, 3.0, 10.0]), st.floats(0.2, 5.0))
+def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_ratio):
+    candidates, faces = draw_candidates(seed), draw_faces(seed)
+    config = Config().replace(
+        **{
+            'lines.max_gap': 6.0,
+            'lines.error_ratio': error_ratio,
+            'growth.min_bend_extent': 3.0,
+            'latent.candidates_per_pseudo_input': per,
+        }
+    )
+    found = backend.extract_lines(candidates, faces, config)
+    expected = Reference().extract_lines(candidates, faces, config)
+    for ours, theirs in zip(found[:3], expected[:3], strict=True):
+        for name, value in ours._asdict().items():
+            other = getattr(theirs, name)
+            assert value.dtype == other.dtype
+            np.testing.assert_allclose(value, other, rtol=1e-9, atol=1e-9, err_msg=name)
+    np.testing.assert_array_equal(found[3], expected[3])
+    assert len(found[0].r) == (~faces.has_occluded_base[candidates.tile]).sum()
+
+
+def test_the_candidates_drawn_hold_every_case():
+    """Slope breaks, and lines that do and do not continue, in the test above."""
+    at_break = continued = alone = 0
+    config = Config().replace(**{'lines.max_gap': 6.0, 'growth.min_bend_extent': 3.0})
+    for seed in range(40):
+        _, lines, _, continues = Reference().extract_lines(draw_candidates(seed), NO_FACES, config)
+        at_break += continues[lines.start[:-1]].sum()
+        continued += (continues[1:] & (lines.line[1:] == lines.line[:-1])).sum()
+        alone += (~continues).sum()
+    assert min(at_break, continued, alone) > 20
+
+
+@settings(max_examples=20)
+@given(st.floats(-0.4, 0.4), st.floats(0.45, 0.8), st.booleans())
+def test_a_change_of_slope_is_a_critical_point(backend, angle, turn, up):
+    slope, new_slope = math.tan(angle), math.tan(angle + (turn if up else -turn))
+    r = np.arange(3.0, 23.0)
+    z = np.where(r <= 12.0, slope * r, slope * 12.0 + new_slope * (r - 12.0))
+    lines, _ = extract(backend, candidates_of(r, z), lines__max_gap=5.0)
+    assert list(lines.line) == [0] * 10 + [1] * 10
+    np.testing.assert_allclose(lines.slope, [slope, new_slope], atol=1e-9)
+
+
+def test_a_gap_ends_a_line_and_may_be_wider_far_away(backend):
+    candidates = candidates_of([3.0, 4.0, 6.0, 50.0, 55.0], np.zeros(5))
+    lines, _ = extract(backend, candidates, lines__max_gap=1.0, lines__max_gap_growth=0.1)
+    assert list(lines.line) == [0, 0, 1, 2, 2]
+    np.testing.assert_array_equal(lines.extent(candidates), [1.0, 0.0, 5.0])
+
+
+def test_a_sharp_change_of_density_ends_a_line(backend):
+    candidates = candidates_of([3, 4, 5, 6, 7], np.zeros(5), [10.0, 20.0, 2.4, 2.4, 30.0])
+    lines, _ = extract(backend, candidates, lines__max_density_ratio=8.0)
+    assert list(lines.line) == [0, 0, 1, 1, 2]
+
+
+def test_lines_do_not_cross_segments_and_single_points_have_no_slope(backend):
+    lines, _ = extract(backend, candidates_of([3, 4, 5], np.zeros(3), offsets=[0, 2, 2, 3]))
+    assert list(lines.line) == [0, 0, 1]
+    assert lines.slope[0] == 0.0
+    assert np.isnan(lines.slope[1])
+    lines, continues = extract(backend, candidates_of([], []))
+    assert len(lines.line) == len(lines.slope) == len(continues) == 0
+
+
+# Candidates that continue a line
+
+
+def test_long_and_flat_lines_are_continued(backend):
+    # A road, a ramp of 0.3, a wall of three candidates.
+    r = np.concatenate([np.arange(2.0, 8.0), np.arange(8.0, 14.0), [14.0, 14.2, 14.4]])
+    z = np.concatenate([np.zeros(6), 0.3 * np.arange(1.0, 7.0), [2.5, 3.5, 4.5]])
+    both = [*range(1, 6), *range(7, 12)]
+    for max_slope, min_size, expected in (
+        (1.0, 4, both), (0.2, 4, both[:5]), (10.0, 3, [*both, 13, 14]), (1.0, 7, []),
+    ):  # fmt: skip
+        bounds = {'growth__max_line_slope': max_slope, 'growth__min_line_size': min_size}
+        lines, continues = extract(
+            backend, candidates_of(r, z), **bounds, growth__min_bend_extent=99.0
+        )
+        assert list(lines.start) == [0, 6, 12, 15]
+        assert list(np.flatnonzero(continues)) == expected
+
+
+ROAD = np.array([3.0, 4.0, 5.0, 6.6, 9.2, 15.0])
+
+
+def breaks(backend, r, z, offsets=None, min_extent=8.0, max_slope=1.0):
+    """First candidates of the lines, and whether each line starts at a slope break."""
+    lines, continues = extract(
+        backend,
+        candidates_of(r, z, offsets=offsets),
+        lines__max_gap=6.0,
+        lines__max_gap_growth=0.6,
+        growth__min_bend_extent=min_extent,
+        growth__max_line_slope=max_slope,
+    )
+    return list(lines.start), list(continues[lines.start[:-1]])
+
+
+def slope_at_16_m(rise, step=0.0):
+    """A level road, then a slope."""
+    at = np.array([19.5, 26.0, 40.0])
+    return np.append(ROAD, at), np.append(np.zeros(len(ROAD)), step + rise * (at - 16.0))
+
+
+@pytest.mark.parametrize(
+    ('rise', 'step', 'at_break'),
+    [(0.12, 0, True), (0.3, 0, True), (-0.12, 0, True), (0.05, 0.6, False), (0.05, 1.5, False)],
+)
+def test_a_slope_starts_at_a_break_and_a_step_does_not(backend, rise, step, at_break):
+    assert breaks(backend, *slope_at_16_m(rise, step)) == ([0, 6, 9], [False, at_break])
+
+
+def test_lines_that_are_short_or_steep_or_of_two_candidates_start_at_no_break(backend):
+    r, z = slope_at_16_m(0.12)
+    assert breaks(backend, r, z, min_extent=21.0)[1] == [False, False]
+    assert breaks(backend, r, z, max_slope=0.1)[1] == [False, False]
+    assert breaks(backend, r[:-1], z[:-1], min_extent=1.0) == ([0, 6, 8], [False, False])
+    # The line before must lie in the same segment.
+    assert breaks(backend, r, z, offsets=[0, 6, 9])[1] == [False, False]
+
+
+def test_a_ramp_seen_by_few_rings_is_ground():
+    scan = SceneScan('vlp-16', 'ramp', 0, 0.0).simulate()
+    config = find_preset('vlp16').config
+    far = scan.is_ground & (np.hypot(*scan.points[:, :2].T) > 25.0)
+    missed = {}
+    for extent in (config.growth.min_bend_extent, 1000.0):
+        segmenter = GroundSegmenter(config.replace(**{'growth.min_bend_extent': extent}))
+        missed[extent] = (segmenter.segment(scan.points).label[far] != 1).sum()
+    assert missed[config.growth.min_bend_extent] < 0.6 * missed[1000.0]
+
+
+# Pseudo-inputs
+
+
+def test_classes_by_slope_and_extent():
+    latent = LatentConfig(
+        sloped_gradient=0.1, steep_gradient=0.4, medium_extent=1.5, long_extent=5.0
+    )
+    slopes = np.array([0.0, -0.05, 0.05, 0.1, -0.3, 0.3, 0.4, -2.0, np.inf, np.nan])
+    extents = np.array([1.0, 1.5, 5.0, 1.0, 2.0, 9.0, 0.5, 3.0, 6.0, 0.0])
+    assert list(classify_lines(slopes, extents, latent)) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 6]
+
+
+@pytest.mark.parametrize('per', [1.0, 3.0, 10.0])
+def test_pseudo_inputs_of_a_frame(backend, per):
+    config = Config().replace(**{'latent.candidates_per_pseudo_input': per})
+    scan = backend.build_grid(hilly_scan(fewer(6000, 2000)), config)
+    faces = backend.find_faces(scan, config)
+    candidates, lines, pseudo, _ = backend.extract_lines(scan.candidates, faces, config)
+    sizes = np.diff(lines.start)
+    assert len(pseudo.r_bar) == np.maximum(np.rint(sizes / per), 1).sum()
+    if per == 1.0:
+        np.testing.assert_array_equal(pseudo.r_bar, candidates.r)
+    for m in range(len(candidates.offsets) - 1):
+        own = range(candidates.offsets[m], candidates.offsets[m + 1])
+        r_bar = pseudo.r_bar[pseudo.offsets[m] : pseudo.offsets[m + 1]]
+        assert (np.diff(r_bar) > 0).all()
+        at = [i for i in own if candidates.r[i] in r_bar]
+        assert len(at) == len(r_bar)
+        assert {lines.line[i] for i in at} == {lines.line[i] for i in own}
+    extent = lines.extent(candidates)
+    classes = classify_lines(lines.slope, extent, config.latent)
+    bounded = np.log(np.clip(extent, config.length_scale.min, config.length_scale.max))
+    for k in range(N_CLASSES):
+        members = bounded[classes == k] if (classes == k).any() else bounded
+        assert pseudo.first_guess[k] == pytest.approx(members.mean())
+
+
+def test_no_candidates_no_pseudo_inputs(backend):
+    pseudo = backend.extract_lines(candidates_of([], []), NO_FACES, Config())[2]
+    assert len(pseudo.r_bar) == 0
+    assert np.isfinite(pseudo.first_guess).all()

@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gp_ground_seg.compiled.numerics import (
+    LANES,
+    NEGLIGIBLE_EXPONENT,
+    exp_neg,
+    factorise,
+    invert,
+    solve_in_place,
+)
+
+
+@given(st.floats(0.0, 1e300))
+def test_exp_neg_is_the_exponential(x):
+    assert abs(exp_neg(x) - np.exp(-x)) <= 1e-14
+    assert (exp_neg(x) == 0.0) == (x > NEGLIGIBLE_EXPONENT)
+
+
+@given(st.floats(-10.0, 0.0))
+def test_exp_neg_of_negative_numbers_is_as_exact_for_its_size(x):
+    np.testing.assert_allclose(exp_neg(x), np.exp(-x), rtol=1e-11)
+
+
+def positive_definite(n, seed):
+    root = np.random.default_rng(seed).normal(size=(n, n + 2))
+    return root @ root.T / n + 0.1 * np.eye(n)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 13))
+def test_small_systems(seed, n):
+    a = positive_definite(n, seed)
+    rng, room = np.random.default_rng(seed), (n + LANES - 1) & -LANES
+    # Arbitrary values left of the diagonal and behind column n.
+    matrix = np.where(np.tri(n, room, -1), rng.normal(size=(n, room)), 7.0)
+    matrix[:, :n][np.triu_indices(n)] = a[np.triu_indices(n)]
+    vector = np.append(rng.normal(size=n), np.zeros(room - n))
+    expected = np.linalg.solve(a, vector[:n])
+    assert solve_in_place(matrix, n, vector)
+    np.testing.assert_allclose(vector[:n], expected, rtol=1e-8, atol=1e-8)
+    factor, inverse = a.copy(), np.empty((n, n))
+    assert factorise(factor, n)
+    np.testing.assert_allclose(np.triu(factor).T, np.linalg.cholesky(a), rtol=1e-9, atol=1e-9)
+    invert(factor, n, np.empty((n, n)), inverse)
+    np.testing.assert_allclose(inverse, np.linalg.inv(a), rtol=1e-7, atol=1e-7)
+    np.testing.assert_array_equal(inverse, inverse.T)
+
+
+@pytest.mark.parametrize('worst', [0.0, -1.0, np.nan])
+def test_no_positive_definite_matrix_no_solution(worst):
+    matrix = np.diag([1.0, 2.0, worst, 1.0])
+    assert not solve_in_place(matrix.copy(), 4, np.ones(4))
+    assert not factorise(matrix, 4)

@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+from conftest import fewer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference import find_faces
+
+from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.frame import OUTSIDE
+from gp_ground_seg.pipeline.vertical_faces import normal_z
+
+BASE = Config().replace(**{'grid.r_max': 30.0})
+CORNER = np.array([10.0, 5.0, 0.0])
+"""Corner of the tile that the clouds below lie in."""
+
+
+def faces_of(backend, xyz, **changes):
+    """Whether each point lies on a face, and on one with occluded base; and the scan."""
+    config = BASE.replace(**{f'faces.{name}': value for name, value in changes.items()})
+    scan = backend.build_grid(np.asarray(xyz, dtype=float), config)
+    faces, tile = backend.find_faces(scan, config), np.maximum(scan.tiles.tile, 0)
+    inside = scan.tiles.tile != OUTSIDE
+    return faces.is_face[tile] & inside, faces.has_occluded_base[tile] & inside, scan
+
+
+@pytest.mark.parametrize(('slope_z', 'is_face'), [(0.3, True), (0.44, True), (0.5, False)])
+def test_faces_are_recognised_by_their_normal(backend, slope_z, is_face):
+    x, y = np.random.default_rng(1).uniform(0.01, 0.49, (2, 200))
+    plane = CORNER + np.column_stack([x, y, x * np.sqrt(1.0 - slope_z**2) / slope_z])
+    found, _, _ = faces_of(backend, plane)
+    assert found.all() if is_face else not found.any()
+
+
+def test_a_wall_of_any_direction_is_a_face(backend):
+    rng = np.random.default_rng(2)
+    for turn in np.linspace(0.0, np.pi, 9):
+        along, z = rng.uniform(-0.2, 0.2, 100), rng.uniform(-1.6, 0.0, 100)
+        wall = np.column_stack([10.25 + along * np.cos(turn), 5.25 + along * np.sin(turn), z])
+        found, _, scan = faces_of(backend, wall)
+        assert found.all()
+        assert list(scan.tiles.extremes[scan.tiles.tile[0]]) == [z.min(), z.max()]
+
+
+@pytest.mark.parametrize(
+    'height',
+    [
+        np.linspace(0.0, 0.49, 60),  # low
+        np.zeros(60),
+        np.where(np.arange(60) > 30, 3.0, 0.0),  # overhanging, as a branch over flat ground
+    ],
+)
+def test_low_flat_and_overhanging_returns_are_no_faces(backend, height):
+    x, y = np.random.default_rng(3).uniform(10.0, 10.5, (2, 60))
+    assert not faces_of(backend, np.column_stack([np.sort(x), y, height]))[0].any()
+
+
+def test_three_returns_have_no_orientation(backend):
+    post = np.array([[10.2, 5.2, z] for z in (0.0, 0.5, 1.0, 1.5)]) + np.eye(4, 3) * 0.01
+    assert faces_of(backend, post)[0].all()
+    assert not faces_of(backend, post[:3])[0].any()
+
+
+def test_points_outside_the_grid_belong_to_no_tile(backend):
+    found, _, scan = faces_of(backend, [[50.0, 0.0, 0.0], [np.nan, 0.0, 0.0], [5.0, 5.0, 0.0]])
+    assert list(scan.tiles.tile[:2]) == [OUTSIDE, OUTSIDE]
+    assert not found.any()
+
+
+@given(st.integers(0, 100_000))
+def test_normal_z_is_the_weighted_normal_of_the_eigenvectors(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(6, 8, 3)) * rng.uniform(0.01, 1.0, 3)
+    scatter = np.array([np.cov(cloud.T) * 7 for cloud in points])
+    value, vector = np.linalg.eigh(scatter)
+    weight = 1.0 / value
+    expected = np.sqrt((weight * vector[:, 2, :] ** 2).sum(axis=1) / weight.sum(axis=1))
+    np.testing.assert_allclose(normal_z(scatter), expected, rtol=1e-6)
+    np.testing.assert_array_equal(normal_z(np.zeros((2, 3, 3))), 1.0)
+
+
+def wall(low=0.0, high=1.5, turn=0.3):
+    """Rings of returns on a vertical plane, evenly spread over its height."""
+    along, z = (
+        a.ravel() for a in np.meshgrid(np.linspace(-0.2, 0.2, 9), np.arange(low, high, 0.05))
+    )
+    return CORNER + np.column_stack([0.25 + along * np.cos(turn), 0.25 + along * np.sin(turn), z])
+
+
+def ring(away, n=9, turn=0.3):
+    """Returns of level ground, so far before that wall [m]."""
+    along = np.linspace(-0.1, 0.1, n)
+    x = 0.25 + along * np.cos(turn) - away * np.sin(turn)
+    y = 0.25 + along * np.sin(turn) + away * np.cos(turn)
+    return CORNER + np.column_stack([x, y, np.zeros(n)])
+
+
+def is_occluded(backend, xyz, **changes):
+    found, occluded, _ = faces_of(backend, xyz, **changes)
+    assert found.all()
+    assert occluded.all() or not occluded.any()
+    return bool(occluded[0])
+
+
+def test_a_wall_down_to_its_lowest_return_has_an_occluded_base(backend):
+    for turn in np.linspace(0.0, np.pi, 7):
+        assert is_occluded(backend, wall(turn=turn))
+    assert not is_occluded(backend, wall(turn=0.0), max_foot_distance=0.0)
+
+
+@pytest.mark.parametrize(('away', 'occluded'), [(0.0, True), (0.02, True), (0.15, False)])
+def test_ground_lies_off_the_plane_of_the_wall(backend, away, occluded):
+    cloud = np.vstack([wall(low=0.1), ring(away, n=30)])
+    assert is_occluded(backend, cloud) == occluded
+
+
+@pytest.mark.parametrize(('n', 'occluded'), [(9, True), (200, False)])
+def test_ground_is_dense_at_one_height(backend, n, occluded):
+    cloud = np.vstack([wall(low=0.15), ring(0.0, n=n)])
+    assert is_occluded(backend, cloud) == occluded
+    assert is_occluded(backend, cloud, max_foot_density=1000.0)
+
+
+def test_a_wall_seen_over_an_obstacle_is_no_ground(backend):
+    rng, n = np.random.default_rng(4), fewer(20_000, 6000)
+    azimuth, r = rng.uniform(-np.pi, np.pi, n), rng.uniform(2.0, 25.0, n)
+    ground = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full(n, -1.7)])
+    # Ahead, a hedge at 12 m occludes the ground behind it and the lowest decimetre of a wall.
+    ahead, n = (np.abs(azimuth) < 0.4) & (r >= 12.0), n * 2 // 5
+    facade = [np.full(n, 16.2), rng.uniform(-4.0, 4.0, n), rng.uniform(-1.6, 0.5, n)]
+    facade = np.column_stack(facade) + rng.normal(0.0, 0.01, (n, 3))
+    scan = np.vstack([ground[~ahead], facade])
+    behind = np.arange(len(scan)) >= (~ahead).sum()
+    taken = {}
+    for distance in (Config().faces.max_foot_distance, 0.0):
+        config = Config().replace(**{'faces.max_foot_distance': distance, 'sensor.height': 1.7})
+        label = GroundSegmenter(config, backend=backend).segment(scan).label
+        assert (label[~behind] == Label.GROUND).mean() > 0.99
+        taken[distance] = (label[behind] == Label.GROUND).mean()
+    assert taken[0.0] > 0.01
+    assert taken[Config().faces.max_foot_distance] < 0.2 * taken[0.0]
+
+
+@settings(max_examples=fewer(100, 10))
+@given(st.integers(0, 10_000), st.sampled_from([np.float32, np.float64]))
+def test_faces_are_the_reference(backend, seed, dtype):
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(-12, 12, (300, 3))
+    xyz[:, 2] *= 0.1
+    xyz[100:250, :2] = np.repeat(xyz[100:115, :2], 10, axis=0) + rng.normal(0, 0.05, (150, 2))
+    xyz[::20] = np.nan
+    config = BASE.replace(**{'faces.max_foot_distance': rng.uniform(0.02, 0.2)})
+    scan = backend.build_grid(xyz.astype(dtype), config)
+    found, expected = backend.find_faces(scan, config), find_faces(scan, config)
+    np.testing.assert_array_equal(found.is_face, expected.is_face)
+    np.testing.assert_array_equal(found.has_occluded_base, expected.has_occluded_base)
+    assert found.is_face.any()
