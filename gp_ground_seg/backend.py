@@ -158,7 +158,12 @@ def make_backend(runtime: RuntimeConfig) -> Backend:
     """Backend for the parameters ``runtime``; raises as `choose_backend`."""
     if choose_backend(runtime.backend) == 'numpy':
         return NumpyBackend()
-    # Imported only where it is used, as it loads compiled code.
-    from gp_ground_seg.compiled.backend import NumbaBackend
-
+    try:
+        # Imported only where it is used, as it imports numba.
+        from gp_ground_seg.compiled.backend import NumbaBackend
+    except ImportError as error:  # a numba that does not fit this numpy, say
+        if runtime.backend == 'numba':
+            raise MissingDependencyError(f'runtime.backend = numba: {error}') from error
+        _LOGGER.warning('numba cannot be imported: using numpy, several times slower (%s)', error)
+        return NumpyBackend()
     return NumbaBackend(runtime.n_threads)

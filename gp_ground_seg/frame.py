@@ -38,25 +38,13 @@ class Label(IntEnum):
 
 
 class PolarGrid(NamedTuple):
-    """Where each point lies in the radial grid.
+    """Where each point lies in the radial grid."""
 
-    Attributes
-    ----------
-    cell : (N,) int32
-        Cell ``segment * n_bins + bin``, or `OUTSIDE`, or `NOT_FINITE`.
-    r : (N,) float32 or float64
-        Horizontal range [m], in the precision of the points; NaN for points that are
-        not finite.
-    edges : (n_bins + 1,) float64
-        Range of the bin edges [m], read-only.
-    n_segments : int
-        Number of segments M.
-    """
-
-    cell: CellArray
+    cell: CellArray  # (N,) cell ``segment * n_bins + bin``, or `OUTSIDE`, or `NOT_FINITE`
+    # (N,) horizontal range [m], in the precision of the points; NaN for points that are not finite
     r: PointArray
-    edges: FloatArray
-    n_segments: int
+    edges: FloatArray  # (n_bins + 1,) range of the bin edges [m], read-only
+    n_segments: int  # number of segments M
 
     @property
     def n_bins(self) -> int:
@@ -81,22 +69,13 @@ class PolarGrid(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """Where each point lies in a square of square tiles that holds the polar grid.
+    """Where each point lies in a square of square tiles that holds the polar grid."""
 
-    Attributes
-    ----------
-    tile : (N,) int32
-        Tile of each point, or `OUTSIDE`.
-    extremes : (T, 2) float32 or float64
-        Height of the lowest and of the highest point of each tile [m], in the
-        precision of the points; infinite, minus infinite in empty ones.
-    occupied : (K,) int32
-        Tiles with a point, in any order.
-    """
-
-    tile: CellArray
+    tile: CellArray  # (N,) tile of each point, or `OUTSIDE`
+    # (T, 2) height of the lowest and of the highest point of each tile [m], in the precision of
+    # the points; infinite, minus infinite in empty ones
     extremes: PointArray
-    occupied: CellArray
+    occupied: CellArray  # (K,) tiles with a point, in any order
 
     @property
     def lowest_z(self) -> PointArray:
@@ -106,28 +85,14 @@ class Tiles(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Ground candidates PG_m of all segments, near to far in each.
+    """Ground candidates PG_m of all segments, near to far in each."""
 
-    Attributes
-    ----------
-    r, z : (C,) float64
-        Horizontal range and height [m] of the lowest point of each occupied bin.
-    bin : (C,) int64
-        Bin of each candidate.
-    density : (C,) float64
-        Vertical density of each candidate's bin [points/m^2].
-    offsets : (M + 1,) int64
-        Candidates of segment m are ``offsets[m]:offsets[m + 1]``.
-    tile : (C,) int32
-        Tile of each candidate.
-    """
-
-    r: FloatArray
-    z: FloatArray
-    bin: IntArray
-    density: FloatArray
-    offsets: IntArray
-    tile: CellArray
+    r: FloatArray  # (C,) horizontal range of the lowest point of each occupied bin [m]
+    z: FloatArray  # (C,) its height [m]
+    bin: IntArray  # (C,) bin of each candidate
+    density: FloatArray  # (C,) vertical density of each candidate's bin [points/m^2]
+    offsets: IntArray  # (M + 1,) candidates of segment m are ``offsets[m]:offsets[m + 1]``
+    tile: CellArray  # (C,) tile of each candidate
 
     @property
     def segment(self) -> IntArray:
@@ -162,58 +127,29 @@ class Candidates(NamedTuple):
 class Scan(NamedTuple):
     """Points of a level frame, sorted into the polar grid and into tiles.
 
-    Attributes
-    ----------
-    xyz : (N, 3) float32 or float64
-        Points [m], each coordinate contiguous (Fortran order), read-only.
-    grid : PolarGrid
-        Cells of the points.
-    tiles : Tiles
-        Tiles of the points.
-    candidates : Candidates
-        Lowest point of each occupied cell.
-
     `xyz` and `tiles` may lie in buffers of the backend, which its next scan reuses.
     """
 
-    xyz: PointArray
-    grid: PolarGrid
-    tiles: Tiles
-    candidates: Candidates
+    xyz: PointArray  # (N, 3) points [m], each coordinate contiguous (Fortran order), read-only
+    grid: PolarGrid  # cells of the points
+    tiles: Tiles  # tiles of the points
+    candidates: Candidates  # lowest point of each occupied cell
 
 
 class Faces(NamedTuple):
-    """Tiles that hold a vertical face: a wall, a fence, a kerb, the side of a car.
+    """Tiles that hold a vertical face: a wall, a fence, a kerb, the side of a car."""
 
-    Attributes
-    ----------
-    is_face : (T,) bool
-        Whether the returns of the tile form a vertical face.
-    has_occluded_base : (T,) bool
-        Whether even the lowest returns belong to the face, so that no ground is seen in
-        the tile.
-    """
-
-    is_face: BoolArray
+    is_face: BoolArray  # (T,) whether the returns of the tile form a vertical face
+    # (T,) whether even the lowest returns belong to the face: the tile shows no ground
     has_occluded_base: BoolArray
 
 
 class Lines(NamedTuple):
-    """Extracted lines of all segments.
+    """Extracted lines of all segments."""
 
-    Attributes
-    ----------
-    line : (C,) int64
-        Line of each candidate.
-    slope : (Q,) float64
-        Slope dz/dr of each line; NaN for a line of one point.
-    start : (Q + 1,) int64
-        Candidates of line q are ``start[q]:start[q + 1]``.
-    """
-
-    line: IntArray
-    slope: FloatArray
-    start: IntArray
+    line: IntArray  # (C,) line of each candidate
+    slope: FloatArray  # (Q,) slope dz/dr of each line; NaN for a line of one point
+    start: IntArray  # (Q + 1,) candidates of line q are ``start[q]:start[q + 1]``
 
     def extent(self, candidates: Candidates) -> FloatArray:
         """Horizontal extent of each line, (Q,) float64 [m]."""
@@ -222,100 +158,48 @@ class Lines(NamedTuple):
 
 
 class PseudoInputs(NamedTuple):
-    """Pseudo-inputs of the latent process; those of one surface class share a log length-scale.
+    """Pseudo-inputs of the latent process; those of one surface class share a log length-scale."""
 
-    Attributes
-    ----------
-    r_bar : (P,) float64
-        Ranges [m], increasing in each segment.
-    surface_class : (P,) int64
-        Surface class, 0 to `N_CLASSES` - 1.
-    offsets : (M + 1,) int64
-        Pseudo-inputs of segment m are ``offsets[m]:offsets[m + 1]``.
-    first_guess : (N_CLASSES,) float64
-        Mean log extent of the lines of each class [log m].
-    """
-
-    r_bar: FloatArray
-    surface_class: IntArray
-    offsets: IntArray
-    first_guess: FloatArray
+    r_bar: FloatArray  # (P,) ranges [m], increasing in each segment
+    surface_class: IntArray  # (P,) surface class, 0 to `N_CLASSES` - 1
+    offsets: IntArray  # (M + 1,) pseudo-inputs of segment m are ``offsets[m]:offsets[m + 1]``
+    first_guess: FloatArray  # (N_CLASSES,) mean log extent of the lines of each class [log m]
 
 
 class Frame(NamedTuple):
-    """What the two processes are fitted to.
-
-    Attributes
-    ----------
-    candidates : Candidates
-        Ground candidates.
-    lines : Lines
-        Lines through them.
-    pseudo : PseudoInputs
-        Pseudo-inputs on the lines.
-    continues_line : (C,) bool
-        Candidates that join the inliers if the one before them has joined.
-    knots : (K,) float64
-        Ranges where the surface is wanted [m], read-only.
-    prior_mean : float
-        Prior mean of the ground's height [m].
-    """
+    """What the two processes are fitted to."""
 
     candidates: Candidates
     lines: Lines
     pseudo: PseudoInputs
+    # (C,) candidates that join the inliers if the one before them has joined
     continues_line: BoolArray
-    knots: FloatArray
-    prior_mean: float
+    knots: FloatArray  # (K,) ranges where the surface is wanted [m], read-only
+    prior_mean: float  # prior mean of the ground's height [m]
 
 
 class Inliers(NamedTuple):
-    """Inliers and pseudo-inputs that the hyper-parameters are learned from.
+    """Inliers and pseudo-inputs that the hyper-parameters are learned from."""
 
-    Attributes
-    ----------
-    offsets : (M + 1,) int64
-        Inliers of segment m are ``offsets[m]:offsets[m + 1]``.
-    r, z : (n,) float64
-        Their ranges and heights about the prior mean [m].
-    log_length_scale : (n,) float64
-        Their log length-scales where no latent process gives them [log m].
-    bar_offsets : (M + 1,) int64
-        Pseudo-inputs of segment m; all zero without a latent process.
-    r_bar : (P,) float64
-        Ranges of the pseudo-inputs [m].
-    surface_class : (P,) int64
-        Surface class of each pseudo-input.
-    """
-
-    offsets: IntArray
-    r: FloatArray
-    z: FloatArray
+    offsets: IntArray  # (M + 1,) inliers of segment m are ``offsets[m]:offsets[m + 1]``
+    r: FloatArray  # (n,) ranges [m]
+    z: FloatArray  # (n,) heights about the prior mean [m]
+    # (n,) log length-scales where no latent process gives them [log m]
     log_length_scale: FloatArray
-    bar_offsets: IntArray
-    r_bar: FloatArray
-    surface_class: IntArray
+    bar_offsets: IntArray  # (M + 1,) pseudo-inputs of segment m; all zero without a latent process
+    r_bar: FloatArray  # (P,) ranges of the pseudo-inputs [m]
+    surface_class: IntArray  # (P,) surface class of each pseudo-input
 
 
 class GroundSurface(NamedTuple):
-    """Ground height over range in every segment.
+    """Ground height over range in every segment."""
 
-    Attributes
-    ----------
-    knots : (K,) float64
-        Ranges [m]: the bin edges.
-    mean, std : (M, K) float64
-        Ground height in the level frame and its standard deviation [m]; NaN in
-        segments without a model, and behind the last bin with a return in a segment
-        and in those that are fused with it.
-    inlier : (C,) bool
-        Candidates that the surface rests on.
-    """
-
-    knots: FloatArray
+    knots: FloatArray  # (K,) ranges [m]: the bin edges
+    # (M, K) ground height in the level frame [m]; NaN in segments without a model, and behind the
+    # last bin with a return in a segment and in those that are fused with it
     mean: FloatArray
-    std: FloatArray
-    inlier: BoolArray
+    std: FloatArray  # (M, K) its standard deviation [m]; NaN in the same places
+    inlier: BoolArray  # (C,) candidates that the surface rests on
 
     def at(self, grid: PolarGrid) -> tuple[FloatArray, FloatArray]:
         """Height and standard deviation [m] under each point, two (N,) float64.
@@ -338,34 +222,20 @@ class GroundSurface(NamedTuple):
 def linear_pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Line across each cell: its value at range 0 and its slope, two (M * n_bins,) float64.
 
-    Parameters
-    ----------
-    knots : (K,) float64
-        Ranges of the knots [m].
-    table : (M, K) float64
-        Values at the knots, linear between them.
+    `knots` (K,) are ranges [m], `table` (M, K) the values there, linear between them.
     """
     slope = np.diff(table, axis=1) / np.diff(knots)
     return (table[:, :-1] - slope * knots[:-1]).ravel(), slope.ravel()
 
 
 class Labelled(NamedTuple):
-    """Labels of a scan and what they follow from.
+    """Labels of a scan and what they follow from."""
 
-    Attributes
-    ----------
-    label : (N,) uint8
-        `Label` of each point; UNKNOWN for points that are not finite.
-    height : (N,) float64
-        Height of each point over the surface [m]; NaN where there is none.
-    margin : (N,) float64
-        Distance of each point to the nearer edge of the band that is ground [m], negative
-        for obstacles; NaN where there is no surface.
-    roughness : (M, n_bins) float64
-        Root mean square height of the returns over the surface about each bin [m].
-    """
-
+    # (N,) `Label` of each point; UNKNOWN for points that are not finite
     label: npt.NDArray[np.uint8]
-    height: FloatArray
+    height: FloatArray  # (N,) height of each point over the surface [m]; NaN where there is none
+    # (N,) distance of each point to the nearer edge of the band that is ground [m], negative for
+    # obstacles; NaN where there is no surface
     margin: FloatArray
+    # (M, n_bins) root mean square height of the returns over the surface about each bin [m]
     roughness: FloatArray

@@ -12,6 +12,7 @@ import contextlib
 import functools
 import grp
 import hashlib
+import importlib.util
 import json
 import logging
 import os
@@ -24,13 +25,10 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-try:
-    import numba
-except ImportError:  # Ubuntu 24.04 has no package of it
-    numba = None
-
-HAVE_NUMBA = numba is not None
-JIT_ENABLED = HAVE_NUMBA and not numba.config.DISABLE_JIT
+# Ubuntu 24.04 has no package of numba. Its import takes most of a second: it waits until something
+# is to be compiled.
+HAVE_NUMBA = importlib.util.find_spec('numba') is not None
+JIT_ENABLED = HAVE_NUMBA and os.environ.get('NUMBA_DISABLE_JIT', '0') in ('', '0')
 """Whether functions are compiled, rather than left plain Python."""
 
 _LOGGER = logging.getLogger('gp_ground_seg')
@@ -64,6 +62,8 @@ def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
     def decorate(function: _Function) -> _Function:
         if not JIT_ENABLED:
             return function
+        import numba
+
         options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
         if fastmath:
             options['fastmath'] = {'reassoc', 'contract', 'nsz'}
@@ -79,6 +79,8 @@ def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
 
 def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     """Compile `function` with its code kept on disk, if there is a folder to trust for it."""
+    import numba
+
     # By the XDG specification such a path is invalid; numba would write to the current folder.
     if os.path.isabs(os.environ.get('XDG_CACHE_HOME', '/')):
         try:
@@ -166,6 +168,8 @@ def _entries(folder: Path) -> list[Path]:
 
 def _stamp(folder: Path) -> dict[str, Any]:
     """Describe the entries in `folder`: sources, versions, checksums."""
+    import numba
+
     sources = hashlib.sha256()
     for source in sorted(_PACKAGE.rglob('*.py')):
         if source.parent.name in _SOURCES or source.name in _SOURCES:

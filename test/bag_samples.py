@@ -72,48 +72,31 @@ def write_ros1_bag(path, n_clouds=3, topic='/kitti/velo/pointcloud', extras=True
     types.register(get_types_from_msg(CUSTOM_DEFINITION, CUSTOM))
     new = types.types
     time_type = new['builtin_interfaces/msg/Time']
-    header_type = new['std_msgs/msg/Header']
     with Ros1Writer(path) as bag:
-        clouds = bag.add_connection(topic, 'sensor_msgs/msg/PointCloud2', typestore=types)
+
+        def connect(name, msgtype, **options):
+            connection = bag.add_connection(name, msgtype, typestore=types, **options)
+
+            def write(time, *body):
+                raw = types.serialize_ros1(new[msgtype](*body), msgtype)
+                bag.write(connection, time, raw)
+
+            return write
+
+        clouds = connect(topic, POINT_CLOUD2)
         if extras:
-            odd = bag.add_connection('/odd', CUSTOM, typestore=types)
-            text = bag.add_connection(
-                '/text', 'std_msgs/msg/String', typestore=types, callerid='/a', latching=1
-            )
-            again = bag.add_connection(
-                '/text', 'std_msgs/msg/String', typestore=types, callerid='/b'
-            )
-            distance = bag.add_connection('/range', 'sensor_msgs/msg/Range', typestore=types)
+            odd = connect('/odd', CUSTOM)
+            text = connect('/text', 'std_msgs/msg/String', callerid='/a', latching=1)
+            again = connect('/text', 'std_msgs/msg/String', callerid='/b')
+            distance = connect('/range', 'sensor_msgs/msg/Range')
         for k in range(n_clouds):
             time = START + k * PERIOD
-            sample = cloud(k)
-            header = header_type(
-                seq=k,
-                stamp=time_type(sample.header.stamp.sec, sample.header.stamp.nanosec),
-                frame_id=sample.header.frame_id,
-            )
-            message = new['sensor_msgs/msg/PointCloud2'](
-                header=header,
-                height=sample.height,
-                width=sample.width,
-                fields=[
-                    new['sensor_msgs/msg/PointField'](f.name, f.offset, f.datatype, f.count)
-                    for f in sample.fields
-                ],
-                is_bigendian=False,
-                point_step=sample.point_step,
-                row_step=sample.row_step,
-                data=sample.data,
-                is_dense=False,
-            )
-            bag.write(clouds, time, types.serialize_ros1(message, 'sensor_msgs/msg/PointCloud2'))
-            if not extras:
-                continue
-            body = new[CUSTOM](header, time_type(k, 5), np.arange(k, dtype=np.uint8), k / 3)
-            bag.write(odd, time + 1, types.serialize_ros1(body, CUSTOM))
-            for offset, connection in ((2, text), (3, again)):
-                body = new['std_msgs/msg/String'](f'{k} {offset}')
-                raw = types.serialize_ros1(body, 'std_msgs/msg/String')
-                bag.write(connection, time + offset, raw)
-            body = new['sensor_msgs/msg/Range'](header, 1, 0.1, 0.2, 30.0, 1.0 + k)
-            bag.write(distance, time + 4, types.serialize_ros1(body, 'sensor_msgs/msg/Range'))
+            header, *body = vars(cloud(k)).values()
+            stamp = time_type(header.stamp.sec, header.stamp.nanosec)
+            header = new['std_msgs/msg/Header'](k, stamp, header.frame_id)
+            clouds(time, header, *body)
+            if extras:
+                odd(time + 1, header, time_type(k, 5), np.arange(k, dtype=np.uint8), k / 3)
+                text(time + 2, f'{k} 2')
+                again(time + 3, f'{k} 3')
+                distance(time + 4, header, 1, 0.1, 0.2, 30.0, 1.0 + k)

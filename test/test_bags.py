@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from gp_ground_seg.data.atomic_output import leftovers, staged_files
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
-from gp_ground_seg.data.bags import BagWriter, cloud_topic, jazzy_topic, open_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, jazzy_topic
 from gp_ground_seg.data.point_cloud2 import encode_cloud
 from gp_ground_seg.errors import DataError
 
@@ -25,7 +25,7 @@ SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive
 
 
 def read_all(path):
-    with open_bag(path) as bag:
+    with BagReader(path) as bag:
         return list(bag.messages())
 
 
@@ -46,15 +46,12 @@ def write_note(path, time, text, **options):
         bag.write('/note', time, samples.string_message(text))
 
 
-# --- reading what we write ----------------------------------------------------------------
-
-
 @pytest.mark.parametrize(('name', 'storage'), SHAPES)
 def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
     path = tmp_path / name
     written = samples.write_ros2_bag(path, storage=storage)
     assert is_bag(path)
-    with open_bag(path) as bag:
+    with BagReader(path) as bag:
         assert bag.topics == {'/points': POINT_CLOUD2, '/note': 'std_msgs/msg/String'}
         assert bag.n_messages('/points') == 3
         assert bag.pick_point_cloud_topic() == '/points'
@@ -79,7 +76,7 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
 
 def copy_bag(source, target):
     """Copy all messages; returns the topics of the source."""
-    with open_bag(source) as old, BagWriter(target) as new:
+    with BagReader(source) as old, BagWriter(target) as new:
         topics = [old.topic(name) for name in old.topics]
         for topic in topics:
             new.add_topic(topic)
@@ -91,7 +88,7 @@ def copy_bag(source, target):
 def test_topics_copied_from_bag_to_bag_keep_definition_and_qos(tmp_path):
     written = samples.write_ros2_bag(tmp_path / 'a.mcap')
     originals = copy_bag(tmp_path / 'a.mcap', tmp_path / 'b.db3')
-    with open_bag(tmp_path / 'b.db3') as bag:
+    with BagReader(tmp_path / 'b.db3') as bag:
         assert [bag.topic(name) for name in bag.topics] == originals
         assert list(bag.messages()) == written
 
@@ -122,9 +119,6 @@ def test_bags_without_definitions_are_read_and_copied(tmp_path):
     assert read_all(tmp_path / 'new') == expected
 
 
-# --- ROS 1 --------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope='module')
 def ros1_bag(tmp_path_factory):
     path = tmp_path_factory.mktemp('ros1') / 'drive.bag'
@@ -133,32 +127,27 @@ def ros1_bag(tmp_path_factory):
 
 
 def test_ros1_clouds_are_the_same_in_ros2(ros1_bag):
-    with open_bag(ros1_bag) as bag:
+    with BagReader(ros1_bag) as bag:
         assert bag.storage == 'ros1'
         topic = bag.pick_point_cloud_topic()
-        assert topic == '/kitti/velo/pointcloud'
-        messages = list(bag.messages([topic]))
-    assert [time for _, time, _ in messages] == [
-        samples.START + k * samples.PERIOD for k in range(3)
-    ]
-    for k, (_, _, raw) in enumerate(messages):
-        assert raw == encode_cloud(samples.cloud(k))
+        for k, message in enumerate(bag.messages([topic])):
+            time = samples.START + k * samples.PERIOD
+            assert message == ('/kitti/velo/pointcloud', time, encode_cloud(samples.cloud(k)))
+        assert k == 2
 
 
 def test_ros1_order_and_merged_publishers(ros1_bag):
-    with open_bag(ros1_bag) as bag:
-        messages = list(bag.messages())
+    with BagReader(ros1_bag) as bag:
+        names, times, _ = zip(*bag.messages(), strict=True)
         assert bag.n_messages('/text') == 6
         # One of the two publishers latches.
         assert [q.durability.name for q in bag.topic('/text').qos] == ['TRANSIENT_LOCAL']
-    assert [name for name, *_ in messages] == 3 * [
-        '/kitti/velo/pointcloud', '/odd', '/text', '/text', '/range',
-    ]  # fmt: skip
-    assert [time for _, time, _ in messages] == sorted(time for _, time, _ in messages)
+    assert list(names) == 3 * ['/kitti/velo/pointcloud', '/odd', '/text', '/text', '/range']
+    assert list(times) == sorted(times)
 
 
 def test_ros1_types_unknown_to_ros2_are_carried_over(ros1_bag):
-    with open_bag(ros1_bag) as bag:
+    with BagReader(ros1_bag) as bag:
         topic = bag.topic('/odd')
         messages = [raw for _, _, raw in bag.messages(['/odd'])]
     types = get_typestore(Stores.EMPTY)
@@ -174,7 +163,7 @@ def test_ros1_types_unknown_to_ros2_are_carried_over(ros1_bag):
 
 def test_ros1_type_that_ros2_changed_is_migrated_and_said(ros1_bag):
     types = get_typestore(Stores.ROS2_JAZZY)
-    with open_bag(ros1_bag) as bag:
+    with BagReader(ros1_bag) as bag:
         assert bag.migrated_topics == ['/range']
         for k, (_, _, raw) in enumerate(bag.messages(['/range'])):
             message = types.deserialize_cdr(raw, 'sensor_msgs/msg/Range')
@@ -186,17 +175,14 @@ def test_ros1_definition_that_cannot_be_parsed_concerns_its_topic_only(tmp_path,
     assert text.count(b'float64 value') >= 1
     broken = tmp_path / 'broken.bag'
     broken.write_bytes(text.replace(b'float64 value', b'float64 **** '))
-    with open_bag(broken) as bag:
+    with BagReader(broken) as bag:
         assert len(list(bag.messages(['/kitti/velo/pointcloud', '/range']))) == 6
     assert re.search('topic /odd .*cannot be converted from ROS 1', problem_of(broken))
 
 
-# --- choosing a topic ---------------------------------------------------------------------
-
-
 def test_several_cloud_topics_are_listed(tmp_path):
     samples.write_ros2_bag(tmp_path / 'two', topics=('/front', '/rear'))
-    with open_bag(tmp_path / 'two') as bag:
+    with BagReader(tmp_path / 'two') as bag:
         assert bag.point_cloud_topics == ['/front', '/rear']
         with pytest.raises(DataError, match=r'2 .*PointCloud2 topics, choose one.*/front, /rear'):
             bag.pick_point_cloud_topic()
@@ -207,12 +193,9 @@ def test_several_cloud_topics_are_listed(tmp_path):
             bag.pick_point_cloud_topic('/note')
         with pytest.raises(DataError, match=r'no topic /left'):
             list(bag.messages(['/left']))
-
-
-def test_bag_without_clouds(tmp_path):
     write_note(tmp_path / 'none.mcap', 5, 'hello')
     expected = rf'no {POINT_CLOUD2} topic; topics here: /note \(std_msgs/msg/String\)'
-    with open_bag(tmp_path / 'none.mcap') as bag, pytest.raises(DataError, match=expected):
+    with BagReader(tmp_path / 'none.mcap') as bag, pytest.raises(DataError, match=expected):
         bag.pick_point_cloud_topic()
 
 
@@ -222,14 +205,11 @@ def test_topic_without_messages(tmp_path, name, storage):
         bag.add_topic(cloud_topic('/silent'))
         bag.add_topic(cloud_topic('/points'))
         bag.write('/points', 5, encode_cloud(samples.cloud()))
-    with open_bag(tmp_path / name) as bag:
+    with BagReader(tmp_path / name) as bag:
         # A topic that was never published on does not make the choice unclear.
         assert bag.pick_point_cloud_topic() == '/points'
         with pytest.raises(DataError, match='no message on /silent'):
             bag.pick_point_cloud_topic('/silent')
-
-
-# --- damaged and missing bags -------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -251,34 +231,29 @@ def test_what_is_no_bag_is_refused_in_one_line(tmp_path, name, content, message)
     assert re.match(f'{re.escape(str(tmp_path / name))}: {message}', problem_of(tmp_path / name))
 
 
-def test_folder_without_metadata_names_the_files(tmp_path):
+@pytest.mark.parametrize(
+    'text', [None, '', 'a: [', 'rosbag2_bagfile_information: {version: 9}', '- 1']
+)
+def test_bad_metadata(tmp_path, text):
     samples.write_ros2_bag(tmp_path / 'drive')
-    (tmp_path / 'drive' / 'metadata.yaml').unlink()
+    metadata = tmp_path / 'drive' / 'metadata.yaml'
+    metadata.unlink() if text is None else metadata.write_text(text)
     expected = r'no metadata\.yaml in it\).*one by one: drive\.mcap'
+    if text is not None:
+        expected = 'cannot be read as a bag'
     assert re.search(expected, problem_of(tmp_path / 'drive'))
 
 
-@pytest.mark.parametrize('text', ['', 'a: [', 'rosbag2_bagfile_information: {version: 9}', '- 1'])
-def test_bad_metadata(tmp_path, text):
-    samples.write_ros2_bag(tmp_path / 'drive')
-    (tmp_path / 'drive' / 'metadata.yaml').write_text(text)
-    assert 'cannot be read as a bag' in problem_of(tmp_path / 'drive')
-
-
-def test_messages_missing_from_a_bag_are_noticed(tmp_path):
+def test_messages_missing_and_an_unmerged_journal_are_noticed(tmp_path):
     samples.write_ros2_bag(tmp_path / 'drive', storage='sqlite3')
-    with sqlite3.connect(tmp_path / 'drive' / 'drive.db3') as connection:
+    file = tmp_path / 'drive' / 'drive.db3'
+    with sqlite3.connect(file) as connection:
         connection.execute('DELETE FROM messages WHERE id = 4')
     connection.close()
     said = problem_of(tmp_path / 'drive')
     assert 'topic /points lists 3 messages, 2 could be read' in said
-
-
-def test_unmerged_journal_is_noticed(tmp_path):
-    samples.write_ros2_bag(tmp_path / 'drive.db3')
-    (tmp_path / 'drive.db3-wal').write_bytes(b'left by a crash')
-    said = problem_of(tmp_path / 'drive.db3')
-    assert 'was not closed, some of it is in drive.db3-wal' in said
+    file.with_name('drive.db3-wal').write_bytes(b'left by a crash')
+    assert 'was not closed, some of it is in drive.db3-wal' in problem_of(tmp_path / 'drive')
 
 
 @pytest.fixture(scope='module')
@@ -316,19 +291,12 @@ def test_damage_is_reported_in_one_line(small_bags, tmp_path, name, data):
     problem_of(damaged)
 
 
-def test_errors_of_the_caller_pass_unchanged(tmp_path):
-    samples.write_ros2_bag(tmp_path / 'drive')
-
-    def fail_on_first_message():
-        with open_bag(tmp_path / 'drive') as bag:
-            for _ in bag.messages():
-                raise KeyError('mine')
-
-    with pytest.raises(KeyError, match='mine'):
-        fail_on_first_message()
-
-
-# --- writing whole or not at all ----------------------------------------------------------
+def test_errors_of_the_caller_pass_unchanged(small_bags):
+    with BagReader(small_bags / 'drive.mcap') as bag:
+        messages = bag.messages()
+        next(messages)
+        with pytest.raises(KeyError, match='mine'):
+            messages.throw(KeyError('mine'))
 
 
 def listing(folder):
@@ -430,39 +398,30 @@ def test_impossible_output_is_refused(tmp_path, name, storage, message):
     assert listing(tmp_path) == []
 
 
-def test_sqlite_bag_whose_path_is_no_uri_is_not_mixed_up(tmp_path):
-    samples.write_ros2_bag(tmp_path / 'a.db3')
-    shutil.copy(tmp_path / 'a.db3', tmp_path / 'a.db3#2.db3')
-    with pytest.raises(DataError, match='cannot have # in its path'):
-        open_bag(tmp_path / 'a.db3#2.db3')
-
-
 @pytest.mark.parametrize('name', ['a#1?.mcap', 'a [x]', 'ä ö'])
-def test_unusual_names_work_with_mcap(tmp_path, name):
+def test_unusual_names_work_with_mcap(tmp_path, small_bags, name):
     written = samples.write_ros2_bag(tmp_path / name)
     assert read_all(tmp_path / name) == written
     assert [p.name for p in tmp_path.iterdir()] == [name]
+    shutil.copy(small_bags / 'drive.db3', tmp_path / 'a#2.db3')
+    with pytest.raises(DataError, match='cannot have # in its path'):
+        BagReader(tmp_path / 'a#2.db3')
     (tmp_path / f'.{name}.partial-1').mkdir()
     assert [p.name for p in leftovers(tmp_path / name)] == [f'.{name}.partial-1']
 
 
-def test_topic_declared_twice(tmp_path):
-    with BagWriter(tmp_path / 'x') as bag:
-        bag.add_topic(cloud_topic('/a'))
-        with pytest.raises(DataError, match='topic /a twice'):
-            bag.add_topic(cloud_topic('/a'))
-
-
-def test_two_types_on_one_topic_are_refused(tmp_path):
+def test_a_topic_is_declared_once_and_has_one_type(tmp_path):
     with BagWriter(tmp_path / 'x.mcap') as bag:
         bag.add_topic(cloud_topic('/same'))
+        with pytest.raises(DataError, match='topic /same twice'):
+            bag.add_topic(cloud_topic('/same'))
         bag.add_topic(jazzy_topic('/diff', 'std_msgs/msg/String'))
         bag.write('/same', 1, encode_cloud(samples.cloud(n_ground=1, n_wall=1)))
         bag.write('/diff', 2, samples.string_message('x'))
     content = (tmp_path / 'x.mcap').read_bytes()
     (tmp_path / 'y.mcap').write_bytes(content.replace(b'/diff', b'/same'))
     with pytest.raises(DataError, match='topic /same has messages of two types'):
-        open_bag(tmp_path / 'y.mcap')
+        BagReader(tmp_path / 'y.mcap')
 
 
 def test_files_into_an_existing_folder_leave_the_others(tmp_path):
@@ -492,7 +451,7 @@ def test_without_rosbags_the_error_says_what_to_install(tmp_path):
         'from gp_ground_seg.data import bags\n'
         'from gp_ground_seg.data.point_cloud2 import decode_cloud\n'
         'from gp_ground_seg.errors import MissingDependencyError\n'
-        'for call in (bags.open_bag, bags.BagWriter, decode_cloud):\n'
+        'for call in (bags.BagReader, bags.BagWriter, decode_cloud):\n'
         '    try:\n'
         '        call(sys.argv[1])\n'
         '    except MissingDependencyError as error:\n'

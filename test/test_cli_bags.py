@@ -23,7 +23,7 @@ from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.cli import bags, options
 from gp_ground_seg.cli.main import main
-from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
 from gp_ground_seg.ros import lifecycle, playback
 from gp_ground_seg.ros.lifecycle import ros_session
@@ -84,7 +84,7 @@ def summary(capsys):
 
 
 def recorded(bag, topic):
-    with open_bag(bag) as reader:
+    with BagReader(bag) as reader:
         return [raw for _, _, raw in reader.messages([topic])]
 
 

@@ -15,7 +15,7 @@ import pytest
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.demo import Tally, check_scan, numbered_cloud, result_text
 from gp_ground_seg.cli.main import main
-from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import (
     decode_cloud,
     read_xyz,
@@ -233,7 +233,7 @@ def test_demo_without_data(rclpy, tmp_path):
         'birds_eye.png', 'drive.mcap', 'node.log'
     ]  # fmt: skip
     assert (folder / 'birds_eye.png').read_bytes().startswith(b'\x89PNG')
-    with open_bag(folder / 'drive.mcap') as bag:
+    with BagReader(folder / 'drive.mcap') as bag:
         n_points = sum(decode_cloud(raw).width for _, _, raw in bag.messages([INPUT]))
     assert f'{n_points:,}'.replace(',', ' ') + ' of these scans' in result.stdout
 

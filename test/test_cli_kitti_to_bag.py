@@ -13,7 +13,7 @@ from rosbags.interfaces import QosReliability
 
 from gp_ground_seg.cli.bags import EPOCH
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -45,7 +45,7 @@ def write_sequence(root, n_scans=5, n_labelled=5, times=TIMES):
 
 
 def read_clouds(path):
-    with open_bag(path) as bag:
+    with BagReader(path) as bag:
         assert bag.topics == {TOPIC: POINT_CLOUD2}
         return [(time, decode_cloud(raw)) for _, time, raw in bag.messages()]
 
@@ -67,7 +67,7 @@ def test_sequence_as_bag(convert, tmp_path, capsys, name, words, storage):
         f'5 frames (5 with labels), {5 * 1801} points, 0.4 s, written to {out}\n', '',
     )  # fmt: skip
     assert out.is_file() == ('.' in name)
-    with open_bag(out) as bag:
+    with BagReader(out) as bag:
         assert bag.storage == storage
         assert bag.topic(TOPIC).qos[0].reliability is QosReliability.RELIABLE
     clouds = read_clouds(out)

@@ -7,7 +7,6 @@ import sys
 
 import pytest
 
-import gp_ground_seg
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.cli.options import library_notes
 
@@ -52,24 +51,6 @@ def test_what_computes_nothing_imports_nothing_heavy(words):
     loaded = {name.split('.')[0] for name in done.stderr.split()}
     assert 'gp_ground_seg' in loaded
     assert not loaded & HEAVY
-
-
-def test_public_names_are_there_when_asked_for():
-    script = (
-        'import sys, gp_ground_seg\n'
-        'assert set(gp_ground_seg.__all__) <= set(dir(gp_ground_seg))\n'
-        "assert 'numpy' not in sys.modules\n"
-        'from gp_ground_seg import *\n'
-        "print(GroundSegmenter.__module__, 'numpy' in sys.modules)"
-    )
-    done = subprocess.run(
-        [sys.executable, '-c', script], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == ['gp_ground_seg.segmenter', 'True']
-    for name in gp_ground_seg.__all__:
-        assert getattr(gp_ground_seg, name) is not None
-    with pytest.raises(AttributeError, match='no attribute'):
-        gp_ground_seg.GroundSegmentor  # noqa: B018
 
 
 def test_what_the_library_logs_is_said_within_a_command_only(capsys):

@@ -6,7 +6,6 @@ import io
 import os
 import re
 import resource
-import shutil
 import signal
 import time
 from pathlib import Path
@@ -17,10 +16,9 @@ import pytest
 from cli_runner import error_line, run, start
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.data.bags import BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 
-BAGS = ['drive', 'drive.mcap', 'drive.db3', 'drive.bag']
 SUMMARY = re.compile(
     r'(\d+) frames?, (\d+) points?, (\d+\.\d)% ground, \d+\.\d ms per frame \(median, '
     r'segmentation only\), written to (.*)\n'
@@ -33,9 +31,7 @@ def _compiled():
     GroundSegmenter().segment(samples.scan())
 
 
-@pytest.fixture
-def segment():
-    return functools.partial(run, 'segment')
+segment = functools.partial(run, 'segment')
 
 
 @pytest.fixture(scope='module')
@@ -49,15 +45,15 @@ def write_bag(path, **changes):
     return path
 
 
-def write_scans(folder, n_scans=3):
+def write_scans(folder, n_scans=3, **changes):
     folder.mkdir(parents=True)
     for k in range(n_scans):
-        samples.scan(k).tofile(folder / f'{k:06d}.bin')
+        samples.scan(k, **changes).tofile(folder / f'{k:06d}.bin')
     return folder
 
 
 def read_messages(path):
-    with open_bag(path) as bag:
+    with BagReader(path) as bag:
         return list(bag.messages())
 
 
@@ -73,19 +69,15 @@ def assert_splits(source, result, topic, segmenter, ground='/ground', obstacles=
     before, after = read_messages(source), read_messages(result)
     assert [m for m in after if m[0] not in (ground, obstacles)] == before
     clouds = [m for m in before if m[0] == topic]
-    grounds = [m for m in after if m[0] == ground]
-    others = [m for m in after if m[0] == obstacles]
-    assert len(clouds) == len(grounds) == len(others) > 0
-    for (_, recorded, raw), (_, time_1, raw_1), (_, time_2, raw_2) in zip(
-        clouds, grounds, others, strict=True
-    ):
-        assert recorded == time_1 == time_2
+    parts = [[m for m in after if m[0] == name] for name in (ground, obstacles)]
+    for (_, recorded, raw), *found in zip(clouds, *parts, strict=True):
         cloud = decode_cloud(raw)
         label = segmenter.segment(read_xyz(cloud)).label
         assert {Label.GROUND, Label.OBSTACLE} <= set(label)
         points = cloud.data.reshape(-1, cloud.point_step)
-        for part_raw, wanted in ((raw_1, Label.GROUND), (raw_2, Label.OBSTACLE)):
+        for (_, time_of_part, part_raw), wanted in zip(found, (1, 2), strict=True):
             part = decode_cloud(part_raw)
+            assert time_of_part == recorded
             assert part.header == cloud.header
             assert (part.fields, part.point_step) == (cloud.fields, cloud.point_step)
             kept = part.data.reshape(-1, cloud.point_step)
@@ -93,16 +85,9 @@ def assert_splits(source, result, topic, segmenter, ground='/ground', obstacles=
     return len(clouds)
 
 
-@pytest.mark.parametrize(
-    ('name', 'expected'),
-    [
-        ('drive', 'drive_ground'),
-        ('drive.mcap', 'drive_ground.mcap'),
-        ('drive.db3', 'drive_ground.db3'),
-        ('drive.bag', 'drive_ground'),
-    ],
-)
-def test_bag_gets_ground_and_obstacles(segment, segmenter, tmp_path, capsys, name, expected):
+@pytest.mark.parametrize('name', ['drive', 'drive.mcap', 'drive.db3', 'drive.bag'])
+def test_bag_gets_ground_and_obstacles(segmenter, tmp_path, capsys, name):
+    expected = name.removesuffix('.bag').replace('drive', 'drive_ground')
     source = write_bag(tmp_path / name)
     assert segment(source, '--quiet') == 0
     said = capsys.readouterr()
@@ -125,40 +110,15 @@ def test_bag_gets_ground_and_obstacles(segment, segmenter, tmp_path, capsys, nam
         ('out.db3', [], 'sqlite3'),
     ],
 )
-def test_format_of_the_output(segment, tmp_path, output, options, storage):
+def test_format_of_the_output(tmp_path, output, options, storage):
     source = tmp_path / 'drive'
     samples.write_ros2_bag(source, storage='sqlite3')
     assert segment(source, '-o', tmp_path / output, *options) == 0
-    with open_bag(tmp_path / output) as bag:
+    with BagReader(tmp_path / output) as bag:
         assert bag.storage == storage
 
 
-def test_organised_big_endian_float64_cloud(segment, segmenter, tmp_path):
-    points = samples.scan(0)[:1800, :3].astype('>f8')
-    base = samples.cloud(0)
-    fields = [type(base.fields[0])(name, 8 * k, 8, 1) for k, name in enumerate('xyz')]
-    rows = np.zeros((20, 90 * 24 + 5), dtype=np.uint8)
-    rows[:, : 90 * 24] = points.view(np.uint8).reshape(20, -1)
-    cloud = dataclasses.replace(
-        base, height=20, width=90, fields=fields, point_step=24, row_step=90 * 24 + 5,
-        data=rows.reshape(-1), is_bigendian=True,
-    )  # fmt: skip
-    with BagWriter(tmp_path / 'in.mcap') as bag:
-        bag.add_topic(cloud_topic('/points'))
-        bag.write('/points', 7, encode_cloud(cloud))
-    assert segment(tmp_path / 'in.mcap') == 0
-    parts = {
-        topic: decode_cloud(raw) for topic, _, raw in read_messages(tmp_path / 'in_ground.mcap')
-    }
-    label = segmenter.segment(points.astype(np.float64)).label
-    for topic, wanted in (('/ground', Label.GROUND), ('/obstacles', Label.OBSTACLE)):
-        part = parts[topic]
-        assert part.is_bigendian
-        assert part.data.tobytes() == points[label == wanted].tobytes()
-        np.testing.assert_array_equal(read_xyz(part), points[label == wanted])
-
-
-def test_empty_and_all_nan_clouds_give_empty_clouds(segment, tmp_path):
+def test_empty_and_all_nan_clouds_give_empty_clouds(tmp_path):
     nothing = select_points(samples.cloud(0), np.zeros(1801, dtype=bool))
     nan = select_points(samples.cloud(0), np.arange(1801) == 1800)
     with BagWriter(tmp_path / 'in.mcap') as bag:
@@ -166,15 +126,13 @@ def test_empty_and_all_nan_clouds_give_empty_clouds(segment, tmp_path):
         for k, cloud in enumerate((nothing, nan)):
             bag.write('/points', k, encode_cloud(cloud))
     assert segment(tmp_path / 'in.mcap') == 0
-    widths = [
-        (topic, decode_cloud(raw).width)
-        for topic, _, raw in read_messages(tmp_path / 'in_ground.mcap')
-    ]
+    messages = read_messages(tmp_path / 'in_ground.mcap')
+    widths = [(topic, decode_cloud(raw).width) for topic, _, raw in messages]
     outputs = [('/ground', 0), ('/obstacles', 0)]
     assert widths == [('/points', 0), *outputs, ('/points', 1), *outputs]
 
 
-def test_topics_can_be_chosen_renamed_and_dropped(segment, segmenter, tmp_path, capsys):
+def test_topics_can_be_chosen_renamed_and_dropped(segmenter, tmp_path, capsys):
     source = tmp_path / 'two.mcap'
     samples.write_ros2_bag(source, topics=('/front', '/ground'))
     for words, message in (
@@ -190,7 +148,7 @@ def test_topics_can_be_chosen_renamed_and_dropped(segment, segmenter, tmp_path, 
     # Dropping a topic frees its name, and the segmented one may be dropped as well.
     words = ['--topic', '/front', '--drop', '/ground', '--drop', '/front', '--force']
     assert segment(source, *words) == 0
-    with open_bag(result) as bag:
+    with BagReader(result) as bag:
         assert list(bag.topics) == ['/note', '/ground', '/obstacles']
         assert [bag.n_messages(topic) for topic in bag.topics] == [3, 3, 3]
 
@@ -214,7 +172,7 @@ def test_topics_can_be_chosen_renamed_and_dropped(segment, segmenter, tmp_path, 
         (['--set', 'label.ground_tolerance=-1'], r'label\.ground_tolerance'),
     ],
 )
-def test_refused_for_bags(segment, tmp_path, capsys, monkeypatch, words, message):
+def test_refused_for_bags(tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     content = write_bag(Path('drive.mcap')).read_bytes()
     assert segment('drive.mcap', *words) == 2
@@ -223,9 +181,8 @@ def test_refused_for_bags(segment, tmp_path, capsys, monkeypatch, words, message
     assert Path('drive.mcap').read_bytes() == content
 
 
-@pytest.mark.parametrize('name', BAGS)
-def test_second_run_needs_force(segment, tmp_path, capsys, name):
-    source = write_bag(tmp_path / name, n_clouds=1)
+def test_second_run_needs_force(tmp_path, capsys):
+    source = write_bag(tmp_path / 'drive.bag', n_clouds=1)
     out = tmp_path / 'out'
     assert segment(source, '-o', out) == 0
     before = {path: path.read_bytes() for path in out.iterdir()}
@@ -254,7 +211,7 @@ def without_x(raw):
     ],
 )
 @pytest.mark.parametrize('words', [[], ['--force']])
-def test_bad_cloud_stops_the_run_and_is_named(segment, tmp_path, capsys, damage, message, words):
+def test_bad_cloud_stops_the_run_and_is_named(tmp_path, capsys, damage, message, words):
     out = tmp_path / 'out'
     before = samples.write_ros2_bag(out) if words else None
     with BagWriter(tmp_path / 'in.mcap') as bag:
@@ -270,17 +227,7 @@ def test_bad_cloud_stops_the_run_and_is_named(segment, tmp_path, capsys, damage,
         assert read_messages(out) == before
 
 
-@pytest.mark.parametrize('name', BAGS)
-def test_damaged_bag(segment, tmp_path, capsys, name):
-    source = write_bag(tmp_path / name)
-    file = next(path for path in (source / 'drive.mcap', source) if path.is_file())
-    file.write_bytes(file.read_bytes()[:9000])
-    assert segment(source) == 2
-    assert re.search('cannot be read as a bag|truncated', error_line(capsys))
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_note_on_migrated_topic(segment, tmp_path, capsys):
+def test_note_on_migrated_topic(tmp_path, capsys):
     write_bag(tmp_path / 'drive.bag', n_clouds=1)
     assert segment(tmp_path / 'drive.bag') == 0
     assert 'note: topic /range: sensor_msgs/msg/Range has other fields' in capsys.readouterr().err
@@ -305,14 +252,12 @@ def expected_labels(segmenter, k, ground=40, obstacle=99):
         ('velodyne', 'velodyne/000000.bin', 'velodyne/000000_ground'),
     ],
 )
-def test_scans_give_label_files(segment, segmenter, tmp_path, capsys, scans, given, expected):
+def test_scans_give_label_files(segmenter, tmp_path, capsys, scans, given, expected):
     write_scans(tmp_path / scans)
     assert segment(tmp_path / given) == 0
     out = tmp_path / expected
     n_scans = 1 if given.endswith('.bin') else 3
-    assert sorted(path.name for path in out.iterdir()) == [
-        f'{k:06d}.label' for k in range(n_scans)
-    ]
+    assert len(list(out.iterdir())) == n_scans
     for k in range(n_scans):
         written = np.fromfile(out / f'{k:06d}.label', dtype='<u4')
         np.testing.assert_array_equal(written, expected_labels(segmenter, k))
@@ -324,7 +269,7 @@ def test_scans_give_label_files(segment, segmenter, tmp_path, capsys, scans, giv
     assert hidden(out.parent) == hidden(out) == []
 
 
-def test_raw_labels_into_one_file_and_settings_are_used(segment, segmenter, tmp_path):
+def test_raw_labels_into_one_file_and_settings_are_used(segmenter, tmp_path):
     scan = write_scans(tmp_path / 'velodyne') / '000000.bin'
     words = ['-o', tmp_path / 'one.label', '--raw']
     assert segment(scan, *words) == 0
@@ -336,13 +281,13 @@ def test_raw_labels_into_one_file_and_settings_are_used(segment, segmenter, tmp_
     assert np.count_nonzero(narrow == 1) < np.count_nonzero(written == 1)
 
 
-def test_default_name_for_the_folder_one_is_in(segment, tmp_path, monkeypatch):
+def test_default_name_for_the_folder_one_is_in(tmp_path, monkeypatch):
     monkeypatch.chdir(write_scans(tmp_path / 'velodyne', n_scans=1))
     assert segment('.') == 0
     assert (tmp_path / 'velodyne_ground' / '000000.label').is_file()
 
 
-def test_label_files_are_replaced_only_with_force(segment, segmenter, tmp_path, capsys):
+def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
     write_scans(tmp_path / 'velodyne', n_scans=2)
     out = tmp_path / 'labels'
     out.mkdir()
@@ -368,7 +313,6 @@ def test_label_files_are_replaced_only_with_force(segment, segmenter, tmp_path, 
         ('empty', [], r'empty: no \.bin file in it, and not a rosbag2 folder$'),
         ('root', [], r'give one of its sequences \(00, 08\), as in root/sequences/00'),
         ('unfinished', [], r'no metadata\.yaml in it\); bag files in it.*: x_0\.mcap'),
-        ('cut', [], r'000000\.bin: 10 bytes is not a whole number of points'),
         ('notes.txt', [], r'not a scan or bag; accepted are \.bin'),
         ('good', ['--topic', '/a'], r'--topic: is for bags'),
         ('good', ['--format', 'mcap'], r'--format: is for bags'),
@@ -378,15 +322,14 @@ def test_label_files_are_replaced_only_with_force(segment, segmenter, tmp_path, 
         ('good', ['-o', 'no/such/x'], r'the folder .*no/such does not exist'),
     ],
 )
-def test_refused_for_scans(segment, tmp_path, capsys, monkeypatch, given, words, message):
+def test_refused_for_scans(tmp_path, capsys, monkeypatch, given, words, message):
     monkeypatch.chdir(tmp_path)
     write_scans(Path('good'), n_scans=1)
     write_scans(Path('root/sequences/00/velodyne'), n_scans=1)
     write_scans(Path('root/sequences/08/velodyne'), n_scans=1)
-    for folder in ('empty', 'unfinished', 'cut'):
+    for folder in ('empty', 'unfinished'):
         Path(folder).mkdir()
     Path('unfinished/x_0.mcap').write_bytes(b'')
-    Path('cut/000000.bin').write_bytes(b'0123456789')
     Path('notes.txt').write_text('mine')
     before = sorted(Path().rglob('*'))
     assert segment(given, *words) == 2
@@ -394,7 +337,7 @@ def test_refused_for_scans(segment, tmp_path, capsys, monkeypatch, given, words,
     assert sorted(Path().rglob('*')) == before
 
 
-def test_a_truncated_scan_late_in_a_folder_leaves_nothing(segment, tmp_path, capsys):
+def test_a_truncated_scan_late_in_a_folder_leaves_nothing(tmp_path, capsys):
     folder = write_scans(tmp_path / 'velodyne')
     (folder / '000003.bin').write_bytes(b'0123456789')
     assert segment(folder) == 2
@@ -411,7 +354,7 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize(('words', 'shown'), [([], True), (['--quiet'], False)])
-def test_progress_bar_on_a_terminal(segment, tmp_path, monkeypatch, words, shown):
+def test_progress_bar_on_a_terminal(tmp_path, monkeypatch, words, shown):
     write_scans(tmp_path / 'velodyne')
     terminal = Terminal()
     monkeypatch.setattr('sys.stderr', terminal)
@@ -428,10 +371,7 @@ def long_inputs(tmp_path_factory):
     """Inputs that take a few seconds."""
     folder = tmp_path_factory.mktemp('long')
     samples.write_ros2_bag(folder / 'long.mcap', n_clouds=150, n_ground=30_000, n_wall=5000)
-    (folder / 'velodyne').mkdir()
-    scan = samples.scan(0, 30_000, 5000)
-    for k in range(100):
-        scan.tofile(folder / 'velodyne' / f'{k:06d}.bin')
+    write_scans(folder / 'velodyne', 100, n_ground=30_000, n_wall=5000)
     return folder
 
 
@@ -456,34 +396,26 @@ def stop_in_the_middle(tmp_path, source, out, how, *words):
     ('source', 'out'), [('long.mcap', 'out'), ('long.mcap', 'out.mcap'), ('velodyne', 'labels')]
 )
 def test_a_killed_run_leaves_nothing_under_the_final_name(
-    segment, tmp_path, capsys, long_inputs, source, out
+    tmp_path, capsys, long_inputs, source, out
 ):
     code, _ = stop_in_the_middle(tmp_path, long_inputs / source, out, signal.SIGKILL)
     assert code == -signal.SIGKILL
     assert not (tmp_path / out).exists()
     (left,) = hidden(tmp_path)
-    # The next run is not in its way, and says that it is there.
-    if source == 'velodyne':
-        write_scans(tmp_path / 'short', n_scans=1)
-    else:
-        samples.write_ros2_bag(tmp_path / 'short', n_clouds=1)
+    # It is not in the way of the next run, which says that it is there.
+    write = write_scans if source == 'velodyne' else samples.write_ros2_bag
+    write(tmp_path / 'short', 1)
     assert segment(tmp_path / 'short', '-o', tmp_path / out) == 0
     assert (tmp_path / out).exists()
     assert f'{left} is the unfinished output of another run' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ('how', 'end'),
-    [
-        (signal.SIGKILL, (-signal.SIGKILL, [])),
-        (signal.SIGINT, (130, ['gp-ground-seg: interrupted'])),
-    ],
-)
-def test_a_stopped_run_with_force_leaves_the_old_bag(tmp_path, long_inputs, how, end):
+@pytest.mark.parametrize(('how', 'code'), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
+def test_a_stopped_run_with_force_leaves_the_old_bag(tmp_path, long_inputs, how, code):
     before = samples.write_ros2_bag(tmp_path / 'out')
-    code, said = stop_in_the_middle(tmp_path, long_inputs / 'long.mcap', 'out', how, '--force')
-    assert code == end[0]
-    assert said[len(said) - len(end[1]) :] == end[1]
+    found, said = stop_in_the_middle(tmp_path, long_inputs / 'long.mcap', 'out', how, '--force')
+    assert found == code
+    assert how == signal.SIGKILL or said == ['gp-ground-seg: interrupted']
     assert read_messages(tmp_path / 'out') == before
     assert bool(hidden(tmp_path)) == (how == signal.SIGKILL)
 
@@ -496,10 +428,8 @@ def test_a_full_disk_is_one_line(tmp_path, long_inputs, source, out):
     def limit_file_size():
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 
-    shutil.copytree(long_inputs / 'velodyne', tmp_path / 'in' / 'velodyne')
-    shutil.copy(long_inputs / 'long.mcap', tmp_path / 'in')
     process = start(
-        'segment', tmp_path / 'in' / source, '-o', tmp_path / out, '--quiet',
+        'segment', long_inputs / source, '-o', tmp_path / out, '--quiet',
         preexec_fn=limit_file_size, env={**os.environ, 'NUMBA_DISABLE_JIT': '0'},
     )  # fmt: skip
     output, said = process.communicate(timeout=120)
@@ -507,32 +437,4 @@ def test_a_full_disk_is_one_line(tmp_path, long_inputs, source, out):
     last_line = said.splitlines()[-1]
     assert re.fullmatch(rf'gp-ground-seg: error: .*{out}.*: cannot be written: .*', last_line)
     assert 'Traceback' not in said
-    assert [path.name for path in tmp_path.iterdir()] == ['in']
-
-
-# --- real frames --------------------------------------------------------------------------
-
-
-def test_kitti_frames_as_scans_and_as_bag_get_the_same_labels(segment, tmp_path, kitti):
-    sequence = kitti / 'sequences' / '00'
-    (tmp_path / 'velodyne').mkdir()
-    for name in ('000000.bin', '000001.bin'):
-        shutil.copy(sequence / 'velodyne' / name, tmp_path / 'velodyne')
-    bag = tmp_path / 'kitti.mcap'
-    words = [kitti, '--sequence', '00', bag, '--count', '2']
-    assert run('kitti-to-bag', *words) == 0
-    assert segment(tmp_path / 'velodyne', '--raw') == 0
-    assert segment(bag) == 0
-    parts = {'/ground': [], '/obstacles': []}
-    for topic, _, raw in read_messages(tmp_path / 'kitti_ground.mcap'):
-        if topic in parts:
-            parts[topic].append(decode_cloud(raw))
-    for k in range(2):
-        points = np.fromfile(tmp_path / 'velodyne' / f'00000{k}.bin', '<f4').reshape(-1, 4)
-        label = np.fromfile(tmp_path / 'velodyne_ground' / f'00000{k}.label', '<u4')
-        for topic, value in (('/ground', 1), ('/obstacles', 2)):
-            cloud = parts[topic][k]
-            assert [field.name for field in cloud.fields] == ['x', 'y', 'z', 'intensity', 'label']
-            kept = cloud.data.reshape(-1, 20)[:, :16].copy().view('<f4')
-            np.testing.assert_array_equal(kept, points[label == value])
-        assert 0.2 < np.mean(label == 1) < 0.8
+    assert list(tmp_path.iterdir()) == []

@@ -18,7 +18,7 @@ from ros_helpers import PATIENCE
 
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.cli.demo import check_scan, numbered_cloud
-from gp_ground_seg.data.bags import BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.evaluation.metrics import count_confusion
 from gp_ground_seg.ros.lifecycle import large_cloud_transport, ros_session
@@ -118,7 +118,7 @@ def assert_is_what_the_library_says(machine, sent):
 
 
 def read_clouds(bag, topic):
-    with open_bag(bag) as reader:
+    with BagReader(bag) as reader:
         return [decode_cloud(raw) for _, _, raw in reader.messages([topic])]
 
 

@@ -21,6 +21,7 @@ from gp_ground_seg.plotting.segment import SegmentView, line_ends, plot_segment,
 
 SEGMENT = 90
 ROAD, BUILDING, UNLABELLED = 40, 50, 0
+TRUE_GROUND_COLOUR = colours.TRUTH_COLOURS['true ground'][1]
 
 
 def ahead(n_points=1500, seed=0):
@@ -96,8 +97,8 @@ def test_line_ends_by_hand(slope, ends):
 def test_everything_is_drawn(draw, scan, tmp_path, capsys):
     upper, lower = draw('--labels', scan.with_suffix('.label'))
     for colour in (
-        colours.TRUE_GROUND_COLOUR,
-        colours.TRUE_OBSTACLE_COLOUR,
+        TRUE_GROUND_COLOUR,
+        colours.TRUTH_COLOURS['true obstacle'][1],
         colours.POINT_COLOUR,
         colours.INLIER_COLOUR,
         colours.SURFACE_COLOUR,
@@ -114,17 +115,14 @@ def test_everything_is_drawn(draw, scan, tmp_path, capsys):
     )
 
 
-def test_without_labels_the_truth_is_not_coloured(draw):
-    upper, _ = draw()
-    assert count(upper, colours.POINT_COLOUR) > 100
-    assert count(upper, colours.TRUE_GROUND_COLOUR) == 0
-
-
 @pytest.mark.parametrize('model', ['line_gradient', 'constant'])
 def test_pseudo_inputs_only_where_they_act(draw, model):
-    _, lower = draw('--set', f'length_scale.model={model}')
+    upper, lower = draw('--set', f'length_scale.model={model}')
     assert count(lower, colours.PSEUDO_INPUT_COLOUR) == 0
     assert count(lower, colours.SURFACE_COLOUR) > 300
+    # Without labels the truth is not coloured.
+    assert count(upper, colours.POINT_COLOUR) > 100
+    assert count(upper, TRUE_GROUND_COLOUR) == 0
 
 
 def test_azimuth_is_another_way_to_say_segment_and_a_pdf_is_the_same_each_time(draw, tmp_path):
@@ -168,16 +166,12 @@ def test_what_is_drawn_is_the_result():
     assert np.abs(np.log(at_pseudo / values)).max() < 1.0
 
 
-@pytest.mark.parametrize('with_truth', [False, True])
-@pytest.mark.parametrize(
-    'points', [np.zeros((0, 3)), np.full((3, 4), np.nan), np.array([[5.0, 0.1, 4.0]])]
-)
-def test_segments_with_nothing_to_see(tmp_path, points, with_truth):
-    config = Config()
-    result = GroundSegmenter(config).segment(points)
-    truth = result.label if with_truth else None
-    plot_segment(result, config, points, SEGMENT, tmp_path / 'a.png', truth, title=r'$\none _ %')
-    assert imread(tmp_path / 'a.png').ndim == 3
+@pytest.mark.parametrize('points', [np.full((3, 4), np.nan), np.array([[5.0, 0.1, 4.0]])])
+def test_segments_with_nothing_to_see(tmp_path, points):
+    result, path = GroundSegmenter().segment(points), tmp_path / 'a.png'
+    for truth in (result.label, None):
+        plot_segment(result, Config(), points, SEGMENT, path, truth, title=r'$\none _ %')
+        assert imread(path).ndim == 3
 
 
 def test_an_existing_file_is_kept_without_force(scan, draw, tmp_path, capsys):
@@ -209,12 +203,10 @@ def test_errors_are_said(scan, tmp_path, monkeypatch, capsys, words, message):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    'words', [['-o', 'a.png'], ['--segment', '1', '--azimuth', '1', '-o', 'a.png']]
-)
+@pytest.mark.parametrize('words', [[], ['--segment', '1', '--azimuth', '1']])
 def test_one_way_to_name_the_segment(scan, words):
     with pytest.raises(SystemExit, match='2'):
-        run('plot', 'segment', scan, *words)
+        run('plot', 'segment', scan, '-o', 'a.png', *words)
 
 
 def test_shapes_have_to_fit(tmp_path):

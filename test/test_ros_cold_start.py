@@ -214,8 +214,10 @@ def test_relative_cache_folder_and_path_are_not_those_of_the_child(monkeypatch, 
     monkeypatch.setattr(warm_up, 'code_folder', lambda: tmp_path)
     monkeypatch.setattr(sys, 'path', ['', 'here', *sys.path])
     monkeypatch.setenv('NUMBA_CACHE_DIR', 'code')
-    loader = BackendLoader(lambda: None)
+    done = threading.Event()
+    loader = BackendLoader(done.set)
     loader.start(CONFIG)
+    assert done.wait(60.0)
     loader.close()
     assert seen['cwd'] == '/'
     assert seen['env']['NUMBA_CACHE_DIR'] == os.path.abspath('code')

@@ -47,15 +47,6 @@ def test_every_kind_has_a_class_and_only_terrain_is_ground():
     }
 
 
-def test_existing_sequence_is_left_alone(tmp_path):
-    mine = tmp_path / 'sequences' / '00' / 'notes.txt'
-    mine.parent.mkdir(parents=True)
-    mine.write_text('mine')
-    with pytest.raises(DataError, match='exists'):
-        write_semantic_kitti(drive(), tmp_path, '00')
-    assert [path.name for path in mine.parent.iterdir()] == ['notes.txt']
-
-
 def broken_drive():
     yield from drive(1)
     raise KeyboardInterrupt
@@ -72,10 +63,13 @@ def test_a_drive_that_fails_leaves_nothing(tmp_path, scans, kind, message):
     assert list((tmp_path / 'sequences').iterdir()) == []
 
 
-@pytest.mark.parametrize('name', ['', '.', '..', 'a/b', '../00'])
-def test_bad_names_are_refused(tmp_path, name):
-    with pytest.raises(DataError, match='one folder'):
+@pytest.mark.parametrize('name', ['', '.', '..', 'a/b', '../00', 'mine'])
+def test_bad_and_taken_names_are_refused(tmp_path, name):
+    mine = tmp_path / 'sequences' / 'mine'
+    mine.mkdir(parents=True)
+    with pytest.raises(DataError, match='exists' if name == 'mine' else 'one folder'):
         write_semantic_kitti(drive(1), tmp_path, name)
+    assert [*tmp_path.rglob('*')] == [mine.parent, mine]
 
 
 def test_unwritable_root_is_one_line(tmp_path):

@@ -36,21 +36,17 @@ def rays_towards(rng, solid, n):
     return direction / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
-solids = st.builds(
-    lambda x, y, bottom, height, length, width, yaw, round_: (
-        Cylinder(Kind.POLE, x, y, bottom, bottom + height, width)
-        if round_
-        else Box(Kind.BOX, x, y, bottom, bottom + height, length, width, yaw)
-    ),
-    st.sampled_from([-20.0, -7.0, 6.0, 15.0]),
-    st.floats(-20.0, 20.0),
-    st.floats(-3.0, 4.0),
-    st.floats(0.3, 6.0),
-    st.floats(0.3, 8.0),
-    st.floats(0.3, 3.0),
-    st.floats(-4.0, 4.0),
-    st.booleans(),
-).filter(lambda solid: math.hypot(solid.x, solid.y) > solid.radius + 0.1)
+@st.composite
+def draw_solid(draw):
+    x = draw(st.sampled_from([-20.0, -7.0, 6.0, 15.0]))
+    y, bottom, height = (draw(st.floats(*ends)) for ends in ((-20, 20), (-3, 4), (0.3, 6)))
+    length, width, yaw = (draw(st.floats(*ends)) for ends in ((0.3, 8), (0.3, 3), (-4, 4)))
+    if draw(st.booleans()):
+        return Cylinder(Kind.POLE, x, y, bottom, bottom + height, width)
+    return Box(Kind.BOX, x, y, bottom, bottom + height, length, width, yaw)
+
+
+solids = draw_solid().filter(lambda s: math.hypot(s.x, s.y) > s.radius + 0.1)
 
 
 @given(solid=solids, seed=st.integers(0, 2**32 - 1))

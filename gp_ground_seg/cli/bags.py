@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli.options import count, new_parser, note, note_leftovers, progress_bar
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError
@@ -213,7 +213,7 @@ def run_play(arguments: argparse.Namespace) -> int:
     options = PlayOptions(
         arguments.rate, arguments.start, arguments.duration, arguments.loop, arguments.clock
     )
-    with open_bag(arguments.bag) as bag:
+    with BagReader(arguments.bag) as bag:
         topics = _choose_topics(bag, arguments)
         others = [f'{name} ({kind})' for name, kind in bag.topics.items() if name not in topics]
         if others and not arguments.quiet:

@@ -19,7 +19,7 @@ from gp_ground_seg.cli.options import (
 )
 from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.bag_files import is_bag
-from gp_ground_seg.data.bags import open_bag
+from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
@@ -200,7 +200,7 @@ def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[B
 
 def _bag_frames(source: Path, n_frames: int, topic: str | None) -> list[BenchFrame]:
     frames = []
-    with open_bag(source) as bag:
+    with BagReader(source) as bag:
         name = bag.pick_point_cloud_topic(topic)
         wanted = {k: run_name for run_name, k in runs(name, bag.n_messages(name), n_frames)}
         for k, (_, time, raw) in enumerate(bag.messages([name])):
@@ -210,7 +210,8 @@ def _bag_frames(source: Path, n_frames: int, topic: str | None) -> list[BenchFra
                 except PointCloudError as error:
                     raise DataError(f'{source}: message {k} of topic {name}: {error}') from error
                 # With full intensity Patchwork++ drops no point as noise.
-                points = np.column_stack([xyz, np.ones(len(xyz))]).astype(np.float32)
+                points = np.ones((len(xyz), 4), dtype=np.float32)
+                points[:, :3] = xyz
                 frames.append(BenchFrame(wanted[k], str(time), points))
     return frames
 

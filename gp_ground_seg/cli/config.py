@@ -9,16 +9,8 @@ from pathlib import Path
 from gp_ground_seg.cli.options import add_config_options, config_from_options, new_parser
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import DataError
+from gp_ground_seg.parameters import export
 from gp_ground_seg.parameters.config import Config, parameter_specs
-from gp_ground_seg.parameters.export import (
-    README_PATH,
-    differences,
-    file_problems,
-    generated_files,
-    to_markdown_table,
-    to_yaml,
-    yaml_scalar,
-)
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.parameters.yaml_io import read_parameters
 
@@ -81,12 +73,9 @@ def run_dump(arguments: argparse.Namespace) -> int:
     config = config_from_options(arguments)
     preset = find_preset(arguments.preset)
     title = preset.title if config == preset.config else ''
-    reasons = {
-        name: reason
-        for name, reason in preset.reasons.items()
-        if config[name] == preset.config[name]
-    }
-    print(to_yaml(config, title, reasons), end='')
+    kept = [name for name in preset.reasons if config[name] == preset.config[name]]
+    reasons = {name: preset.reasons[name] for name in kept}
+    print(export.to_yaml(config, title, reasons), end='')
     return 0
 
 
@@ -94,18 +83,16 @@ def run_check(arguments: argparse.Namespace) -> int:
     """Print the problems of each file, or how much it gives and changes."""
     code = 0
     for path in arguments.files:
-        problems = file_problems(path)
+        problems = export.file_problems(path)
         for problem in problems:
             print(f'{path}: {problem}', file=sys.stderr)
         if problems:
             code = EXIT_WRONG
-        else:
-            n_given = len(read_parameters(path).values)
-            n_changed = len(differences(Config(), Config.from_yaml(path)))
-            print(
-                f'{path}: good; {n_given} of {len(parameter_specs())} parameters given, '
-                f'{n_changed} differ from the defaults'
-            )
+            continue
+        n_given = len(read_parameters(path).values)
+        n_changed = len(export.differences(Config(), Config.from_yaml(path)))
+        given = f'{n_given} of {len(parameter_specs())} parameters given'
+        print(f'{path}: good; {given}, {n_changed} differ from the defaults')
     return code
 
 
@@ -115,10 +102,10 @@ def run_diff(arguments: argparse.Namespace) -> int:
         PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
         for name in (arguments.a, arguments.b)
     )
-    different = differences(first, second)
+    different = export.differences(first, second)
     for spec, before, after in different:
         unit = f' {spec.unit}' if spec.unit else ''
-        print(f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)}{unit}')
+        print(f'{spec.name}: {export.yaml_scalar(before)} -> {export.yaml_scalar(after)}{unit}')
     return EXIT_DIFFERENT if different else 0
 
 
@@ -132,30 +119,26 @@ def run_presets(_arguments: argparse.Namespace) -> int:
 
 def run_table(_arguments: argparse.Namespace) -> int:
     """Print the Markdown table."""
-    print(to_markdown_table(), end='')
+    print(export.to_markdown_table(), end='')
     return 0
 
 
 def run_generate(arguments: argparse.Namespace) -> int:
     """Rewrite the generated files that have changed, and name all of them."""
     root = Path(arguments.root)
-    readme = root / README_PATH
+    readme = root / export.README_PATH
     if not readme.is_file():
         raise DataError(f'{readme}: no such file; name the root of a checkout')
     try:
-        files = generated_files(readme.read_bytes().decode('utf-8'))
+        files = export.generated_files(readme.read_bytes().decode('utf-8'))
     except DataError as error:
         raise DataError(f'{readme}: {error}') from error
     for name, text in files.items():
-        _rewrite(root / name, text)
+        path, data = root / name, text.encode('utf-8')
+        changed = not path.exists() or path.read_bytes() != data
+        if changed:
+            path.parent.mkdir(exist_ok=True)
+            with staged_file(path, force=True) as part:
+                part.write_bytes(data)
+        print(f'{path}: {"rewritten" if changed else "unchanged"}')
     return 0
-
-
-def _rewrite(path: Path, text: str) -> None:
-    data = text.encode('utf-8')
-    changed = not path.exists() or path.read_bytes() != data
-    if changed:
-        path.parent.mkdir(exist_ok=True)
-        with staged_file(path, force=True) as part:
-            part.write_bytes(data)
-    print(f'{path}: {"rewritten" if changed else "unchanged"}')

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from gp_ground_seg.cli.bags import above_zero, scan_cloud
 from gp_ground_seg.cli.options import count, new_parser, positive, progress_bar
 from gp_ground_seg.data.atomic_output import staged_files
-from gp_ground_seg.data.bags import BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, stamp_of
 from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
@@ -339,7 +339,7 @@ def _write(drive: Drive, path: Path, session: Session) -> list[tuple[int, int]]:
 
 def _play(path: Path, n_frames: int, wanted: float | None, probe: Probe) -> dict[str, Any]:
     """Send the scans of a bag to the node; return the statistics of `rate_result`."""
-    with open_bag(path) as bag:
+    with BagReader(path) as bag:
         rate = wanted or sustainable_rate(
             next(decode_cloud(raw) for _, _, raw in bag.messages([INPUT])), probe
         )

@@ -108,17 +108,9 @@ def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command.
+    """Run the command of `argv`, by default of the process, and return its exit code.
 
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Words after the program's name; those of the process by default.
-
-    Returns
-    -------
-    int
-        Exit code: 0, 2 for an error said in one line, 130 when interrupted.
+    It is that of the command, 2 after an error, which takes one line, or 130 when interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:

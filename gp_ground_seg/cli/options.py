@@ -1,4 +1,4 @@
-"""What several commands share: options, kinds of values, notes, progress over frames."""
+"""Shared by the commands: options, kinds of values, notes, progress over frames."""
 
 from __future__ import annotations
 
@@ -65,31 +65,17 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
 
 def add_config_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--preset NAME``, ``--config FILE`` and ``--set NAME=VALUE``."""
-    parser.add_argument(
-        '--preset',
-        metavar='NAME',
-        default=DEFAULT_PRESET,
-        help=f'parameters of a sensor: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})',
-    )
+    presets = f'parameters of a sensor: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})'
+    parser.add_argument('--preset', metavar='NAME', default=DEFAULT_PRESET, help=presets)
     parser.add_argument('--config', metavar='FILE', help='parameter file (YAML), over the preset')
     parser.add_argument(
-        '--set',
-        metavar='NAME=VALUE',
-        action='append',
-        default=[],
-        dest='settings',
+        '--set', metavar='NAME=VALUE', action='append', default=[], dest='settings',
         help='one parameter, as in --set label.ground_tolerance=0.15 (may be repeated)',
-    )
+    )  # fmt: skip
 
 
 def config_from_options(arguments: argparse.Namespace) -> Config:
-    """Return the preset, changed by the file, changed by the settings.
-
-    Raises
-    ------
-    ConfigError
-        If the preset, the file or a setting is not accepted.
-    """
+    """Return the preset, changed by the file, changed by the settings."""
     config = find_preset(arguments.preset).config
     if arguments.config:
         config = Config.from_yaml(arguments.config, config)
@@ -97,13 +83,7 @@ def config_from_options(arguments: argparse.Namespace) -> Config:
 
 
 def parse_setting(setting: str) -> tuple[str, Any]:
-    """Split ``NAME=VALUE``; the parameter's own checks come with `Config.replace`.
-
-    Raises
-    ------
-    ConfigError
-        If it is not of that form.
-    """
+    """Split ``NAME=VALUE``; the parameter's own checks come with `Config.replace`."""
     name, separator, text = setting.partition('=')
     if not separator:
         raise ConfigError(f'--set {setting}: must be NAME=VALUE')
@@ -150,11 +130,7 @@ def count(number: int, noun: str) -> str:
 
 def progress_bar(total: int, *, quiet: bool, title: str) -> tqdm[Any]:
     """Return a progress bar over frames on standard error, silent where that is no terminal."""
+    disable = True if quiet else None  # None: where it is no terminal.
     return tqdm(
-        total=total,
-        desc=title,
-        unit='frame',
-        file=sys.stderr,
-        disable=True if quiet else None,
-        leave=False,
+        total=total, desc=title, unit='frame', file=sys.stderr, disable=disable, leave=False
     )

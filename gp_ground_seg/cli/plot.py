@@ -8,7 +8,6 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.cli.options import add_config_options, config_from_options, new_parser
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
@@ -56,15 +55,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     source = scan.add_mutually_exclusive_group(required=True)
     source.add_argument('input', metavar='INPUT', nargs='?', help='KITTI scan (.bin)')
     source.add_argument('--simulate', metavar='SCENE', choices=SCENES, help=', '.join(SCENES))
-    scan.add_argument(
-        '--sensor',
-        choices=SENSORS,
-        default='hdl-64e',
-        help='sensor of the simulated scan (default: %(default)s)',
-    )
-    scan.add_argument(
-        '--seed', metavar='N', type=int, default=0, help='of the simulated scene (default: 0)'
-    )
+    sensor = 'sensor of the simulated scan (default: %(default)s)'
+    scan.add_argument('--sensor', choices=SENSORS, default='hdl-64e', help=sensor)
+    seed = 'of the simulated scene (default: %(default)s)'
+    scan.add_argument('--seed', metavar='N', type=int, default=0, help=seed)
     scan.set_defaults(run=run_scan)
 
     segment = new_parser(
@@ -72,14 +66,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     segment.add_argument('input', metavar='INPUT', help='KITTI scan (.bin)')
     which = segment.add_mutually_exclusive_group(required=True)
-    which.add_argument('--segment', metavar='M', type=int, help='number of the segment')
-    which.add_argument(
-        '--azimuth', metavar='DEG', type=float, help='the one that looks there, 90 = left'
-    )
-    segment.add_argument('--labels', metavar='FILE', help='colour the points by these labels')
-    segment.add_argument(
-        '--max-range', metavar='R', type=float, help='range shown [m] (default: all candidates)'
-    )
+    for group, option, metavar, kind, text in (
+        (which, '--segment', 'M', int, 'number of the segment'),
+        (which, '--azimuth', 'DEG', float, 'the one that looks there, 90 = left'),
+        (segment, '--labels', 'FILE', str, 'colour the points by these labels'),
+        (segment, '--max-range', 'R', float, 'range shown [m] (default: all candidates)'),
+    ):
+        group.add_argument(option, metavar=metavar, type=kind, help=text)
     segment.set_defaults(run=run_segment)
 
     for picture, kinds in ((scan, '.png'), (segment, '.png or .pdf')):
@@ -94,7 +87,17 @@ def run_scan(arguments: argparse.Namespace) -> int:
     if Path(arguments.output).suffix != '.png':
         raise DataError(f'{arguments.output}: must end in .png')
     _refuse_existing(arguments)
-    points, title = _scan(arguments)
+    if arguments.input is not None:
+        points, title = read_points(arguments.input), Path(arguments.input).name
+    elif arguments.seed < 0:
+        raise DataError(f'--seed {arguments.seed}: must not be negative')
+    else:
+        scene, rng = (
+            SCENES[arguments.simulate](arguments.seed),
+            np.random.default_rng(arguments.seed),
+        )
+        points = simulate_scan(scene, SENSORS[arguments.sensor], rng).points
+        title = f'simulated {arguments.sensor}: {arguments.simulate}'
     with closing(GroundSegmenter(config)) as segmenter:
         result = segmenter.segment(points)
     plot_scan_view(points, result, config, arguments.output, title)
@@ -118,15 +121,11 @@ def run_segment(arguments: argparse.Namespace) -> int:
         truth = GROUNDGRID.truth(semantic, points[:, 2])
     with closing(GroundSegmenter(config)) as segmenter:
         result = segmenter.segment(points)
+    scan = Path(arguments.input)
+    folder = scan.resolve().parent
+    title = f'{folder.parent.name}/{scan.stem}' if folder.name == 'velodyne' else scan.name
     plot_segment(
-        result,
-        config,
-        points,
-        segment,
-        arguments.output,
-        truth,
-        title=_title(Path(arguments.input)),
-        max_range=arguments.max_range,
+        result, config, points, segment, arguments.output, truth, title, arguments.max_range
     )
     own = slice(*result.candidates.offsets[segment : segment + 2])
     pseudo = slice(*result.pseudo.offsets[segment : segment + 2])
@@ -142,23 +141,3 @@ def _refuse_existing(arguments: argparse.Namespace) -> None:
     """Refuse early, before the scan is segmented."""
     if Path(arguments.output).exists() and not arguments.force:
         raise DataError(f'{arguments.output}: exists already; --force replaces it')
-
-
-def _scan(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.float32], str]:
-    """Return the points of the scan, read or simulated, and its title."""
-    if arguments.input is not None:
-        return read_points(arguments.input), Path(arguments.input).name
-    if arguments.seed < 0:
-        raise DataError(f'--seed {arguments.seed}: must not be negative')
-    scan = simulate_scan(
-        SCENES[arguments.simulate](arguments.seed),
-        SENSORS[arguments.sensor],
-        np.random.default_rng(arguments.seed),
-    )
-    return scan.points, f'simulated {arguments.sensor}: {arguments.simulate}'
-
-
-def _title(scan: Path) -> str:
-    """Sequence and frame where the folders say so, else the file's name."""
-    folder = scan.resolve().parent
-    return f'{folder.parent.name}/{scan.stem}' if folder.name == 'velodyne' else scan.name

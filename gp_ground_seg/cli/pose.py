@@ -12,7 +12,7 @@ from gp_ground_seg.cli.options import add_config_options, config_from_options, n
 from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation.table import Cell, Column, Table
+from gp_ground_seg.evaluation.table import Cell, Column, Table, percent
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.segmenter import GroundSegmenter
 
@@ -31,12 +31,13 @@ EXAMPLES = """\
   gp-ground-seg pose scans --set sensor.height=1.2      does it agree?
 """
 
+DEGREES = math.degrees(1.0)
 COLUMNS = (
     Column('scan'),
     Column('height [m]', '.2f'),
-    Column('roll [deg]', '+.2f', scale=math.degrees(1.0)),
-    Column('pitch [deg]', '+.2f', scale=math.degrees(1.0)),
-    Column('support [%]', '.0f', scale=100.0),
+    Column('roll [deg]', '+.2f', scale=DEGREES),
+    Column('pitch [deg]', '+.2f', scale=DEGREES),
+    percent('support [%]', form='.0f'),
     Column('residual [m]', '.3f'),
     Column('used as'),
 )
@@ -52,24 +53,21 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print a line for each scan, and the medians."""
-    config = config_from_options(arguments)
-    poses: dict[str, SensorPose] = {}
-    notes = []
-    scans = find_scans(Path(arguments.input))
-    with closing(GroundSegmenter(config)) as segmenter:
-        for scan in scans:
+    poses, rows, notes = [], [], []
+    with closing(GroundSegmenter(config_from_options(arguments))) as segmenter:
+        for scan in find_scans(Path(arguments.input)):
             try:
                 pose = segmenter.estimate_pose(read_points(scan))
             except PointCloudError as error:
                 notes.append(f'{scan.name}: refused: {error}')
                 continue
-            poses[scan.name] = pose
+            poses.append(pose)
+            rows.append(_row(scan.name, pose))
             notes += [f'{scan.name}: {line}' for line in pose.contradictions]
     if poses:
-        print(Table(COLUMNS, [_row(name, pose) for name, pose in poses.items()]).text())
-        print(_summary(list(poses.values())))
-    for line in notes:
-        print(line)
+        print(Table(COLUMNS, rows).text())
+        notes.insert(0, _summary(poses))
+    print('\n'.join(notes))
     return 0
 
 
@@ -82,9 +80,9 @@ def _row(name: str, pose: SensorPose) -> list[Cell]:
         used += f', roll {math.degrees(pose.roll):.1f} pitch {math.degrees(pose.pitch):.1f}'
     found = pose.measured
     if found is None or not found.tells_height:
-        return [name, None, None, None, None, None, used]
-    roll, pitch = (found.roll, found.pitch) if found.tells_tilt else (None, None)
-    return [name, found.height, roll, pitch, found.plane.support, found.plane.residual, used]
+        return [name, *5 * [None], used]
+    tilt = (found.roll, found.pitch) if found.tells_tilt else (None, None)
+    return [name, found.height, *tilt, found.plane.support, found.plane.residual, used]
 
 
 def _summary(poses: list[SensorPose]) -> str:

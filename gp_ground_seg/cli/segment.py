@@ -11,18 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gp_ground_seg.cli.options import (
-    add_config_options,
-    config_from_options,
-    count,
-    new_parser,
-    note,
-    note_leftovers,
-    progress_bar,
-)
+from gp_ground_seg.cli import options
+from gp_ground_seg.cli.options import count, note, note_leftovers, progress_bar
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, open_bag
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE, is_bag
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
@@ -65,7 +58,6 @@ GROUND_TOPIC, OBSTACLES_TOPIC = '/ground', '/obstacles'
 
 FOR_SCANS = ('raw',)
 FOR_BAGS = ('topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
-
 # Unlabelled, road and other-object.
 SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
 _SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data')
@@ -74,22 +66,19 @@ _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
+    parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
     parser.add_argument('input', metavar='INPUT', help='scan, folder of scans, or bag')
-    parser.add_argument(
-        '-o',
-        '--output',
-        metavar='OUT',
-        help='for scans a folder, or a .label file for a single scan; for bags a folder, or a '
-        '.mcap or .db3 file (default: INPUT with _ground added, beside it)',
+    output = (
+        'for scans a folder, or a .label file for a single scan; for bags a folder, or a '
+        '.mcap or .db3 file (default: INPUT with _ground added, beside it)'
     )
+    parser.add_argument('-o', '--output', metavar='OUT', help=output)
     parser.add_argument('--force', action='store_true', help='replace output that exists')
     parser.add_argument('--quiet', action='store_true', help='no progress bar, no notes')
-    add_config_options(parser)
+    options.add_config_options(parser)
     scans = parser.add_argument_group('for scans')
-    scans.add_argument(
-        '--raw', action='store_true', help='write 0 unknown, 1 ground, 2 obstacle as labels'
-    )
+    raw = 'write 0 unknown, 1 ground, 2 obstacle as labels'
+    scans.add_argument('--raw', action='store_true', help=raw)
     bags = parser.add_argument_group('for bags')
     for option, text in (
         ('--topic', 'PointCloud2 topic (default: the only one there is)'),
@@ -97,18 +86,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--obstacles-topic', f'topic of the obstacles (default: {OBSTACLES_TOPIC})'),
     ):
         bags.add_argument(option, metavar='T', help=text)
-    bags.add_argument(
-        '--drop',
-        metavar='T',
-        action='append',
-        default=[],
-        help='leave this topic out of the output (may be repeated)',
-    )
-    bags.add_argument(
-        '--format',
-        choices=('mcap', 'sqlite3'),
-        help='storage of the output (default: by its name, else as the input; mcap for ROS 1)',
-    )
+    drop = 'leave this topic out of the output (may be repeated)'
+    bags.add_argument('--drop', metavar='T', action='append', default=[], help=drop)
+    storage = 'storage of the output (default: by its name, else as the input; mcap for ROS 1)'
+    bags.add_argument('--format', choices=SUFFIX_OF_STORAGE, help=storage)
     parser.set_defaults(run=run)
 
 
@@ -118,7 +99,7 @@ _Counts = tuple[int, int, float]
 
 def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
-    config = config_from_options(arguments)
+    config = options.config_from_options(arguments)
     source = Path(arguments.input)
     holds_bag = is_bag(source) or _holds_bag_files(source)
     scans = [] if holds_bag else find_scans(source)
@@ -145,12 +126,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _count(result: Segmentation) -> _Counts:
-    n_ground = int(np.count_nonzero(result.label == Label.GROUND))
-    return len(result.label), n_ground, result.timings['total']
+    return len(result.label), int((result.label == Label.GROUND).sum()), result.timings['total']
 
 
 def _holds_bag_files(source: Path) -> bool:
-    """Whether a folder holds bag files and no scans: `open_bag` says what is missing there."""
+    """Whether a folder holds bag files and no scans: `BagReader` says what is missing there."""
     if not source.is_dir() or any(source.glob('*.bin')):
         return False
     return any(child.suffix in BAG_SUFFIXES for child in source.iterdir())
@@ -166,17 +146,9 @@ def _default_output(source: Path) -> Path:
 
 
 def find_scans(source: Path) -> list[Path]:
-    """Return the .bin files that `source` stands for, in order.
+    """Return the .bin files that a file, folder, sequence or KITTI raw drive stands for, in order.
 
-    Parameters
-    ----------
-    source : Path
-        A .bin file, a folder of them, a SemanticKITTI sequence, or a KITTI raw drive.
-
-    Raises
-    ------
-    DataError
-        If there is none; the message says what was expected.
+    Raises `DataError` if there is none; the message says what was expected.
     """
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
@@ -188,8 +160,7 @@ def find_scans(source: Path) -> list[Path]:
             )
         return [source]
     for name in _SCAN_FOLDERS:
-        scans = sorted((source / name).glob('*.bin'))
-        if scans:
+        if scans := sorted((source / name).glob('*.bin')):
             return scans
     sequences = sorted(path.parent.name for path in source.glob('sequences/*/velodyne'))
     hint = ''
@@ -200,17 +171,12 @@ def find_scans(source: Path) -> list[Path]:
 
 
 def _segment_scans(
-    scans: Sequence[Path],
-    target: Path,
-    arguments: argparse.Namespace,
-    segmenter: GroundSegmenter,
+    scans: Sequence[Path], target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
 ) -> list[_Counts]:
     """Write one label file per scan."""
     frames = []
-    code = np.array(
-        [label if arguments.raw else SEMANTIC_KITTI_CODE[label] for label in sorted(Label)],
-        dtype='<u4',
-    )
+    codes = sorted(Label) if arguments.raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
+    code = np.array(codes, dtype='<u4')
     if not arguments.quiet:
         note_leftovers(target)
     with (
@@ -255,7 +221,7 @@ def _segment_bag(
         raise DataError(f'{target}: is the input, or has it in it; name another output')
     topics = (arguments.ground_topic or GROUND_TOPIC, arguments.obstacles_topic or OBSTACLES_TOPIC)
     outputs = dict(zip(topics, (Label.GROUND, Label.OBSTACLE), strict=True))
-    with open_bag(source) as bag:
+    with BagReader(source) as bag:
         topic = bag.pick_point_cloud_topic(arguments.topic)
         for name in arguments.drop:
             bag.topic(name)  # Raises where there is none.
@@ -266,7 +232,12 @@ def _segment_bag(
             storage = bag.storage
         if not arguments.quiet:
             note_leftovers(target)
-            _note_migrated(bag, copied)
+            for name in bag.migrated_topics:
+                if name in copied:
+                    note(
+                        f'topic {name}: {bag.topics[name]} has other fields in ROS 2; those of '
+                        'the same name are kept, new ones are zero'
+                    )
         with (
             BagWriter(target, storage=storage, force=arguments.force) as output,
             progress_bar(bag.n_messages(topic), quiet=arguments.quiet, title='segment') as bar,
@@ -289,9 +260,8 @@ def _segment_bag(
                         f'recorded at {time} ns: {error}'
                     ) from error
                 for part, label in outputs.items():
-                    output.write(
-                        part, time, encode_cloud(select_points(cloud, result.label == label))
-                    )
+                    chosen = select_points(cloud, result.label == label)
+                    output.write(part, time, encode_cloud(chosen))
                 frames.append(_count(result))
                 bar.update()
     return frames
@@ -308,12 +278,3 @@ def _check_output_topics(source: Path, topics: tuple[str, str], copied: list[str
             )
     if topics[0] == topics[1]:
         raise DataError(f'--obstacles-topic {topics[1]}: is the topic of the ground as well')
-
-
-def _note_migrated(bag: BagReader, copied: list[str]) -> None:
-    for name in bag.migrated_topics:
-        if name in copied:
-            note(
-                f'topic {name}: {bag.topics[name]} has other fields in ROS 2; those of the same '
-                'name are kept, new ones are zero'
-            )

@@ -26,11 +26,8 @@ def leftovers(target: str | Path) -> list[Path]:
 def staged_file(target: str | Path, *, force: bool) -> Iterator[Path]:
     """Yield a path to write; the file takes the name `target` once the block ends well.
 
-    Raises
-    ------
-    DataError
-        If the target exists and `force` is false, is not a regular file, or
-        cannot be written.
+    Raises DataError if the target exists and `force` is false, is not a regular file, or cannot
+    be written.
     """
     path = Path(target).resolve()
 
@@ -51,19 +48,8 @@ def staged_folder(
 ) -> Iterator[Path]:
     """Yield a folder to create; it takes the name `target` once the block ends well.
 
-    Parameters
-    ----------
-    target : str or Path
-        Final name.
-    force : bool
-        Whether a folder of that name may be replaced.
-    is_ours : callable
-        Whether an existing folder holds nothing but such output; any other is never replaced.
-
-    Raises
-    ------
-    DataError
-        If the target exists and may not be replaced, or cannot be written.
+    With `force` a folder of that name is replaced, if `is_ours` says of it that it holds nothing
+    but such output. Raises DataError if it may not be replaced or cannot be written.
     """
     path = Path(target).resolve()
 
@@ -93,12 +79,8 @@ def staged_files(folder: str | Path, names: Sequence[str], *, force: bool) -> It
     """Yield a folder to write the files `names` into; all appear in `folder` at the end.
 
     A folder that does not exist yet appears at once; into an existing one the
-    files are moved one by one, each of them whole, beside what is there.
-
-    Raises
-    ------
-    DataError
-        If one of the files exists and `force` is false, or they cannot be written.
+    files are moved one by one, each of them whole, beside what is there. Raises DataError if one
+    of the files exists and `force` is false, or they cannot be written.
     """
     path = Path(folder).resolve()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,84 +32,22 @@ _NEXT_STEP = {
 
 @dataclass(frozen=True)
 class BagTopic:
-    """A topic in ROS 2 terms.
-
-    Attributes
-    ----------
-    name, msgtype : str
-        As in ``/points``, ``sensor_msgs/msg/PointCloud2``.
-    definition : str
-        Text of the message definition, empty if unknown.
-    type_hash : str
-        RIHS01 hash of the type.
-    encoding : str
-        Serialisation of the messages, ``cdr`` for all ROS 2 writes itself.
-    qos : tuple
-        Profiles offered by the publishers (``rosbags.interfaces.Qos``).
-    n_messages : int
-        Messages in the bag.
-    migrated : bool
-        Whether a ROS 1 type has other fields in ROS 2.
-    problem : str
-        Why messages of ROS 1 cannot be converted, empty if they can.
-    """
+    """A topic in ROS 2 terms."""
 
     name: str
-    msgtype: str
-    definition: str
-    type_hash: str
-    encoding: str = 'cdr'
-    qos: tuple[Any, ...] = ()
+    msgtype: str  # as in ``sensor_msgs/msg/PointCloud2``
+    definition: str  # text of the message definition, empty if unknown
+    type_hash: str  # RIHS01 hash of the type
+    encoding: str = 'cdr'  # of the messages; ``cdr`` for all that ROS 2 writes itself
+    qos: tuple[Any, ...] = ()  # offered by the publishers (``rosbags.interfaces.Qos``)
     n_messages: int = 0
-    migrated: bool = False
-    problem: str = ''
+    migrated: bool = False  # whether a ROS 1 type has other fields in ROS 2
+    problem: str = ''  # why messages of ROS 1 cannot be converted, empty if they can
 
     @property
     def is_cloud(self) -> bool:
         """Whether its messages are point clouds that can be read."""
         return self.msgtype == POINT_CLOUD2 and self.encoding == 'cdr'
-
-
-def find_topic(path: Path, topics: Mapping[str, BagTopic], name: str) -> BagTopic:
-    """Return one of the `topics` of a bag; raises `DataError` if it is not there."""
-    if name not in topics:
-        raise DataError(f'{path}: no topic {name}; topics here: {_list_topics(topics)}')
-    return topics[name]
-
-
-def _list_topics(topics: Mapping[str, BagTopic]) -> str:
-    listed = (f'{name} ({topic.msgtype})' for name, topic in topics.items())
-    return ', '.join(listed) or 'none'
-
-
-def pick_cloud_topic(path: Path, topics: Mapping[str, BagTopic], wanted: str | None) -> str:
-    """Return `wanted` if it is one of point clouds with messages, or the only such topic.
-
-    Raises
-    ------
-    DataError
-        If there is none, or the choice is not clear; the message lists the topics.
-    """
-    clouds = [name for name, topic in topics.items() if topic.is_cloud]
-    if wanted is not None:
-        msgtype = find_topic(path, topics, wanted).msgtype
-        if msgtype != POINT_CLOUD2:
-            raise DataError(
-                f'{path}: topic {wanted} is of type {msgtype}, must be {POINT_CLOUD2}; '
-                f'such topics here: {", ".join(clouds) or "none"}'
-            )
-    candidates = clouds if wanted is None else [wanted]
-    if not candidates:
-        raise DataError(f'{path}: no {POINT_CLOUD2} topic; topics here: {_list_topics(topics)}')
-    recorded = [name for name in candidates if topics[name].n_messages]
-    if not recorded:
-        raise DataError(f'{path}: no message on {", ".join(candidates)}')
-    if len(recorded) > 1:
-        raise DataError(
-            f'{path}: {len(recorded)} {POINT_CLOUD2} topics, choose one with --topic: '
-            f'{", ".join(recorded)}'
-        )
-    return recorded[0]
 
 
 def is_bag(path: str | Path) -> bool:
@@ -120,14 +58,9 @@ def is_bag(path: str | Path) -> bool:
     return candidate.suffix in BAG_SUFFIXES
 
 
-def is_ros1_bag(path: Path) -> bool:
-    """Whether a bag is of ROS 1."""
-    return path.suffix == '.bag' and not path.is_dir()
-
-
 def storage_of(path: Path) -> str:
     """Storage of a bag: ``ros1``, ``mcap`` or ``sqlite3``."""
-    if is_ros1_bag(path):
+    if path.suffix == '.bag' and not path.is_dir():
         return 'ros1'
     files = path.glob('*.db3*') if path.is_dir() else [path]
     return 'sqlite3' if any('.db3' in file.suffixes for file in files) else 'mcap'
@@ -173,7 +106,13 @@ def _check_sqlite_file(path: Path) -> None:
     check_sqlite_path(path)
     with path.open('rb') as file:
         header = file.read(100)
-    size, wanted = path.stat().st_size, _sqlite_size(header)
+    size, wanted = path.stat().st_size, 0
+    # The format is that of https://www.sqlite.org/fileformat.html.
+    if len(header) == 100 and header[24:28] == header[92:96]:
+        page_size = int.from_bytes(header[16:18], 'big')
+        # 65536 does not fit into the two bytes.
+        page_size = 65536 if page_size == 1 else page_size
+        wanted = page_size * int.from_bytes(header[28:32], 'big')
     if size < wanted:
         raise DataError(f'{path}: truncated, {size} bytes where its header says {wanted}')
     for ending in ('-wal', '-journal'):
@@ -185,25 +124,11 @@ def _check_sqlite_file(path: Path) -> None:
             )
 
 
-def _sqlite_size(header: bytes) -> int:
-    """Size of the file by its header, 0 if not given; https://www.sqlite.org/fileformat.html."""
-    if len(header) < 100 or header[24:28] != header[92:96]:
-        return 0
-    page_size = int.from_bytes(header[16:18], 'big')
-    # 65536 does not fit into the two bytes.
-    page_size = 65536 if page_size == 1 else page_size
-    return page_size * int.from_bytes(header[28:32], 'big')
-
-
 def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
     """Storage of a new bag: `wanted`, 'mcap' or 'sqlite3', or by default what the suffix says.
 
     A path that ends in .mcap or .db3 is a single file, any other a folder, of MCAP by default.
-
-    Raises
-    ------
-    DataError
-        If the two contradict, or the storage cannot hold that path.
+    Raises DataError if the two contradict, or the storage cannot hold that path.
     """
     suffix = Path(path).suffix
     if suffix == '.bag':

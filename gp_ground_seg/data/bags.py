@@ -24,11 +24,8 @@ from gp_ground_seg.data.bag_files import (
     UNKNOWN_TYPE_HASH,
     BagTopic,
     check_is_bag,
-    find_topic,
     in_one_line,
     is_bag_folder,
-    is_ros1_bag,
-    pick_cloud_topic,
     reading,
     resolve_storage,
     storage_of,
@@ -164,21 +161,13 @@ def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
     return topic, convert
 
 
-def open_bag(path: str | Path) -> BagReader:
-    """Open a ROS 1 ``.bag``, rosbag2 folder, ``.mcap`` or ``.db3``, in a ``with`` statement.
-
-    Raises
-    ------
-    DataError
-        If there is no bag, or it cannot be read.
-    MissingDependencyError
-        If rosbags is not installed.
-    """
-    return BagReader(path)
-
-
 class BagReader:
-    """A bag as ROS 2 topics with CDR messages; ROS 1 messages are converted (see `open_bag`)."""
+    """A bag as ROS 2 topics with CDR messages, to be used in a ``with`` statement.
+
+    `path` is a ROS 1 ``.bag``, whose messages are converted, a rosbag2 folder, ``.mcap`` or
+    ``.db3``. Raises DataError if there is no bag, or it cannot be read, and
+    MissingDependencyError if rosbags is not installed.
+    """
 
     def __init__(self, path: str | Path) -> None:
         require_rosbags()
@@ -189,7 +178,8 @@ class BagReader:
         with ExitStack() as stack:
             with reading(self.path):
                 check_is_bag(self.path)
-                reader: Any = (rosbag1 if is_ros1_bag(self.path) else rosbag2).Reader(self.path)
+                rosbag: Any = rosbag1 if self.storage == 'ros1' else rosbag2
+                reader = rosbag.Reader(self.path)
                 reader.open()
             stack.callback(reader.close)
             self._reader = reader
@@ -225,33 +215,49 @@ class BagReader:
         return sorted(name for name, topic in self._topics.items() if topic.migrated)
 
     def topic(self, name: str) -> BagTopic:
-        """Return the description of a topic; raises `DataError` if there is none of that name."""
-        return find_topic(self.path, self._topics, name)
+        """Return the description of a topic; raises DataError if there is none of that name."""
+        if name not in self._topics:
+            raise DataError(f'{self.path}: no topic {name}; topics here: {self._list_topics()}')
+        return self._topics[name]
+
+    def _list_topics(self) -> str:
+        return ', '.join(f'{name} ({kind})' for name, kind in self.topics.items()) or 'none'
 
     def n_messages(self, topic: str) -> int:
         """Messages of one topic; raises as `topic` does."""
         return self.topic(topic).n_messages
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
-        """Return `topic` if it can be read as point clouds, or the only one that can.
+        """Return `topic` if it is one of point clouds with messages, or the only such topic.
 
-        Raises `DataError` with the topics if there is none, or the choice is not clear.
+        Raises DataError with the topics if there is none, or the choice is not clear.
         """
-        return pick_cloud_topic(self.path, self._topics, topic)
+        clouds = self.point_cloud_topics
+        if topic is not None:
+            msgtype = self.topic(topic).msgtype
+            if msgtype != POINT_CLOUD2:
+                raise DataError(
+                    f'{self.path}: topic {topic} is of type {msgtype}, must be {POINT_CLOUD2}; '
+                    f'such topics here: {", ".join(clouds) or "none"}'
+                )
+            clouds = [topic]
+        recorded = [name for name in clouds if self.n_messages(name)]
+        if len(recorded) == 1:
+            return recorded[0]
+        if recorded:
+            problem = f'{len(recorded)} {POINT_CLOUD2} topics, choose one with --topic: '
+            problem += ', '.join(recorded)
+        elif clouds:
+            problem = f'no message on {", ".join(clouds)}'
+        else:
+            problem = f'no {POINT_CLOUD2} topic; topics here: {self._list_topics()}'
+        raise DataError(f'{self.path}: {problem}')
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """Messages in order of their recorded time; file after file in a split bag.
+        """Topic, recorded time [ns] and CDR bytes of each message, of all topics by default.
 
-        Parameters
-        ----------
-        topics : collection of str, optional
-            Topics wanted; all by default.
-
-        Yields
-        ------
-        (str, int, bytes)
-            Topic, recorded time [ns], message as CDR. `DataError` is raised if the bag is
-            damaged, a topic is unknown, or fewer messages can be read than the bag lists.
+        In order of their time; file after file in a split bag. Raises DataError if the bag is
+        damaged, a topic is unknown, or fewer messages can be read than the bag lists.
         """
         wanted = list(self._topics) if topics is None else list(dict.fromkeys(topics))
         for name in wanted:
@@ -307,7 +313,7 @@ class BagReader:
         return topics
 
     def _describe(self, connection: Any) -> BagTopic:
-        if not is_ros1_bag(self.path):
+        if self.storage != 'ros1':
             return _ros2_topic(connection)
         try:
             topic, self._converters[connection.id] = _ros1_topic(connection)
@@ -322,21 +328,10 @@ class BagReader:
 class BagWriter:
     """A new rosbag2 bag, in a ``with`` statement; written whole or not at all (`staged_file`).
 
-    Parameters
-    ----------
-    path : str or Path
-        A folder as ``ros2 bag record -o`` makes; or a single file, by its suffix.
-    storage : {'mcap', 'sqlite3'}, optional
-        See `resolve_storage`.
-    force : bool
-        Whether a bag of that name is replaced, once the new one is complete.
-
-    Raises
-    ------
-    DataError
-        If the path is taken, or cannot be written.
-    MissingDependencyError
-        If rosbags is not installed.
+    `path` is a folder as ``ros2 bag record -o`` makes, or a single file, by its suffix; for
+    `storage` see `resolve_storage`. With `force` a bag of that name is replaced once the new one
+    is complete. Raises DataError if the path is taken or cannot be written, and
+    MissingDependencyError if rosbags is not installed.
     """
 
     def __init__(

@@ -19,11 +19,8 @@ from gp_ground_seg.data.bag_files import POINT_CLOUD2, in_one_line
 from gp_ground_seg.data.bags import jazzy_types
 from gp_ground_seg.errors import PointCloudError
 
-_DATATYPE_NAMES = {
-    1: 'INT8', 2: 'UINT8', 3: 'INT16', 4: 'UINT16',
-    5: 'INT32', 6: 'UINT32', 7: 'FLOAT32', 8: 'FLOAT64',
-}  # fmt: skip
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+_DATATYPE_NAMES = {datatype: np.dtype(code).name.upper() for datatype, code in _CODES.items()}
 _DATATYPES = {code: datatype for datatype, code in _CODES.items()}
 _FLOATS = (7, 8)
 _ALIGNMENT = 4
@@ -63,20 +60,10 @@ class WiderCloud(NamedTuple):
 def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
     """Coordinates of every point, row by row.
 
-    Only x, y and z are checked; other fields may be anything. As in PCL, a cloud of one row
-    never uses ``row_step``, and bytes after the last point are ignored. A cloud without
-    points needs no fields.
-
-    Returns
-    -------
-    (height * width, 3) float32 or float64
-        A copy in native byte order; float64 if any of the three is FLOAT64.
-
-    Raises
-    ------
-    PointCloudError
-        If the layout cannot hold what it claims; the message names the
-        attribute, its value and what is accepted.
+    A copy in native byte order, (height * width, 3); float64 if any of the three is FLOAT64. Only
+    x, y and z are checked; other fields may be anything. As in PCL, a cloud of one row never uses
+    ``row_step``, and bytes after the last point are ignored. A cloud without points needs no
+    fields. Raises PointCloudError if the layout cannot hold what it claims.
     """
     if cloud.height * cloud.width == 0:
         return np.empty((0, 3), dtype=np.float32)
@@ -95,11 +82,8 @@ def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.fl
 def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     """Values of the fields `names`, each (height, width), a copy in native byte order.
 
-    Raises
-    ------
-    PointCloudError
-        If a field is missing, there twice, no single number or beyond the point, or the
-        layout cannot hold what it claims.
+    Raises PointCloudError if a field is missing, there twice, no single number or beyond the
+    point, or the layout cannot hold what it claims.
     """
     views = _views(cloud, names, _CODES)
     return {
@@ -109,24 +93,10 @@ def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDA
 
 
 def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
-    """Bytes of the points where `mask` is true, packed into one row.
+    """Every byte of the points where `mask`, (height * width,) bool, is true, in one row.
 
-    Parameters
-    ----------
-    cloud : CloudMessage
-        The points to select from.
-    mask : (height * width,) bool
-        Which points to keep, row by row.
-
-    Returns
-    -------
-    (n * point_step,) uint8
-        Every byte of the `n` kept points, in order.
-
-    Raises
-    ------
-    PointCloudError
-        If the layout cannot hold what it claims, or the mask has another length.
+    Raises PointCloudError if the layout cannot hold what it claims, or the mask has another
+    length.
     """
     size = cloud.height * cloud.width
     if mask.shape != (size,) or mask.dtype != np.bool_:
@@ -141,26 +111,11 @@ def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray
 
 
 def append_columns(cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]]) -> WiderCloud:
-    """Put columns behind the bytes of every point.
+    """Put columns behind the bytes of every point, at multiples of four bytes or of their size.
 
-    Parameters
-    ----------
-    cloud : CloudMessage
-        The points.
-    columns : mapping of str to (height * width,) array
-        Values, row by row, of an integer or float type of one to eight bytes that
-        PointField knows; written in the byte order of the cloud.
-
-    Returns
-    -------
-    WiderCloud
-        Every byte of every point, then the columns at multiples of four bytes or of
-        their own size, zeros between them. Padding of the rows is gone.
-
-    Raises
-    ------
-    PointCloudError
-        If the layout cannot hold what it claims.
+    Columns, (height * width,) row by row, are of integer or float types that PointField knows and
+    are written in the byte order of the cloud; bytes between them are zero, padding of the rows is
+    gone. Raises PointCloudError if the layout cannot hold what it claims.
     """
     placed = []
     end = _round_up(cloud.point_step, _ALIGNMENT)
@@ -342,12 +297,7 @@ def _new_header(stamp: tuple[int, int], frame_id: str) -> Any:
 def decode_cloud(raw: bytes | memoryview) -> CloudMessage:
     """Message of rosbags from its CDR bytes.
 
-    Raises
-    ------
-    PointCloudError
-        If the bytes are no PointCloud2.
-    MissingDependencyError
-        If rosbags is not installed.
+    Raises PointCloudError if they are no PointCloud2, MissingDependencyError without rosbags.
     """
     types = jazzy_types()
     try:

@@ -18,33 +18,17 @@ FRAME_PERIOD = 0.1
 
 @dataclass(frozen=True)
 class Frame:
-    """One scan on disk.
+    """One scan on disk."""
 
-    Attributes
-    ----------
-    sequence, index : str
-        Names of the sequence folder, and of the file without its ending.
-    points_path, labels_path : Path or None
-        The ``.bin`` file; the ``.label`` file, if there is one.
-    time : float
-        Time since the start of the sequence [s].
-    """
-
-    sequence: str
-    index: str
-    points_path: Path
-    labels_path: Path | None
-    time: float
+    sequence: str  # name of the sequence folder
+    index: str  # name of the file without its ending
+    points_path: Path  # the ``.bin`` file
+    labels_path: Path | None  # the ``.label`` file, if there is one
+    time: float  # since the start of the sequence [s]
 
 
 def list_sequences(root: str | Path) -> list[str]:
-    """Names of the sequences below ``root/sequences``.
-
-    Raises
-    ------
-    DataError
-        If there is none.
-    """
+    """Names of the sequences below ``root/sequences``; raises DataError if there is none."""
     folder = Path(root) / 'sequences'
     names = sorted(path.parent.name for path in folder.glob('*/velodyne') if path.is_dir())
     if not names:
@@ -55,10 +39,7 @@ def list_sequences(root: str | Path) -> list[str]:
 def list_frames(root: str | Path, sequence: str) -> list[Frame]:
     """Frames of one sequence, in order.
 
-    Raises
-    ------
-    DataError
-        If the sequence is missing or empty, or times.txt does not fit it.
+    Raises DataError if the sequence is missing or empty, or times.txt does not fit it.
     """
     folder = Path(root) / 'sequences' / sequence
     if not (folder / 'velodyne').is_dir():
@@ -80,9 +61,7 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
     if not path.exists():
         return [FRAME_PERIOD * k for k in range(len(frames))]
     try:
-        lines = [float(word) for word in path.read_text(encoding='utf-8').split()]
-    except OSError as error:
-        raise DataError(f'{path}: {error.strerror or error}') from error
+        lines = [float(word) for word in _read_bytes(path).split()]
     except ValueError as error:
         raise DataError(f'{path}: {error}') from error
     times: list[float] = []
@@ -101,10 +80,7 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
 def read_points(path: str | Path) -> npt.NDArray[np.float32]:
     """Points of a KITTI ``.bin`` file: x, y, z [m] and intensity, (N, 4) float32.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read or its size is not a whole number of points.
+    Raises DataError if the file cannot be read or its size is not a whole number of points.
     """
     data = _read_bytes(path)
     if len(data) % BYTES_PER_POINT:
@@ -118,10 +94,7 @@ def read_points(path: str | Path) -> npt.NDArray[np.float32]:
 def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
     """Semantic classes of a ``.label`` file, (n_points,) uint16.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read or holds another number of labels.
+    Raises DataError if the file cannot be read or holds another number of labels.
     """
     data = _read_bytes(path)
     if len(data) != 4 * n_points:

@@ -316,14 +316,21 @@ class DiagnosticsConfig:
 # fmt: on
 
 
+_ASCENDING = (
+    ('grid.r_min', 'grid.r_max'),
+    ('length_scale.min', 'length_scale.max'),
+    ('latent.sloped_gradient', 'latent.steep_gradient'),
+    ('latent.medium_extent', 'latent.long_extent'),
+    ('label.obstacle_min_height', 'label.obstacle_max_height'),
+)
+"""Pairs of which the first must be below the second."""
+
+
 @dataclass(frozen=True)
 class Config(ParameterGroups):
     """All parameters, immutable and valid by construction.
 
-    Raises
-    ------
-    ConfigError
-        If a value has the wrong type, is out of range, or contradicts another.
+    Raises ConfigError if a value has the wrong type, is out of range, or contradicts another.
     """
 
     sensor: SensorConfig = SensorConfig()
@@ -344,11 +351,10 @@ class Config(ParameterGroups):
     def __post_init__(self) -> None:
         """Check every value, then the rules between values."""
         super().__post_init__()
-        self.require_order('grid.r_min', 'grid.r_max')
-        self.require_order('length_scale.min', 'length_scale.max')
-        self.require_order('latent.sloped_gradient', 'latent.steep_gradient')
-        self.require_order('latent.medium_extent', 'latent.long_extent')
-        self.require_order('label.obstacle_min_height', 'label.obstacle_max_height')
+        for lower, upper in _ASCENDING:
+            low, high = float(self[lower]), float(self[upper])
+            if not low < high:
+                raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
         if 2 * self.surface.n_neighbours >= self.grid.n_segments:
             raise ConfigError(
                 f'surface.n_neighbours = {self.surface.n_neighbours}: must be below half of '
@@ -361,6 +367,4 @@ def parameter_specs() -> tuple[ParameterSpec, ...]:
     return tuple(Config.specs().values())
 
 
-def find_spec(name: str) -> ParameterSpec:
-    """Return the declaration of one parameter; raises ConfigError with the nearest name."""
-    return Config.find_spec(name)
+find_spec = Config.find_spec

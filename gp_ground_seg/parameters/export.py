@@ -118,15 +118,8 @@ def _accepted(spec: ParameterSpec) -> str:
 def generated_files(readme: str) -> dict[str, str]:
     """Text of every generated file of a checkout, by its path from the root.
 
-    Parameters
-    ----------
-    readme : str
-        Text of README.md; the table of the basic parameters goes between its markers.
-
-    Raises
-    ------
-    DataError
-        If the two markers are not there once each, in order.
+    The table of the basic parameters goes between the markers of `readme`, the text of README.md;
+    raises DataError if the two are not there once each, in order.
     """
     begin, end = readme.find(README_BEGIN), readme.find(README_END)
     unique = readme.count(README_BEGIN) == 1 and readme.count(README_END) == 1

@@ -11,21 +11,12 @@ from gp_ground_seg.parameters.schema import ParameterValue, did_you_mean
 
 @dataclass(frozen=True)
 class Preset:
-    """A named set of parameters.
-
-    Attributes
-    ----------
-    name : str
-        Name on the command line, and of the file in ``config/``.
-    purpose : str
-        What it is for.
-    overrides : dict of str to (value, str)
-        Values that differ from the defaults, each with the reason, by name.
-    """
+    """A named set of parameters; `name` is that of its file in ``config/`` too."""
 
     name: str
     purpose: str
     overrides: dict[str, tuple[ParameterValue, str]] = field(default_factory=dict)
+    """Values that differ from the defaults, each with the reason, by name."""
 
     @property
     def config(self) -> Config:
@@ -125,13 +116,7 @@ PRESETS = {preset.name: preset for preset in _PRESETS}
 
 
 def find_preset(name: str) -> Preset:
-    """Return the preset `name`.
-
-    Raises
-    ------
-    ConfigError
-        If there is none; the message names the nearest one and all others.
-    """
+    """Return the preset `name`; raises ConfigError with the nearest one and all others."""
     preset = PRESETS.get(name)
     if preset is None:
         hint = did_you_mean(name, PRESETS)

@@ -26,43 +26,19 @@ AUTO: Literal['auto'] = 'auto'
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """What is declared of one parameter.
+    """What is declared of one parameter."""
 
-    Attributes
-    ----------
-    name : str
-        Dotted name, ``group.field``.
-    type : type
-        ``bool``, ``int``, ``float`` or ``str``; that of the number where it may be ``auto``.
-    default : bool, int, float or str
-        Value used when nothing else is given.
-    description : str
-        One line on what it does.
-    unit : str
-        SI unit; empty for a pure number.
-    symbol : str
-        The paper's symbol, empty if it has none.
-    minimum, maximum : float or None
-        Inclusive bounds of a number; ``None`` for other types.
-    choices : tuple of str
-        Accepted values of a string; empty for other types, and for names of the user's.
-    auto : bool
-        Whether a number may also be `AUTO`.
-    basic : bool
-        Whether it is one of the few that are set for a robot; the others are advanced.
-    """
-
-    name: str
-    type: type
+    name: str  # dotted, ``group.field``
+    type: type  # bool, int, float or str; that of the number where it may be `AUTO`
     default: ParameterValue
     description: str
-    unit: str
-    symbol: str
-    minimum: float | None
+    unit: str  # SI; empty for a pure number
+    symbol: str  # in the paper; empty if it has none
+    minimum: float | None  # inclusive, of a number; None for other types
     maximum: float | None
-    choices: tuple[str, ...]
-    auto: bool
-    basic: bool
+    choices: tuple[str, ...]  # accepted strings; empty for other types, and for any name
+    auto: bool  # whether a number may also be `AUTO`
+    basic: bool  # whether it is one of the few that are set for a robot
 
     @property
     def accepted(self) -> str:
@@ -83,13 +59,7 @@ class ParameterSpec:
         return not self.choices and re.fullmatch(r'[\w\-./]+', value, re.ASCII) is not None
 
     def check(self, value: object) -> ParameterValue:
-        """Return `value` in the declared type.
-
-        Raises
-        ------
-        ConfigError
-            If the type is wrong or the value is out of range.
-        """
+        """Return `value` in the declared type; ConfigError if it is of another or out of range."""
         if self.auto and isinstance(value, str) and value == AUTO:
             return AUTO
         if self.type is bool:
@@ -128,21 +98,15 @@ def declare(
     *,
     basic: bool,
 ) -> Any:
-    """Declare a parameter as a field of a frozen dataclass.
+    """Declare a parameter as a field of a frozen dataclass; see `ParameterSpec`.
 
-    Parameters
-    ----------
-    default : bool, int, float or str
-        The default; `AUTO` where a number may be that too.
-    accepted : tuple
-        Lowest and highest number, or the accepted strings; empty for a bool or any name.
-    description, unit, symbol, basic
-        See `ParameterSpec`.
+    `accepted` holds the lowest and highest number, or the accepted strings; it is empty for a bool
+    or any name. A number whose `default` is `AUTO` may be that too.
     """
     choices = accepted if accepted and isinstance(accepted[0], str) else ()
     auto = default == AUTO and not choices
-    low, high = accepted if accepted and not choices else (None, None)
     kind = float if auto else type(default)
+    low, high = accepted if kind in (int, float) else (None, None)
     spec = ParameterSpec(
         '', kind, default, description, unit, symbol, low, high, choices, auto, basic
     )
@@ -157,10 +121,7 @@ advanced = functools.partial(declare, basic=False)
 
 @dataclass(frozen=True)
 class ParameterGroups:
-    """Base of a frozen dataclass whose fields are groups of declared parameters.
-
-    Values are checked when an instance is made; they are found by dotted names.
-    """
+    """Base of a frozen dataclass of groups of declared parameters; checks all values."""
 
     @classmethod
     @functools.cache
@@ -199,14 +160,6 @@ class ParameterGroups:
         value: ParameterValue = getattr(getattr(self, group_name), field_name)
         return value
 
-    def require_order(self, lower: str, upper: str) -> None:
-        """Raise ConfigError unless the first parameter is below the second."""
-        low, high = self[lower], self[upper]
-        assert isinstance(low, float)
-        assert isinstance(high, float)
-        if not low < high:
-            raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
-
     def flat(self) -> dict[str, ParameterValue]:
         """Every value by its dotted name, in order of declaration."""
         return {name: self[name] for name in self.specs()}
@@ -216,18 +169,9 @@ class ParameterGroups:
         return _nest(self.flat())
 
     def replace(self, **changes: object) -> Self:
-        """Copy with some values changed.
+        """Copy with some values changed, given by dotted names (``**{'grid.r_max': 60.0}``).
 
-        Parameters
-        ----------
-        **changes
-            Dotted name -> value, as in
-            ``config.replace(**{'label.ground_tolerance': 0.15})``.
-
-        Raises
-        ------
-        ConfigError
-            If a name is unknown or the changed configuration is invalid.
+        Raises ConfigError if a name is unknown or the changed configuration is invalid.
         """
         checked = {name: self.find_spec(name).check(value) for name, value in changes.items()}
         groups: dict[str, Any] = {
@@ -240,13 +184,8 @@ class ParameterGroups:
     def from_yaml(cls, path: str | Path, base: Self | None = None) -> Self:
         """Read a YAML file: ROS form (``/**: ros__parameters:``) or bare groups.
 
-        Parameters not in the file are as in `base`, by default the defaults.
-
-        Raises
-        ------
-        ConfigError
-            If the file cannot be read or parsed, a name is unknown, or a value
-            is not accepted. The message starts with the path.
+        Parameters not in the file are as in `base`, by default the defaults. Raises ConfigError,
+        with the path, if the file cannot be read, a name is unknown, or a value is not accepted.
         """
         try:
             return (base or cls()).replace(**read_parameters(path).values)

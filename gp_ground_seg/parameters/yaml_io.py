@@ -45,23 +45,14 @@ def load_yaml(text: str) -> object:
 
 @dataclass(frozen=True)
 class ParameterFile:
-    """Values of a parameter file by dotted names, unchecked.
-
-    `is_ros` says whether it is in the form of ROS, where types are strict.
-    """
+    """Values of a parameter file by dotted names, unchecked."""
 
     values: dict[str, object]
-    is_ros: bool
+    is_ros: bool  # whether it is in the form of ROS, where types are strict
 
 
 def read_parameters(path: str | Path) -> ParameterFile:
-    """Read a parameter file.
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read or parsed, or gives a name twice.
-    """
+    """Read a parameter file; ConfigError if it cannot be read or parsed, or gives a name twice."""
     try:
         document = load_yaml(Path(path).read_text(encoding='utf-8'))
         values: dict[str, object] = {}
@@ -74,17 +65,11 @@ def read_parameters(path: str | Path) -> ParameterFile:
         raise ConfigError(error.strerror or str(error)) from error
     except UnicodeDecodeError as error:
         raise ConfigError('not a text file') from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise ConfigError(f'not valid YAML: {_one_line(error)}') from error
     except ConfigError:
         raise
-    except ValueError as error:
-        # What looks like a date or a number and is none, as in 2011-99-99.
-        raise ConfigError(f'not valid YAML: {_one_line(error)}') from error
-
-
-def _one_line(error: Exception) -> str:
-    return ' '.join(str(error).split())
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        # A ValueError comes from what looks like a date and is none, as in 2011-99-99.
+        raise ConfigError(f'not valid YAML: {" ".join(str(error).split())}') from error
 
 
 def _unwrap_ros(document: object) -> Mapping[str, object]:

@@ -55,26 +55,14 @@ MIN_CELLS = 3
 
 
 class LowestPoints(NamedTuple):
-    """Lowest point of each occupied cell: sectors by rings, rings wider the farther they are.
+    """Lowest point of each occupied cell: sectors by rings, rings wider the farther they are."""
 
-    Attributes
-    ----------
-    x, y, z : (C,) float64
-        The points [m]; z along the axis that is taken to be up.
-    r : (C,) float64
-        Horizontal range of the points [m].
-    tolerance : (C,) float64
-        Distance of the point to the plane that it still supports [m].
-    sector : (C,) int64
-        Sector of each cell, 0 to `N_SECTORS` - 1.
-    """
-
-    x: FloatArray
-    y: FloatArray
-    z: FloatArray
-    r: FloatArray
-    tolerance: FloatArray
-    sector: IntArray
+    x: FloatArray  # (C,) [m]
+    y: FloatArray  # (C,) [m]
+    z: FloatArray  # (C,) along the axis that is taken to be up [m]
+    r: FloatArray  # (C,) horizontal range [m]
+    tolerance: FloatArray  # (C,) distance to the plane that the point still supports [m]
+    sector: IntArray  # (C,) sector of each cell, 0 to `N_SECTORS` - 1
 
 
 @lru_cache(maxsize=4)
@@ -90,13 +78,8 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     """Lowest ground candidate of each cell, in sectors by rings.
 
     Of equally low ones the nearest counts, then that of the first segment, so that the
-    order of the points does not matter.
-
-    Parameters
-    ----------
-    candidates : Candidates
-        Lowest points of the bins of the polar grid. A point's azimuth is taken to be
-        that of the middle of its segment.
+    order of the points does not matter. A point's azimuth is taken to be that of the middle of
+    its segment.
     """
     lowest = _lowest(candidates.offsets, candidates.r, candidates.z)
     cell = np.flatnonzero(lowest != _NONE)
@@ -129,45 +112,23 @@ def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> IntArray:
 
 
 class GroundPlane(NamedTuple):
-    """The plane z = -height + slope_x x + slope_y y.
+    """The plane z = -height + slope_x x + slope_y y."""
 
-    Attributes
-    ----------
-    height : float
-        How far below the sensor it is, along z [m].
-    slope_x, slope_y : float
-        Rise per metre.
-    near_height : float
-        The same as `height` for the parallel plane through the middle of the near cells [m].
-    support : float
-        Share of the cells that lie on it, in [0, 1].
-    coverage : float
-        Share of all sectors around the sensor with such a cell, in [0, 1].
-    far_coverage : float
-        Share of the sectors with any cell that have such a cell `FAR` away, in [0, 1].
-    reach : float
-        Range within which nine of ten of these cells are [m].
-    spread : float
-        Difference of the angles of depression of these cells [rad], a tenth of them left out
-        at either end: the lowest beam alone, on walls, makes a cone that looks like a plane.
-    residual : float
-        Root mean square of the distances along z of these cells to it [m].
-    n_cells, n_support : int
-        How many cells there were, and how many lie on it.
-    """
-
-    height: float
-    slope_x: float
-    slope_y: float
+    height: float  # how far below the sensor it is, along z [m]
+    slope_x: float  # rise per metre
+    slope_y: float  # rise per metre
+    # as `height`, for the parallel plane through the middle of the near cells [m]
     near_height: float
-    support: float
-    coverage: float
-    far_coverage: float
-    reach: float
+    support: float  # share of the cells that lie on it
+    coverage: float  # share of all sectors around the sensor with such a cell
+    far_coverage: float  # share of the sectors with any cell that have such a cell `FAR` away
+    reach: float  # range within which nine of ten of these cells are [m]
+    # Difference of the angles of depression of these cells [rad], a tenth of them left out at
+    # either end: the lowest beam alone, on walls, makes a cone that looks like a plane.
     spread: float
-    residual: float
-    n_cells: int
-    n_support: int
+    residual: float  # root mean square of the distances along z of these cells to it [m]
+    n_cells: int  # how many cells there were
+    n_support: int  # how many of them lie on it
 
     @property
     def normal(self) -> tuple[float, float, float]:
@@ -186,14 +147,8 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
 
     Consensus (Fischler & Bolles, CACM 1981) over planes through a fixed, evenly spread
     choice of three cells and level planes through one, then a redescending M-estimator
-    (Beaton & Tukey, Technometrics 1974) from the best of them.
-
-    Parameters
-    ----------
-    candidates : Candidates
-        Lowest points of the cells of the polar grid.
-    max_slope : float
-        Steepest plane to look for, as rise per metre.
+    (Beaton & Tukey, Technometrics 1974) from the best of them. `max_slope` is that of the
+    steepest plane to look for, as rise per metre.
     """
     cells = lowest_points(candidates)
     if len(cells.z) < MIN_CELLS:
@@ -314,14 +269,9 @@ def solve_plane(
     moments: tuple[float, float, float, float, float, float, float, float, float],
     plane: tuple[float, float, float],
 ) -> tuple[float, float, float]:
-    """Plane of least squares: height, slope_x, slope_y.
+    """Plane of least squares: height, slope_x, slope_y; `plane` where it is not determined.
 
-    Parameters
-    ----------
-    moments : tuple of float
-        Weighted sums of 1, x, y, x x, x y, y y, z, x z and y z.
-    plane : tuple of float
-        Result where the moments do not determine one.
+    `moments` are the weighted sums of 1, x, y, x x, x y, y y, z, x z and y z.
     """
     w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = moments
     height, slope_x, slope_y = plane

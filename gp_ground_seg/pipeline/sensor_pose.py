@@ -87,26 +87,15 @@ _AXES = (
 
 @dataclass(frozen=True)
 class MeasuredPose:
-    """What one scan says of the sensor, whatever was given.
+    """What one scan says of the sensor, whatever was given."""
 
-    Attributes
-    ----------
-    height : float
-        Height over the ground plane under the sensor, along the vertical of the pose used [m].
-    roll, pitch : float
-        Angles that would make the ground plane level [rad].
-    tells_height, tells_tilt : bool
-        Whether the scan shows enough ground for either.
-    plane : GroundPlane
-        The plane in the frame levelled by the angles given, and what speaks for it.
-    """
-
+    # over the ground plane under the sensor, along the vertical of the pose used [m]
     height: float
-    roll: float
-    pitch: float
-    tells_height: bool
-    tells_tilt: bool
-    plane: GroundPlane
+    roll: float  # angle that would make the ground plane level [rad]
+    pitch: float  # as `roll`
+    tells_height: bool  # whether the scan shows enough ground for the height
+    tells_tilt: bool  # the same for the tilt
+    plane: GroundPlane  # in the frame levelled by the angles given
 
 
 @dataclass(frozen=True)
@@ -152,20 +141,11 @@ class SensorPose:
         return xyz if self.is_level else rotate(xyz, self.rotation)
 
     def ground_z(self, z: PointArray, height: FloatArray) -> FloatArray:
-        """Height of the surface along the sensor's z axis, sensor frame [m].
+        """Height of the surface along the sensor's z axis, sensor frame, (N,) float64 [m].
 
-        Parameters
-        ----------
-        z : (N,) float32 or float64
-            Of the points, sensor frame [m].
-        height : (N,) float64
-            Of the points over the surface, vertical [m].
-
-        Returns
-        -------
-        (N,) float64
-            Exact where the surface is level in the level frame. NaN if the axis lies
-            within 6 degrees of the horizontal: it does not meet the ground.
+        `z`, in the sensor frame, and the vertical `height` over the surface are those of the
+        points, (N,) [m]. Exact where the surface is level in the level frame; NaN if the axis
+        lies within 6 degrees of the horizontal: it does not meet the ground.
         """
         cosine = math.cos(self.roll) * math.cos(self.pitch)
         if abs(cosine) < LEAST_COSINE:
@@ -325,19 +305,8 @@ def find_up_axis(
 ) -> str | None:
     """Return one line on where the ground clearly lies if not along z; None otherwise.
 
-    Parameters
-    ----------
-    given : (3, 3) float64
-        Rotation from the sensor frame to the frame looked at, in which z should be up.
-    plane : GroundPlane or None
-        Plane that was fitted there.
-    fit_plane, candidates_rotated
-        See `estimate_pose`; a sample of the points is enough.
-
-    Returns
-    -------
-    str or None
-        The axis that seems to be up, and the angles to set.
+    `given` is the rotation (3, 3) from the sensor frame to that of `plane`, in which z should be
+    up; for the callables see `estimate_pose`.
     """
     support = 0.0 if plane is None else plane.support
     ratio = UP_SUPPORT_RATIO_TALL if _is_tall(plane) else UP_SUPPORT_RATIO

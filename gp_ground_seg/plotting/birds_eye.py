@@ -10,21 +10,28 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.frame import BoolArray, Label
 from gp_ground_seg.pipeline.points import check_points, finite_points
-from gp_ground_seg.plotting.style import BLUE, PINK, VERMILION, check_lengths, new_figure, save
+from gp_ground_seg.plotting import style
+from gp_ground_seg.plotting.style import add_axes, check_lengths, new_figure, save, write_line
 
-GROUND_COLOUR = '#E3B968'
-OBSTACLE_COLOUR = '#1B4F72'
-UNKNOWN_COLOUR = PINK
-RIGHT_COLOUR = '#BCC2C8'
-NOT_SCORED_COLOUR = '#E3E6E9'
-FALSE_GROUND_COLOUR = VERMILION
-MISSED_GROUND_COLOUR = BLUE
-# On a sheet, where true ground and true obstacles differ in lightness.
-RIGHT_OBSTACLE_COLOUR = '#757D86'
-RIGHT_GROUND_COLOUR = '#D3C5A6'
+Labels = npt.NDArray[np.uint8]
+
+COLOURS = {
+    'ground': '#E3B968',
+    'obstacle': '#1B4F72',
+    'unknown': style.PINK,
+    'not scored': '#E3E6E9',
+    'right': '#BCC2C8',
+    # On a sheet, where true ground and true obstacles differ in lightness.
+    'right obstacle': '#757D86',
+    'right ground': '#D3C5A6',
+    'missed ground': style.BLUE,
+    'false ground': style.VERMILION,
+}
+EXTENT = 50.0
+"""Half the side of the square shown [m]."""
+RING_STEP = 10.0
 
 # Inches: the square of a panel, left, right, below and above it; the line above all panels.
 SINGLE = (6.2, 0.8, 0.2, 0.95, 0.4, 0.4)
@@ -34,23 +41,34 @@ SHEET_COLUMNS = 3
 
 
 class Layer(NamedTuple):
-    """Points drawn alike: name in the legend, area of a dot [pt^2], which points, (N,) bool."""
+    """Points drawn alike: one of `COLOURS`, area of a dot [pt^2], which points, (N,) bool."""
 
     name: str
-    colour: str
     size: float
     chosen: BoolArray
 
 
+class SheetPanel(NamedTuple):
+    """One scan of a sheet: lines above it, x and y of the points [m], labels as in `Label`.
+
+    The true label is UNKNOWN where the point does not count.
+    """
+
+    title: str
+    subtitle: str
+    points: npt.NDArray[np.floating]
+    label: Labels
+    truth: Labels
+
+
 def plot_birds_eye(
     points: npt.ArrayLike,
-    label: npt.NDArray[np.uint8],
+    label: Labels,
     path: str | Path,
-    truth: npt.NDArray[np.uint8] | None = None,
+    truth: Labels | None = None,
     title: str = '',
-    extent: float = 50.0,
 ) -> None:
-    """Draw a scan from above, replacing the file `path`.
+    """Draw a scan from above as a PNG, replacing the file `path`.
 
     Parameters
     ----------
@@ -58,45 +76,29 @@ def plot_birds_eye(
         x forward, y left, z up [m].
     label : (N,) uint8
         `Label` of each point.
-    path : str or Path
-        File to write, a PNG.
     truth : (N,) uint8, optional
         True `Label` of each point, UNKNOWN where it does not count. With it a
         second panel shows the errors.
-    title : str
-        Line above the panels.
-    extent : float
-        Half the side of the square shown [m].
 
     Raises
     ------
-    PointCloudError, ConfigError
-        If the shapes do not fit together; if `extent` is not a positive number.
+    PointCloudError
+        If the shapes do not fit together.
     """
     xyz = check_points(points)
     check_lengths(len(xyz), label=label, truth=truth)
-    if not (extent > 0.0 and math.isfinite(extent)):
-        raise ConfigError(f'extent = {extent}: must be a positive number of metres')
     xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
     panels = [_label_panel(label)]
     if truth is not None:
         panels.append(_error_panel(label, truth))
-    # Placed by hand: matplotlib's own layouts leave no room for a legend below equal axes.
     square, left, right, bottom, top, title_height = SINGLE
-    width = (left + square + right) * len(panels)
-    height = bottom + square + top + (title_height if title else 0.0)
-    figure = new_figure(width, height)
-    if title:
-        figure.text(
-            0.5, 1.0 - 0.6 * title_height / height, title, fontsize=15, fontweight='bold',
-            ha='center', va='center', parse_math=False,
-        )  # fmt: skip
+    panel_width, height = left + square + right, bottom + square + top
+    figure = new_figure(panel_width * len(panels), height + (title_height if title else 0.0))
+    write_line(figure, title, 0.5, 0.6 * title_height, fontsize=15, fontweight='bold')
     for k, (panel_title, layers) in enumerate(panels):
-        start = left + k * (left + square + right)
-        axes = figure.add_axes((start / width, bottom / height, square / width, square / height))
+        axes = add_axes(figure, k * panel_width + left, bottom, (square, square))
         axes.set_title(panel_title, fontsize=11)
-        shown = _draw_layers(axes, xy, layers, extent)
-        sensor = _draw_sensor(axes, len(layers) + 2, size=8)
+        shown, sensor = _draw_panel(axes, xy, layers, sensor_size=8)
         axes.set_xlabel('y, to the left [m]')
         axes.set_ylabel('x, forward [m]')
         axes.legend(
@@ -107,105 +109,49 @@ def plot_birds_eye(
     save(figure, path)
 
 
-class SheetPanel(NamedTuple):
-    """One scan of a sheet.
+def plot_error_sheet(panels: Sequence[SheetPanel], path: str | Path, title: str) -> None:
+    """Draw the errors of at least one scan from above, three in a row, replacing `path`, a PNG.
 
-    Attributes
-    ----------
-    title, subtitle : str
-        Lines above it.
-    points : (N, >=2) float
-        x forward, y left [m].
-    label, truth : (N,) uint8
-        Given and true `Label`; truth is UNKNOWN where the point does not count.
+    Raises `PointCloudError` if the lengths of a panel differ.
     """
-
-    title: str
-    subtitle: str
-    points: npt.NDArray[np.floating]
-    label: npt.NDArray[np.uint8]
-    truth: npt.NDArray[np.uint8]
-
-    def layers(self) -> list[Layer]:
-        """Return the layers, lowest first; each point is in one."""
-        given = self.label == Label.GROUND
-        ground, obstacle = self.truth == Label.GROUND, self.truth == Label.OBSTACLE
-        return [
-            Layer('not scored', NOT_SCORED_COLOUR, 0.8, ~(ground | obstacle)),
-            Layer('right obstacle', RIGHT_OBSTACLE_COLOUR, 0.8, obstacle & ~given),
-            Layer('right ground', RIGHT_GROUND_COLOUR, 0.8, ground & given),
-            Layer('missed ground', MISSED_GROUND_COLOUR, 2.6, ground & ~given),
-            Layer('false ground', FALSE_GROUND_COLOUR, 2.6, obstacle & given),
-        ]
-
-
-def plot_error_sheet(
-    panels: Sequence[SheetPanel], path: str | Path, title: str = '', extent: float = 50.0
-) -> None:
-    """Draw the errors of scans from above, three in a row, replacing the file `path`.
-
-    Parameters
-    ----------
-    panels : sequence of SheetPanel
-        At least one.
-    path : str or Path
-        File to write, a PNG.
-    title : str
-        Line above all of them.
-    extent : float
-        Half the side of the square shown of each [m].
-
-    Raises
-    ------
-    PointCloudError
-        If the lengths of a panel differ.
-    """
-    for panel in panels:
-        check_lengths(len(panel.points), label=panel.label, truth=panel.truth)
     square, left, right, bottom, top, title_height = SHEET
     n_columns = min(SHEET_COLUMNS, len(panels))
     panel_width, panel_height = left + square + right, top + square + bottom
-    width = n_columns * panel_width
-    height = title_height + SHEET_LEGEND + math.ceil(len(panels) / n_columns) * panel_height
+    width, head = n_columns * panel_width, title_height + SHEET_LEGEND
+    height = head + math.ceil(len(panels) / n_columns) * panel_height
     figure = new_figure(width, height)
-    figure.text(
-        left / width, 1.0 - 0.55 * title_height / height, title, fontsize=15, fontweight='bold',
-        ha='left', va='center', parse_math=False,
-    )  # fmt: skip
-    dots = _dots(panels[0].layers()[::-1], 8)
-    figure.legend(
-        handles=dots, loc='center left', frameon=False, fontsize=11,
-        bbox_to_anchor=(left / width, 1.0 - (title_height + 0.4 * SHEET_LEGEND) / height),
-        ncols=len(dots) if n_columns > 1 else 3, handletextpad=0.2, columnspacing=1.2,
-        borderpad=0.0, borderaxespad=0.0,
-    )  # fmt: skip
-    for k, panel in enumerate(panels):
+    write_line(
+        figure, title, left / width, 0.55 * title_height, fontsize=15, fontweight='bold', ha='left'
+    )
+    for k, (panel_title, subtitle, points, label, truth) in enumerate(panels):
+        check_lengths(len(points), label=label, truth=truth)
         row, column = divmod(k, n_columns)
-        start = column * panel_width + left
-        base = height - title_height - SHEET_LEGEND - row * panel_height - top - square
-        axes = figure.add_axes((start / width, base / height, square / width, square / height))
-        layers = panel.layers()
-        _draw_layers(axes, panel.points[:, :2], layers, extent)
-        _draw_sensor(axes, len(layers) + 2, size=7)
+        base = height - head - row * panel_height - top - square
+        axes = add_axes(figure, column * panel_width + left, base, (square, square))
+        layers = _error_layers(label, truth, ('right obstacle', 'right ground'), (0.8, 2.6))
+        _draw_panel(axes, points[:, :2], layers, sensor_size=7)
         axes.tick_params(labelsize=8)
-        for line, above, style in (
-            (panel.title, 20, {'fontsize': 12, 'fontweight': 'bold'}),
-            (panel.subtitle, 6, {'fontsize': 9.5, 'color': '#3B4046'}),
+        for line, above, look in (
+            (panel_title, 20, {'fontsize': 12, 'fontweight': 'bold'}),
+            (subtitle, 6, {'fontsize': 9.5, 'color': '#3B4046'}),
         ):
             axes.annotate(
                 line, (0.0, 1.0), (0, above), 'axes fraction', textcoords='offset points',
-                parse_math=False, **style,
+                parse_math=False, **look,
             )  # fmt: skip
+    figure.legend(
+        handles=_dots(layers[::-1], 8), loc='center left', frameon=False, fontsize=11,
+        bbox_to_anchor=(left / width, 1.0 - (title_height + 0.4 * SHEET_LEGEND) / height),
+        ncols=len(layers) if n_columns > 1 else 3, handletextpad=0.2, columnspacing=1.2,
+        borderpad=0.0, borderaxespad=0.0,
+    )  # fmt: skip
     save(figure, path)
 
 
-def _label_panel(label: npt.NDArray[np.uint8]) -> tuple[str, list[Layer]]:
+def _label_panel(label: Labels) -> tuple[str, list[Layer]]:
     """Return title and layers of the given labels."""
-    layers = [
-        Layer('ground', GROUND_COLOUR, 1.0, label == Label.GROUND),
-        Layer('obstacle', OBSTACLE_COLOUR, 1.0, label == Label.OBSTACLE),
-        Layer('unknown', UNKNOWN_COLOUR, 1.0, label == Label.UNKNOWN),
-    ]
+    shown = (Label.GROUND, Label.OBSTACLE, Label.UNKNOWN)
+    layers = [Layer(value.name.lower(), 1.0, label == value) for value in shown]
     counts = [
         f'{_thousands(int(layer.chosen.sum()))} {layer.name}'
         for layer in layers
@@ -214,87 +160,80 @@ def _label_panel(label: npt.NDArray[np.uint8]) -> tuple[str, list[Layer]]:
     return f'{_thousands(len(label))} points: {", ".join(counts)}', layers
 
 
-def _error_panel(
-    label: npt.NDArray[np.uint8], truth: npt.NDArray[np.uint8]
-) -> tuple[str, list[Layer]]:
+def _error_panel(label: Labels, truth: Labels) -> tuple[str, list[Layer]]:
     """Return title and layers of the errors."""
-    given, ground = label == Label.GROUND, truth == Label.GROUND
-    false, missed = given & (truth == Label.OBSTACLE), ~given & ground
-    not_scored = truth == Label.UNKNOWN
-    layers = [
-        Layer('not scored', NOT_SCORED_COLOUR, 1.0, not_scored),
-        Layer('right', RIGHT_COLOUR, 1.0, ~(false | missed | not_scored)),
-        Layer('missed ground', MISSED_GROUND_COLOUR, 3.0, missed),
-        Layer('false ground', FALSE_GROUND_COLOUR, 3.0, false),
-    ]
-    n_hit, n_false, n_missed = (int(part.sum()) for part in (given & ground, false, missed))
-    n_union = n_hit + n_false + n_missed
+    layers = _error_layers(label, truth, ('right',), (1.0, 3.0))
+    missed, false = (layer.chosen for layer in layers[-2:])
+    hit = (label == Label.GROUND) & (truth == Label.GROUND)
+    n_hit, n_missed, n_false = (int(part.sum()) for part in (hit, missed, false))
+    n_union = n_hit + n_missed + n_false
     iou = f', IoU {100.0 * n_hit / n_union:.2f} %' if n_union else ''
     return f'{_thousands(n_false)} false ground, {_thousands(n_missed)} missed ground{iou}', layers
+
+
+def _error_layers(
+    label: Labels, truth: Labels, right: tuple[str, ...], sizes: tuple[float, float]
+) -> list[Layer]:
+    """Return layers, lowest first; each point is in one. Sizes are of right points and errors."""
+    given, ground, obstacle = label == Label.GROUND, truth == Label.GROUND, truth == Label.OBSTACLE
+    chosen = {
+        'not scored': ~(ground | obstacle),
+        'right': (ground & given) | (obstacle & ~given),
+        'right obstacle': obstacle & ~given,
+        'right ground': ground & given,
+        'missed ground': ground & ~given,
+        'false ground': obstacle & given,
+    }
+    errors = ('missed ground', 'false ground')
+    names = ('not scored', *right, *errors)
+    return [Layer(name, sizes[name in errors], chosen[name]) for name in names]
 
 
 def _thousands(number: int) -> str:
     return f'{number:,}'.replace(',', ' ')
 
 
-def _draw_layers(
-    axes: Any, xy: npt.NDArray[np.floating], layers: Sequence[Layer], extent: float
-) -> list[Layer]:
-    """Draw the points and rings of equal range, forward up and left to the left.
+def _dots(layers: Sequence[Layer], size: float) -> list[Any]:
+    return style.legend_dots({layer.name: COLOURS[layer.name] for layer in layers}, size)
 
-    Returns the layers that have a point in the picture.
+
+def _draw_panel(
+    axes: Any, xy: npt.NDArray[np.floating], layers: Sequence[Layer], sensor_size: float
+) -> tuple[list[Layer], Any]:
+    """Draw points, rings of equal range and the sensor, forward up and left to the left.
+
+    Returns the layers that have a point in the picture, and the legend entry of the sensor.
     """
-    inside = (np.abs(xy) <= extent).all(axis=1)  # False where it is NaN.
+    inside = (np.abs(xy) <= EXTENT).all(axis=1)  # False where it is NaN.
     shown = []
     for depth, layer in enumerate(layers, start=1):
         x, y = xy[layer.chosen & inside].T
         if len(x):
-            axes.scatter(y, x, s=layer.size, c=layer.colour, linewidths=0.0, zorder=depth)
+            colour = COLOURS[layer.name]
+            axes.scatter(y, x, s=layer.size, c=colour, linewidths=0.0, zorder=depth)
             shown.append(layer)
-    _draw_rings(axes, extent, len(layers) + 1)
+    _draw_rings(axes, len(layers) + 1)
     axes.set_aspect('equal')
-    axes.set_xlim(extent, -extent)
-    axes.set_ylim(-extent, extent)
-    return shown
-
-
-def _dots(layers: Sequence[Layer], size: float) -> list[Any]:
-    """Return legend entries; dots as small as in the picture would show no colour."""
-    from matplotlib.lines import Line2D
-
-    return [
-        Line2D([], [], marker='o', markersize=size, color=colour, linestyle='none', label=name)
-        for name, colour, *_ in layers
-    ]
-
-
-def _draw_sensor(axes: Any, depth: int, size: float) -> Any:
+    axes.set_xlim(EXTENT, -EXTENT)
+    axes.set_ylim(-EXTENT, EXTENT)
     (sensor,) = axes.plot(
         0, 0, marker='^', color='white', markeredgecolor='black', linestyle='none',
-        markersize=size, zorder=depth, label='sensor',
+        markersize=sensor_size, zorder=len(layers) + 2, label='sensor',
     )  # fmt: skip
-    return sensor
+    return shown, sensor
 
 
-def _draw_rings(axes: Any, extent: float, depth: int) -> None:
-    """Draw circles of equal range, at most five, a round number of metres apart."""
-    step = _round_step(extent / 5.0)
+def _draw_rings(axes: Any, depth: int) -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    for radius in np.arange(step, extent * math.sqrt(2.0), step):
+    for radius in np.arange(RING_STEP, EXTENT * math.sqrt(2.0), RING_STEP):
         axes.plot(
             radius * np.cos(angle), radius * np.sin(angle), color='#6B7178', linewidth=0.5,
             linestyle=(0, (4, 4)), zorder=depth,
         )  # fmt: skip
-        if radius < extent:
+        if radius < EXTENT:
             axes.text(
-                -radius * math.sin(math.pi / 4), -radius * math.cos(math.pi / 4), f'{radius:g} m',
-                fontsize=8, color='#3B4046', ha='center', va='center', zorder=depth,
+                *(-radius * math.sqrt(0.5),) * 2, f'{radius:g} m', fontsize=8, color='#3B4046',
+                ha='center', va='center', zorder=depth,
                 bbox={'boxstyle': 'round,pad=0.15', 'facecolor': 'white', 'edgecolor': 'none',
                       'alpha': 0.8},
             )  # fmt: skip
-
-
-def _round_step(least: float) -> float:
-    """Smallest of 1, 2, 5 times a power of ten that is at least `least`."""
-    power = 10.0 ** math.floor(math.log10(least))
-    return next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least)

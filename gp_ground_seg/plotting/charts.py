@@ -11,21 +11,15 @@ import numpy as np
 
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.frame import FloatArray, IntArray
-from gp_ground_seg.plotting.style import (
-    BLUE,
-    GREEN,
-    ORANGE,
-    PINK,
-    SKY,
-    VERMILION,
-    VIOLET,
-    new_figure,
-    save,
-)
+from gp_ground_seg.plotting import style
+from gp_ground_seg.plotting.style import add_axes, new_figure, save, write_line
 
-STAGE_COLOURS = (BLUE, SKY, GREEN, ORANGE, VERMILION, PINK, '#B4BAC0', VIOLET)
+STAGE_COLOURS = (
+    style.BLUE, style.SKY, style.GREEN, style.ORANGE, style.VERMILION, style.PINK, '#B4BAC0',
+    style.VIOLET,
+)  # fmt: skip
 REFERENCE_COLOUR = '#3B4046'
-POOLED_COLOUR = BLUE
+POOLED_COLOUR = style.BLUE
 SEQUENCE_COLOUR = '#9AA1A9'
 COUNT_COLOUR = '#BFD7EA'
 
@@ -40,31 +34,25 @@ MIN_POINTS = 20
 def plot_stage_bars(
     cases: Mapping[str, Mapping[str, float]],
     path: str | Path,
-    title: str = '',
+    title: str,
     baseline: tuple[str, float] | None = None,
     *,
     force: bool = False,
 ) -> None:
-    """Draw one bar per case, in stages, as a PNG.
+    """Draw one bar per case, in stages, as a PNG; `force` replaces an existing file.
 
     Parameters
     ----------
     cases : mapping of str to mapping of str to float
         Time of each stage by its name [ms], by name of the case; at least one, all with the
         same stages.
-    path : str or Path
-        File to write.
-    title : str
-        Line above.
     baseline : tuple of str and float, optional
         Name of another method and its time for a whole frame [ms].
-    force : bool
-        Whether an existing file is replaced.
     """
     stages = list(next(iter(cases.values())))
     height = AROUND + BAR * len(cases)
     figure = new_figure(BARS_WIDTH, height)
-    axes = figure.add_axes((0.19, 0.75 / height, 0.77, BAR * len(cases) / height))
+    axes = add_axes(figure, 0.19 * BARS_WIDTH, 0.75, (0.77 * BARS_WIDTH, BAR * len(cases)))
     start = np.zeros(len(cases))
     for stage, colour in zip(stages, cycle(STAGE_COLOURS)):
         width = np.array([case[stage] for case in cases.values()])
@@ -85,9 +73,7 @@ def plot_stage_bars(
         loc='upper center', ncols=len(stages) + 1, frameon=False, fontsize=9.5,
         bbox_to_anchor=(0.5, 1.0 - 0.55 / height), handlelength=1.2, columnspacing=1.2,
     )  # fmt: skip
-    figure.text(
-        0.5, 1.0 - 0.3 / height, title, fontsize=11, ha='center', va='center', parse_math=False
-    )
+    write_line(figure, title, 0.5, 0.3, fontsize=11)
     save(figure, path, force=force)
 
 
@@ -107,34 +93,20 @@ class Reliability(Protocol):
 
 
 def plot_reliability(
-    pooled: Reliability, sequences: Mapping[str, Reliability], path: str | Path, title: str = ''
+    pooled: Reliability, sequences: Mapping[str, Reliability], path: str | Path, title: str
 ) -> None:
     """Draw the share of ground over probability, and points per bin below, as a PNG.
 
-    Parameters
-    ----------
-    pooled : Reliability
-        Of all frames.
-    sequences : mapping of str to Reliability
-        By sequence; drawn thin if there is more than one.
-    path : str or Path
-        File to write, replaced if it exists.
-    title : str
-        Line above.
-
-    Raises
-    ------
-    PointCloudError
-        If there is no point to draw.
+    `pooled` is of all frames; `sequences`, by name, are drawn thin if there is more than one.
+    The file `path` is replaced. Raises `PointCloudError` if there is no point to draw.
     """
     if not pooled.n_points.sum():
         raise PointCloudError('reliability diagram: no scored point has a probability')
     height = TITLE + SQUARE + GAP + COUNTS + BOTTOM
-    width = LEFT + SQUARE + RIGHT
-    figure = new_figure(width, height)
-    left, across = LEFT / width, SQUARE / width
-    upper = figure.add_axes((left, (BOTTOM + COUNTS + GAP) / height, across, SQUARE / height))
-    lower = figure.add_axes((left, BOTTOM / height, across, COUNTS / height), sharex=upper)
+    figure = new_figure(LEFT + SQUARE + RIGHT, height)
+    upper = add_axes(figure, LEFT, BOTTOM + COUNTS + GAP, (SQUARE, SQUARE))
+    lower = add_axes(figure, LEFT, BOTTOM, (SQUARE, COUNTS))
+    lower.sharex(upper)
     upper.tick_params(labelbottom=False)
     upper.plot([0, 1], [0, 1], color=REFERENCE_COLOUR, linestyle='--', linewidth=1, label='ideal')
     for k, one in enumerate(sequences.values() if len(sequences) > 1 else ()):
@@ -150,24 +122,20 @@ def plot_reliability(
     text = f'ECE {pooled.ece:.4f}\nBrier {pooled.brier:.4f}'
     upper.text(0.97, 0.03, text, ha='right', va='bottom', fontsize=11)
     upper.legend(loc='lower right', bbox_to_anchor=(1.0, 0.1), frameon=False)
-    _draw_counts(lower, pooled)
+    share = 100.0 * pooled.n_points / pooled.n_points.sum()
+    edges = np.linspace(0.0, 1.0, len(share) + 1)
+    lower.bar(
+        edges[:-1], share, np.diff(edges), align='edge', color=COUNT_COLOUR, edgecolor='white'
+    )
+    lower.set_yscale('log')
+    lower.set_ylim(min(0.1, 0.7 * share[share > 0].min()), 100.0)
+    lower.set_yticks([0.1, 1.0, 10.0, 100.0], ['0.1', '1', '10', '100'])
+    lower.minorticks_off()
+    lower.set_ylabel('points [%]')
+    lower.set_xlabel('probability of ground, p_ground')
     save(figure, path)
 
 
-def _draw_line(axes: Any, one: Reliability, **style: Any) -> None:
+def _draw_line(axes: Any, one: Reliability, **look: Any) -> None:
     enough = one.n_points >= MIN_POINTS
-    axes.plot(one.mean_p[enough], one.share_ground[enough], markersize=6, clip_on=False, **style)
-
-
-def _draw_counts(axes: Any, pooled: Reliability) -> None:
-    share = 100.0 * pooled.n_points / pooled.n_points.sum()
-    edges = np.linspace(0.0, 1.0, len(share) + 1)
-    axes.bar(
-        edges[:-1], share, np.diff(edges), align='edge', color=COUNT_COLOUR, edgecolor='white'
-    )
-    axes.set_yscale('log')
-    axes.set_ylim(min(0.1, 0.7 * share[share > 0].min()), 100.0)
-    axes.set_yticks([0.1, 1.0, 10.0, 100.0], ['0.1', '1', '10', '100'])
-    axes.minorticks_off()
-    axes.set_ylabel('points [%]')
-    axes.set_xlabel('probability of ground, p_ground')
+    axes.plot(one.mean_p[enough], one.share_ground[enough], markersize=6, clip_on=False, **look)

@@ -13,16 +13,10 @@ from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.frame import OUTSIDE, FloatArray, Label
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.points import check_points
-from gp_ground_seg.plotting.style import (
-    BLUE,
-    GREEN,
-    VERMILION,
-    VIOLET,
-    check_lengths,
-    new_figure,
-    save,
-)
+from gp_ground_seg.plotting import style
 from gp_ground_seg.result import Segmentation
+
+Labels = npt.NDArray[np.uint8]
 
 FORMATS = ('.png', '.pdf')
 DPI = 130
@@ -31,13 +25,16 @@ WIDTH, HEIGHT, LEGEND = 12.2, 7.6, 2.6
 
 # The truth is light, so that what is estimated stands out.
 POINT_COLOUR = '#B4BAC0'
-TRUE_GROUND_COLOUR = '#E8CF9A'
-TRUE_OBSTACLE_COLOUR = '#A9C4DA'
+TRUTH_COLOURS = {
+    'not scored': (Label.UNKNOWN, POINT_COLOUR),
+    'true obstacle': (Label.OBSTACLE, '#A9C4DA'),
+    'true ground': (Label.GROUND, '#E8CF9A'),
+}
 CANDIDATE_COLOUR = '#56636E'
-INLIER_COLOUR = BLUE
-LINE_COLOUR = GREEN
-SURFACE_COLOUR = VERMILION
-PSEUDO_INPUT_COLOUR = VIOLET
+INLIER_COLOUR = style.BLUE
+LINE_COLOUR = style.GREEN
+SURFACE_COLOUR = style.VERMILION
+PSEUDO_INPUT_COLOUR = style.VIOLET
 
 # Metres kept free below and above the ground, and beyond the last candidate; and the distance
 # from the ground up to which a candidate is always in the picture.
@@ -55,7 +52,7 @@ def plot_segment(
     points: npt.ArrayLike,
     segment: int,
     path: str | Path,
-    truth: npt.NDArray[np.uint8] | None = None,
+    truth: Labels | None = None,
     title: str = '',
     max_range: float | None = None,
 ) -> None:
@@ -67,32 +64,25 @@ def plot_segment(
 
     Parameters
     ----------
-    result : Segmentation
-        The segmentation of `points`.
-    config : Config
-        The parameters it was segmented with.
+    result, config : Segmentation, Config
+        The segmentation of `points` and its parameters.
     points : (N, >=3) float array
         x forward, y left, z up [m].
-    segment : int
-        Number of the segment.
-    path : str or Path
-        File to write, .png or .pdf.
+    segment, path : int, str or Path
+        Number of the segment; file to write, .png or .pdf, replaced if it exists.
     truth : (N,) uint8, optional
         True `Label` of each point, UNKNOWN where it does not count.
-    title : str
-        Line above the panels, before the segment's number.
     max_range : float, optional
         Range shown [m]; by default a little more than that of the last candidate.
 
     Raises
     ------
-    PointCloudError
-        If the shapes do not fit together.
-    ConfigError
-        If the segment, the range or the ending of the file is not one accepted.
+    PointCloudError, ConfigError
+        If the shapes do not fit together; if the segment, the range or the file's ending is
+        not accepted.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
-    check_lengths(len(z), result=result.label, truth=truth)
+    style.check_lengths(len(z), result=result.label, truth=truth)
     n_segments = result.grid.n_segments
     if not 0 <= segment < n_segments:
         raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
@@ -100,7 +90,7 @@ def plot_segment(
         raise ConfigError(f'max_range = {max_range}: must be a positive number of metres')
     if Path(path).suffix.lower() not in FORMATS:
         raise ConfigError(f'{path}: must end in {" or ".join(FORMATS)}')
-    figure = new_figure(WIDTH, HEIGHT, DPI)
+    figure = style.new_figure(WIDTH, HEIGHT, DPI)
     from matplotlib.ticker import LogLocator, NullFormatter
 
     view = SegmentView(result, z, segment, truth)
@@ -122,21 +112,16 @@ def plot_segment(
             borderaxespad=0.0, labelspacing=0.8, markerscale=1.3,
         )  # fmt: skip
     figure.align_ylabels()
-    save(figure, path)
+    style.save(figure, path)
 
 
 class SegmentView:
     """The parts of the picture; `z` is the height of each point in the level frame, (N,) [m]."""
 
     def __init__(
-        self,
-        result: Segmentation,
-        z: FloatArray,
-        segment: int,
-        truth: npt.NDArray[np.uint8] | None,
+        self, result: Segmentation, z: FloatArray, segment: int, truth: Labels | None
     ) -> None:
-        self._result = result
-        self._segment = segment
+        self._result, self._segment = result, segment
         own = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
         self._r, self._z = result.grid.r[own], z[own]
         self._truth = None if truth is None else truth[own]
@@ -152,9 +137,8 @@ class SegmentView:
         width = 360.0 / self._result.grid.n_segments
         first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
         model = '' if np.isfinite(self._mean).any() else ': no ground model'
-        parts = [title] if title else []
-        parts += [f'segment {self._segment}', f'azimuth {first:g}° to {last:g}°{model}']
-        return ', '.join(parts)
+        own = f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
+        return f'{title}, {own}' if title else own
 
     def reach(self) -> float:
         """Range that holds all candidates, or all points where there are none [m]."""
@@ -164,11 +148,17 @@ class SegmentView:
 
     def draw_heights(self, axes: Any, reach: float) -> None:
         """Draw points, candidates, lines and ground over range, up to `reach` [m]."""
-        for title, colour, chosen in self._point_groups():
+        groups = {'points': (POINT_COLOUR, np.ones(len(self._r), dtype=np.bool_))}
+        if self._truth is not None:
+            groups = {
+                f'points, {name}': (colour, self._truth == label)
+                for name, (label, colour) in TRUTH_COLOURS.items()
+            }
+        for name, (colour, chosen) in groups.items():
             if chosen.any():
                 axes.plot(
                     self._r[chosen], self._z[chosen], 'o', ms=3.6, mew=0.0, color=colour,
-                    zorder=2, label=f'{title} ({np.count_nonzero(chosen)})',
+                    zorder=2, label=f'{name} ({np.count_nonzero(chosen)})',
                 )  # fmt: skip
         axes.fill_between(
             self._knots, self._mean - 2.0 * self._std, self._mean + 2.0 * self._std,
@@ -176,43 +166,32 @@ class SegmentView:
         )  # fmt: skip
         self._draw_lines(axes)
         axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='ground')
-        for name, chosen, style in (
+        for name, chosen, look in (
             ('rejected', ~self._inlier, {'mfc': 'white', 'mec': CANDIDATE_COLOUR, 'mew': 1.1,
                                          'ms': 5.5, 'zorder': 6}),
             ('inliers', self._inlier, {'color': INLIER_COLOUR, 'mew': 0.0, 'ms': 5, 'zorder': 7}),
         ):  # fmt: skip
             axes.plot(
                 self._candidate_r[chosen], self._candidate_z[chosen], 'o',
-                label=f'candidates, {name} ({np.count_nonzero(chosen)})', **style,
+                label=f'candidates, {name} ({np.count_nonzero(chosen)})', **look,
             )  # fmt: skip
         axes.set_xlim(0.0, reach)
         low, high = self._heights_shown(reach)
         axes.set_ylim(low, high)
         axes.set_ylabel('height z, sensor frame [m]')
         inside = self._r <= reach
-        counts = {
-            'above': np.count_nonzero(inside & (self._z > high)),
-            'below': np.count_nonzero(inside & (self._z < low)),
-            'beyond': np.count_nonzero(~inside),
-        }
-        outside = ', '.join(f'{n} points {side}' for side, n in counts.items() if n)
+        sides = {'above': inside & (self._z > high), 'below': inside & (self._z < low)}
+        sides['beyond'] = ~inside
+        outside = ', '.join(
+            f'{np.count_nonzero(which)} points {side}'
+            for side, which in sides.items()
+            if which.any()
+        )
         axes.annotate(
-            f'not shown: {outside}' if outside else '', (1.0, 1.0), (0, 4),
-            xycoords='axes fraction', textcoords='offset points', ha='right', va='bottom',
-            fontsize=8.5, color=CANDIDATE_COLOUR,
+            f'not shown: {outside}' if outside else '', (1.0, 1.0), (0, 4), 'axes fraction',
+            textcoords='offset points', ha='right', va='bottom', fontsize=8.5,
+            color=CANDIDATE_COLOUR,
         )  # fmt: skip
-
-    def _point_groups(self) -> list[tuple[str, str, npt.NDArray[np.bool_]]]:
-        if self._truth is None:
-            return [('points', POINT_COLOUR, np.ones(len(self._r), dtype=np.bool_))]
-        return [
-            (f'points, {name}', colour, self._truth == label)
-            for name, colour, label in (
-                ('not scored', POINT_COLOUR, Label.UNKNOWN),
-                ('true obstacle', TRUE_OBSTACLE_COLOUR, Label.OBSTACLE),
-                ('true ground', TRUE_GROUND_COLOUR, Label.GROUND),
-            )
-        ]
 
     def _heights_shown(self, reach: float) -> tuple[float, float]:
         """Limits around the ground as far as it rests on inliers, and candidates near it.
@@ -239,17 +218,14 @@ class SegmentView:
         """Draw each line over its extent, and the critical points where the next one begins."""
         candidates, lines = self._result.candidates, self._result.lines
         ids = np.unique(lines.line[self._own])
-        title: str | None = f'lines ({len(ids)})'
-        for q in ids:
-            own = slice(int(lines.start[q]), int(lines.start[q + 1]))
-            if own.stop - own.start < 2:
-                continue
-            r, z = line_ends(candidates.r[own], candidates.z[own], float(lines.slope[q]))
+        drawn = [q for q in ids if lines.start[q + 1] - lines.start[q] > 1]
+        for q in drawn:
+            own = slice(lines.start[q], lines.start[q + 1])
             axes.plot(
-                r, z, color=LINE_COLOUR, lw=3.2, alpha=0.75, solid_capstyle='butt', zorder=4,
-                label=title,
+                *line_ends(candidates.r[own], candidates.z[own], float(lines.slope[q])),
+                color=LINE_COLOUR, lw=3.2, alpha=0.75, solid_capstyle='butt', zorder=4,
+                label=f'lines ({len(ids)})' if q == drawn[0] else None,
             )  # fmt: skip
-            title = None
         critical = lines.start[ids[1:]]
         axes.plot(
             candidates.r[critical], candidates.z[critical], 'd', ms=9, mfc='none',
@@ -285,12 +261,7 @@ class SegmentView:
 def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, FloatArray]:
     """Return range and height of the ends of a line, (2,) each [m]: its outermost points on it.
 
-    Parameters
-    ----------
-    r, z : (n,) float64
-        Range and height of its points [m].
-    slope : float
-        Its slope; may be infinite.
+    `r` and `z` are those of its points, (n,) each [m]; the slope may be infinite.
     """
     angle = math.atan(slope)
     along = (r - r.mean()) * math.cos(angle) + (z - z.mean()) * math.sin(angle)

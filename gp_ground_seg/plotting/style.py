@@ -1,8 +1,9 @@
-"""What the pictures share: figures without a display, colours, checks of their input."""
+"""Shared by the pictures: figures without a display, colours, checks of the input."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,25 +25,13 @@ BLUE, SKY, GREEN, ORANGE, VERMILION, PINK, VIOLET = (
 # Lightness rises evenly from one to the next, and hue only goes from blue to yellow: that
 # is told apart with any of the common colour vision deficiencies, and in print.
 _RAMP = np.array(
-    [
-        [0.02, 0.12, 0.40],
-        [0.16, 0.30, 0.56],
-        [0.36, 0.47, 0.60],
-        [0.58, 0.63, 0.56],
-        [0.82, 0.79, 0.42],
-        [1.00, 0.95, 0.50],
-    ]
-)
+    [[0.02, 0.12, 0.40], [0.16, 0.30, 0.56], [0.36, 0.47, 0.60],
+     [0.58, 0.63, 0.56], [0.82, 0.79, 0.42], [1.00, 0.95, 0.50]]
+)  # fmt: skip
 
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Any:
-    """Return an empty matplotlib figure [inch] outside pyplot's global state.
-
-    Raises
-    ------
-    MissingDependencyError
-        If matplotlib is not installed.
-    """
+    """Return an empty matplotlib figure [inch] outside pyplot's global state."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -52,14 +41,33 @@ def new_figure(width: float, height: float, dpi: int = DPI) -> Any:
     return Figure((width, height), dpi=dpi)
 
 
-def save(figure: Any, path: str | Path, *, force: bool = True) -> None:
-    """Write a figure as PDF where `path` ends so, else as PNG.
+def add_axes(figure: Any, left: float, bottom: float, size: tuple[float, float]) -> Any:
+    """Return new axes at a place from the lower left corner, width and height `size` [inch].
 
-    Raises
-    ------
-    DataError
-        If the file cannot be written, or exists and `force` is false.
+    matplotlib's own layouts leave no room for a legend below equal axes.
     """
+    width, height = figure.get_size_inches()
+    return figure.add_axes((left / width, bottom / height, size[0] / width, size[1] / height))
+
+
+def write_line(figure: Any, text: str, x: float, below_top: float, **style: Any) -> None:
+    """Write a line of text at a share of the width, `below_top` inches from the upper edge."""
+    y = 1.0 - below_top / figure.get_size_inches()[1]
+    figure.text(x, y, text, **{'ha': 'center', 'va': 'center', 'parse_math': False, **style})
+
+
+def legend_dots(colours: Mapping[str, str], size: float) -> list[Any]:
+    """Return legend entries; dots as small as in the picture would show no colour."""
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], marker='o', markersize=size, color=colour, linestyle='none', label=name)
+        for name, colour in colours.items()
+    ]
+
+
+def save(figure: Any, path: str | Path, *, force: bool = True) -> None:
+    """Write a figure as PDF where `path` ends so, else as PNG."""
     kind = 'pdf' if Path(path).suffix.lower() == '.pdf' else 'png'
     # With its date no PDF would equal another.
     metadata = {'CreationDate': None} if kind == 'pdf' else {}
@@ -68,13 +76,7 @@ def save(figure: Any, path: str | Path, *, force: bool = True) -> None:
 
 
 def check_lengths(n_points: int, **values: Any) -> None:
-    """Check that arrays have one value per point; those that are None are left out.
-
-    Raises
-    ------
-    PointCloudError
-        If one has another shape than (n_points,).
-    """
+    """Raise `PointCloudError` for an array without one value per point; None is left out."""
     for name, array in values.items():
         if array is not None and array.shape != (n_points,):
             raise PointCloudError(
@@ -85,18 +87,8 @@ def check_lengths(n_points: int, **values: Any) -> None:
 def length_scale_colours(length_scale: FloatArray, low: float, high: float) -> FloatArray:
     """Return colours from dark blue (rough ground) to pale yellow (smooth), on a log scale.
 
-    Parameters
-    ----------
-    length_scale : array of float
-        [m]; NaN gives `UNKNOWN`.
-    low, high : float
-        Length-scales at the ends of the ramp [m], 0 < low < high; values beyond take the
-        colour of the end.
-
-    Returns
-    -------
-    (..., 3) float64
-        Red, green and blue in [0, 1].
+    The ramp goes from `low` to `high` [m], 0 < low < high; values beyond take the colour of
+    the end, and NaN that of `UNKNOWN`. Returns red, green and blue in [0, 1], (..., 3).
     """
     known = np.isfinite(length_scale) & (length_scale > 0.0)
     value = np.log(np.where(known, length_scale, low) / low) / math.log(high / low)

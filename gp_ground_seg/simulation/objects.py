@@ -16,6 +16,9 @@ from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.simulation.terrain import Terrain
 
 KindArray: TypeAlias = npt.NDArray[np.uint8]
+Interval: TypeAlias = tuple[FloatArray, FloatArray]
+Size: TypeAlias = tuple[float, float, float]
+"""Length, width and height [m]."""
 
 BURIED_DEPTH = 3.0
 """How far standing solids reach below the ground at their centre, so that none hovers [m]."""
@@ -37,52 +40,32 @@ class Kind(IntEnum):
     VEGETATION = 6
 
 
-SEMANTIC_KITTI_CLASS: dict[Kind, int] = {
-    Kind.TERRAIN: 40,  # road
-    Kind.BOX: 10,  # car
-    Kind.WALL: 50,  # building
-    Kind.POLE: 80,  # pole
-    Kind.OVERHANG: 52,  # other structure; scored as an obstacle, unlike vegetation
-    Kind.REFLECTION: 1,  # outlier
-    Kind.VEGETATION: 70,  # vegetation
+# In order of the codes: class in SemanticKITTI, and share of the light that comes back.
+_CLASS_AND_REFLECTANCE: dict[Kind, tuple[int, float]] = {
+    Kind.TERRAIN: (40, 0.25),  # road
+    Kind.BOX: (10, 0.5),  # car
+    Kind.WALL: (50, 0.4),  # building
+    Kind.POLE: (80, 0.6),  # pole
+    Kind.OVERHANG: (52, 0.35),  # other structure; scored as an obstacle, unlike vegetation
+    Kind.REFLECTION: (1, 0.05),  # outlier
+    Kind.VEGETATION: (70, 0.3),  # vegetation
 }
-
-# Share of the light that comes back, for an intensity that is not constant.
-REFLECTANCE: dict[Kind, float] = {
-    Kind.TERRAIN: 0.25,
-    Kind.BOX: 0.5,
-    Kind.WALL: 0.4,
-    Kind.POLE: 0.6,
-    Kind.OVERHANG: 0.35,
-    Kind.REFLECTION: 0.05,
-    Kind.VEGETATION: 0.3,
-}
+SEMANTIC_KITTI_CLASS = {kind: entry[0] for kind, entry in _CLASS_AND_REFLECTANCE.items()}
 
 
 def semantic_kitti_labels(kind: KindArray) -> npt.NDArray[np.uint32]:
     """Class in SemanticKITTI of each `Kind` code, (N,) uint32, as ``.label`` files hold them."""
-    table = np.array([SEMANTIC_KITTI_CLASS[entry] for entry in Kind], dtype=np.uint32)
-    return table[kind]
+    return np.array(list(SEMANTIC_KITTI_CLASS.values()), dtype=np.uint32)[kind]
 
 
 def reflectance(kind: KindArray) -> npt.NDArray[np.float64]:
     """Share of the light that each `Kind` code sends back, (N,) float64 in [0, 1]."""
-    return np.array([REFLECTANCE[entry] for entry in Kind])[kind]
+    return np.array([share for _, share in _CLASS_AND_REFLECTANCE.values()])[kind]
 
 
 @dataclass(frozen=True)
 class Solid(ABC):
-    """A convex solid.
-
-    Attributes
-    ----------
-    kind : Kind
-        What it counts as.
-    x, y : float
-        Centre [m].
-    bottom, top : float
-        Heights [m].
-    """
+    """A convex solid about x, y, from the height `bottom` to `top` [m]."""
 
     kind: Kind
     x: float
@@ -96,9 +79,7 @@ class Solid(ABC):
         """Radius of the vertical cylinder around it [m]."""
 
     @abstractmethod
-    def _horizontal_interval(
-        self, offset: FloatArray, direction: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
         """Ranges between which rays are inside its outline, seen from above."""
 
     def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
@@ -116,10 +97,8 @@ class Solid(ABC):
         offset, direction = offset[near], direction[near]
 
         enter, leave = self._horizontal_interval(offset, direction)
-        z_rate = _without_zeros(direction[:, 2])
-        low, high = (self.bottom - offset[:, 2]) / z_rate, (self.top - offset[:, 2]) / z_rate
-        enter = np.maximum(enter, np.minimum(low, high))
-        leave = np.minimum(leave, np.maximum(low, high))
+        between = _slab(self.bottom, self.top, offset[:, 2], direction[:, 2])
+        enter, leave = np.maximum(enter, between[0]), np.minimum(leave, between[1])
         result[near] = np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
         return result
 
@@ -137,17 +116,13 @@ class Box(Solid):
         """Half the diagonal [m]."""
         return 0.5 * math.hypot(self.length, self.width)
 
-    def _horizontal_interval(
-        self, offset: FloatArray, direction: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         enter, leave = np.full(len(offset), -np.inf), np.full(len(offset), np.inf)
         for axis, size in (((cos, sin), self.length), ((-sin, cos), self.width)):
-            position = offset[:, :2] @ np.array(axis)
-            rate = _without_zeros(direction[:, :2] @ np.array(axis))
-            low, high = (-0.5 * size - position) / rate, (0.5 * size - position) / rate
-            enter = np.maximum(enter, np.minimum(low, high))
-            leave = np.minimum(leave, np.maximum(low, high))
+            position, rate = (rays[:, :2] @ np.array(axis) for rays in (offset, direction))
+            between = _slab(-0.5 * size, 0.5 * size, position, rate)
+            enter, leave = np.maximum(enter, between[0]), np.minimum(leave, between[1])
         return enter, leave
 
 
@@ -162,9 +137,7 @@ class Cylinder(Solid):
         """Radius [m]."""
         return self.cylinder_radius
 
-    def _horizontal_interval(
-        self, offset: FloatArray, direction: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
         xy, rate = offset[:, :2], direction[:, :2]
         a = np.maximum(np.sum(rate * rate, axis=1), SMALLEST_RATE**2)
         half_b = np.sum(xy * rate, axis=1)
@@ -176,28 +149,20 @@ class Cylinder(Solid):
         return enter, np.where(miss, -np.inf, (-half_b + root) / a)
 
 
-def _without_zeros(values: FloatArray) -> FloatArray:
-    return np.where(np.abs(values) < SMALLEST_RATE, SMALLEST_RATE, values)
+def _slab(low: float, high: float, position: FloatArray, rate: FloatArray) -> Interval:
+    """Ranges between which a coordinate that grows at `rate` is between `low` and `high`."""
+    rate = np.where(np.abs(rate) < SMALLEST_RATE, SMALLEST_RATE, rate)
+    at_low, at_high = (low - position) / rate, (high - position) / rate
+    return np.minimum(at_low, at_high), np.maximum(at_low, at_high)
 
 
 def nearest_solid(
     solids: Iterable[Solid], origin: FloatArray, direction: FloatArray
 ) -> tuple[FloatArray, KindArray]:
-    """First solid that each ray meets.
+    """Range [m] at which each ray first meets a solid, infinite if none, and its `Kind`: two (R,).
 
-    Parameters
-    ----------
-    solids : iterable of Solid
-        Solids.
-    origin : (3,) or (R, 3) array
-        Start of all rays, or of each [m]. One common start is much faster.
-    direction : (R, 3) array
-        Unit vector of each ray.
-
-    Returns
-    -------
-    (R,) float64, (R,) uint8
-        Range [m], infinite where a ray meets none, and `Kind` of the solid.
+    `origin`, (3,) or (R, 3) [m], is the start of all rays, which is much faster, or of each;
+    `direction`, (R, 3), holds unit vectors.
     """
     distance = np.full(len(direction), np.inf)
     kind = np.zeros(len(direction), dtype=np.uint8)
@@ -239,27 +204,17 @@ class _Fan:
 
 
 def standing_box(
-    terrain: Terrain,
-    x: float,
-    y: float,
-    size: tuple[float, float, float],
-    yaw: float = 0.0,
-    kind: Kind = Kind.BOX,
+    terrain: Terrain, x: float, y: float, size: Size, yaw: float = 0.0, kind: Kind = Kind.BOX
 ) -> Box:
-    """Box of a (length, width, height) [m] that stands on the terrain."""
+    """Box that stands on the terrain."""
     ground, (length, width, height) = float(terrain.height(x, y)), size
     return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, length, width, yaw)
 
 
 def floating_box(
-    terrain: Terrain,
-    x: float,
-    y: float,
-    size: tuple[float, float, float],
-    clearance: float,
-    kind: Kind = Kind.OVERHANG,
+    terrain: Terrain, x: float, y: float, size: Size, clearance: float, kind: Kind = Kind.OVERHANG
 ) -> Box:
-    """Box of a (length, width, height) [m] that floats `clearance` [m] over the terrain."""
+    """Box that floats `clearance` [m] over the terrain."""
     bottom, (length, width, height) = float(terrain.height(x, y)) + clearance, size
     return Box(kind, x, y, bottom, bottom + height, length, width, yaw=0.0)
 
@@ -306,17 +261,8 @@ def wall(
     )
 
 
-def bridge(
-    terrain: Terrain, x: float, y: float, length: float, width: float, clearance: float
-) -> tuple[Box, ...]:
-    """Bridge across the x direction: a deck `length` [m] long in y, `width` in x."""
-    return (floating_box(terrain, x, y, (width, length, 0.8), clearance),)
-
-
-def tree(
-    terrain: Terrain, x: float, y: float, crown: float = 3.0, clearance: float = 2.5
-) -> tuple[Solid, ...]:
-    """Tree: a trunk and a floating crown, a cube of size `crown` [m]."""
+def tree(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
+    """Tree: a trunk and a floating crown."""
+    crown, clearance = 3.0, 2.5
     trunk = pole(terrain, x, y, clearance + 0.5, 0.18)
-    size = (crown, crown, crown)
-    return trunk, floating_box(terrain, x, y, size, clearance, kind=Kind.VEGETATION)
+    return trunk, floating_box(terrain, x, y, (crown, crown, crown), clearance, Kind.VEGETATION)

@@ -39,36 +39,25 @@ class SimulatedScan:
 
     All of it is measured at one instant: the motion during a turn is left out. Rays without a
     return are absent.
-
-    Attributes
-    ----------
-    points : (N, 4) float32
-        x forward, y left, z up in the sensor frame [m], intensity in [0, 1].
-    ring : (N,) uint16
-        Beam of each point, 0 = highest.
-    is_ground : (N,) bool
-        Whether the ray hit the terrain.
-    ground_z : (N,) float64
-        Exact terrain height under (or over) each point along the sensor's z axis, sensor
-        frame [m]. Over a vertical step it is that of one side.
-    kind : (N,) uint8
-        `Kind` that the ray hit.
-    time : float
-        Time since the start of the drive [s].
-    position : (3,) float64
-        Position of the sensor in the world [m].
-    rotation : (3, 3) float64
-        Turns vectors of the sensor frame into the world's.
     """
 
     points: npt.NDArray[np.float32]
+    """x forward, y left, z up in the sensor frame [m], intensity in [0, 1], (N, 4)."""
     ring: npt.NDArray[np.uint16]
+    """Beam of each point, 0 = highest, (N,)."""
     is_ground: npt.NDArray[np.bool_]
+    """Whether the ray hit the terrain, (N,)."""
     ground_z: FloatArray
+    """Exact terrain height under (or over) each point along the sensor's z axis, sensor frame [m],
+    (N,). Over a vertical step it is that of one side."""
     kind: KindArray
+    """`Kind` that the ray hit, (N,)."""
     time: float
+    """Time since the start of the drive [s]."""
     position: FloatArray
+    """Position of the sensor in the world [m], (3,)."""
     rotation: FloatArray
+    """Matrix (3, 3) that turns vectors of the sensor frame into the world's."""
 
 
 def simulate_scan(
@@ -82,19 +71,10 @@ def simulate_scan(
 ) -> SimulatedScan:
     """Scan the scene from one place.
 
-    Every ray has its own random numbers, drawn whether or not it hits anything: the
-    same generator state gives the same noise in another scene.
-
-    Parameters
-    ----------
-    scene, sensor : Scene, SensorModel
-        The sensor is `sensor.height` above the ground at x, y.
-    rng : Generator
-        Source of azimuth phase, noise, dropouts and reflections.
-    x, y, yaw : float
-        Place [m] and heading [rad] of the vehicle.
-    time : float
-        Passed on to the scan [s].
+    The vehicle is at `x`, `y` [m], heads to `yaw` [rad], and the sensor is `sensor.height` above
+    the ground there. Every ray has its own random numbers, drawn from `rng` whether or not it hits
+    anything: the same generator state gives the same noise in another scene. `time` [s] is only
+    passed on to the scan.
     """
     n_rays = sensor.n_rays
     phase = rng.uniform(0.0, 2.0 * np.pi / sensor.n_columns)
@@ -173,22 +153,10 @@ def _mirror(
 def ground_below(
     terrain: Terrain, points: npt.NDArray[np.floating], position: FloatArray, rotation: FloatArray
 ) -> FloatArray:
-    """Exact terrain height along the sensor's z axis under each point.
+    """Exact terrain height along the sensor's z axis under each point, sensor frame, (N,) [m].
 
-    Parameters
-    ----------
-    terrain : Terrain
-        The ground.
-    points : (N, >=3) array
-        Points in the sensor frame [m].
-    position, rotation : (3,) and (3, 3) array
-        See `SimulatedScan`.
-
-    Returns
-    -------
-    (N,) float64
-        z in the sensor frame [m]; where a tilted axis meets the terrain more than once,
-        the highest.
+    `points`, (N, >= 3) [m], are in the sensor frame; see `SimulatedScan` for the others. Where a
+    tilted axis meets the terrain more than once, it is the highest.
     """
     local = points[:, :3].astype(np.float64)
     world = local @ rotation.T + position
@@ -225,22 +193,9 @@ def simulate_drive(
 def write_semantic_kitti(scans: Iterable[SimulatedScan], root: str | Path, sequence: str) -> Path:
     """Write ``root/sequences/<sequence>/{velodyne/*.bin, labels/*.label, times.txt}``.
 
-    The sequence appears whole or not at all: it is written beside its place and moved there.
-
-    Parameters
-    ----------
-    scans : iterable of SimulatedScan
-        Scans in order; a generator is consumed one by one.
-    root : path
-        Folder that holds ``sequences``; made if need be.
-    sequence : str
-        Name of the sequence's folder, which is returned.
-
-    Raises
-    ------
-    DataError
-        If the name is not that of a folder, the sequence exists, there is no scan, or the
-        folder cannot be written.
+    The sequence appears whole or not at all; missing parent folders are made. Returns its folder.
+    Raises DataError if the name is not that of a folder, the sequence exists, there is no scan,
+    or the folder cannot be written.
     """
     root = Path(root)
     if not sequence or sequence in ('.', '..') or Path(sequence).name != sequence:

@@ -12,7 +12,6 @@ import numpy as np
 from gp_ground_seg.simulation import terrain as landforms
 from gp_ground_seg.simulation.objects import (
     Solid,
-    bridge,
     car,
     floating_box,
     pole,
@@ -33,15 +32,7 @@ URBAN_X = (-80.0, 160.0)
 
 @dataclass(frozen=True)
 class WetPatch:
-    """A disc of wet road that mirrors.
-
-    Attributes
-    ----------
-    x, y, radius : float
-        Where it is [m].
-    reflectivity : float
-        Probability that a ray is mirrored rather than scattered back, in [0, 1].
-    """
+    """A disc of wet road [m] that mirrors a ray with the probability `reflectivity`."""
 
     x: float
     y: float
@@ -81,15 +72,6 @@ def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
     return tuple(solids)
 
 
-def _road_then_rubble(rng: np.random.Generator) -> Terrain:
-    return landforms.smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0)
-
-
-def _ditch(rng: np.random.Generator) -> Terrain:
-    heading = rng.uniform(-0.5, 0.5)
-    return landforms.ditch(rng.uniform(10.0, 14.0), 4.0, 1.5, 1.0, heading)
-
-
 _OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
     # Level ground.
     'flat': lambda rng: landforms.flat(),
@@ -100,11 +82,13 @@ _OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
     # Waves of 2 to 20 m, 8 cm rms.
     'rough': landforms.rough,
     # Smooth road that ends in rubble: waves of 0.8 to 6 m, 15 cm rms.
-    'road_then_rubble': _road_then_rubble,
+    'road_then_rubble': lambda rng: landforms.smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0),
     # Road between sidewalks 15 cm higher.
     'kerb': lambda rng: landforms.kerb(rng.uniform(3.5, 5.0), 0.15),
     # Ditch 1 m deep across the drive, at an angle.
-    'ditch': _ditch,
+    'ditch': lambda rng: landforms.ditch(
+        rng.uniform(-0.5, 0.5), rng.uniform(10.0, 14.0), 4.0, 1.5, 1.0
+    ),
     # Hill of 8 % slopes with a rounded top that hides what is behind it.
     'crest': lambda rng: landforms.crest(rng.uniform(8.0, 12.0), 15.0, 0.08, 12.0),
 }
@@ -141,7 +125,8 @@ def _urban(seed: int) -> Scene:
             solids += tree(terrain, x + 8.0, side * 8.0)
     solids += truck(terrain, rng.uniform(25.0, 35.0), 2.6, math.pi)
     # Low enough for the flat upper beams of an HDL-64E to meet it.
-    solids += bridge(terrain, rng.uniform(40.0, 50.0), 0.0, 2.0 * front, 5.0, 2.8)
+    deck = (5.0, 2.0 * front, 0.8)
+    solids.append(floating_box(terrain, rng.uniform(40.0, 50.0), 0.0, deck, 2.8))
     for x in np.arange(URBAN_X[0], URBAN_X[1], 30.0) + rng.uniform(0.0, 20.0):
         solids.append(floating_box(terrain, x, front - 1.0, (6.0, 2.0, 0.2), 2.1))
     solids.append(standing_box(terrain, rng.uniform(10.0, 20.0), -8.0, (0.5, 0.5, 0.4)))

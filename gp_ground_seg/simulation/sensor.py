@@ -20,71 +20,46 @@ _STRIDES = np.array([1.0 / _PLASTIC, 1.0 / _PLASTIC**2])
 
 @dataclass(frozen=True)
 class SensorModel:
-    """A spinning LiDAR and how it is mounted.
-
-    Attributes
-    ----------
-    name : str
-        Name of the model.
-    elevations : tuple of float
-        Elevation of each beam [rad], highest first; the index is the ring.
-    n_columns : int
-        Firings per turn.
-    min_range, max_range : float
-        Ranges outside of these are not reported [m].
-    range_std : float
-        Standard deviation of the range noise, along the ray [m].
-    dropout : float
-        Probability that a return is lost.
-    height : float
-        Height above the ground under the sensor [m].
-    roll, pitch : float
-        Tilt of the sensor against the level vehicle [rad], REP-103: positive
-        roll lowers the right side, positive pitch lowers the nose.
-
-    Raises
-    ------
-    ConfigError
-        If a value is out of range.
-    """
+    """A spinning LiDAR and how it is mounted; ConfigError if a value is out of range."""
 
     name: str
     elevations: tuple[float, ...]
+    """Elevation of each beam [rad], highest first; the index is the ring."""
     n_columns: int
+    """Firings per turn."""
     min_range: float
     max_range: float
+    """Ranges outside of these are not reported [m]."""
     range_std: float
-    dropout: float
+    """Standard deviation of the range noise, along the ray [m]."""
     height: float
+    """Height above the ground under the sensor [m]."""
+    dropout: float = 0.02
+    """Probability that a return is lost."""
     roll: float = 0.0
     pitch: float = 0.0
+    """Tilt against the level vehicle [rad]: positive roll lowers the right side, positive pitch
+    the nose (REP-103)."""
 
     def __post_init__(self) -> None:
         """Check every value."""
-        beams = np.asarray(self.elevations)
-        in_order = (np.abs(beams) < math.pi / 2).all() and (np.diff(beams) < 0).all()
-        self._require(
-            beams.size > 0 and bool(in_order),
-            'elevations: must be given, within (-pi/2, pi/2) rad, highest first',
-        )
-        self._require(self.n_columns >= 1, f'n_columns = {self.n_columns}: must be at least 1')
-        self._require(
-            0.0 <= self.min_range < self.max_range < math.inf,
-            f'min_range = {self.min_range}, max_range = {self.max_range}: '
-            'must be 0 <= min_range < max_range, finite',
-        )
-        self._require(
-            0.0 <= self.range_std < math.inf, f'range_std = {self.range_std}: must be >= 0 m'
-        )
-        self._require(0.0 <= self.dropout <= 1.0, f'dropout = {self.dropout}: must be in [0, 1]')
-        self._require(0.0 < self.height < math.inf, f'height = {self.height}: must be > 0 m')
-        for name, angle in (('roll', self.roll), ('pitch', self.pitch)):
-            within = abs(angle) < math.pi / 2
-            self._require(within, f'{name} = {angle}: must be within (-pi/2, pi/2) rad')
+        beams, half = np.asarray(self.elevations), math.pi / 2.0
+        in_order = beams.size > 0 and (np.abs(beams) < half).all() and (np.diff(beams) < 0).all()
+        self._require(bool(in_order), 'elevations', 'given, within (-pi/2, pi/2), highest first')
+        self._require(self.n_columns >= 1, 'n_columns', 'at least 1')
+        self._require(0.0 <= self.min_range < self.max_range, 'min_range', '>= 0, < max_range')
+        self._require(self.max_range < math.inf, 'max_range', 'finite')
+        self._require(0.0 <= self.range_std < math.inf, 'range_std', '>= 0 m, finite')
+        self._require(0.0 <= self.dropout <= 1.0, 'dropout', 'in [0, 1]')
+        self._require(0.0 < self.height < math.inf, 'height', '> 0 m, finite')
+        self._require(abs(self.roll) < half, 'roll', 'within (-pi/2, pi/2) rad')
+        self._require(abs(self.pitch) < half, 'pitch', 'within (-pi/2, pi/2) rad')
 
-    def _require(self, condition: bool, problem: str) -> None:
+    def _require(self, condition: bool, name: str, wanted: str) -> None:
         if not condition:
-            raise ConfigError(f'sensor {self.name}: {problem}')
+            raise ConfigError(
+                f'sensor {self.name}: {name} = {getattr(self, name)}: must be {wanted}'
+            )
 
     @property
     def n_rays(self) -> int:
@@ -124,21 +99,17 @@ class ScatterModel(SensorModel):
     Takes the place of the prisms of a Livox: what matters to a segmentation is that
     there are no rings. `elevations` holds the ends of the field of view, highest first,
     and `n_columns` is 1.
-
-    Attributes
-    ----------
-    n_points : int
-        Rays of one scan.
     """
 
     n_points: int = 20_000
+    """Rays of one scan."""
 
     def __post_init__(self) -> None:
         """Check every value."""
         super().__post_init__()
-        self._require(len(self.elevations) == 2, 'elevations: must be the two ends')
-        self._require(self.n_columns == 1, f'n_columns = {self.n_columns}: must be 1')
-        self._require(self.n_points >= 1, f'n_points = {self.n_points}: must be at least 1')
+        self._require(len(self.elevations) == 2, 'elevations', 'the two ends')
+        self._require(self.n_columns == 1, 'n_columns', '1')
+        self._require(self.n_points >= 1, 'n_points', 'at least 1')
 
     @property
     def n_rays(self) -> int:
@@ -150,10 +121,7 @@ class ScatterModel(SensorModel):
         return np.zeros(self.n_points, dtype=np.uint16)
 
     def directions(self, phase: float = 0.0) -> FloatArray:
-        """Return the unit vectors of all rays in the sensor frame, (n_points, 3).
-
-        The azimuth of the first ray, `phase` [rad], decides on the elevations too.
-        """
+        """Return the unit vectors of all rays, (n_points, 3); `phase` changes all of them."""
         turns = phase / (2.0 * math.pi)
         spread = (np.arange(self.n_points)[:, None] * _STRIDES + [turns, 7.0 * turns]) % 1.0
         azimuth = 2.0 * math.pi * spread[:, 0]
@@ -173,60 +141,18 @@ def _beams(*blocks: tuple[float, float, int]) -> tuple[float, ...]:
 
 # Fields of view, ranges and accuracies are those of the makers' data sheets, columns those at
 # 10 turns a second. Heights are typical mounts: KITTI's car for the HDL-64E, nuScenes' roof for
-# the HDL-32E, a field robot for the VLP-16.
-HDL_64E = SensorModel(
-    name='hdl-64e',
-    elevations=_beams((2.0, -8.33, 32), (-8.83, -24.33, 32)),
-    n_columns=2000,
-    min_range=0.9,
-    max_range=120.0,
-    range_std=0.02,
-    dropout=0.02,
-    height=1.73,
+# the HDL-32E, field robots for the VLP-16 and the Mid-360.
+HDL_64E, HDL_32E, VLP_16, OS1_128 = (
+    SensorModel(name, _beams(*blocks), n_columns, nearest, farthest, range_std, height)
+    for name, blocks, n_columns, nearest, farthest, range_std, height in (
+        ('hdl-64e', ((2.0, -8.33, 32), (-8.83, -24.33, 32)), 2000, 0.9, 120.0, 0.02, 1.73),
+        ('hdl-32e', ((10.67, -30.67, 32),), 2170, 0.9, 100.0, 0.02, 1.84),
+        ('vlp-16', ((15.0, -15.0, 16),), 1800, 0.5, 100.0, 0.03, 0.8),
+        ('os1-128', ((22.5, -22.5, 128),), 1024, 0.8, 120.0, 0.015, 1.8),
+    )
 )
-HDL_32E = SensorModel(
-    name='hdl-32e',
-    elevations=_beams((10.67, -30.67, 32)),
-    n_columns=2170,
-    min_range=0.9,
-    max_range=100.0,
-    range_std=0.02,
-    dropout=0.02,
-    height=1.84,
-)
-VLP_16 = SensorModel(
-    name='vlp-16',
-    elevations=_beams((15.0, -15.0, 16)),
-    n_columns=1800,
-    min_range=0.5,
-    max_range=100.0,
-    range_std=0.03,
-    dropout=0.02,
-    height=0.8,
-)
-OS1_128 = SensorModel(
-    name='os1-128',
-    elevations=_beams((22.5, -22.5, 128)),
-    n_columns=1024,
-    min_range=0.8,
-    max_range=120.0,
-    range_std=0.015,
-    dropout=0.02,
-    height=1.8,
-)
-# Field of view, rate, range and accuracy of the maker's data sheet; on a field robot.
 MID_360 = ScatterModel(
-    name='mid-360',
-    elevations=(math.radians(52.0), math.radians(-7.0)),
-    n_columns=1,
-    min_range=0.1,
-    max_range=40.0,
-    range_std=0.02,
-    dropout=0.02,
-    height=0.5,
-    n_points=20_000,
+    'mid-360', (math.radians(52.0), math.radians(-7.0)), 1, 0.1, 40.0, range_std=0.02, height=0.5
 )
-SENSORS: dict[str, SensorModel] = {
-    sensor.name: sensor for sensor in (HDL_64E, HDL_32E, VLP_16, OS1_128, MID_360)
-}
+SENSORS = {sensor.name: sensor for sensor in (HDL_64E, HDL_32E, VLP_16, OS1_128, MID_360)}
 """The preset sensors by name."""

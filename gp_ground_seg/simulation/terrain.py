@@ -25,15 +25,11 @@ OptionalArray: TypeAlias = FloatArray | None
 
 
 class Along(NamedTuple):
-    """The terrain below points that move along a line; arrays of shape (R,).
+    """The terrain below points that move along a line; arrays of shape (R,)."""
 
-    Height [m], its change per unit of travel, and an upper bound, over the whole piece, of its
-    second derivative.
-    """
-
-    height: FloatArray
-    slope: FloatArray
-    bend: FloatArray
+    height: FloatArray  # [m]
+    slope: FloatArray  # change of the height per unit of travel
+    bend: FloatArray  # upper bound of its second derivative over the whole piece
 
 
 class Terrain(ABC):
@@ -84,23 +80,12 @@ class Profile(Terrain):
 
     Over u = x cos(heading) + y sin(heading), piece k reaches up to ``edges[k]`` and is
     z = c0 + c1 (u - anchor) + c2 (u - anchor)^2.
-
-    Attributes
-    ----------
-    heading : float
-        Direction of u [rad].
-    edges : (B,) array
-        Ascending u of the break lines [m].
-    anchor : (B + 1,) array
-        Reference u of each piece [m].
-    coefficients : (B + 1, 3) array
-        c0 [m], c1, c2 [1/m] of each piece.
     """
 
-    heading: float
-    edges: FloatArray
-    anchor: FloatArray
-    coefficients: FloatArray
+    heading: float  # direction of u [rad]
+    edges: FloatArray  # (B,) ascending u of the break lines [m]
+    anchor: FloatArray  # (B + 1,) reference u of each piece [m]
+    coefficients: FloatArray  # (B + 1, 3) c0 [m], c1, c2 [1/m] of each piece
 
     def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
         """See `Terrain.along`."""
@@ -155,28 +140,15 @@ def _terms(terrain: Terrain) -> tuple[Terrain, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Waves(Terrain):
-    """Sum of plane waves A sin(k . (x, y) + phase), scaled by an envelope.
+    """Sum of n plane waves A sin(k . (x, y) + phase), scaled by an envelope.
 
-    Attributes
-    ----------
-    wave_vectors : (n, 2) array
-        k of each wave [rad/m].
-    amplitudes : (n,) array
-        A of each wave [m].
-    phases : (n,) array
-        [rad].
-    envelope : Profile
-        Factor of all waves: never negative, of straight pieces, the two outer ones level.
-
-    Raises
-    ------
-    ConfigError
-        If the envelope is of another form.
+    The envelope is never negative, of straight pieces, the two outer ones level; any other
+    raises ConfigError.
     """
 
-    wave_vectors: FloatArray
-    amplitudes: FloatArray
-    phases: FloatArray
+    wave_vectors: FloatArray  # (n, 2) k [rad/m]
+    amplitudes: FloatArray  # (n,) A [m]
+    phases: FloatArray  # (n,) [rad]
     envelope: Profile
 
     def __post_init__(self) -> None:
@@ -242,27 +214,27 @@ class Waves(Terrain):
         )
 
 
-def random_waves(
+def rough(
     rng: np.random.Generator,
-    rms: float,
-    wavelengths: tuple[float, float],
-    n_waves: int,
-    envelope: Profile,
+    rms: float = 0.08,
+    wavelengths: tuple[float, float] = (2.0, 20.0),
+    n_waves: int = 8,
+    envelope: Profile | None = None,
 ) -> Waves:
-    """Waves of random heading and phase that together have one root-mean-square height.
+    """Ground with waves of random heading and phase.
 
     Parameters
     ----------
     rng : Generator
         Source of headings, phases and wavelengths.
     rms : float
-        Root-mean-square height where the envelope is one [m].
+        Root-mean-square height of all waves together where the envelope is one [m].
     wavelengths : (float, float)
         Shortest and longest [m], evenly spread on a log scale; all waves are equally steep.
     n_waves : int
         Number of waves.
-    envelope : Profile
-        Factor of the waves.
+    envelope : Profile, optional
+        Factor of the waves (see `Waves`), by default one everywhere.
 
     Raises
     ------
@@ -280,30 +252,20 @@ def random_waves(
     phase = rng.uniform(0.0, 2.0 * np.pi, n_waves)
     k = (2.0 * np.pi / wavelength)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
     amplitude = wavelength * rms * np.sqrt(2.0 / np.sum(wavelength**2))
-    return Waves(k, amplitude, phase, envelope)
+    return Waves(k, amplitude, phase, flat(1.0) if envelope is None else envelope)
 
 
 def polyline(
-    heading: float,
-    points: Sequence[tuple[float, float]],
-    slope_before: float = 0.0,
-    slope_after: float = 0.0,
+    heading: float, points: Sequence[tuple[float, float]], slope_after: float = 0.0
 ) -> Profile:
-    """Profile of straight pieces.
+    """Profile of straight pieces along `heading` [rad], level before the first corner.
 
-    Parameters
-    ----------
-    heading : float
-        Direction of u [rad].
-    points : sequence of (u, z)
-        Corners in ascending u [m]. Corners with the same u are a vertical step from the
-        first to the last of them.
-    slope_before, slope_after : float
-        Slope before the first and after the last corner.
+    `points` are the corners (u, z) in ascending u [m]; those of the same u are a vertical step
+    from the first to the last of them. `slope_after` is that after the last corner.
     """
     if not points or any(b[0] < a[0] for a, b in itertools.pairwise(points)):
         raise ConfigError(f'polyline: corners {list(points)}: must be given, in ascending u')
-    anchors, coefficients = [points[0][0]], [(points[0][1], slope_before, 0.0)]
+    anchors, coefficients = [points[0][0]], [(points[0][1], 0.0, 0.0)]
     for (u0, z0), (u1, z1) in itertools.pairwise(points):
         if u1 > u0:
             anchors.append(u0)
@@ -344,9 +306,9 @@ def kerb(
 
 
 def ditch(
-    start: float, top_width: float, bottom_width: float, depth: float, heading: float = 0.0
+    heading: float, start: float, top_width: float, bottom_width: float, depth: float
 ) -> Profile:
-    """Trapezoidal ditch in level ground, between u = `start` and `start` + `top_width` [m]."""
+    """Trapezoidal ditch in level ground, from u = `start` to `start` + `top_width` [m]."""
     side = (top_width - bottom_width) / 2.0
     end = start + top_width
     corners = [(start, 0.0), (start + side, -depth), (end - side, -depth), (end, 0.0)]
@@ -374,25 +336,9 @@ def crest(
     return Profile(heading, edges, np.array([start, *edges]), np.array(coefficients))
 
 
-def rough(
-    rng: np.random.Generator,
-    rms: float = 0.08,
-    wavelengths: tuple[float, float] = (2.0, 20.0),
-    n_waves: int = 8,
-) -> Terrain:
-    """Ground with waves of `rms` height [m] everywhere; see `random_waves`."""
-    return random_waves(rng, rms, wavelengths, n_waves, flat(1.0))
-
-
 def smooth_then_rough(
-    rng: np.random.Generator,
-    start: float,
-    transition: float,
-    rms: float = 0.15,
-    wavelengths: tuple[float, float] = (0.8, 6.0),
-    n_waves: int = 8,
-    heading: float = 0.0,
-) -> Terrain:
-    """Flat ground that grows rough from u = `start` [m] on, fully so after `transition` [m]."""
-    envelope = polyline(heading, [(start, 0.0), (start + transition, 1.0)])
-    return random_waves(rng, rms, wavelengths, n_waves, envelope)
+    rng: np.random.Generator, start: float, transition: float, rms: float = 0.15
+) -> Waves:
+    """Flat ground that grows rough from x = `start` [m] on, fully so after `transition` [m]."""
+    envelope = polyline(0.0, [(start, 0.0), (start + transition, 1.0)])
+    return rough(rng, rms, (0.8, 6.0), envelope=envelope)
