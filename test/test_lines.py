@@ -11,11 +11,11 @@ from reference import Reference
 from scipy.optimize import minimize
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.experiments.scene_scores import SceneScan
 from gp_ground_seg.frame import Candidates, Faces
 from gp_ground_seg.parameters.config import LatentConfig
 from gp_ground_seg.parameters.presets import find_preset
 from gp_ground_seg.pipeline.lines import classify_lines, deming_slope, differs_in_direction
+from gp_ground_seg.simulation import SCENES, VLP_16, simulate_scan
 
 N_TILES = 50
 NO_FACES = Faces(*np.zeros((2, N_TILES), dtype=bool))
@@ -232,7 +232,7 @@ def test_lines_that_are_short_or_steep_or_of_two_candidates_start_at_no_break(ba
 
 
 def test_a_ramp_seen_by_few_rings_is_ground():
-    scan = SceneScan('vlp-16', 'ramp', 0, 0.0).simulate()
+    scan = simulate_scan(SCENES['ramp'](0), VLP_16, np.random.default_rng(0))
     config = find_preset('vlp16').config
     far = scan.is_ground & (np.hypot(*scan.points[:, :2].T) > 25.0)
     missed = {}
