@@ -12,7 +12,7 @@ help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
 	@echo 'make test      the whole test suite (KITTI=PATH adds labelled frames)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
-	@echo 'make bench-docs  the same, into docs/performance.md'
+	@echo 'make bench-docs  the same, into docs/performance.json and its picture'
 	@echo 'make node-bench  latency, losses and memory of the node over DDS'
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make lint      ruff and mypy'
@@ -45,7 +45,7 @@ bench: $(VENV)/.dev
 
 bench-docs: $(VENV)/.dev
 	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy --force \
-		--json docs/performance.json --docs docs/performance.md --plot docs/images/performance.png
+		--json docs/performance.json --plot docs/images/performance.png
 
 node-bench: $(VENV)/.ros
 	$(BIN)/gp-ground-seg node-bench $(KITTI)

@@ -232,7 +232,7 @@ def test_lines_that_are_short_or_steep_or_of_two_candidates_start_at_no_break(ba
 
 
 def test_a_ramp_seen_by_few_rings_is_ground():
-    scan = simulate_scan(SCENES['ramp'](0), VLP_16, np.random.default_rng(0), x=0.0)
+    scan = simulate_scan(SCENES['ramp'](0), VLP_16, np.random.default_rng(0))
     config = find_preset('vlp16').config
     far = scan.is_ground & (np.hypot(*scan.points[:, :2].T) > 25.0)
     missed = {}
