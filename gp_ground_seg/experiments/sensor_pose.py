@@ -193,7 +193,7 @@ def _pooled(trials: Sequence[Trial], way: str, group: str | None = None) -> Meth
 
 
 def _change(trials: Sequence[Trial], group: str | None) -> float:
-    """IoU with the pose estimated over that with the pose told."""
+    """Return the IoU with the pose estimated over that with the pose given."""
     return _pooled(trials, FOUND, group).iou - _pooled(trials, TOLD, group).iou
 
 
