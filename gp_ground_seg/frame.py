@@ -137,7 +137,7 @@ class Scan(NamedTuple):
 
 
 class Faces(NamedTuple):
-    """Tiles that hold a vertical face: a wall, a fence, a kerb, the side of a car."""
+    """Tiles that hold a vertical face: a wall, a fence, the side of a car."""
 
     is_face: BoolArray  # (T,) whether the returns of the tile form a vertical face
     # (T,) whether even the lowest returns belong to the face: the tile shows no ground

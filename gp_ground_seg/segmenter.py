@@ -34,7 +34,7 @@ class GroundSegmenter:
     clock : callable
         Source of the seconds in ``Segmentation.timings`` and of ``learning.max_time``.
     backend : Backend, optional
-        Backend to use until the parameters ``runtime`` change; by default as they say.
+        Backend to use until the parameters ``runtime`` change; by default one made from them.
 
     Raises
     ------
@@ -74,14 +74,15 @@ class GroundSegmenter:
         PointCloudError
             If the array has another shape or type, or z clearly does not point up.
         """
-        with self._turn():
+        with self._exclusive():
             config, backend, timer = self._config, self._backend, StageTimer(self._clock)
             sensor = config.sensor
             if tilt is not None:
                 sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
 
             # 1. Polar grid: the lowest point of each cell is a ground candidate.
-            # 2. Sensor pose: height and tilt, from a plane through the candidates near the sensor.
+            # 2. Sensor pose: height and tilt, from a plane through the candidates near the
+            #    sensor; a tilted scan is levelled and sorted again.
             xyz = take_points(points)
             scan, pose = self._level(xyz, sensor, timer)
 
@@ -89,13 +90,15 @@ class GroundSegmenter:
             faces = backend.find_faces(scan, config)
             timer.mark('faces')
 
-            # 4. Lines along each segment, and pseudo-inputs on them.
+            # 4. Lines along each segment, and pseudo-inputs on them. Lowest points of faces
+            #    with occluded base are left out of the candidates.
             extracted = backend.extract_lines(scan.candidates, faces, config)
-            # With mean zero, the process would be drawn towards the height of the sensor.
+            # Heights are relative to the sensor: the prior mean is the ground below it.
             frame = Frame(*extracted, scan.grid.edges, prior_mean=-pose.height)
             timer.mark('lines')
 
-            # 5. Both processes: hyper-parameters, then inliers and surface.
+            # 5. Observation process (height over range) and latent process (its log
+            #    length-scale): hyper-parameters theta, in log space, then inliers and surface.
             theta, learned = self._learn(frame)
             timer.mark('learning')
             surface, log_length_scale = backend.estimate_surface(frame, theta, config)
@@ -127,7 +130,7 @@ class GroundSegmenter:
 
         Parameters and errors are those of `segment`.
         """
-        with self._turn():
+        with self._exclusive():
             xyz, timer = take_points(points), StageTimer(self._clock)
             return self._level(xyz, self._config.sensor, timer)[1]
 
@@ -148,7 +151,7 @@ class GroundSegmenter:
 
     def configure(self, config: Config) -> None:
         """Use `config` from the next scan on; what was learned under another is forgotten."""
-        with self._turn():
+        with self._exclusive():
             if config.runtime != self._config.runtime:
                 self.use_backend(make_backend(config.runtime))
             if dataclasses.replace(config, diagnostics=self._config.diagnostics) != self._config:
@@ -157,7 +160,7 @@ class GroundSegmenter:
 
     def use_backend(self, backend: Backend) -> None:
         """Use `backend` from the next scan on, and close the one before."""
-        with self._turn():
+        with self._exclusive():
             self.close()
             self._backend, self._sample_backend = backend, None
 
@@ -167,10 +170,10 @@ class GroundSegmenter:
 
     def close(self) -> None:
         """End the worker threads, once the scan at hand is segmented."""
-        with self._turn():
+        with self._exclusive():
             self._backend.close()
 
-    def _turn(self) -> threading.RLock:
+    def _exclusive(self) -> threading.RLock:
         """Lock that callers from several threads hold in turn."""
         if self._pid != os.getpid():
             # In a forked process it may be held by a thread that does not exist here.
@@ -186,7 +189,7 @@ class GroundSegmenter:
         timer.mark('grid')
 
         def candidates_rotated(matrix: FloatArray) -> Candidates:
-            # Another backend, whose buffers do not hold the scan.
+            # `backend` would overwrite the scan in its buffers.
             if self._sample_backend is None:
                 runtime = dataclasses.replace(config.runtime, n_threads=1, backend=backend.name)
                 self._sample_backend = make_backend(runtime)
@@ -222,7 +225,7 @@ class GroundSegmenter:
 
 
 def warm_up(config: Config | None = None) -> Backend:
-    """Compile or load all code that a frame needs, and return the backend it belongs to.
+    """Compile or load all code that a frame needs, and return a backend that uses it.
 
     A small scan of single precision, the type of most sensors, is segmented. Where
     numba is not installed, or not asked for, there is nothing to compile.
@@ -230,7 +233,7 @@ def warm_up(config: Config | None = None) -> Backend:
     Parameters
     ----------
     config : Config, optional
-        Parameters; hyper-parameters are learned whatever they say.
+        Parameters; hyper-parameters are learned even if ``learning.mode`` is fixed.
 
     Raises
     ------
@@ -263,7 +266,7 @@ class StageTimer:
         self.seconds: dict[str, float] = {}
 
     def mark(self, stage: str) -> None:
-        """Record the time since the mark before as that of `stage`."""
+        """Record the seconds since the previous mark under `stage`."""
         now = self._clock()
         self.seconds[stage] = now - self._last
         self.seconds['total'] = now - self._start

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -81,7 +82,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for name, experiment in EXPERIMENTS.items():
         own = names.add_parser(
             name,
-            help=experiment.description.partition('.')[0],
+            help=re.split(r'\.(?:\s|$)', experiment.description)[0],
             description=experiment.description,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )

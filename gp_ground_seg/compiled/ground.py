@@ -38,15 +38,15 @@ class GroundParams(NamedTuple):
         """Take the values out of a configuration."""
         growth = config.growth
         return cls(
-            config.observation.sigma_n,
-            config.observation.slope_std,
-            growth.seed_range,
-            growth.seed_height_tolerance,
-            segment_step,
-            growth.max_std,
-            growth.max_standardised_residual,
-            growth.max_standardised_depth,
-            config.surface.n_neighbours,
+            least_gate_noise=config.observation.sigma_n,
+            slope_std=config.observation.slope_std,
+            seed_range=growth.seed_range,
+            seed_height_tolerance=growth.seed_height_tolerance,
+            segment_step=segment_step,
+            max_std=growth.max_std,
+            max_standardised_residual=growth.max_standardised_residual,
+            max_standardised_depth=growth.max_standardised_depth,
+            n_neighbours=config.surface.n_neighbours,
         )
 
 

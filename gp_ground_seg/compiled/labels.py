@@ -50,14 +50,14 @@ class LabelParams(NamedTuple):
         """Take the values out of a configuration."""
         label = config.label
         return cls(
-            label.ground_tolerance,
-            label.roughness_gain,
-            label.obstacle_tolerance,
-            label.obstacle_roughness_gain,
-            label.obstacle_min_height,
-            label.obstacle_max_height,
-            label.below_tolerance,
-            config.faces.tolerance,
+            ground_tolerance=label.ground_tolerance,
+            roughness_gain=label.roughness_gain,
+            obstacle_tolerance=label.obstacle_tolerance,
+            obstacle_roughness_gain=label.obstacle_roughness_gain,
+            obstacle_min_height=label.obstacle_min_height,
+            obstacle_max_height=label.obstacle_max_height,
+            below_tolerance=label.below_tolerance,
+            face_tolerance=config.faces.tolerance,
         )
 
 

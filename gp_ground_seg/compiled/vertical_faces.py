@@ -1,7 +1,8 @@
 """Compiled twin of `gp_ground_seg.pipeline.vertical_faces`.
 
-Sums over the returns of each tall tile, for the lowest returns and for those above, in a table for
-each part of the points. Coordinates are rounded so that the sums are exact in any order.
+In three calls: `select_tall` lists the tiles with a high return, `sum_returns` sums over the
+returns of a part of the points in them, the lowest and those above apart, `decide_faces` decides
+from the sums of all parts. Coordinates are rounded so that the sums are exact in any order.
 """
 
 from __future__ import annotations
@@ -44,13 +45,13 @@ class FaceParams(NamedTuple):
         """Take the values out of a configuration."""
         faces = config.faces
         return cls(
-            faces.cell_size,
-            faces.min_height,
-            config.label.obstacle_max_height,
-            faces.max_normal_z,
-            faces.tolerance,
-            faces.max_foot_distance,
-            faces.max_foot_density,
+            cell_size=faces.cell_size,
+            min_height=faces.min_height,
+            max_height=config.label.obstacle_max_height,
+            max_normal_z=faces.max_normal_z,
+            tolerance=faces.tolerance,
+            max_foot_distance=faces.max_foot_distance,
+            max_foot_density=faces.max_foot_density,
         )
 
 

@@ -20,7 +20,8 @@ from gp_ground_seg.frame import (
 from gp_ground_seg.parameters.config import Config, LabelConfig
 
 SQUARE_UNITS = 2.0**40
-"""Squared heights are summed in whole multiples of 1 / this [1/m^2], in any order the same."""
+"""Squared heights are rounded to multiples of 1 / this [1/m^2], so that the order in which they
+are summed does not matter."""
 
 
 def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Config) -> Labelled:
@@ -28,8 +29,8 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
 
     The paper's one tolerance is a band here that follows the local roughness, is
     narrower in a cell with an obstacle, and is wide below the surface: obstacles
-    stand on the ground, not below it. Of a vertical face only the base is ground, and
-    nothing where the base is occluded.
+    stand on the ground, not below it. Of a vertical face only
+    returns near its lowest one are ground; none are where its base is occluded.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     band = ground_band(roughness, bin_has_obstacle(height, grid, label), label).ravel()
     margin = np.minimum(band[np.maximum(grid.cell, 0)] - height, height + label.below_tolerance)
     over_base = np.maximum(height, z - np.where(in_face, tiles.lowest_z[tile], 0.0))
-    # An occluded base lies lower than the lowest return by more than the tolerance.
+    # With a limit below zero no return of the tile is ground; the margin stays a distance.
     tolerance = config.faces.tolerance
     limit = np.where(faces.has_occluded_base[tile], -tolerance, tolerance)
     margin = np.where(in_face, np.minimum(margin, limit - over_base), margin)
@@ -139,9 +140,9 @@ def ground_probability(
 ) -> npt.NDArray[np.float32]:
     """Probability that each point is ground.
 
-    The height of a point is uncertain by the standard deviation of the surface, the
-    noise and the roughness together. The result is the probability that its true height
-    lies on its side of the band's edge.
+    The height of a point over the surface is uncertain by the standard deviation of the
+    surface, the noise and the roughness together. The result is the probability that it
+    lies within the band of ground.
 
     Parameters
     ----------

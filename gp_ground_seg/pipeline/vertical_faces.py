@@ -1,4 +1,4 @@
-"""Stage 3: vertical faces (walls, fences, kerbs, sides of cars) by the scatter of their returns.
+"""Stage 3: vertical faces (walls, fences, sides of cars) by the scatter of their returns.
 
 A band about the ground cannot separate the base of a wall from the ground before it. The
 returns above the base can: together they form a vertical surface. The base of a face is
