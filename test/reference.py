@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.stats import multivariate_normal
 
 from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.frame import (
@@ -24,7 +25,6 @@ from gp_ground_seg.frame import (
     Scan,
 )
 
-LOG_2PI = math.log(2.0 * math.pi)
 N_SLICES = 3
 
 
@@ -373,20 +373,16 @@ def _log_likelihood(theta, inliers, slope_std, latent_terms):
                 l_bar = theta[5 + inliers.surface_class[bar]]
                 u = log_length_scale(r_bar, l_bar, r, *latent)
             if len(r_bar) and latent_terms:
-                # The density of the pseudo-inputs at their mean.
-                value += _log_density(squared_exponential(r_bar, r_bar, *latent[:2]), latent[2])
-            k = paciorek(r, np.exp(u), r, np.exp(u), sigma_f) + slope_std**2 * np.outer(r, r)
-            value += _log_density(k, sigma_n, inliers.z[own])
-        except (LinAlgError, ValueError):  # not positive definite, or not finite
+                # Density at its mean: the quadratic term, which the paper leaves out, is zero.
+                b = squared_exponential(r_bar, r_bar, *latent[:2])
+                b += latent[2] ** 2 * np.eye(len(r_bar))
+                value += multivariate_normal(cov=b).logpdf(np.zeros(len(r_bar)))
+            a = paciorek(r, np.exp(u), r, np.exp(u), sigma_f) + slope_std**2 * np.outer(r, r)
+            a += sigma_n**2 * np.eye(len(r))
+            value += multivariate_normal(cov=a).logpdf(inliers.z[own])
+        except LinAlgError:  # not positive definite
             return -math.inf
-    return value
-
-
-def _log_density(k, sigma, z=0.0):
-    """log N(z | 0, k + sigma^2 I)."""
-    factor, z = cho_factor(k + sigma**2 * np.eye(len(k))), z + np.zeros(len(k))
-    log_determinant = 2.0 * np.log(np.diagonal(factor[0])).sum()
-    return -0.5 * (z @ cho_solve(factor, z) + log_determinant + len(z) * LOG_2PI)
+    return value if math.isfinite(value) else -math.inf
 
 
 # Labels (Algorithm 2, line 14)
@@ -407,11 +403,13 @@ def label_points(scan, faces, surface, config):
         height[i] = scan.xyz[i, 2] - np.interp(r, surface.knots[ends], surface.mean[m, ends])
     near = grid.inside & ~is_face & (abs(height) < label.obstacle_min_height)
     shows = (height >= label.obstacle_min_height) & (height <= label.obstacle_max_height)
-    for i, m, n in places:
+    for m, n in np.ndindex(roughness.shape):
         # The cell and the eight around it; segments form a ring.
         aside = np.isin(grid.segment, [(m + k) % grid.n_segments for k in (-1, 0, 1)])
         about = height[near & aside & (abs(grid.bin - n) <= 1)]
-        rough = roughness[m, n] = math.sqrt(np.mean(about**2)) if len(about) else 0.0
+        roughness[m, n] = math.sqrt(np.mean(about**2)) if len(about) else 0.0
+    for i, m, n in places:
+        rough = roughness[m, n]
         band = label.ground_tolerance + label.roughness_gain * rough
         if shows[grid.cell == grid.cell[i]].any():
             strict = label.obstacle_tolerance + label.obstacle_roughness_gain * rough

@@ -155,19 +155,6 @@ def test_growth_stops_where_the_surface_is_uncertain(backend):
     assert std[-1] > level_std[-1]
 
 
-def test_no_seed_no_model(backend):
-    inlier, knots, _, _ = grow_line(backend, np.full(5, 5.0))
-    assert inlier == [] and len(knots) == 0
-
-
-def test_looser_bounds_take_more(backend):
-    z = np.where(np.arange(20) % 4 == 3, 0.35, 0.0)
-    strict, loose = (
-        len(grow_line(backend, z, max_standardised_residual=limit)[0]) for limit in (1.0, 8.0)
-    )
-    assert strict < loose == 20
-
-
 def test_below_the_prediction_the_gate_is_wider_than_above(backend):
     z = np.zeros(12)
     # Beside the seeds, where the surface is certain.

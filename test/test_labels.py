@@ -66,17 +66,6 @@ def test_the_base_of_an_obstacle_is_judged_more_strictly(backend, other, expecte
     assert label(backend, [3.0, 5.0, 1e3], [0.08, 1.0, 1.0])[0].label[0] == G
 
 
-@pytest.mark.parametrize(('rough', 'expected'), [(0.0, 'OOO'), (0.08, 'GOO'), (0.4, 'GGO')])
-def test_the_band_follows_the_roughness_up_to_the_height_of_an_obstacle(backend, rough, expected):
-    # Beside the points, as many below the surface as make that roughness.
-    ranges = np.concatenate([[3.0, 5.0, 7.0], np.tile([3.0, 5.0, 7.0], 3000)])
-    heights = np.concatenate([[0.3, 0.45, 0.51], np.full(9000, -rough)])
-    gain = CONFIG.label.roughness_gain
-    found, _ = label(backend, ranges, heights, roughness_gain=gain)
-    assert [Label(value).name[0] for value in found.label[:3]] == list(expected)
-    assert list(label(backend, ranges, heights)[0].label[:3]) == [O, O, O]
-
-
 def test_of_a_face_only_the_base_is_ground_and_nothing_where_it_is_occluded(backend):
     # The surface climbs a step, and its riser lies on it.
     ranges, riser = [5.0, 5.001, 5.002], np.array([0.0, 0.06, 0.14])

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import reference
 from conftest import sharing
-from scipy.stats import multivariate_normal
 
 from gp_ground_seg.frame import Inliers
 
@@ -83,31 +82,6 @@ def test_threads_do_not_change_a_bit():
     for value, gradient in results[1:]:
         assert value == results[0][0]
         np.testing.assert_array_equal(gradient, results[0][1])
-
-
-def test_value_is_the_density_of_the_printed_model(backend):
-    """Sum over segments of log N(z | 0, A), and -1/2 log|2 pi B|, by scipy.stats."""
-    inliers = random_inliers(5)
-    sigma_f, sigma_n, *latent = np.exp(TYPICAL[:5])
-    expected = printed = 0.0
-    for m in range(len(inliers.offsets) - 1):
-        own = slice(*inliers.offsets[m : m + 2])
-        bar = slice(*inliers.bar_offsets[m : m + 2])
-        r, r_bar = inliers.r[own], inliers.r_bar[bar]
-        if len(r) == 0:
-            continue
-        l_bar = TYPICAL[5 + inliers.surface_class[bar]]
-        length = np.exp(reference.log_length_scale(r_bar, l_bar, r, *latent))
-        a = reference.paciorek(r, length, r, length, sigma_f) + 0.05**2 * np.outer(r, r)
-        a += sigma_n**2 * np.eye(len(r))
-        expected += multivariate_normal(np.zeros(len(r)), a).logpdf(inliers.z[own])
-        b = reference.squared_exponential(r_bar, r_bar, *latent[:2])
-        b += latent[2] ** 2 * np.eye(len(r_bar))
-        # The density at its mean: the quadratic term, which the paper leaves out, is zero.
-        printed += multivariate_normal(np.zeros(len(r_bar)), b).logpdf(np.zeros(len(r_bar)))
-    ours, whole = (backend.log_likelihood(TYPICAL, inliers, 0.05, t)[0] for t in (False, True))
-    assert ours == pytest.approx(expected)
-    assert whole == pytest.approx(expected + printed)
 
 
 def test_the_printed_objective_has_no_upper_bound_and_ours_does_not_move(backend):

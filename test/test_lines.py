@@ -176,22 +176,6 @@ def test_critical_points(backend, name):
 # Candidates that continue a line
 
 
-def test_long_and_flat_lines_are_continued(backend):
-    # A road, a ramp of 0.3, a wall of three candidates.
-    r = np.concatenate([np.arange(2.0, 8.0), np.arange(8.0, 14.0), [14.0, 14.2, 14.4]])
-    z = np.concatenate([np.zeros(6), 0.3 * np.arange(1.0, 7.0), [2.5, 3.5, 4.5]])
-    both = [*range(1, 6), *range(7, 12)]
-    for max_slope, min_size, expected in (
-        (1.0, 4, both), (0.2, 4, both[:5]), (10.0, 3, [*both, 13, 14]), (1.0, 7, []),
-    ):  # fmt: skip
-        bounds = {'growth__max_line_slope': max_slope, 'growth__min_line_size': min_size}
-        lines, continues = extract(
-            backend, candidates_of(r, z), **bounds, growth__min_bend_extent=99.0
-        )
-        assert list(lines.start) == [0, 6, 12, 15]
-        assert list(np.flatnonzero(continues)) == expected
-
-
 ROAD = np.array([3.0, 4.0, 5.0, 6.6, 9.2, 15.0])
 
 
@@ -220,15 +204,6 @@ def slope_at_16_m(rise, step=0.0):
 )
 def test_a_slope_starts_at_a_break_and_a_step_does_not(backend, rise, step, at_break):
     assert breaks(backend, *slope_at_16_m(rise, step)) == ([0, 6, 9], [False, at_break])
-
-
-def test_lines_that_are_short_or_steep_or_of_two_candidates_start_at_no_break(backend):
-    r, z = slope_at_16_m(0.12)
-    assert breaks(backend, r, z, min_extent=21.0)[1] == [False, False]
-    assert breaks(backend, r, z, max_slope=0.1)[1] == [False, False]
-    assert breaks(backend, r[:-1], z[:-1], min_extent=1.0) == ([0, 6, 8], [False, False])
-    # The line before must lie in the same segment.
-    assert breaks(backend, r, z, offsets=[0, 6, 9])[1] == [False, False]
 
 
 def test_a_ramp_seen_by_few_rings_is_ground():
