@@ -14,6 +14,7 @@ from hypothesis import settings
 from gp_ground_seg.backend import Backend, NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.jit import JIT_ENABLED
+from gp_ground_seg.segmenter import warm_up
 
 # The duration of an example depends on the machine more than on the code.
 settings.register_profile('default', deadline=None)
@@ -70,6 +71,13 @@ def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
     plain = nullcontext(NumpyBackend())
     with plain if request.param == 'numpy' else sharing(3 if '3' in request.param else 1) as one:
         yield one
+
+
+@pytest.fixture(scope='session', autouse=True)
+def compiled_code():
+    """Code compiled once for this checkout: nodes and commands of the tests load it."""
+    if JIT_ENABLED:
+        warm_up().close()
 
 
 @pytest.fixture

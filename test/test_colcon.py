@@ -114,7 +114,7 @@ def test_colcon_test_collects_our_tests(workspace):
     assert done.returncode == 0, done.stdout + done.stderr
     results = workspace.folder / 'build' / PACKAGE / 'pytest.xml'
     (suite,) = ElementTree.parse(results).getroot().iter('testsuite')
-    assert int(suite.get('tests')) > 50
+    assert int(suite.get('tests')) > 5
     assert suite.get('failures') == suite.get('errors') == '0'
     done = workspace.colcon('test-result', '--test-result-base', str(workspace.folder / 'build'))
     assert done.returncode == 0
