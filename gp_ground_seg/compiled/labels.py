@@ -104,16 +104,20 @@ def survey(
     room: LabelRoom,
 ) -> None:
     """Heights of the points of a part over the surface, and the sums for roughness."""
-    z, cell, r, tile = scan.xyz.T[2], scan.grid.cell, scan.grid.r, scan.tiles.tile
+    # Slices, because indices from 0 on need no check for negative ones.
+    points = slice(part.first, part.stop)
+    z, tile = scan.xyz.T[2, points], scan.tiles.tile[points]
+    cell, r = scan.grid.cell[points], scan.grid.r[points]
+    own_height = height[points]
     pieces, sums, nearest = room.pieces, room.sums[part.number], scan.grid.edges[0]
     min_height, max_height = params.obstacle_min_height, params.obstacle_max_height
     for k in range(len(sums)):
         sums[k, 0] = sums[k, 1] = 0
-    for i in range(part.first, part.stop):
+    for i in range(len(cell)):
         own = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
         away = max(np.float64(r[i]), nearest)
         h = np.float64(z[i]) - (pieces[own, 0] + pieces[own, 1] * away)
-        height[i] = h
+        own_height[i] = h
         if h >= min_height:
             if h <= max_height:
                 sums[own, 0] += OBSTACLE_FLAG
@@ -160,19 +164,21 @@ def label_part(
     part: Part, scan: Scan, faces: Faces, params: LabelParams, band: FloatArray, result: Labelled
 ) -> None:
     """Label the points of a part from their heights in `result`."""
-    z, cell = scan.xyz.T[2], scan.grid.cell
-    for i in range(part.first, part.stop):
-        n, h = cell[i], result.height[i]
+    points = slice(part.first, part.stop)
+    z, tile, cell = scan.xyz.T[2, points], scan.tiles.tile[points], scan.grid.cell[points]
+    height, label, margins = result.height[points], result.label[points], result.margin[points]
+    for i in range(len(cell)):
+        n, h = cell[i], height[i]
         margin = min(
             band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + params.below_tolerance
         )
-        t = np.uintp(scan.tiles.tile[i] if n >= 0 else 0)
+        t = np.uintp(tile[i] if n >= 0 else 0)
         if faces.is_face[t]:
             over_base = max(h, np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0]))
             limit = params.face_tolerance
             if faces.has_occluded_base[t]:
                 limit = -limit
             margin = min(margin, limit - over_base)
-        result.margin[i] = margin
+        margins[i] = margin
         own = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
-        result.label[i] = _GROUND if margin >= 0.0 else own
+        label[i] = _GROUND if margin >= 0.0 else own

@@ -100,11 +100,13 @@ def sum_returns(
     """Sum over the returns of a part of the points, (3, N), in tall tiles."""
     sums = room.sums[part.number]
     _clear_sums(tiles.extremes, params.cell_size, n_tall, room.row_to_tile, sums)
-    x, y, z = columns[0], columns[1], columns[2]
-    for i in range(part.first, part.stop):
-        if tiles.tile[i] == OUTSIDE:
+    # Slices, because indices from 0 on need no check for negative ones.
+    own = slice(part.first, part.stop)
+    x, y, z, tile = columns[0, own], columns[1, own], columns[2, own], tiles.tile[own]
+    for i in range(len(tile)):
+        if tile[i] == OUTSIDE:
             continue
-        k = room.tile_to_row[np.uintp(tiles.tile[i])]
+        k = room.tile_to_row[np.uintp(tile[i])]
         if k == NOT_TALL:
             continue
         low = sums[np.uintp(k)]
