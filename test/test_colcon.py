@@ -109,12 +109,13 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
 def test_colcon_test_collects_our_tests(workspace):
     """It returns 0 as well where it finds none."""
     done = workspace.colcon(
-        'test', '--return-code-on-test-failure', '--pytest-args', 'test/test_package.py',
+        'test', '--return-code-on-test-failure',
+        '--pytest-args', 'test/test_package.py', 'test/test_config.py',
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     results = workspace.folder / 'build' / PACKAGE / 'pytest.xml'
     (suite,) = ElementTree.parse(results).getroot().iter('testsuite')
-    assert int(suite.get('tests')) > 5
+    assert int(suite.get('tests')) > 50
     assert suite.get('failures') == suite.get('errors') == '0'
     done = workspace.colcon('test-result', '--test-result-base', str(workspace.folder / 'build'))
     assert done.returncode == 0
