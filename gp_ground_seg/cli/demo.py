@@ -281,7 +281,7 @@ def run(arguments: argparse.Namespace) -> int:
         probed_node(part / LOG, 'demo') as (node, session),
     ):
         tally = Tally(_write(drive, part / BAG, session))
-        print('[2/3] connecting to the node, a second process', flush=True)
+        print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)
         start = time.monotonic()
         probe = Probe(session, tally.add)
         probe.connect(node)
