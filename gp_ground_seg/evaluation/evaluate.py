@@ -23,15 +23,16 @@ from gp_ground_seg.data.semantic_kitti import (
     read_points,
 )
 from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.evaluation.calibration import Calibration, count_calibration
 from gp_ground_seg.evaluation.methods import TITLES, Method
 from gp_ground_seg.evaluation.metrics import (
     CONVENTIONS,
     GROUNDGRID,
+    Calibration,
     ClassCount,
     Confusion,
     HeightError,
     Labels,
+    count_calibration,
     count_classes,
     count_confusion,
     count_rings,
@@ -128,10 +129,8 @@ class MethodScore:
         """Names of the sequences, in order."""
         return list(dict.fromkeys(scan.sequence for scan in self.scans))
 
-    def of(self, *sequences: str | None) -> MethodScore:
-        """Return the part of some sequences; None stands for all."""
-        if None in sequences:
-            return self
+    def of(self, *sequences: str) -> MethodScore:
+        """Return the part of some sequences."""
         return MethodScore(self.name, tuple(s for s in self.scans if s.sequence in sequences))
 
     def by_sequence(self) -> list[tuple[str, MethodScore]]:
@@ -238,17 +237,12 @@ def load_kitti(frame: Frame) -> KnownScan:
     return KnownScan(frame.sequence, frame.index, points, truths, semantic, z, parts)
 
 
-Observer = Callable[[str, KnownScan, ScanScore, Labels], None]
-"""Called as a scan is scored with the name of the method, the scan, its score, its labels."""
-
-
 def score_methods(
     items: Sequence[Any],
     load: Callable[[Any], KnownScan],
     methods: Sequence[Method],
     *,
     each_alone: bool = False,
-    observe: Observer | None = None,
     clock: Callable[[], float] = time.perf_counter,
     progress: Progress = iter,
 ) -> list[MethodScore]:
@@ -264,8 +258,6 @@ def score_methods(
         What is loaded, such as frames, grouped by sequence, and by what.
     methods : sequence of Method
         Each with a name of its own.
-    observe, clock, progress : callable
-        Sees each scan as it is scored; source of seconds; wraps the items.
 
     Raises
     ------
@@ -286,11 +278,7 @@ def score_methods(
                 method.reset()
             start = clock()
             _run(method, scan)
-            seconds = clock() - start
-            score, label = _score(scan, method, seconds)
-            scores[method.name].append(score)
-            if observe is not None:
-                observe(method.name, scan, score, label)
+            scores[method.name].append(_score(scan, method, clock() - start))
     return [MethodScore(name, tuple(found)) for name, found in scores.items()]
 
 
@@ -301,7 +289,7 @@ def _run(method: Method, scan: KnownScan) -> None:
         raise PointCloudError(f'{scan.sequence}/{scan.index}: {method.name}: {error}') from error
 
 
-def _score(scan: KnownScan, method: Method, seconds: float) -> tuple[ScanScore, Labels]:
+def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
     result = method.result()
     label, p_ground = result.label, result.p_ground
     truth = next(iter(scan.truths.values()))
@@ -309,7 +297,7 @@ def _score(scan: KnownScan, method: Method, seconds: float) -> tuple[ScanScore, 
     if scan.ground_z is not None and scan.parts:
         z, estimate = scan.ground_z, method.ground_z()
         heights = {name: height_error(z[own], estimate[own]) for name, own in scan.parts.items()}
-    score = ScanScore(
+    return ScanScore(
         scan.sequence,
         scan.index,
         seconds,
@@ -322,4 +310,3 @@ def _score(scan: KnownScan, method: Method, seconds: float) -> tuple[ScanScore, 
         result.pose,
         result.fit,
     )
-    return score, label

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from gp_ground_seg.evaluation.environment import changed_parameters
 from gp_ground_seg.evaluation.evaluate import MethodScore, Progress, pool
 from gp_ground_seg.evaluation.methods import OURS, PATCHWORKPP, TITLES, PatchworkppMethod
 from gp_ground_seg.evaluation.metrics import ratio
-from gp_ground_seg.evaluation.table import Column, Row, Table, centimetres, percent
-from gp_ground_seg.experiments.variants import (
+from gp_ground_seg.evaluation.report import (
+    Column,
     Report,
+    Row,
+    Table,
+    centimetres,
+    changed_parameters,
+    percent,
+)
+from gp_ground_seg.experiments.variants import (
     load_simulated,
     make_report,
     score_variants,

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.environment import Environment, changed_parameters
 from gp_ground_seg.evaluation.evaluate import ALL, KnownScan, MethodScore, Progress, score_methods
 from gp_ground_seg.evaluation.methods import Method, OurMethod
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name
-from gp_ground_seg.evaluation.table import Table, write_json
+from gp_ground_seg.evaluation.report import Report, Table, changed_parameters
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
-from gp_ground_seg.result import FitReport
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 
 Changes = Mapping[str, ParameterValue]
@@ -35,6 +31,11 @@ class SimulatedFrame(NamedTuple):
     seed: int
     x: float
 
+    @property
+    def sequence(self) -> str:
+        """Scans of one sensor in one kind of scene belong together."""
+        return f'{self.sensor} {self.scene}'
+
 
 def load_simulated(frame: SimulatedFrame) -> KnownScan:
     """Simulate a scan: what the ray hit of the terrain is ground, all else is an obstacle."""
@@ -45,10 +46,10 @@ def load_simulated(frame: SimulatedFrame) -> KnownScan:
         x=frame.x,
     )
     truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
-    group, index = f'{frame.sensor} {frame.scene}', f'{frame.seed}/{frame.x:g}'
     return KnownScan(
-        group, index, made.points, {'exact': truth}, None, made.ground_z, {ALL: made.is_ground}
-    )
+        frame.sequence, f'{frame.seed}/{frame.x:g}', made.points, {'exact': truth},
+        ground_z=made.ground_z, parts={ALL: made.is_ground},
+    )  # fmt: skip
 
 
 def simulated_frames(
@@ -72,38 +73,16 @@ def score_variants(
     variants: Mapping[str, Config],
     peers: Sequence[Method] = (),
     *,
-    make: type[OurMethod] = OurMethod,
     progress: Progress = iter,
 ) -> list[MethodScore]:
     """Run every variant once on every scan, alternately, each scan without a past.
 
     `items` are loaded one by one, as by `score_methods`; `peers` are other methods to run on
-    the same scans, whose scores come last; `make` makes the method of a configuration.
+    the same scans, whose scores come last.
     """
     with ExitStack() as stack:
-        ours = [stack.enter_context(closing(make(c, name))) for name, c in variants.items()]
+        ours = [stack.enter_context(closing(OurMethod(c, name))) for name, c in variants.items()]
         return score_methods(items, load, [*ours, *peers], each_alone=True, progress=progress)
-
-
-class Report(NamedTuple):
-    """Tables to show, every number by scan or segment, a fit (of any frame), further facts."""
-
-    tables: dict[str, Table]
-    rows: list[dict[str, Any]]
-    fit: FitReport
-    facts: dict[str, Any]
-
-    def write(self, path: Path, environment: Environment) -> None:
-        """Write every number as JSON."""
-        document = {
-            **self.facts,
-            'n_threads': self.fit.n_threads,
-            'backend': self.fit.backend,
-            'environment': dataclasses.asdict(environment),
-            **{name: table.json() for name, table in self.tables.items()},
-            'rows': self.rows,
-        }
-        write_json(document, path)
 
 
 def make_report(
