@@ -4,33 +4,28 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import statistics
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from gp_ground_seg.cli.options import (
+    FORCE,
+    TO_JSON,
     add_config_options,
+    add_options,
     config_from_options,
     count,
     new_parser,
     positive,
+    progress,
 )
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.semantic_kitti import Frame
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.calibration import BIN_EDGES, N_BINS, THRESHOLDS, Calibration
-from gp_ground_seg.evaluation.environment import describe_environment, parameters_line
 from gp_ground_seg.evaluation.evaluate import (
-    KnownScan,
     MethodScore,
-    Progress,
-    ScanScore,
     labelled_frames,
     load_kitti,
     score_methods,
@@ -43,20 +38,29 @@ from gp_ground_seg.evaluation.methods import (
     PatchworkppMethod,
 )
 from gp_ground_seg.evaluation.metrics import (
+    BIN_EDGES,
     CONVENTIONS,
-    GROUNDGRID,
+    N_BINS,
     RATIOS,
     RING_TITLES,
+    Calibration,
     Convention,
-    Labels,
     class_errors,
     class_name,
     ratio,
 )
-from gp_ground_seg.evaluation.table import Cell, Column, Table, fold, milliseconds, percent
+from gp_ground_seg.evaluation.report import (
+    Cell,
+    Column,
+    Table,
+    describe_environment,
+    fold,
+    milliseconds,
+    parameters_line,
+    percent,
+)
 from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
-from gp_ground_seg.plotting.birds_eye import SheetPanel, plot_error_sheet
 from gp_ground_seg.plotting.charts import plot_reliability
 
 DESCRIPTION = (
@@ -68,46 +72,36 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08 --json scores.json
   gp-ground-seg evaluate KITTI_ROOT --set label.ground_tolerance=0.15
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
-  gp-ground-seg evaluate KITTI_ROOT --sheet worst.png --worst 9
+  gp-ground-seg evaluate KITTI_ROOT --worst 9
   gp-ground-seg evaluate KITTI_ROOT --reliability reliability.png
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI).
 """
 
-FRAME_OPTIONS: dict[str, dict[str, Any]] = {
-    'sequences': {'metavar': 'LIST', 'help': 'sequences, as in 00,08 (default: all there are)'},
-    'frame_step': {
-        'metavar': 'N', 'type': positive, 'help': 'every Nth frame of a sequence only'
-    },
-}  # fmt: skip
-N_WORST, MAX_WORST = 6, 60
-LEAST_SHARE = 0.01
-"""Classes with a smaller share of the errors of a frame are not named on the sheet."""
+ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
+OF_FRAMES = (
+    ('--sequences', 'sequences, as in 00,08 (default: all there are)', {'metavar': 'LIST'}),
+    ('--frame-step', 'every Nth frame of a sequence only', {'metavar': 'N', 'type': positive}),
+)
 COUNTS_AS = {Label.GROUND: 'ground', Label.OBSTACLE: 'obstacle', Label.UNKNOWN: 'left out'}
 RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
-
-Scored = tuple[KnownScan, ScanScore, Labels]
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
-    parser.add_argument('root', metavar='ROOT', help='folder in SemanticKITTI layout')
-    for name, options in FRAME_OPTIONS.items():
-        parser.add_argument(f'--{name.replace("_", "-")}', **options)
-    for name, what in (
-        ('--sheet', 'draw the worst frames from above, errors coloured (PNG)'),
-        ('--reliability', 'draw share of ground over p_ground (PNG)'),
-    ):
-        parser.add_argument(name, metavar='FILE', help=what)
-    parser.add_argument(
-        '--worst', metavar='N', type=positive,
-        help=f'frames on the sheet (default: {N_WORST}, at most {MAX_WORST})',
-    )  # fmt: skip
-    parser.add_argument(
-        '--peer', choices=(PATCHWORKPP,), help='run this one on the same frames, alternately'
+    reliability = 'draw share of ground over p_ground (PNG)'
+    worst = {'metavar': 'N', 'type': positive}
+    add_options(
+        parser,
+        ROOT,
+        *OF_FRAMES,
+        ('--worst', 'list the N frames with the lowest IoU', worst),
+        ('--reliability', reliability, {'metavar': 'FILE'}),
+        ('--peer', 'run this one on the same frames, alternately', {'choices': (PATCHWORKPP,)}),
+        TO_JSON,
+        FORCE,
     )
-    add_json_options(parser)
     add_config_options(parser)
     parser.set_defaults(run=run)
 
@@ -115,46 +109,28 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate, write the files, print the tables."""
     config = config_from_options(arguments)
-    if arguments.worst is not None and arguments.sheet is None:
-        raise DataError('--worst: is for --sheet only')
-    n_worst = arguments.worst or N_WORST
-    if n_worst > MAX_WORST:
-        raise DataError(f'--worst {n_worst}: must be at most {MAX_WORST}')
-    worst: list[Scored] = []
-
-    def keep_worst(method: str, scan: KnownScan, score: ScanScore, label: Labels) -> None:
-        if method == OURS and score.confusion.tp + score.confusion.errors:
-            worst.append((scan, score, label))
-            worst.sort(key=lambda one: one[1].confusion.iou)
-            del worst[n_worst:]
-
-    files = {
-        'json': 'every number', 'sheet': 'worst frames', 'reliability': 'reliability diagram',
-    }  # fmt: skip
+    files = {'json': 'every number', 'reliability': 'reliability diagram'}
     with staged_options(arguments, *files) as parts, ExitStack() as stack:
         frames = frames_from_options(arguments)
         methods: list[Method] = [stack.enter_context(closing(OurMethod(config)))]
         if arguments.peer is not None:
             methods.append(PatchworkppMethod())
-        scores = score_methods(
-            frames, load_kitti, methods,
-            observe=keep_worst if 'sheet' in parts else None, progress=progress('evaluate'),
-        )  # fmt: skip
+        scores = score_methods(frames, load_kitti, methods, progress=progress('evaluate'))
         report = make_report(
-            score_tables(scores), scores, config,
+            score_tables(scores, arguments.worst), scores, config,
             data=arguments.root, reliability=reliability_rows(scores[0]),
             stages={score.name: score.median_stages for score in scores},
         )  # fmt: skip
         environment = describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
         if 'json' in parts:
             report.write(parts['json'], environment)
-        if 'sheet' in parts:
-            _draw_sheet(worst, len(frames), parts['sheet'])
         if 'reliability' in parts:
-            _draw_reliability(scores[0], parts['reliability'])
+            sequences = {name: _calibration(own) for name, own in scores[0].by_sequence()}
+            title = f'Reliability, {len(frames)} frames'
+            plot_reliability(sequences, parts['reliability'], title)
     print('\n\n'.join([_headline(scores), *(table.text() for table in report.tables.values())]))
     print(f'\n{fold(parameters_line(report.facts["config_changes"]))}')
-    print(fold(environment.machine(report.fit.n_threads, report.fit.backend)))
+    print(fold(environment.machine(report.fit)))
     for name in parts:
         print(f'{files[name]}: {getattr(arguments, name)}')
     return 0
@@ -171,13 +147,14 @@ def _headline(scores: Sequence[MethodScore]) -> str:
     )
 
 
-def score_tables(scores: Sequence[MethodScore]) -> dict[str, Table]:
+def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str, Table]:
     """Tables of an evaluation by name, ours first in `scores`."""
     return {
         **{one.key: _convention_table(scores, one) for one in CONVENTIONS},
         'rings': _ring_table(scores),
         'classes': _class_table(scores[0]),
         'probabilities': _calibration_table(scores[0]),
+        **({'worst': _worst_table(scores[0], n_worst)} if n_worst else {}),
         'times': _time_table(scores),
     }
 
@@ -251,22 +228,29 @@ def _class_table(score: MethodScore) -> Table:
 
 def _calibration_table(score: MethodScore) -> Table:
     """Errors of the probabilities by sequence and pooled."""
-    rows: list[list[Cell]] = []
-    for sequence, own in score.by_sequence():
-        found = _calibration(own)
-        best = found.confusion_at(found.best_step).iou if found.n_total else None
-        threshold = float(THRESHOLDS[found.best_step]) if found.n_total else None
-        cells = [found.n_total, found.ece, found.brier, own.iou, best, threshold]
-        rows.append([sequence, *cells])
+    found = [(sequence, _calibration(own)) for sequence, own in score.by_sequence()]
+    rows = [[sequence, one.n_total, one.ece, one.brier] for sequence, one in found]
     columns = [Column('sequence'), Column('points', '_d'), Column('ECE', '.4f', 'ece')]
-    columns += [Column('Brier', '.4f', 'brier'), percent('IoU of labels', 'iou')]
-    columns += [percent('best IoU', 'best_iou'), Column('at p_ground', '.3f', 'best_threshold')]
     title = (
         f'Probabilities (GroundGrid convention): expected calibration error over {N_BINS} bins, '
-        'Brier score; IoU [%] of the labels, and if ground were all points from the best '
-        'threshold on'
+        'Brier score'
     )
-    return Table(columns, rows, title, n_sums=1)
+    return Table([*columns, Column('Brier', '.4f', 'brier')], rows, title, n_sums=1)
+
+
+def _worst_table(score: MethodScore, n_worst: int) -> Table:
+    """Frames with the lowest IoU, and the class that costs them most."""
+    rows: list[list[Cell]] = []
+    known = [scan for scan in score.scans if not math.isnan(scan.confusion.iou)]
+    for scan in sorted(known, key=lambda scan: scan.confusion.iou)[:n_worst]:
+        found, (main, *_) = scan.confusion, class_errors(scan.classes)
+        share = ratio(main.errors, found.errors)
+        cells = [found.iou, found.fp, found.fn, class_name(main.number), share]
+        rows.append([scan.sequence, scan.index, *cells])
+    columns = [Column('sequence'), Column('frame'), percent('IoU', 'iou')]
+    columns += [Column('false', '_d'), Column('missed', '_d'), Column('most errors on')]
+    title = 'Frames with the lowest IoU (GroundGrid convention)  [%]'
+    return Table([*columns, percent('of errors', 'share_of_errors')], rows, title)
 
 
 def _time_table(scores: Sequence[MethodScore]) -> Table:
@@ -291,50 +275,16 @@ def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
     rows = []
     for sequence, own in score.by_sequence():
         found = _calibration(own)
-        bins = zip(itertools.pairwise(BIN_EDGES.tolist()), found.n_points.tolist(),
-                   found.mean_p.tolist(), found.share_ground.tolist(), strict=True)  # fmt: skip
-        for (low, high), n, mean, share in bins:
-            row = {'sequence': sequence, 'from': low, 'to': high, 'points': n}
-            rows.append({**row, 'mean_p': mean, 'share_ground': share})
+        bins = (found.n_points, found.by_bin(found.sum_p), found.by_bin(found.n_ground))
+        values = zip(BIN_EDGES[:-1], BIN_EDGES[1:], *bins, strict=True)
+        keys = ('from', 'to', 'points', 'mean_p', 'share_ground')
+        for row in values:
+            named = zip(keys, (value.item() for value in row), strict=True)
+            rows.append({'sequence': sequence, **dict(named)})
     return rows
 
 
-def _draw_sheet(worst: Sequence[Scored], n_frames: int, path: Path) -> None:
-    """Draw frames with their errors."""
-    if not worst:
-        raise DataError(f'no sheet of worst frames: nothing to score in {n_frames} frames')
-    panels = []
-    for scan, score, label in worst:
-        confusion = score.confusion
-        # The classes with most errors, as in ``missed terrain 68 %, false building 16 %``.
-        causes = ', '.join(
-            f'{"missed" if one.missed else "false"} {class_name(one.number)} '
-            f'{one.errors / confusion.errors:.0%}'
-            for one in class_errors(score.classes)[:3]
-            if one.errors > LEAST_SHARE * confusion.errors
-        )
-        errors = f'{confusion.fp} false, {confusion.fn} missed: {causes}'
-        title = f'{scan.sequence} / {scan.index}    IoU {100.0 * confusion.iou:.2f} %'
-        subtitle = errors if confusion.errors else 'no errors'
-        truth = scan.truths[GROUNDGRID.key]
-        panels.append(SheetPanel(title, subtitle, scan.points, label, truth))
-    title = f'Worst {len(worst)} of {n_frames} frames, GroundGrid convention; x up, y left [m]'
-    plot_error_sheet(panels, path, title)
-
-
-def _draw_reliability(score: MethodScore, path: Path) -> None:
-    sequences = {name: _calibration(score.of(name)) for name in score.sequences}
-    title = f'Reliability, {len(score.scans)} frames'
-    plot_reliability(_calibration(score), sequences, path, title)
-
-
 # What `experiment` and `bench` share with this command.
-
-
-def add_json_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json FILE`` and ``--force``."""
-    parser.add_argument('--json', metavar='FILE', help='write every number to this file as well')
-    parser.add_argument('--force', action='store_true', help='overwrite the files written')
 
 
 def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
@@ -358,8 +308,3 @@ def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[
             for name in names
             if (path := getattr(arguments, name)) is not None
         }
-
-
-def progress(title: str, unit: str = 'frame') -> Progress:
-    """Wrap items in a progress bar on standard error, if that is a terminal."""
-    return partial(tqdm, unit=unit, desc=title, file=sys.stderr, disable=None, leave=False)

@@ -38,7 +38,7 @@ COMMANDS = {
     'bench': Command('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': Command('experiment', 'repeat an experiment of docs/, such as ablation'),
     'plot': Command('plot', 'draw a scan in perspective, or a segment of it from the side'),
-    'pose': Command('pose', 'estimate height and tilt of the sensor from scans'),
+    'pose': Command('segment', 'estimate height and tilt of the sensor from scans'),
     'kitti-to-bag': Command('bags', 'write a KITTI sequence as a rosbag2'),
     'play': Command('bags', "publish a bag's clouds as they were recorded"),
     'demo': Command('demo', 'see it work, no data needed'),

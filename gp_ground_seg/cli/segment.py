@@ -1,8 +1,9 @@
-"""``segment``: label scans on disk, or split the clouds of a bag."""
+"""``segment``: label scans, or split the clouds of a bag; ``pose``: height and tilt."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import statistics
 from collections.abc import Iterator, Sequence
@@ -11,15 +12,28 @@ from pathlib import Path
 
 import numpy as np
 
-from gp_ground_seg.cli import options
-from gp_ground_seg.cli.options import count, note, note_leftovers, progress_bar
+from gp_ground_seg.cli.options import (
+    FLAG,
+    FORCE,
+    QUIET,
+    add_config_options,
+    add_options,
+    config_from_options,
+    count,
+    new_parser,
+    note,
+    note_leftovers,
+    progress,
+)
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE, is_bag
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.frame import Label
+from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
 
@@ -53,6 +67,21 @@ EXAMPLES = """\
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
 """
 
+POSE_DESCRIPTION = """\
+Estimate from scans how high the sensor is and how it is tilted.
+
+INPUT is a .bin scan (float32 x, y, z, intensity), a folder of them, or a sequence
+with velodyne/ in it. Each scan is judged by itself. Support is the share of the
+low points on the plane that was found, residual their distance to it. With enough
+scans of level ground the medians are values to set: docs/pose.md.
+"""
+
+POSE_EXAMPLES = """\
+  gp-ground-seg pose 000000.bin
+  gp-ground-seg pose KITTI_ROOT/sequences/00
+  gp-ground-seg pose scans --set sensor.height=1.2      does it agree?
+"""
+
 GROUND_TOPIC, OBSTACLES_TOPIC = '/ground', '/obstacles'
 """Topics of the clouds in the output, unless others are given."""
 
@@ -65,32 +94,38 @@ _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the command."""
-    parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
-    parser.add_argument('input', metavar='INPUT', help='scan, folder of scans, or bag')
+    """Declare the commands."""
+    parser = new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
     output = (
         'for scans a folder, or a .label file for a single scan; for bags a folder, or a '
         '.mcap or .db3 file (default: INPUT with _ground added, beside it)'
     )
-    parser.add_argument('-o', '--output', metavar='OUT', help=output)
-    parser.add_argument('--force', action='store_true', help='replace output that exists')
-    parser.add_argument('--quiet', action='store_true', help='no progress bar, no notes')
-    options.add_config_options(parser)
-    scans = parser.add_argument_group('for scans')
+    add_options(
+        parser,
+        ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
+        ('-o --output', output, {'metavar': 'OUT'}),
+        FORCE,
+        QUIET,
+    )
+    add_config_options(parser)
     raw = 'write 0 unknown, 1 ground, 2 obstacle as labels'
-    scans.add_argument('--raw', action='store_true', help=raw)
-    bags = parser.add_argument_group('for bags')
-    for option, text in (
-        ('--topic', 'PointCloud2 topic (default: the only one there is)'),
-        ('--ground-topic', f'topic of the ground (default: {GROUND_TOPIC})'),
-        ('--obstacles-topic', f'topic of the obstacles (default: {OBSTACLES_TOPIC})'),
-    ):
-        bags.add_argument(option, metavar='T', help=text)
-    drop = 'leave this topic out of the output (may be repeated)'
-    bags.add_argument('--drop', metavar='T', action='append', default=[], help=drop)
+    add_options(parser.add_argument_group('for scans'), ('--raw', raw, FLAG))
     storage = 'storage of the output (default: by its name, else as the input; mcap for ROS 1)'
-    bags.add_argument('--format', choices=SUFFIX_OF_STORAGE, help=storage)
+    topic, several = {'metavar': 'T'}, {'metavar': 'T', 'action': 'append', 'default': []}
+    add_options(
+        parser.add_argument_group('for bags'),
+        ('--topic', 'PointCloud2 topic (default: the only one there is)', topic),
+        ('--ground-topic', f'topic of the ground (default: {GROUND_TOPIC})', topic),
+        ('--obstacles-topic', f'topic of the obstacles (default: {OBSTACLES_TOPIC})', topic),
+        ('--drop', 'leave this topic out of the output (may be repeated)', several),
+        ('--format', storage, {'choices': SUFFIX_OF_STORAGE}),
+    )
     parser.set_defaults(run=run)
+
+    parser = new_parser(subparsers, 'pose', POSE_DESCRIPTION, POSE_EXAMPLES)
+    add_options(parser, ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}))
+    add_config_options(parser)
+    parser.set_defaults(run=run_pose)
 
 
 _Counts = tuple[int, int, float]
@@ -99,7 +134,7 @@ _Counts = tuple[int, int, float]
 
 def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
-    config = options.config_from_options(arguments)
+    config = config_from_options(arguments)
     source = Path(arguments.input)
     holds_bag = is_bag(source) or _holds_bag_files(source)
     scans = [] if holds_bag else find_scans(source)
@@ -181,7 +216,7 @@ def _segment_scans(
         note_leftovers(target)
     with (
         _label_files(scans, target, arguments) as label_paths,
-        progress_bar(len(scans), quiet=arguments.quiet, title='segment') as bar,
+        progress('segment', quiet=arguments.quiet)(total=len(scans)) as bar,
     ):
         for scan, label_path in zip(scans, label_paths, strict=True):
             try:
@@ -240,7 +275,7 @@ def _segment_bag(
                     )
         with (
             BagWriter(target, storage=storage, force=arguments.force) as output,
-            progress_bar(bag.n_messages(topic), quiet=arguments.quiet, title='segment') as bar,
+            progress('segment', quiet=arguments.quiet)(total=bag.n_messages(topic)) as bar,
         ):
             for name in copied:
                 output.add_topic(bag.topic(name))
@@ -278,3 +313,63 @@ def _check_output_topics(source: Path, topics: tuple[str, str], copied: list[str
             )
     if topics[0] == topics[1]:
         raise DataError(f'--obstacles-topic {topics[1]}: is the topic of the ground as well')
+
+
+DEGREES = math.degrees(1.0)
+POSE_COLUMNS = (
+    Column('scan'),
+    Column('height [m]', '.2f'),
+    Column('roll [deg]', '+.2f', scale=DEGREES),
+    Column('pitch [deg]', '+.2f', scale=DEGREES),
+    percent('support [%]', form='.0f'),
+    Column('residual [m]', '.3f'),
+    Column('used as'),
+)
+
+
+def run_pose(arguments: argparse.Namespace) -> int:
+    """Print a line for each scan, and the medians."""
+    poses, rows, notes = [], [], []
+    with closing(GroundSegmenter(config_from_options(arguments))) as segmenter:
+        for scan in find_scans(Path(arguments.input)):
+            try:
+                pose = segmenter.estimate_pose(read_points(scan))
+            except PointCloudError as error:
+                notes.append(f'{scan.name}: refused: {error}')
+                continue
+            poses.append(pose)
+            rows.append(_pose_row(scan.name, pose))
+            notes += [f'{scan.name}: {line}' for line in pose.contradictions]
+    if poses:
+        print(Table(POSE_COLUMNS, rows).text())
+        notes.insert(0, _pose_summary(poses))
+    print('\n'.join(notes))
+    return 0
+
+
+def _pose_row(name: str, pose: SensorPose) -> list[Cell]:
+    """Return what was measured, where the scan tells it, and the values used."""
+    used = f'height {pose.height:.2f}'
+    if not pose.height_estimated:
+        used = f'height {pose.height:g} (not measured)'
+    if not pose.is_level:
+        used += f', roll {math.degrees(pose.roll):.1f} pitch {math.degrees(pose.pitch):.1f}'
+    found = pose.measured
+    if found is None or not found.tells_height:
+        return [name, *5 * [None], used]
+    tilt = (found.roll, found.pitch) if found.tells_tilt else (None, None)
+    return [name, found.height, *tilt, found.plane.support, found.plane.residual, used]
+
+
+def _pose_summary(poses: list[SensorPose]) -> str:
+    """Return the medians over the scans that tell, as parameters."""
+    found = [pose.measured for pose in poses if pose.measured is not None]
+    heights = [one.height for one in found if one.tells_height]
+    tilts = [(one.roll, one.pitch) for one in found if one.tells_tilt]
+    if not heights:
+        return 'no scan shows enough ground to tell the height: set sensor.height'
+    words = f'median of {len(heights)}: sensor.height={statistics.median(heights):.2f}'
+    if tilts:
+        roll, pitch = (statistics.median(angles) for angles in zip(*tilts, strict=True))
+        words += f' sensor.roll={roll:.3f} sensor.pitch={pitch:.3f} [m, rad]'
+    return words

@@ -106,7 +106,7 @@ def compare_models(
     config: Config,
     progress: Progress = iter,
 ) -> Report:
-    """Score `MODELS` on labelled or simulated scans; ConfigError if `config` sets what they set."""
+    """Score `MODELS` on scans; ConfigError if `config` sets what they set."""
     refuse_changed(config, {name for changes in MODELS.values() for name in changes})
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     scores = score_variants(items, load, variants, progress=progress)
