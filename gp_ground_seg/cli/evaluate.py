@@ -228,8 +228,8 @@ def _class_table(score: MethodScore) -> Table:
 
 def _calibration_table(score: MethodScore) -> Table:
     """Errors of the probabilities by sequence and pooled."""
-    found = [(sequence, _calibration(own)) for sequence, own in score.by_sequence()]
-    rows = [[sequence, one.n_total, one.ece, one.brier] for sequence, one in found]
+    found = [(name, _calibration(own)) for name, own in score.by_sequence()]
+    rows: list[list[Cell]] = [[name, one.n_total, one.ece, one.brier] for name, one in found]
     columns = [Column('sequence'), Column('points', '_d'), Column('ECE', '.4f', 'ece')]
     title = (
         f'Probabilities (GroundGrid convention): expected calibration error over {N_BINS} bins, '
@@ -245,7 +245,7 @@ def _worst_table(score: MethodScore, n_worst: int) -> Table:
     for scan in sorted(known, key=lambda scan: scan.confusion.iou)[:n_worst]:
         found, (main, *_) = scan.confusion, class_errors(scan.classes)
         share = ratio(main.errors, found.errors)
-        cells = [found.iou, found.fp, found.fn, class_name(main.number), share]
+        cells: list[Cell] = [found.iou, found.fp, found.fn, class_name(main.number), share]
         rows.append([scan.sequence, scan.index, *cells])
     columns = [Column('sequence'), Column('frame'), percent('IoU', 'iou')]
     columns += [Column('false', '_d'), Column('missed', '_d'), Column('most errors on')]

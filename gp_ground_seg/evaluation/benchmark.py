@@ -8,6 +8,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,8 @@ MODES = {'fixed': 'theta fixed', 'every_frame': 'learning'}
 """Values of ``learning.mode`` that are timed, and their titles."""
 
 
-class BenchFrame(NamedTuple):
+@dataclass(frozen=True)
+class BenchFrame:
     """A cloud in memory, (N, 4) x, y, z [m] and intensity.
 
     What is temporal starts anew with each sequence.

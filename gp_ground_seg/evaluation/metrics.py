@@ -394,5 +394,5 @@ def pool_height_errors(errors: Sequence[HeightError]) -> HeightError:
     """Sum up the errors of several frames."""
     medians = [one.median_absolute for one in errors if one.n_points]
     *names, _median = (field.name for field in dataclasses.fields(HeightError))
-    sums = (sum(getattr(one, name) for one in errors) for name in names)
-    return HeightError(*sums, float(np.median(medians)) if medians else math.nan)
+    sums = {name: sum(getattr(one, name) for one in errors) for name in names}
+    return HeightError(**sums, median_absolute=float(np.median(medians)) if medians else math.nan)

@@ -97,8 +97,8 @@ def score_poses(
 def load_turned(mount: Mount, frame: Frame) -> KnownScan:
     """Read a labelled frame as a turned sensor would see it; its height is what it is."""
     scan = load_kitti(frame)
-    rotation = SensorPose(0.0, *map(math.radians, mount[1])).rotation
-    points = scan.points[:, :3].astype(np.float64) @ rotation
+    roll, pitch = map(math.radians, mount[1])
+    points = scan.points[:, :3].astype(np.float64) @ SensorPose(0.0, roll, pitch).rotation
     return dataclasses.replace(scan, points=points, semantic=None, parts={})
 
 

@@ -18,7 +18,6 @@ from gp_ground_seg.result import Segmentation
 
 Labels = npt.NDArray[np.uint8]
 
-FORMATS = ('.png', '.pdf')
 DPI = 130
 # Inches: the figure, and the part of it that the two panels leave to the legend.
 WIDTH, HEIGHT, LEGEND = 12.2, 7.6, 2.6
@@ -69,7 +68,7 @@ def plot_segment(
     points : (N, >=3) float array
         x forward, y left, z up [m].
     segment, path : int, str or Path
-        Number of the segment; file to write, .png or .pdf, replaced if it exists.
+        Number of the segment; file to write, a PDF or else a PNG, replaced if it exists.
     truth : (N,) uint8, optional
         True `Label` of each point, UNKNOWN where it does not count.
     max_range : float, optional
@@ -78,8 +77,7 @@ def plot_segment(
     Raises
     ------
     PointCloudError, ConfigError
-        If the shapes do not fit together; if the segment, the range or the file's ending is
-        not accepted.
+        If the shapes do not fit together; if the segment or the range is not accepted.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     style.check_lengths(len(z), result=result.label, truth=truth)
@@ -88,8 +86,6 @@ def plot_segment(
         raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
     if max_range is not None and not (max_range > 0.0 and math.isfinite(max_range)):
         raise ConfigError(f'max_range = {max_range}: must be a positive number of metres')
-    if Path(path).suffix.lower() not in FORMATS:
-        raise ConfigError(f'{path}: must end in {" or ".join(FORMATS)}')
     figure = style.new_figure(WIDTH, HEIGHT, DPI)
     from matplotlib.ticker import LogLocator, NullFormatter
 
