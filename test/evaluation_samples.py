@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gp_ground_seg.evaluation.methods import MethodResult
+from gp_ground_seg.evaluation.evaluate import MethodResult
 from gp_ground_seg.evaluation.metrics import SemanticClass
 from gp_ground_seg.frame import Label
 

@@ -24,7 +24,7 @@ from gp_ground_seg.evaluation.benchmark import (
     time_growth,
 )
 from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.methods import PATCHWORKPP
+from gp_ground_seg.evaluation.evaluate import PATCHWORKPP
 
 NUMPY = Config().replace(
     **{'runtime.backend': 'numpy', 'grid.n_segments': 8, 'learning.max_evaluations': 1}

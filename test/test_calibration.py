@@ -15,7 +15,7 @@ from gp_ground_seg import Label
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation.calibration import BIN_EDGES, N_BINS, THRESHOLDS, count_calibration
 from gp_ground_seg.evaluation.evaluate import labelled_frames, load_kitti, score_methods
-from gp_ground_seg.evaluation.methods import MethodResult
+from gp_ground_seg.evaluation.evaluate import MethodResult
 from gp_ground_seg.evaluation.metrics import count_confusion
 
 PROBABILITY = st.one_of(

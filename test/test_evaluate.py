@@ -19,7 +19,7 @@ from gp_ground_seg.evaluation.evaluate import (
     pool,
     score_methods,
 )
-from gp_ground_seg.evaluation.methods import OurMethod, PatchworkppMethod
+from gp_ground_seg.evaluation.evaluate import OurMethod, PatchworkppMethod
 from gp_ground_seg.evaluation.metrics import (
     ClassCount,
     Confusion,

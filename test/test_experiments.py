@@ -20,7 +20,7 @@ from gp_ground_seg.evaluation.evaluate import (
     load_kitti,
     score_methods,
 )
-from gp_ground_seg.evaluation.methods import OurMethod, PatchworkppMethod
+from gp_ground_seg.evaluation.evaluate import OurMethod, PatchworkppMethod
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
 from gp_ground_seg.experiments import ablation, cross_validation, sensor_pose, simulated_scenes
 from gp_ground_seg.experiments.ablation import (

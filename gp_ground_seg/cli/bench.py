@@ -29,7 +29,7 @@ from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation.benchmark import BenchFrame, bench_cases, bench_document, run_cases
-from gp_ground_seg.evaluation.methods import PATCHWORKPP, TITLES, PatchworkppMethod
+from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, TITLES, PatchworkppMethod
 from gp_ground_seg.evaluation.report import (
     Cell,
     Column,

@@ -25,17 +25,15 @@ from gp_ground_seg.cli.options import (
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.evaluation.evaluate import (
-    MethodScore,
-    labelled_frames,
-    load_kitti,
-    score_methods,
-)
-from gp_ground_seg.evaluation.methods import (
     OURS,
     PATCHWORKPP,
     Method,
+    MethodScore,
     OurMethod,
     PatchworkppMethod,
+    labelled_frames,
+    load_kitti,
+    score_methods,
 )
 from gp_ground_seg.evaluation.metrics import (
     BIN_EDGES,

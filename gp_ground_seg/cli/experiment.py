@@ -23,7 +23,7 @@ from gp_ground_seg.cli.options import (
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.evaluate import load_kitti
 from gp_ground_seg.evaluation.report import Report, describe_environment, fold
-from gp_ground_seg.experiments import ablation, sensor_pose, simulated_scenes
+from gp_ground_seg.experiments import ablation, sensor_pose, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
 from gp_ground_seg.parameters.schema import ParameterValue
@@ -154,11 +154,11 @@ def _scenes(arguments: argparse.Namespace) -> Report:
     given = vars(arguments)
     configs = {}
     for sensor in arguments.sensors or DEFAULT_SENSORS:
-        preset = arguments.preset or simulated_scenes.PRESET_OF[sensor]
+        preset = arguments.preset or variants.PRESET_OF[sensor]
         configs[sensor] = config_from_options(argparse.Namespace(**{**given, 'preset': preset}))
     scenes, seeds = arguments.scenes or list(SCENES), arguments.seeds or 3
     with_peer = not arguments.no_peer
-    return simulated_scenes.score_scenes(configs, scenes, seeds, with_peer, progress('scenes'))
+    return variants.score_scenes(configs, scenes, seeds, with_peer, progress('scenes'))
 
 
 def _cross_validation(arguments: argparse.Namespace) -> Report:

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.evaluation.evaluate import Progress
-from gp_ground_seg.evaluation.methods import Method, OurMethod
+from gp_ground_seg.evaluation.evaluate import Method, OurMethod, Progress
 from gp_ground_seg.evaluation.report import Environment, changed_parameters
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.result import FitReport
@@ -109,10 +108,8 @@ def run_cases(
                     if method is not None and frame.sequence != sequence:
                         method.reset()
                 seconds = [_time(method, frame, clock) for method in order]
-                result = ours.result()
-                assert result.fit is not None
                 own, other = seconds[order.index(ours)], seconds[order.index(baseline)]
-                found = FrameTime(frame, own, result.stages, other, result.fit)
+                found = FrameTime(frame, own, ours.stages, other, ours.last.fit)
                 times[names[j % len(names)]].append(found)
             sequence = frame.sequence
     return times

@@ -115,8 +115,8 @@ def compare_models(
             (Column('method'), one.name),
             (percent('IoU [%]', 'iou'), one.iou),
             *_worst_and_rmse(one),
-            (centimetres('median [cm]', 'median_absolute'), one.height().median_absolute),
-            (Column('SMSE', '.5f', 'smse'), one.height().smse),
+            (centimetres('median [cm]', 'median_absolute'), one.height.median_absolute),
+            (Column('SMSE', '.5f', 'smse'), one.height.smse),
             (milliseconds('ms', 'seconds'), one.seconds()),
         ]
         for one in scores
@@ -177,7 +177,7 @@ def _worst_and_rmse(score: MethodScore) -> Row:
     return [
         (percent('worst [%]', 'worst_iou'), iou),
         (Column('in', '', 'worst_sequence'), name),
-        (centimetres('RMSE [cm]', 'rmse'), score.height().rmse),
+        (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
     ]
 
 

@@ -99,7 +99,7 @@ def load_turned(mount: Mount, frame: Frame) -> KnownScan:
     scan = load_kitti(frame)
     roll, pitch = map(math.radians, mount[1])
     points = scan.points[:, :3].astype(np.float64) @ SensorPose(0.0, roll, pitch).rotation
-    return dataclasses.replace(scan, points=points, semantic=None, parts={})
+    return dataclasses.replace(scan, points=points, semantic=None, ground_z=None)
 
 
 def load_mounted(mount: Mount, frame: SimulatedFrame) -> KnownScan:

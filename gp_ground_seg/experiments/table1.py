@@ -13,7 +13,7 @@ import numpy as np
 
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.evaluate import ALL, Progress, load_kitti
+from gp_ground_seg.evaluation.evaluate import Progress, load_kitti
 from gp_ground_seg.evaluation.metrics import height_error
 from gp_ground_seg.evaluation.report import Column, Report, Table, changed_parameters
 from gp_ground_seg.experiments.variants import refuse_changed
@@ -139,7 +139,7 @@ def _rows(
     candidates = common.candidates
     # A candidate is the point of its segment with the same range and height.
     place = common.grid.r + 1j * common.pose.level(scan.points[:, :3])[:, 2]
-    modelled = scan.parts[ALL] & (common.grid.bin != OUTSIDE)
+    modelled = scan.is_ground & (common.grid.bin != OUTSIDE)
     rows = []
     for segment in choice.segments:
         its = slice(*candidates.offsets[segment : segment + 2])
