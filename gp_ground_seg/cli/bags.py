@@ -11,18 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.cli.options import (
-    FLAG,
-    FORCE,
-    QUIET,
-    above_zero,
-    add_options,
-    count,
-    new_parser,
-    note,
-    note_leftovers,
-    progress,
-)
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
@@ -84,9 +73,9 @@ exit code: 0, 1 if clouds were not delivered (always 0 with --no-wait), 2 for an
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
-    parser = new_parser(subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES)
+    parser = options.new_parser(subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES)
     storage = 'storage (default: by the name of OUT, else mcap)'
-    add_options(
+    options.add(
         parser,
         ('root', 'folder with sequences/ in it', {'metavar': 'ROOT'}),
         ('output', 'folder, .mcap or .db3 file to write', {'metavar': 'OUT'}),
@@ -94,35 +83,35 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--format', storage, {'choices': ('mcap', 'sqlite3')}),
         ('--start', 'scans to skip (default: 0)', {'metavar': 'N', 'type': int, 'default': 0}),
         ('--count', 'scans to write (default: all)', {'metavar': 'N', 'type': int}),
-        FORCE,
-        QUIET,
+        options.FORCE,
+        options.QUIET,
     )
     parser.set_defaults(run=run_convert)
 
-    parser = new_parser(subparsers, 'play', PLAY_DESCRIPTION, PLAY_EXAMPLES)
-    seconds = {'metavar': 'S', 'type': partial(above_zero, or_zero=True)}
-    add_options(
+    parser = options.new_parser(subparsers, 'play', PLAY_DESCRIPTION, PLAY_EXAMPLES)
+    seconds = {'metavar': 'S', 'type': partial(options.above_zero, or_zero=True)}
+    options.add(
         parser,
         ('bag', 'bag to play', {'metavar': 'BAG'}),
         ('--rate', 'speed, 2 = twice as fast as recorded (default: 1)',
-         {'metavar': 'R', 'type': above_zero, 'default': 1.0}),
-        ('--loop', 'begin again at the end, until Ctrl-C', FLAG),
-        ('--clock', "publish the bag's time on /clock, 50 Hz (for use_sim_time)", FLAG),
+         {'metavar': 'R', 'type': options.above_zero, 'default': 1.0}),
+        ('--loop', 'begin again at the end, until Ctrl-C', options.FLAG),
+        ('--clock', "publish the bag's time on /clock, 50 Hz (for use_sim_time)", options.FLAG),
         ('--start', 'skip the first S seconds', {**seconds, 'default': 0.0}),
-        ('--duration', 'play S seconds only', {'metavar': 'S', 'type': above_zero}),
-        QUIET,
+        ('--duration', 'play S seconds only', {'metavar': 'S', 'type': options.above_zero}),
+        options.QUIET,
     )  # fmt: skip
-    add_options(
+    options.add(
         parser.add_mutually_exclusive_group(),
         ('--topic', 'PointCloud2 topic to play (may be repeated; default: the only one)',
          {'metavar': 'T', 'action': 'append'}),
-        ('--all', 'play all PointCloud2 topics', FLAG),
+        ('--all', 'play all PointCloud2 topics', options.FLAG),
     )  # fmt: skip
-    add_options(
+    options.add(
         parser.add_mutually_exclusive_group(),
         ('--wait', 'give up without a subscriber within S seconds (default: wait until there is '
          'one)', seconds),
-        ('--no-wait', 'start at once, with or without a subscriber', FLAG),
+        ('--no-wait', 'start at once, with or without a subscriber', options.FLAG),
     )  # fmt: skip
     parser.set_defaults(run=run_play, accepts_ros_args=True)
 
@@ -144,11 +133,11 @@ def run_convert(arguments: argparse.Namespace) -> int:
     stamps = [_nanoseconds(frame) for frame in frames]
     target = Path(arguments.output)
     if not arguments.quiet:
-        note_leftovers(target)
+        options.note_leftovers(target)
     n_points = 0
     with (
         BagWriter(target, storage=arguments.format, force=arguments.force) as bag,
-        progress('kitti-to-bag', quiet=arguments.quiet)(total=len(frames)) as bar,
+        options.progress('kitti-to-bag', quiet=arguments.quiet)(total=len(frames)) as bar,
     ):
         bag.add_topic(cloud_topic(TOPIC))
         for frame, stamp in zip(frames, stamps, strict=True):
@@ -160,16 +149,15 @@ def run_convert(arguments: argparse.Namespace) -> int:
             n_points += len(points)
             bar.update()
     n_labelled = sum(frame.labels_path is not None for frame in frames)
-    print(
-        f'{count(len(frames), "frame")} ({n_labelled} with labels), {count(n_points, "point")}, '
-        f'{1e-9 * (stamps[-1] - stamps[0]):.1f} s, written to {target}'
-    )
+    n_frames, n_all = options.count(len(frames), 'frame'), options.count(n_points, 'point')
+    seconds = 1e-9 * (stamps[-1] - stamps[0])
+    print(f'{n_frames} ({n_labelled} with labels), {n_all}, {seconds:.1f} s, written to {target}')
     return 0
 
 
 def _choose(frames: Sequence[Frame], arguments: argparse.Namespace) -> Sequence[Frame]:
     start = arguments.start
-    where = f'sequence {arguments.sequence}: {count(len(frames), "scan")} there'
+    where = f'sequence {arguments.sequence}: {options.count(len(frames), "scan")} there'
     if not 0 <= start < len(frames):
         raise DataError(f'--start {start}: must be in [0, {len(frames) - 1}]; {where}')
     left = len(frames) - start
@@ -194,23 +182,23 @@ def run_play(arguments: argparse.Namespace) -> int:
     with needing_ros('play'):
         from gp_ground_seg.ros.playback import Player, PlayOptions
 
-    options = PlayOptions(
+    how = PlayOptions(
         arguments.rate, arguments.start, arguments.duration, arguments.loop, arguments.clock
     )
     with BagReader(arguments.bag) as bag:
         topics = _choose_topics(bag, arguments)
         others = [f'{name} ({kind})' for name, kind in bag.topics.items() if name not in topics]
         if others and not arguments.quiet:
-            note(f'not played: {", ".join(others)}')
+            options.note(f'not played: {", ".join(others)}')
         n_clouds = sum(bag.n_messages(topic) for topic in topics)
         with large_cloud_transport(), ros_session('bag_player', arguments.ros_args) as session:
-            player = Player(session.node, bag, topics, session.sleep, options)
+            player = Player(session.node, bag, topics, session.sleep, how)
             if not arguments.no_wait:
                 _wait_for_subscribers(player, arguments)
             try:
                 # With --loop there is no end to show progress towards, only a count.
                 total = 0 if arguments.loop else n_clouds
-                with progress('play', quiet=arguments.quiet)(total=total) as bar:
+                with options.progress('play', quiet=arguments.quiet)(total=total) as bar:
                     player.play(bar.update)
             finally:
                 # After an interrupt, too: with --loop it is the only end.
@@ -234,7 +222,7 @@ def _wait_for_subscribers(player: Player, arguments: argparse.Namespace) -> None
     lonely = ', '.join(player.topics_without_subscriber())
     if limit is None or limit > SILENT_WAIT:
         if not arguments.quiet:
-            note(f'waiting for a subscriber of {lonely}')
+            options.note(f'waiting for a subscriber of {lonely}')
         if player.wait_for_subscribers(None if limit is None else limit - SILENT_WAIT):
             return
     raise GroundSegError(
@@ -247,4 +235,4 @@ def _print_summary(player: Player, arguments: argparse.Namespace) -> None:
     if summary:
         print(summary, flush=True)
         for topic in player.best_effort_topics() if not arguments.quiet else ():
-            note(f'{topic} has a best-effort subscriber; clouds it lost are not counted')
+            options.note(f'{topic} has a best-effort subscriber; clouds it lost are not counted')

@@ -9,36 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import staged_options
-from gp_ground_seg.cli.options import (
-    FLAG,
-    FORCE,
-    TO_JSON,
-    add_config_options,
-    add_options,
-    config_from_options,
-    new_parser,
-    note,
-    positive,
-    progress,
-)
 from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.bag_files import is_bag
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.evaluation import report
 from gp_ground_seg.evaluation.benchmark import BenchFrame, bench_cases, bench_document, run_cases
 from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, TITLES, PatchworkppMethod
-from gp_ground_seg.evaluation.report import (
-    Cell,
-    Column,
-    Table,
-    describe_environment,
-    fold,
-    parameters_line,
-    write_json,
-)
+from gp_ground_seg.evaluation.report import Cell, Column, Table
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.plotting.charts import plot_stage_bars
@@ -66,10 +48,10 @@ RUN_LENGTH = 10
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = new_parser(subparsers, 'bench', DESCRIPTION, EXAMPLES)
-    number: dict[str, Any] = {'metavar': 'N', 'type': positive}
+    parser = options.new_parser(subparsers, 'bench', DESCRIPTION, EXAMPLES)
+    number: dict[str, Any] = {'metavar': 'N', 'type': options.positive}
     file = {'metavar': 'FILE'}
-    add_options(
+    options.add(
         parser,
         ('data', 'scans or a bag', {'metavar': 'DATA', 'nargs': '?'}),
         ('--frames', 'frames, in runs of ten spread over the data (default: %(default)s)',
@@ -79,11 +61,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
         ('--plot', 'draw the stages as a PNG', file),
-        ('--numpy', 'time learning without compiled code as well', FLAG),
-        TO_JSON,
-        FORCE,
+        ('--numpy', 'time learning without compiled code as well', options.FLAG),
+        options.TO_JSON,
+        options.FORCE,
     )  # fmt: skip
-    add_config_options(parser)
+    options.add_config(parser)
     parser.set_defaults(run=run)
 
 
@@ -97,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             document = _measure(arguments)
         if 'json' in parts:
-            write_json(document, parts['json'])
+            report.write_json(document, parts['json'])
         if 'plot' in parts:
             _plot(document, parts['plot'])
     print(bench_text(document))
@@ -127,21 +109,21 @@ def read_record(path: str | Path) -> dict[str, Any]:
 
 
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    config = config_from_options(arguments)
-    environment = describe_environment('pypatchworkpp')
-    threads = _threads(arguments.threads, config, environment.n_cores)
+    config = options.read_config(arguments)
+    environment = report.describe_environment('pypatchworkpp')
+    threads = _threads(arguments.threads, config, environment['n_cores'])
     try:
         PatchworkppMethod()
         baseline = PATCHWORKPP
     except MissingDependencyError:
-        note('no ratios without the baseline: pip install pypatchworkpp')
+        options.note('no ratios without the baseline: pip install pypatchworkpp')
         baseline = None
     measured = run_cases(
         load_frames(Path(arguments.data), arguments.frames, arguments.topic),
         bench_cases(config, threads, with_numpy=arguments.numpy),
         PatchworkppMethod if baseline else None,
         arguments.passes,
-        progress=progress('bench'),
+        progress=options.progress('bench'),
     )
     data = Path(arguments.data).resolve().name
     return bench_document(measured, config, environment, baseline, data)
@@ -225,20 +207,17 @@ def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
 
 def bench_text(document: dict[str, Any]) -> str:
     """Lay out a `gp_ground_seg.evaluation.benchmark.bench_document` for the terminal."""
-    run, cases = document['environment'], document['cases']
-    versions = ', '.join(f'{name} {v or "absent"}' for name, v in run['versions'].items())
+    cases = document['cases']
     footer = (
-        parameters_line(document['config_changes']),
-        f'machine: {run["cpu"]}, {run["n_cores"]} cores for this process',
-        f'versions: Python {run["python"]}, {versions}',
-        f'commit: {run["commit"] or "unknown"}',
+        report.parameters_line(document['config_changes']),
+        report.machine_line(document['environment']),
     )
     stages = [Column(name, '.2f') for name in cases[0]['stages_ms']]
     by_stage = Table(
         [Column('stage, median [ms]'), *stages],
         [[case['name'], *case['stages_ms'].values()] for case in cases],
     )
-    parts = [_case_table(document).text(), by_stage.text(), '\n'.join(map(fold, footer))]
+    parts = [_case_table(document).text(), by_stage.text(), '\n'.join(map(report.fold, footer))]
     return '\n\n'.join(parts)
 
 

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from gp_ground_seg.cli.options import add_config_options, config_from_options, new_parser
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.parameters import export
@@ -46,7 +46,7 @@ from gp_ground_seg/parameters.
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its own commands."""
     description = 'Show the parameters, their units and ranges.'
-    parser = new_parser(subparsers, 'config', description, EXAMPLES)
+    parser = options.new_parser(subparsers, 'config', description, EXAMPLES)
     commands = parser.add_subparsers(metavar='WHAT', required=True)
     added = {}
     for name, run, purpose, text in (
@@ -59,7 +59,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     ):
         added[name] = commands.add_parser(name, help=purpose, description=text or purpose)
         added[name].set_defaults(run=run)
-    add_config_options(added['dump'])
+    options.add_config(added['dump'])
     added['check'].add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
     for side in 'ab':
         added['diff'].add_argument(side, metavar=side.upper(), help='parameter file or preset')
@@ -70,7 +70,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run_dump(arguments: argparse.Namespace) -> int:
     """Print the parameters as YAML, with the preset's reasons for the values it has given."""
-    config = config_from_options(arguments)
+    config = options.read_config(arguments)
     preset = find_preset(arguments.preset)
     title = preset.title if config == preset.config else ''
     kept = [name for name in preset.reasons if config[name] == preset.config[name]]

@@ -13,16 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
-from gp_ground_seg.cli.options import (
-    FORCE,
-    above_zero,
-    add_options,
-    count,
-    new_parser,
-    positive,
-    progress,
-)
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, stamp_of
@@ -51,9 +43,8 @@ BAG, PICTURE, LOG = 'drive.mcap', 'birds_eye.png', 'node.log'
 FRAME_ID = 'lidar'
 EPOCH = 1_700_000_000
 """Second at which every drive starts: the same drive gives the same bag."""
-SEED = 3
-SPEED = 8.0
-"""Of the simulated drive [m/s]."""
+SEED, SPEED = 3, 8.0
+"""Of the simulated drive; the second [m/s]."""
 RATE = 10.0
 """Scans per second [Hz]."""
 MAX_LOAD, COMFORTABLE_LOAD = 0.9, 0.6
@@ -86,18 +77,18 @@ error, 130 when interrupted
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = new_parser(subparsers, 'demo', DESCRIPTION, EXAMPLES)
+    parser = options.new_parser(subparsers, 'demo', DESCRIPTION, EXAMPLES)
     rate = f'scans per second (default: {RATE:g}, or what this machine can do if that is less)'
-    add_options(
+    options.add(
         parser,
         ('--kitti', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'}),
         ('--sequence', 'sequence of it, as in 00 (default: the first)', {'metavar': 'S'}),
         ('--frames', 'scans to play, at most (default: %(default)s)',
-         {'metavar': 'N', 'type': positive, 'default': 30}),
-        ('--rate', rate, {'metavar': 'HZ', 'type': above_zero}),
+         {'metavar': 'N', 'type': options.positive, 'default': 30}),
+        ('--rate', rate, {'metavar': 'HZ', 'type': options.above_zero}),
         ('--output', 'folder for what is written (default: %(default)s)',
          {'metavar': 'DIR', 'default': 'demo_output'}),
-        FORCE,
+        options.FORCE,
     )  # fmt: skip
     parser.set_defaults(run=run)
 
@@ -147,44 +138,26 @@ def numbered_cloud(
     return scan_cloud(points, stamp, FRAME_ID, label=label, index=index)
 
 
-class ScanCheck(NamedTuple):
-    """A scan that went through the node.
+def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> tuple[bool, Labels]:
+    """Compare a `numbered_cloud` with the clouds on `GROUND` and `OBSTACLES` that came back.
 
-    `is_exact` if each of the `n_points` finite points came back once, in one of the two clouds,
-    with every byte, and nothing else did. `label` (N,) is the `Label` by the cloud a point came
-    back in, `truth` (N,) that of the GroundGrid convention; `points` (N, 4) x, y, z, intensity.
+    Returns whether each finite point came back once, in one of the two clouds, with every byte,
+    and nothing else did; and the `Label` (N,) by the cloud a point came back in.
     """
-
-    n_points: int
-    is_exact: bool
-    label: Labels
-    truth: Labels
-    points: npt.NDArray[np.float32]
-
-
-def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> ScanCheck:
-    """Compare a `numbered_cloud` with the clouds on `GROUND` and `OBSTACLES` that came back."""
-    points, clouds = _records(sent), [results[GROUND], results[OBSTACLES]]
-    xyz = np.stack([points['x'], points['y'], points['z']], axis=1)
-    finite = np.isfinite(xyz).all(axis=1)
-    alike = all(
-        getattr(sent, name) == getattr(cloud, name)
-        for cloud in clouds
-        for name in ('header', 'fields', 'point_step', 'is_bigendian')
-    ) and all(len(c.data) == c.height * c.width * c.point_step for c in clouds)
-    ground, obstacles = map(_records, clouds) if alike else (points[:0], points[:0])
-    back = np.concatenate([ground, obstacles])
-    back = back[np.argsort(back['index'], kind='stable')]
+    points, clouds = _records(sent), (results[GROUND], results[OBSTACLES])
     label = np.full(len(points), Label.UNKNOWN, dtype=np.uint8)
+    for cloud in clouds:
+        names = ('header', 'fields', 'point_step', 'is_bigendian')
+        is_whole = len(cloud.data) == cloud.height * cloud.width * cloud.point_step
+        if not is_whole or any(getattr(sent, name) != getattr(cloud, name) for name in names):
+            return False, label
+    ground, obstacles = map(_records, clouds)
     for value, part in ((Label.GROUND, ground), (Label.OBSTACLE, obstacles)):
         label[part['index'][part['index'] < len(points)]] = value
-    return ScanCheck(
-        n_points=int(np.count_nonzero(finite)),
-        is_exact=alike and back.tobytes() == points[finite].tobytes(),
-        label=label,
-        truth=GROUNDGRID.truth(points['label'], xyz[:, 2]),
-        points=np.column_stack([xyz, points['intensity']]),
-    )
+    back = np.concatenate([ground, obstacles])
+    back = back[np.argsort(back['index'], kind='stable')]
+    finite = np.isfinite(_xyz(points)).all(axis=1)
+    return back.tobytes() == points[finite].tobytes(), label
 
 
 def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
@@ -193,29 +166,45 @@ def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
     return np.frombuffer(cloud.data, [(n, '<f4' if k < 4 else '<u4') for k, n in enumerate(names)])
 
 
+def _xyz(points: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    return np.stack([points['x'], points['y'], points['z']], axis=1)
+
+
+class Picture(NamedTuple):
+    """A scan to draw: its number, places, labels and true labels of its points, (N,) each."""
+
+    number: int
+    xyz: npt.NDArray[np.float32]
+    label: Labels
+    truth: Labels
+
+
 class Tally:
     """Sums over the scans of the given `stamps` that came back.
 
-    `picture` is the check, and the number, of the middle scan or the nearest before it.
+    `picture` is the middle scan or the nearest before it.
     """
 
     def __init__(self, stamps: Sequence[tuple[int, int]]) -> None:
         self._numbers = {stamp: k for k, stamp in enumerate(stamps)}
         self.n_points = self.n_faulty = 0
         self.confusion = Confusion()
-        self.picture: tuple[ScanCheck, int] | None = None
+        self.picture: Picture | None = None
 
     def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
         """Check a scan that came back, and add it; other clouds are trials."""
         number = self._numbers.get(stamp_of(sent))
         if number is None:
             return
-        check = check_scan(sent, results)
-        self.n_points += check.n_points
-        self.n_faulty += not check.is_exact
-        self.confusion += count_confusion(check.label, check.truth)
+        is_exact, label = check_scan(sent, results)
+        points = _records(sent)
+        xyz = _xyz(points)
+        truth = GROUNDGRID.truth(points['label'], xyz[:, 2])
+        self.n_points += int(np.isfinite(xyz).all(axis=1).sum())
+        self.n_faulty += not is_exact
+        self.confusion += count_confusion(label, truth)
         if self.picture is None or number <= len(self._numbers) // 2:
-            self.picture = check, number
+            self.picture = Picture(number, xyz, label, truth)
 
 
 def result_text(
@@ -252,10 +241,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
     if importlib.util.find_spec('matplotlib') is None:
         # Said now, not after everything else is done.
-        raise MissingDependencyError(
-            "the demo draws with matplotlib: pip install 'gp_ground_seg[plot]'"
-        )
-    drive = _choose_drive(arguments)
+        raise MissingDependencyError('the demo draws with matplotlib: pip install matplotlib')
+    sequence = arguments.sequence
+    if arguments.kitti is not None:
+        sequence = sequence or list_sequences(arguments.kitti)[0]
+        drive = kitti_drive(arguments.kitti, sequence, arguments.frames)
+    elif sequence is not None:
+        raise DataError(f'--sequence {sequence}: goes with --kitti ROOT')
+    else:
+        drive = simulated_drive(arguments.frames)
     folder = Path(arguments.output)
     with (
         staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
@@ -271,13 +265,10 @@ def run(arguments: argparse.Namespace) -> int:
         result = _play(part / BAG, drive.n_frames, arguments.rate, probe)
         node.check()
         if tally.picture is None:
-            raise GroundSegError(
-                f'none of {count(drive.n_frames, "scan")} came back; the last words of the '
-                f'node:\n{node.log_tail()}'
-            )
-        check, number = tally.picture
+            raise GroundSegError(f'no scan came back; the node said:\n{node.log_tail()}')
+        number, xyz, label, truth = tally.picture
         title = f'{drive.name}, scan {number + 1} of {drive.n_frames}'
-        plot_birds_eye(check.points, check.label, part / PICTURE, truth=check.truth, title=title)
+        plot_birds_eye(xyz, label, part / PICTURE, truth, title)
     text, is_good = result_text(tally, result, probe.n_stray, drive.truth)
     print(f'\n{text}\n')
     print(f'picture  {folder / PICTURE}  one of the scans from above, and the errors in it')
@@ -285,23 +276,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if is_good else EXIT_FAILED
 
 
-def _choose_drive(arguments: argparse.Namespace) -> Drive:
-    sequence = arguments.sequence
-    if arguments.kitti is not None:
-        sequence = sequence or list_sequences(arguments.kitti)[0]
-        return kitti_drive(arguments.kitti, sequence, arguments.frames)
-    if sequence is not None:
-        raise DataError(f'--sequence {sequence}: goes with --kitti ROOT')
-    return simulated_drive(arguments.frames)
-
-
 def _write(drive: Drive, path: Path, session: Session) -> list[tuple[int, int]]:
     """Write the drive as a bag; return the stamps of its scans."""
-    scans = count(drive.n_frames, 'scan')
+    scans = options.count(drive.n_frames, 'scan')
     print(f'[1/3] writing {scans} as a bag: {drive.name}; meanwhile the node starts', flush=True)
     start = time.monotonic()
     stamps, n_points = [], 0
-    with progress('scans')(total=drive.n_frames) as bar, BagWriter(path) as bag:
+    with options.progress('scans')(total=drive.n_frames) as bar, BagWriter(path) as bag:
         bag.add_topic(cloud_topic(INPUT))
         for points, semantic, seconds in drive.scans:
             stamp = EPOCH * 10**9 + round(seconds * 1e9)
@@ -323,7 +304,7 @@ def _play(path: Path, n_frames: int, wanted: float | None, probe: Probe) -> dict
         )
         what = f'playing the bag to the node, {rate:g} scans per second'
         print(f'[3/3] {what}, and receiving both clouds', flush=True)
-        with progress('scans')(total=n_frames) as bar:
+        with options.progress('scans')(total=n_frames) as bar:
             clouds = (decode_cloud(raw) for _, _, raw in bag.messages([INPUT]))
             return rate_result(rate, probe.paced(clouds, rate, bar.update), 0)
 

@@ -11,52 +11,14 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.cli.options import (
-    FORCE,
-    TO_JSON,
-    add_config_options,
-    add_options,
-    config_from_options,
-    count,
-    new_parser,
-    positive,
-    progress,
-)
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.semantic_kitti import Frame
-from gp_ground_seg.evaluation.evaluate import (
-    OURS,
-    PATCHWORKPP,
-    Method,
-    MethodScore,
-    OurMethod,
-    PatchworkppMethod,
-    labelled_frames,
-    load_kitti,
-    score_methods,
-)
-from gp_ground_seg.evaluation.metrics import (
-    BIN_EDGES,
-    CONVENTIONS,
-    N_BINS,
-    RATIOS,
-    RING_TITLES,
-    Calibration,
-    Convention,
-    class_errors,
-    class_name,
-    ratio,
-)
-from gp_ground_seg.evaluation.report import (
-    Cell,
-    Column,
-    Table,
-    describe_environment,
-    fold,
-    milliseconds,
-    parameters_line,
-    percent,
-)
+from gp_ground_seg.evaluation import evaluate as methods
+from gp_ground_seg.evaluation import metrics
+from gp_ground_seg.evaluation import report as tables
+from gp_ground_seg.evaluation.evaluate import MethodScore
+from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.charts import plot_reliability
@@ -79,7 +41,11 @@ KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI).
 ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
 OF_FRAMES = (
     ('--sequences', 'sequences, as in 00,08 (default: all there are)', {'metavar': 'LIST'}),
-    ('--frame-step', 'every Nth frame of a sequence only', {'metavar': 'N', 'type': positive}),
+    (
+        '--frame-step',
+        'every Nth frame of a sequence only',
+        {'metavar': 'N', 'type': options.positive},
+    ),
 )
 COUNTS_AS = {Label.GROUND: 'ground', Label.OBSTACLE: 'obstacle', Label.UNKNOWN: 'left out'}
 RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
@@ -87,39 +53,44 @@ RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
+    parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
     reliability = 'draw share of ground over p_ground (PNG)'
-    worst = {'metavar': 'N', 'type': positive}
-    add_options(
+    worst = {'metavar': 'N', 'type': options.positive}
+    options.add(
         parser,
         ROOT,
         *OF_FRAMES,
         ('--worst', 'list the N frames with the lowest IoU', worst),
         ('--reliability', reliability, {'metavar': 'FILE'}),
-        ('--peer', 'run this one on the same frames, alternately', {'choices': (PATCHWORKPP,)}),
-        TO_JSON,
-        FORCE,
+        (
+            '--peer',
+            'run this one on the same frames, alternately',
+            {'choices': (methods.PATCHWORKPP,)},
+        ),
+        options.TO_JSON,
+        options.FORCE,
     )
-    add_config_options(parser)
+    options.add_config(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate, write the files, print the tables."""
-    config = config_from_options(arguments)
+    config = options.read_config(arguments)
     files = {'json': 'every number', 'reliability': 'reliability diagram'}
     with staged_options(arguments, *files) as parts, ExitStack() as stack:
         frames = frames_from_options(arguments)
-        methods: list[Method] = [stack.enter_context(closing(OurMethod(config)))]
+        chosen: list[methods.Method] = [stack.enter_context(closing(methods.OurMethod(config)))]
         if arguments.peer is not None:
-            methods.append(PatchworkppMethod())
-        scores = score_methods(frames, load_kitti, methods, progress=progress('evaluate'))
+            chosen.append(methods.PatchworkppMethod())
+        bar = options.progress('evaluate')
+        scores = methods.score_methods(frames, methods.load_kitti, chosen, progress=bar)
         report = make_report(
             score_tables(scores, arguments.worst), scores, config,
             data=arguments.root, reliability=reliability_rows(scores[0]),
             stages={score.name: score.median_stages for score in scores},
         )  # fmt: skip
-        environment = describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
+        environment = tables.describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
         if 'json' in parts:
             report.write(parts['json'], environment)
         if 'reliability' in parts:
@@ -127,8 +98,8 @@ def run(arguments: argparse.Namespace) -> int:
             title = f'Reliability, {len(frames)} frames'
             plot_reliability(sequences, parts['reliability'], title)
     print('\n\n'.join([_headline(scores), *(table.text() for table in report.tables.values())]))
-    print(f'\n{fold(parameters_line(report.facts["config_changes"]))}')
-    print(fold(environment.machine(report.fit)))
+    print(f'\n{tables.fold(tables.parameters_line(report.facts["config_changes"]))}')
+    print(tables.fold(tables.machine_line(environment, report.fit)))
     for name in parts:
         print(f'{files[name]}: {getattr(arguments, name)}')
     return 0
@@ -138,17 +109,15 @@ def _headline(scores: Sequence[MethodScore]) -> str:
     ious = [f'{one.title} {100.0 * one.iou:.2f} %' for one in scores]
     times = [f'{one.title} {1e3 * one.seconds():.1f} ms' for one in scores]
     frames, sequences = len(scores[0].scans), len(scores[0].sequences)
-    pooled = f'{count(frames, "frame")} of {count(sequences, "sequence")}'
-    return (
-        f'IoU {", ".join(ious).removeprefix(OURS).strip()}  (GroundGrid convention, {pooled})\n'
-        f'{", ".join(times).removeprefix(OURS).strip()} per frame  (median)'
-    )
+    pooled = f'{options.count(frames, "frame")} of {options.count(sequences, "sequence")}'
+    iou, seconds = (', '.join(own).removeprefix(methods.OURS).strip() for own in (ious, times))
+    return f'IoU {iou}  (GroundGrid convention, {pooled})\n{seconds} per frame  (median)'
 
 
 def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str, Table]:
     """Tables of an evaluation by name, ours first in `scores`."""
     return {
-        **{one.key: _convention_table(scores, one) for one in CONVENTIONS},
+        **{one.key: _convention_table(scores, one) for one in metrics.CONVENTIONS},
         'rings': _ring_table(scores),
         'classes': _class_table(scores[0]),
         'probabilities': _calibration_table(scores[0]),
@@ -169,16 +138,16 @@ def _with_peers(iou: float, peers: Iterator[float]) -> list[Cell]:
     return [cell for its in peers for cell in (its, iou - its)]
 
 
-def _convention_table(scores: Sequence[MethodScore], convention: Convention) -> Table:
+def _convention_table(scores: Sequence[MethodScore], convention: metrics.Convention) -> Table:
     rows = []
     for parts in zip(*(score.by_sequence() for score in scores), strict=True):
         found, *its = (own.pooled(convention.key) for _, own in parts)
         sequence, ours = parts[0]
         row: list[Cell] = [sequence, len(ours.scans)]
-        row += [getattr(found, name) for name in RATIOS]
+        row += [getattr(found, name) for name in metrics.RATIOS]
         rows.append([*row, *_with_peers(found.iou, (one.iou for one in its))])
     columns = [Column('sequence'), Column('frames', 'd')]
-    columns += [percent(RATIO_TITLES.get(name, name), name) for name in RATIOS]
+    columns += [percent(RATIO_TITLES.get(name, name), name) for name in metrics.RATIOS]
     title = f'{convention.title} convention: {convention.rule}  [%]'
     return Table([*columns, *_peer_columns(scores[1:])], rows, title, n_sums=1)
 
@@ -188,9 +157,9 @@ def _ring_table(scores: Sequence[MethodScore]) -> Table:
     columns += [percent('of errors', 'share_of_errors'), percent('precision'), percent('recall')]
     n_errors = scores[0].confusion.errors
     rows = [
-        [title, ring.points, ring.errors, ratio(ring.errors, n_errors), ring.precision,
+        [title, ring.points, ring.errors, metrics.ratio(ring.errors, n_errors), ring.precision,
          ring.recall, ring.iou, *_with_peers(ring.iou, (one.iou for one in its))]
-        for title, ring, *its in zip(RING_TITLES, *(s.rings for s in scores), strict=True)
+        for title, ring, *its in zip(metrics.RING_TITLES, *(s.rings for s in scores), strict=True)
     ]  # fmt: skip
     columns = [*columns, percent('IoU', 'iou'), *_peer_columns(scores[1:])]
     return Table(columns, rows, 'Horizontal range (GroundGrid convention)  [%]')
@@ -198,19 +167,19 @@ def _ring_table(scores: Sequence[MethodScore]) -> Table:
 
 def _class_table(score: MethodScore) -> Table:
     """Classes by what they count as, and in that by their number of errors."""
-    found = class_errors(score.classes)
+    found = metrics.class_errors(score.classes)
     n_errors = score.confusion.errors
     n_points = sum(one.n_points for one in found)
     rows: list[list[Cell]] = [
         [
-            class_name(one.number),
+            metrics.class_name(one.number),
             COUNTS_AS[one.truth],
             one.n_points,
             one.n_points / n_points,
             one.n_ground / one.n_points,
             one.missed / one.n_points if one.truth is Label.GROUND else None,
             one.false / one.n_points if one.truth is Label.OBSTACLE else None,
-            None if one.truth is Label.UNKNOWN else ratio(one.errors, n_errors),
+            None if one.truth is Label.UNKNOWN else metrics.ratio(one.errors, n_errors),
         ]
         for one in sorted(found, key=lambda one: list(COUNTS_AS).index(one.truth))
     ]
@@ -230,8 +199,8 @@ def _calibration_table(score: MethodScore) -> Table:
     rows: list[list[Cell]] = [[name, one.n_total, one.ece, one.brier] for name, one in found]
     columns = [Column('sequence'), Column('points', '_d'), Column('ECE', '.4f', 'ece')]
     title = (
-        f'Probabilities (GroundGrid convention): expected calibration error over {N_BINS} bins, '
-        'Brier score'
+        'Probabilities (GroundGrid convention): expected calibration error over '
+        f'{metrics.N_BINS} bins, Brier score'
     )
     return Table([*columns, Column('Brier', '.4f', 'brier')], rows, title, n_sums=1)
 
@@ -241,9 +210,9 @@ def _worst_table(score: MethodScore, n_worst: int) -> Table:
     rows: list[list[Cell]] = []
     known = [scan for scan in score.scans if not math.isnan(scan.confusion.iou)]
     for scan in sorted(known, key=lambda scan: scan.confusion.iou)[:n_worst]:
-        found, (main, *_) = scan.confusion, class_errors(scan.classes)
-        share = ratio(main.errors, found.errors)
-        cells: list[Cell] = [found.iou, found.fp, found.fn, class_name(main.number), share]
+        found, (main, *_) = scan.confusion, metrics.class_errors(scan.classes)
+        share = metrics.ratio(main.errors, found.errors)
+        cells: list[Cell] = [found.iou, found.fp, found.fn, metrics.class_name(main.number), share]
         rows.append([scan.sequence, scan.index, *cells])
     columns = [Column('sequence'), Column('frame'), percent('IoU', 'iou')]
     columns += [Column('false', '_d'), Column('missed', '_d'), Column('most errors on')]
@@ -257,13 +226,13 @@ def _time_table(scores: Sequence[MethodScore]) -> Table:
         [one.title, one.seconds(), one.seconds(statistics.fmean), ours / one.seconds()]
         for one in scores
     ]
-    columns = [Column('method'), milliseconds('median'), milliseconds('mean')]
+    columns = [Column('method'), tables.milliseconds('median'), tables.milliseconds('mean')]
     columns.append(Column('ours / this', '.2f', 'ratio'))
     stages = ', '.join(f'{name} {1e3 * s:.1f}' for name, s in scores[0].median_stages.items())
     return Table(columns, rows, 'Time per frame, reading left out  [ms]', [f'stages: {stages}'])
 
 
-def _calibration(score: MethodScore) -> Calibration:
+def _calibration(score: MethodScore) -> metrics.Calibration:
     assert score.calibration is not None, 'our method has probabilities'
     return score.calibration
 
@@ -274,7 +243,7 @@ def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
     for sequence, own in score.by_sequence():
         found = _calibration(own)
         bins = (found.n_points, found.by_bin(found.sum_p), found.by_bin(found.n_ground))
-        values = zip(BIN_EDGES[:-1], BIN_EDGES[1:], *bins, strict=True)
+        values = zip(metrics.BIN_EDGES[:-1], metrics.BIN_EDGES[1:], *bins, strict=True)
         keys = ('from', 'to', 'points', 'mean_p', 'share_ground')
         for row in values:
             named = zip(keys, (value.item() for value in row), strict=True)
@@ -289,7 +258,7 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
     """Labelled frames of the options, grouped by sequence; errors as `labelled_frames`."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
-    frames = labelled_frames(arguments.root, chosen)
+    frames = methods.labelled_frames(arguments.root, chosen)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]
 

@@ -7,22 +7,11 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, staged_options
-from gp_ground_seg.cli.options import (
-    FLAG,
-    FORCE,
-    TO_JSON,
-    add_config_options,
-    add_options,
-    config_from_options,
-    parse_setting,
-    positive,
-    progress,
-    some_of,
-)
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.evaluate import load_kitti
-from gp_ground_seg.evaluation.report import Report, describe_environment, fold
+from gp_ground_seg.evaluation.report import Report, describe_environment, fold, machine_line
 from gp_ground_seg.experiments import ablation, sensor_pose, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
@@ -34,17 +23,17 @@ Option = tuple[str, str, dict[str, Any]]
 DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 
 OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
-SIMULATED = ('--simulated', 'simulated scans instead of ROOT', FLAG)
-SEEDS = ('--seeds', 'simulated scenes of each kind', {'metavar': 'N', 'type': positive})
+SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
+SEEDS = ('--seeds', 'simulated scenes of each kind', {'metavar': 'N', 'type': options.positive})
 SCENE_LIST = (
     '--scenes', f'simulated scenes, some of {",".join(SCENES)} (default: all)',
-    {'metavar': 'LIST', 'type': some_of(SCENES)},
+    {'metavar': 'LIST', 'type': options.some_of(SCENES)},
 )  # fmt: skip
 SENSOR_LIST = (
     '--sensors', f'some of {",".join(SENSORS)} (default: {",".join(DEFAULT_SENSORS)})',
-    {'metavar': 'LIST', 'type': some_of(SENSORS)},
+    {'metavar': 'LIST', 'type': options.some_of(SENSORS)},
 )  # fmt: skip
-NO_PEER = ('--no-peer', 'leave Patchwork++ out', FLAG)
+NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
 SWITCH = (
     '--switch',
     'measure this departure instead, and the parameters that switch it off (may be repeated)',
@@ -56,7 +45,7 @@ SEGMENTS = (
 )  # fmt: skip
 REPEATS = (
     '--repeats', 'timed runs of each method (default: %(default)s)',
-    {'metavar': 'N', 'type': positive, 'default': 9},
+    {'metavar': 'N', 'type': options.positive, 'default': 9},
 )  # fmt: skip
 
 
@@ -83,9 +72,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             description=experiment.description,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        markdown = ('--markdown', 'print the tables as Markdown', FLAG)
-        add_options(own, *experiment.options, markdown, TO_JSON, FORCE)
-        add_config_options(own)
+        markdown = ('--markdown', 'print the tables as Markdown', options.FLAG)
+        options.add(own, *experiment.options, markdown, options.TO_JSON, options.FORCE)
+        options.add_config(own)
         own.set_defaults(run=run)
         if name == 'scenes':
             own.set_defaults(preset=None)
@@ -106,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
             report.write(parts['json'], environment)
     tables = report.tables.values()
     print('\n\n'.join(t.markdown() if arguments.markdown else t.text() for t in tables))
-    machine = environment.machine(report.fit)
+    machine = machine_line(environment, report.fit)
     print(f'\n{machine if arguments.markdown else fold(machine)}')
     return 0
 
@@ -126,7 +115,7 @@ def _check_source(arguments: argparse.Namespace) -> None:
 
 
 def _ablation(arguments: argparse.Namespace) -> Report:
-    config, bar = config_from_options(arguments), progress('ablation')
+    config, bar = options.read_config(arguments), options.progress('ablation')
     if not arguments.simulated:
         return ablation.compare_models(frames_from_options(arguments), load_kitti, config, bar)
     seeds = arguments.seeds or 10
@@ -135,10 +124,10 @@ def _ablation(arguments: argparse.Namespace) -> Report:
 
 
 def _departures(arguments: argparse.Namespace) -> Report:
-    config = config_from_options(arguments)
+    config = options.read_config(arguments)
     chosen = [parse_departure(text) for text in arguments.switch or []] or ablation.DEPARTURES
     frames = frames_from_options(arguments)
-    return ablation.compare_departures(frames, chosen, config, progress('departures'))
+    return ablation.compare_departures(frames, chosen, config, options.progress('departures'))
 
 
 def parse_departure(text: str) -> ablation.Departure:
@@ -147,7 +136,7 @@ def parse_departure(text: str) -> ablation.Departure:
     settings = switch.split()
     if not title.strip() or not settings:
         raise ConfigError(f'--switch {text!r}: must be TITLE: NAME=VALUE ...')
-    return ablation.Departure(title.strip(), dict(map(parse_setting, settings)))
+    return ablation.Departure(title.strip(), dict(map(options.parse_setting, settings)))
 
 
 def _scenes(arguments: argparse.Namespace) -> Report:
@@ -155,16 +144,16 @@ def _scenes(arguments: argparse.Namespace) -> Report:
     configs = {}
     for sensor in arguments.sensors or DEFAULT_SENSORS:
         preset = arguments.preset or variants.PRESET_OF[sensor]
-        configs[sensor] = config_from_options(argparse.Namespace(**{**given, 'preset': preset}))
+        configs[sensor] = options.read_config(argparse.Namespace(**{**given, 'preset': preset}))
     scenes, seeds = arguments.scenes or list(SCENES), arguments.seeds or 3
     with_peer = not arguments.no_peer
-    return variants.score_scenes(configs, scenes, seeds, with_peer, progress('scenes'))
+    return variants.score_scenes(configs, scenes, seeds, with_peer, options.progress('scenes'))
 
 
 def _cross_validation(arguments: argparse.Namespace) -> Report:
     grid, fixed = split_settings(arguments.settings)
-    config = config_from_options(argparse.Namespace(**{**vars(arguments), 'settings': fixed}))
-    bar = progress('cross-validation')
+    config = options.read_config(argparse.Namespace(**{**vars(arguments), 'settings': fixed}))
+    bar = options.progress('cross-validation')
     return ablation.cross_validate(frames_from_options(arguments), config, grid, bar)
 
 
@@ -183,14 +172,14 @@ def split_settings(settings: Sequence[str]) -> tuple[dict[str, list[ParameterVal
         if name.strip() in grid:
             raise ConfigError(f'--set {setting}: {name.strip()} is searched twice')
         words = [word for word in text.split(',') if word]
-        grid[name.strip()] = [parse_setting(f'{name}={word}')[1] for word in words]
+        grid[name.strip()] = [options.parse_setting(f'{name}={word}')[1] for word in words]
     if not grid:
         raise ConfigError('cross-validation: nothing to choose, give --set NAME=VALUE,VALUE,...')
     return grid, fixed
 
 
 def _sensor_pose(arguments: argparse.Namespace) -> Report:
-    config, bar = config_from_options(arguments), progress('sensor-pose')
+    config, bar = options.read_config(arguments), options.progress('sensor-pose')
     if not arguments.simulated:
         frames, mounts = frames_from_options(arguments), sensor_pose.MOUNTS
         return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, bar)
@@ -200,7 +189,7 @@ def _sensor_pose(arguments: argparse.Namespace) -> Report:
 
 
 def _table1(arguments: argparse.Namespace) -> Report:
-    config, bar = config_from_options(arguments), progress('table1')
+    config, bar = options.read_config(arguments), options.progress('table1')
     choices = [Choice.parse(word) for word in arguments.frames]
     return table1(arguments.root, choices, config, arguments.repeats, bar)
 

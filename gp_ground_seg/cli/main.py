@@ -51,17 +51,8 @@ COMMANDS = {
 EXAMPLES = """\
 examples:
   gp-ground-seg demo                             see it work, no data needed
-  gp-ground-seg segment scan.bin                 label one KITTI scan
   gp-ground-seg segment drive.mcap -o out.mcap   ground and obstacle clouds of a bag
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
-  gp-ground-seg pose scan.bin                    how high and how tilted is the sensor?
-  gp-ground-seg bench KITTI_ROOT                 time per frame by stage, beside Patchwork++
-  gp-ground-seg plot segment scan.bin --azimuth 0 -o ahead.png
-  gp-ground-seg plot scan --simulate urban -o scan.png
-  gp-ground-seg experiment table1 KITTI_ROOT     the paper's Table I
-  gp-ground-seg experiment scenes                simulated scenes, beside Patchwork++
-  gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 00 drive.mcap
-  gp-ground-seg play drive.mcap --clock
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud
 """
 

@@ -8,23 +8,11 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gp_ground_seg.cli.options import (
-    FORCE,
-    QUIET,
-    TO_JSON,
-    above_zero,
-    add_options,
-    count,
-    new_parser,
-    note,
-    positive,
-    progress,
-)
+from gp_ground_seg.cli import options
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
 from gp_ground_seg.ros.lifecycle import needing_ros, stop_on_signals
 
@@ -78,16 +66,16 @@ WARM_UP_EXAMPLES = """\
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands; what follows ``--ros-args`` is left to ROS or the node."""
     description = 'Run the ROS 2 node: points in, ground and obstacles out.'
-    parser = new_parser(subparsers, 'node', description, NODE_EXAMPLES)
+    parser = options.new_parser(subparsers, 'node', description, NODE_EXAMPLES)
     parser.usage = 'gp-ground-seg node [--ros-args ...]'
     parser.set_defaults(run=lambda a: start(a.ros_args), accepts_ros_args=True)
 
-    parser = new_parser(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES)
+    parser = options.new_parser(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES)
     parser.set_defaults(run=run_warm_up)
 
-    parser = new_parser(subparsers, 'node-bench', BENCH_DESCRIPTION, BENCH_EXAMPLES)
-    number: dict[str, Any] = {'metavar': 'N', 'type': partial(positive, least=FEWEST)}
-    add_options(
+    parser = options.new_parser(subparsers, 'node-bench', BENCH_DESCRIPTION, BENCH_EXAMPLES)
+    number: dict[str, Any] = {'metavar': 'N', 'type': partial(options.positive, least=FEWEST)}
+    options.add(
         parser,
         ('data', 'scans or a bag', {'metavar': 'DATA', 'nargs': '?'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
@@ -99,15 +87,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {**number, 'default': 600}),
         ('--memory-frames', 'clouds sent one by one; 0 = leave memory out (default: %(default)s)',
          {'metavar': 'N', 'type': int, 'default': 2000}),
-        TO_JSON,
-        FORCE,
-        QUIET,
+        options.TO_JSON,
+        options.FORCE,
+        options.QUIET,
     )  # fmt: skip
     parser.set_defaults(run=run_bench, accepts_ros_args=True)
 
 
 def _rates(text: str) -> list[float]:
-    return [above_zero(word) for word in text.split(',')]
+    return [options.above_zero(word) for word in text.split(',')]
 
 
 def start(words: Sequence[str]) -> int:
@@ -171,7 +159,7 @@ def run_bench(arguments: argparse.Namespace) -> int:
             },
             'rates': rates,
             'memory': memory or None,
-            'environment': asdict(describe_environment()),
+            'environment': describe_environment(),
         }
         if 'json' in parts:
             write_json(document, parts['json'])
@@ -219,11 +207,11 @@ def _measure(
     ):
         probe = Probe(session, lambda *_: None)
         if not arguments.quiet:
-            note('waiting for the node; it compiles when it runs the first time')
+            options.note('waiting for the node; it compiles when it runs the first time')
         probe.connect(node)
         rates = []
         for rate in arguments.rates:
-            bar = progress(f'{rate:g} Hz', quiet=arguments.quiet)(total=arguments.frames)
+            bar = options.progress(f'{rate:g} Hz', quiet=arguments.quiet)(total=arguments.frames)
             _, dropped_before = probe.counters()
             own = itertools.islice(stamped, arguments.frames)
             with bar:
@@ -234,7 +222,7 @@ def _measure(
         if not arguments.memory_frames:
             return rates, {}
         resident: list[int] = []
-        bar = progress('memory', quiet=arguments.quiet)(total=arguments.memory_frames)
+        bar = options.progress('memory', quiet=arguments.quiet)(total=arguments.memory_frames)
 
         def watch(trip: Trip) -> None:
             if trip.back is None:
@@ -288,8 +276,8 @@ def _text(document: dict[str, Any], missed: Sequence[str]) -> str:
     rows = [[rate[key] for key in columns] for rate in document['rates']]
     source, environment, memory = (document[k] for k in ('source', 'environment', 'memory'))
     parts = [
-        f'{source["data"]}: {count(source["n_clouds"], "cloud")} of {source["mean_points"]:.0f} '
-        f'points, {source["mean_bytes"] / 1e6:.2f} MB, on average\n'
+        f'{source["data"]}: {options.count(source["n_clouds"], "cloud")} of '
+        f'{source["mean_points"]:.0f} points, {source["mean_bytes"] / 1e6:.2f} MB, on average\n'
         f'{environment["cpu"]}, {environment["n_cores"]} cores',
         Table(list(columns.values()), rows).text(),
     ]

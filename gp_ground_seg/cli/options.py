@@ -45,9 +45,7 @@ def new_parser(
     )
 
 
-def add_options(
-    parser: argparse._ActionsContainer, *options: tuple[str, str, dict[str, Any]]
-) -> None:
+def add(parser: argparse._ActionsContainer, *options: tuple[str, str, dict[str, Any]]) -> None:
     """Add options: names, help, and what else `add_argument` takes."""
     for names, text, more in options:
         parser.add_argument(*names.split(), help=text, **more)
@@ -88,12 +86,12 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
     return parse
 
 
-def add_config_options(parser: argparse.ArgumentParser) -> None:
+def add_config(parser: argparse.ArgumentParser) -> None:
     """Add ``--preset NAME``, ``--config FILE`` and ``--set NAME=VALUE``."""
     presets = f'parameters of a sensor: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})'
     setting = 'one parameter, as in --set label.ground_tolerance=0.15 (may be repeated)'
     repeated = {'action': 'append', 'default': [], 'dest': 'settings'}
-    add_options(
+    add(
         parser,
         ('--preset', presets, {'metavar': 'NAME', 'default': DEFAULT_PRESET}),
         ('--config', 'parameter file (YAML), over the preset', {'metavar': 'FILE'}),
@@ -101,7 +99,7 @@ def add_config_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def config_from_options(arguments: argparse.Namespace) -> Config:
+def read_config(arguments: argparse.Namespace) -> Config:
     """Return the preset, changed by the file, changed by the settings."""
     config = find_preset(arguments.preset).config
     if arguments.config:

@@ -11,13 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.cli.options import (
-    FORCE,
-    add_config_options,
-    add_options,
-    config_from_options,
-    new_parser,
-)
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Labels
@@ -67,34 +61,36 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Declare the command and its pictures."""
     description = 'Draw a segmented scan: in perspective, from above, or one segment of it.'
     examples = SCAN_EXAMPLES + ABOVE_EXAMPLES + SEGMENT_EXAMPLES
-    parser = new_parser(subparsers, 'plot', description, examples)
+    parser = options.new_parser(subparsers, 'plot', description, examples)
     pictures = parser.add_subparsers(metavar='PICTURE', required=True)
     number: dict[str, Any] = {'metavar': 'N', 'type': int}
     scan = ('input', 'KITTI scan (.bin)', {'metavar': 'INPUT'})
     labels = ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'})
 
-    view = new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
-    add_options(
+    view = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
+    options.add(
         view.add_mutually_exclusive_group(required=True),
         (*scan[:2], {'metavar': 'INPUT', 'nargs': '?'}),
         ('--simulate', ', '.join(SCENES), {'metavar': 'SCENE', 'choices': SCENES}),
     )
     sensor = 'sensor of the simulated scan (default: %(default)s)'
-    add_options(
+    options.add(
         view,
         ('--sensor', sensor, {'choices': SENSORS, 'default': 'hdl-64e'}),
         ('--seed', 'of the simulated scene (default: %(default)s)', {**number, 'default': 0}),
     )
-    above = new_parser(
+    above = options.new_parser(
         pictures, 'above', ABOVE, ABOVE_EXAMPLES, 'a scan and its errors from above'
     )
-    add_options(above, scan, labels)
+    options.add(above, scan, labels)
 
-    segment = new_parser(pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side')
+    segment = options.new_parser(
+        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side'
+    )
     metres, degrees = {'metavar': 'R', 'type': float}, {'metavar': 'DEG', 'type': float}
     shown = ('--max-range', 'range shown [m] (default: all candidates)', metres)
-    add_options(segment, scan, labels, shown)
-    add_options(
+    options.add(segment, scan, labels, shown)
+    options.add(
         segment.add_mutually_exclusive_group(required=True),
         ('--segment', 'number of the segment', number),
         ('--azimuth', 'the one that looks there, 90 = left', degrees),
@@ -105,8 +101,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         (segment, _draw_segment, ('.png', '.pdf')),
     ):
         output = {'metavar': 'OUT', 'required': True}
-        add_options(picture, ('-o --output', f'{" or ".join(endings)} file', output), FORCE)
-        add_config_options(picture)
+        options.add(
+            picture, ('-o --output', f'{" or ".join(endings)} file', output), options.FORCE
+        )
+        options.add_config(picture)
         picture.set_defaults(run=run, draw=draw, endings=endings)
 
 
@@ -122,7 +120,7 @@ class Segmented(NamedTuple):
 
 def run(arguments: argparse.Namespace) -> int:
     """Segment the scan and draw it."""
-    config = config_from_options(arguments)
+    config = options.read_config(arguments)
     path = Path(arguments.output)
     if path.suffix.lower() not in arguments.endings:
         raise DataError(f'{path}: must end in {" or ".join(arguments.endings)}')

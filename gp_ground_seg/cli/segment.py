@@ -12,19 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gp_ground_seg.cli.options import (
-    FLAG,
-    FORCE,
-    QUIET,
-    add_config_options,
-    add_options,
-    config_from_options,
-    count,
-    new_parser,
-    note,
-    note_leftovers,
-    progress,
-)
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE, is_bag
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
@@ -95,24 +83,24 @@ _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
-    parser = new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
+    parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
     output = (
         'for scans a folder, or a .label file for a single scan; for bags a folder, or a '
         '.mcap or .db3 file (default: INPUT with _ground added, beside it)'
     )
-    add_options(
+    options.add(
         parser,
         ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
         ('-o --output', output, {'metavar': 'OUT'}),
-        FORCE,
-        QUIET,
+        options.FORCE,
+        options.QUIET,
     )
-    add_config_options(parser)
+    options.add_config(parser)
     raw = 'write 0 unknown, 1 ground, 2 obstacle as labels'
-    add_options(parser.add_argument_group('for scans'), ('--raw', raw, FLAG))
+    options.add(parser.add_argument_group('for scans'), ('--raw', raw, options.FLAG))
     storage = 'storage of the output (default: by its name, else as the input; mcap for ROS 1)'
     topic, several = {'metavar': 'T'}, {'metavar': 'T', 'action': 'append', 'default': []}
-    add_options(
+    options.add(
         parser.add_argument_group('for bags'),
         ('--topic', 'PointCloud2 topic (default: the only one there is)', topic),
         ('--ground-topic', f'topic of the ground (default: {GROUND_TOPIC})', topic),
@@ -122,19 +110,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.set_defaults(run=run)
 
-    parser = new_parser(subparsers, 'pose', POSE_DESCRIPTION, POSE_EXAMPLES)
-    add_options(parser, ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}))
-    add_config_options(parser)
+    parser = options.new_parser(subparsers, 'pose', POSE_DESCRIPTION, POSE_EXAMPLES)
+    options.add(parser, ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}))
+    options.add_config(parser)
     parser.set_defaults(run=run_pose)
-
-
-_Counts = tuple[int, int, float]
-"""Points, those of them that are ground, and seconds of one frame."""
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
-    config = config_from_options(arguments)
+    config = options.read_config(arguments)
     source = Path(arguments.input)
     holds_bag = is_bag(source) or _holds_bag_files(source)
     scans = [] if holds_bag else find_scans(source)
@@ -149,15 +133,19 @@ def run(arguments: argparse.Namespace) -> int:
             frames = _segment_bag(target, arguments, segmenter)
         else:
             frames = _segment_scans(scans, target, arguments, segmenter)
-    all_points, all_ground, seconds = zip(*frames, strict=True)
-    n_points, n_ground = sum(all_points), sum(all_ground)
+    n_points = sum(frame[0] for frame in frames)
+    n_ground = sum(frame[1] for frame in frames)
     share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
-    time = statistics.median(seconds)
+    time = statistics.median(frame[2] for frame in frames)
     print(
-        f'{count(len(frames), "frame")}, {count(n_points, "point")}, {share}, '
+        f'{options.count(len(frames), "frame")}, {options.count(n_points, "point")}, {share}, '
         f'{1e3 * time:.1f} ms per frame (median, segmentation only), written to {target}'
     )
     return 0
+
+
+_Counts = tuple[int, int, float]
+"""Points, those of them that are ground, and seconds of one frame."""
 
 
 def _count(result: Segmentation) -> _Counts:
@@ -181,10 +169,7 @@ def _default_output(source: Path) -> Path:
 
 
 def find_scans(source: Path) -> list[Path]:
-    """Return the .bin files that a file, folder, sequence or KITTI raw drive stands for, in order.
-
-    Raises `DataError` if there is none; the message says what was expected.
-    """
+    """Return the .bin files of a file, folder, sequence or KITTI raw drive, or raise DataError."""
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
     if source.is_file():
@@ -213,10 +198,10 @@ def _segment_scans(
     codes = sorted(Label) if arguments.raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
     code = np.array(codes, dtype='<u4')
     if not arguments.quiet:
-        note_leftovers(target)
+        options.note_leftovers(target)
     with (
         _label_files(scans, target, arguments) as label_paths,
-        progress('segment', quiet=arguments.quiet)(total=len(scans)) as bar,
+        options.progress('segment', quiet=arguments.quiet)(total=len(scans)) as bar,
     ):
         for scan, label_path in zip(scans, label_paths, strict=True):
             try:
@@ -266,16 +251,13 @@ def _segment_bag(
         if storage is None and target.suffix not in BAG_SUFFIXES and bag.storage != 'ros1':
             storage = bag.storage
         if not arguments.quiet:
-            note_leftovers(target)
-            for name in bag.migrated_topics:
-                if name in copied:
-                    note(
-                        f'topic {name}: {bag.topics[name]} has other fields in ROS 2; those of '
-                        'the same name are kept, new ones are zero'
-                    )
+            options.note_leftovers(target)
+            for name in set(bag.migrated_topics) & set(copied):
+                kind = bag.topics[name]
+                options.note(f'topic {name}: {kind} has other fields in ROS 2; new ones are zero')
         with (
             BagWriter(target, storage=storage, force=arguments.force) as output,
-            progress('segment', quiet=arguments.quiet)(total=bag.n_messages(topic)) as bar,
+            options.progress('segment', quiet=arguments.quiet)(total=bag.n_messages(topic)) as bar,
         ):
             for name in copied:
                 output.add_topic(bag.topic(name))
@@ -330,7 +312,7 @@ POSE_COLUMNS = (
 def run_pose(arguments: argparse.Namespace) -> int:
     """Print a line for each scan, and the medians."""
     poses, rows, notes = [], [], []
-    with closing(GroundSegmenter(config_from_options(arguments))) as segmenter:
+    with closing(GroundSegmenter(options.read_config(arguments))) as segmenter:
         for scan in find_scans(Path(arguments.input)):
             try:
                 pose = segmenter.estimate_pose(read_points(scan))

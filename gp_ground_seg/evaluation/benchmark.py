@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import statistics
 import time
@@ -15,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.evaluation.evaluate import Method, OurMethod, Progress
-from gp_ground_seg.evaluation.report import Environment, changed_parameters
+from gp_ground_seg.evaluation.report import changed_parameters
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.result import FitReport
 
@@ -126,7 +125,7 @@ def _time(method: Method | None, frame: BenchFrame, clock: Callable[[], float]) 
 def bench_document(
     cases: Mapping[str, Sequence[FrameTime]],
     config: Config,
-    environment: Environment,
+    environment: dict[str, Any],
     baseline: str | None,
     data: str,
 ) -> dict[str, Any]:
@@ -143,7 +142,7 @@ def bench_document(
         'n_frames': len({(one.frame.sequence, one.frame.index) for one in times}),
         'n_points': {'median': statistics.median(points), 'max': max(points)},
         'config_changes': changed_parameters(config),
-        'environment': dataclasses.asdict(environment),
+        'environment': environment,
         'baseline': baseline,
         'baseline_ms': _spread(peer) if baseline else None,
         'cases': [_case(name, own, baseline is not None) for name, own in cases.items()],

@@ -25,21 +25,8 @@ from gp_ground_seg.data.semantic_kitti import (
     read_points,
 )
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
-from gp_ground_seg.evaluation.metrics import (
-    CONVENTIONS,
-    GROUNDGRID,
-    Calibration,
-    ClassCount,
-    Confusion,
-    HeightError,
-    Labels,
-    count_calibration,
-    count_classes,
-    count_confusion,
-    count_rings,
-    height_error,
-    pool_height_errors,
-)
+from gp_ground_seg.evaluation import metrics
+from gp_ground_seg.evaluation.metrics import CONVENTIONS, GROUNDGRID, Confusion, Labels
 from gp_ground_seg.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
@@ -120,9 +107,8 @@ class OurMethod:
 class PatchworkppMethod:
     """Patchwork++ (Lee, Lim, Myung, IROS 2022) from PyPI, with its published parameters.
 
-    Only its estimation is timed. Its adaptive thresholds are learned over a sequence. The
-    published sensor height [m], that of KITTI, is its default. Raises MissingDependencyError
-    if pypatchworkpp is not installed.
+    Its thresholds adapt over a sequence. The published sensor height [m], that of KITTI, is its
+    default. Raises MissingDependencyError if pypatchworkpp is not installed.
     """
 
     name = PATCHWORKPP
@@ -204,10 +190,10 @@ class ScanScore:
     seconds: float  # without reading
     stages: dict[str, float] = field(default_factory=dict)  # seconds, if the method tells them
     confusions: dict[str, Confusion] = field(default_factory=dict)  # as `KnownScan.truths`
-    height: HeightError | None = None  # where the truth is known
-    classes: dict[int, ClassCount] = field(default_factory=dict)
+    height: metrics.HeightError | None = None  # where the truth is known
+    classes: dict[int, metrics.ClassCount] = field(default_factory=dict)
     rings: tuple[Confusion, ...] = ()  # by `RING_TITLES`
-    calibration: Calibration | None = None  # where the method has probabilities
+    calibration: metrics.Calibration | None = None  # where the method has probabilities
     pose: SensorPose | None = None  # of our own method
     fit: FitReport | None = None
 
@@ -262,11 +248,13 @@ class MethodScore:
         return math.nan if self.calibration is None else self.calibration.ece
 
     @property
-    def classes(self) -> dict[int, ClassCount]:
+    def classes(self) -> dict[int, metrics.ClassCount]:
         """Sum of the counts by class, by ascending class number."""
         numbers = sorted({number for scan in self.scans for number in scan.classes})
         counts = {n: [s.classes[n] for s in self.scans if n in s.classes] for n in numbers}
-        return {n: ClassCount(*map(sum, zip(*own, strict=True))) for n, own in counts.items()}
+        return {
+            n: metrics.ClassCount(*map(sum, zip(*own, strict=True))) for n, own in counts.items()
+        }
 
     @property
     def rings(self) -> tuple[Confusion, ...]:
@@ -275,7 +263,7 @@ class MethodScore:
         return tuple(sum(ring, Confusion()) for ring in by_ring)
 
     @property
-    def calibration(self) -> Calibration | None:
+    def calibration(self) -> metrics.Calibration | None:
         """Sum over the scans; None unless every scan has one."""
         found = [scan.calibration for scan in self.scans if scan.calibration is not None]
         if not found or len(found) < len(self.scans):
@@ -283,9 +271,9 @@ class MethodScore:
         return sum(found[1:], found[0])
 
     @property
-    def height(self) -> HeightError:
+    def height(self) -> metrics.HeightError:
         """Pooled height error."""
-        return pool_height_errors([s.height for s in self.scans if s.height is not None])
+        return metrics.pool_height_errors([s.height for s in self.scans if s.height is not None])
 
     def seconds(self, average: Callable[[list[float]], float] = statistics.median) -> float:
         """Average time per scan; NaN without scans."""
@@ -319,10 +307,7 @@ def labelled_frames(root: str | Path, sequences: Sequence[str] | None = None) ->
         own = list_frames(root, name)
         bare = [frame.index for frame in own if frame.labels_path is None]
         if bare:
-            raise DataError(
-                f'{root}: {len(bare)} of {len(own)} frames of sequence {name} have no labels, the '
-                f'first is {bare[0]}; leave it out with --sequences'
-            )
+            raise DataError(f'{root}: frames of sequence {name} have no labels, as {bare[0]}')
         frames += own
     return frames
 
@@ -387,17 +372,19 @@ def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
     truth = next(iter(scan.truths.values()))
     height = None
     if scan.ground_z is not None:
-        height = height_error(scan.ground_z[scan.is_ground], result.ground_z[scan.is_ground])
+        height = metrics.height_error(
+            scan.ground_z[scan.is_ground], result.ground_z[scan.is_ground]
+        )
     return ScanScore(
         scan.sequence,
         scan.index,
         seconds,
         result.stages,
-        {key: count_confusion(label, one) for key, one in scan.truths.items()},
+        {key: metrics.count_confusion(label, one) for key, one in scan.truths.items()},
         height,
-        {} if scan.semantic is None else count_classes(label, scan.semantic),
-        count_rings(label, truth, scan.points),
-        None if p_ground is None else count_calibration(p_ground, truth),
+        {} if scan.semantic is None else metrics.count_classes(label, scan.semantic),
+        metrics.count_rings(label, truth, scan.points),
+        None if p_ground is None else metrics.count_calibration(p_ground, truth),
         result.pose,
         result.fit,
     )

@@ -7,7 +7,6 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,61 +38,24 @@ LOW_VEGETATION_Z = -0.75 * SENSOR_HEIGHT
 """Height [m, sensor frame] below which Patchwork's evaluation counts vegetation as ground."""
 
 
-class SemanticClass(IntEnum):
-    """Class of a point in SemanticKITTI (Behley et al., ICCV 2019), low 16 bits of a label."""
-
-    UNLABELLED = 0
-    OUTLIER = 1
-    CAR = 10
-    BICYCLE = 11
-    BUS = 13
-    MOTORCYCLE = 15
-    ON_RAILS = 16
-    TRUCK = 18
-    OTHER_VEHICLE = 20
-    PERSON = 30
-    BICYCLIST = 31
-    MOTORCYCLIST = 32
-    ROAD = 40
-    PARKING = 44
-    SIDEWALK = 48
-    OTHER_GROUND = 49
-    BUILDING = 50
-    FENCE = 51
-    OTHER_STRUCTURE = 52
-    LANE_MARKING = 60
-    VEGETATION = 70
-    TRUNK = 71
-    TERRAIN = 72
-    POLE = 80
-    TRAFFIC_SIGN = 81
-    OTHER_OBJECT = 99
-    MOVING_CAR = 252
-    MOVING_BICYCLIST = 253
-    MOVING_PERSON = 254
-    MOVING_MOTORCYCLIST = 255
-    MOVING_ON_RAILS = 256
-    MOVING_BUS = 257
-    MOVING_TRUCK = 258
-    MOVING_OTHER_VEHICLE = 259
-
-
-GROUND_CLASSES = (
-    SemanticClass.ROAD,
-    SemanticClass.PARKING,
-    SemanticClass.SIDEWALK,
-    SemanticClass.OTHER_GROUND,
-    SemanticClass.LANE_MARKING,
-    SemanticClass.TERRAIN,
-)
+CLASS_NAMES = {
+    0: 'unlabelled', 1: 'outlier', 10: 'car', 11: 'bicycle', 13: 'bus', 15: 'motorcycle',
+    16: 'on rails', 18: 'truck', 20: 'other vehicle', 30: 'person', 31: 'bicyclist',
+    32: 'motorcyclist', 40: 'road', 44: 'parking', 48: 'sidewalk', 49: 'other ground',
+    50: 'building', 51: 'fence', 52: 'other structure', 60: 'lane marking', 70: 'vegetation',
+    71: 'trunk', 72: 'terrain', 80: 'pole', 81: 'traffic sign', 99: 'other object',
+    252: 'moving car', 253: 'moving bicyclist', 254: 'moving person',
+    255: 'moving motorcyclist', 256: 'moving on rails', 257: 'moving bus', 258: 'moving truck',
+    259: 'moving other vehicle',
+}  # fmt: skip
+"""Classes of SemanticKITTI (Behley et al., ICCV 2019), the low 16 bits of a label."""
+UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
+GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
 
 
 def class_name(number: int) -> str:
     """Name of a class in words; ``class 77`` where SemanticKITTI has no such number."""
-    try:
-        return SemanticClass(number).name.lower().replace('_', ' ')
-    except ValueError:
-        return f'class {number}'
+    return CLASS_NAMES.get(number, f'class {number}')
 
 
 @dataclass(frozen=True)
@@ -116,7 +78,7 @@ class Convention:
         `semantic` (N,) are classes, `z` (N,) heights in the sensor frame [m].
         """
         ground = np.isin(semantic, GROUND_CLASSES)
-        ground |= (semantic == SemanticClass.VEGETATION) & (z < self.low_vegetation_z)
+        ground |= (semantic == VEGETATION) & (z < self.low_vegetation_z)
         truth = np.where(ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
         truth[np.isin(semantic, self.left_out)] = Label.UNKNOWN
         return truth
@@ -126,7 +88,7 @@ GROUNDGRID = Convention(
     'groundgrid',
     'GroundGrid',
     'vegetation left out',
-    (SemanticClass.UNLABELLED, SemanticClass.OUTLIER, SemanticClass.VEGETATION),
+    (UNLABELLED, OUTLIER, VEGETATION),
 )
 """Steinke et al., "GroundGrid: LiDAR Point Cloud Ground Segmentation and Terrain Estimation",
 RA-L 2024. Our headline."""
@@ -135,7 +97,7 @@ PATCHWORK = Convention(
     'patchwork',
     'Patchwork',
     f'vegetation below {LOW_VEGETATION_Z:.2f} m is ground, above it an obstacle',
-    (SemanticClass.UNLABELLED, SemanticClass.OUTLIER),
+    (UNLABELLED, OUTLIER),
     LOW_VEGETATION_Z,
 )
 """Lim et al., "Patchwork: Concentric Zone-Based Region-Wise Ground Segmentation With Ground

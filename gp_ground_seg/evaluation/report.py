@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.metadata
 import json
 import math
@@ -10,7 +9,7 @@ import os
 import platform
 import subprocess
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,17 +30,9 @@ Cell = str | int | float | None
 class Column:
     """A column of a table.
 
-    Attributes
-    ----------
-    title : str
-        Heading, with the unit: ``RMSE [cm]``.
-    format : str
-        Format of its numbers, such as ``.2f`` or ``+.1f``; ``_d`` separates thousands by
-        spaces. Without one the column holds text and is aligned left.
-    key : str
-        Name in JSON; the title by default.
-    scale : float
-        Factor between what a row holds and what is shown: 100 for a ratio in percent.
+    `format` is that of its numbers, such as ``.2f``; ``_d`` separates thousands by spaces.
+    Without one the column holds text and is aligned left. `key` is its name in JSON, the title
+    by default, `scale` the factor between what a row holds and what is shown.
     """
 
     title: str
@@ -154,53 +145,38 @@ def write_json(document: Any, path: str | Path) -> None:
     Path(path).write_text(text, encoding='utf-8')
 
 
-@dataclass(frozen=True)
-class Environment:
-    """Machine and software of a run.
+def describe_environment(*packages: str) -> dict[str, Any]:
+    """Describe machine and software of a run.
 
-    Attributes
-    ----------
-    cpu, n_cores : str, int
-        Name of the processor, and the cores this process may use.
-    python, versions : str, dict of str to str or None
-        Versions of Python, of this package and of those it computes with; None = not installed.
-    commit : str or None
-        Commit of the source, with ``-dirty`` if changed since; None outside git.
+    `packages` are further ones whose version matters; None = not installed. The commit is that
+    of the source, with ``-dirty`` if it was changed since; None outside git.
     """
-
-    cpu: str
-    n_cores: int
-    python: str
-    versions: dict[str, str | None]
-    commit: str | None
-
-    def machine(self, fit: FitReport) -> str:
-        """One line on where a measurement ran."""
-        threads = '1 thread' if fit.n_threads == 1 else f'{fit.n_threads} threads'
-        cores = '1 core' if self.n_cores == 1 else f'{self.n_cores} cores'
-        versions = ', '.join(f'{name} {v or "absent"}' for name, v in self.versions.items())
-        commit, _, dirty = (self.commit or 'unknown').partition('-')
-        commit = commit[:12] + (' (changed since)' if dirty else '')
-        return (
-            f'machine: {self.cpu}, {threads} on {cores}, {fit.backend}; Python {self.python}, '
-            f'{versions}, commit {commit}'
-        )
-
-
-def describe_environment(*packages: str) -> Environment:
-    """Describe this machine; `packages` are further ones whose version matters."""
     versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
     for package in ('numpy', 'scipy', 'numba', *packages):
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             versions[package] = None
-    return Environment(
-        cpu=_cpu_name(),
-        n_cores=len(os.sched_getaffinity(0)),
-        python=platform.python_version(),
-        versions=versions,
-        commit=_commit(Path(gp_ground_seg.__file__)),
+    return {
+        'cpu': _cpu_name(),
+        'n_cores': len(os.sched_getaffinity(0)),
+        'python': platform.python_version(),
+        'versions': versions,
+        'commit': _commit(Path(gp_ground_seg.__file__)),
+    }
+
+
+def machine_line(environment: Mapping[str, Any], fit: FitReport | None = None) -> str:
+    """One line on where a measurement ran."""
+    cores = '1 core' if environment['n_cores'] == 1 else f'{environment["n_cores"]} cores'
+    if fit is not None:
+        threads = '1 thread' if fit.n_threads == 1 else f'{fit.n_threads} threads'
+        cores = f'{threads} on {cores}, {fit.backend}'
+    versions = ', '.join(f'{name} {v or "absent"}' for name, v in environment['versions'].items())
+    commit, _, dirty = (environment['commit'] or 'unknown').partition('-')
+    return (
+        f'machine: {environment["cpu"]}, {cores}; Python {environment["python"]}, {versions}, '
+        f'commit {commit[:12]}{" (changed since)" if dirty else ""}'
     )
 
 
@@ -256,13 +232,13 @@ class Report(NamedTuple):
     fit: FitReport
     facts: dict[str, Any]
 
-    def write(self, path: Path, environment: Environment) -> None:
+    def write(self, path: Path, environment: dict[str, Any]) -> None:
         """Write every number as JSON."""
         document = {
             **self.facts,
             'n_threads': self.fit.n_threads,
             'backend': self.fit.backend,
-            'environment': dataclasses.asdict(environment),
+            'environment': environment,
             **{name: table.json() for name, table in self.tables.items()},
             'rows': self.rows,
         }

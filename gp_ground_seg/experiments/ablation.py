@@ -8,16 +8,9 @@ from typing import Any, NamedTuple
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError, DataError
+from gp_ground_seg.evaluation import report
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, load_kitti, pool
-from gp_ground_seg.evaluation.report import (
-    Column,
-    Report,
-    Row,
-    Table,
-    centimetres,
-    milliseconds,
-    percent,
-)
+from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.experiments.variants import (
     Changes,
     make_report,
@@ -115,9 +108,9 @@ def compare_models(
             (Column('method'), one.name),
             (percent('IoU [%]', 'iou'), one.iou),
             *_worst_and_rmse(one),
-            (centimetres('median [cm]', 'median_absolute'), one.height.median_absolute),
+            (report.centimetres('median [cm]', 'median_absolute'), one.height.median_absolute),
             (Column('SMSE', '.5f', 'smse'), one.height.smse),
-            (milliseconds('ms', 'seconds'), one.seconds()),
+            (report.milliseconds('ms', 'seconds'), one.seconds()),
         ]
         for one in scores
     ]
@@ -177,7 +170,7 @@ def _worst_and_rmse(score: MethodScore) -> Row:
     return [
         (percent('worst [%]', 'worst_iou'), iou),
         (Column('in', '', 'worst_sequence'), name),
-        (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
+        (report.centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
     ]
 
 

@@ -10,29 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.evaluate import (
-    OURS,
-    PATCHWORKPP,
-    TITLES,
-    KnownScan,
-    Method,
-    MethodScore,
-    OurMethod,
-    PatchworkppMethod,
-    Progress,
-    pool,
-    score_methods,
-)
+from gp_ground_seg.evaluation import evaluate as methods
+from gp_ground_seg.evaluation import report as results
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
-from gp_ground_seg.evaluation.report import (
-    Column,
-    Report,
-    Row,
-    Table,
-    centimetres,
-    changed_parameters,
-    percent,
-)
+from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
@@ -51,7 +33,7 @@ PRESET_OF = {
 """Preset that goes with each simulated sensor."""
 SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
-PEER = TITLES[PATCHWORKPP]
+PEER = methods.TITLES[methods.PATCHWORKPP]
 
 
 class SimulatedFrame(NamedTuple):
@@ -102,7 +84,7 @@ def score_variants(
     items: Sequence[Any],
     load: Callable[[Any], KnownScan],
     variants: Mapping[str, Config],
-    peers: Sequence[Method] = (),
+    peers: Sequence[methods.Method] = (),
     *,
     progress: Progress = iter,
 ) -> list[MethodScore]:
@@ -113,7 +95,9 @@ def score_variants(
     """
     with ExitStack() as stack:
         ours = [stack.enter_context(closing(OurMethod(c, name))) for name, c in variants.items()]
-        return score_methods(items, load, [*ours, *peers], each_alone=True, progress=progress)
+        return methods.score_methods(
+            items, load, [*ours, *peers], each_alone=True, progress=progress
+        )
 
 
 def make_report(
@@ -122,7 +106,11 @@ def make_report(
     """Report of scored variants; `config` is what they change, the first is of our method."""
     fit = scores[0].scans[-1].fit
     assert fit is not None
-    facts = {'config_changes': changed_parameters(config), 'config': config.nested(), **facts}
+    facts = {
+        'config_changes': results.changed_parameters(config),
+        'config': config.nested(),
+        **facts,
+    }
     return Report(tables, scan_rows(scores), fit, facts)
 
 
@@ -169,15 +157,18 @@ def score_scenes(
     ours, theirs = [], []
     for sensor, config in configs.items():
         frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
-        peers = [PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
+        peers = [methods.PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
         own, *other = score_variants(
-            frames, load_simulated, {OURS: config}, peers, progress=progress
+            frames, load_simulated, {methods.OURS: config}, peers, progress=progress
         )
         ours.append(own)
         theirs += other
-    scores = [pool(OURS, ours), *([pool(PATCHWORKPP, theirs)] if theirs else [])]
+    scores = [
+        methods.pool(methods.OURS, ours),
+        *([methods.pool(methods.PATCHWORKPP, theirs)] if theirs else []),
+    ]
     report = make_report({'scenes': scene_table(*scores)}, scores, Config())
-    for name, of in (('config_changes', changed_parameters), ('config', Config.nested)):
+    for name, of in (('config_changes', results.changed_parameters), ('config', Config.nested)):
         report.facts[name] = {sensor: of(config) for sensor, config in configs.items()}
     return report
 
@@ -195,8 +186,8 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
                 (Column('sensor'), sensor),
                 (Column('scene'), scene),
                 (percent('IoU', 'iou'), own.iou),
-                (centimetres('RMSE', 'rmse'), height.rmse),
-                (centimetres('median', 'median_absolute'), height.median_absolute),
+                (results.centimetres('RMSE', 'rmse'), height.rmse),
+                (results.centimetres('median', 'median_absolute'), height.median_absolute),
                 (percent('no model', 'share_without_model'), share),
             ]
         )
@@ -205,8 +196,11 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
             rows[-1] += [
                 (percent(PEER, 'peer_iou'), its.iou),
                 (percent('difference', 'difference', '+.2f'), own.iou - its.iou),
-                (centimetres('its RMSE', 'peer_rmse'), its.height.rmse),
-                (centimetres('its median', 'peer_median_absolute'), its.height.median_absolute),
+                (results.centimetres('its RMSE', 'peer_rmse'), its.height.rmse),
+                (
+                    results.centimetres('its median', 'peer_median_absolute'),
+                    its.height.median_absolute,
+                ),
             ]
             if not own.iou > its.iou:
                 behind.append(group)
