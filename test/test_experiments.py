@@ -15,12 +15,13 @@ from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.evaluate import (
     MethodScore,
+    OurMethod,
+    PatchworkppMethod,
     ScanScore,
     labelled_frames,
     load_kitti,
     score_methods,
 )
-from gp_ground_seg.evaluation.evaluate import OurMethod, PatchworkppMethod
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
 from gp_ground_seg.experiments import ablation, cross_validation, sensor_pose, simulated_scenes
 from gp_ground_seg.experiments.ablation import (

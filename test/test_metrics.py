@@ -1,4 +1,4 @@
-"""Conventions, counts, ratios, rings, classes and height errors, against loops and by hand."""
+"""Conventions, counts, ratios, rings, classes, probabilities, height errors: by loops and hand."""
 
 import itertools
 import math
@@ -8,21 +8,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from sklearn.calibration import calibration_curve
+from sklearn.metrics import brier_score_loss
 
 from gp_ground_seg import Label
+from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation.metrics import (
+    BIN_EDGES,
+    CLASS_NAMES,
     CONVENTIONS,
     GROUNDGRID,
     LOW_VEGETATION_Z,
+    N_BINS,
     PATCHWORK,
     RATIOS,
     RING_EDGES,
     RING_TITLES,
     ClassCount,
     Confusion,
-    SemanticClass,
     class_errors,
     class_name,
+    count_calibration,
     count_classes,
     count_confusion,
     count_rings,
@@ -37,9 +43,7 @@ ANY_LABELS = hnp.arrays(np.uint8, st.integers(0, 60), elements=ANY_LABEL)
 
 @pytest.mark.parametrize('convention', CONVENTIONS, ids=lambda c: c.key)
 def test_ground_classes_are_ground_and_unlabelled_is_left_out(convention):
-    for number in SemanticClass:
-        if number == SemanticClass.VEGETATION:
-            continue
+    for number in CLASS_NAMES.keys() - {70}:
         expected = Label.GROUND if number in GROUND_NUMBERS else Label.OBSTACLE
         for z in (-5.0, -1.3, 0.0, 3.0):
             (truth,) = convention.truth(np.array([number]), np.array([z]))
@@ -119,6 +123,79 @@ def test_rings_hold_their_inner_edge_and_no_point_without_a_range():
     ones = np.ones(6, dtype=np.uint8)
     assert [ring.tp for ring in count_rings(ones, ones, xy)] == [1, 1, 0, 0, 0, 2]
     assert (RING_TITLES[0], RING_TITLES[-1]) == ('0-10 m', '> 50 m')
+
+
+PROBABILITY = st.one_of(
+    st.floats(0.0, 1.0, width=32), st.sampled_from([0.0, 1.0, 0.5, 0.001, 0.999, math.nan])
+)
+TRUTHS = st.sampled_from([Label.UNKNOWN, Label.GROUND, Label.OBSTACLE])
+
+
+def draw(data, n):
+    p = data.draw(hnp.arrays(np.float32, n, elements=PROBABILITY))
+    return p, data.draw(hnp.arrays(np.uint8, n, elements=TRUTHS))
+
+
+def slow(p, truth):
+    """ECE and Brier score, point by point."""
+    bins = {k: [] for k in range(N_BINS)}
+    for one, true_label in zip(p.astype(float), truth, strict=True):
+        if true_label != Label.UNKNOWN and not math.isnan(one):
+            k = max(k for k in range(N_BINS) if BIN_EDGES[k] <= one)
+            bins[k].append((one, true_label == Label.GROUND))
+    squares = [(q - y) ** 2 for pairs in bins.values() for q, y in pairs]
+    gaps = [abs(sum(y for _, y in pairs) - sum(q for q, _ in pairs)) for pairs in bins.values()]
+    n = len(squares)
+    return (sum(gaps) / n, sum(squares) / n) if n else (math.nan, math.nan)
+
+
+@given(st.integers(0, 40), st.integers(0, 40), st.data())
+def test_probabilities_against_a_loop_and_those_of_frames_add_up(n, m, data):
+    (p, truth), (q, other) = draw(data, n), draw(data, m)
+    found = count_calibration(p, truth) + count_calibration(q, other)
+    p, truth = np.concatenate([p, q]), np.concatenate([truth, other])
+    assert (found.ece, found.brier) == pytest.approx(slow(p, truth), nan_ok=True, abs=1e-12)
+    assert found.n_total == ((truth != Label.UNKNOWN) & ~np.isnan(p)).sum()
+    both = count_calibration(p, truth)
+    assert (found.n_points.tolist(), found.n_ground.tolist()) == (
+        both.n_points.tolist(), both.n_ground.tolist(),
+    )  # fmt: skip
+
+
+def synthetic(n=20_000, seed=0, power=1.0):
+    """Probabilities p; the truth is ground with probability p ** power."""
+    rng = np.random.default_rng(seed)
+    p = rng.beta(0.3, 0.3, n).astype(np.float32)
+    ground = rng.random(n) < p.astype(float) ** power
+    return p, np.where(ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
+
+
+@pytest.mark.parametrize('power', [1.0, 3.0])
+def test_probabilities_against_scikit_learn(power):
+    p, truth = synthetic(power=power)
+    found = count_calibration(p, truth)
+    ground = truth == Label.GROUND
+    assert found.brier == pytest.approx(brier_score_loss(ground, p.astype(float)), rel=1e-12)
+    share, mean = calibration_curve(ground, p.astype(float), n_bins=N_BINS)
+    np.testing.assert_allclose(found.by_bin(found.sum_p), mean, rtol=1e-9)
+    np.testing.assert_allclose(found.by_bin(found.n_ground), share, rtol=1e-9)
+
+
+def test_true_probabilities_have_no_calibration_error_and_wrong_ones_do():
+    assert count_calibration(*synthetic()).ece < 0.01
+    # E[p - p^3] of Beta(a, a): 1/2 - a (a+1) (a+2) / (2a (2a+1) (2a+2)).
+    assert count_calibration(*synthetic(power=3.0)).ece == pytest.approx(0.1406, abs=0.01)
+
+
+def test_the_last_bin_holds_certainty():
+    certain = count_calibration(np.array([1.0, 0.0]), np.array([1, 2], dtype=np.uint8))
+    assert (certain.ece, certain.brier, certain.n_points[-1]) == (0.0, 0.0, 1)
+
+
+@pytest.mark.parametrize('p', [[0.5, 1.01], [-0.01, 0.5], [0.5, np.inf], [0.5]])
+def test_what_is_no_probability_is_refused(p):
+    with pytest.raises(PointCloudError, match='p_ground'):
+        count_calibration(np.array(p), np.array([1, 2], dtype=np.uint8))
 
 
 def test_height_error_by_hand():
