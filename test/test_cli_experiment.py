@@ -12,11 +12,11 @@ from evaluation_samples import write_streets
 from gp_ground_seg import Config
 from gp_ground_seg.cli.experiment import EXPERIMENTS, parse_departure, split_settings
 from gp_ground_seg.cli.main import build_parser
-from gp_ground_seg.cli.options import config_from_options
+from gp_ground_seg.cli.options import read_config
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import evaluate as runner
-from gp_ground_seg.experiments import ablation, sensor_pose, simulated_scenes
-from gp_ground_seg.experiments.simulated_scenes import PRESET_OF
+from gp_ground_seg.experiments import ablation, sensor_pose, variants
+from gp_ground_seg.experiments.variants import PRESET_OF
 from gp_ground_seg.parameters.presets import PRESETS
 
 SMALL = ['--set', 'grid.n_bins=40']
@@ -29,7 +29,7 @@ def root(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch):
-    monkeypatch.setattr(simulated_scenes, 'PLACES', (0.0,))
+    monkeypatch.setattr(variants, 'SCENE_PLACES', (0.0,))
     monkeypatch.setattr(ablation, 'PLACES', (12.0,))
 
 
@@ -73,8 +73,7 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
         first = next(str(cell) for cell in row.values() if cell is not None)
         rows = [re.split(r'  +', line.strip()) for line in lines if line.startswith(first)]
         assert len(row) in map(len, rows), row
-    width = max(map(len, lines))
-    assert width <= (110 if case == 'ablation --simulated' else 100)
+    assert max(map(len, lines)) <= 100
     assert document['n_threads'] >= 1 and document['environment']['cpu']
     if case != 'scenes' and 'grid.n_bins=40' in words:
         assert document['config_changes']['grid.n_bins'] == 40
@@ -97,7 +96,7 @@ def test_scenes_have_the_presets_of_their_sensors(monkeypatch):
         found.update(configs)
         raise DataError('enough')
 
-    monkeypatch.setattr(simulated_scenes, 'score_scenes', note)
+    monkeypatch.setattr(variants, 'score_scenes', note)
     words = ['--sensors', ','.join(PRESET_OF)]
     for extra, expected in (
         ([], {sensor: PRESETS[preset].config for sensor, preset in PRESET_OF.items()}),
@@ -110,15 +109,16 @@ def test_scenes_have_the_presets_of_their_sensors(monkeypatch):
 def test_simulated_poses_have_their_own_options(monkeypatch, capsys):
     found = []
 
-    def note(n_seeds, config, scenes, progress):
-        found.append((n_seeds, config.grid.n_bins, scenes))
+    def note(frames, load, mounts, config, _):
+        found.append((len(frames), {frame.scene for frame in frames}, config.grid.n_bins))
+        assert (load, mounts) == (sensor_pose.load_mounted, sensor_pose.SIMULATED_MOUNTS)
         raise DataError('enough')
 
-    monkeypatch.setattr(sensor_pose, 'score_simulated_poses', note)
+    monkeypatch.setattr(sensor_pose, 'score_poses', note)
     words = ['--simulated', '--seeds', 2, '--scenes', 'flat,kerb', *SMALL]
     assert run('experiment', 'sensor-pose', *words) == 2
     assert error_line(capsys) == 'enough'
-    assert found == [(2, 40, ['flat', 'kerb'])]
+    assert found == [(2 * 2 * 3, {'flat', 'kerb'}, 40)]
 
 
 def test_a_departure_in_words():
@@ -140,7 +140,7 @@ def test_a_departure_in_words():
         (['ablation', '--simulated', '--frame-step', '2'], '--frame-step: is for labelled frames'),
         (['ablation', 'ROOT', '--sequences', '07'], 'no sequence 07; sequences here: 00, 08'),
         (['ablation', 'ROOT', '--set', 'learning.mode=fixed'], 'leave it out'),
-        (['ablation', '--simulated', '--set', 'length_scale.constant=3'], 'leave it out'),
+        (['ablation', '--simulated', '--set', 'length_scale.model=latent2'], 'length_scale.model'),
         (['departures', 'ROOT', '--switch', 'a: '], 'must be TITLE'),
         (['cross-validation', 'ROOT', '--set', 'grid.r_max=50,0.001'], 'grid.r_max'),
         (['cross-validation', 'ROOT', '--set', 'grid.rmax=50,60'], 'grid.rmax'),
@@ -204,5 +204,5 @@ def test_commands_of_the_docs_are_accepted():
                     for value in values:
                         Config().replace(**{name: value})
             arguments.preset = arguments.preset or 'default'  # scenes: one for each sensor
-            config_from_options(arguments)
+            read_config(arguments)
     assert names == set(EXPERIMENTS)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -23,28 +22,23 @@ from gp_ground_seg.evaluation.evaluate import (
     score_methods,
 )
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
-from gp_ground_seg.experiments import ablation, cross_validation, sensor_pose, simulated_scenes
+from gp_ground_seg.experiments import ablation, sensor_pose, variants
 from gp_ground_seg.experiments.ablation import (
     DEPARTURES,
     MODELS,
-    SIMULATED_MODELS,
     Departure,
     compare_departures,
-    compare_models_simulated,
-    load_stretches,
+    compare_models,
+    coordinate_search,
+    cross_validate,
 )
-from gp_ground_seg.experiments.cross_validation import coordinate_search, cross_validate
-from gp_ground_seg.experiments.sensor_pose import (
-    AXES_UP,
-    HEIGHTS,
-    TURNS,
-    score_poses,
-    score_simulated_poses,
-)
-from gp_ground_seg.experiments.simulated_scenes import PRESET_OF, scene_table, score_scenes
+from gp_ground_seg.experiments.sensor_pose import MOUNTS, SIMULATED_MOUNTS, score_poses
 from gp_ground_seg.experiments.variants import (
+    PRESET_OF,
     SimulatedFrame,
     load_simulated,
+    scene_table,
+    score_scenes,
     score_variants,
     simulated_frames,
 )
@@ -101,29 +95,14 @@ def test_each_way_to_learn_gives_a_theta_of_its_own(frames):
     assert len({values for name, values in theta.items() if 'not learned' in name}) == 1
 
 
-def test_stretches_are_smooth_and_rough():
-    """By the exact heights: the road is level, the rubble is not."""
-    scan = load_stretches(SimulatedFrame('hdl-64e', ablation.SCENE, 3, 12.0))
-    smooth, rubble = scan.parts['smooth'], scan.parts['rubble']
-    assert not (smooth & rubble).any()
-    assert ((smooth | rubble) <= scan.parts['all']).all()
-    assert min(smooth.sum(), rubble.sum()) > 10_000
-    assert np.ptp(scan.ground_z[smooth]) < 1e-9
-    assert 0.1 < np.std(scan.ground_z[rubble]) < 0.2
-
-
 def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     """The worth of the latent process; docs/experiments.md has the whole table."""
-    names = ('constant, 10 m', 'line gradient', 'latent')
-    monkeypatch.setattr(ablation, 'SIMULATED_MODELS', {n: SIMULATED_MODELS[n] for n in names})
-    report = compare_models_simulated(2, Config())
-    rows = {row['length-scale']: row for row in report.tables['models'].json()}
-    latent = rows.pop('latent')
-    for other in rows.values():
-        for key in ('rmse_all', 'rmse_rubble', 'median_absolute_rubble'):
-            assert latent[key] < 0.9 * other[key], key
-    # On the road no error is larger than the noise of the sensor.
-    assert all(row['rmse_smooth'] < 0.02 for row in (latent, *rows.values()))
+    names = ('constant, learned', 'Z, learned', 'Z-L, learned over the frame')
+    monkeypatch.setattr(ablation, 'MODELS', {name: MODELS[name] for name in names})
+    frames = simulated_frames(['hdl-64e'], [ablation.SCENE], 2, ablation.PLACES)
+    report = compare_models(frames, load_simulated, Config())
+    constant, gradient, latent = (row['rmse'] for row in report.tables['models'].json())
+    assert latent < 0.9 * min(constant, gradient)
 
 
 # Departures.
@@ -206,9 +185,9 @@ def test_each_sequence_is_scored_with_values_chosen_without_it(monkeypatch):
             ScanScore(s, '0', 0.1, confusions={'g': Confusion(tp=tp, fn=100 - tp)}, fit=fit)
             for s, tp in zip(('00', '05', '08'), hits[config[name]], strict=True)
         ]
-        return [MethodScore(title, tuple(dataclasses.replace(s, heights={}) for s in scans))]
+        return [MethodScore(title, tuple(scans))]
 
-    monkeypatch.setattr(cross_validation, 'score_variants', score)
+    monkeypatch.setattr(ablation, 'score_variants', score)
     places = [Frame(s, '0', None, None, None) for s in ('00', '05', '08')]
     report = cross_validate(places, Config().replace(**{name: 0.1}), {name: [0.2, 0.3]})
     # By hand: on all 150, 190, 210; without 00 100, 100, 150; without 05 100, 130, 140;
@@ -247,7 +226,7 @@ def test_every_sensor_has_a_preset_of_its_height():
 
 
 def test_scene_scores_follow_their_definitions(monkeypatch):
-    monkeypatch.setattr(simulated_scenes, 'PLACES', (6.0,))
+    monkeypatch.setattr(variants, 'SCENE_PLACES', (6.0,))
     config = PRESETS['vlp16'].config
     report = score_scenes({'vlp-16': config}, ['kerb'], 2, with_peer=True)
     (row,) = report.tables['scenes'].json()
@@ -256,15 +235,16 @@ def test_scene_scores_follow_their_definitions(monkeypatch):
     segmenter, method = GroundSegmenter(config), PatchworkppMethod(SENSORS['vlp-16'].height)
     for seed in (0, 1):
         scan = load_simulated(SimulatedFrame('vlp-16', 'kerb', seed, 6.0))
-        ground, z = scan.parts['all'], scan.ground_z
+        ground, z = scan.is_ground, scan.ground_z
         segmenter.reset()
         result = segmenter.segment(scan.points)
         total += count_confusion(result.label, scan.truths['exact'])
         errors.append((result.ground_z - z)[ground])
         method.reset()
         method.run(scan.points)
-        its_total += count_confusion(method.result().label, scan.truths['exact'])
-        its_errors.append(height_error(z[ground], method.ground_z()[ground]))
+        its = method.result()
+        its_total += count_confusion(its.label, scan.truths['exact'])
+        its_errors.append(height_error(z[ground], its.ground_z[ground]))
     assert (row['sensor'], row['scene']) == ('vlp-16', 'kerb')
     assert (row['iou'], row['peer_iou']) == (total.iou, its_total.iou)
     assert row['rmse'] == pytest.approx(np.sqrt(np.nanmean(np.concatenate(errors) ** 2)))
@@ -279,7 +259,7 @@ def test_behind_is_said():
         error = height_error(np.zeros(1), np.zeros(1))
         return MethodScore('x', tuple(
             ScanScore(f'vlp-16 {name}', '', 0.1, confusions={'e': Confusion(iou, 100 - iou)},
-                      heights={'all': error})
+                      height=error)
             for name, iou in zip(('flat', 'ramp', 'kerb'), ious, strict=True)
         ))  # fmt: skip
 
@@ -304,34 +284,36 @@ def streets(tmp_path_factory):
 
 
 def test_frames_turned(streets):
-    report = score_poses(streets, FIXED)
-    (level,) = report.tables['heights'].json()
+    report = score_poses(streets, sensor_pose.load_turned, MOUNTS, FIXED)
+    level, pooled = report.tables['heights'].json()
+    assert {**level, 'scans of': 'all'} == pooled
     assert level['told'] > 0.9
     assert (level['scans'], level['levelled'], level['silent']) == (2, 0, 0)
     assert max(abs(level['low']), abs(level['high'])) < 0.1
     turns = report.tables['turns'].json()
-    assert len(turns) == len(TURNS) - 1 + 1
+    n_turns = len(MOUNTS) - 1
+    assert len(turns) == n_turns + 1
     for row in turns:
         assert row['told'] == pytest.approx(level['told'], abs=1e-3)
         assert row['auto'] > level['told'] - 0.01
+        assert row['worst'] <= row['change_auto'] + 1e-12
     by_angle = {row['turned by']: row for row in turns}
-    assert by_angle['all']['scans'] == 2 * (len(TURNS) - 1)
+    assert by_angle['all']['scans'] == 2 * n_turns
+    assert by_angle['all']['worst'] == min(row['worst'] for row in turns)
     assert by_angle['roll +3° pitch -3°']['levelled'] == 2
-    refused = {row['up']: (row['scans'], row['refused']) for row in report.tables['axes'].json()}
-    assert refused == {'z': (2, 0), **dict.fromkeys(AXES_UP, (2, 2))}
-    assert len(report.rows) == 2 * 3 * len(TURNS)
+    assert len(report.rows) == 2 * 3 * len(MOUNTS)
 
 
 def test_poses_of_simulated_scans(monkeypatch):
     small = dataclasses.replace(VLP_16, n_columns=600)
     monkeypatch.setitem(sensor_pose.SENSORS, 'vlp-16', small)
-    report = score_simulated_poses(1, FIXED, ['flat'], ['vlp-16'])
-    (level,) = report.tables['heights'].json()
-    assert level['scans'] == len(HEIGHTS)
+    frames = simulated_frames(['vlp-16'], ['flat'], 1, (0.0,))
+    report = score_poses(frames, sensor_pose.load_mounted, SIMULATED_MOUNTS, FIXED)
+    level, _ = report.tables['heights'].json()
+    n_heights = len(SIMULATED_MOUNTS) // 2
+    assert level['scans'] == n_heights
     assert max(abs(level['low']), abs(level['high'])) < 0.06
     turned, pooled = report.tables['turns'].json()
     assert pooled['auto'] == turned['auto'] > turned['level']
-    assert turned['levelled'] == len(HEIGHTS)
+    assert turned['levelled'] == n_heights
     assert 'by roll +3° pitch -3°' in report.tables['turns'].title
-    assert sum(row['scans'] for row in report.tables['axes'].json()) == 4 * (1 + len(AXES_UP))
-    assert not math.isnan(level['told'])

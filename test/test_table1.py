@@ -11,7 +11,6 @@ from gp_ground_seg.experiments.table1 import (
     DEFAULT_CHOICES,
     VARIANCES,
     Choice,
-    is_candidate,
     table1,
 )
 from gp_ground_seg.simulation import HDL_32E, SCENES, simulate_scan, write_semantic_kitti
@@ -91,16 +90,6 @@ def test_theta_is_of_the_whole_frame_and_learned(measured):
     assert first == second
     given = np.square([0.9, 2.0, 0.25])
     assert (np.abs(first[2:] / given - 1.0) > 1e-4).all()
-
-
-def test_each_candidate_is_one_point(frame):
-    points, _ = frame
-    result = GroundSegmenter().segment(points)
-    z = points[:, 2].astype(float)
-    found = is_candidate(result, z)
-    assert found.sum() == len(result.candidates.z)
-    order = np.argsort(result.grid.segment[found] * 10_000 + result.grid.bin[found])
-    np.testing.assert_array_equal(z[found][order], result.candidates.z)
 
 
 @pytest.mark.parametrize(

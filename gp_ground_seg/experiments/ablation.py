@@ -165,11 +165,14 @@ def compare_departures(
 
 
 def _worst_and_rmse(score: MethodScore) -> Row:
-    """Cells of the sequence with the lowest IoU, and of the height error."""
+    """Cells of the sequence with the lowest IoU, if there are several, and of the height error."""
     iou, name = min((score.of(name).iou, name) for name in score.sequences)
-    return [
+    worst: Row = [
         (percent('worst [%]', 'worst_iou'), iou),
         (Column('in', '', 'worst_sequence'), name),
+    ]
+    return [
+        *(worst if len(score.sequences) > 1 else []),
         (report.centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
     ]
 
