@@ -17,8 +17,7 @@ from evaluation_samples import real_kitti, street, write_streets
 from matplotlib.image import imread
 
 from gp_ground_seg.evaluation import evaluate as runner
-from gp_ground_seg.evaluation.metrics import GROUNDGRID, RATIOS, Confusion
-from gp_ground_seg.frame import Label
+from gp_ground_seg.evaluation.metrics import RATIOS, Confusion
 
 
 def rows_of(output, title=''):
@@ -45,7 +44,7 @@ def root(tmp_path_factory):
 def evaluated(root, tmp_path_factory):
     """Files of a run beside Patchwork++."""
     folder = tmp_path_factory.mktemp('evaluated')
-    options = ('--json', 'a.json'), ('--sheet', 'a.png'), ('--reliability', 'b.png')
+    options = ('--json', 'a.json'), ('--reliability', 'a.png')
     words = [word for option, name in options for word in (option, folder / name)]
     assert run('evaluate', root, *words, '--worst', 2, '--peer', 'patchworkpp') == 0
     return folder
@@ -97,6 +96,12 @@ def test_classes_rings_and_probabilities(evaluated):
     assert classes['vegetation']['share_of_errors'] is None
     for name in ('share_of_points', 'share_of_errors'):
         assert sum(row[name] or 0.0 for row in classes.values()) == pytest.approx(1.0)
+    ious = sorted(
+        f['groundgrid_iou'] for f in document['rows'] if f['method'] == 'gp_ground_seg'
+    )  # fmt: skip
+    assert [row['iou'] for row in document['worst']] == ious[:2]
+    assert {row['most errors on'] for row in document['worst']} <= {'road', 'building'}
+    assert imread(evaluated / 'a.png').shape[2] == 4
     rings = {row['range']: row for row in document['rings']}
     assert rings['> 50 m']['iou'] is rings['> 50 m']['patchworkpp_iou'] is None
     assert sum(row['share_of_errors'] for row in rings.values()) == pytest.approx(1.0)
@@ -134,7 +139,7 @@ def test_width_on_real_frames(capsys):
     assert float(output.split()[1]) > 94.0
 
 
-@pytest.mark.parametrize('option', ['--json', '--sheet'])
+@pytest.mark.parametrize('option', ['--json', '--reliability'])
 def test_files_are_not_overwritten_without_force(root, tmp_path, option, monkeypatch, capsys):
     target = tmp_path / 'mine'
     target.write_text('mine')
@@ -165,8 +170,6 @@ def test_a_run_that_fails_leaves_nothing(tmp_path, capsys):
         (['--sequences', ','], 'no sequence asked for'),
         (['--set', 'label.ground_tolerence=1'], 'label.ground_tolerance'),
         (['--json', '/no/such/folder/x.json'], '/no/such/folder'),
-        (['--worst', '2'], '--worst: is for --sheet only'),
-        (['--worst', '61', '--sheet', 'x.png'], 'must be at most 60'),
     ],
 )
 def test_errors_are_said(root, words, message, capsys):
@@ -195,31 +198,11 @@ def test_progress_only_on_a_terminal(root):
     assert shown.stdout.splitlines()[3:12] == quiet.stdout.splitlines()[3:12]
 
 
-def test_sheet_of_the_command(root, evaluated, tmp_path, monkeypatch):
-    assert imread(evaluated / 'a.png').shape[2] == imread(evaluated / 'b.png').shape[2] == 4
-    drawn = []
-
-    def draw(panels, path, title):
-        drawn.append((panels, title))
-        path.write_text('drawn')
-
-    monkeypatch.setattr('gp_ground_seg.cli.evaluate.plot_error_sheet', draw)
-    run('evaluate', root, '--sheet', tmp_path / 'a.png', '--worst', 60)
-    ((panels, title),) = drawn
-    frames = json.loads((evaluated / 'a.json').read_text())['rows']
-    ious = sorted(f['groundgrid_iou'] for f in frames if f['method'] == 'gp_ground_seg')
-    assert [float(p.title.split()[-2]) for p in panels] == [round(100 * iou, 2) for iou in ious]
-    assert title.startswith('Worst 3 of 3 frames')
-    for panel in panels:
-        assert panel.truth.tolist() == GROUNDGRID.truth(street()[1], panel.points[:, 2]).tolist()
-        n_false = np.count_nonzero((panel.label == Label.GROUND) & (panel.truth == Label.OBSTACLE))
-        assert panel.subtitle.startswith(f'{n_false} false, ')
-        assert 'building' in panel.subtitle
-
-
-def test_a_sheet_of_nothing_is_refused(tmp_path, capsys):
+def test_frames_without_a_scored_point(tmp_path, capsys):
     root = write_streets(tmp_path / 'kitti', s00=1)
     label = root / 'sequences/00/labels/000000.label'
     label.write_bytes(bytes(len(label.read_bytes())))  # all unlabelled
-    assert run('evaluate', root, '--sheet', tmp_path / 'a.png') == 2
-    assert 'nothing to score in 1 frames' in error_line(capsys)
+    assert run('evaluate', root, '--worst', 2) == 0
+    assert run('evaluate', root, '--reliability', tmp_path / 'a.png') == 2
+    assert 'no scored point' in capsys.readouterr().err
+    assert not (tmp_path / 'a.png').exists()
