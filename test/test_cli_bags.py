@@ -21,7 +21,7 @@ from ros_helpers import BEST_EFFORT, ISOLATION, PATIENCE, isolated_context, spin
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.cli import bags, options
+from gp_ground_seg.cli import options
 from gp_ground_seg.cli.main import main
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
@@ -197,12 +197,14 @@ def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
     write_ros2_bag(bag, 2)
     is_said = threading.Event()
 
+    tell = options.note
+
     def note(text):
-        options.note(text)
+        tell(text)
         if text.startswith('waiting'):
             is_said.set()
 
-    monkeypatch.setattr(bags, 'note', note)
+    monkeypatch.setattr(options, 'note', note)
     with isolated_context() as context:
         node = Node('late', context=context)
         clouds = []

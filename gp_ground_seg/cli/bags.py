@@ -202,7 +202,13 @@ def run_play(arguments: argparse.Namespace) -> int:
                     player.play(bar.update)
             finally:
                 # After an interrupt, too: with --loop it is the only end.
-                _print_summary(player, arguments)
+                if summary := player.summary():
+                    print(summary, flush=True)
+                    lossy = [] if arguments.quiet else player.best_effort_topics()
+                    for topic in lossy:
+                        options.note(
+                            f'{topic} has a best-effort subscriber: its losses are unknown'
+                        )
     return EXIT_UNDELIVERED if player.n_undelivered and not arguments.no_wait else 0
 
 
@@ -228,11 +234,3 @@ def _wait_for_subscribers(player: Player, arguments: argparse.Namespace) -> None
     raise GroundSegError(
         f'no subscriber of {lonely} within {limit:g} s; --no-wait plays without one'
     )
-
-
-def _print_summary(player: Player, arguments: argparse.Namespace) -> None:
-    summary = player.summary()
-    if summary:
-        print(summary, flush=True)
-        for topic in player.best_effort_topics() if not arguments.quiet else ():
-            options.note(f'{topic} has a best-effort subscriber; clouds it lost are not counted')

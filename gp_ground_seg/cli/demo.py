@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import itertools
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -49,9 +48,8 @@ RATE = 10.0
 """Scans per second [Hz]."""
 MAX_LOAD, COMFORTABLE_LOAD = 0.9, 0.6
 """Share of the time that the node may need: above the first the rate is lowered."""
-N_TRIALS = 5
-TRIAL_TIMEOUT = 60.0
-"""Longest time one scan may take [s]."""
+N_TRIALS, TRIAL_TIMEOUT = 5, 60.0
+"""Scans sent one by one to see that, and the longest time one may take [s]."""
 EXIT_FAILED = 1
 
 DESCRIPTION = """\
@@ -258,10 +256,8 @@ def run(arguments: argparse.Namespace) -> int:
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)
-        start = time.monotonic()
         probe = Probe(session, tally.add)
         probe.connect(node)
-        _detail(f'its compiled code was there after {time.monotonic() - start:.1f} s more')
         result = _play(part / BAG, drive.n_frames, arguments.rate, probe)
         node.check()
         if tally.picture is None:
@@ -280,19 +276,15 @@ def _write(drive: Drive, path: Path, session: Session) -> list[tuple[int, int]]:
     """Write the drive as a bag; return the stamps of its scans."""
     scans = options.count(drive.n_frames, 'scan')
     print(f'[1/3] writing {scans} as a bag: {drive.name}; meanwhile the node starts', flush=True)
-    start = time.monotonic()
-    stamps, n_points = [], 0
+    stamps = []
     with options.progress('scans')(total=drive.n_frames) as bar, BagWriter(path) as bag:
         bag.add_topic(cloud_topic(INPUT))
         for points, semantic, seconds in drive.scans:
             stamp = EPOCH * 10**9 + round(seconds * 1e9)
             bag.write(INPUT, stamp, encode_cloud(numbered_cloud(points, semantic, stamp)))
-            n_points += len(points)
             stamps.append(divmod(stamp, 10**9))
             session.check()
             bar.update()
-    seconds, size = time.monotonic() - start, path.stat().st_size / 1e6
-    _detail(f'{_thousands(n_points)} points, {size:.0f} MB, took {seconds:.1f} s')
     return stamps
 
 
@@ -319,12 +311,8 @@ def sustainable_rate(cloud: CloudMessage, probe: Probe) -> float:
     if np.isnan(seconds):
         raise GroundSegError(f'no answer to a scan within {TRIAL_TIMEOUT:g} s')
     rate = float(f'{COMFORTABLE_LOAD / seconds:.1g}')
-    _detail(f'a scan takes {1e3 * seconds:.0f} ms here and now: playing {rate:g} per second')
+    print(f'      a scan takes {1e3 * seconds:.0f} ms here and now: playing {rate:g} per second')
     return rate
-
-
-def _detail(text: str) -> None:
-    print(f'      {text}', flush=True)
 
 
 def _thousands(number: int) -> str:

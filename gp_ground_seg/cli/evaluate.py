@@ -127,15 +127,18 @@ def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str
 
 
 def _peer_columns(peers: Sequence[MethodScore]) -> list[Column]:
-    columns = []
-    for peer in peers:
-        columns.append(percent(f'{peer.title} IoU', f'{peer.name}_iou'))
-        columns.append(percent('difference', f'difference_to_{peer.name}', '+.2f'))
-    return columns
+    return [
+        column
+        for peer in peers
+        for column in (
+            percent(f'{peer.title} IoU', f'{peer.name}_iou'),
+            percent('difference', f'difference_to_{peer.name}', '+.2f'),
+        )
+    ]
 
 
-def _with_peers(iou: float, peers: Iterator[float]) -> list[Cell]:
-    return [cell for its in peers for cell in (its, iou - its)]
+def _with_peers(iou: float, peers: Sequence[metrics.Confusion]) -> list[Cell]:
+    return [cell for its in peers for cell in (its.iou, iou - its.iou)]
 
 
 def _convention_table(scores: Sequence[MethodScore], convention: metrics.Convention) -> Table:
@@ -145,7 +148,7 @@ def _convention_table(scores: Sequence[MethodScore], convention: metrics.Convent
         sequence, ours = parts[0]
         row: list[Cell] = [sequence, len(ours.scans)]
         row += [getattr(found, name) for name in metrics.RATIOS]
-        rows.append([*row, *_with_peers(found.iou, (one.iou for one in its))])
+        rows.append([*row, *_with_peers(found.iou, its)])
     columns = [Column('sequence'), Column('frames', 'd')]
     columns += [percent(RATIO_TITLES.get(name, name), name) for name in metrics.RATIOS]
     title = f'{convention.title} convention: {convention.rule}  [%]'
@@ -158,7 +161,7 @@ def _ring_table(scores: Sequence[MethodScore]) -> Table:
     n_errors = scores[0].confusion.errors
     rows = [
         [title, ring.points, ring.errors, metrics.ratio(ring.errors, n_errors), ring.precision,
-         ring.recall, ring.iou, *_with_peers(ring.iou, (one.iou for one in its))]
+         ring.recall, ring.iou, *_with_peers(ring.iou, its)]
         for title, ring, *its in zip(metrics.RING_TITLES, *(s.rings for s in scores), strict=True)
     ]  # fmt: skip
     columns = [*columns, percent('IoU', 'iou'), *_peer_columns(scores[1:])]

@@ -187,55 +187,44 @@ def _load_clouds(arguments: argparse.Namespace) -> list[CloudMessage]:
 
 
 def _measure(
-    arguments: argparse.Namespace, clouds: Sequence[CloudMessage]
+    arguments: argparse.Namespace, different: Sequence[CloudMessage]
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the results at each rate, and those of memory, if wanted."""
-    from gp_ground_seg.ros.probe import (
-        Probe,
-        memory,
-        memory_result,
-        probed_node,
-        rate_result,
-        restamped,
-    )
+    from gp_ground_seg.ros import probe as probing
 
-    stamped = restamped(clouds, 1_700_000_000)
+    quiet, words, n, n_memory = (
+        arguments.quiet, arguments.ros_args[1:], arguments.frames, arguments.memory_frames
+    )  # fmt: skip
+    stamped = probing.restamped(different, 1_700_000_000)
     with (
         tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
         needing_ros('node-bench'),
-        probed_node(Path(folder, 'log'), 'node_bench', arguments.ros_args[1:]) as (node, session),
+        probing.probed_node(Path(folder, 'log'), 'node_bench', words) as (node, session),
     ):
-        probe = Probe(session, lambda *_: None)
-        if not arguments.quiet:
+        probe = probing.Probe(session, lambda *_: None)
+        if not quiet:
             options.note('waiting for the node; it compiles when it runs the first time')
         probe.connect(node)
         rates = []
         for rate in arguments.rates:
-            bar = options.progress(f'{rate:g} Hz', quiet=arguments.quiet)(total=arguments.frames)
             _, dropped_before = probe.counters()
-            own = itertools.islice(stamped, arguments.frames)
-            with bar:
-                trips = probe.paced(own, rate, bar.update)
+            with options.progress(f'{rate:g} Hz', quiet=quiet)(total=n) as bar:
+                trips = probe.paced(itertools.islice(stamped, n), rate, bar.update)
             _, dropped = probe.counters()
-            rates.append(rate_result(rate, trips, dropped - dropped_before))
+            rates.append(probing.rate_result(rate, trips, dropped - dropped_before))
         node.check()
-        if not arguments.memory_frames:
-            return rates, {}
         resident: list[int] = []
-        bar = options.progress('memory', quiet=arguments.quiet)(total=arguments.memory_frames)
 
         def watch(trip: Trip) -> None:
             if trip.back is None:
                 node.check()
-                raise GroundSegError(
-                    f'no answer to a cloud; the last words of the node:\n{node.log_tail()}'
-                )
-            resident.append(memory(node.pid)[0])
-            bar.update()
+                raise GroundSegError(f'no answer to a cloud; the node said:\n{node.log_tail()}')
+            resident.append(probing.memory(node.pid)[0])
 
-        with bar:
-            probe.one_by_one(itertools.islice(stamped, arguments.memory_frames), watch)
-        return rates, memory_result(resident, memory(node.pid)[1])
+        clouds = itertools.islice(stamped, n_memory)
+        probe.one_by_one(options.progress('memory', quiet=quiet)(clouds, total=n_memory), watch)
+        peak = probing.memory(node.pid)[1]
+        return rates, probing.memory_result(resident, peak) if n_memory else {}
 
 
 def _rate_goals(rate: dict[str, Any]) -> dict[str, bool]:

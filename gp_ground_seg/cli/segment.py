@@ -182,11 +182,11 @@ def find_scans(source: Path) -> list[Path]:
     for name in _SCAN_FOLDERS:
         if scans := sorted((source / name).glob('*.bin')):
             return scans
-    sequences = sorted(path.parent.name for path in source.glob('sequences/*/velodyne'))
+    sequences = sorted(path.parent for path in source.glob('sequences/*/velodyne'))
     hint = ''
     if sequences:
-        first = source / 'sequences' / sequences[0]
-        hint = f'; give one of its sequences ({", ".join(sequences)}), as in {first}'
+        names = ', '.join(path.name for path in sequences)
+        hint = f'; give one of its sequences ({names}), as in {sequences[0]}'
     raise DataError(f'{source}: no .bin file in it, and not a rosbag2 folder{hint}')
 
 
@@ -289,10 +289,8 @@ def _check_output_topics(source: Path, topics: tuple[str, str], copied: list[str
         if not _TOPIC_NAME.fullmatch(name):
             raise DataError(f'{option} {name}: must be a full topic name, as in {GROUND_TOPIC}')
         if name in copied:
-            raise DataError(
-                f'{source}: has a topic {name} already; choose another with {option}, '
-                f'or leave that one out with --drop {name}'
-            )
+            choices = f'choose another with {option}, or leave that one out with --drop {name}'
+            raise DataError(f'{source}: has a topic {name} already; {choices}')
     if topics[0] == topics[1]:
         raise DataError(f'--obstacles-topic {topics[1]}: is the topic of the ground as well')
 

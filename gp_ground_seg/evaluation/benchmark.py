@@ -79,14 +79,8 @@ def run_cases(
     is the first, changes from frame to frame. Before the first frame counts, each has
     run on it: compilation and first allocations are not its speed.
 
-    Parameters
-    ----------
-    frames : sequence of BenchFrame
-        At least one, grouped by sequence.
-    cases : mapping of str to Config
-        What to time, by title, such as ``learning, 1 thread``.
-    make_baseline : callable, optional
-        Makes the baseline of each case, which sees every frame as often as the case does.
+    `frames` are grouped by sequence; `cases` are what to time, by title, such as ``learning, 1
+    thread``; `make_baseline` makes the baseline of each, which sees every frame as often.
     """
     names = list(cases)
     with ExitStack() as stack:

@@ -173,10 +173,9 @@ def count_confusion(label: Labels, truth: Labels) -> Confusion:
 def count_rings(
     label: Labels, truth: Labels, points: npt.NDArray[np.floating]
 ) -> tuple[Confusion, ...]:
-    """Compare as `count_confusion` by horizontal range, one `Confusion` for each ring.
+    """Compare by horizontal range of `points` (N, >=2) [m], one `Confusion` for each ring.
 
-    `points` (N, >=2) are x, y, ... in the sensor frame [m]; one without a finite range is in
-    no ring.
+    A point without a finite range is in no ring.
     """
     x, y = points[:, :2].astype(np.float64).T
     reach = np.hypot(x, y)

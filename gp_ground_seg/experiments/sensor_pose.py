@@ -61,6 +61,11 @@ class Trial(NamedTuple):
     level: MethodScore
     auto: MethodScore
 
+    @property
+    def change(self) -> float:
+        """Change of the IoU by the estimate."""
+        return self.auto.iou - self.told.iou
+
 
 def score_poses(
     items: Sequence[Any],
@@ -126,11 +131,6 @@ def _pooled(trials: Sequence[Trial]) -> tuple[MethodScore, ...]:
     return tuple(pool(one[0].name, one) for one in zip(*(t[2:] for t in trials), strict=True))
 
 
-def _worst(trials: Sequence[Trial]) -> float:
-    """Lowest change of the IoU by the estimate."""
-    return min(trial.auto.iou - trial.told.iou for trial in trials)
-
-
 def _n_levelled(found: MethodScore) -> int:
     return sum(scan.pose is not None and not scan.pose.is_level for scan in found.scans)
 
@@ -149,7 +149,7 @@ def height_table(trials: Sequence[Trial]) -> Table:
                 (percent('told'), told.iou),
                 (percent('auto'), found.iou),
                 (percent('change', form='+.2f'), found.iou - told.iou),
-                (percent('worst', form='+.2f'), _worst(own)),
+                (percent('worst', form='+.2f'), min(t.change for t in own)),
                 (Column('low', '+.2f'), min(errors)),
                 (Column('high', '+.2f'), max(errors)),
                 (Column('tilt', '.1f'), max(_lean(pose) for pose, _ in poses)),
@@ -193,7 +193,7 @@ def turn_table(trials: Sequence[Trial]) -> Table:
                 (percent('change', 'change_level', '+.2f'), level.iou - told.iou),
                 (percent('auto'), found.iou),
                 (percent('change', 'change_auto', '+.2f'), found.iou - told.iou),
-                (percent('worst', form='+.2f'), _worst(own)),
+                (percent('worst', form='+.2f'), min(t.change for t in own)),
                 (Column('levelled', 'd'), _n_levelled(found)),
             ]
         )

@@ -50,17 +50,6 @@ DEFAULT_CHOICES = ('10/000000:157,158', '03/000006:147,148')
 """An adjacent pair that climbs a verge and a hill, 3 m over 30 m, and one on uneven ground."""
 
 
-def find_frame(root: str | Path, choice: Choice) -> Frame:
-    """Frame of a choice; DataError if it is not there."""
-    frames = {frame.index: frame for frame in list_frames(root, choice.sequence)}
-    if choice.frame not in frames:
-        raise DataError(
-            f'{root}: no frame {choice.frame} in sequence {choice.sequence}; '
-            f'there are {min(frames)} to {max(frames)}'
-        )
-    return frames[choice.frame]
-
-
 def table1(
     root: str | Path,
     choices: Sequence[Choice],
@@ -81,7 +70,13 @@ def table1(
     for segment in (segment for choice in choices for segment in choice.segments):
         if not 0 <= segment <= last:
             raise ConfigError(f'segment {segment}: must be in [0, {last}]')
-    frames = [find_frame(root, choice) for choice in choices]
+    frames = []
+    for choice in choices:
+        own = {frame.index: frame for frame in list_frames(root, choice.sequence)}
+        if choice.frame not in own:
+            where = f'{choice.sequence}; there are {min(own)} to {max(own)}'
+            raise DataError(f'{root}: no frame {choice.frame} in sequence {where}')
+        frames.append(own[choice.frame])
     rows: list[dict[str, Any]] = []
     with ExitStack() as stack:
         segmenters = {
@@ -110,14 +105,11 @@ def table1(
 
 
 def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> Table:
-    columns = [Column('segment'), *(Column(name, _format(name)) for name in names)]
+    columns = [Column('segment')]
+    for name in names:
+        number = '.4f' if name.startswith('t ') else '#.4g'
+        columns.append(Column(name, 'd' if isinstance(rows[0][name], int) else number))
     return Table(columns, [[row[c.title] for c in columns] for row in rows], title)
-
-
-def _format(name: str) -> str:
-    if name.startswith('n_') or name == 'held out':
-        return 'd'
-    return '.4f' if name.startswith('t ') else '#.4g'
 
 
 def _rows(

@@ -95,9 +95,8 @@ def score_variants(
     """
     with ExitStack() as stack:
         ours = [stack.enter_context(closing(OurMethod(c, name))) for name, c in variants.items()]
-        return methods.score_methods(
-            items, load, [*ours, *peers], each_alone=True, progress=progress
-        )
+        every = [*ours, *peers]
+        return methods.score_methods(items, load, every, each_alone=True, progress=progress)
 
 
 def make_report(
@@ -106,12 +105,8 @@ def make_report(
     """Report of scored variants; `config` is what they change, the first is of our method."""
     fit = scores[0].scans[-1].fit
     assert fit is not None
-    facts = {
-        'config_changes': results.changed_parameters(config),
-        'config': config.nested(),
-        **facts,
-    }
-    return Report(tables, scan_rows(scores), fit, facts)
+    given = {'config_changes': results.changed_parameters(config), 'config': config.nested()}
+    return Report(tables, scan_rows(scores), fit, {**given, **facts})
 
 
 def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
@@ -163,10 +158,8 @@ def score_scenes(
         )
         ours.append(own)
         theirs += other
-    scores = [
-        methods.pool(methods.OURS, ours),
-        *([methods.pool(methods.PATCHWORKPP, theirs)] if theirs else []),
-    ]
+    pairs = [(methods.OURS, ours), (methods.PATCHWORKPP, theirs)]
+    scores = [methods.pool(name, own) for name, own in pairs if own]
     report = make_report({'scenes': scene_table(*scores)}, scores, Config())
     for name, of in (('config_changes', results.changed_parameters), ('config', Config.nested)):
         report.facts[name] = {sensor: of(config) for sensor, config in configs.items()}
@@ -193,14 +186,12 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
         )
         if peer is not None:
             its = peer.of(group)
+            median = its.height.median_absolute
             rows[-1] += [
                 (percent(PEER, 'peer_iou'), its.iou),
                 (percent('difference', 'difference', '+.2f'), own.iou - its.iou),
                 (results.centimetres('its RMSE', 'peer_rmse'), its.height.rmse),
-                (
-                    results.centimetres('its median', 'peer_median_absolute'),
-                    its.height.median_absolute,
-                ),
+                (results.centimetres('its median', 'peer_median_absolute'), median),
             ]
             if not own.iou > its.iou:
                 behind.append(group)

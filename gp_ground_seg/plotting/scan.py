@@ -62,21 +62,10 @@ def plot_scan_view(
 ) -> None:
     """Draw a scan in perspective as a PNG, replacing the file `path`.
 
-    Ground and obstacles, and on them profiles of the ground model with two standard
-    deviations, coloured by length-scale: what the node's topics show in RViz.
-
-    Parameters
-    ----------
-    points : (N, >=3) float array
-        The scan, x forward, y left, z up [m].
-    segmentation, config : Segmentation, Config
-        Its segmentation and the parameters of that; ``length_scale.min`` and ``max`` end the
-        colours, ``label.ground_tolerance`` the profiles: less certain ground is not drawn.
-
-    Raises
-    ------
-    PointCloudError
-        If the scan is another one than was segmented.
+    Ground and obstacles of `points`, (N, >=3) [m], and on them profiles of the ground model with
+    two standard deviations, coloured by length-scale: what the node's topics show in RViz.
+    ``length_scale.min`` and ``max`` end the colours; ground less certain than
+    ``label.ground_tolerance`` is not drawn. Raises PointCloudError if another scan was segmented.
     """
     xyz = check_points(points)
     finite = finite_points(xyz)
@@ -182,22 +171,10 @@ def plot_birds_eye(
     truth: Labels | None = None,
     title: str = '',
 ) -> None:
-    """Draw a scan from above as a PNG, replacing the file `path`.
+    """Draw points (N, >=3) [m] from above by their `Label`, as a PNG, replacing the file `path`.
 
-    Parameters
-    ----------
-    points : (N, >=3) float array
-        x forward, y left, z up [m].
-    label : (N,) uint8
-        `Label` of each point.
-    truth : (N,) uint8, optional
-        True `Label` of each point, UNKNOWN where it does not count. With it a
-        second panel shows the errors.
-
-    Raises
-    ------
-    PointCloudError
-        If the shapes do not fit together.
+    With the true labels, UNKNOWN where a point does not count, a second panel shows the errors.
+    Raises PointCloudError if the shapes do not fit together.
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=label, truth=truth)

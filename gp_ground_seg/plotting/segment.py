@@ -62,23 +62,10 @@ def plot_segment(
     points, inliers, and the surface with twice its standard deviation. Below:
     the length-scale and the pseudo-inputs it follows.
 
-    Parameters
-    ----------
-    result, config : Segmentation, Config
-        The segmentation of `points` and its parameters.
-    points : (N, >=3) float array
-        x forward, y left, z up [m].
-    segment, path : int, str or Path
-        Number of the segment; file to write, a PDF or else a PNG, replaced if it exists.
-    truth : (N,) uint8, optional
-        True `Label` of each point, UNKNOWN where it does not count.
-    max_range : float, optional
-        Range shown [m]; by default a little more than that of the last candidate.
-
-    Raises
-    ------
-    PointCloudError, ConfigError
-        If the shapes do not fit together; if the segment or the range is not accepted.
+    `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
+    labels, UNKNOWN where a point does not count; `max_range` [m] is by default a little more than
+    that of the last candidate. The file `path`, a PDF or else a PNG, is replaced. Raises
+    PointCloudError or ConfigError if shapes do not fit, or segment or range are not accepted.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     style.check_lengths(len(z), result=result.label, truth=truth)
