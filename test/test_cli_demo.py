@@ -158,7 +158,7 @@ def test_counts_and_words():
     assert (tally.n_points, tally.n_faulty) == (117, 1)
     assert tally.confusion.tp == 20 + 0 + 18
     # The middle one was lost: the one before it that came back.
-    assert tally.picture.number == 0
+    assert tally.picture[0] == 0
     assert 'FAILED: the two clouds are not the scan' in result_text(tally, result, 0, '')[0]
 
 

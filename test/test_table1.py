@@ -7,12 +7,7 @@ from evaluation_samples import write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
-from gp_ground_seg.experiments.table1 import (
-    DEFAULT_CHOICES,
-    VARIANCES,
-    Choice,
-    table1,
-)
+from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, VARIANCES, Choice, table1
 from gp_ground_seg.simulation import HDL_32E, SCENES, simulate_scan, write_semantic_kitti
 
 SEGMENTS = (90, 91)

@@ -206,9 +206,7 @@ def run_play(arguments: argparse.Namespace) -> int:
                     print(summary, flush=True)
                     lossy = [] if arguments.quiet else player.best_effort_topics()
                     for topic in lossy:
-                        options.note(
-                            f'{topic} has a best-effort subscriber: its losses are unknown'
-                        )
+                        options.note(f'{topic} has a best-effort subscriber, losses unknown')
     return EXIT_UNDELIVERED if player.n_undelivered and not arguments.no_wait else 0
 
 
@@ -216,9 +214,8 @@ def _choose_topics(bag: BagReader, arguments: argparse.Namespace) -> list[str]:
     if arguments.all:
         topics = [name for name in bag.point_cloud_topics if bag.n_messages(name)]
         return topics or [bag.pick_point_cloud_topic()]
-    if arguments.topic:
-        return [bag.pick_point_cloud_topic(name) for name in dict.fromkeys(arguments.topic)]
-    return [bag.pick_point_cloud_topic()]
+    chosen = dict.fromkeys(arguments.topic or [None])
+    return [bag.pick_point_cloud_topic(name) for name in chosen]
 
 
 def _wait_for_subscribers(player: Player, arguments: argparse.Namespace) -> None:

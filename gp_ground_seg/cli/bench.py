@@ -141,11 +141,7 @@ def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
 
 
 def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[BenchFrame]:
-    """Read at most about `n_frames` frames into memory, in runs spread over all there are.
-
-    `source` is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
-    Raises DataError if there is nothing to read there, or no point in it.
-    """
+    """Read about `n_frames` frames of DATA into memory, or raise DataError if there is no point."""
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
     if is_bag(source):

@@ -37,11 +37,6 @@ Print the parameters that differ. A and B are parameter files or names of preset
 Exit code 1 if any differ, as that of diff(1).
 """
 
-GENERATE = """\
-Rewrite the files of the presets in config/, docs/parameters.md and the table of README.md
-from gp_ground_seg/parameters.
-"""
-
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its own commands."""
@@ -55,7 +50,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('diff', run_diff, 'compare two parameter files or presets', DIFF),
         ('presets', run_presets, 'list the presets and what they are for', ''),
         ('table', run_table, 'print every parameter as a Markdown table', ''),
-        ('generate', run_generate, 'for developers: rewrite generated files', GENERATE),
+        (
+            'generate',
+            run_generate,
+            'rewrite config/*.yaml and the tables of README.md and docs/',
+            '',
+        ),
     ):
         added[name] = commands.add_parser(name, help=purpose, description=text or purpose)
         added[name].set_defaults(run=run)
@@ -63,9 +63,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     added['check'].add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
     for side in 'ab':
         added['diff'].add_argument(side, metavar=side.upper(), help='parameter file or preset')
-    added['generate'].add_argument(
-        'root', metavar='REPO_ROOT', nargs='?', default='.', help='the checkout (default: here)'
-    )
+    root = {'metavar': 'REPO_ROOT', 'nargs': '?', 'default': '.'}
+    options.add(added['generate'], ('root', 'the checkout (default: here)', root))
 
 
 def run_dump(arguments: argparse.Namespace) -> int:

@@ -168,26 +168,18 @@ def _xyz(points: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
     return np.stack([points['x'], points['y'], points['z']], axis=1)
 
 
-class Picture(NamedTuple):
-    """A scan to draw: its number, places, labels and true labels of its points, (N,) each."""
-
-    number: int
-    xyz: npt.NDArray[np.float32]
-    label: Labels
-    truth: Labels
-
-
 class Tally:
     """Sums over the scans of the given `stamps` that came back.
 
-    `picture` is the middle scan or the nearest before it.
+    `picture` is the middle scan or the nearest before it: its number, places (N, 3), labels and
+    true labels of its points.
     """
 
     def __init__(self, stamps: Sequence[tuple[int, int]]) -> None:
         self._numbers = {stamp: k for k, stamp in enumerate(stamps)}
         self.n_points = self.n_faulty = 0
         self.confusion = Confusion()
-        self.picture: Picture | None = None
+        self.picture: tuple[int, npt.NDArray[np.float32], Labels, Labels] | None = None
 
     def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
         """Check a scan that came back, and add it; other clouds are trials."""
@@ -202,7 +194,7 @@ class Tally:
         self.n_faulty += not is_exact
         self.confusion += count_confusion(label, truth)
         if self.picture is None or number <= len(self._numbers) // 2:
-            self.picture = Picture(number, xyz, label, truth)
+            self.picture = number, xyz, label, truth
 
 
 def result_text(

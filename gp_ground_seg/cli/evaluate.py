@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         if 'json' in parts:
             report.write(parts['json'], environment)
         if 'reliability' in parts:
-            sequences = {name: _calibration(own) for name, own in scores[0].by_sequence()}
+            sequences = _calibrations(scores[0])
             title = f'Reliability, {len(frames)} frames'
             plot_reliability(sequences, parts['reliability'], title)
     print('\n\n'.join([_headline(scores), *(table.text() for table in report.tables.values())]))
@@ -127,14 +127,11 @@ def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str
 
 
 def _peer_columns(peers: Sequence[MethodScore]) -> list[Column]:
-    return [
-        column
-        for peer in peers
-        for column in (
-            percent(f'{peer.title} IoU', f'{peer.name}_iou'),
-            percent('difference', f'difference_to_{peer.name}', '+.2f'),
-        )
-    ]
+    columns = []
+    for peer in peers:
+        columns.append(percent(f'{peer.title} IoU', f'{peer.name}_iou'))
+        columns.append(percent('difference', f'difference_to_{peer.name}', '+.2f'))
+    return columns
 
 
 def _with_peers(iou: float, peers: Sequence[metrics.Confusion]) -> list[Cell]:
@@ -196,10 +193,17 @@ def _class_table(score: MethodScore) -> Table:
     return Table(columns, rows, title)
 
 
+def _calibrations(score: MethodScore) -> dict[str, metrics.Calibration]:
+    """Return the sums by sequence and of all; our method has probabilities for every scan."""
+    parts = score.by_sequence()
+    return {name: own.calibration for name, own in parts if own.calibration is not None}
+
+
 def _calibration_table(score: MethodScore) -> Table:
     """Errors of the probabilities by sequence and pooled."""
-    found = [(name, _calibration(own)) for name, own in score.by_sequence()]
-    rows: list[list[Cell]] = [[name, one.n_total, one.ece, one.brier] for name, one in found]
+    rows: list[list[Cell]] = [
+        [name, one.n_total, one.ece, one.brier] for name, one in _calibrations(score).items()
+    ]
     columns = [Column('sequence'), Column('points', '_d'), Column('ECE', '.4f', 'ece')]
     title = (
         'Probabilities (GroundGrid convention): expected calibration error over '
@@ -235,16 +239,10 @@ def _time_table(scores: Sequence[MethodScore]) -> Table:
     return Table(columns, rows, 'Time per frame, reading left out  [ms]', [f'stages: {stages}'])
 
 
-def _calibration(score: MethodScore) -> metrics.Calibration:
-    assert score.calibration is not None, 'our method has probabilities'
-    return score.calibration
-
-
 def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
     """Share of ground and mean probability in each bin of probability, by sequence and pooled."""
     rows = []
-    for sequence, own in score.by_sequence():
-        found = _calibration(own)
+    for sequence, found in _calibrations(score).items():
         bins = (found.n_points, found.by_bin(found.sum_p), found.by_bin(found.n_ground))
         values = zip(metrics.BIN_EDGES[:-1], metrics.BIN_EDGES[1:], *bins, strict=True)
         keys = ('from', 'to', 'points', 'mean_p', 'share_ground')
@@ -258,7 +256,7 @@ def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
 
 
 def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
-    """Labelled frames of the options, grouped by sequence; errors as `labelled_frames`."""
+    """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
     frames = methods.labelled_frames(arguments.root, chosen)
@@ -268,10 +266,7 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
 
 @contextmanager
 def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
-    """Yield a path to write for each of the options `names` that is given.
-
-    The files take their names when the block ends well; DataError if one cannot be written.
-    """
+    """Yield a path for each of the options given; the files appear when the block ends well."""
     with ExitStack() as stack:
         yield {
             name: stack.enter_context(staged_file(path, force=arguments.force))

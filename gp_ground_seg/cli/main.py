@@ -22,8 +22,8 @@ ROS_ARGS = '--ros-args'
 
 # Module in `gp_ground_seg.cli` and purpose of each command. The `add_parser(subparsers)` of a
 # module declares its commands: their options, and the default `run`, a function of the parsed
-# arguments that returns an exit code. One that sets the default `accepts_ros_args` finds `ros_args`
-# in them. Only the module of the command at hand is imported: all of them take a second.
+# arguments that returns an exit code. One that sets the default `accepts_ros_args` finds them in
+# `ros_args`. Only the module of the command at hand is imported: all of them take a second.
 COMMANDS = {
     'segment': ('segment', 'label scans, or split the clouds of a bag'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),

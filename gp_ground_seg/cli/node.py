@@ -145,10 +145,6 @@ def run_bench(arguments: argparse.Namespace) -> int:
     clouds = _load_clouds(arguments)
     with staged_options(arguments, 'json') as parts:
         rates, memory = _measure(arguments, clouds)
-        for rate in rates:
-            rate['goals'] = _rate_goals(rate)
-        if memory:
-            memory['goals'] = _memory_goals(memory)
         document = {
             'source': {
                 'data': arguments.data or 'simulated HDL-64E',
@@ -192,9 +188,8 @@ def _measure(
     """Return the results at each rate, and those of memory, if wanted."""
     from gp_ground_seg.ros import probe as probing
 
-    quiet, words, n, n_memory = (
-        arguments.quiet, arguments.ros_args[1:], arguments.frames, arguments.memory_frames
-    )  # fmt: skip
+    quiet, words = arguments.quiet, arguments.ros_args[1:]
+    n, n_memory = arguments.frames, arguments.memory_frames
     stamped = probing.restamped(different, 1_700_000_000)
     with (
         tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
@@ -211,7 +206,8 @@ def _measure(
             with options.progress(f'{rate:g} Hz', quiet=quiet)(total=n) as bar:
                 trips = probe.paced(itertools.islice(stamped, n), rate, bar.update)
             _, dropped = probe.counters()
-            rates.append(probing.rate_result(rate, trips, dropped - dropped_before))
+            found = probing.rate_result(rate, trips, dropped - dropped_before)
+            rates.append({**found, 'goals': _rate_goals(found)})
         node.check()
         resident: list[int] = []
 
@@ -223,8 +219,14 @@ def _measure(
 
         clouds = itertools.islice(stamped, n_memory)
         probe.one_by_one(options.progress('memory', quiet=quiet)(clouds, total=n_memory), watch)
-        peak = probing.memory(node.pid)[1]
-        return rates, probing.memory_result(resident, peak) if n_memory else {}
+        if not n_memory:
+            return rates, {}
+        memory = probing.memory_result(resident, probing.memory(node.pid)[1])
+        goals = {
+            f'peak below {MAX_PEAK / 1e6:.0f} MB': memory['peak'] < MAX_PEAK,
+            f'growth at most {MAX_GROWTH:.0%}': memory['growth'] <= MAX_GROWTH,
+        }
+        return rates, {**memory, 'goals': goals}
 
 
 def _rate_goals(rate: dict[str, Any]) -> dict[str, bool]:
@@ -238,13 +240,6 @@ def _rate_goals(rate: dict[str, Any]) -> dict[str, bool]:
     if rate['asked'] <= PUNCTUAL_RATE:
         goals[f'p99 at most {1e3 * MAX_P99:.0f} ms'] = rate['p99'] <= MAX_P99
     return goals
-
-
-def _memory_goals(memory: dict[str, float]) -> dict[str, bool]:
-    return {
-        f'peak below {MAX_PEAK / 1e6:.0f} MB': memory['peak'] < MAX_PEAK,
-        f'growth at most {MAX_GROWTH:.0%}': memory['growth'] <= MAX_GROWTH,
-    }
 
 
 def _text(document: dict[str, Any], missed: Sequence[str]) -> str:

@@ -85,10 +85,7 @@ class Convention:
 
 
 GROUNDGRID = Convention(
-    'groundgrid',
-    'GroundGrid',
-    'vegetation left out',
-    (UNLABELLED, OUTLIER, VEGETATION),
+    'groundgrid', 'GroundGrid', 'vegetation left out', (UNLABELLED, OUTLIER, VEGETATION)
 )
 """Steinke et al., "GroundGrid: LiDAR Point Cloud Ground Segmentation and Terrain Estimation",
 RA-L 2024. Our headline."""

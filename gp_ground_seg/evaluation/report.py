@@ -146,10 +146,9 @@ def write_json(document: Any, path: str | Path) -> None:
 
 
 def describe_environment(*packages: str) -> dict[str, Any]:
-    """Describe machine and software of a run.
+    """Describe machine and software of a run, with the versions of further `packages`.
 
-    `packages` are further ones whose version matters; None = not installed. The commit is that
-    of the source, with ``-dirty`` if it was changed since; None outside git.
+    None stands for a package that is not installed, and for the commit outside git.
     """
     versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
     for package in ('numpy', 'scipy', 'numba', *packages):

@@ -11,12 +11,7 @@ from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import report
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, load_kitti, pool
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
-from gp_ground_seg.experiments.variants import (
-    Changes,
-    make_report,
-    refuse_changed,
-    score_variants,
-)
+from gp_ground_seg.experiments.variants import Changes, make_report, refuse_changed, score_variants
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
 
@@ -124,10 +119,7 @@ def compare_departures(
     config: Config,
     progress: Progress = iter,
 ) -> Report:
-    """Switch one departure after the other, on the same frames in the same run.
-
-    Raises ConfigError if two titles are alike, a switch is not accepted or changes nothing.
-    """
+    """Switch one departure after the other, on the same frames in the same run."""
     variants = {AS_GIVEN: config}
     for one in departures:
         if one.title in variants:
@@ -178,16 +170,13 @@ def _worst_and_rmse(score: MethodScore) -> Row:
 
 
 def _counted(score: MethodScore) -> str:
-    (convention, *_) = score.scans[0].confusions
-    rule = 'by exact labels' if convention == 'exact' else 'in the GroundGrid convention'
+    is_exact = 'exact' in score.scans[0].confusions
+    rule = 'by exact labels' if is_exact else 'in the GroundGrid convention'
     return f'{len(score.scans)} scans of {", ".join(score.sequences)}; IoU {rule}'
 
 
 def coordinate_search(grid: Grid, start: Choice, worth: Callable[[Choice], float]) -> Choice:
-    """Improve one parameter after the other until none can be.
-
-    `grid` has the values to try; `worth` is maximised, of equal choices the earlier one stays.
-    """
+    """Maximise `worth` one parameter after the other; of equal choices the earlier one stays."""
     best, highest = dict(start), worth(start)
     better = True
     while better:
@@ -206,8 +195,7 @@ def cross_validate(
     """Choose values by pooled IoU, once on all sequences and once without each.
 
     Each configuration segments every frame once, however many searches need it. `grid` has the
-    values to try beside those of `base`, where each search starts. Raises ConfigError if a value
-    is not accepted, DataError if there are fewer than two sequences.
+    values to try beside those of `base`, where each search starts.
     """
     sequences = list(dict.fromkeys(frame.sequence for frame in frames))
     if len(sequences) < 2:

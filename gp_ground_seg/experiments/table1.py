@@ -60,8 +60,6 @@ def table1(
     """Measure the table on the chosen segments, at least one choice.
 
     Each method runs on each frame once without counting, then `n_repeats` times, alternately.
-    Raises ConfigError if ``length_scale.model`` is not the default, nothing is learned or a
-    segment is out of range; DataError if a frame is missing or unlabelled.
     """
     refuse_changed(config, ['length_scale.model'])
     if config.learning.mode == 'fixed':

@@ -199,12 +199,9 @@ def _label_panel(label: Labels) -> tuple[str, list[Layer]]:
     """Return title and layers of the given labels."""
     shown = (Label.GROUND, Label.OBSTACLE, Label.UNKNOWN)
     layers = [Layer(value.name.lower(), 1.0, label == value) for value in shown]
-    counts = [
-        f'{_thousands(int(layer.chosen.sum()))} {layer.name}'
-        for layer in layers
-        if layer.name != 'unknown' or layer.chosen.any()
-    ]
-    return f'{_thousands(len(label))} points: {", ".join(counts)}', layers
+    named = [layer for layer in layers if layer.name != 'unknown' or layer.chosen.any()]
+    counts = ', '.join(f'{_thousands(int(one.chosen.sum()))} {one.name}' for one in named)
+    return f'{_thousands(len(label))} points: {counts}', layers
 
 
 def _error_panel(label: Labels, truth: Labels) -> tuple[str, list[Layer]]:
