@@ -141,7 +141,7 @@ def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
 
 
 def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[BenchFrame]:
-    """Read about `n_frames` frames of DATA into memory, or raise DataError if there is no point."""
+    """Read about `n_frames` frames of DATA; DataError if there is no point in any."""
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
     if is_bag(source):
