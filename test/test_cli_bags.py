@@ -252,30 +252,17 @@ def test_best_effort_subscriber(tmp_path, capsys):
     assert '/points has a best-effort subscriber' in capsys.readouterr().err
 
 
-class Program:
-    """The command in a process of its own, `lines` of its output as they come."""
-
-    def __init__(self, *words, code=('-m', 'gp_ground_seg', 'play')):
-        self.popen = subprocess.Popen(
-            [sys.executable, *code, *map(str, words)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **ISOLATION},
-        )
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_error):
-        self.popen.kill()
-        self.popen.communicate()
-
-    def end(self, number):
-        """Send a signal; return exit code, output, errors."""
-        self.popen.send_signal(number)
-        output, errors = self.popen.communicate(timeout=PATIENCE)
-        return self.popen.returncode, output, errors
+@contextlib.contextmanager
+def program(*words, code=('-m', 'gp_ground_seg', 'play')):
+    """The command in a process of its own."""
+    with subprocess.Popen(
+        [sys.executable, *code, *map(str, words)], env={**os.environ, **ISOLATION}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
@@ -284,12 +271,13 @@ def test_loop_until_interrupted(tmp_path, number):
     write_ros2_bag(bag, 3)
     with (
         listening('/points') as listener,
-        Program(bag, '--loop', '--rate', 2, '--clock') as program,
+        program(bag, '--loop', '--rate', 2, '--clock') as process,
     ):
         wait_for(lambda: len(listener.clouds['/points']) >= 7, 'third round')
-        code, output, errors = program.end(number)
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=PATIENCE)
         wait_for(lambda: listener.subscriptions[0].get_publisher_count() == 0, 'farewell')
-    assert code == 130
+    assert process.returncode == 130
     assert errors.splitlines()[-1] == 'gp-ground-seg: interrupted'
     assert 'Traceback' not in errors
     numbers = SUMMARY.fullmatch(output).groups()
@@ -342,27 +330,23 @@ def test_subscriber_that_is_killed(tmp_path, capsys, monkeypatch):
     bag = tmp_path / 'drive.mcap'
     n_clouds = playback.DEPTH + 50
     write_ros2_bag(bag, n_clouds)
-    with Program(code=('-c', SUBSCRIBER)) as subscriber, isolated_context():
+    with program(code=('-c', SUBSCRIBER)) as subscriber, isolated_context():
         assert play(bag, '--quiet', '--rate', 10, '--wait', PATIENCE) == 1
-        assert subscriber.popen.wait(PATIENCE) == -signal.SIGKILL
+        assert subscriber.wait(PATIENCE) == -signal.SIGKILL
     n_sent, *_, n_undelivered = summary(capsys)
     assert n_sent == n_clouds
     # More than still wait in the queue: those that were pushed out of it count as well.
     assert playback.DEPTH < n_undelivered <= n_clouds
 
 
-def test_without_ros(tmp_path):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 1)
-    code = (
-        'import sys; sys.modules["rclpy"] = None; from gp_ground_seg.cli.main import main; '
-        'sys.exit(main(sys.argv[1:]))'
-    )
-    result = subprocess.run(
-        [sys.executable, '-c', code, 'play', str(bag)], capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 2
-    (line,) = result.stderr.splitlines()
+def test_without_ros(tmp_path, capsys, monkeypatch):
+    write_ros2_bag(tmp_path / 'drive.mcap', 1)
+    for name in [name for name in sys.modules if name.startswith('gp_ground_seg.ros.playback')]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr('gp_ground_seg.ros.playback')
+    monkeypatch.setitem(sys.modules, 'rclpy.duration', None)
+    assert play(tmp_path / 'drive.mcap') == 2
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('gp-ground-seg: error: play needs ROS 2, which cannot be imported')
     assert "pip install 'gp_ground_seg[ros]'" in line
 
@@ -370,20 +354,14 @@ def test_without_ros(tmp_path):
 @pytest.mark.parametrize(
     'words',
     [
-        ('--rate', '0'),
-        ('--rate', '-1'),
-        ('--rate', 'nan'),
-        ('--start', '-1'),
-        ('--duration', 'inf'),
-        ('--wait', 'soon'),
-        ('--wait', '1', '--no-wait'),
-        ('--all', '--topic', '/points'),
+        '--rate 0', '--rate -1', '--rate nan', '--start -1', '--duration inf', '--wait soon',
+        '--wait 1 --no-wait', '--all --topic /points',
     ],
-)
+)  # fmt: skip
 def test_refused_options(words, tmp_path, capsys):
     with pytest.raises(SystemExit, match='2'):
-        play(tmp_path / 'drive.mcap', *words)
-    assert words[0] in capsys.readouterr().err
+        play(tmp_path / 'drive.mcap', *words.split())
+    assert words.split()[0] in capsys.readouterr().err
 
 
 def test_no_bag(tmp_path, capsys):
