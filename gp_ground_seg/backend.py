@@ -26,7 +26,7 @@ from gp_ground_seg.gp import ground, likelihood
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config, RuntimeConfig
 from gp_ground_seg.pipeline import ground_plane, labels, lines, polar_grid, vertical_faces
-from gp_ground_seg.pipeline.points import in_columns
+from gp_ground_seg.pipeline.points import copy_points, points_in
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 _warned_slow = False
@@ -91,7 +91,8 @@ class NumpyBackend:
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:
         """Sort points into cells and tiles; lowest point of each cell."""
         columns = np.empty((3, len(xyz)), dtype=xyz.dtype)
-        return polar_grid.build_scan(in_columns(xyz, columns), config)
+        copy_points(xyz, columns)
+        return polar_grid.build_scan(points_in(columns), config)
 
     def fit_plane(
         self, candidates: Candidates, max_slope: float

@@ -17,7 +17,7 @@ from gp_ground_seg.compiled import (
 )
 from gp_ground_seg.compiled import vertical_faces as faces_
 from gp_ground_seg.compiled.buffers import Buffers
-from gp_ground_seg.compiled.threads import Workers, equal_parts, parts_of_segments
+from gp_ground_seg.compiled.threads import Part, Workers, run_of
 from gp_ground_seg.frame import (
     BoolArray,
     Candidates,
@@ -38,7 +38,7 @@ from gp_ground_seg.gp.latent import given_log_length_scales
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.pipeline.points import in_columns
+from gp_ground_seg.pipeline.points import copy_points, points_in
 
 
 class NumbaBackend:
@@ -78,7 +78,6 @@ class NumbaBackend:
         n_segments, n_cells = config.grid.n_segments, config.grid.n_segments * config.grid.n_bins
         n_tiles = geometry.n_sides**2
         columns = take('columns', (3, n_points), dtype)
-        xyz = in_columns(xyz, columns)
         cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points, dtype=dtype)
         tile = take('tile', (n_points,), np.int32)
         cells = polar_grid.CellTable(
@@ -87,8 +86,13 @@ class NumbaBackend:
         )
         tiles = self._buffers.tile_table(self._workers.n_threads, n_tiles, dtype)
         places = polar_grid.Places(cell, r, tile)
-        parts = equal_parts(n_points, n_parts)
-        self._workers.run(polar_grid.sort_points, parts, columns, geometry, places, cells, tiles)
+
+        def copy_and_sort(part: Part) -> None:
+            own = run_of(part, n_points)
+            copy_points(xyz[own], columns[:, own])
+            polar_grid.sort_points(part, columns, geometry, places, cells, tiles)
+
+        self._workers.run(copy_and_sort, n_parts)
         room = Candidates(
             r=np.empty(n_cells),
             z=np.empty(n_cells),
@@ -105,7 +109,7 @@ class NumbaBackend:
         )
         occupied = tiles.occupied[0, 1 : 1 + tiles.occupied[0, 0]]
         return Scan(
-            xyz,
+            points_in(columns),
             PolarGrid(cell, r, geometry.edges, n_segments),
             Tiles(tile, tiles.extremes[0, :-1], occupied),
             candidates,
@@ -126,7 +130,7 @@ class NumbaBackend:
         n_tall = faces_.select_tall(scan.tiles, params, room)
         self._workers.run(
             faces_.sum_returns,
-            equal_parts(len(scan.xyz), n_parts),
+            n_parts,
             scan.xyz.T,
             scan.tiles,
             params,
@@ -155,7 +159,7 @@ class NumbaBackend:
         values, gradients = np.empty(n_segments), np.empty((n_segments, len(theta)))
         self._workers.run(
             likelihood.log_likelihood,
-            parts_of_segments(inliers.offsets, self._workers.n_threads),
+            self._workers.n_threads,
             theta,
             inliers,
             slope_std,
@@ -174,10 +178,9 @@ class NumbaBackend:
         """Inliers, the surface, and log length-scales at the knots."""
         take, params = self._buffers.take, ground.GroundParams.of(config, segment_step)
         shape, n_candidates = (len(theta), len(frame.knots)), len(frame.candidates.r)
-        parts = parts_of_segments(frame.candidates.offsets, self._workers.n_threads)
-        if config.length_scale.model == 'latent':
+        is_latent = config.length_scale.model == 'latent'
+        if is_latent:
             u, knot_u = take('u', (n_candidates,), np.float64), np.empty(shape)
-            self._workers.run(latent.latent_log_length_scales, parts, frame, theta, u, knot_u)
         else:
             u, knot_u = given_log_length_scales(frame, config.length_scale)
         own = ground.SegmentSurfaces(
@@ -188,7 +191,13 @@ class NumbaBackend:
             std=take('std', shape, np.float64),
             n_knots=take('n_knots', shape[:1], np.int64),
         )
-        self._workers.run(ground.grow_surfaces, parts, frame, theta, params, own)
+
+        def grow_surfaces(part: Part) -> None:
+            if is_latent:
+                latent.latent_log_length_scales(part, frame, theta, u, knot_u)
+            ground.grow_surfaces(part, frame, theta, params, own)
+
+        self._workers.run(grow_surfaces, self.n_threads)
         mean, std = np.empty((2, *shape))
         ground.fuse_neighbours(own, frame.knots, params, frame.prior_mean, mean, std)
         return GroundSurface(frame.knots, mean, std, own.inlier), knot_u
@@ -211,11 +220,10 @@ class NumbaBackend:
             np.empty(n_points),
             np.empty((scan.grid.n_segments, n_bins)),
         )
-        parts = equal_parts(n_points, n_parts)
         labels.fit_pieces(surface, room)
-        self._workers.run(labels.survey, parts, scan, faces.is_face, params, result.height, room)
+        self._workers.run(labels.survey, n_parts, scan, faces.is_face, params, result.height, room)
         labels.set_bands(n_parts, params, room, result.roughness)
-        self._workers.run(labels.label_part, parts, scan, faces, params, room.band, result)
+        self._workers.run(labels.label_part, n_parts, scan, faces, params, room.band, result)
         keep_code()
         return result
 

@@ -84,7 +84,7 @@ def grow_surfaces(
     offsets, r = candidates.offsets, candidates.r
     inlier, mean, std = own.inlier, own.mean, own.std
     most = 0
-    for m in range(part.first, part.stop):
+    for m in range(part.number, len(mean), part.n_parts):
         most = max(most, offsets[m + 1] - offsets[m])
     room = (most + len(knots) + LANES - 1) & -LANES
     columns, whitened = np.empty((6, room)), np.empty((most, room))
@@ -93,7 +93,7 @@ def grow_surfaces(
     predicted, variance, observed = columns[3], columns[4], columns[5]
     new = np.empty(most, np.int64)
     slope = params.slope_std**2
-    for m in range(part.first, part.stop):
+    for m in range(part.number, len(mean), part.n_parts):
         first = offsets[m]
         n = offsets[m + 1] - first
         for j in range(len(knots)):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.compiled.threads import Part
+from gp_ground_seg.compiled.threads import Part, points_of
 from gp_ground_seg.frame import (
     NOT_FINITE,
     BoolArray,
@@ -104,26 +104,25 @@ def survey(
     room: LabelRoom,
 ) -> None:
     """Heights of the points of a part over the surface, and the sums for roughness."""
-    # Slices, because indices from 0 on need no check for negative ones.
-    points = slice(part.first, part.stop)
-    z, tile = scan.xyz.T[2, points], scan.tiles.tile[points]
-    cell, r = scan.grid.cell[points], scan.grid.r[points]
-    own_height = height[points]
     pieces, sums, nearest = room.pieces, room.sums[part.number], scan.grid.edges[0]
     min_height, max_height = params.obstacle_min_height, params.obstacle_max_height
     for k in range(len(sums)):
         sums[k, 0] = sums[k, 1] = 0
+    # Slices, because indices from 0 on need no check for negative ones.
+    own = points_of(part, len(height))
+    z, tile, heights = scan.xyz.T[2, own], scan.tiles.tile[own], height[own]
+    cell, r = scan.grid.cell[own], scan.grid.r[own]
     for i in range(len(cell)):
-        own = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
+        c = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
         away = max(np.float64(r[i]), nearest)
-        h = np.float64(z[i]) - (pieces[own, 0] + pieces[own, 1] * away)
-        own_height[i] = h
+        h = np.float64(z[i]) - (pieces[c, 0] + pieces[c, 1] * away)
+        heights[i] = h
         if h >= min_height:
             if h <= max_height:
-                sums[own, 0] += OBSTACLE_FLAG
+                sums[c, 0] += OBSTACLE_FLAG
         elif h >= -min_height and not is_face[np.uintp(tile[i])]:
-            sums[own, 0] += 1
-            sums[own, 1] += int(h * h * SQUARE_UNITS + 0.5)
+            sums[c, 0] += 1
+            sums[c, 1] += int(h * h * SQUARE_UNITS + 0.5)
 
 
 @jit(entry=True)
@@ -164,7 +163,7 @@ def label_part(
     part: Part, scan: Scan, faces: Faces, params: LabelParams, band: FloatArray, result: Labelled
 ) -> None:
     """Label the points of a part from their heights in `result`."""
-    points = slice(part.first, part.stop)
+    points = points_of(part, len(result.height))
     z, tile, cell = scan.xyz.T[2, points], scan.tiles.tile[points], scan.grid.cell[points]
     height, label, margins = result.height[points], result.label[points], result.margin[points]
     for i in range(len(cell)):

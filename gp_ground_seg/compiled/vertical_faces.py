@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.compiled.threads import Part
+from gp_ground_seg.compiled.threads import Part, points_of
 from gp_ground_seg.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Tiles
 from gp_ground_seg.jit import jit
 from gp_ground_seg.parameters.config import Config
@@ -101,7 +101,7 @@ def sum_returns(
     sums = room.sums[part.number]
     _clear_sums(tiles.extremes, params.cell_size, n_tall, room.row_to_tile, sums)
     # Slices, because indices from 0 on need no check for negative ones.
-    own = slice(part.first, part.stop)
+    own = points_of(part, len(tiles.tile))
     x, y, z, tile = columns[0, own], columns[1, own], columns[2, own], tiles.tile[own]
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
