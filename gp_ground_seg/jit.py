@@ -34,7 +34,7 @@ JIT_ENABLED = HAVE_NUMBA and os.environ.get('NUMBA_DISABLE_JIT', '0') in ('', '0
 _LOGGER = logging.getLogger('gp_ground_seg')
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 _PACKAGE = Path(__file__).parent
-_SOURCES = ('jit.py', 'frame.py', 'pipeline', 'gp', 'compiled')
+_SOURCES = ('jit.py', 'frame.py', 'parameters', 'pipeline', 'gp', 'compiled')
 _entry_points: list[Any] = []
 _folder: Path | None = None
 _is_warm = False

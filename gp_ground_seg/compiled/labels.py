@@ -24,41 +24,13 @@ from gp_ground_seg.frame import (
     Scan,
 )
 from gp_ground_seg.jit import jit
-from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.config import LabelConfig
 from gp_ground_seg.pipeline.labels import SQUARE_UNITS
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
 OBSTACLE_FLAG = 2**32
 """Added to the number of points for each that shows an obstacle: more than there are points."""
-
-
-class LabelParams(NamedTuple):
-    """Tolerances, see `gp_ground_seg.parameters.config`."""
-
-    ground_tolerance: float
-    roughness_gain: float
-    obstacle_tolerance: float
-    obstacle_roughness_gain: float
-    obstacle_min_height: float
-    obstacle_max_height: float
-    below_tolerance: float
-    face_tolerance: float
-
-    @classmethod
-    def of(cls, config: Config) -> LabelParams:
-        """Take the values out of a configuration."""
-        label = config.label
-        return cls(
-            ground_tolerance=label.ground_tolerance,
-            roughness_gain=label.roughness_gain,
-            obstacle_tolerance=label.obstacle_tolerance,
-            obstacle_roughness_gain=label.obstacle_roughness_gain,
-            obstacle_min_height=label.obstacle_min_height,
-            obstacle_max_height=label.obstacle_max_height,
-            below_tolerance=label.below_tolerance,
-            face_tolerance=config.faces.tolerance,
-        )
 
 
 class LabelRoom(NamedTuple):
@@ -99,13 +71,13 @@ def survey(
     part: Part,
     scan: Scan,
     is_face: BoolArray,
-    params: LabelParams,
+    config: LabelConfig,
     height: FloatArray,
     room: LabelRoom,
 ) -> None:
     """Heights of the points of a part over the surface, and the sums for roughness."""
     pieces, sums, nearest = room.pieces, room.sums[part.number], scan.grid.edges[0]
-    min_height, max_height = params.obstacle_min_height, params.obstacle_max_height
+    min_height, max_height = config.obstacle_min_height, config.obstacle_max_height
     for k in range(len(sums)):
         sums[k, 0] = sums[k, 1] = 0
     # Slices, because indices from 0 on need no check for negative ones.
@@ -126,7 +98,7 @@ def survey(
 
 
 @jit(entry=True)
-def set_bands(n_parts: int, params: LabelParams, room: LabelRoom, roughness: FloatArray) -> None:
+def set_bands(n_parts: int, config: LabelConfig, room: LabelRoom, roughness: FloatArray) -> None:
     """Roughness and band of each cell from the sums of all parts."""
     n_segments, n_bins = roughness.shape
     # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
@@ -150,17 +122,23 @@ def set_bands(n_parts: int, params: LabelParams, room: LabelRoom, roughness: Flo
             count = max(number[n] + number[n + 1] + number[n + 2], 1)
             total = squares[n] + squares[n + 1] + squares[n + 2]
             rough = math.sqrt(np.float64(total) / (SQUARE_UNITS * np.float64(count)))
-            free = params.ground_tolerance + params.roughness_gain * rough
-            beside = params.obstacle_tolerance + params.obstacle_roughness_gain * rough
+            free = config.ground_tolerance + config.roughness_gain * rough
+            beside = config.obstacle_tolerance + config.obstacle_roughness_gain * rough
             own = min(free, beside) if n_obstacles[n] > 0 else free
-            room.band[m * n_bins + n] = min(own, params.obstacle_min_height)
+            room.band[m * n_bins + n] = min(own, config.obstacle_min_height)
             roughness[m, n] = rough
     room.band[n_segments * n_bins] = math.nan
 
 
 @jit(entry=True)
 def label_part(
-    part: Part, scan: Scan, faces: Faces, params: LabelParams, band: FloatArray, result: Labelled
+    part: Part,
+    scan: Scan,
+    faces: Faces,
+    config: LabelConfig,
+    face_tolerance: float,
+    band: FloatArray,
+    result: Labelled,
 ) -> None:
     """Label the points of a part from their heights in `result`."""
     points = points_of(part, len(result.height))
@@ -169,12 +147,12 @@ def label_part(
     for i in range(len(cell)):
         n, h = cell[i], height[i]
         margin = min(
-            band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + params.below_tolerance
+            band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + config.below_tolerance
         )
         t = np.uintp(tile[i] if n >= 0 else 0)
         if faces.is_face[t]:
             over_base = max(h, np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0]))
-            limit = params.face_tolerance
+            limit = face_tolerance
             if faces.has_occluded_base[t]:
                 limit = -limit
             margin = min(margin, limit - over_base)
