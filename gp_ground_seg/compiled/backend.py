@@ -39,6 +39,7 @@ from gp_ground_seg.gp.latent import given_log_length_scales
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.pipeline.labels import square_units
 from gp_ground_seg.pipeline.points import copy_points, points_in
 
 
@@ -218,6 +219,7 @@ class NumbaBackend:
             take('pieces', (n_cells + 1, 2), np.float64),
             take('square_sums', (n_parts, n_cells + 1, 2), np.int64),
             take('band', (n_cells + 1,), np.float64),
+            square_units(n_points, config.label.obstacle_min_height),
         )
         result = Labelled(
             np.empty(n_points, dtype=np.uint8),
