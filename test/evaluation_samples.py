@@ -1,23 +1,11 @@
-"""Small SemanticKITTI folders, and where the real frames are."""
+"""Small SemanticKITTI folders, and a method whose scores are known by hand."""
 
-import os
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from gp_ground_seg.evaluation.evaluate import MethodResult
 from gp_ground_seg.frame import Label
-
-REPOSITORY = Path(__file__).resolve().parents[1]
-
-
-def real_kitti() -> Path:
-    """Root of the real frames; the test is skipped on machines without them."""
-    root = Path(os.environ.get('GP_GROUND_SEG_KITTI', REPOSITORY.parent / 'shared' / 'kitti'))
-    if not (root / 'sequences').is_dir():
-        pytest.skip('no KITTI frames: set GP_GROUND_SEG_KITTI')
-    return root
 
 
 def street(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -230,7 +230,6 @@ def write_sequences(root):
 def test_frames_come_from_whatever_holds_scans(name, write, expected, tmp_path):
     write(tmp_path / name)
     frames = load_frames(tmp_path / name, 60)
-    assert len(frames) == len(expected)
     for frame, k in zip(frames, expected, strict=True):
         assert frame.points.dtype == np.float32
         np.testing.assert_array_equal(frame.points[:, :3], scan(k)[:, :3])
@@ -242,9 +241,8 @@ def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
         scan(k, n_ground=20, n_wall=5).tofile(tmp_path / f'{k:06d}.bin')
     frames = load_frames(tmp_path, 20)
     assert [int(frame.index) for frame in frames] == [*range(10, 20), *range(30, 40)]
-    assert [frame.sequence for frame in frames] == 10 * [f'{tmp_path.name}:10'] + 10 * [
-        f'{tmp_path.name}:30'
-    ]
+    names = [f'{tmp_path.name}:{start}' for start in (10, 30)]
+    assert [frame.sequence for frame in frames] == 10 * names[:1] + 10 * names[1:]
 
 
 @pytest.mark.parametrize(

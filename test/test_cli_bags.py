@@ -72,6 +72,11 @@ def listening(*topics, qos=RELIABLE):
             yield listener
 
 
+def drive(folder, n_clouds, **options):
+    write_ros2_bag(folder / 'drive.mcap', n_clouds, **options)
+    return folder / 'drive.mcap'
+
+
 def play(*words):
     return main(['play', *(str(word) for word in words)])
 
@@ -89,8 +94,7 @@ def recorded(bag, topic):
 
 
 def test_every_byte_at_the_recorded_times(tmp_path, capsys, monkeypatch):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 8)
+    bag = drive(tmp_path, 8)
     told = []
     tell = playback.Player._publish_time
     monkeypatch.setattr(
@@ -128,8 +132,7 @@ def test_every_byte_at_the_recorded_times(tmp_path, capsys, monkeypatch):
 
 
 def test_part_of_a_bag(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 10)
+    bag = drive(tmp_path, 10)
     with listening('/points') as listener:
         assert play(bag, '--start', 0.25, '--duration', 0.3, '--rate', 5, '--quiet') == 0
         wait_for(lambda: len(listener.clouds['/points']) == 3, 'last cloud')
@@ -145,8 +148,7 @@ def test_part_of_a_bag(tmp_path, capsys):
 
 
 def test_which_topics(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 2, topics=('/front', '/rear'))
+    bag = drive(tmp_path, 2, topics=('/front', '/rear'))
     with listening('/front', '/rear') as listener:
         assert play(bag, '--quiet') == 2
         assert 'choose one with --topic: /front, /rear' in capsys.readouterr().err
@@ -179,8 +181,7 @@ def test_bag_of_ros_1_on_another_topic(tmp_path, capsys):
 
 
 def test_nobody_listens(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 3)
+    bag = drive(tmp_path, 3)
     with isolated_context():
         assert play(bag, '--wait', 0.2, '--quiet') == 2
         assert capsys.readouterr().err == (
@@ -193,8 +194,7 @@ def test_nobody_listens(tmp_path, capsys):
 
 
 def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 2)
+    bag = drive(tmp_path, 2)
     is_said = threading.Event()
 
     tell = options.note
@@ -223,8 +223,7 @@ def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
 
 
 def test_subscriber_that_leaves(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 20)
+    bag = drive(tmp_path, 20)
     with listening('/points') as listener:
 
         def leave():
@@ -244,8 +243,7 @@ def test_subscriber_that_leaves(tmp_path, capsys):
 
 
 def test_best_effort_subscriber(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 2)
+    bag = drive(tmp_path, 2)
     with listening('/points', qos=BEST_EFFORT) as listener:
         assert play(bag) == 0
         wait_for(lambda: len(listener.clouds['/points']) == 2, 'last cloud')
@@ -267,8 +265,7 @@ def program(*words, code=('-m', 'gp_ground_seg', 'play')):
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_loop_until_interrupted(tmp_path, number):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 3)
+    bag = drive(tmp_path, 3)
     with (
         listening('/points') as listener,
         program(bag, '--loop', '--rate', 2, '--clock') as process,

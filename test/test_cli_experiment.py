@@ -193,7 +193,9 @@ def test_commands_of_the_docs_are_accepted():
     names = set()
     for page in ('experiments', 'accuracy', 'algorithm', 'pose'):
         text = (REPOSITORY / 'docs' / f'{page}.md').read_text(encoding='utf-8')
-        for words in re.findall(r'`gp-ground-seg ((?:experiment|evaluate) [^`]*?)`', text):
+        for words in re.findall(
+            r'`gp-ground-seg ((?:experiment|evaluate|plot|pose) [^`]*?)`', text
+        ):
             arguments = build_parser(words.split()[0]).parse_args(shlex.split(words))
             if 'experiment' not in vars(arguments):
                 continue

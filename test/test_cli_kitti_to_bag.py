@@ -94,7 +94,7 @@ def test_scans_without_labels_have_no_label_field(convert, tmp_path, capsys):
         assert cloud.data.reshape(1801, -1)[:, :16].tobytes() == samples.scan(k).tobytes()
 
 
-def test_start_and_count_and_ten_hertz_without_times(convert, tmp_path):
+def test_start_and_count_then_all_by_force_at_ten_hertz(convert, tmp_path, capsys):
     folder = write_sequence(tmp_path)
     words = ['--start', '2', '--count', '2']
     assert convert(tmp_path, '--sequence', '04', tmp_path / 'out', *words) == 0
@@ -103,6 +103,10 @@ def test_start_and_count_and_ten_hertz_without_times(convert, tmp_path):
     assert [time - EPOCH * 10**9 for time, _ in clouds] == [207_200_000, 311_000_000]
     assert clouds[0][1].data.reshape(-1, 20)[:, :16].tobytes() == samples.scan(2).tobytes()
     (folder / 'times.txt').unlink()
+    capsys.readouterr()
+    assert convert(tmp_path, '--sequence', '04', tmp_path / 'out') == 2
+    assert 'out: exists already; --force replaces it' in cli_runner.error_line(capsys)
+    assert len(read_clouds(tmp_path / 'out')) == 2
     assert convert(tmp_path, '--sequence', '04', tmp_path / 'out', '--force') == 0
     recorded = [time - EPOCH * 10**9 for time, _ in read_clouds(tmp_path / 'out')]
     assert recorded == [0, 100_000_000, 200_000_000, 300_000_000, 400_000_000]
@@ -145,18 +149,6 @@ def test_damaged_file_leaves_nothing(convert, tmp_path, capsys, file, content, m
     assert convert(tmp_path / 'kitti', '--sequence', '04', tmp_path / 'out') == 2
     assert re.search(message, cli_runner.error_line(capsys))
     assert [path.name for path in tmp_path.iterdir()] == ['kitti']
-
-
-def test_force(convert, tmp_path, capsys):
-    write_sequence(tmp_path)
-    words = ['--sequence', '04', tmp_path / 'out']
-    assert convert(tmp_path, *words) == 0
-    capsys.readouterr()
-    assert convert(tmp_path, *words) == 2
-    assert 'out: exists already; --force replaces it' in cli_runner.error_line(capsys)
-    assert len(read_clouds(tmp_path / 'out')) == 5
-    assert convert(tmp_path, *words, '--count', '1', '--force') == 0
-    assert len(read_clouds(tmp_path / 'out')) == 1
 
 
 def test_real_frames(convert, kitti, tmp_path):

@@ -25,18 +25,15 @@ SUMMARY = re.compile(
 )
 
 
-@pytest.fixture(scope='module', autouse=True)
-def _compiled():
-    """Compile, or the first command would say that it does."""
-    GroundSegmenter().segment(samples.scan())
-
-
 segment = functools.partial(run, 'segment')
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture(scope='module', autouse=True)
 def segmenter():
-    return GroundSegmenter(Config())
+    """Compiled, or the first command would say that it does."""
+    found = GroundSegmenter(Config())
+    found.segment(samples.scan())
+    return found
 
 
 def write_bag(path, **changes):
@@ -59,9 +56,6 @@ def read_messages(path):
 
 def hidden(folder):
     return [path.name for path in folder.iterdir() if '.partial-' in path.name]
-
-
-# --- bags ---------------------------------------------------------------------------------
 
 
 def assert_splits(source, result, topic, segmenter, ground='/ground', obstacles='/obstacles'):
@@ -315,9 +309,6 @@ def test_a_truncated_scan_late_in_a_folder_leaves_nothing(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ['velodyne']
 
 
-# --- progress -----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(('words', 'shown'), [([], True), (['--quiet'], False)])
 def test_progress_bar_on_a_terminal(tmp_path, monkeypatch, words, shown):
     write_scans(tmp_path / 'velodyne')
@@ -378,7 +369,8 @@ def test_a_killed_run_leaves_nothing_under_the_final_name(
 @pytest.mark.parametrize(('how', 'code'), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
 def test_a_stopped_run_with_force_leaves_the_old_bag(tmp_path, long_inputs, how, code):
     before = samples.write_ros2_bag(tmp_path / 'out')
-    found, said = stop_in_the_middle(tmp_path, long_inputs / 'long.mcap', 'out', how, '--force')
+    source = long_inputs / 'long.mcap'
+    found, said = stop_in_the_middle(tmp_path, source, 'out', how, '--force')
     assert found == code
     assert how == signal.SIGKILL or said == ['gp-ground-seg: interrupted']
     assert read_messages(tmp_path / 'out') == before

@@ -96,13 +96,8 @@ def test_line_ends_by_hand(slope, ends):
 
 def test_everything_is_drawn(draw, scan, tmp_path, capsys):
     upper, lower = draw('--labels', scan.with_suffix('.label'))
-    for colour in (
-        TRUE_GROUND_COLOUR,
-        colours.TRUTH_COLOURS['true obstacle'][1],
-        colours.POINT_COLOUR,
-        colours.INLIER_COLOUR,
-        colours.SURFACE_COLOUR,
-    ):
+    truths = [colour for _, colour in colours.TRUTH_COLOURS.values()]
+    for colour in (*truths, colours.INLIER_COLOUR, colours.SURFACE_COLOUR):
         assert count(upper, colour) > 10, colour
     assert count(lower, colours.PSEUDO_INPUT_COLOUR) > 30
     assert count(lower, colours.SURFACE_COLOUR) > 300

@@ -87,16 +87,12 @@ def test_json_files_have_null_for_what_is_undefined(tmp_path):
     assert json.loads((tmp_path / 'a.json').read_text()) == {'a': [None, {'b': [1.0, None]}]}
 
 
-def test_parameters_are_recorded():
+def test_parameters_and_environment_are_recorded():
     changes = {'label.ground_tolerance': 0.123, 'runtime.backend': 'numpy'}
-    config = Config().replace(**changes)
     assert changed_parameters(Config()) == {}
-    assert changed_parameters(config) == changes
+    assert changed_parameters(Config().replace(**changes)) == changes
     assert parameters_line({}) == 'parameters: defaults'
     assert 'runtime.backend=numpy' in parameters_line(changes)
-
-
-def test_environment():
     environment = describe_environment('no-such-package')
     assert environment['versions']['gp_ground_seg'] == __version__
     assert environment['versions']['no-such-package'] is None

@@ -108,7 +108,7 @@ def test_frames_without_labels(tmp_path, capsys):
     root = write_streets(tmp_path, s00=1)
     (root / 'sequences/00/labels/000000.label').unlink()
     assert run('experiment', 'table1', root, '--repeats', 1, '--frames', '00/000000:3') == 2
-    assert 'has no labels' in capsys.readouterr().err
+    assert 'has no labels' in error_line(capsys)
 
 
 def test_default_segments_of_real_frames(kitti):
