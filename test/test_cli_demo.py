@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -130,13 +131,10 @@ def test_every_fault_is_found():
 # --- counts over a drive
 
 
-def trips(*latencies, period=0.1):
-    """Trips of scans, None = lost."""
-    sent = [1000 + round(1e9 * period * k) for k in range(len(latencies))]
-    return [
-        Trip(t, None if latency is None else t + round(1e9 * latency))
-        for t, latency in zip(sent, latencies, strict=True)
-    ]
+def trips(*latencies):
+    """Trips of scans sent every 0.1 s, None = lost."""
+    sent = [(1000 + k * 10**8, latency) for k, latency in enumerate(latencies)]
+    return [Trip(t, None if late is None else t + round(1e9 * late)) for t, late in sent]
 
 
 def test_counts_and_words():
@@ -149,15 +147,13 @@ def test_counts_and_words():
     result = rate_result(10.0, trips(0.05, None, None, 0.07, 0.02), 0)
     text, is_good = result_text(tally, result, 0, 'the truth')
     assert not is_good
+    assert '5 sent, 3 back, 2 lost' in text and 'median 50.0 ms' in text
     assert 'each is in exactly one of the two clouds, not a byte changed' in text
-    assert '5 sent, 3 back, 2 lost' in text
-    assert 'median 50.0 ms' in text
     assert text.endswith('FAILED: 2 of 5 scans were lost')
     results = split(clouds[4], perfect())
     results[GROUND] = select_points(results[GROUND], ~chosen(20, 1, 2))
     tally.add(clouds[4], results)
-    assert (tally.n_points, tally.n_faulty) == (117, 1)
-    assert tally.confusion.tp == 20 + 0 + 18
+    assert (tally.n_points, tally.n_faulty, tally.confusion.tp) == (117, 1, 20 + 0 + 18)
     # The middle one was lost: the one before it that came back.
     assert tally.picture[0] == 0
     assert 'FAILED: the two clouds are not the scan' in result_text(tally, result, 0, '')[0]
@@ -284,13 +280,13 @@ def test_refused_options(rclpy, tmp_path, capsys):
     [(0.05, 10.0), (0.08, 10.0), (0.095, 6.0), (0.2, 3.0), (0.7, 0.9), (1.0, 0.6), (30.0, 0.02)],
 )
 def test_rate_that_a_machine_can_do(seconds, rate, capsys):
-    class StandInProbe:
-        def one_by_one(self, clouds, silence):
-            stamps = [stamp_of(cloud) for cloud in clouds]
-            assert len(set(stamps)) == demo.N_TRIALS
-            return trips(*[seconds] * len(stamps))
+    def one_by_one(clouds, silence):
+        stamps = {stamp_of(cloud) for cloud in clouds}
+        assert len(stamps) == demo.N_TRIALS
+        return trips(*[seconds] * len(stamps))
 
-    assert demo.sustainable_rate(sent_cloud(), StandInProbe()) == pytest.approx(rate)
+    probe = SimpleNamespace(one_by_one=one_by_one)
+    assert demo.sustainable_rate(sent_cloud(), probe) == pytest.approx(rate)
     assert ('per second' in capsys.readouterr().out) == (rate < 10.0)
 
 

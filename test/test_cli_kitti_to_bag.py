@@ -54,6 +54,8 @@ def read_clouds(path):
     ],
 )
 def test_sequence_as_bag(convert, tmp_path, capsys, name, words, storage):
+    day = datetime.fromtimestamp(EPOCH, timezone.utc).isoformat()
+    assert day == '2011-09-26T00:00:00+00:00'  # as the help says
     write_sequence(tmp_path / 'kitti')
     out = tmp_path / name
     assert convert(tmp_path / 'kitti', '--sequence', '04', out, *words) == 0
@@ -79,10 +81,6 @@ def test_sequence_as_bag(convert, tmp_path, capsys, name, words, storage):
         assert points[:, :16].tobytes() == samples.scan(k).tobytes()
         label = points[:, 16:].copy().view('<u4')[:, 0]
         np.testing.assert_array_equal(label, np.arange(1801) % 260)
-
-
-def test_stamps_are_of_the_day_that_the_help_says():
-    assert datetime.fromtimestamp(EPOCH, timezone.utc).isoformat() == '2011-09-26T00:00:00+00:00'
 
 
 def test_scans_without_labels_have_no_label_field(convert, tmp_path, capsys):

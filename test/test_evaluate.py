@@ -230,21 +230,6 @@ def test_patchworkpp_on_real_frames_scores_as_measured_elsewhere(kitti):
 # The command.
 
 
-def rows_of(output, title=''):
-    """Rows below the rule of a table, split at runs of two blanks, by first cell."""
-    lines = output.splitlines()
-    start = next(k for k, line in enumerate(lines) if line.startswith(title))
-    rule = next(k for k in range(start, len(lines)) if lines[k].startswith('---'))
-    rows = {}
-    for line in lines[rule + 1 :]:
-        if not line:
-            break
-        if not line.startswith('---'):
-            first, *cells = (cell.strip() for cell in line.split('  ') if cell.strip())
-            rows[first] = cells
-    return rows
-
-
 @pytest.fixture(scope='module')
 def root(tmp_path_factory):
     return write_streets(tmp_path_factory.mktemp('kitti'), s00=2, s08=1)
@@ -264,24 +249,26 @@ def test_tables_hold_the_sums_of_the_frames(root, evaluated, capsys):
     run('evaluate', root, '--peer', 'patchworkpp')
     output, errors = capsys.readouterr()
     assert errors == ''  # no progress where standard error is no terminal
-    assert max(len(line) for line in output.splitlines()) <= 100
+    lines = output.splitlines()
+    assert max(map(len, lines)) <= 100
     document = json.loads((evaluated / 'a.json').read_text())
     frames = document['rows']
-    for key, title in (('groundgrid', 'GroundGrid conv'), ('patchwork', 'Patchwork conv')):
-        rows = rows_of(output, title)
-        for name, n_frames in (('00', '2'), ('08', '1'), ('all', '3')):
-            sums = []
-            for method in ('gp_ground_seg', 'patchworkpp'):
-                own = [f for f in frames if f['method'] == method and f['sequence'] == name]
-                own = own or [f for f in frames if f['method'] == method]
-                counts = [sum(f[f'{key}_{n}'] for f in own) for n in ('tp', 'fp', 'fn', 'tn')]
-                sums.append(Confusion(*counts))
-            ours, its = sums
-            cells = [f'{100 * getattr(ours, ratio):.2f}' for ratio in RATIOS]
-            cells += [f'{100 * its.iou:.2f}', f'{100 * (ours.iou - its.iou):+.2f}']
-            assert rows[name] == [n_frames, *cells]
-            (row,) = (row for row in document[key] if row['sequence'] == name)
-            assert row['iou'] == pytest.approx(ours.iou)
+    for key, name in itertools.product(('groundgrid', 'patchwork'), ('00', '08', 'all')):
+        ours, its = (
+            Confusion(*(
+                sum(f[f'{key}_{n}'] for f in frames
+                    if f['method'] == method and name in (f['sequence'], 'all'))
+                for n in ('tp', 'fp', 'fn', 'tn')
+            ))
+            for method in ('gp_ground_seg', 'patchworkpp')
+        )  # fmt: skip
+        (row,) = (row for row in document[key] if row['sequence'] == name)
+        assert row['frames'] == {'00': 2, '08': 1, 'all': 3}[name]
+        assert [row[ratio] for ratio in RATIOS] == [getattr(ours, ratio) for ratio in RATIOS]
+        assert row['patchworkpp_iou'] == its.iou
+        assert row['difference_to_patchworkpp'] == ours.iou - its.iou
+        shown = f'{100 * ours.iou:.2f}  {100 * its.iou:15.2f}  {100 * (ours.iou - its.iou):+10.2f}'
+        assert any(line.startswith(name) and line.endswith(shown) for line in lines)
     headline = f'IoU {100 * document["groundgrid"][-1]["iou"]:.2f} %, Patchwork++ '
     assert output.startswith(headline)
     times = {row['method']: row for row in document['times']}
