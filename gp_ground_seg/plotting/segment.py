@@ -56,11 +56,7 @@ def plot_segment(
     title: str = '',
     max_range: float | None = None,
 ) -> None:
-    """Draw a segment from the side as PNG or PDF, replacing the file `path`.
-
-    Above: points, ground candidates, the lines through them with their critical
-    points, inliers, and the surface with twice its standard deviation. Below:
-    the length-scale and the pseudo-inputs it follows.
+    """Draw a segment from the side; below it the length-scale and its pseudo-inputs.
 
     `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
     labels, UNKNOWN where a point does not count; `max_range` [m] is by default a little more than
@@ -78,15 +74,19 @@ def plot_segment(
     from matplotlib.ticker import LogLocator, NullFormatter
 
     own = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
+    r, z = result.grid.r[own], z[own]
     view = SegmentView(result, segment)
-    reach = view.reach(result.grid.r[own]) if max_range is None else max_range
+    reach = view.reach(r) if max_range is None else max_range
+    low, high = view.heights_shown(reach, z)
+    n_hidden = np.count_nonzero((r > reach) | (z < low) | (z > high))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
     figure.subplots_adjust(0.065, 0.075, 1.0 - LEGEND / WIDTH, 0.93, hspace=0.08)
-    above.set_title(view.title(title), fontsize=12, loc='left', parse_math=False)
-    view.draw_points(above, result.grid.r[own], z[own], None if truth is None else truth[own])
+    name = f'{view.title(title)}; {n_hidden} points outside'
+    above.set_title(name, fontsize=12, loc='left', parse_math=False)
+    view.draw_points(above, r, z, None if truth is None else truth[own])
     view.draw_ground(above)
     above.set_xlim(0.0, reach)
-    above.set_ylim(*view.heights_shown(reach, z[own]))
+    above.set_ylim(low, high)
     view.draw_length_scale(below, reach, with_pseudo_inputs=config.length_scale.model == 'latent')
     below.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     below.yaxis.set_major_formatter('{x:g}')
