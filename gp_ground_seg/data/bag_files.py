@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import struct
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -43,11 +44,6 @@ class BagTopic:
     n_messages: int = 0
     migrated: bool = False  # whether a ROS 1 type has other fields in ROS 2
     problem: str = ''  # why messages of ROS 1 cannot be converted, empty if they can
-
-    @property
-    def is_cloud(self) -> bool:
-        """Whether its messages are point clouds that can be read."""
-        return self.msgtype == POINT_CLOUD2 and self.encoding == 'cdr'
 
 
 def is_bag(path: str | Path) -> bool:
@@ -106,15 +102,13 @@ def _check_sqlite_file(path: Path) -> None:
     check_sqlite_path(path)
     with path.open('rb') as file:
         header = file.read(100)
-    size, wanted = path.stat().st_size, 0
     # The format is that of https://www.sqlite.org/fileformat.html.
     if len(header) == 100 and header[24:28] == header[92:96]:
-        page_size = int.from_bytes(header[16:18], 'big')
+        page_size, n_pages = struct.unpack_from('>16xH10xI', header)
         # 65536 does not fit into the two bytes.
-        page_size = 65536 if page_size == 1 else page_size
-        wanted = page_size * int.from_bytes(header[28:32], 'big')
-    if size < wanted:
-        raise DataError(f'{path}: truncated, {size} bytes where its header says {wanted}')
+        size, wanted = path.stat().st_size, n_pages * (65536 if page_size == 1 else page_size)
+        if size < wanted:
+            raise DataError(f'{path}: truncated, {size} bytes where its header says {wanted}')
     for ending in ('-wal', '-journal'):
         journal = path.with_name(path.name + ending)
         if journal.exists() and journal.stat().st_size > 0:
@@ -125,9 +119,8 @@ def _check_sqlite_file(path: Path) -> None:
 
 
 def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
-    """Storage of a new bag: `wanted`, 'mcap' or 'sqlite3', or by default what the suffix says.
+    """Storage of a new bag: `wanted`, or by its suffix; 'mcap' for a folder.
 
-    A path that ends in .mcap or .db3 is a single file, any other a folder, of MCAP by default.
     Raises DataError if the two contradict, or the storage cannot hold that path.
     """
     suffix = Path(path).suffix

@@ -8,9 +8,9 @@ Source: sensor_msgs/msg/PointCloud2.msg, sensor_msgs/msg/PointField.msg.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ _DATATYPE_NAMES = {datatype: np.dtype(code).name.upper() for datatype, code in _
 _DATATYPES = {code: datatype for datatype, code in _CODES.items()}
 _FLOATS = (7, 8)
 _ALIGNMENT = 4
-"""The added columns start at a multiple of this within a point [bytes]."""
+"""Added columns start at a multiple of this within a point, or of their size [bytes]."""
 
 
 class CloudMessage(Protocol):
@@ -39,6 +39,9 @@ class CloudMessage(Protocol):
     row_step: int
     data: Any
     is_dense: bool
+
+
+Cloud = TypeVar('Cloud', bound=CloudMessage)
 
 
 class Column(NamedTuple):
@@ -58,12 +61,11 @@ class WiderCloud(NamedTuple):
 
 
 def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
-    """Coordinates of every point, row by row.
+    """Coordinates of every point, row by row, a copy in native byte order, (height * width, 3).
 
-    A copy in native byte order, (height * width, 3); float64 if any of the three is FLOAT64. Only
-    x, y and z are checked; other fields may be anything. As in PCL, a cloud of one row never uses
-    ``row_step``, and bytes after the last point are ignored. A cloud without points needs no
-    fields. Raises PointCloudError if the layout cannot hold what it claims.
+    float64 if any of the three is FLOAT64. Only x, y and z are checked. As in PCL, a cloud of one
+    row never uses ``row_step``, and bytes after the last point are ignored. A cloud without points
+    needs no fields. Raises PointCloudError if the layout cannot hold what it claims.
     """
     if cloud.height * cloud.width == 0:
         return np.empty((0, 3), dtype=np.float32)
@@ -95,8 +97,7 @@ def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDA
 def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
     """Every byte of the points where `mask`, (height * width,) bool, is true, in one row.
 
-    Raises PointCloudError if the layout cannot hold what it claims, or the mask has another
-    length.
+    Raises PointCloudError if the layout or the mask does not fit.
     """
     size = cloud.height * cloud.width
     if mask.shape != (size,) or mask.dtype != np.bool_:
@@ -111,11 +112,10 @@ def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray
 
 
 def append_columns(cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]]) -> WiderCloud:
-    """Put columns behind the bytes of every point, at multiples of four bytes or of their size.
+    """Put columns, (height * width,) of types that PointField knows, behind every point.
 
-    Columns, (height * width,) row by row, are of integer or float types that PointField knows and
-    are written in the byte order of the cloud; bytes between them are zero, padding of the rows is
-    gone. Raises PointCloudError if the layout cannot hold what it claims.
+    They are written in the byte order of the cloud; bytes between them are zero, padding of the
+    rows is gone. Raises PointCloudError if the layout cannot hold what it claims.
     """
     placed = []
     end = _round_up(cloud.point_step, _ALIGNMENT)
@@ -227,16 +227,20 @@ def _checked_bytes(cloud: CloudMessage) -> npt.NDArray[np.uint8]:
     return raw
 
 
-def select_points(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> CloudMessage:
+def select_points(
+    cloud: Cloud,
+    mask: npt.NDArray[np.bool_],
+    as_data: Callable[[npt.NDArray[np.uint8]], Any] = lambda data: data,
+) -> Cloud:
     """Message of the points where `mask` is true: same header, same fields, one row.
 
-    ``is_dense`` says whether the kept points are all finite. `cloud` is a message of rosbags.
-    Raises as `select_rows` and `read_xyz` do.
+    ``is_dense`` says whether the kept points are all finite. `as_data` makes the bytes what the
+    message wants. Raises as `select_rows` and `read_xyz` do.
     """
-    data, width = select_rows(cloud, mask), int(np.count_nonzero(mask))
-    shape = {'height': 1, 'width': width, 'row_step': width * cloud.point_step}
-    message: Any = cloud
-    kept: CloudMessage = dataclasses.replace(message, **shape, data=data)
+    kept = copy(cloud)
+    kept.data = as_data(select_rows(cloud, mask))
+    kept.height, kept.width = 1, int(np.count_nonzero(mask))
+    kept.row_step = kept.width * cloud.point_step
     kept.is_dense = bool(np.isfinite(read_xyz(kept)).all())
     return kept
 
@@ -246,14 +250,11 @@ def stamp_of(cloud: CloudMessage) -> tuple[int, int]:
     return cloud.header.stamp.sec, cloud.header.stamp.nanosec
 
 
-def with_header(
-    cloud: CloudMessage, stamp: tuple[int, int], frame_id: str | None = None
-) -> CloudMessage:
+def with_header(cloud: Cloud, stamp: tuple[int, int], frame_id: str | None = None) -> Cloud:
     """Copy of a message of rosbags with another stamp, or frame too; the points are shared."""
-    header = _new_header(stamp, cloud.header.frame_id if frame_id is None else frame_id)
-    message: Any = cloud
-    copy: CloudMessage = dataclasses.replace(message, header=header)
-    return copy
+    moved = copy(cloud)
+    moved.header = _new_header(stamp, cloud.header.frame_id if frame_id is None else frame_id)
+    return moved
 
 
 def cloud_from_columns(
@@ -265,24 +266,22 @@ def cloud_from_columns(
     """
     types = jazzy_types().types
     codes = {name: f'{values.dtype.kind}4' for name, values in columns.items()}
-    points = np.empty(
-        len(next(iter(columns.values()), ())),
-        dtype=[(name, f'<{code}') for name, code in codes.items()],
-    )
+    n_points = len(next(iter(columns.values()), ()))
+    points = np.empty(n_points, dtype=[(name, f'<{code}') for name, code in codes.items()])
     for name, values in columns.items():
         points[name] = values
     step = points.dtype.itemsize
     cloud: CloudMessage = types[POINT_CLOUD2](
         header=_new_header(stamp, frame_id),
         height=1,
-        width=len(points),
+        width=n_points,
         fields=[
             types['sensor_msgs/msg/PointField'](name, 4 * k, _DATATYPES[code], 1)
             for k, (name, code) in enumerate(codes.items())
         ],
         is_bigendian=False,
         point_step=step,
-        row_step=step * len(points),
+        row_step=step * n_points,
         data=np.frombuffer(points.tobytes(), np.uint8),
         is_dense=False,
     )
@@ -302,11 +301,9 @@ def decode_cloud(raw: bytes | memoryview) -> CloudMessage:
     types = jazzy_types()
     try:
         cloud: CloudMessage = types.deserialize_cdr(raw, POINT_CLOUD2)
-    except Exception as error:
-        # The kind of error depends on where parsing went astray.
-        raise PointCloudError(
-            f'{len(raw)} bytes that are no {POINT_CLOUD2}: {in_one_line(error)}'
-        ) from error
+    except Exception as error:  # Its kind depends on where parsing went astray.
+        said = f'{len(raw)} bytes that are no {POINT_CLOUD2}: {in_one_line(error)}'
+        raise PointCloudError(said) from error
     return cloud
 
 

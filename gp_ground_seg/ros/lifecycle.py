@@ -22,7 +22,7 @@ from typing import Any
 import yaml
 
 from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyError
-from gp_ground_seg.parameters.yaml_io import load_yaml
+from gp_ground_seg.parameters.schema import load_yaml
 
 HIGHEST_DOMAIN = 232
 
@@ -32,11 +32,9 @@ def initialize(words: Sequence[str]) -> None:
 
     Raises a ConfigError if the ROS arguments or a parameter file cannot be read.
     """
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
     from rclpy.utilities import remove_ros_args
 
-    check_surroundings(words)
+    _check_surroundings(words)
     with start_errors():
         other_words = remove_ros_args(list(words))[1:]
     parser = argparse.ArgumentParser(
@@ -46,8 +44,16 @@ def initialize(words: Sequence[str]) -> None:
         epilog='example: %(prog)s --ros-args -r points:=/lidar --params-file vlp16.yaml',
     )
     parser.parse_args(other_words)
+    _init(words)
+
+
+def _init(words: Sequence[str], context: Any = None) -> None:
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
     with start_errors():
-        rclpy.init(args=list(words), signal_handler_options=SignalHandlerOptions.NO)
+        options = SignalHandlerOptions.NO
+        rclpy.init(args=list(words), context=context, signal_handler_options=options)
 
 
 @contextmanager
@@ -65,17 +71,16 @@ def start_errors() -> Iterator[None]:
         raise ConfigError(text if kind == 'RCLError' else f'{kind}: {text}') from error
 
 
-def check_surroundings(words: Sequence[str]) -> None:
+def _check_surroundings(words: Sequence[str]) -> None:
     """Raise a ConfigError for what rcl takes without a word, or ends the process for.
 
     These are parameter files that are not text, hold no parameters or give one twice, and a
-    ``ROS_DOMAIN_ID`` for which DDS has no ports.
+    domain for which DDS has no ports.
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '')
     if domain.isdecimal() and int(domain) > HIGHEST_DOMAIN:
         raise ConfigError(f'ROS_DOMAIN_ID = {domain}: must be an integer in [0, {HIGHEST_DOMAIN}]')
-    paths = (path for flag, path in itertools.pairwise(words) if flag == '--params-file')
-    for path in paths:
+    for path in (path for flag, path in itertools.pairwise(words) if flag == '--params-file'):
         with contextlib.suppress(OSError, yaml.YAMLError, RecursionError):
             try:
                 document = load_yaml(Path(path).read_text(encoding='utf-8'))
@@ -155,8 +160,7 @@ _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class StopRequest:
     """Whether a signal to end the process has come."""
 
-    def __init__(self) -> None:
-        self.made = False
+    made = False
 
     def note(self, _number: int, _frame: FrameType | None) -> None:
         """Set `made`.
@@ -167,37 +171,38 @@ class StopRequest:
         self.made = True
 
 
-class _Watchdog:
-    """Ends the process with code 0 if it does not end within `GRACE` of a signal.
+@contextmanager
+def _watchdog() -> Iterator[None]:
+    """End the process with code 0 if the block does not end within `GRACE` of a signal.
 
     Python calls its handlers between two steps of the main thread, and the next step may be
     seconds away, behind a long computation. The number of a signal is written to a pipe at
     once, where a thread waits for it.
     """
+    done = threading.Event()
+    read_end, write_end = os.pipe()
+    os.set_blocking(write_end, False)
 
-    def __init__(self) -> None:
-        self._done = threading.Event()
-        self._read_end, self._write_end = os.pipe()
-        os.set_blocking(self._write_end, False)
-        self._before = signal.set_wakeup_fd(self._write_end, warn_on_full_buffer=False)
-        self._thread = threading.Thread(target=self._watch, name='signals', daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._done.set()
-        signal.set_wakeup_fd(self._before)
-        os.close(self._write_end)
-        self._thread.join()
-        os.close(self._read_end)
-
-    def _watch(self) -> None:
+    def watch() -> None:
         with contextlib.suppress(OSError):
-            while number := os.read(self._read_end, 1):
+            while number := os.read(read_end, 1):
                 if number[0] in _STOPS:
                     break
-        # At the end of the pipe too; then `_done` is set.
-        if not self._done.wait(GRACE):
+        # At the end of the pipe too; then `done` is set.
+        if not done.wait(GRACE):
             os._exit(0)
+
+    before = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+    thread = threading.Thread(target=watch, name='signals', daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        signal.set_wakeup_fd(before)
+        os.close(write_end)
+        thread.join()
+        os.close(read_end)
 
 
 @contextmanager
@@ -212,14 +217,13 @@ def stop_on_signals() -> Iterator[StopRequest]:
     if threading.current_thread() is not threading.main_thread():
         yield request
         return
-    watchdog = _Watchdog()
-    before = {number: signal.signal(number, request.note) for number in _STOPS}
-    try:
-        yield request
-    finally:
-        if not request.made:
-            _restore(before)
-        watchdog.close()
+    with _watchdog():
+        before = {number: signal.signal(number, request.note) for number in _STOPS}
+        try:
+            yield request
+        finally:
+            if not request.made:
+                _restore(before)
 
 
 def _restore(handlers: dict[signal.Signals, Any]) -> None:
@@ -268,7 +272,7 @@ class Session:
             self._is_held_back = False
 
     def close(self) -> None:
-        """Destroy the node, which tells the network that it goes."""
+        """Destroy the node."""
         self._executor.shutdown()
         self.node.destroy_node()
 
@@ -291,13 +295,10 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
     """
     import rclpy
     from rclpy.context import Context
-    from rclpy.signals import SignalHandlerOptions
 
-    check_surroundings(ros_args)
+    _check_surroundings(ros_args)
     context = Context()
-    with start_errors():
-        options = SignalHandlerOptions.NO
-        rclpy.init(args=[name, *ros_args], context=context, signal_handler_options=options)
+    _init([name, *ros_args], context)
     try:
         with start_errors():
             node = rclpy.create_node(

@@ -24,8 +24,10 @@ from gp_ground_seg.ros.input import (
     LOG_PERIOD,
     Arrival,
     CloudSubscription,
+    TfTilt,
     TimeJumps,
     in_words,
+    require_tf2,
 )
 from gp_ground_seg.ros.lifecycle import (
     initialize,
@@ -35,12 +37,10 @@ from gp_ground_seg.ros.lifecycle import (
 )
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
-from gp_ground_seg.ros.tf_tilt import TfTilt, require_tf2
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader, LibraryLog
 from gp_ground_seg.segmenter import GroundSegmenter
 
 NODE_NAME = 'ground_segmentation_node'
-INPUT_TOPIC = 'points'
 LONGEST_WAIT = 0.1
 """Time after which a signal is seen at the latest [s]."""
 
@@ -56,10 +56,8 @@ class GroundSegmentationNode(ConfiguredNode):
     for it, is made meanwhile, and takes over between two clouds.
 
     Latency is the time between the arrival of a cloud in this process and the publication of
-    the results, its wait in the queue included. Clouds are counted as dropped where the
-    publisher's own numbering has a hole, see `SequenceGaps`.
-    Options are those of `rclpy.node.Node`. Raises a ConfigError if a given parameter is not
-    accepted.
+    the results, its wait in the queue included. Options are those of `rclpy.node.Node`. Raises
+    a ConfigError if a given parameter is not accepted.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -84,7 +82,7 @@ class GroundSegmentationNode(ConfiguredNode):
         logger.info(f'effective configuration:\n{describe(self.config)}')
         with start_errors():
             self._outputs = OutputPublishers(self)
-            self._input = CloudSubscription(self, INPUT_TOPIC, self.is_given, self._on_cloud)
+            self._input = CloudSubscription(self, 'points', self.is_given, self._on_cloud)
         self._follow_tf(self.config)
         self._time_jumps = TimeJumps(self, self._on_time_jump)
         self._diagnostics = Diagnostics(self, self._state, self.config.diagnostics)
@@ -128,9 +126,9 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _follow_tf(self, config: Config) -> None:
         """Listen to TF while the parameters ask for it."""
-        if config.frame.level == 'tf' and self._tf is None:
-            self._tf = TfTilt(self)
-        elif config.frame.level != 'tf' and self._tf is not None:
+        if config.frame.level == 'tf':
+            self._tf = self._tf or TfTilt(self)
+        elif self._tf is not None:
             self._tf.close()
             self._tf = None
 
@@ -204,10 +202,10 @@ class GroundSegmentationNode(ConfiguredNode):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT, SIGTERM or a shutdown of its context; return an exit code.
+    """Run the node until SIGINT, SIGTERM or a shutdown of its context.
 
-    `args` are the words after the program's name, those of the process by default. The code
-    is 0, or 2 for an error at start, reported in one line.
+    `args` are the words after the program's name, those of the process by default. Returns 0, or
+    2 for an error at start, reported in one line.
     """
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None

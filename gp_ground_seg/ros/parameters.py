@@ -17,8 +17,7 @@ from rclpy.parameter_service import ParameterService
 
 from gp_ground_seg.errors import ConfigError, GroundSegError
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.parameters.schema import ParameterSpec, check_typed
-from gp_ground_seg.parameters.yaml_io import OF_EVERY_NODE
+from gp_ground_seg.parameters.schema import OF_EVERY_NODE, ParameterSpec
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.lifecycle import start_errors
 
@@ -50,17 +49,13 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 
 
 def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
-    """Return `config` with those of the `parameters` that it declares.
-
-    Raises a ConfigError if a value has another type, is out of range or contradicts another.
-    """
-    return config.replace(
-        **{
-            parameter.name: check_typed(find_spec(parameter.name), parameter.value)
-            for parameter in parameters
-            if parameter.name in _OWN_NAMES
-        }
-    )
+    """Return `config` with those of the `parameters` that it declares, if they are accepted."""
+    values = {
+        parameter.name: find_spec(parameter.name).check_typed(parameter.value)
+        for parameter in parameters
+        if parameter.name in _OWN_NAMES
+    }
+    return config.replace(**values)
 
 
 def describe(config: Config) -> str:
@@ -131,11 +126,9 @@ class ConfiguredNode(Node):  # type: ignore[misc]
                 start_parameter_services=False,
                 **options,
             )
-        given = {
-            parameter_name: parameter
-            for parameter_name, parameter in self.get_parameters_by_prefix('').items()
-            if parameter_name not in OF_EVERY_NODE
-        }
+        given = self.get_parameters_by_prefix('')
+        for inherited in OF_EVERY_NODE:
+            given.pop(inherited, None)
         # rclpy logs the error and goes on.
         use_sim_time = self.get_parameter('use_sim_time').value
         if not isinstance(use_sim_time, bool):
@@ -173,8 +166,9 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         for name in sorted(self._given_names):
             if self.has_parameter(name):
                 continue
-            is_override = name.startswith(QOS_OVERRIDES)
-            reason = 'no such topic or policy here' if is_override else _unknown(name)
+            reason = _unknown(name)
+            if name.startswith(QOS_OVERRIDES):
+                reason = 'no such topic or policy here'
             self.get_logger().warning(f'parameter {name} is not used: {reason}')
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
@@ -187,21 +181,19 @@ class ConfiguredNode(Node):  # type: ignore[misc]
             if parameter.name not in _OWN_NAMES and not self.has_parameter(parameter.name):
                 return SetParametersResult(successful=False, reason=_unknown(parameter.name))
         result = self._on_set(parameter_list)
-        if not result.successful:
-            return result
-        return super().set_parameters_atomically(parameter_list)
+        return super().set_parameters_atomically(parameter_list) if result.successful else result
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         # An exception out of here would end the executor and leave the caller waiting.
+        reason = ''
         try:
             self.check_config(changed(self._config, parameters))
         except GroundSegError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            reason = str(error)
         except Exception as error:
             reason = f'{type(error).__name__}: {error}'
             self.get_logger().error(f'parameters could not be checked: {reason}')
-            return SetParametersResult(successful=False, reason=reason)
-        return SetParametersResult(successful=True)
+        return SetParametersResult(successful=not reason, reason=reason)
 
     def _post_set(self, parameters: list[Parameter]) -> None:
         try:

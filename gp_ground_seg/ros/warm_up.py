@@ -41,15 +41,16 @@ class BackendLoader:
     called in the thread when the backend is there or cannot be made; not after `stop`.
     """
 
+    error = ''
+    seconds = 0.0
+    _backend: Backend | None = None
+    _is_stopped = False
+    _compiler: subprocess.Popen[bytes] | None = None
+    _thread: threading.Thread | None = None
+
     def __init__(self, on_done: Callable[[], None]) -> None:
-        self.error = ''
-        self.seconds = 0.0
         self._on_done = on_done
-        self._backend: Backend | None = None
         self._lock = threading.Lock()
-        self._is_stopped = False
-        self._compiler: subprocess.Popen[bytes] | None = None
-        self._thread: threading.Thread | None = None
 
     @property
     def is_started(self) -> bool:
@@ -101,8 +102,8 @@ class BackendLoader:
     def _compile(self) -> None:
         """Compile in a child process; raise a RuntimeError if that fails."""
         environment = dict(os.environ)
-        if 'NUMBA_CACHE_DIR' in environment:
-            environment['NUMBA_CACHE_DIR'] = os.path.abspath(environment['NUMBA_CACHE_DIR'])
+        if cache := environment.get('NUMBA_CACHE_DIR'):
+            environment['NUMBA_CACHE_DIR'] = os.path.abspath(cache)
         # Nothing is imported from the current folder, which may be any.
         path = [entry for entry in sys.path if os.path.isabs(entry)]
         with self._lock:
