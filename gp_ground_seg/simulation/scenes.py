@@ -42,7 +42,8 @@ def rough(
     `rms` [m] is the height of all waves together where the envelope is one. Their lengths [m] are
     evenly spread on a log scale between the two ends; all waves are equally steep.
     """
-    wavelength = np.exp(rng.uniform(*np.log(wavelengths), N_WAVES))
+    shortest, longest = np.log(wavelengths)
+    wavelength = np.exp(rng.uniform(shortest, longest, N_WAVES))
     heading = rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
     phase = rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
     k = (2.0 * np.pi / wavelength)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])

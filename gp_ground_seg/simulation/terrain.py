@@ -150,7 +150,8 @@ class Waves(Terrain):
         edges, anchor = self.envelope.edges, self.envelope.anchor
         near = c0 + c1 * (np.concatenate([anchor[:1], edges]) - anchor)
         far = c0 + c1 * (np.concatenate([edges, anchor[-1:]]) - anchor)
-        return np.maximum(near, far)
+        factors: FloatArray = np.maximum(near, far)
+        return factors
 
     def breaks(self) -> FloatArray:
         """Edges of the envelope, (B, 3)."""
