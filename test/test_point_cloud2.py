@@ -130,16 +130,16 @@ def test_points_stay_and_columns_follow(case, data):
         for k, datatype in enumerate(datatypes)
     }
     wide = append_columns(layout, columns)
-    assert [column.name for column in wide.columns] == list(columns)
+    assert [name for name, _, _ in wide.columns] == list(columns)
     assert wide.point_step % 4 == 0
     assert len(wide.data) == len(points) * wide.point_step
     order = '>' if layout.is_bigendian else '<'
     end = layout.point_step
-    for column in wide.columns:
-        size = struct.calcsize(STRUCT_CODES[column.datatype])
-        assert column.offset >= end
-        assert column.offset % size == 0
-        end = column.offset + size
+    for _, offset, datatype in wide.columns:
+        size = struct.calcsize(STRUCT_CODES[datatype])
+        assert offset >= end
+        assert offset % size == 0
+        end = offset + size
     assert end <= wide.point_step < end + 12
     for k, old in enumerate(points):
         new = bytes(wide.data[k * wide.point_step :][: wide.point_step])

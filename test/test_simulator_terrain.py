@@ -249,7 +249,8 @@ def draw_solid(draw):
     length, width, yaw = (draw(st.floats(*ends)) for ends in ((0.3, 8), (0.3, 3), (-4, 4)))
     if draw(st.booleans()):
         return Cylinder(Kind.POLE, x, y, bottom, bottom + height, width)
-    return Box(Kind.BOX, x, y, bottom, bottom + height, length, width, yaw)
+    radius = 0.5 * math.hypot(length, width)
+    return Box(Kind.BOX, x, y, bottom, bottom + height, radius, length, width, yaw)
 
 
 @given(
@@ -276,7 +277,7 @@ def test_entry_is_where_the_inside_begins_and_no_ray_through_the_middle_misses(s
 
 
 def test_axis_parallel_rays_and_starts_inside():
-    box = Box(Kind.BOX, 5.0, 0.0, -1.0, 1.0, 2.0, 2.0, 0.0)
+    box = Box(Kind.BOX, 5.0, 0.0, -1.0, 1.0, math.sqrt(2.0), 2.0, 2.0, 0.0)
     origin = np.array([[0.0, 0.0, 0.0], [0.0, 1.5, 0.0], [5.0, 0.0, 0.0], [5.0, 0.0, 4.0]])
     direction = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     np.testing.assert_allclose(box.entry(origin, direction), [4.0, np.inf, np.inf, 3.0])

@@ -72,17 +72,9 @@ def _reliable_qos(durability: str) -> Any:
     from rosbags import interfaces as ros
 
     forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
-    return ros.Qos(
-        ros.QosHistory.KEEP_LAST,
-        10,
-        ros.QosReliability.RELIABLE,
-        ros.QosDurability[durability],
-        forever,
-        forever,
-        ros.QosLiveliness.AUTOMATIC,
-        forever,
-        avoid_ros_namespace_conventions=False,
-    )
+    history, liveliness = ros.QosHistory.KEEP_LAST, ros.QosLiveliness.AUTOMATIC
+    kind = ros.QosReliability.RELIABLE, ros.QosDurability[durability]
+    return ros.Qos(history, 10, *kind, forever, forever, liveliness, forever, False)
 
 
 @functools.cache
@@ -112,14 +104,9 @@ def _ros2_topic(connection: Any) -> BagTopic:
     elif text and not type_hash:
         with suppress(Exception):  # A definition rosbags cannot parse is copied all the same.
             type_hash = _parse_definition(text, msgtype).hash_rihs01(msgtype)
-    return BagTopic(
-        name=connection.topic,
-        msgtype=msgtype,
-        definition=text,
-        type_hash=type_hash or UNKNOWN_TYPE_HASH,
-        encoding=connection.ext.serialization_format,
-        qos=tuple(connection.ext.offered_qos_profiles),
-    )
+    encoding, qos = connection.ext
+    known_hash = type_hash or UNKNOWN_TYPE_HASH
+    return BagTopic(connection.topic, msgtype, text, known_hash, encoding, tuple(qos))
 
 
 def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
@@ -144,14 +131,10 @@ def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
         convert = functools.partial(
             migrate_bytes, source, target, old, new, {}, src_is2=False, dst_is2=True
         )
-    topic = BagTopic(
-        name=connection.topic,
-        msgtype=new,
-        definition=target.generate_msgdef(new, ros_version=2)[0],
-        type_hash=target.hash_rihs01(new),
-        qos=(_reliable_qos('TRANSIENT_LOCAL'),) if connection.ext.latching else (),
-        migrated=migrated,
-    )
+    definition, _ = target.generate_msgdef(new, ros_version=2)
+    type_hash = target.hash_rihs01(new)
+    qos = (_reliable_qos('TRANSIENT_LOCAL'),) if connection.ext.latching else ()
+    topic = BagTopic(connection.topic, new, definition, type_hash, qos=qos, migrated=migrated)
     return topic, convert
 
 
@@ -159,8 +142,7 @@ class BagReader:
     """A bag as ROS 2 topics with CDR messages, to be used in a ``with`` statement.
 
     `path` is a ROS 1 ``.bag``, whose messages are converted, a rosbag2 folder, ``.mcap`` or
-    ``.db3``. Raises DataError if there is no bag, or it cannot be read, and
-    MissingDependencyError if rosbags is not installed.
+    ``.db3``. Raises DataError if it cannot be read, MissingDependencyError without rosbags.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -226,10 +208,7 @@ class BagReader:
         return self.topic(topic).n_messages
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
-        """Return `topic` if it is one of point clouds with messages, or the only such topic.
-
-        Raises DataError with the topics if there is none, or the choice is not clear.
-        """
+        """Return `topic` if it has point clouds, or the only one that has; else a DataError."""
         clouds = self.point_cloud_topics
         if topic is not None:
             if (msgtype := self.topic(topic).msgtype) != POINT_CLOUD2:
@@ -253,8 +232,8 @@ class BagReader:
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
         """Topic, recorded time [ns] and CDR bytes of each message, of all topics by default.
 
-        In order of their time; file after file in a split bag. Raises DataError if the bag is
-        damaged, a topic is unknown, or fewer messages can be read than the bag lists.
+        In order of their time; file after file in a split bag. Raises DataError if a topic is
+        unknown, the bag damaged, or its list of messages wrong.
         """
         wanted = {name: self.topic(name) for name in (self._topics if topics is None else topics)}
         for name, topic in wanted.items():
@@ -265,8 +244,7 @@ class BagReader:
                 )
         connections = [c for c in self._reader.connections if c.topic in wanted]
         found: Counter[str] = Counter()
-        with reading(self.path):
-            source = iter(self._reader.messages(connections=connections) if connections else ())
+        source = iter(self._reader.messages(connections=connections) if connections else ())
         while True:
             # The caller's own errors, raised at the yield, must not pass through here.
             with reading(self.path):
@@ -317,10 +295,9 @@ class BagReader:
 class BagWriter:
     """A new rosbag2 bag, in a ``with`` statement; written whole or not at all (`staged_file`).
 
-    `path` is a folder as ``ros2 bag record -o`` makes, or a single file, by its suffix; for
-    `storage` see `resolve_storage`. With `force` a bag of that name is replaced once the new one
-    is complete. Raises DataError if the path is taken or cannot be written, and
-    MissingDependencyError if rosbags is not installed.
+    `path` is a folder as ``ros2 bag record -o`` makes, or a single file, by its suffix; `storage`
+    see `resolve_storage`. With `force` a bag of that name is replaced. Raises DataError if the
+    path is taken or cannot be written, MissingDependencyError without rosbags.
     """
 
     def __init__(

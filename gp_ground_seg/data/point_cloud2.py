@@ -44,18 +44,10 @@ class CloudMessage(Protocol):
 Cloud = TypeVar('Cloud', bound=CloudMessage)
 
 
-class Column(NamedTuple):
-    """Place of an added column: attributes of a ``sensor_msgs/PointField`` with count 1."""
-
-    name: str
-    offset: int
-    datatype: int
-
-
 class WiderCloud(NamedTuple):
     """Points of a cloud with columns added, in the order given; rows are not padded."""
 
-    columns: tuple[Column, ...]
+    columns: tuple[tuple[str, int, int], ...]  # name, offset and datatype, as of a PointField
     point_step: int
     data: npt.NDArray[np.uint8]
 
@@ -71,21 +63,18 @@ def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.fl
         return np.empty((0, 3), dtype=np.float32)
     columns = _views(cloud, 'xyz', _FLOATS)
     wide = any(column.dtype.itemsize == 8 for column in columns)
-    # Each coordinate is contiguous, as the segmentation reads it.
-    xyz = np.empty((3, cloud.height, cloud.width), dtype=np.float64 if wide else np.float32)
     # Arbitrary bytes may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
-        for axis, column in enumerate(columns):
-            xyz[axis] = column
-    result: npt.NDArray[np.float32] | npt.NDArray[np.float64] = xyz.reshape(3, -1).T
+        # Each coordinate is contiguous, as the segmentation reads it.
+        xyz = np.stack(columns, dtype=np.float64 if wide else np.float32).reshape(3, -1)
+    result: npt.NDArray[np.float32] | npt.NDArray[np.float64] = xyz.T
     return result
 
 
 def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     """Values of the fields `names`, each (height, width), a copy in native byte order.
 
-    Raises PointCloudError if a field is missing, there twice, no single number or beyond the
-    point, or the layout cannot hold what it claims.
+    Raises PointCloudError if a field is not there as one number, or the layout cannot hold it.
     """
     views = _views(cloud, names, _CODES)
     return {
@@ -122,7 +111,7 @@ def append_columns(cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]])
     for name, values in columns.items():
         itemsize = values.dtype.itemsize
         start = _round_up(end, itemsize)
-        placed.append(Column(name, start, _DATATYPES[f'{values.dtype.kind}{itemsize}']))
+        placed.append((name, start, _DATATYPES[f'{values.dtype.kind}{itemsize}']))
         end = start + itemsize
     step = _round_up(end, _ALIGNMENT)
     height, width = cloud.height, cloud.width
@@ -133,9 +122,8 @@ def append_columns(cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]])
         np.ndarray((height, width), points.dtype, wide.data, 0, (width * step, step))[...] = points
         with np.errstate(over='ignore', invalid='ignore'):
             for name, offset, datatype in placed:
-                code = _byte_order(cloud) + _CODES[datatype]
-                target: npt.NDArray[Any] = np.ndarray((size,), code, wide.data, offset, (step,))
-                target[...] = columns[name]
+                code = _code(cloud, datatype)
+                np.ndarray((size,), code, wide.data, offset, (step,))[...] = columns[name]
     return WiderCloud(tuple(placed), step, wide)
 
 
@@ -143,8 +131,8 @@ def _round_up(value: int, multiple: int) -> int:
     return -(-value // multiple) * multiple
 
 
-def _byte_order(cloud: CloudMessage) -> str:
-    return '>' if cloud.is_bigendian else '<'
+def _code(cloud: CloudMessage, datatype: int) -> str:
+    return f'{">" if cloud.is_bigendian else "<"}{_CODES[datatype]}'
 
 
 def _whole_points(cloud: CloudMessage) -> npt.NDArray[np.void]:
@@ -159,7 +147,7 @@ def _views(
     cloud: CloudMessage, names: Sequence[str], accepted: Collection[int]
 ) -> list[npt.NDArray[Any]]:
     """Fields `names` where they lie in the data, each (height, width), checked."""
-    shape = cloud.height, cloud.width
+    shape, strides = (cloud.height, cloud.width), (cloud.row_step, cloud.point_step)
     raw = _checked_bytes(cloud) if cloud.height * cloud.width else None
     views: list[npt.NDArray[Any]] = []
     for name in names:
@@ -171,59 +159,52 @@ def _views(
                 f'point cloud: {many} named {name}: must have exactly one; fields: {known}'
             )
         (field,) = matches
-        code = _byte_order(cloud) + _accepted_code(field, accepted, cloud.point_step)
-        view: npt.NDArray[Any] = (
-            np.empty(shape, code)
-            if raw is None
-            else np.ndarray(shape, code, raw, field.offset, (cloud.row_step, cloud.point_step))
+        _check_field(field, accepted, cloud.point_step)
+        code, offset = _code(cloud, field.datatype), field.offset
+        views.append(
+            np.empty(shape, code) if raw is None else np.ndarray(shape, code, raw, offset, strides)
         )
-        views.append(view)
     return views
 
 
-def _accepted_code(field: Any, accepted: Collection[int], point_step: int) -> str:
-    """Type code of a field, if it is one number of an accepted type within the point."""
+def _check_field(field: Any, accepted: Collection[int], point_step: int) -> None:
+    """Raise PointCloudError unless a field is one number of an accepted type within the point."""
+    problem = ''
     if field.datatype not in accepted:
         kind = _DATATYPE_NAMES.get(field.datatype, 'unknown')
         wanted = ' or '.join(f'{_DATATYPE_NAMES[datatype]} ({datatype})' for datatype in accepted)
-        raise PointCloudError(
-            f'point cloud: field {field.name} has datatype {field.datatype} ({kind}): '
-            f'must be {wanted}'
-        )
+        problem = f'has datatype {field.datatype} ({kind}): must be {wanted}'
     # Some old writers leave count at 0 and mean 1; PCL reads these too.
-    if field.count not in (0, 1):
-        raise PointCloudError(
-            f'point cloud: field {field.name} has count {field.count}: must be 1'
-        )
-    code = _CODES[field.datatype]
-    size = int(code[1])
-    if field.offset < 0 or field.offset + size > point_step:
-        raise PointCloudError(
-            f'point cloud: field {field.name} at offset {field.offset} of {size} bytes: '
-            f'must end within point_step {point_step}'
-        )
-    return code
+    elif field.count not in (0, 1):
+        problem = f'has count {field.count}: must be 1'
+    else:
+        size = int(_CODES[field.datatype][1])
+        if not 0 <= field.offset <= point_step - size:
+            problem = f'at offset {field.offset} of {size} bytes: '
+            problem += f'must end within point_step {point_step}'
+    if problem:
+        raise PointCloudError(f'point cloud: field {field.name} {problem}')
 
 
 def _checked_bytes(cloud: CloudMessage) -> npt.NDArray[np.uint8]:
     """Return the data as numbers, if all points lie within it without overlap."""
     height, width = cloud.height, cloud.width
-    point_step, row_step = cloud.point_step, cloud.row_step
-    if point_step < 1:
-        raise PointCloudError(f'point cloud: point_step {point_step}: must be at least 1 byte')
-    row_bytes = width * point_step
-    if height > 1 and row_step < row_bytes:
-        raise PointCloudError(
-            f'point cloud: row_step {row_step}: must be at least {row_bytes} '
-            f'(width {width} * point_step {point_step})'
-        )
+    point_step, row_step, row_bytes = cloud.point_step, cloud.row_step, width * cloud.point_step
     needed = (height - 1) * row_step + row_bytes
     raw = np.frombuffer(cloud.data, dtype=np.uint8)
-    if len(raw) < needed:
-        raise PointCloudError(
-            f'point cloud: data of {len(raw)} bytes: must be at least {needed} '
+    problem = ''
+    if point_step < 1:
+        problem = f'point_step {point_step}: must be at least 1 byte'
+    elif height > 1 and row_step < row_bytes:
+        problem = f'row_step {row_step}: must be at least {row_bytes} '
+        problem += f'(width {width} * point_step {point_step})'
+    elif len(raw) < needed:
+        problem = f'data of {len(raw)} bytes: must be at least {needed} '
+        problem += (
             f'(height {height}, width {width}, point_step {point_step}, row_step {row_step})'
         )
+    if problem:
+        raise PointCloudError(f'point cloud: {problem}')
     return raw
 
 

@@ -125,13 +125,12 @@ class ParameterGroups:
     @functools.cache
     def specs(cls) -> dict[str, ParameterSpec]:
         """Every declared parameter by its dotted name, in order of declaration."""
-        groups: dict[str, Any] = {group.name: group.default for group in dataclasses.fields(cls)}
-        specs = (
-            dataclasses.replace(entry.metadata['spec'], name=f'{name}.{entry.name}')
-            for name, group in groups.items()
-            for entry in dataclasses.fields(group)
-        )
-        return {spec.name: spec for spec in specs}
+        specs = {}
+        for group in dataclasses.fields(cls):
+            for entry in dataclasses.fields(group.default):  # type: ignore[arg-type]
+                name = f'{group.name}.{entry.name}'
+                specs[name] = dataclasses.replace(entry.metadata['spec'], name=name)
+        return specs
 
     @classmethod
     def find_spec(cls, name: str) -> ParameterSpec:

@@ -1,7 +1,7 @@
 """Start and end of a ROS process: arguments, transport, signals.
 
-ROS is imported by the functions that need it, so that the signals of a process can be
-handled before that, which takes half a second.
+ROS is imported by the functions that need it: that takes half a second, in which the signals of
+the process can be handled already.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -28,10 +28,7 @@ HIGHEST_DOMAIN = 232
 
 
 def initialize(words: Sequence[str]) -> None:
-    """Initialise rclpy with a command line, the program's name first; no signal handlers.
-
-    Raises a ConfigError if the ROS arguments or a parameter file cannot be read.
-    """
+    """Initialise rclpy with a command line; raises a ConfigError if that cannot be read."""
     from rclpy.utilities import remove_ros_args
 
     _check_surroundings(words)
@@ -72,11 +69,7 @@ def start_errors() -> Iterator[None]:
 
 
 def _check_surroundings(words: Sequence[str]) -> None:
-    """Raise a ConfigError for what rcl takes without a word, or ends the process for.
-
-    These are parameter files that are not text, hold no parameters or give one twice, and a
-    domain for which DDS has no ports.
-    """
+    """Raise a ConfigError for what rcl takes without a word, or ends the process for."""
     domain = os.environ.get('ROS_DOMAIN_ID', '')
     if domain.isdecimal() and int(domain) > HIGHEST_DOMAIN:
         raise ConfigError(f'ROS_DOMAIN_ID = {domain}: must be an integer in [0, {HIGHEST_DOMAIN}]')
@@ -104,8 +97,6 @@ def needing_ros(command: str) -> Iterator[None]:
         ) from error
 
 
-# --- Transport
-
 _PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _TRANSPORT_VARIABLES = (
     _PROFILE_VARIABLE, 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS',
@@ -118,8 +109,8 @@ MIN_SHARED_MEMORY = 128 << 20
 def large_cloud_transport() -> Iterator[None]:
     """Name the Fast DDS profile for large clouds, if the user has chosen none.
 
-    It holds for this process, if ROS is used for the first time within the block, and for
-    those started within it. Without it, clouds above 0.5 MB are sent in pieces, which get lost.
+    For processes started, and ROS used for the first time, within the block. Without it, clouds
+    above 0.5 MB are sent in pieces, which get lost.
     """
     profile = _find_profile()
     is_chosen = any(os.environ.get(name) for name in _TRANSPORT_VARIABLES)
@@ -149,8 +140,6 @@ def _free_shared_memory() -> int:
     return status.f_bavail * status.f_frsize
 
 
-# --- Signals
-
 GRACE = 0.5
 """Time from the signal to the end of the process, if the work does not end before [s]."""
 _STOPS = (signal.SIGINT, signal.SIGTERM)
@@ -163,11 +152,7 @@ class StopRequest:
     made = False
 
     def note(self, _number: int, _frame: FrameType | None) -> None:
-        """Set `made`.
-
-        An exception here would come out of any running code: rclpy's bindings turn it into
-        another one, the compiler and destructors print and swallow it.
-        """
+        """Set `made`; an exception would come out of any running code, or be swallowed there."""
         self.made = True
 
 
@@ -214,21 +199,30 @@ def stop_on_signals() -> Iterator[StopRequest]:
     must not break the clean-up. In other threads than the main one nothing is changed.
     """
     request = StopRequest()
-    if threading.current_thread() is not threading.main_thread():
+    if not _is_main_thread():
         yield request
         return
-    with _watchdog():
-        before = {number: signal.signal(number, request.note) for number in _STOPS}
-        try:
-            yield request
-        finally:
-            if not request.made:
-                _restore(before)
+    with _watchdog(), _handling(_STOPS, request.note, lambda: not request.made):
+        yield request
 
 
-def _restore(handlers: dict[signal.Signals, Any]) -> None:
-    for number, handler in handlers.items():
-        signal.signal(number, signal.SIG_DFL if handler is None else handler)
+def _is_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
+@contextmanager
+def _handling(
+    numbers: Iterable[signal.Signals],
+    handler: Callable[[int, FrameType | None], None],
+    is_over: Callable[[], bool] = lambda: True,
+) -> Iterator[None]:
+    """Handle signals within the block; the handlers before are back after it if `is_over`."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items() if is_over() else ():
+            signal.signal(number, signal.SIG_DFL if earlier is None else earlier)
 
 
 class Session:
@@ -237,14 +231,15 @@ class Session:
     `node` has no parameter services and does not log to /rosout.
     """
 
+    _is_interrupted = False
+    _is_held_back = False
+
     def __init__(self, node: Any) -> None:
         from rclpy.executors import SingleThreadedExecutor
 
         self.node = node
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._is_interrupted = False
-        self._is_held_back = False
 
     def sleep(self, seconds: float) -> None:
         """Wait without handling messages; as exact as the system's clock is."""
@@ -277,7 +272,7 @@ class Session:
         self.node.destroy_node()
 
     def check(self, cause: Exception | None = None) -> None:
-        """Raise KeyboardInterrupt once interrupted; `cause` is the exception it came out as.
+        """Raise KeyboardInterrupt once interrupted, `cause` being what the interrupt came out as.
 
         Python swallows an exception that a signal raises within a destructor or a callback:
         long loops call this now and then.
@@ -304,29 +299,20 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
             node = rclpy.create_node(
                 name, context=context, start_parameter_services=False, enable_rosout=False
             )
-        session = Session(node)
-        try:
-            with _signals_to(session):
-                yield session
-        finally:
-            session.close()
+        with contextlib.closing(Session(node)) as session, _signals_to(session):
+            yield session
     finally:
         rclpy.try_shutdown(context=context)
 
 
 @contextmanager
 def _signals_to(session: Session) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     # What is ignored on purpose, as by nohup, stays so.
     heeded = [number for number in _INTERRUPTS if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, session.interrupt) for number in heeded}
-    try:
-        yield
-    except Exception as error:
-        # An interrupt within rclpy's bindings may come out of them as another exception.
-        session.check(error)
-        raise
-    finally:
-        _restore(before)
+    with _handling(heeded if _is_main_thread() else (), session.interrupt):
+        try:
+            yield
+        except Exception as error:
+            # An interrupt within rclpy's bindings may come out of them as another exception.
+            session.check(error)
+            raise

@@ -71,11 +71,7 @@ class Solid(ABC):
     y: float
     bottom: float
     top: float
-
-    @property
-    @abstractmethod
-    def radius(self) -> float:
-        """Of the vertical cylinder around it [m]."""
+    radius: float  # of the vertical cylinder around it
 
     @abstractmethod
     def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
@@ -110,11 +106,6 @@ class Box(Solid):
     width: float
     yaw: float
 
-    @property
-    def radius(self) -> float:
-        """Half the diagonal [m]."""
-        return 0.5 * math.hypot(self.length, self.width)
-
     def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         enter, leave = np.full(len(offset), -np.inf), np.full(len(offset), np.inf)
@@ -129,18 +120,11 @@ class Box(Solid):
 class Cylinder(Solid):
     """Upright cylinder."""
 
-    cylinder_radius: float
-
-    @property
-    def radius(self) -> float:
-        """Radius [m]."""
-        return self.cylinder_radius
-
     def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
         xy, rate = offset[:, :2], direction[:, :2]
         a = np.maximum(np.sum(rate * rate, axis=1), SMALLEST_RATE**2)
         half_b = np.sum(xy * rate, axis=1)
-        c = np.sum(xy * xy, axis=1) - self.cylinder_radius**2
+        c = np.sum(xy * xy, axis=1) - self.radius**2
         discriminant = half_b**2 - a * c
         root = np.sqrt(np.maximum(discriminant, 0.0))
         miss = discriminant < 0.0
@@ -190,20 +174,27 @@ def _find_towards(solid: Solid, origin: FloatArray, azimuth: FloatArray) -> IntA
     return np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
 
 
+def _box(
+    kind: Kind, x: float, y: float, heights: tuple[float, float], size: Size, yaw: float
+) -> Box:
+    length, width, _ = size
+    return Box(kind, x, y, *heights, 0.5 * math.hypot(length, width), length, width, yaw)
+
+
 def standing_box(
     terrain: Terrain, x: float, y: float, size: Size, yaw: float = 0.0, kind: Kind = Kind.BOX
 ) -> Box:
     """Box that stands on the terrain."""
-    ground, (length, width, height) = float(terrain.height(x, y)), size
-    return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, length, width, yaw)
+    ground = float(terrain.height(x, y))
+    return _box(kind, x, y, (ground - BURIED_DEPTH, ground + size[2]), size, yaw)
 
 
 def floating_box(
     terrain: Terrain, x: float, y: float, size: Size, clearance: float, kind: Kind = Kind.OVERHANG
 ) -> Box:
     """Box that floats `clearance` [m] over the terrain."""
-    bottom, (length, width, height) = float(terrain.height(x, y)) + clearance, size
-    return Box(kind, x, y, bottom, bottom + height, length, width, yaw=0.0)
+    bottom = float(terrain.height(x, y)) + clearance
+    return _box(kind, x, y, (bottom, bottom + size[2]), size, 0.0)
 
 
 def pole(

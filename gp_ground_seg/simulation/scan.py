@@ -18,7 +18,7 @@ from gp_ground_seg.simulation.terrain import Terrain, first_hit
 FRAME_PERIOD = 0.1
 """Time of one turn of the sensor [s]."""
 REFLECTION_MIN_DEPTH = 0.1
-"""A mirrored point less deep below the ground than this is the road itself to any sensor [m]."""
+"""A mirrored point less deep below the ground than this is the road itself [m]."""
 INTENSITY_STD = 0.05
 PLUMB_LINE = 200.0
 """How far above a point the search for the ground below it starts, for a tilted sensor [m]."""
@@ -51,13 +51,10 @@ class SensorModel:
         Ring by ring from the highest beam down; within a ring counter-clockwise from the
         azimuth `phase` [rad], 0 = straight ahead, as in KITTI's files.
         """
-        azimuth = phase + np.arange(self.n_columns) * (2.0 * math.pi / self.n_columns)
-        elevation = np.asarray(self.elevations)[:, None]
-        horizontal = np.cos(elevation)
-        rays = np.empty((len(self.elevations), self.n_columns, 3))
-        rays[..., 0] = horizontal * np.cos(azimuth)
-        rays[..., 1] = horizontal * np.sin(azimuth)
-        rays[..., 2] = np.sin(elevation)
+        turn = phase + np.arange(self.n_columns) * (2.0 * math.pi / self.n_columns)
+        azimuth, elevation = np.broadcast_arrays(turn, np.asarray(self.elevations)[:, None])
+        flat = np.cos(elevation)
+        rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
         return rays.reshape(-1, 3)
 
     def rotation(self) -> FloatArray:
@@ -68,11 +65,9 @@ class SensorModel:
 
 @dataclass(frozen=True)
 class ScatterModel(SensorModel):
-    """A LiDAR whose rays fill its field of view evenly, in another pattern for each scan.
+    """A LiDAR without rings whose rays fill its field of view, in another pattern for each scan.
 
-    Takes the place of the prisms of a Livox: what matters to a segmentation is that
-    there are no rings. `elevations` holds the ends of the field of view, highest first,
-    and `n_columns` is 1.
+    `elevations` holds the ends of the field of view, highest first, and `n_columns` is 1.
     """
 
     n_points: int = 20_000  # rays of one scan
@@ -143,9 +138,8 @@ def simulate_scan(
 ) -> SimulatedScan:
     """Scan the scene at `time` [s] from the place `x` [m] of the drive.
 
-    The sensor is `sensor.height` above the ground there. Every ray has its own random numbers,
-    drawn from `rng` whether or not it hits anything: the same generator state gives the same
-    noise in another scene.
+    Every ray has its own random numbers, drawn from `rng` whether or not it hits anything: the
+    same generator state gives the same noise in another scene.
     """
     beams = sensor.directions(rng.uniform(0.0, 2.0 * np.pi / sensor.n_columns))
     n_rays = len(beams)
@@ -165,24 +159,15 @@ def simulate_scan(
     _mirror(scene, origin, direction, distance, kind, mirror_draw)
 
     measured = distance + sensor.range_std * range_noise
-    kept = np.flatnonzero(
-        (measured >= sensor.min_range)
-        & (measured <= sensor.max_range)
-        & (drop_draw >= sensor.dropout)
-    )
+    is_in_range = (measured >= sensor.min_range) & (measured <= sensor.max_range)
+    kept = np.flatnonzero(is_in_range & (drop_draw >= sensor.dropout))
     kind = kind[kept]
     points = np.empty((len(kept), 4), dtype=np.float32)
     points[:, :3] = beams[kept] * measured[kept, None]
     points[:, 3] = np.clip(reflectance(kind) + INTENSITY_STD * intensity_noise[kept], 0.0, 1.0)
-    return SimulatedScan(
-        points=points,
-        is_ground=kind == Kind.TERRAIN,
-        ground_z=_ground_below(scene.terrain, points, position, rotation),
-        kind=kind,
-        time=time,
-        position=position,
-        rotation=rotation,
-    )
+    ground_z = _ground_below(scene.terrain, points, position, rotation)
+    is_ground = kind == Kind.TERRAIN
+    return SimulatedScan(points, is_ground, ground_z, kind, time, position, rotation)
 
 
 def _mirror(
@@ -193,11 +178,7 @@ def _mirror(
     kind: KindArray,
     draw: FloatArray,
 ) -> None:
-    """Move hits on wet road to the mirror images of solids, in place.
-
-    The measured range is the length of the whole path of the light, so that the image is
-    straight on along the ray, below the ground.
-    """
+    """Move hits on wet road, in place, to the mirror images of solids, farther along the ray."""
     ray = np.flatnonzero((kind == Kind.TERRAIN) & np.isfinite(distance))
     foot = origin[ray] + distance[ray, None] * direction[ray]
     reflectivity = np.zeros(len(ray))
@@ -240,8 +221,7 @@ def simulate_drive(
 ) -> Iterator[SimulatedScan]:
     """Drive along x from the origin at `speed` [m/s], ten scans a second.
 
-    The sensor stays `sensor.height` above the ground under it and does not follow its slope.
-    `seed` is that of all noise; the scene has its own.
+    The sensor does not follow the slope of the ground. `seed` is that of all noise.
     """
     rng = np.random.default_rng(seed)
     return (

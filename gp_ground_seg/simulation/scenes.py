@@ -23,10 +23,8 @@ from gp_ground_seg.simulation.objects import (
 from gp_ground_seg.simulation.terrain import Profile, Terrain, Waves
 
 N_WAVES = 8
-SCATTER_X = (-60.0, 100.0)
-SCATTER_Y = (6.0, 35.0)
-"""Distance of scattered solids from the drive [m]; leaves its lane free."""
-N_SCATTERED = 36
+N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
+"""Scattered solids, and their distance from the drive [m], which leaves its lane free."""
 URBAN_X = (-80.0, 160.0)
 """Where the street of the urban scene begins and ends [m]."""
 
@@ -59,16 +57,14 @@ def polyline(
     `points` are the corners (u, z) in ascending u [m]; those of the same u are a vertical step
     from the first to the last of them. `slope_after` is that after the last corner.
     """
-    anchors, coefficients = [points[0][0]], [(points[0][1], 0.0, 0.0)]
+    (first_u, first_z), (last_u, last_z) = points[0], points[-1]
+    pieces = [(first_u, first_z, 0.0)]
     for (u0, z0), (u1, z1) in itertools.pairwise(points):
         if u1 > u0:
-            anchors.append(u0)
-            coefficients.append((z0, (z1 - z0) / (u1 - u0), 0.0))
-    anchors.append(points[-1][0])
-    coefficients.append((points[-1][1], slope_after, 0.0))
+            pieces.append((u0, z0, (z1 - z0) / (u1 - u0)))
+    anchor, height, rise = np.array([*pieces, (last_u, last_z, slope_after)]).T
     # A piece ends where the next one begins; one lone vertical step has its one edge at the end.
-    edges = anchors[1:]
-    return Profile(heading, np.array(edges), np.array(anchors), np.array(coefficients))
+    return Profile(heading, anchor[1:], anchor, np.column_stack([height, rise, 0.0 * rise]))
 
 
 def flat(z: float = 0.0) -> Profile:
@@ -113,19 +109,17 @@ def crest(
 ) -> Profile:
     """Climb from u = `start` [m], rounded top, descent as steep, level ground on both sides.
 
-    `climb` [m] is the horizontal length of the climb and of the descent, `rounding` [m] that of
-    the top.
+    `climb` and `rounding` are the horizontal lengths of climb and descent, and of the top [m].
     """
-    top, z = start + climb, gradient * climb
+    top, z, level = start + climb, gradient * climb, (0.0, 0.0, 0.0)
     edges = np.array([start, top, top + rounding, top + rounding + climb])
-    coefficients = [
-        (0.0, 0.0, 0.0),
+    up, rounded, down = (
         (0.0, gradient, 0.0),
         (z, gradient, -gradient / rounding),
         (z, -gradient, 0.0),
-        (0.0, 0.0, 0.0),
-    ]
-    return Profile(heading, edges, np.array([start, *edges]), np.array(coefficients))
+    )
+    coefficients = np.array([level, up, rounded, down, level])
+    return Profile(heading, edges, np.array([start, *edges]), coefficients)
 
 
 def smooth_then_rough(
@@ -215,9 +209,8 @@ def _urban(seed: int) -> Scene:
         x = URBAN_X[0]
         while x < URBAN_X[1]:
             house = rng.uniform(12.0, 25.0)
-            solids += wall(
-                terrain, (x, side * front), (x + house, side * front), rng.uniform(4.0, 9.0)
-            )
+            ends = (x, side * front), (x + house, side * front)
+            solids += wall(terrain, *ends, rng.uniform(4.0, 9.0))
             x += house + rng.uniform(2.0, 8.0)
         for x in np.arange(URBAN_X[0], URBAN_X[1], 9.0) + rng.uniform(0.0, 2.0):
             if rng.random() < 0.6:

@@ -1,10 +1,9 @@
 """Analytic terrain: height, slope and bend at any point, and where rays meet it.
 
-Every terrain is smooth on pieces that lie between parallel break lines. Rays cross one
-piece at a time, so kinks and vertical steps are met exactly. Within a piece the clearance
-f(t) = z_ray(t) - z_terrain(t) has a second derivative of at least -K, with K the terrain's
-bend bound. So f(t + s) >= f + f' s - K s^2 / 2, and the root of that parabola is the largest
-step that is sure not to pass a crossing. Near a crossing it is a Newton step.
+Every terrain is smooth on pieces between parallel break lines, which rays cross one by one, so
+that kinks and vertical steps are met exactly. Within a piece the clearance f(t) of a ray has a
+second derivative of at least -K, with K the terrain's bend bound. So f(t + s) >= f + f' s -
+K s^2 / 2, and the root of that parabola is the largest step that is sure not to pass a crossing.
 Why no mesh library: heights and labels are to be exact.
 """
 
@@ -22,10 +21,8 @@ from gp_ground_seg.frame import FloatArray
 
 OptionalArray: TypeAlias = FloatArray | None
 
-CLEARANCE_TOLERANCE = 1e-9
-"""Height above the terrain at which a ray has met it [m]."""
-SHORTEST_PIECE = 1e-9
-"""Pieces that a ray crosses in less than this are numerical debris of equal break lines [m]."""
+TOLERANCE = 1e-9
+"""Height above the terrain at which a ray has met it; length of a piece of no width [m]."""
 
 
 class Along(NamedTuple):
@@ -193,14 +190,13 @@ def _march(
     while len(ray):
         rows = np.arange(len(ray))
         end = ends[rows, piece]
-        debris = end - t < SHORTEST_PIECE
+        debris = end - t < TOLERANCE
         middle = 0.5 * (np.where(piece > 0, ends[rows, piece - 1], 0.0) + end)
         o, d = origin[ray], direction[ray]
-        height, slope, bend = terrain.along(
-            o[:, :2] + t[:, None] * d[:, :2], d[:, :2], o[:, :2] + middle[:, None] * d[:, :2]
-        )
+        at, inside = (o[:, :2] + s[:, None] * d[:, :2] for s in (t, middle))
+        height, slope, bend = terrain.along(at, d[:, :2], inside)
         clearance = o[:, 2] + t * d[:, 2] - height
-        met = (clearance <= CLEARANCE_TOLERANCE) & ~debris
+        met = (clearance <= TOLERANCE) & ~debris
         hit[ray[met]] = t[met]
 
         step = _safe_step(clearance, d[:, 2] - slope, np.maximum(bend, 0.0))
@@ -236,6 +232,7 @@ def _piece_ends(
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         crossing = distance / rate
     ahead = (crossing > 0.0) & (crossing < max_range)
-    crossing = np.where(ahead, crossing, max_range)
-    last = np.full((len(origin), 1), max_range)
-    return np.sort(np.concatenate([crossing, last], axis=1), axis=1)
+    ends = np.pad(
+        np.where(ahead, crossing, max_range), ((0, 0), (0, 1)), constant_values=max_range
+    )
+    return np.sort(ends, axis=1)
