@@ -32,8 +32,7 @@ from gp_ground_seg.pipeline.tilt import angles_of
 INPUT_DEPTH = 5
 """Clouds that may wait to be processed: half a second of a LiDAR at 10 Hz."""
 OUTPUT_DEPTH = 20
-"""Clouds kept for repair: with stock Fast DDS, a lost fragment of a large cloud is sent again
-after up to 0.7 s on a busy machine; what is overwritten by then is lost."""
+"""Clouds kept for repair: Fast DDS may send a lost fragment again after 0.7 s only."""
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 REVIEW_PERIOD = 1.0
@@ -62,14 +61,13 @@ select_points = functools.partial(point_cloud2.select_points, as_data=message_da
 def check_overrides(given: Mapping[str, object]) -> None:
     """Raise a ConfigError if a ``qos_overrides`` parameter, of any topic, is not accepted."""
     for name, value in given.items():
-        policy = name.rpartition('.')[2]
-        if not name.startswith(QOS_OVERRIDES):
-            continue
+        policy, expected = name.rpartition('.')[2], ''
         if policy == 'depth' and not (type(value) is int and 1 <= value <= MAX_DEPTH):
-            raise ConfigError(f'{name} = {value!r}: must be an integer in [1, {MAX_DEPTH}]')
-        if policy in _CHOICES and value not in _CHOICES[policy]:
-            choices = ', '.join(_CHOICES[policy])
-            raise ConfigError(f'{name} = {value!r}: must be one of {choices}')
+            expected = f'an integer in [1, {MAX_DEPTH}]'
+        elif value not in _CHOICES.get(policy, (value,)):
+            expected = f'one of {", ".join(_CHOICES[policy])}'
+        if expected and name.startswith(QOS_OVERRIDES):
+            raise ConfigError(f'{name} = {value!r}: must be {expected}')
 
 
 def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
@@ -120,10 +118,9 @@ class Arrival(NamedTuple):
 class CloudSubscription:
     """Subscription that is best-effort if a publisher is, and reliable otherwise.
 
-    Large clouds need reliable delivery: a best-effort reader loses most of a replayed KITTI
-    bag with stock Fast DDS. A reliable reader gets nothing from a best-effort LiDAR driver.
-    Reliability given in ``qos_overrides``, by `is_given`, is kept for any publisher.
-    `callback` takes each cloud and its `Arrival`, in the executor of the node.
+    A best-effort reader loses most of a replayed KITTI bag with stock Fast DDS; a reliable one
+    gets nothing from a best-effort LiDAR driver. Reliability given in ``qos_overrides``, by
+    `is_given`, is kept for any publisher. `callback` takes each cloud and its `Arrival`.
     """
 
     def __init__(
@@ -140,8 +137,8 @@ class CloudSubscription:
         self._offered: dict[bytes, ReliabilityPolicy] = {}
         self.topic: str = node.resolve_topic_name(topic)
         self._is_pinned = is_given(f'qos_overrides.{self.topic}.subscription.reliability')
-        # A subscription destroyed within its own event is still used by the executor; a guard
-        # condition runs after all that became ready with the event.
+        # The executor still uses a subscription within its own event; a guard condition runs
+        # after all that became ready with it.
         self._review_soon = node.create_guard_condition(self._review)
         self._subscription = self._create(
             cloud_profile(INPUT_DEPTH), QoSOverridingOptions.with_default_policies()
@@ -289,9 +286,8 @@ def tilt_of(rotation: Quaternion) -> tuple[float, float]:
     x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
     square = x * x + y * y + z * z + w * w
     if not abs(square - 1.0) < 1e-3:
-        raise PointCloudError(
-            f'quaternion ({x:g}, {y:g}, {z:g}, {w:g}) of length {square**0.5:g}: must be 1'
-        )
+        given = f'({x:g}, {y:g}, {z:g}, {w:g}) of length {square**0.5:g}'
+        raise PointCloudError(f'quaternion {given}: must be 1')
     # Third row of its matrix: the level frame's z axis in the sensor frame.
     up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), square - 2.0 * (x * x + y * y)])
     return angles_of(up / np.linalg.norm(up))
@@ -319,9 +315,8 @@ class TfTilt:
             except self._tf2_ros.ExtrapolationException:
                 found = self._buffer.lookup_transform(base, frame, Time())
         except self._tf2_ros.TransformException as error:
-            raise PointCloudError(
-                f'no transform from its frame {frame!r} to frame.base = {base!r}: {error}'
-            ) from error
+            way = f'from its frame {frame!r} to frame.base = {base!r}'
+            raise PointCloudError(f'no transform {way}: {error}') from error
         return tilt_of(found.transform.rotation)
 
     def reset(self) -> None:

@@ -19,6 +19,7 @@ from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.errors import GroundSegError, PointCloudError
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.points import single_precision
+from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
 from gp_ground_seg.ros.input import (
     LOG_PERIOD,
@@ -28,12 +29,6 @@ from gp_ground_seg.ros.input import (
     TimeJumps,
     in_words,
     require_tf2,
-)
-from gp_ground_seg.ros.lifecycle import (
-    initialize,
-    large_cloud_transport,
-    start_errors,
-    stop_on_signals,
 )
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
@@ -80,7 +75,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def _start(self) -> None:
         logger = self.get_logger()
         logger.info(f'effective configuration:\n{describe(self.config)}')
-        with start_errors():
+        with lifecycle.start_errors():
             self._outputs = OutputPublishers(self)
             self._input = CloudSubscription(self, 'points', self.is_given, self._on_cloud)
         self._follow_tf(self.config)
@@ -191,13 +186,9 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _state(self) -> tuple[InputFacts, dict[str, int]]:
         clock = self.get_clock()
-        facts = InputFacts(
-            topic=self._input.topic,
-            qos=in_words(self._input.qos),
-            n_publishers=self._input.n_publishers,
-            ros_time=1e-9 * clock.now().nanoseconds,
-            is_simulated=clock.ros_time_is_active,
-        )
+        topic, qos, n_publishers = self._input.topic, self._input.qos, self._input.n_publishers
+        now, is_simulated = 1e-9 * clock.now().nanoseconds, clock.ros_time_is_active
+        facts = InputFacts(topic, in_words(qos), n_publishers, now, is_simulated)
         return facts, self._outputs.n_subscribers()
 
 
@@ -209,11 +200,11 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None
-    with stop_on_signals() as stop:
+    with lifecycle.stop_on_signals() as stop:
         try:
             # Both outputs at once are more than stock Fast DDS sends without loss.
-            with large_cloud_transport():
-                initialize(words)
+            with lifecycle.large_cloud_transport():
+                lifecycle.initialize(words)
                 node = GroundSegmentationNode()
             executor = SingleThreadedExecutor()
             executor.add_node(node)

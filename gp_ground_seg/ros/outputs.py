@@ -86,10 +86,9 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
 def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> Any:
     """Return the ground model as a MarkerArray in the frame of `cloud`.
 
-    ``profiles``: ground height over range, coloured by length-scale from
-    ``length_scale.min`` (dark blue) to ``length_scale.max`` (pale yellow), grey where
-    there is none. ``band``: two standard deviations about it, vertical. Neither is drawn
-    where the standard deviation is above ``label.ground_tolerance``.
+    ``profiles``: ground height over range, coloured by length-scale from ``length_scale.min``
+    to ``length_scale.max``. ``band``: two standard deviations about it, vertical. Neither is
+    drawn where the standard deviation is above ``label.ground_tolerance``.
     """
     from visualization_msgs.msg import Marker, MarkerArray
 
@@ -188,11 +187,9 @@ class OutputPublishers:
         overrides = QoSOverridingOptions.with_default_policies()
         self._publishers = []
         for output in outputs:
+            kind, topic = output.message_type, output.topic
             publisher = node.create_publisher(
-                output.message_type,
-                output.topic,
-                cloud_profile(),
-                qos_overriding_options=overrides,
+                kind, topic, cloud_profile(), qos_overriding_options=overrides
             )
             self._publishers.append((output, publisher))
 

@@ -79,8 +79,7 @@ class BackendLoader:
         self.stop()
         if self._thread is not None:
             self._thread.join()
-        backend = self.take_backend()
-        if backend is not None:
+        if (backend := self.take_backend()) is not None:
             backend.close()
 
     def _run(self, config: Config) -> None:
@@ -110,13 +109,9 @@ class BackendLoader:
             if self._is_stopped:
                 return
             self._compiler = subprocess.Popen(
-                [sys.executable, '-c', _COMPILE.format(path=path)],
-                cwd='/',
-                env=environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-            )
+                [sys.executable, '-c', _COMPILE.format(path=path)], cwd='/', env=environment,
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            )  # fmt: skip
         with self._compiler:
             assert self._compiler.stderr is not None
             said = self._compiler.stderr.read().decode(errors='replace').strip()
