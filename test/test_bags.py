@@ -40,6 +40,10 @@ def problem_of(path):
     return said
 
 
+def listing(folder):
+    return sorted(path.name for path in folder.rglob('*'))
+
+
 def write_note(path, time, text, **options):
     with BagWriter(path, **options) as bag:
         bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
@@ -61,7 +65,7 @@ def test_messages_come_back_bit_for_bit(tmp_path, name, storage):
         assert list(bag.messages([])) == []
     if path.is_dir():
         suffix = '.mcap' if storage == 'mcap' else '.db3'
-        assert sorted(p.name for p in path.iterdir()) == [f'drive{suffix}', 'metadata.yaml']
+        assert listing(path) == [f'drive{suffix}', 'metadata.yaml']
         assert is_bag_folder(path)
         assert 'partial' not in (path / 'metadata.yaml').read_text()
     # AnyReader compares the stored hash of each type with that of the stored definition.
@@ -126,18 +130,14 @@ def ros1_bag(tmp_path_factory):
     return path
 
 
-def test_ros1_clouds_are_the_same_in_ros2(ros1_bag):
+def test_ros1_clouds_order_and_merged_publishers(ros1_bag):
     with BagReader(ros1_bag) as bag:
         assert bag.storage == 'ros1'
         topic = bag.pick_point_cloud_topic()
-        for k, message in enumerate(bag.messages([topic])):
-            time = samples.START + k * samples.PERIOD
-            assert message == ('/kitti/velo/pointcloud', time, encode_cloud(samples.cloud(k)))
-        assert k == 2
-
-
-def test_ros1_order_and_merged_publishers(ros1_bag):
-    with BagReader(ros1_bag) as bag:
+        assert list(bag.messages([topic])) == [
+            (topic, samples.START + k * samples.PERIOD, encode_cloud(samples.cloud(k)))
+            for k in range(3)
+        ]
         names, times, _ = zip(*bag.messages(), strict=True)
         assert bag.n_messages('/text') == 6
         # One of the two publishers latches.
@@ -220,9 +220,7 @@ def test_topic_without_messages(tmp_path, name, storage):
         ('empty.mcap', b'', 'cannot be read as a bag: .*empty'),
         ('empty.bag', b'', 'cannot be read as a bag: .*empty'),
         ('empty.db3', b'', 'cannot be read as a bag'),
-        ('text.mcap', b'hello', 'cannot be read as a bag'),
-        ('text.bag', b'hello', 'cannot be read as a bag'),
-        ('text.db3', b'hello', 'cannot be read as a bag'),
+        *((f'text.{end}', b'hello', 'cannot be read as a bag') for end in ('mcap', 'bag', 'db3')),
     ],
 )
 def test_what_is_no_bag_is_refused_in_one_line(tmp_path, name, content, message):
@@ -238,9 +236,8 @@ def test_bad_metadata(tmp_path, text):
     samples.write_ros2_bag(tmp_path / 'drive')
     metadata = tmp_path / 'drive' / 'metadata.yaml'
     metadata.unlink() if text is None else metadata.write_text(text)
-    expected = r'no metadata\.yaml in it\).*one by one: drive\.mcap'
-    if text is not None:
-        expected = 'cannot be read as a bag'
+    missing = r'no metadata\.yaml in it\).*one by one: drive\.mcap'
+    expected = missing if text is None else 'cannot be read as a bag'
     assert re.search(expected, problem_of(tmp_path / 'drive'))
 
 
@@ -299,34 +296,11 @@ def test_errors_of_the_caller_pass_unchanged(small_bags):
             messages.throw(KeyError('mine'))
 
 
-def listing(folder):
-    return sorted(path.name for path in folder.rglob('*'))
-
-
 @pytest.mark.parametrize(('name', 'storage'), SHAPES)
-def test_existing_bag_is_replaced_only_with_force(tmp_path, name, storage):
+def test_a_bag_is_replaced_with_force_only_and_by_a_whole_one_only(tmp_path, name, storage):
     path = tmp_path / name
-    before = samples.write_ros2_bag(path, storage=storage)
-    with pytest.raises(DataError, match='exists already; --force replaces it'):
-        BagWriter(path, storage=storage).__enter__()
-    assert read_all(path) == before
-    with BagWriter(path, storage=storage, force=True) as bag:
-        bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
-        bag.write('/note', 1, samples.string_message('new'))
-        # Until the new one is complete, the old one is there.
-        assert read_all(path) == before
-    assert read_all(path) == [('/note', 1, samples.string_message('new'))]
-    assert [p.name for p in tmp_path.iterdir()] == [name]
 
-
-@pytest.mark.parametrize('force', [False, True])
-@pytest.mark.parametrize(('name', 'storage'), SHAPES)
-def test_after_an_error_nothing_is_left_and_nothing_is_lost(tmp_path, name, storage, force):
-    path = tmp_path / name
-    before = samples.write_ros2_bag(path, storage=storage) if force else None
-    files = listing(tmp_path)
-
-    def fail_in_the_middle():
+    def fail_in_the_middle(force):
         with BagWriter(path, storage=storage, force=force) as bag:
             bag.add_topic(cloud_topic('/points'))
             bag.write('/points', 5, encode_cloud(samples.cloud()))
@@ -334,11 +308,23 @@ def test_after_an_error_nothing_is_left_and_nothing_is_lost(tmp_path, name, stor
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        fail_in_the_middle()
+        fail_in_the_middle(force=False)
+    assert listing(tmp_path) == []
+    before = samples.write_ros2_bag(path, storage=storage)
+    files = listing(tmp_path)
+    with pytest.raises(DataError, match='exists already; --force replaces it'):
+        BagWriter(path, storage=storage).__enter__()
+    with pytest.raises(ZeroDivisionError):
+        fail_in_the_middle(force=True)
     assert listing(tmp_path) == files
     assert not leftovers(path)
-    if force:
+    with BagWriter(path, storage=storage, force=True) as bag:
+        bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
+        bag.write('/note', 1, samples.string_message('new'))
+        # Until the new one is complete, the old one is there.
         assert read_all(path) == before
+    assert read_all(path) == [('/note', 1, samples.string_message('new'))]
+    assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
 @pytest.mark.parametrize('error', [OSError(28, 'No space left'), sqlite3.Error('disk full')])
@@ -353,32 +339,25 @@ def test_a_full_disk_is_reported(tmp_path, monkeypatch, error):
 
 
 def test_force_never_replaces_what_is_no_bag(tmp_path):
-    home = tmp_path / 'home'
-    home.mkdir()
-    (home / 'thesis.tex').write_text('years of work')
-    (home / 'metadata.yaml').write_text('')
-    file = tmp_path / 'file'
-    file.write_text('notes')
-    folder = tmp_path / 'folder.mcap'
-    folder.mkdir()
-    for path in (home, file, folder):
+    (tmp_path / 'home').mkdir()
+    (tmp_path / 'folder.mcap').mkdir()
+    for name in ('home/thesis.tex', 'home/metadata.yaml', 'file'):
+        (tmp_path / name).write_text('years of work')
+    files = listing(tmp_path)
+    for name in ('home', 'file', 'folder.mcap'):
         with pytest.raises(DataError, match='not replaced'):
-            BagWriter(path, force=True).__enter__()
-    assert (home / 'thesis.tex').read_text() == 'years of work'
-    assert file.read_text() == 'notes'
-    assert folder.is_dir()
+            BagWriter(tmp_path / name, force=True).__enter__()
+    assert listing(tmp_path) == files
+    assert (tmp_path / 'file').read_text() == 'years of work'
 
 
-def test_output_that_appeared_meanwhile_is_kept(tmp_path):
-    def write(path):
-        with BagWriter(path) as bag:
-            bag.add_topic(jazzy_topic('/note', 'std_msgs/msg/String'))
-            path.write_text("another process's")
-
-    for name in ('drive', 'drive.mcap'):
+@pytest.mark.parametrize('name', ['drive', 'drive.mcap'])
+def test_output_that_appeared_meanwhile_is_kept(tmp_path, name):
+    with BagWriter(tmp_path / name) as bag:
+        (tmp_path / name).write_text("another process's")
         with pytest.raises(DataError, match='exists already'):
-            write(tmp_path / name)
-        assert (tmp_path / name).read_text() == "another process's"
+            bag.__exit__(None, None, None)
+    assert (tmp_path / name).read_text() == "another process's"
 
 
 @pytest.mark.parametrize(
@@ -444,21 +423,19 @@ def test_files_into_an_existing_folder_leave_the_others(tmp_path):
 
 
 def test_without_rosbags_the_error_says_what_to_install(tmp_path):
-    samples.write_ros2_bag(tmp_path / 'drive.mcap')
-    code = (
-        'import sys\n'
-        'sys.modules["rosbags"] = None\n'
-        'from gp_ground_seg.data import bags\n'
-        'from gp_ground_seg.data.point_cloud2 import decode_cloud\n'
-        'from gp_ground_seg.errors import MissingDependencyError\n'
-        'for call in (bags.BagReader, bags.BagWriter, decode_cloud):\n'
-        '    try:\n'
-        '        call(sys.argv[1])\n'
-        '    except MissingDependencyError as error:\n'
-        '        print(error)\n'
-    )
+    code = """if True:
+        import sys
+        sys.modules['rosbags'] = None
+        from gp_ground_seg.data import bags
+        from gp_ground_seg.data.point_cloud2 import decode_cloud
+        from gp_ground_seg.errors import MissingDependencyError
+        for call in (bags.BagReader, bags.BagWriter, decode_cloud):
+            try:
+                call('drive.mcap')
+            except MissingDependencyError as error:
+                print(error)
+        """
     done = subprocess.run(
-        [sys.executable, '-c', code, str(tmp_path / 'drive.mcap')],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        [sys.executable, '-c', code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert done.stdout.count("pip install 'gp_ground_seg[bags]'") == 3

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -42,14 +42,6 @@ class CloudMessage(Protocol):
 
 
 Cloud = TypeVar('Cloud', bound=CloudMessage)
-
-
-class WiderCloud(NamedTuple):
-    """Points of a cloud with columns added, in the order given; rows are not padded."""
-
-    columns: tuple[tuple[str, int, int], ...]  # name, offset and datatype, as of a PointField
-    point_step: int
-    data: npt.NDArray[np.uint8]
 
 
 def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
@@ -100,11 +92,14 @@ def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray
     return kept.view(np.uint8)
 
 
-def append_columns(cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]]) -> WiderCloud:
+def append_columns(
+    cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]]
+) -> tuple[list[tuple[str, int, int]], int, npt.NDArray[np.uint8]]:
     """Put columns, (height * width,) of types that PointField knows, behind every point.
 
     They are written in the byte order of the cloud; bytes between them are zero, padding of the
-    rows is gone. Raises PointCloudError if the layout cannot hold what it claims.
+    rows is gone. Returns name, offset and datatype of each, the new ``point_step`` and the data.
+    Raises PointCloudError if the layout cannot hold what it claims.
     """
     placed = []
     end = _round_up(cloud.point_step, _ALIGNMENT)
@@ -124,7 +119,7 @@ def append_columns(cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]])
             for name, offset, datatype in placed:
                 code = _code(cloud, datatype)
                 np.ndarray((size,), code, wide.data, offset, (step,))[...] = columns[name]
-    return WiderCloud(tuple(placed), step, wide)
+    return placed, step, wide
 
 
 def _round_up(value: int, multiple: int) -> int:

@@ -8,7 +8,7 @@ import time
 from array import array
 from collections.abc import Callable, Mapping
 from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -108,19 +108,13 @@ class SequenceGaps:
         return number - last - 1
 
 
-class Arrival(NamedTuple):
-    """How a cloud arrived."""
-
-    wait: float  # in this process [s]
-    n_lost: int  # just before it; 0 with several publishers, whose numbers cannot be told apart
-
-
 class CloudSubscription:
     """Subscription that is best-effort if a publisher is, and reliable otherwise.
 
     A best-effort reader loses most of a replayed KITTI bag with stock Fast DDS; a reliable one
     gets nothing from a best-effort LiDAR driver. Reliability given in ``qos_overrides``, by
-    `is_given`, is kept for any publisher. `callback` takes each cloud and its `Arrival`.
+    `is_given`, is kept for any publisher. `callback` takes each cloud, its wait in this process
+    [s] and the clouds lost before it: 0 with several publishers, whose numbers tell nothing.
     """
 
     def __init__(
@@ -128,7 +122,7 @@ class CloudSubscription:
         node: Node,
         topic: str,
         is_given: Callable[[str], bool],
-        callback: Callable[[PointCloud2, Arrival], None],
+        callback: Callable[[PointCloud2, float, int], None],
     ) -> None:
         self._node = node
         self._unresolved_topic = topic
@@ -177,7 +171,7 @@ class CloudSubscription:
         n_lost = self._gaps.note(info.get('publication_sequence_number'))
         if n_lost and (self._look_at_publishers() or self.n_publishers != 1):
             n_lost = 0
-        self._callback(message, Arrival(wait, n_lost))
+        self._callback(message, wait, n_lost)
 
     def _on_incompatible(self, _event: object) -> None:
         if self._is_pinned:

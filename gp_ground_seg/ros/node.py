@@ -23,7 +23,6 @@ from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
 from gp_ground_seg.ros.input import (
     LOG_PERIOD,
-    Arrival,
     CloudSubscription,
     TfTilt,
     TimeJumps,
@@ -142,14 +141,14 @@ class GroundSegmentationNode(ConfiguredNode):
         self._segmenter.close()
         self._library_log.close()
 
-    def _on_cloud(self, cloud: PointCloud2, arrival: Arrival) -> None:
+    def _on_cloud(self, cloud: PointCloud2, wait: float, n_lost: int) -> None:
         start = time.monotonic()
         stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
         fields = [field.name for field in cloud.fields]
         health = self._diagnostics
         self._time_jumps.note(stamp)
         health.input.arrived(start, stamp, cloud.header.frame_id, fields)
-        health.processing.arrived(start, arrival.n_lost)
+        health.processing.arrived(start, n_lost)
         try:
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
@@ -163,7 +162,7 @@ class GroundSegmentationNode(ConfiguredNode):
             self._refuse(cloud, f'{type(error).__name__}: {error}')
         else:
             end = time.monotonic()
-            stages = {'queue': arrival.wait, **segmentation.timings, 'publish': end - segmented}
+            stages = {'queue': wait, **segmentation.timings, 'publish': end - segmented}
             health.processing.processed(end - start, stages, segmentation.fit)
             health.model.segmented(segmentation)
             health.output.published(end, topics)

@@ -69,15 +69,15 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
         if field != 'label':
             with np.errstate(over='ignore'):
                 columns[name] = columns[name].astype(np.float32, copy=False)
-    wide = append_columns(cloud, columns)
+    placed, step, data = append_columns(cloud, columns)
     added = [
         PointField(name=name, offset=offset, datatype=datatype, count=1)
-        for name, offset, datatype in wide.columns
+        for name, offset, datatype in placed
     ]
     message = copy(cloud)
     message.fields = [*cloud.fields, *added]
-    message.point_step, message.row_step = wide.point_step, cloud.width * wide.point_step
-    message.data = message_data(wide.data)
+    message.point_step, message.row_step = step, cloud.width * step
+    message.data = message_data(data)
     known = read_xyz(cloud), *columns.values()
     message.is_dense = all(bool(np.isfinite(values).all()) for values in known)
     return message
