@@ -29,8 +29,10 @@ def take_points(points: npt.ArrayLike) -> PointArray:
     Raises
     ------
     PointCloudError
-        If the shape or type is another; the message holds both.
+        If the shape or type is another, or the array is masked.
     """
+    if isinstance(points, np.ma.MaskedArray):
+        raise PointCloudError('points are a masked array: pass points.filled(numpy.nan)')
     array = np.asarray(points)
     if array.ndim != 2 or array.shape[1] < 3:
         raise PointCloudError(
@@ -53,19 +55,14 @@ def check_points(points: npt.ArrayLike) -> FloatArray:
     return np.array(take_points(points), dtype=np.float64, order='F')
 
 
-def in_columns(xyz: PointArray, columns: PointArray) -> PointArray:
-    """Return points (N, 3) with each coordinate contiguous (Fortran order), read-only.
-
-    Parameters
-    ----------
-    xyz : (N, 3) float32 or float64
-        Points.
-    columns : (3, N) float32 or float64
-        Memory to copy them to. They are always copied: the caller may change its array
-        meanwhile.
-    """
+def copy_points(xyz: PointArray, columns: PointArray) -> None:
+    """Copy points (N, 3) to `columns` (3, N), of their type: the caller may change its array."""
     with np.errstate(invalid='ignore'):
         columns[...] = xyz.T
+
+
+def points_in(columns: PointArray) -> PointArray:
+    """Return points (N, 3), read-only, whose coordinates lie in `columns` (3, N)."""
     result: PointArray = columns.T
     # To compiled code, arrays that may be written to are another type.
     result.flags.writeable = False
@@ -84,7 +81,7 @@ def single_precision(xyz: PointArray) -> PointArray:
     return single
 
 
-def finite_points(xyz: FloatArray) -> BoolArray:
+def finite_points(xyz: PointArray) -> BoolArray:
     """Which points (N, 3) have three finite coordinates, (N,) bool."""
     # Column by column: a reduction along rows of three takes ten times as long.
     finite: BoolArray = np.isfinite(xyz[:, 0])

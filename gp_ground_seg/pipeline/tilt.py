@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.frame import FloatArray
+from gp_ground_seg.pipeline.points import finite_points
 
-BoolArray = npt.NDArray[np.bool_]
 Direction = tuple[float, float, float]
 
 ENOUGH_POINTS = 20000
@@ -41,9 +41,10 @@ def vertical(roll: float, pitch: float) -> Direction:
 
 
 def rotate(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
-    """Points (N, 3) turned by a rotation (3, 3), in their own precision; finite ones stay finite.
+    """Points (N, 3) turned by a rotation (3, 3), in their own precision.
 
-    It is computed in double precision; rounded to single, a point 100 m away moves by 4 um.
+    Finite ones stay finite, others become NaN. It is computed in double precision; rounded to
+    single, a point 100 m away moves by 4 um.
     """
     largest = LARGEST[xyz.dtype.itemsize]
     x, y, z = np.clip(xyz, -largest, largest).T.astype(np.float64)
@@ -52,6 +53,7 @@ def rotate(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
         # Not a matrix product: BLAS would wake its threads, which spin long after.
         for i, (a, b, c) in enumerate(matrix.tolist()):
             columns[i] = a * x + b * y + c * z
+    columns[:, ~finite_points(xyz)] = np.nan
     result: npt.NDArray[_Float] = columns.T
     return result
 
