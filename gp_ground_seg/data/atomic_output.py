@@ -38,10 +38,7 @@ def staged_file(target: str | Path, *, force: bool) -> AbstractContextManager[Pa
 
 
 def staged_bag_folder(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
-    """Return the path of a folder to create, as `staged_file`.
-
-    With `force` a rosbag2 folder of that name is replaced, and no other one.
-    """
+    """Return the path of a folder to create, as `staged_file`; `force` replaces a rosbag2 only."""
 
     def check(path: Path) -> None:
         _refuse_existing(path, target, force)

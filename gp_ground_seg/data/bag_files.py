@@ -113,10 +113,7 @@ def _check_sqlite_file(path: Path) -> None:
 
 
 def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
-    """Storage of a new bag: `wanted`, or by its suffix; 'mcap' for a folder.
-
-    Raises DataError if the two contradict, or the storage cannot hold that path.
-    """
+    """Storage of a new bag: `wanted`, or by its suffix; DataError if the two contradict."""
     suffix = Path(path).suffix
     if suffix == '.bag':
         raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder name')

@@ -64,10 +64,7 @@ def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.fl
 
 
 def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-    """Values of the fields `names`, each (height, width), a copy in native byte order.
-
-    Raises PointCloudError if a field is not there as one number, or the layout cannot hold it.
-    """
+    """Values of the fields `names`, each (height, width), a copy in native byte order."""
     views = _views(cloud, names, _CODES)
     return {
         name: view.astype(view.dtype.newbyteorder('='))
@@ -76,10 +73,7 @@ def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDA
 
 
 def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
-    """Every byte of the points where `mask`, (height * width,) bool, is true, in one row.
-
-    Raises PointCloudError if the layout or the mask does not fit.
-    """
+    """Every byte of the points where `mask`, (height * width,) bool, is true, in one row."""
     size = cloud.height * cloud.width
     if mask.shape != (size,) or mask.dtype != np.bool_:
         raise PointCloudError(
@@ -236,10 +230,7 @@ def with_header(cloud: Cloud, stamp: tuple[int, int], frame_id: str | None = Non
 def cloud_from_columns(
     stamp: tuple[int, int], frame_id: str, columns: Mapping[str, npt.NDArray[Any]]
 ) -> CloudMessage:
-    """Message with one float32 or uint32 field per column (N,), packed, in the given order.
-
-    `stamp` is in seconds and nanoseconds. Raises MissingDependencyError without rosbags.
-    """
+    """Message with one float32 or uint32 field per column (N,), packed; `stamp` in s and ns."""
     types = jazzy_types().types
     codes = {name: f'{values.dtype.kind}4' for name, values in columns.items()}
     n_points = len(next(iter(columns.values()), ()))
@@ -270,10 +261,7 @@ def _new_header(stamp: tuple[int, int], frame_id: str) -> Any:
 
 
 def decode_cloud(raw: bytes | memoryview) -> CloudMessage:
-    """Message of rosbags from its CDR bytes.
-
-    Raises PointCloudError if they are no PointCloud2, MissingDependencyError without rosbags.
-    """
+    """Message of rosbags from its CDR bytes; PointCloudError if they are no PointCloud2."""
     types = jazzy_types()
     try:
         cloud: CloudMessage = types.deserialize_cdr(raw, POINT_CLOUD2)

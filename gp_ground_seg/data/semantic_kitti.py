@@ -37,10 +37,7 @@ def list_sequences(root: str | Path) -> list[str]:
 
 
 def list_frames(root: str | Path, sequence: str) -> list[Frame]:
-    """Frames of one sequence, in order.
-
-    Raises DataError if the sequence is missing or empty, or times.txt does not fit it.
-    """
+    """Frames of one sequence, in order; DataError if there are none, or times.txt does not fit."""
     folder = Path(root) / 'sequences' / sequence
     if not (folder / 'velodyne').is_dir():
         known = ', '.join(list_sequences(root))

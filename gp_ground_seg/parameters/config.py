@@ -282,10 +282,7 @@ _ASCENDING = (
 
 @dataclass(frozen=True)
 class Config(ParameterGroups):
-    """All parameters, immutable and valid by construction.
-
-    Raises ConfigError if a value has the wrong type, is out of range, or contradicts another.
-    """
+    """All parameters, immutable; ConfigError if a value is not accepted or contradicts another."""
 
     sensor: SensorConfig = SensorConfig()
     frame: FrameConfig = FrameConfig()

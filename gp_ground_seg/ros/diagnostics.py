@@ -186,11 +186,7 @@ class ProcessingTask:
 
 
 def frame_quality(fit: FitReport, n_occupied: int, certainty: float) -> float:
-    """Return how reliable a frame is, from 0 to 1.
-
-    The product of three shares: segments with a model among the `n_occupied` that hold
-    candidates, inliers among the candidates, certainty of the labels (if not NaN).
-    """
+    """Return how reliable a frame is, 0 to 1: a product of shares (docs/diagnostics.md)."""
     if fit.status == 'failed' or not fit.n_candidates or not n_occupied:
         return 0.0
     share = min(1.0, fit.n_segments / n_occupied) * (fit.n_inliers / fit.n_candidates)

@@ -226,10 +226,7 @@ def _handling(
 
 
 class Session:
-    """The node of a command, and the time it spends waiting; made by `ros_session`.
-
-    `node` has no parameter services and does not log to /rosout.
-    """
+    """The node of a command, without services and /rosout, and the time it spends waiting."""
 
     _is_interrupted = False
     _is_held_back = False

@@ -192,11 +192,7 @@ class GroundSegmentationNode(ConfiguredNode):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT, SIGTERM or a shutdown of its context.
-
-    `args` are the words after the program's name, those of the process by default. Returns 0, or
-    2 for an error at start, reported in one line.
-    """
+    """Run the node until a signal or a shutdown; return 0, or 2 for an error at start."""
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None
     with lifecycle.stop_on_signals() as stop:

@@ -43,10 +43,7 @@ class Output(NamedTuple):
 
 
 def labelled_names(taken: Iterable[str]) -> dict[str, str]:
-    """Return the name of each of `LABELLED_FIELDS` in a cloud whose fields are `taken`.
-
-    A field of the input keeps its name; ours gets ``gp_`` in front, as often as needed.
-    """
+    """Return the names of `LABELLED_FIELDS` beside those `taken`: ours get ``gp_`` in front."""
     used, names = set(taken), {}
     for field in LABELLED_FIELDS:
         name = field

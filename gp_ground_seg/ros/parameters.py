@@ -63,10 +63,7 @@ def describe(config: Config) -> str:
 
 
 class _ParameterService(ParameterService):  # type: ignore[misc]
-    """rclpy's parameter services, of which ``set_parameters`` works in any order.
-
-    If another rclpy calls its method by another name, its own order is back.
-    """
+    """rclpy's services; ``set_parameters`` works in any order, while its method has this name."""
 
     def __init__(self, node: Node) -> None:
         self._set_atomically = node.set_parameters_atomically

@@ -101,10 +101,7 @@ class PlayOptions(NamedTuple):
 
 
 class Player:
-    """Publishes the PointCloud2 `topics` of a bag, reliably, as the bytes that were recorded.
-
-    `pause` waits for at most the given time [s]; it is called when there is nothing to send.
-    """
+    """Publishes PointCloud2 `topics` of a bag as recorded; `pause` waits at most that long [s]."""
 
     _first_sent: float | None = None
     _last_sent = _worst_delay = 0.0

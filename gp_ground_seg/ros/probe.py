@@ -66,10 +66,7 @@ def private_network() -> Iterator[None]:
 
 
 class NodeProcess:
-    """``python -m gp_ground_seg node`` in a second process, for a ``with`` statement.
-
-    Its output goes to the file `log`; a signal raises no exception within ``uninterrupted()``.
-    """
+    """A node in a second process, for a ``with`` statement; its output goes to the file `log`."""
 
     def __init__(
         self,
@@ -204,11 +201,7 @@ class Probe:
         session.node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnosed, 10)
 
     def connect(self, node: NodeProcess, timeout: float = START_TIMEOUT) -> None:
-        """Send empty clouds until both topics have answered and the node is settled.
-
-        Only a result proves the connection. Raises a GroundSegError if that takes longer than
-        `timeout` [s], or the node ends.
-        """
+        """Send empty clouds until both topics have answered and the node is settled."""
         empty = point_cloud2.cloud_from_columns((0, 0), _PROBE_FRAME, {})
         end, next_time, trip = time.monotonic() + timeout, 0.0, Trip(0)
         for cloud in restamped([empty], 1):
@@ -308,11 +301,7 @@ class Probe:
 
 
 def rate_result(asked: float, trips: Sequence[Trip], n_dropped: int) -> dict[str, Any]:
-    """Return the statistics of clouds sent at a rate of `asked` [Hz], times in seconds.
-
-    ``is_accounted``: the node reported as dropped, `n_dropped`, what did not come back;
-    ``is_bounded``: the latency did not grow from the second quarter to the last.
-    """
+    """Return the statistics of clouds sent at a rate of `asked` [Hz]; times in seconds."""
     latency = np.array([trip.latency for trip in trips])
     quarter = len(trips) // 4
     early = _percentile(latency[quarter : 2 * quarter], 50)
@@ -340,10 +329,7 @@ def _percentile(latency: FloatArray, q: float) -> float:
 
 
 def memory_result(resident: Sequence[int], peak: int) -> dict[str, float]:
-    """Return the growth of the memory after each of ten clouds or more [bytes].
-
-    ``start`` and ``end`` are the medians of the tenth after the first one and of the last.
-    """
+    """Return memory near the start and at the end of ten values or more [bytes]; its growth."""
     n_clouds, share = len(resident), len(resident) // 10
     start, end = (
         float(np.median(part)) for part in (resident[share : 2 * share], resident[-share:])

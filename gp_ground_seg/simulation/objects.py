@@ -78,11 +78,7 @@ class Solid(ABC):
         """Ranges between which rays are inside its outline, seen from above."""
 
     def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
-        """Range [m] at which each ray enters the solid, (R,).
-
-        `origin` [m] and `direction`, unit vectors, are (R, 3). Infinite where a ray misses the
-        solid or starts inside.
-        """
+        """Range [m] at which each ray (R, 3) enters the solid, infinite if it does not, (R,)."""
         result = np.full(len(direction), np.inf)
         offset = origin - np.array([self.x, self.y, 0.0])
         dx, dy = direction[:, 0], direction[:, 1]

@@ -65,10 +65,7 @@ class SensorModel:
 
 @dataclass(frozen=True)
 class ScatterModel(SensorModel):
-    """A LiDAR without rings whose rays fill its field of view, in another pattern for each scan.
-
-    `elevations` holds the ends of the field of view, highest first, and `n_columns` is 1.
-    """
+    """A LiDAR without rings: rays fill the field between two `elevations`; `n_columns` is 1."""
 
     n_points: int = 20_000  # rays of one scan
 
@@ -219,10 +216,7 @@ def _ground_below(
 def simulate_drive(
     scene: Scene, sensor: SensorModel, n_frames: int, speed: float, seed: int
 ) -> Iterator[SimulatedScan]:
-    """Drive along x from the origin at `speed` [m/s], ten scans a second.
-
-    The sensor does not follow the slope of the ground. `seed` is that of all noise.
-    """
+    """Drive along x from the origin at `speed` [m/s], ten scans a second; `seed` is of noise."""
     rng = np.random.default_rng(seed)
     return (
         simulate_scan(scene, sensor, rng, x=speed * k * FRAME_PERIOD, time=k * FRAME_PERIOD)

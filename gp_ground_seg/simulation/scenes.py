@@ -85,10 +85,7 @@ def ramp(start: float, gradient: float, heading: float = 0.0) -> Profile:
 def kerb(
     half_width: float, height: float, face_width: float = 0.05, heading: float = math.pi / 2
 ) -> Profile:
-    """Road between two sidewalks `height` [m] above it; `heading` [rad] is across the road.
-
-    `face_width` [m] is the horizontal depth of the kerb's face, 0 for a vertical one.
-    """
+    """Road between sidewalks, `heading` [rad] across it; a kerb is `face_width` [m] deep."""
     outer = half_width + face_width
     corners = [(-outer, height), (-half_width, 0.0), (half_width, 0.0), (outer, height)]
     return polyline(heading, corners)
@@ -107,10 +104,7 @@ def ditch(
 def crest(
     start: float, climb: float, gradient: float, rounding: float, heading: float = 0.0
 ) -> Profile:
-    """Climb from u = `start` [m], rounded top, descent as steep, level ground on both sides.
-
-    `climb` and `rounding` are the horizontal lengths of climb and descent, and of the top [m].
-    """
+    """Climb from u = `start` [m], rounded top, descent as steep; horizontal lengths [m]."""
     top, z, level = start + climb, gradient * climb, (0.0, 0.0, 0.0)
     edges = np.array([start, top, top + rounding, top + rounding + climb])
     up, rounded, down = (

@@ -104,10 +104,7 @@ class Profile(Terrain):
 
 @dataclass(frozen=True, eq=False)
 class Waves(Terrain):
-    """Sum of n plane waves A sin(k . (x, y) + phase), scaled by an envelope.
-
-    The envelope is never negative, of straight pieces, the two outer ones level.
-    """
+    """Sum of n plane waves A sin(k . (x, y) + phase), times an envelope: >= 0, no parabolas."""
 
     wave_vectors: FloatArray  # (n, 2) k [rad/m]
     amplitudes: FloatArray  # (n,) A [m]
@@ -163,10 +160,7 @@ class Waves(Terrain):
 def first_hit(
     terrain: Terrain, origin: FloatArray, direction: FloatArray, max_range: float
 ) -> FloatArray:
-    """Range [m] at which each ray first meets the terrain, (R,), infinite beyond `max_range` [m].
-
-    `origin` [m], above the terrain, and `direction`, unit vectors, are (R, 3).
-    """
+    """Range [m] at which each ray (R, 3) first meets the terrain, infinite beyond `max_range`."""
     entry = np.zeros(len(origin))
     ceiling = terrain.ceiling()
     if ceiling is not terrain:
@@ -222,10 +216,7 @@ def _safe_step(clearance: FloatArray, rate: FloatArray, bend: FloatArray) -> Flo
 def _piece_ends(
     terrain: Terrain, origin: FloatArray, direction: FloatArray, max_range: float
 ) -> FloatArray:
-    """Ranges at which each ray leaves the smooth pieces it crosses, ascending, (R, B + 1).
-
-    The last one is `max_range`; lines that a ray does not cross on the way are there too.
-    """
+    """Ranges at which each ray leaves pieces, ascending, the last `max_range`, (R, B + 1)."""
     a, b, c = terrain.breaks().T
     rate = direction[:, :1] * a + direction[:, 1:2] * b
     distance = c - (origin[:, :1] * a + origin[:, 1:2] * b)
