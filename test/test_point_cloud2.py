@@ -2,11 +2,8 @@
 
 import array
 import dataclasses
-import importlib.util
 import itertools
 import struct
-import subprocess
-import sys
 from typing import NamedTuple
 
 import bag_samples as samples
@@ -236,36 +233,6 @@ def test_select_and_append_refuse_what_they_cannot_read():
 def assert_same_cloud(cloud, expected):
     for field in dataclasses.fields(expected):
         np.testing.assert_equal(getattr(cloud, field.name), getattr(expected, field.name))
-
-
-ROS_ROUND_TRIP = """
-import sys
-from rclpy.serialization import deserialize_message, serialize_message
-from sensor_msgs.msg import PointCloud2
-raw = open(sys.argv[1], 'rb').read()
-message = deserialize_message(raw, PointCloud2)
-open(sys.argv[1], 'wb').write(serialize_message(message))
-print(message.header.stamp.sec, message.header.stamp.nanosec, message.header.frame_id)
-print(message.height, message.width, message.point_step, message.row_step)
-print([(f.name, f.offset, f.datatype, f.count) for f in message.fields])
-"""
-
-
-@pytest.mark.skipif(not importlib.util.find_spec('rclpy'), reason='library-only environment')
-def test_ros_itself_reads_the_encoded_cloud(tmp_path):
-    cloud = samples.cloud(1)
-    (tmp_path / 'raw').write_bytes(encode_cloud(cloud))
-    # In a process of its own: importing rclpy may restart the interpreter.
-    done = subprocess.run(
-        [sys.executable, '-c', ROS_ROUND_TRIP, str(tmp_path / 'raw')],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert done.stdout.splitlines() == [
-        '{} {} {}'.format(*stamp_of(cloud), cloud.header.frame_id),
-        f'{cloud.height} {cloud.width} {cloud.point_step} {cloud.row_step}',
-        str([(f.name, f.offset, f.datatype, f.count) for f in cloud.fields]),
-    ]
-    assert_same_cloud(decode_cloud((tmp_path / 'raw').read_bytes()), cloud)
 
 
 def test_selection_and_another_header_keep_all_else():

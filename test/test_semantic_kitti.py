@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from evaluation_samples import real_kitti, street, write_frame, write_streets
+from evaluation_samples import street, write_frame, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -120,15 +120,3 @@ def test_scans_without_numbers_cannot_have_times(tmp_path):
     (folder / 'times.txt').write_text('0.0\n')
     with pytest.raises(DataError, match=r'first\.bin.*number'):
         list_frames(tmp_path, '00')
-
-
-def test_real_frames():
-    root = real_kitti()
-    sequence = list_sequences(root)[0]
-    frame = list_frames(root, sequence)[0]
-    points = read_points(frame.points_path)
-    assert 100_000 < len(points) < 140_000
-    assert np.isfinite(points).all()
-    assert np.linalg.norm(points[:, :3], axis=1).max() < 130.0
-    semantic = read_labels(frame.labels_path, len(points))
-    assert np.median(points[semantic == 40, 2]) == pytest.approx(-1.73, abs=0.15)

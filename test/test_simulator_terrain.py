@@ -157,31 +157,6 @@ def test_polyline_agrees_with_scalar_oracle(gaps, heights, slope_after, elevatio
     assert t <= latest + 1e-6 if latest <= 60.0 - 1e-6 else t <= 60.0 or t == math.inf
 
 
-@pytest.mark.parametrize(
-    ('elevation', 'y', 'across', 'expected'),
-    [
-        # Onto the face, 7 cm above the road; along the road.
-        (-math.atan2(1.73 - 0.07, 4.0), 0.0, 1.0, [0.0, 4.0, 0.07]),
-        (-0.1, 1.0, 0.0, [1.73 / math.tan(0.1), 1.0, 0.0]),
-    ],
-)
-def test_vertical_kerb_is_exact(elevation, y, across, expected):
-    flat = math.cos(elevation)
-    direction = np.array([[flat * (1.0 - across), flat * across, math.sin(elevation)]])
-    origin = np.array([[0.0, y, 1.73]])
-    t = first_hit(TERRAINS['kerb_vertical'], origin, direction, 120.0)
-    np.testing.assert_allclose((origin + t * direction)[0], expected, atol=1e-9)
-
-
-def test_crest_hides_the_descent():
-    """No level or falling ray from below reaches the ground behind the top."""
-    direction = random_rays(np.random.default_rng(2), 500, -0.4, 0.0)
-    direction = direction[direction[:, 0] > 0.5]
-    _, t = cast(landforms.crest(8.0, 10.0, 0.3, 4.0), direction, max_range=120.0)
-    x = t * direction[:, 0]
-    assert (x[np.isfinite(x)] < 20.0).all()
-
-
 def test_slope_bend_bound_and_ceiling_hold(terrain):
     """Slope equals a central difference; no second difference exceeds the bend bound."""
     rng = np.random.default_rng(6)
