@@ -126,10 +126,9 @@ class NumbaBackend:
         take, thresholds = self._buffers.take, numbers_of(config.faces)
         n_tiles, n_parts = len(scan.tiles.extremes), self._workers.n_parts(len(scan.xyz))
         tile_to_row, row_to_tile = take('tile_rows', (2, n_tiles), np.int32)
-        # As much as could be needed; pages that are not used take no memory.
-        sums = take('face_sums', (n_parts, 2 * n_tiles, faces_.N_COLUMNS), np.float64)
+        n_tall = faces_.select_tall(scan.tiles, thresholds, tile_to_row, row_to_tile)
+        sums = take('face_sums', (n_parts, 2 * n_tall, faces_.N_COLUMNS), np.float64)
         room = faces_.FaceSums(tile_to_row, row_to_tile, sums)
-        n_tall = faces_.select_tall(scan.tiles, thresholds, room)
         self._workers.run(
             faces_.sum_returns,
             n_parts,

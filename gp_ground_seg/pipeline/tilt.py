@@ -64,9 +64,13 @@ def rotate_sample(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_
 
 
 def angles_of(up: FloatArray | Direction) -> tuple[float, float]:
-    """Roll and pitch [rad] of a sensor in whose frame the unit vector `up` (3,) points up."""
-    roll = math.atan2(up[1], up[2])
-    return rounded(roll), rounded(math.atan2(-up[0], math.hypot(up[1], up[2])))
+    """Roll and pitch [rad] of a sensor in whose frame the unit vector `up` (3,) points up.
+
+    Where rounding would decide it, the roll is 0 (x points up or down) or half a turn to the left.
+    """
+    across = math.hypot(up[1], up[2])
+    roll = rounded(math.atan2(up[1], up[2])) if across > 1e-4 else 0.0
+    return roll if roll > -rounded(math.pi) else -roll, rounded(math.atan2(-up[0], across))
 
 
 def rounded(value: float) -> float:
