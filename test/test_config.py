@@ -114,6 +114,8 @@ def test_words_are_names_or_choices(value):
             with pytest.raises(ConfigError, match='one of ' + ', '.join(spec.choices)):
                 spec.check(wrong)
         assert [spec.check(choice) for choice in spec.choices] == list(spec.choices)
+    with pytest.raises(ConfigError, match='must be true or false'):
+        find_spec('learning.warm_start').check(1 if value is True else value)
 
 
 @given(st.sampled_from(SPECS), st.data())
