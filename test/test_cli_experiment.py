@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cli_runner import error_line, run
 from conftest import REPOSITORY
-from evaluation_samples import write_streets
+from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.cli.experiment import EXPERIMENTS, parse_departure, split_settings
@@ -21,7 +21,7 @@ from gp_ground_seg.experiments import ablation, sensor_pose, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, VARIANCES, Choice, table1
 from gp_ground_seg.experiments.variants import PRESET_OF
 from gp_ground_seg.parameters.presets import PRESETS
-from gp_ground_seg.simulation import HDL_32E, SCENES, simulate_scan, write_semantic_kitti
+from gp_ground_seg.simulation import HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
 
 SMALL = ['--set', 'grid.n_bins=40']
 
@@ -225,7 +225,7 @@ def rubble(tmp_path_factory):
     """Rubble ahead, from segment 90 on."""
     folder = tmp_path_factory.mktemp('kitti')
     scan = simulate_scan(SCENES['road_then_rubble'](1), HDL_32E, np.random.default_rng(1), x=12.0)
-    write_semantic_kitti([scan], folder, '00')
+    write_frame(folder, '00', 0, scan.points, semantic_kitti_labels(scan.kind))
     return folder
 
 

@@ -15,8 +15,9 @@ import ros_helpers  # noqa: F401  imports type support without its warnings
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 
+from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.ros.input import JUMP_TOLERANCE, StampWatch, read_xyz, select_points
+from gp_ground_seg.ros.input import JUMP_TOLERANCE, StampWatch, select_points
 
 STRUCT_CODE = {
     PointField.INT8: 'b',

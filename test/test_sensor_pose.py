@@ -27,7 +27,7 @@ from gp_ground_seg.simulation import (
     Scene,
     simulate_scan,
 )
-from gp_ground_seg.simulation import terrain as landforms
+from gp_ground_seg.simulation import scenes as landforms
 from gp_ground_seg.simulation.objects import floating_box, wall
 
 # Scans of 100,000 points, too many for the compiled twins as plain Python.
