@@ -23,25 +23,9 @@ from gp_ground_seg.evaluation.evaluate import (
 )
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
 from gp_ground_seg.experiments import ablation, sensor_pose, variants
-from gp_ground_seg.experiments.ablation import (
-    DEPARTURES,
-    MODELS,
-    Departure,
-    compare_departures,
-    compare_models,
-    coordinate_search,
-    cross_validate,
-)
+from gp_ground_seg.experiments.ablation import MODELS, Departure
 from gp_ground_seg.experiments.sensor_pose import MOUNTS, SIMULATED_MOUNTS, score_poses
-from gp_ground_seg.experiments.variants import (
-    PRESET_OF,
-    SimulatedFrame,
-    load_simulated,
-    scene_table,
-    score_scenes,
-    score_variants,
-    simulated_frames,
-)
+from gp_ground_seg.experiments.variants import PRESET_OF, SimulatedFrame, load_simulated
 from gp_ground_seg.parameters.presets import PRESETS
 from gp_ground_seg.simulation import (
     HDL_64E,
@@ -85,7 +69,7 @@ def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(fra
         assert (config.learning.mode == 'fixed') == ('not learned' in title)
         assert (config.learning.scope == 'segment') == ('per segment' in title)
     assert config == Config()  # the last one is the default
-    scores = score_variants(frames[:1], load_kitti, configs)
+    scores = variants.score_variants(frames[:1], load_kitti, configs)
     theta = {score.name: tuple(score.scans[-1].fit.theta.values()) for score in scores}
     assert len(set(theta.values())) == len(MODELS) - 2
     assert len({values for name, values in theta.items() if 'not learned' in name}) == 1
@@ -95,8 +79,8 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     """The worth of the latent process; docs/experiments.md has the whole table."""
     names = ('constant, learned', 'Z, learned', 'Z-L, learned over the frame')
     monkeypatch.setattr(ablation, 'MODELS', {name: MODELS[name] for name in names})
-    frames = simulated_frames(['hdl-64e'], [ablation.SCENE], 2, ablation.PLACES)
-    report = compare_models(frames, load_simulated, Config())
+    frames = variants.simulated_frames(['hdl-64e'], [ablation.SCENE], 2, ablation.PLACES)
+    report = ablation.compare_models(frames, load_simulated, Config())
     constant, gradient, latent = (row['rmse'] for row in report.tables['models'].json())
     assert latent < 0.9 * min(constant, gradient)
 
@@ -104,7 +88,7 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
 # Departures.
 
 
-@pytest.mark.parametrize('departure', DEPARTURES, ids=lambda one: one.title)
+@pytest.mark.parametrize('departure', ablation.DEPARTURES, ids=lambda one: one.title)
 def test_every_switch_of_the_list_is_accepted_and_turns_something(departure):
     switched = Config().replace(**departure.changes)
     for name in departure.changes:
@@ -113,9 +97,11 @@ def test_every_switch_of_the_list_is_accepted_and_turns_something(departure):
 
 def test_worth_is_what_having_it_adds(frames):
     departures = [Departure('far grid', NEAR), Departure('near grid', NEAR, kept=False)]
-    report = compare_departures(frames, departures, FAR)
+    report = ablation.compare_departures(frames, departures, FAR)
     rows = {row['departure']: row for row in report.tables['departures'].json()}
-    given, near = score_variants(frames, load_kitti, {'given': FAR, 'near': FAR.replace(**NEAR)})
+    given, near = variants.score_variants(
+        frames, load_kitti, {'given': FAR, 'near': FAR.replace(**NEAR)}
+    )
     gain = given.iou - near.iou
     assert gain > 0.1
     assert list(rows) == ['as given', 'far grid', 'near grid']  # the largest worth first
@@ -141,7 +127,7 @@ def test_worth_is_what_having_it_adds(frames):
 )
 def test_lists_that_cannot_be(departures, message):
     with pytest.raises(ConfigError, match=message):
-        compare_departures([], departures, Config())
+        ablation.compare_departures([], departures, Config())
 
 
 # Cross-validation.
@@ -156,16 +142,20 @@ def test_no_single_change_betters_the_choice(heights):
     def of(choice):
         return worth[choice['a'], choice['b']]
 
-    best = coordinate_search(GRID, {'a': 0, 'b': 0}, of)
+    best = ablation.coordinate_search(GRID, {'a': 0, 'b': 0}, of)
     for name, value in itertools.product(GRID, range(3)):
         assert of({**best, name: value}) <= of(best)
     assert of(best) >= worth[0, 0]
 
 
 def test_a_separable_maximum_is_found():
-    best = coordinate_search(GRID, {'a': 0, 'b': 0}, lambda c: -abs(c['a'] - 1) - abs(c['b'] - 2))
+    best = ablation.coordinate_search(
+        GRID, {'a': 0, 'b': 0}, lambda c: -abs(c['a'] - 1) - abs(c['b'] - 2)
+    )
     assert best == {'a': 1, 'b': 2}
-    assert coordinate_search(GRID, best, lambda c: 0.0) == best  # ties keep the given value
+    assert (
+        ablation.coordinate_search(GRID, best, lambda c: 0.0) == best
+    )  # ties keep the given value
 
 
 def test_each_sequence_is_scored_with_values_chosen_without_it(monkeypatch):
@@ -185,7 +175,7 @@ def test_each_sequence_is_scored_with_values_chosen_without_it(monkeypatch):
 
     monkeypatch.setattr(ablation, 'score_variants', score)
     places = [Frame(s, '0', None, None, None) for s in ('00', '05', '08')]
-    report = cross_validate(places, Config().replace(**{name: 0.1}), {name: [0.2, 0.3]})
+    report = ablation.cross_validate(places, Config().replace(**{name: 0.1}), {name: [0.2, 0.3]})
     # By hand: on all 150, 190, 210; without 00 100, 100, 150; without 05 100, 130, 140;
     # without 08 100, 150, 130.
     (choices,) = report.tables['choices'].json()
@@ -200,7 +190,7 @@ def test_each_sequence_is_scored_with_values_chosen_without_it(monkeypatch):
 
 def test_scores_of_the_search_are_those_of_evaluate(frames):
     name = 'grid.r_max'
-    report = cross_validate(frames, FAR, {name: [15.0, 90]})
+    report = ablation.cross_validate(frames, FAR, {name: [15.0, 90]})
     assert report.facts['n_configurations'] == 2  # 90 is the given value
     ours = OurMethod(FAR)
     (score,) = score_methods(frames, load_kitti, [ours])
@@ -209,7 +199,7 @@ def test_scores_of_the_search_are_those_of_evaluate(frames):
     assert row['iou given'] == score.of('00').iou
     assert (pooled['iou given'], pooled['ECE given']) == (score.iou, score.ece)
     with pytest.raises(DataError, match='at least two sequences'):
-        cross_validate(frames[:2], FAR, {name: [15.0]})
+        ablation.cross_validate(frames[:2], FAR, {name: [15.0]})
 
 
 # Simulated scenes.
@@ -224,7 +214,7 @@ def test_every_sensor_has_a_preset_of_its_height():
 def test_scene_scores_follow_their_definitions(monkeypatch):
     monkeypatch.setattr(variants, 'SCENE_PLACES', (6.0,))
     config = PRESETS['vlp16'].config
-    report = score_scenes({'vlp-16': config}, ['kerb'], 2, with_peer=True)
+    report = variants.score_scenes({'vlp-16': config}, ['kerb'], 2, with_peer=True)
     (row,) = report.tables['scenes'].json()
     total, its_total = Confusion(), Confusion()
     errors, its_errors = [], []
@@ -259,7 +249,7 @@ def test_behind_is_said():
             for name, iou in zip(('flat', 'ramp', 'kerb'), ious, strict=True)
         ))  # fmt: skip
 
-    (note,) = scene_table(score(90, 80, 70), score(89, 81, 70)).notes
+    (note,) = variants.scene_table(score(90, 80, 70), score(89, 81, 70)).notes
     assert note == 'ahead of Patchwork++ on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
 
 
@@ -301,7 +291,7 @@ def test_frames_turned(streets):
 def test_poses_of_simulated_scans(monkeypatch):
     small = dataclasses.replace(VLP_16, n_columns=600)
     monkeypatch.setitem(sensor_pose.SENSORS, 'vlp-16', small)
-    frames = simulated_frames(['vlp-16'], ['flat'], 1, (0.0,))
+    frames = variants.simulated_frames(['vlp-16'], ['flat'], 1, (0.0,))
     report = score_poses(frames, sensor_pose.load_mounted, SIMULATED_MOUNTS, FIXED)
     level, _ = report.tables['heights'].json()
     n_heights = len(SIMULATED_MOUNTS) // 2

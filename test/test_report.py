@@ -10,17 +10,8 @@ import subprocess
 import pytest
 
 from gp_ground_seg import Config, __version__
-from gp_ground_seg.evaluation.report import (
-    WIDTH,
-    Column,
-    Table,
-    _commit,
-    changed_parameters,
-    describe_environment,
-    machine_line,
-    parameters_line,
-    write_json,
-)
+from gp_ground_seg.evaluation import report
+from gp_ground_seg.evaluation.report import Column, Table
 
 TABLE = Table(
     [
@@ -70,8 +61,8 @@ def test_forms_of_a_table(form):
 
 def test_long_titles_are_folded_in_the_terminal_only():
     table = Table([Column('a')], [['b']], title='word ' * 40)
-    assert max(map(len, table.text().splitlines())) <= WIDTH
-    assert len(table.markdown().splitlines()[0]) > WIDTH
+    assert max(map(len, table.text().splitlines())) <= report.WIDTH
+    assert len(table.markdown().splitlines()[0]) > report.WIDTH
 
 
 def test_rows_that_name_their_columns_and_rows_of_another_length():
@@ -83,23 +74,23 @@ def test_rows_that_name_their_columns_and_rows_of_another_length():
 
 
 def test_json_files_have_null_for_what_is_undefined(tmp_path):
-    write_json({'a': [math.nan, {'b': (1.0, math.nan)}]}, tmp_path / 'a.json')
+    report.write_json({'a': [math.nan, {'b': (1.0, math.nan)}]}, tmp_path / 'a.json')
     assert json.loads((tmp_path / 'a.json').read_text()) == {'a': [None, {'b': [1.0, None]}]}
 
 
 def test_parameters_and_environment_are_recorded():
     changes = {'label.ground_tolerance': 0.123, 'runtime.backend': 'numpy'}
-    assert changed_parameters(Config()) == {}
-    assert changed_parameters(Config().replace(**changes)) == changes
-    assert parameters_line({}) == 'parameters: defaults'
-    assert 'runtime.backend=numpy' in parameters_line(changes)
-    environment = describe_environment('no-such-package')
+    assert report.changed_parameters(Config()) == {}
+    assert report.changed_parameters(Config().replace(**changes)) == changes
+    assert report.parameters_line({}) == 'parameters: defaults'
+    assert 'runtime.backend=numpy' in report.parameters_line(changes)
+    environment = report.describe_environment('no-such-package')
     assert environment['versions']['gp_ground_seg'] == __version__
     assert environment['versions']['no-such-package'] is None
     assert environment['n_cores'] == len(os.sched_getaffinity(0))
     assert environment['python'] == platform.python_version()
     assert environment['cpu']
-    line = machine_line({**environment, 'n_cores': 1, 'commit': f'{"a" * 40}-dirty'})
+    line = report.machine_line({**environment, 'n_cores': 1, 'commit': f'{"a" * 40}-dirty'})
     assert ', 1 core; Python' in line and 'no-such-package absent' in line
     assert line.endswith(f'commit {"a" * 12} (changed since)')
 
@@ -114,17 +105,17 @@ def test_commit_is_that_of_the_source_or_none(tmp_path):
     source = tmp_path / 'package' / '__init__.py'
     source.parent.mkdir()
     source.write_text('')
-    assert _commit(source) is None
+    assert report._commit(source) is None
     if shutil.which('git') is None:
         return
     git(tmp_path, 'init')
     (tmp_path / 'other').write_text('')
     git(tmp_path, 'add', 'other')
     git(tmp_path, 'commit', '-m', 'another repository')
-    assert _commit(source) is None  # inside a repository that is not its own
+    assert report._commit(source) is None  # inside a repository that is not its own
     git(tmp_path, 'add', 'package')
     git(tmp_path, 'commit', '-m', 'ours')
     commit = git(tmp_path, 'rev-parse', 'HEAD').strip()
-    assert _commit(source) == commit
+    assert report._commit(source) == commit
     source.write_text('changed')
-    assert _commit(source) == f'{commit}-dirty'
+    assert report._commit(source) == f'{commit}-dirty'
