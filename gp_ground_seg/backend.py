@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 from typing import Protocol
 
-import numpy as np
-
 from gp_ground_seg.errors import MissingDependencyError
 from gp_ground_seg.frame import (
     BoolArray,
@@ -26,7 +24,6 @@ from gp_ground_seg.gp import ground, likelihood
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config, RuntimeConfig
 from gp_ground_seg.pipeline import ground_plane, labels, lines, polar_grid, vertical_faces
-from gp_ground_seg.pipeline.points import in_columns
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 _warned_slow = False
@@ -87,46 +84,13 @@ class NumpyBackend:
 
     name = 'numpy'
     n_threads = 1
-
-    def build_grid(self, xyz: PointArray, config: Config) -> Scan:
-        """Sort points into cells and tiles; lowest point of each cell."""
-        columns = np.empty((3, len(xyz)), dtype=xyz.dtype)
-        return polar_grid.build_scan(in_columns(xyz, columns), config)
-
-    def fit_plane(
-        self, candidates: Candidates, max_slope: float
-    ) -> ground_plane.GroundPlane | None:
-        """Plane of the ground around the sensor."""
-        return ground_plane.fit_plane(candidates, max_slope)
-
-    def find_faces(self, scan: Scan, config: Config) -> Faces:
-        """Tiles that hold a vertical face."""
-        max_height = config.label.obstacle_max_height
-        return vertical_faces.find_faces(scan.xyz, scan.tiles, config.faces, max_height)
-
-    def extract_lines(
-        self, candidates: Candidates, faces: Faces, config: Config
-    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
-        """Candidates that show ground, lines, pseudo-inputs, candidates that continue a line."""
-        return lines.find_lines(candidates, faces, config)
-
-    def log_likelihood(
-        self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
-    ) -> tuple[float, FloatArray]:
-        """Log marginal likelihood of the frame and its gradient."""
-        return likelihood.log_likelihood(theta, inliers, slope_std, latent_terms)
-
-    def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
-    ) -> tuple[GroundSurface, FloatArray]:
-        """Inliers, the surface, and log length-scales at the knots."""
-        return ground.estimate_surface(frame, theta, config, segment_step)
-
-    def label_points(
-        self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
-    ) -> Labelled:
-        """Height, label and margin of each point; roughness of each cell."""
-        return labels.label_points(scan, faces, surface, config)
+    build_grid = staticmethod(polar_grid.build_scan)
+    fit_plane = staticmethod(ground_plane.fit_plane)
+    find_faces = staticmethod(vertical_faces.find_faces)
+    extract_lines = staticmethod(lines.find_lines)
+    log_likelihood = staticmethod(likelihood.log_likelihood)
+    estimate_surface = staticmethod(ground.estimate_surface)
+    label_points = staticmethod(labels.label_points)
 
     def close(self) -> None:
         """Nothing to end."""

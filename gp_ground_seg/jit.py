@@ -34,11 +34,11 @@ JIT_ENABLED = HAVE_NUMBA and os.environ.get('NUMBA_DISABLE_JIT', '0') in ('', '0
 _LOGGER = logging.getLogger('gp_ground_seg')
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 _PACKAGE = Path(__file__).parent
-_SOURCES = ('jit.py', 'frame.py', 'pipeline', 'gp', 'compiled')
+_SOURCES = ('jit.py', 'frame.py', 'parameters', 'pipeline', 'gp', 'compiled')
 _entry_points: list[Any] = []
 _folder: Path | None = None
 _is_warm = False
-_n_stamped = 0
+_n_ready = _n_stamped = 0
 
 
 class _Decorator(Protocol):
@@ -199,9 +199,14 @@ def keep_code(*, warm: bool = False) -> None:
     warm : bool
         Whether all code that a frame needs has been compiled.
     """
-    global _n_stamped, _is_warm
+    global _n_ready, _n_stamped, _is_warm
+    n_ready = sum(len(entry.overloads) for entry in _entry_points)
+    if _folder is None or (n_ready == _n_ready and not warm):
+        return
+    _n_ready = n_ready
+    # Of those the ones that were compiled, not loaded; slow to count.
     n_compiled = sum(len(entry.stats.cache_misses) for entry in _entry_points)
-    if _folder is None or (n_compiled == _n_stamped and (_is_warm or not warm)):
+    if n_compiled == _n_stamped and (_is_warm or not warm):
         return
     _n_stamped, _is_warm = n_compiled, _is_warm or warm
     target = _stamp_file(_folder)

@@ -183,14 +183,12 @@ def fuse(request):
     """Compute mean and std of fused surfaces."""
 
     def compiled(mean, std, knots, n_neighbours, slope_std):
-        changes = {'surface.n_neighbours': n_neighbours, 'observation.slope_std': slope_std}
-        params = compiled_ground.GroundParams.of(Config().replace(**changes), 1)
         n_knots = np.isfinite(mean).sum(axis=1)
         own = compiled_ground.SegmentSurfaces(
             np.empty(0), mean, np.empty(0, dtype=bool), mean, std, n_knots
         )
         fused = np.empty((2, *mean.shape))
-        compiled_ground.fuse_neighbours(own, knots, params, -1.7, *fused)
+        compiled_ground.fuse_neighbours(own, knots, slope_std, n_neighbours, -1.7, *fused)
         return fused[0] + 1.7, fused[1]
 
     return fuse_neighbours if request.param == 'numpy' else compiled

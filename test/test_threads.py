@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg.compiled import threads
-from gp_ground_seg.compiled.threads import Workers, equal_parts, parts_of_segments
+from gp_ground_seg.compiled.threads import Part, Workers, run_of
 
 
 @pytest.fixture
@@ -23,26 +23,11 @@ def workers():
 
 
 @given(st.integers(0, 1000), st.integers(1, 9))
-def test_equal_parts_hold_every_point_once(n, n_parts):
-    parts = equal_parts(n, n_parts)
-    assert [p.number for p in parts] == list(range(n_parts))
-    assert [i for p in parts for i in range(p.first, p.stop)] == list(range(n))
-    sizes = [p.stop - p.first for p in parts]
+def test_runs_of_points_hold_every_point_once(n, n_parts):
+    runs = [run_of(Part(number, n_parts), n) for number in range(n_parts)]
+    assert [i for run in runs for i in range(n)[run]] == list(range(n))
+    sizes = [run.stop - run.start for run in runs]
     assert max(sizes) - min(sizes) <= 1
-
-
-@given(st.lists(st.integers(0, 80), min_size=1, max_size=60), st.integers(1, 9))
-def test_parts_of_segments_hold_every_segment_once(sizes, n_parts):
-    parts = parts_of_segments(np.concatenate([[0], np.cumsum(sizes)]), n_parts)
-    assert len(parts) == n_parts
-    assert [m for p in parts for m in range(p.first, p.stop)] == list(range(len(sizes)))
-
-
-def test_parts_of_segments_cost_alike():
-    sizes = np.tile([10, 80], 90)
-    parts = parts_of_segments(np.concatenate([[0], np.cumsum(sizes)]), 4)
-    costs = [(sizes[p.first : p.stop] ** 2).sum() for p in parts]
-    assert max(costs) <= 1.1 * min(costs)
 
 
 def test_each_part_runs_once_and_in_threads(workers):
@@ -51,11 +36,11 @@ def test_each_part_runs_once_and_in_threads(workers):
 
     def work(part, seen):
         barrier.wait()  # only if all three run at the same time
-        seen[part.first : part.stop] += 1
+        seen[run_of(part, 1000)] += 1
         names.add(threading.current_thread().name)
 
     for _ in range(20):
-        workers.run(work, equal_parts(1000, 3), seen)
+        workers.run(work, 3, seen)
     assert (seen == 20).all()
     assert len(names) == 3
 
@@ -71,7 +56,7 @@ def test_an_error_is_raised_after_all_parts_have_ended(workers, failing):
         ended.append(part.number)
 
     with pytest.raises(ValueError, match='that part'):
-        workers.run(work, equal_parts(3, 3))
+        workers.run(work, 3)
     assert sorted(ended) == sorted({0, 1, 2} - {failing})
 
 
@@ -92,7 +77,7 @@ def test_one_thread_does_it_where_none_can_be_started(workers, n_started):
 
     seen = []
     with patch.object(threading.Thread, 'start', start):
-        workers.run(lambda part: seen.append(part.number), equal_parts(3, 3))
+        workers.run(lambda part: seen.append(part.number), 3)
     assert seen == [0, 1, 2]
     assert workers.n_threads == 1
     for thread in started:
@@ -103,7 +88,7 @@ def test_one_thread_does_it_where_none_can_be_started(workers, n_started):
 def test_threads_end_and_start_again(workers):
     before = threading.active_count()
     for _ in range(2):
-        workers.run(lambda part: None, equal_parts(3, 3))
+        workers.run(lambda part: None, 3)
         assert threading.active_count() == before + 2
         workers.close()
         assert threading.active_count() == before

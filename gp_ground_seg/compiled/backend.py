@@ -10,14 +10,15 @@ from gp_ground_seg.compiled import (
     ground,
     ground_plane,
     labels,
-    latent,
     likelihood,
     lines,
     polar_grid,
 )
+from gp_ground_seg.compiled import latent as latent_
 from gp_ground_seg.compiled import vertical_faces as faces_
 from gp_ground_seg.compiled.buffers import Buffers
-from gp_ground_seg.compiled.threads import Workers, equal_parts, parts_of_segments
+from gp_ground_seg.compiled.sections import numbers_of
+from gp_ground_seg.compiled.threads import Part, Workers, run_of
 from gp_ground_seg.frame import (
     BoolArray,
     Candidates,
@@ -38,7 +39,7 @@ from gp_ground_seg.gp.latent import given_log_length_scales
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.pipeline.points import in_columns
+from gp_ground_seg.pipeline.points import copy_points, points_in
 
 
 class NumbaBackend:
@@ -78,7 +79,6 @@ class NumbaBackend:
         n_segments, n_cells = config.grid.n_segments, config.grid.n_segments * config.grid.n_bins
         n_tiles = geometry.n_sides**2
         columns = take('columns', (3, n_points), dtype)
-        xyz = in_columns(xyz, columns)
         cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points, dtype=dtype)
         tile = take('tile', (n_points,), np.int32)
         cells = polar_grid.CellTable(
@@ -87,8 +87,13 @@ class NumbaBackend:
         )
         tiles = self._buffers.tile_table(self._workers.n_threads, n_tiles, dtype)
         places = polar_grid.Places(cell, r, tile)
-        parts = equal_parts(n_points, n_parts)
-        self._workers.run(polar_grid.sort_points, parts, columns, geometry, places, cells, tiles)
+
+        def copy_and_sort(part: Part) -> None:
+            own = run_of(part, n_points)
+            copy_points(xyz[own], columns[:, own])
+            polar_grid.sort_points(part, columns, geometry, places, cells, tiles)
+
+        self._workers.run(copy_and_sort, n_parts)
         room = Candidates(
             r=np.empty(n_cells),
             z=np.empty(n_cells),
@@ -105,7 +110,7 @@ class NumbaBackend:
         )
         occupied = tiles.occupied[0, 1 : 1 + tiles.occupied[0, 0]]
         return Scan(
-            xyz,
+            points_in(columns),
             PolarGrid(cell, r, geometry.edges, n_segments),
             Tiles(tile, tiles.extremes[0, :-1], occupied),
             candidates,
@@ -117,35 +122,37 @@ class NumbaBackend:
 
     def find_faces(self, scan: Scan, config: Config) -> Faces:
         """Tiles that hold a vertical face."""
-        take, params = self._buffers.take, faces_.FaceParams.of(config)
+        take, thresholds = self._buffers.take, numbers_of(config.faces)
         n_tiles, n_parts = len(scan.tiles.extremes), self._workers.n_parts(len(scan.xyz))
         tile_to_row, row_to_tile = take('tile_rows', (2, n_tiles), np.int32)
         # As much as could be needed; pages that are not used take no memory.
         sums = take('face_sums', (n_parts, 2 * n_tiles, faces_.N_COLUMNS), np.float64)
         room = faces_.FaceSums(tile_to_row, row_to_tile, sums)
-        n_tall = faces_.select_tall(scan.tiles, params, room)
+        n_tall = faces_.select_tall(scan.tiles, thresholds, room)
         self._workers.run(
             faces_.sum_returns,
-            equal_parts(len(scan.xyz), n_parts),
+            n_parts,
             scan.xyz.T,
             scan.tiles,
-            params,
+            thresholds,
+            config.label.obstacle_max_height,
             n_tall,
             room,
         )
         result = Faces(*take('faces', (2, n_tiles), np.bool_))
-        faces_.decide_faces(n_parts, n_tall, params, room, result)
+        faces_.decide_faces(n_parts, n_tall, thresholds, room, result)
         return result
 
     def extract_lines(
         self, candidates: Candidates, faces: Faces, config: Config
     ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
         """Candidates that show ground, lines, pseudo-inputs, candidates that continue a line."""
-        params = lines.LineParams.of(config)
+        tolerances, growth = numbers_of(config.lines), numbers_of(config.growth)
+        latent, limits = numbers_of(config.latent), numbers_of(config.length_scale)
         kept = lines.keep_visible(candidates, faces.has_occluded_base)
-        found = lines.extract_lines(kept, params)
-        pseudo = lines.select_pseudo_inputs(kept, found, params)
-        return kept, found, pseudo, lines.candidates_on_lines(kept, found, params)
+        found = lines.extract_lines(kept, tolerances)
+        pseudo = lines.select_pseudo_inputs(kept, found, latent, limits)
+        return kept, found, pseudo, lines.candidates_on_lines(kept, found, tolerances, growth)
 
     def log_likelihood(
         self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
@@ -155,7 +162,7 @@ class NumbaBackend:
         values, gradients = np.empty(n_segments), np.empty((n_segments, len(theta)))
         self._workers.run(
             likelihood.log_likelihood,
-            parts_of_segments(inliers.offsets, self._workers.n_threads),
+            self._workers.n_threads,
             theta,
             inliers,
             slope_std,
@@ -172,12 +179,12 @@ class NumbaBackend:
         self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
     ) -> tuple[GroundSurface, FloatArray]:
         """Inliers, the surface, and log length-scales at the knots."""
-        take, params = self._buffers.take, ground.GroundParams.of(config, segment_step)
+        take, observation = self._buffers.take, numbers_of(config.observation)
+        growth, n_neighbours = numbers_of(config.growth), config.surface.n_neighbours
         shape, n_candidates = (len(theta), len(frame.knots)), len(frame.candidates.r)
-        parts = parts_of_segments(frame.candidates.offsets, self._workers.n_threads)
-        if config.length_scale.model == 'latent':
+        is_latent = config.length_scale.model == 'latent'
+        if is_latent:
             u, knot_u = take('u', (n_candidates,), np.float64), np.empty(shape)
-            self._workers.run(latent.latent_log_length_scales, parts, frame, theta, u, knot_u)
         else:
             u, knot_u = given_log_length_scales(frame, config.length_scale)
         own = ground.SegmentSurfaces(
@@ -188,16 +195,23 @@ class NumbaBackend:
             std=take('std', shape, np.float64),
             n_knots=take('n_knots', shape[:1], np.int64),
         )
-        self._workers.run(ground.grow_surfaces, parts, frame, theta, params, own)
+
+        def grow_surfaces(part: Part) -> None:
+            if is_latent:
+                latent_.latent_log_length_scales(part, frame, theta, u, knot_u)
+            ground.grow_surfaces(part, frame, theta, observation, growth, segment_step, own)
+
+        self._workers.run(grow_surfaces, self.n_threads)
         mean, std = np.empty((2, *shape))
-        ground.fuse_neighbours(own, frame.knots, params, frame.prior_mean, mean, std)
+        spread = observation.slope_std, n_neighbours
+        ground.fuse_neighbours(own, frame.knots, *spread, frame.prior_mean, mean, std)
         return GroundSurface(frame.knots, mean, std, own.inlier), knot_u
 
     def label_points(
         self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
     ) -> Labelled:
         """Height, label and margin of each point; roughness of each cell."""
-        take, params = self._buffers.take, labels.LabelParams.of(config)
+        take, tolerances = self._buffers.take, numbers_of(config.label)
         n_points, n_bins = len(scan.xyz), scan.grid.n_bins
         n_cells, n_parts = scan.grid.n_segments * n_bins, self._workers.n_parts(n_points)
         room = labels.LabelRoom(
@@ -211,11 +225,21 @@ class NumbaBackend:
             np.empty(n_points),
             np.empty((scan.grid.n_segments, n_bins)),
         )
-        parts = equal_parts(n_points, n_parts)
         labels.fit_pieces(surface, room)
-        self._workers.run(labels.survey, parts, scan, faces.is_face, params, result.height, room)
-        labels.set_bands(n_parts, params, room, result.roughness)
-        self._workers.run(labels.label_part, parts, scan, faces, params, room.band, result)
+        self._workers.run(
+            labels.survey, n_parts, scan, faces.is_face, tolerances, result.height, room
+        )
+        labels.set_bands(n_parts, tolerances, room, result.roughness)
+        self._workers.run(
+            labels.label_part,
+            n_parts,
+            scan,
+            faces,
+            tolerances,
+            config.faces.tolerance,
+            room.band,
+            result,
+        )
         keep_code()
         return result
 

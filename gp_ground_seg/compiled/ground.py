@@ -17,37 +17,7 @@ from gp_ground_seg.compiled.numerics import LANES, exp_neg
 from gp_ground_seg.compiled.threads import Part
 from gp_ground_seg.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.jit import jit
-from gp_ground_seg.parameters.config import Config
-
-
-class GroundParams(NamedTuple):
-    """Model, gates and seeds, see `gp_ground_seg.parameters.config`."""
-
-    least_gate_noise: float
-    slope_std: float
-    seed_range: float
-    seed_height_tolerance: float
-    segment_step: int
-    max_std: float
-    max_standardised_residual: float
-    max_standardised_depth: float
-    n_neighbours: int
-
-    @classmethod
-    def of(cls, config: Config, segment_step: int) -> GroundParams:
-        """Take the values out of a configuration."""
-        growth = config.growth
-        return cls(
-            least_gate_noise=config.observation.sigma_n,
-            slope_std=config.observation.slope_std,
-            seed_range=growth.seed_range,
-            seed_height_tolerance=growth.seed_height_tolerance,
-            segment_step=segment_step,
-            max_std=growth.max_std,
-            max_standardised_residual=growth.max_standardised_residual,
-            max_standardised_depth=growth.max_standardised_depth,
-            n_neighbours=config.surface.n_neighbours,
-        )
+from gp_ground_seg.parameters.config import GrowthConfig, ObservationConfig
 
 
 class SegmentSurfaces(NamedTuple):
@@ -77,14 +47,20 @@ class SegmentSurfaces(NamedTuple):
 
 @jit(entry=True, fastmath=True)
 def grow_surfaces(
-    part: Part, frame: Frame, theta: FloatArray, params: GroundParams, own: SegmentSurfaces
+    part: Part,
+    frame: Frame,
+    theta: FloatArray,
+    observation: ObservationConfig,
+    growth: GrowthConfig,
+    segment_step: int,
+    own: SegmentSurfaces,
 ) -> None:
     """Inliers and surface of the segments of a part, into `own`."""
     candidates, knots = frame.candidates, frame.knots
     offsets, r = candidates.offsets, candidates.r
     inlier, mean, std = own.inlier, own.mean, own.std
     most = 0
-    for m in range(part.first, part.stop):
+    for m in range(part.number, len(mean), part.n_parts):
         most = max(most, offsets[m + 1] - offsets[m])
     room = (most + len(knots) + LANES - 1) & -LANES
     columns, whitened = np.empty((6, room)), np.empty((most, room))
@@ -92,8 +68,8 @@ def grow_surfaces(
     all_r, all_l, square = columns[0], columns[1], columns[2]
     predicted, variance, observed = columns[3], columns[4], columns[5]
     new = np.empty(most, np.int64)
-    slope = params.slope_std**2
-    for m in range(part.first, part.stop):
+    slope = observation.slope_std**2
+    for m in range(part.number, len(mean), part.n_parts):
         first = offsets[m]
         n = offsets[m + 1] - first
         for j in range(len(knots)):
@@ -102,8 +78,8 @@ def grow_surfaces(
         for i in range(n):
             inlier[first + i] = False
             observed[i] = candidates.z[first + i] - frame.prior_mean
-            is_low = abs(observed[i]) <= params.seed_height_tolerance
-            if is_low and r[first + i] <= params.seed_range and m % params.segment_step == 0:
+            is_low = abs(observed[i]) <= growth.seed_height_tolerance
+            if is_low and r[first + i] <= growth.seed_range and m % segment_step == 0:
                 new[n_new] = i
                 n_new += 1
         own.n_knots[m] = 0
@@ -128,7 +104,7 @@ def grow_surfaces(
             predicted[j] = 0.0
             variance[j] = sill + slope * all_r[j] * all_r[j]
         # Learned on inliers the noise comes out small, which must not close the gate.
-        noise, gate = sigma_n**2, max(sigma_n, params.least_gate_noise) ** 2
+        noise, gate = sigma_n**2, max(sigma_n, observation.sigma_n) ** 2
         n_inliers = done = 0
         # Unsigned, as a signed index could count from the end.
         end = np.uintp(size)
@@ -177,12 +153,12 @@ def grow_surfaces(
                 if inlier[first + i]:
                     continue
                 residual = observed[i] - predicted[i]
-                limit = params.max_standardised_depth
+                limit = growth.max_standardised_depth
                 if residual > 0.0:
-                    limit = params.max_standardised_residual
+                    limit = growth.max_standardised_residual
                 spread = max(variance[i], 0.0) + gate
                 if (frame.continues_line[first + i] and inlier[first + i - 1]) or (
-                    variance[i] <= params.max_std**2
+                    variance[i] <= growth.max_std**2
                     and residual * residual <= limit * limit * spread
                 ):
                     new[n_new] = i
@@ -197,15 +173,16 @@ def grow_surfaces(
 def fuse_neighbours(
     own: SegmentSurfaces,
     knots: FloatArray,
-    params: GroundParams,
+    slope_std: float,
+    n_neighbours: int,
     prior_mean: float,
     fused_mean: FloatArray,
     fused_std: FloatArray,
 ) -> None:
     """Do what the twin does; `own` is about `prior_mean`, and the result is not."""
-    mean, std, n_neighbours = own.mean, own.std, params.n_neighbours
+    mean, std = own.mean, own.std
     n_segments, n_knots = mean.shape
-    aside = params.slope_std * 2.0 * math.pi / n_segments
+    aside = slope_std * 2.0 * math.pi / n_segments
     total_weight, weighted = np.empty(n_knots), np.empty(n_knots)
     for m in range(n_segments):
         if n_neighbours == 0:

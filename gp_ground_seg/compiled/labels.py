@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.compiled.threads import Part
+from gp_ground_seg.compiled.threads import Part, points_of
 from gp_ground_seg.frame import (
     NOT_FINITE,
     BoolArray,
@@ -24,41 +24,13 @@ from gp_ground_seg.frame import (
     Scan,
 )
 from gp_ground_seg.jit import jit
-from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.config import LabelConfig
 from gp_ground_seg.pipeline.labels import SQUARE_UNITS
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
 OBSTACLE_FLAG = 2**32
 """Added to the number of points for each that shows an obstacle: more than there are points."""
-
-
-class LabelParams(NamedTuple):
-    """Tolerances, see `gp_ground_seg.parameters.config`."""
-
-    ground_tolerance: float
-    roughness_gain: float
-    obstacle_tolerance: float
-    obstacle_roughness_gain: float
-    obstacle_min_height: float
-    obstacle_max_height: float
-    below_tolerance: float
-    face_tolerance: float
-
-    @classmethod
-    def of(cls, config: Config) -> LabelParams:
-        """Take the values out of a configuration."""
-        label = config.label
-        return cls(
-            ground_tolerance=label.ground_tolerance,
-            roughness_gain=label.roughness_gain,
-            obstacle_tolerance=label.obstacle_tolerance,
-            obstacle_roughness_gain=label.obstacle_roughness_gain,
-            obstacle_min_height=label.obstacle_min_height,
-            obstacle_max_height=label.obstacle_max_height,
-            below_tolerance=label.below_tolerance,
-            face_tolerance=config.faces.tolerance,
-        )
 
 
 class LabelRoom(NamedTuple):
@@ -99,35 +71,34 @@ def survey(
     part: Part,
     scan: Scan,
     is_face: BoolArray,
-    params: LabelParams,
+    config: LabelConfig,
     height: FloatArray,
     room: LabelRoom,
 ) -> None:
     """Heights of the points of a part over the surface, and the sums for roughness."""
-    # Slices, because indices from 0 on need no check for negative ones.
-    points = slice(part.first, part.stop)
-    z, tile = scan.xyz.T[2, points], scan.tiles.tile[points]
-    cell, r = scan.grid.cell[points], scan.grid.r[points]
-    own_height = height[points]
     pieces, sums, nearest = room.pieces, room.sums[part.number], scan.grid.edges[0]
-    min_height, max_height = params.obstacle_min_height, params.obstacle_max_height
+    min_height, max_height = config.obstacle_min_height, config.obstacle_max_height
     for k in range(len(sums)):
         sums[k, 0] = sums[k, 1] = 0
+    # Slices, because indices from 0 on need no check for negative ones.
+    own = points_of(part, len(height))
+    z, tile, heights = scan.xyz.T[2, own], scan.tiles.tile[own], height[own]
+    cell, r = scan.grid.cell[own], scan.grid.r[own]
     for i in range(len(cell)):
-        own = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
+        c = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
         away = max(np.float64(r[i]), nearest)
-        h = np.float64(z[i]) - (pieces[own, 0] + pieces[own, 1] * away)
-        own_height[i] = h
+        h = np.float64(z[i]) - (pieces[c, 0] + pieces[c, 1] * away)
+        heights[i] = h
         if h >= min_height:
             if h <= max_height:
-                sums[own, 0] += OBSTACLE_FLAG
+                sums[c, 0] += OBSTACLE_FLAG
         elif h >= -min_height and not is_face[np.uintp(tile[i])]:
-            sums[own, 0] += 1
-            sums[own, 1] += int(h * h * SQUARE_UNITS + 0.5)
+            sums[c, 0] += 1
+            sums[c, 1] += int(h * h * SQUARE_UNITS + 0.5)
 
 
 @jit(entry=True)
-def set_bands(n_parts: int, params: LabelParams, room: LabelRoom, roughness: FloatArray) -> None:
+def set_bands(n_parts: int, config: LabelConfig, room: LabelRoom, roughness: FloatArray) -> None:
     """Roughness and band of each cell from the sums of all parts."""
     n_segments, n_bins = roughness.shape
     # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
@@ -151,31 +122,37 @@ def set_bands(n_parts: int, params: LabelParams, room: LabelRoom, roughness: Flo
             count = max(number[n] + number[n + 1] + number[n + 2], 1)
             total = squares[n] + squares[n + 1] + squares[n + 2]
             rough = math.sqrt(np.float64(total) / (SQUARE_UNITS * np.float64(count)))
-            free = params.ground_tolerance + params.roughness_gain * rough
-            beside = params.obstacle_tolerance + params.obstacle_roughness_gain * rough
+            free = config.ground_tolerance + config.roughness_gain * rough
+            beside = config.obstacle_tolerance + config.obstacle_roughness_gain * rough
             own = min(free, beside) if n_obstacles[n] > 0 else free
-            room.band[m * n_bins + n] = min(own, params.obstacle_min_height)
+            room.band[m * n_bins + n] = min(own, config.obstacle_min_height)
             roughness[m, n] = rough
     room.band[n_segments * n_bins] = math.nan
 
 
 @jit(entry=True)
 def label_part(
-    part: Part, scan: Scan, faces: Faces, params: LabelParams, band: FloatArray, result: Labelled
+    part: Part,
+    scan: Scan,
+    faces: Faces,
+    config: LabelConfig,
+    face_tolerance: float,
+    band: FloatArray,
+    result: Labelled,
 ) -> None:
     """Label the points of a part from their heights in `result`."""
-    points = slice(part.first, part.stop)
+    points = points_of(part, len(result.height))
     z, tile, cell = scan.xyz.T[2, points], scan.tiles.tile[points], scan.grid.cell[points]
     height, label, margins = result.height[points], result.label[points], result.margin[points]
     for i in range(len(cell)):
         n, h = cell[i], height[i]
         margin = min(
-            band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + params.below_tolerance
+            band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + config.below_tolerance
         )
         t = np.uintp(tile[i] if n >= 0 else 0)
         if faces.is_face[t]:
             over_base = max(h, np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0]))
-            limit = params.face_tolerance
+            limit = face_tolerance
             if faces.has_occluded_base[t]:
                 limit = -limit
             margin = min(margin, limit - over_base)

@@ -25,14 +25,14 @@ def latent_log_length_scales(
     candidates = frame.candidates
     offsets, r = candidates.offsets, candidates.r
     most = most_bar = 0
-    for m in range(part.first, part.stop):
+    for m in range(part.number, len(at_knots), part.n_parts):
         most = max(most, offsets[m + 1] - offsets[m])
         most_bar = max(most_bar, pseudo.offsets[m + 1] - pseudo.offsets[m])
     room = (most + len(knots) + LANES - 1) & -LANES
     wanted, value = np.empty(room), np.empty(room)
     room = (most_bar + LANES - 1) & -LANES
     matrix, weight, centres = np.empty((most_bar, room)), np.empty(room), np.empty(room)
-    for m in range(part.first, part.stop):
+    for m in range(part.number, len(at_knots), part.n_parts):
         for j in range(len(knots)):
             at_knots[m, j] = np.nan
         first, own = pseudo.offsets[m], offsets[m]

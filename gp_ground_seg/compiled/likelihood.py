@@ -28,7 +28,7 @@ def log_likelihood(
     sigma_f, sigma_n = math.exp(theta[0]), math.exp(theta[1])
     sigma_f_bar, sigma_l_bar = math.exp(theta[2]), math.exp(theta[3])
     sigma_n_bar = math.exp(theta[4])
-    for m in range(part.first, part.stop):
+    for m in range(part.number, len(values), part.n_parts):
         first, bar_first = inliers.offsets[m], inliers.bar_offsets[m]
         n, p = inliers.offsets[m + 1] - first, inliers.bar_offsets[m + 1] - bar_first
         values[m] = 0.0

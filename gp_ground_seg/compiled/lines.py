@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,57 +15,16 @@ from gp_ground_seg.frame import (
     PseudoInputs,
 )
 from gp_ground_seg.jit import jit
-from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.config import (
+    GrowthConfig,
+    LatentConfig,
+    LengthScaleConfig,
+    LinesConfig,
+)
 from gp_ground_seg.pipeline import lines as plain
 from gp_ground_seg.pipeline.lines import MIN_BREAK_CANDIDATES
 
 _deming_slope = jit()(plain.deming_slope)
-
-
-class LineParams(NamedTuple):
-    """Tolerances of lines and pseudo-inputs, see `gp_ground_seg.parameters.config`."""
-
-    slope_tolerance: float
-    offset_tolerance: float
-    max_line_distance: float
-    max_gap: float
-    max_gap_growth: float
-    max_density_ratio: float
-    error_ratio: float
-    candidates_per_pseudo_input: float
-    medium_extent: float
-    long_extent: float
-    sloped_gradient: float
-    steep_gradient: float
-    shortest: float
-    longest: float
-    min_line_size: int
-    min_bend_extent: float
-    max_line_slope: float
-
-    @classmethod
-    def of(cls, config: Config) -> LineParams:
-        """Take the values out of a configuration."""
-        lines, latent, growth = config.lines, config.latent, config.growth
-        return cls(
-            slope_tolerance=lines.slope_tolerance,
-            offset_tolerance=lines.offset_tolerance,
-            max_line_distance=lines.max_line_distance,
-            max_gap=lines.max_gap,
-            max_gap_growth=lines.max_gap_growth,
-            max_density_ratio=lines.max_density_ratio,
-            error_ratio=lines.error_ratio,
-            candidates_per_pseudo_input=latent.candidates_per_pseudo_input,
-            medium_extent=latent.medium_extent,
-            long_extent=latent.long_extent,
-            sloped_gradient=latent.sloped_gradient,
-            steep_gradient=latent.steep_gradient,
-            shortest=config.length_scale.min,
-            longest=config.length_scale.max,
-            min_line_size=growth.min_line_size,
-            min_bend_extent=growth.min_bend_extent,
-            max_line_slope=growth.max_line_slope,
-        )
 
 
 @jit(entry=True)
@@ -88,14 +46,14 @@ def keep_visible(candidates: Candidates, has_occluded_base: BoolArray) -> Candid
 
 
 @jit(entry=True)
-def extract_lines(candidates: Candidates, params: LineParams) -> Lines:
+def extract_lines(candidates: Candidates, config: LinesConfig) -> Lines:
     """Do what the twin does."""
     r, z, density, offsets = candidates.r, candidates.z, candidates.density, candidates.offsets
     line = np.empty(len(r), np.int64)
     start = np.empty(len(r) + 1, np.int64)
     slopes = np.empty(len(r))
-    tangent = math.tan(params.slope_tolerance)
-    square_distance = params.max_line_distance * params.max_line_distance
+    tangent = math.tan(config.slope_tolerance)
+    square_distance = config.max_line_distance * config.max_line_distance
     current = 0
     for m in range(len(offsets) - 1):
         stop = offsets[m + 1]
@@ -113,9 +71,9 @@ def extract_lines(candidates: Candidates, params: LineParams) -> Lines:
             while j < stop:
                 last_density, own_density = density[j - 1], density[j]
                 if (
-                    r[j] - r[j - 1] > params.max_gap + params.max_gap_growth * r[j]
-                    or own_density > params.max_density_ratio * last_density
-                    or last_density > params.max_density_ratio * own_density
+                    r[j] - r[j - 1] > config.max_gap + config.max_gap_growth * r[j]
+                    or own_density > config.max_density_ratio * last_density
+                    or last_density > config.max_density_ratio * own_density
                 ):
                     break
                 dr, dz = r[j] - first_r, z[j] - first_z
@@ -134,12 +92,12 @@ def extract_lines(candidates: Candidates, params: LineParams) -> Lines:
                     sum_rr - n * mean_r * mean_r,
                     sum_zz - n * mean_z * mean_z,
                     sum_rz - n * mean_r * mean_z,
-                    params.error_ratio,
+                    config.error_ratio,
                 )
                 if n > 2:
                     moved = mean_z + new_slope * (dr - mean_r) - expected
-                    if abs(moved) > params.offset_tolerance or _differs_in_direction(
-                        slope, new_slope, params.slope_tolerance, tangent
+                    if abs(moved) > config.offset_tolerance or _differs_in_direction(
+                        slope, new_slope, config.slope_tolerance, tangent
                     ):
                         break
                 slope = new_slope
@@ -164,14 +122,16 @@ def _differs_in_direction(
 
 
 @jit(entry=True)
-def select_pseudo_inputs(candidates: Candidates, lines: Lines, params: LineParams) -> PseudoInputs:
+def select_pseudo_inputs(
+    candidates: Candidates, lines: Lines, latent: LatentConfig, limits: LengthScaleConfig
+) -> PseudoInputs:
     """Do what the twin does."""
     r, start, slope = candidates.r, lines.start, lines.slope
     n_lines = len(slope)
     r_bar, surface_class = np.empty(len(r)), np.empty(len(r), dtype=np.int64)
     offsets = np.empty(len(candidates.offsets), dtype=np.int64)
     count, total = np.zeros(N_CLASSES, dtype=np.int64), np.zeros(N_CLASSES)
-    log_shortest = math.log(params.shortest)
+    log_shortest = math.log(limits.min)
     m = 0
     p = 0
     for q in range(n_lines):
@@ -183,21 +143,21 @@ def select_pseudo_inputs(candidates: Candidates, lines: Lines, params: LineParam
         extent = r[first + size - 1] - r[first]
         steepness = abs(slope[q])
         own = 0
-        if extent >= params.medium_extent:
+        if extent >= latent.medium_extent:
             own += 1
-        if extent >= params.long_extent:
+        if extent >= latent.long_extent:
             own += 1
         # Negated, so that a line of one point, whose slope is NaN, counts as steep.
-        if not steepness < params.sloped_gradient:
+        if not steepness < latent.sloped_gradient:
             own += 3
-        if not steepness < params.steep_gradient:
+        if not steepness < latent.steep_gradient:
             own += 3
         log_extent = log_shortest
-        if extent > params.shortest:
-            log_extent = math.log(min(extent, params.longest))
+        if extent > limits.min:
+            log_extent = math.log(min(extent, limits.max))
         count[own] += 1
         total[own] += log_extent
-        number = max(int(np.rint(size / params.candidates_per_pseudo_input)), 1)
+        number = max(int(np.rint(size / latent.candidates_per_pseudo_input)), 1)
         for rank in range(number):
             r_bar[p] = r[first + (size * (2 * rank + 1)) // (2 * number)]
             surface_class[p] = own
@@ -212,7 +172,9 @@ def select_pseudo_inputs(candidates: Candidates, lines: Lines, params: LineParam
 
 
 @jit(entry=True)
-def candidates_on_lines(candidates: Candidates, lines: Lines, params: LineParams) -> BoolArray:
+def candidates_on_lines(
+    candidates: Candidates, lines: Lines, config: LinesConfig, growth: GrowthConfig
+) -> BoolArray:
     """Do what the twin does."""
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     start, slope = lines.start, lines.slope
@@ -222,15 +184,24 @@ def candidates_on_lines(candidates: Candidates, lines: Lines, params: LineParams
         first, stop = start[q], start[q + 1]
         while offsets[m] < first:
             m += 1
-        is_flat = abs(slope[q]) <= params.max_line_slope
+        is_flat = abs(slope[q]) <= growth.max_line_slope
         at_break = False
         is_long = stop - first >= MIN_BREAK_CANDIDATES
-        is_long = is_long and r[stop - 1] - r[first] >= params.min_bend_extent
+        is_long = is_long and r[stop - 1] - r[first] >= growth.min_bend_extent
         if is_flat and is_long and offsets[m] != first:
-            at_break = _meets_line_before(first, stop, r, z, slope[q - 1], slope[q], params)
+            at_break = _meets_line_before(
+                first,
+                stop,
+                r,
+                z,
+                slope[q - 1],
+                slope[q],
+                config.offset_tolerance,
+                growth.max_line_slope,
+            )
         continues_line[first] = at_break
         for c in range(first + 1, stop):
-            continues_line[c] = at_break or (is_flat and stop - first >= params.min_line_size)
+            continues_line[c] = at_break or (is_flat and stop - first >= growth.min_line_size)
     return continues_line
 
 
@@ -242,7 +213,8 @@ def _meets_line_before(
     z: FloatArray,
     before: float,
     slope: float,
-    params: LineParams,
+    offset_tolerance: float,
+    max_line_slope: float,
 ) -> bool:
     """Whether the line and that before it intersect between them."""
     mean_r, mean_z = 0.0, 0.0
@@ -250,11 +222,11 @@ def _meets_line_before(
         mean_r += r[c] / (stop - first)
         mean_z += z[c] / (stop - first)
     last = first - 1
-    if not abs(before) <= params.max_line_slope:
+    if not abs(before) <= max_line_slope:
         before = 0.0
     over_last = mean_z + slope * (r[last] - mean_r) - z[last]
     over_line = z[first] - (z[last] + before * (r[first] - r[last]))
-    tolerance = params.offset_tolerance
+    tolerance = offset_tolerance
     upwards = over_last <= tolerance and over_line >= -tolerance
     downwards = over_last >= -tolerance and over_line <= tolerance
     meets: bool = upwards or downwards

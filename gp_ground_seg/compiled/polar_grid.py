@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.compiled.buffers import TileTable
-from gp_ground_seg.compiled.threads import Part
+from gp_ground_seg.compiled.threads import Part, points_of
 from gp_ground_seg.frame import (
     NO_TILE,
     NOT_FINITE,
@@ -152,20 +152,21 @@ def sort_points(
     extremes.
     """
     cell, r, tile = places.cell, places.r, places.tile
+    points = points_of(part, len(r))
     extremes, numbers = cells.extremes[part.number], cells.numbers[part.number]
     tile_extremes, occupied = tiles.extremes[part.number], tiles.occupied[part.number]
     _clear(extremes, numbers, tile_extremes, occupied)
     range_entry = np.empty(BLOCK, dtype=np.int32)
     key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
-    for first in range(part.first, part.stop, BLOCK):
-        own = slice(first, min(first + BLOCK, part.stop))
+    for first in range(points.start, points.stop, BLOCK):
+        own = slice(first, min(first + BLOCK, points.stop))
         x, y, z = columns[0, own], columns[1, own], columns[2, own]
         _compute_range(x, y, z, geometry.ranges, r[own], range_entry, cell[own])
         _compute_azimuth_key(x, y, geometry, cell[own], key, key_entry, tile[own])
         _look_up(geometry, r[own], range_entry, key, key_entry, cell[own])
         _widen(z, cell[own], tile[own], extremes, numbers, tile_extremes, occupied)
-    for first in range(part.first, part.stop, BLOCK):
-        own = slice(first, min(first + BLOCK, part.stop))
+    for first in range(points.start, points.stop, BLOCK):
+        own = slice(first, min(first + BLOCK, points.stop))
         _resolve_lowest(columns[2, own], r[own], cell[own], tile[own], extremes, numbers)
 
 

@@ -8,10 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from gp_ground_seg.frame import IntArray
-from gp_ground_seg.jit import JIT_ENABLED
+from gp_ground_seg.jit import JIT_ENABLED, jit
 
 MIN_POINTS_TO_SPLIT = 4096
 """Points below which sharing out costs more than it saves."""
@@ -21,36 +18,19 @@ costs more than a small part of the work saves."""
 
 
 class Part(NamedTuple):
-    """A part of the work: points or segments `first` to `stop` - 1; parts count from 0."""
+    """A part of the work: a run of points (see `run_of`), or every `n_parts`-th segment."""
 
     number: int
-    first: int
-    stop: int
+    n_parts: int
 
 
-def equal_parts(n: int, n_parts: int) -> list[Part]:
-    """Split n points into parts of equal size."""
-    edges = [n * k // n_parts for k in range(n_parts + 1)]
-    return [Part(k, edges[k], edges[k + 1]) for k in range(n_parts)]
+def run_of(part: Part, n: int) -> slice:
+    """Return which of `n` points are those of a part."""
+    return slice(n * part.number // part.n_parts, n * (part.number + 1) // part.n_parts)
 
 
-def parts_of_segments(offsets: IntArray, n_parts: int) -> list[Part]:
-    """Split segments into parts of equal cost, which grows as the square of their size.
-
-    Parameters
-    ----------
-    offsets : (M + 1,) int64
-        Values of segment m are ``offsets[m]:offsets[m + 1]``.
-    n_parts : int
-        Number of parts.
-    """
-    n_segments = len(offsets) - 1
-    if n_parts == 1:
-        return [Part(0, 0, n_segments)]
-    cost = np.cumsum(np.diff(offsets) ** 2)
-    wanted = cost[-1] * np.arange(1, n_parts) / n_parts
-    edges = [0, *np.searchsorted(cost, wanted).tolist(), n_segments]
-    return [Part(k, edges[k], edges[k + 1]) for k in range(n_parts)]
+points_of = jit()(run_of)
+"""The same for compiled code."""
 
 
 class Workers:
@@ -76,7 +56,7 @@ class Workers:
         """Return the number of parts that so many points are split into."""
         return self.n_threads if n_points >= MIN_POINTS_TO_SPLIT else 1
 
-    def run(self, function: Callable[..., None], parts: list[Part], *arguments: Any) -> None:
+    def run(self, function: Callable[..., None], n_parts: int, *arguments: Any) -> None:
         """Call ``function(part, *arguments)`` for each part; return when all are done.
 
         Raises
@@ -84,15 +64,16 @@ class Workers:
         Exception
             The first error of a part, after all parts have ended.
         """
-        if len(parts) > 1 and self._pool is None:
+        if n_parts > 1 and self._pool is None:
             self._start()
-        if len(parts) == 1 or self._pool is None:
-            for part in parts:
+        own, *others = (Part(number, n_parts) for number in range(n_parts))
+        if self._pool is None:
+            for part in (own, *others):
                 function(part, *arguments)
             return
-        futures = [self._pool.submit(function, part, *arguments) for part in parts[1:]]
+        futures = [self._pool.submit(function, part, *arguments) for part in others]
         try:
-            function(parts[0], *arguments)
+            function(own, *arguments)
         finally:
             # The parts work on arrays that belong to the caller afterwards.
             errors = [future.exception() for future in futures]

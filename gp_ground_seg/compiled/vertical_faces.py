@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.compiled.threads import Part
+from gp_ground_seg.compiled.threads import Part, points_of
 from gp_ground_seg.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Tiles
 from gp_ground_seg.jit import jit
-from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.config import FacesConfig
 from gp_ground_seg.pipeline.vertical_faces import MIN_RETURNS, UNITS_PER_METRE
 
 # Each tall tile has two rows of sums, for the lowest returns and for those above: number, x, y, z,
@@ -27,32 +27,6 @@ NOT_TALL = -1
 """Row of a tile without a tall return."""
 # Adding this to a number and subtracting it again leaves whole units.
 _TO_UNITS = 1.5 * 2.0**52 / UNITS_PER_METRE
-
-
-class FaceParams(NamedTuple):
-    """Thresholds, see `gp_ground_seg.parameters.config.FacesConfig`."""
-
-    cell_size: float
-    min_height: float
-    max_height: float
-    max_normal_z: float
-    tolerance: float
-    max_foot_distance: float
-    max_foot_density: float
-
-    @classmethod
-    def of(cls, config: Config) -> FaceParams:
-        """Take the values out of a configuration."""
-        faces = config.faces
-        return cls(
-            cell_size=faces.cell_size,
-            min_height=faces.min_height,
-            max_height=config.label.obstacle_max_height,
-            max_normal_z=faces.max_normal_z,
-            tolerance=faces.tolerance,
-            max_foot_distance=faces.max_foot_distance,
-            max_foot_density=faces.max_foot_density,
-        )
 
 
 class FaceSums(NamedTuple):
@@ -74,12 +48,12 @@ class FaceSums(NamedTuple):
 
 
 @jit(entry=True)
-def select_tall(tiles: Tiles, params: FaceParams, room: FaceSums) -> int:
+def select_tall(tiles: Tiles, config: FacesConfig, room: FaceSums) -> int:
     """Give each tall tile its rows; return the number of tall tiles."""
     extremes, n_tall = tiles.extremes, 0
     for tile in tiles.occupied:
         t = np.uintp(tile)
-        if np.float64(extremes[t, 1]) - np.float64(extremes[t, 0]) > params.min_height:
+        if np.float64(extremes[t, 1]) - np.float64(extremes[t, 0]) > config.min_height:
             room.tile_to_row[t] = 2 * n_tall
             room.row_to_tile[n_tall] = tile
             n_tall += 1
@@ -93,15 +67,16 @@ def sum_returns(
     part: Part,
     columns: PointArray,
     tiles: Tiles,
-    params: FaceParams,
+    config: FacesConfig,
+    max_height: float,
     n_tall: int,
     room: FaceSums,
 ) -> None:
     """Sum over the returns of a part of the points, (3, N), in tall tiles."""
     sums = room.sums[part.number]
-    _clear_sums(tiles.extremes, params.cell_size, n_tall, room.row_to_tile, sums)
+    _clear_sums(tiles.extremes, config.cell_size, n_tall, room.row_to_tile, sums)
     # Slices, because indices from 0 on need no check for negative ones.
-    own = slice(part.first, part.stop)
+    own = points_of(part, len(tiles.tile))
     x, y, z, tile = columns[0, own], columns[1, own], columns[2, own], tiles.tile[own]
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
@@ -111,13 +86,13 @@ def sum_returns(
             continue
         low = sums[np.uintp(k)]
         above = np.float64(z[i]) - low[_BASE]
-        if above > params.max_height:
+        if above > max_height:
             continue
         dx = (np.float64(x[i]) + low[_TO_UNITS_X]) - _TO_UNITS
         dy = (np.float64(y[i]) + low[_TO_UNITS_Y]) - _TO_UNITS
         dz = (above + _TO_UNITS) - _TO_UNITS
         # No branch: whether a return is one of the lowest is unpredictable.
-        s = sums[np.uintp(k + np.int32(above > params.tolerance))]
+        s = sums[np.uintp(k + np.int32(above > config.tolerance))]
         s[0] += 1.0
         s[1] += dx
         s[2] += dy
@@ -150,7 +125,7 @@ def _clear_sums(
 
 @jit(entry=True)
 def decide_faces(
-    n_parts: int, n_tall: int, params: FaceParams, room: FaceSums, faces: Faces
+    n_parts: int, n_tall: int, config: FacesConfig, room: FaceSums, faces: Faces
 ) -> None:
     """Decide from the sums of all parts which tiles hold a face, into `faces`."""
     for t in range(len(faces.is_face)):
@@ -160,10 +135,10 @@ def decide_faces(
         _add_parts(n_parts, 2 * k, room.sums, low)
         _add_parts(n_parts, 2 * k + 1, room.sums, high)
         top = max(low[_TOP], high[_TOP])
-        if top > params.min_height and _is_vertical(low, high, params.max_normal_z):
+        if top > config.min_height and _is_vertical(low, high, config.max_normal_z):
             t = room.row_to_tile[k]
             faces.is_face[t] = True
-            faces.has_occluded_base[t] = _is_base_occluded(low, high, top, params)
+            faces.has_occluded_base[t] = _is_base_occluded(low, high, top, config)
 
 
 @jit()
@@ -194,13 +169,13 @@ def _is_vertical(low: FloatArray, high: FloatArray, max_normal_z: float) -> bool
 
 
 @jit()
-def _is_base_occluded(low: FloatArray, high: FloatArray, top: float, params: FaceParams) -> bool:
+def _is_base_occluded(low: FloatArray, high: FloatArray, top: float, config: FacesConfig) -> bool:
     """Whether the lowest returns are the face's own, see `is_base_occluded` of the twin."""
     n_low, n_high = low[0], high[0]
-    if params.max_foot_distance <= 0.0 or n_high < 2.0:
+    if config.max_foot_distance <= 0.0 or n_high < 2.0:
         return False
-    usual = n_high * params.tolerance
-    if n_low * (top - params.tolerance) > params.max_foot_density * usual:
+    usual = n_high * config.tolerance
+    if n_low * (top - config.tolerance) > config.max_foot_density * usual:
         return False
     mean_x, mean_y = high[1] / n_high, high[2] / n_high
     xx = high[4] - n_high * mean_x * mean_x
@@ -214,5 +189,5 @@ def _is_base_occluded(low: FloatArray, high: FloatArray, top: float, params: Fac
     if size > 0.0:
         aligned = ((low_xx - low_yy) * (xx - yy) + 4.0 * low_xy * xy) / size
     square: float = 0.5 * (low_xx + low_yy - aligned)
-    in_plane: bool = square <= n_low * params.max_foot_distance * params.max_foot_distance
+    in_plane: bool = square <= n_low * config.max_foot_distance * config.max_foot_distance
     return in_plane

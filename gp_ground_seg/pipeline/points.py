@@ -53,19 +53,14 @@ def check_points(points: npt.ArrayLike) -> FloatArray:
     return np.array(take_points(points), dtype=np.float64, order='F')
 
 
-def in_columns(xyz: PointArray, columns: PointArray) -> PointArray:
-    """Return points (N, 3) with each coordinate contiguous (Fortran order), read-only.
-
-    Parameters
-    ----------
-    xyz : (N, 3) float32 or float64
-        Points.
-    columns : (3, N) float32 or float64
-        Memory to copy them to. They are always copied: the caller may change its array
-        meanwhile.
-    """
+def copy_points(xyz: PointArray, columns: PointArray) -> None:
+    """Copy points (N, 3) to `columns` (3, N), of their type: the caller may change its array."""
     with np.errstate(invalid='ignore'):
         columns[...] = xyz.T
+
+
+def points_in(columns: PointArray) -> PointArray:
+    """Return points (N, 3), read-only, whose coordinates lie in `columns` (3, N)."""
     result: PointArray = columns.T
     # To compiled code, arrays that may be written to are another type.
     result.flags.writeable = False

@@ -19,10 +19,11 @@ from gp_ground_seg.frame import (
     Tiles,
 )
 from gp_ground_seg.parameters.config import Config, GridConfig
+from gp_ground_seg.pipeline.points import copy_points, points_in
 
 
 def build_scan(xyz: PointArray, config: Config) -> Scan:
-    """Sort points into cells and tiles, and take the lowest point of each cell.
+    """Copy points, sort them into cells and tiles, and take the lowest point of each cell.
 
     Parameters
     ----------
@@ -31,6 +32,9 @@ def build_scan(xyz: PointArray, config: Config) -> Scan:
     config : Config
         Size of the grid and of the tiles; least height of a cell in the density.
     """
+    columns = np.empty((3, len(xyz)), dtype=xyz.dtype)
+    copy_points(xyz, columns)
+    xyz = points_in(columns)
     grid = build_polar_grid(xyz, config.grid)
     tiles = build_tiles(xyz, grid, config.faces.cell_size)
     extremes, numbers = reduce_cells(grid, xyz[:, 2], tiles.tile)

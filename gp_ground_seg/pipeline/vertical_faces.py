@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.frame import OUTSIDE, BoolArray, Faces, FloatArray, IntArray, PointArray, Tiles
-from gp_ground_seg.parameters.config import FacesConfig
+from gp_ground_seg.frame import OUTSIDE, BoolArray, Faces, FloatArray, IntArray, Scan
+from gp_ground_seg.parameters.config import Config, FacesConfig
 
 MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
@@ -22,26 +22,16 @@ UNITS_PER_METRE = 2.0**16
 hundred thousand of them, are then exact, so that their order does not matter."""
 
 
-def find_faces(xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: float) -> Faces:
+def find_faces(scan: Scan, config: Config) -> Faces:
     """Find the tiles that hold a vertical face.
 
-    A tile is examined if a return lies more than ``faces.min_height`` above the lowest.
-    The scatter of its returns determines their orientation; see `normal_z`.
-
-    Parameters
-    ----------
-    xyz : (N, 3) float32 or float64
-        Points [m].
-    tiles : Tiles
-        Tiles of the points.
-    faces : FacesConfig
-        Thresholds.
-    max_height : float
-        Height above the lowest return up to which returns are used [m]; higher ones
-        may overhang.
+    A tile is examined if a return lies more than ``faces.min_height`` above the lowest. The
+    scatter of its returns determines their orientation, see `normal_z`; those higher than
+    ``label.obstacle_max_height`` above the lowest may overhang, and are left out.
     """
+    tiles, faces = scan.tiles, config.faces
     inside = tiles.tile != OUTSIDE
-    own, points = tiles.tile[inside], xyz[inside].astype(np.float64)
+    own, points = tiles.tile[inside], scan.xyz[inside].astype(np.float64)
     n_tiles = len(tiles.extremes)
     n_sides = math.isqrt(n_tiles)
     # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
@@ -51,7 +41,7 @@ def find_faces(xyz: PointArray, tiles: Tiles, faces: FacesConfig, max_height: fl
     above = points[:, 2] - tiles.lowest_z[own]
     points[:, 2] = above
     points = np.rint(points * UNITS_PER_METRE) / UNITS_PER_METRE
-    low = above <= max_height
+    low = above <= config.label.obstacle_max_height
     is_tall = np.zeros(n_tiles, dtype=np.bool_)
     is_tall[own[low & (above > faces.min_height)]] = True
 

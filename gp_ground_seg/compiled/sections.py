@@ -1,0 +1,35 @@
+"""Sections of the configuration as named tuples of their numbers, which compiled code reads."""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from dataclasses import fields
+from functools import lru_cache
+from typing import Any, TypeVar, cast
+
+from gp_ground_seg.parameters import config
+
+_Section = TypeVar('_Section')
+
+
+def _tuple_type(section: type[Any]) -> type[Any]:
+    # numba keeps code under the type of its arguments, which it finds again by this module's name.
+    names = [field.name for field in fields(section) if field.type in ('int', 'float')]
+    return namedtuple(section.__name__, names, module=__name__)
+
+
+LinesConfig = _tuple_type(config.LinesConfig)
+LengthScaleConfig = _tuple_type(config.LengthScaleConfig)
+ObservationConfig = _tuple_type(config.ObservationConfig)
+LatentConfig = _tuple_type(config.LatentConfig)
+GrowthConfig = _tuple_type(config.GrowthConfig)
+FacesConfig = _tuple_type(config.FacesConfig)
+LabelConfig = _tuple_type(config.LabelConfig)
+
+
+@lru_cache(maxsize=64)
+def numbers_of(section: _Section) -> _Section:
+    """Return the numbers of a section under the same names."""
+    tuple_type = globals()[type(section).__name__]
+    values = [getattr(section, name) for name in tuple_type._fields]
+    return cast(_Section, tuple_type(*values))
