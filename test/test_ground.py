@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import reference
-from conftest import fewer, hilly_scan, sharing
+from conftest import fewer, hilly_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -61,31 +61,7 @@ def test_surfaces_are_the_reference(backend, seed):
     np.testing.assert_allclose(found.std, expected.std, atol=1e-5)
 
 
-def test_threads_do_not_change_a_bit():
-    config, results = config_of(n_neighbours=2), []
-    frame = frame_of(hilly_scan(fewer(4000, 400)), config)
-    theta = given_theta(frame, config)
-    for n_threads in (1, 2, 3, 7):
-        with sharing(n_threads) as backend:
-            surface, u = backend.estimate_surface(frame, theta, config)
-            results.append((surface.mean, surface.std, surface.inlier, u.copy()))
-    for other in results[1:]:
-        for a, b in zip(results[0], other, strict=True):
-            np.testing.assert_array_equal(a, b)
-
-
 # Length-scales
-
-
-def test_latent_mean_is_the_conditional_of_the_joint_gaussian():
-    rng = np.random.default_rng(2)
-    r_bar, r = np.sort(rng.uniform(3, 40, 6)), rng.uniform(3, 60, 9)
-    l_bar = rng.normal(1.0, 0.5, 6)
-    b = reference.squared_exponential(r_bar, r_bar, 0.8, 4.0) + 0.3**2 * np.eye(6)
-    gain = reference.squared_exponential(r, r_bar, 0.8, 4.0) @ np.linalg.inv(b)
-    expected = l_bar.mean() + gain @ (l_bar - l_bar.mean())
-    found = reference.log_length_scale(r_bar, l_bar, r, 0.8, 4.0, 0.3)
-    np.testing.assert_allclose(found, expected)
 
 
 def test_equal_pseudo_inputs_give_that_length_scale_everywhere(backend):
@@ -102,19 +78,45 @@ def test_equal_pseudo_inputs_give_that_length_scale_everywhere(backend):
 
 @settings(max_examples=30)
 @given(st.integers(0, 10_000), st.integers(1, 15), st.floats(0.0, 0.2))
-def test_posterior_is_the_conditional_of_the_joint_gaussian(seed, n, slope_std):
+def test_the_oracle_is_the_conditional_of_the_joint_gaussian(seed, n, slope_std):
     """Against the textbook form: invert the joint covariance, read off the block."""
+
+    def conditional(joint, values):
+        gain = np.linalg.solve(joint[:n, :n], joint[:n, n:]).T
+        return gain @ values, np.diag(joint[n:, n:] - gain @ joint[:n, n:])
+
     rng = np.random.default_rng(seed)
     r, length_scale = rng.uniform(2, 60, n + 4), rng.uniform(0.5, 30, n + 4)
-    z = np.sin(r[:n])
+    noise, values = np.diag(np.arange(n + 4) < n), rng.normal(1.0, 0.5, n)
     joint = reference.paciorek(r, length_scale, r, length_scale, 0.6)
-    joint += slope_std**2 * np.outer(r, r)
-    joint[:n, :n] += 0.1**2 * np.eye(n)
-    gain = np.linalg.solve(joint[:n, :n], joint[:n, n:]).T
-    data, at = (r[:n], z, length_scale[:n]), (r[n:], length_scale[n:])
-    mean, variance = reference.posterior(*data, *at, 0.6, 0.1, slope_std)
-    np.testing.assert_allclose(mean, gain @ z, atol=1e-9)
-    np.testing.assert_allclose(variance, np.diag(joint[n:, n:] - gain @ joint[:n, n:]), atol=1e-9)
+    joint += slope_std**2 * np.outer(r, r) + 0.1**2 * noise
+    at = (r[:n], values, length_scale[:n], r[n:], length_scale[n:], 0.6, 0.1, slope_std)
+    for found, expected in zip(reference.posterior(*at), conditional(joint, values), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    latent = reference.squared_exponential(r, r, 0.8, 4.0) + 0.3**2 * noise
+    found = reference.log_length_scale(r[:n], values, r[n:], 0.8, 4.0, 0.3)
+    mean = values.mean()
+    np.testing.assert_allclose(found, mean + conditional(latent, values - mean)[0], atol=1e-9)
+
+
+def test_noise_free_candidates_are_interpolated_with_no_uncertainty(backend):
+    config = config_of('constant').replace(**{'length_scale.constant': 1.0})
+    r, z = np.arange(3.0, 15.0), 0.05 * np.sin(np.arange(12.0))
+    frame = frame_of(np.column_stack([r, 0.01 * r, z - 1.73]), config)
+    # Knots where the candidates are.
+    places = frame.candidates.r
+    frame = frame._replace(
+        candidates=frame.candidates._replace(bin=np.arange(len(r))),
+        knots=np.append(places, places[-1] + 1.0),
+        continues_line=np.ones(len(r), dtype=bool),
+    )
+    theta = given_theta(frame, config)
+    theta[:, 1] = np.log(1e-6)
+    surface, _ = backend.estimate_surface(frame, theta, config)
+    m = frame.candidates.segment[0]
+    assert surface.inlier.all()
+    np.testing.assert_allclose(surface.mean[m, :-1], z - 1.73, atol=1e-6)
+    np.testing.assert_allclose(surface.std[m, :-1], 0.0, atol=1e-4)
 
 
 # Growth
@@ -139,6 +141,18 @@ def test_growth_follows_ground_and_leaves_obstacles_out(backend):
     inlier, knots, mean, _ = grow_line(backend, z)
     assert inlier == [*range(8), *range(11, 20)]
     assert np.max(np.abs(mean[knots < 20])) < 0.02
+
+
+def test_without_a_seed_there_is_no_model(backend):
+    inlier, knots, _, _ = grow_line(backend, np.full(5, 5.0))
+    assert inlier == [] and len(knots) == 0
+
+
+def test_looser_bounds_take_more(backend):
+    z = np.where(np.arange(20) % 4 == 3, 0.35, 0.0)
+    limits = {'max_standardised_residual': 1.0}, {'max_standardised_residual': 8.0}
+    strict, loose = (grow_line(backend, z, **limit)[0] for limit in limits)
+    assert set(strict) < set(loose) == set(range(20))
 
 
 def test_growth_stops_where_the_surface_is_uncertain(backend):
