@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import Config
 from gp_ground_seg.backend import NumpyBackend
-from gp_ground_seg.compiled import ground as compiled_ground
 from gp_ground_seg.frame import Frame
-from gp_ground_seg.gp.ground import fuse_neighbours
 from gp_ground_seg.gp.learning import given_theta
 
 
@@ -192,45 +190,19 @@ def test_a_line_is_followed_from_inliers_on(backend):
 # Fusion of neighbours
 
 
-@pytest.fixture(params=['numpy', 'numba'])
-def fuse(request):
-    """Compute mean and std of fused surfaces."""
-
-    def compiled(mean, std, knots, n_neighbours, slope_std):
-        n_knots = np.isfinite(mean).sum(axis=1)
-        own = compiled_ground.SegmentSurfaces(
-            np.empty(0), mean, np.empty(0, dtype=bool), mean, std, n_knots
-        )
-        fused = np.empty((2, *mean.shape))
-        compiled_ground.fuse_neighbours(own, knots, slope_std, n_neighbours, -1.7, *fused)
-        return fused[0] + 1.7, fused[1]
-
-    return fuse_neighbours if request.param == 'numpy' else compiled
-
-
-RANGES = np.array([2.0, 4.0, 6.0, 8.0, 10.0])
-RANGES.setflags(write=False)
-
-
-def test_a_segment_without_a_model_gets_its_neighbours(fuse):
-    mean, std = np.full((8, 5), 0.4), np.full((8, 5), 0.1)
-    mean[:4] = std[:4] = np.nan
-    fused, fused_std = fuse(mean, std, RANGES, 1, 0.05)
-    np.testing.assert_allclose(fused[[0, 3]], 0.4)
-    assert (fused_std[[0, 3]] > 0.1).all()
-    assert np.isnan(fused[1:3]).all()
-    np.testing.assert_allclose(fuse(mean, std, RANGES, 0, 0.05)[0], mean, rtol=1e-12)
-
-
-@pytest.mark.parametrize('seed', range(12))
-@pytest.mark.parametrize('n_neighbours', [0, 1, 3])
-def test_fusing_is_the_reference(fuse, seed, n_neighbours):
-    rng = np.random.default_rng(seed)
-    mean, std = rng.normal(0, 0.3, (9, 5)), rng.uniform(0, 0.5, (9, 5))
-    std[:, 2] = 0.0
-    # Some segments have no model at all, some up to a knot.
-    for m, n in enumerate(rng.integers(0, 6, 9) * rng.integers(0, 2, 9)):
-        mean[m, n:] = std[m, n:] = np.nan
-    found = fuse(mean, std, RANGES, n_neighbours, 0.05)
-    for a, b in zip(found, reference.fuse(mean, std, RANGES, n_neighbours, 0.05), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+def test_a_segment_without_a_model_gets_its_neighbours(backend):
+    config = config_of(n_neighbours=1)
+    xyz = hilly_scan(fewer(4000, 1000))
+    frame = frame_of(xyz[xyz[:, 1] > 0.0], config)
+    theta = given_theta(frame, config)
+    fused, alone = (
+        backend.estimate_surface(frame, theta, config.replace(**{'surface.n_neighbours': n}))[0]
+        for n in (1, 0)
+    )
+    has_model, had_model = (np.isfinite(s.mean[:, 5]) for s in (fused, alone))
+    beside = np.roll(had_model, 1) | np.roll(had_model, -1)
+    np.testing.assert_array_equal(has_model, had_model | beside)
+    (m, *_) = np.flatnonzero(has_model & ~had_model)
+    source = m - 1 if had_model[m - 1] else (m + 1) % len(had_model)
+    assert fused.mean[m, 5] == pytest.approx(alone.mean[source, 5])
+    assert fused.std[m, 5] > alone.std[source, 5]

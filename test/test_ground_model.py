@@ -48,14 +48,9 @@ def flat(*knots):
 
 def rounded(model):
     """The model as it arrives over the network: knots in single precision."""
-    return GroundModel.from_knot_points(
-        model.knot_points().astype(np.float32),
-        model.knots.astype(np.float32),
-        model.std.astype(np.float32),
-        model.length_scale.astype(np.float32),
-        float(np.float32(model.roll)),
-        float(np.float32(model.pitch)),
-    )
+    arrays = model.knot_points(), model.knots, model.std, model.length_scale
+    roll, pitch = (float(np.float32(angle)) for angle in (model.roll, model.pitch))
+    return GroundModel.from_knot_points(*(a.astype(np.float32) for a in arrays), roll, pitch)
 
 
 def test_height_under_every_point_is_that_of_the_segmentation(segmented):
@@ -122,12 +117,8 @@ def test_along_a_level_axis_there_is_no_height():
     model = dataclasses.replace(flat(1.0, 2.0), roll=np.pi / 2)
     assert np.isnan(model.at([1.0, 2.0], 0.0)).all()
     # The knots are where they are all the same.
-    points = model.knot_points()
-    np.testing.assert_allclose(points[..., 1], -1.0, atol=1e-12)
-    again = GroundModel.from_knot_points(
-        points, model.knots, model.std, model.length_scale, model.roll, model.pitch
-    )
-    np.testing.assert_allclose(again.height, model.height)
+    np.testing.assert_allclose(model.knot_points()[..., 1], -1.0, atol=1e-12)
+    np.testing.assert_allclose(rounded(model).height, model.height, atol=1e-6)
 
 
 @settings(max_examples=50)
@@ -145,9 +136,8 @@ def test_any_place_has_a_height_or_none(x, y):
 
 
 def test_places_broadcast():
-    model = GroundModel(
-        np.array([0.0, 1.0]), np.array([[0.0, 1.0]] * 4), np.ones((4, 2)), np.ones((4, 2))
-    )
+    ones = np.ones((4, 2))
+    model = GroundModel(np.array([0.0, 1.0]), ones * [0.0, 1.0], ones, ones)
     height, _ = model.at(np.linspace(-1, 1, 5)[:, None], np.zeros(3))
     np.testing.assert_allclose(height, np.tile([[np.nan], [0.5], [0], [0.5], [np.nan]], 3))
 
