@@ -59,12 +59,19 @@ def wait_for(condition, what, timeout=PATIENCE):
 
 
 @contextlib.contextmanager
-def isolated_context():
-    """A context of our own domain, on this machine only."""
-    context = Context()
+def isolated(**changes):
+    """The environment of our own domain, on this machine only."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in ISOLATION.items():
+        for name, value in {**ISOLATION, **changes}.items():
             patch.setenv(name, value)
+        yield
+
+
+@contextlib.contextmanager
+def isolated_context():
+    """A context of that domain."""
+    context = Context()
+    with isolated():
         try:
             rclpy.init(context=context, args=[], domain_id=DOMAIN_ID)
             yield context
@@ -110,9 +117,8 @@ class Collector:
 
     def __init__(self, node, message_type, topic, qos=RELIABLE):
         self.messages = []
-        self.subscription = node.create_subscription(
-            message_type, topic, self.messages.append, qos
-        )
+        take = self.messages.append
+        self.subscription = node.create_subscription(message_type, topic, take, qos)
 
     def wait(self, count):
         what = f'message {count} on {self.subscription.topic_name}'
@@ -200,30 +206,24 @@ class Process:
         with self._log.open('wb') as log:
             self.popen = subprocess.Popen(
                 command or [sys.executable, *start, *words],
-                stdout=subprocess.DEVNULL,
-                stderr=log,
                 env={**os.environ, **ISOLATION, **environment},
-            )
+                stdout=subprocess.DEVNULL, stderr=log,
+            )  # fmt: skip
 
     @property
     def log(self):
         """What it wrote to stderr so far."""
         return self._log.read_text()
 
-    def wait_until_ready(self):
-        self._wait_for_log('listening to')
+    def wait_until_ready(self, text='listening to'):
+        wait_for(lambda: text in self.log or self.popen.poll() is not None, f'{text!r} in the log')
+        assert self.popen.poll() is None, self.log
 
     def wait_until_settled(self):
         """Wait until it has the backend that it keeps: labels may differ by one or two."""
         self.wait_until_ready()
         if FOLLOWS in self.log:
-            self._wait_for_log(CHANGED)
-
-    def _wait_for_log(self, text):
-        wait_for(
-            lambda: text in self.log or self.popen.poll() is not None, f'{text!r} of the node'
-        )
-        assert self.popen.poll() is None, self.log
+            self.wait_until_ready(CHANGED)
 
     def stop(self, number):
         """Send a signal; return exit code and seconds until the end."""
@@ -252,8 +252,8 @@ def values_of(status):
     return {entry.key: entry.value for entry in status.values}
 
 
-def parameter_message(name, value):
-    return Parameter(name, value=value).to_parameter_msg()
+def parameter_messages(values):
+    return [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
 
 
 class Link:
@@ -301,8 +301,7 @@ class Link:
 
     def load(self, values):
         """Results of setting all values at once, in their order, as ``ros2 param load`` does."""
-        messages = [parameter_message(name, value) for name, value in values.items()]
-        request = SetParameters.Request(parameters=messages)
+        request = SetParameters.Request(parameters=parameter_messages(values))
         return self.call(SetParameters, 'set_parameters', request).results
 
     def call(self, service_type, name, request):
@@ -336,12 +335,8 @@ class Bench(Link):
     """The node under test in this process, beside the probe that talks to it."""
 
     def __init__(self, context, *words):
-        self.node = GroundSegmentationNode(
-            context=context,
-            namespace=NAMESPACE,
-            cli_args=['--ros-args', *words],
-            use_global_arguments=False,
-        )
+        cli_args = ['--ros-args', '-r', f'__ns:={NAMESPACE}', *words]
+        self.node = GroundSegmentationNode(context=context, cli_args=cli_args)
         self.node_name = self.node.get_fully_qualified_name()
         super().__init__(context)
 
@@ -361,12 +356,12 @@ class Bench(Link):
 def bench(*words, settled=True):
     """A connected `Bench`, the node started with ``--ros-args words``."""
     with isolated_context() as context:
-        result = Bench(context, *words)
-        with spinning(context, result.node, result.probe):
-            result.wait_until_connected()
+        b = Bench(context, *words)
+        with spinning(context, b.node, b.probe):
+            b.wait_until_connected()
             if settled:
-                result.wait_until_settled()
-            yield result
+                b.wait_until_settled()
+            yield b
 
 
 @contextlib.contextmanager
@@ -399,14 +394,11 @@ def started_node(*words):
 
 def start_error(capfd, *words):
     """Line that the node ends with when it refuses to start with ``--ros-args words``."""
-    domain = os.environ.get('ROS_DOMAIN_ID', ISOLATION['ROS_DOMAIN_ID'])
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {**ISOLATION, 'ROS_DOMAIN_ID': domain}.items():
-            patch.setenv(name, value)
+    # The domain may be what is wrong.
+    with isolated(ROS_DOMAIN_ID=os.environ.get('ROS_DOMAIN_ID', str(DOMAIN_ID))):
         assert main(['--ros-args', *words]) == 2
     said = capfd.readouterr()
-    assert said.out == ''
-    assert 'Traceback' not in said.err
+    assert said.out == '' and 'Traceback' not in said.err
     line = said.err.splitlines()[-1]
     assert line.startswith('ground_segmentation_node: error: ')
     return line

@@ -11,13 +11,8 @@ from hypothesis import strategies as st
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
 import ros_helpers as ros
+from rcl_interfaces import srv
 from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import (
-    DescribeParameters,
-    GetParameters,
-    ListParameters,
-    SetParametersAtomically,
-)
 from rclpy.parameter import Parameter, parameter_value_to_python
 from ros_helpers import bench, street, to_message
 
@@ -57,14 +52,14 @@ def assert_loaded(b, config):
 
 
 def values_of(b, names=OWN):
-    response = b.call(GetParameters, 'get_parameters', GetParameters.Request(names=names))
+    response = b.call(srv.GetParameters, 'get_parameters', srv.GetParameters.Request(names=names))
     values = [parameter_value_to_python(value) for value in response.values]
     return dict(zip(names, values, strict=True))
 
 
 def described(b, names):
-    request = DescribeParameters.Request(names=names)
-    return b.call(DescribeParameters, 'describe_parameters', request).descriptors
+    request = srv.DescribeParameters.Request(names=names)
+    return b.call(srv.DescribeParameters, 'describe_parameters', request).descriptors
 
 
 def test_every_parameter_is_described_with_type_range_unit_and_symbol(b):
@@ -150,9 +145,9 @@ def test_a_number_or_auto_is_taken_and_nothing_else(b, name):
 
 def test_several_at_once_are_all_taken_or_none(b):
     def set_all(**values):
-        messages = [ros.parameter_message(f'grid.{name}', v) for name, v in values.items()]
-        request = SetParametersAtomically.Request(parameters=messages)
-        return b.call(SetParametersAtomically, 'set_parameters_atomically', request).result
+        messages = ros.parameter_messages({f'grid.{name}': v for name, v in values.items()})
+        request = srv.SetParametersAtomically.Request(parameters=messages)
+        return b.call(srv.SetParametersAtomically, 'set_parameters_atomically', request).result
 
     refused = set_all(n_segments=90, r_min=40.0, r_max=30.0)
     assert not refused.successful
@@ -164,11 +159,6 @@ def test_several_at_once_are_all_taken_or_none(b):
     assert values_of(b) == {**Config().flat(), 'grid.r_min': 1.0, 'grid.r_max': 30.0}
 
 
-def test_parameters_of_ros_itself_pass_through(b):
-    assert b.set('use_sim_time', True).successful
-    assert b.set('use_sim_time', False).successful
-
-
 def test_a_fault_in_the_check_is_answered_and_the_node_lives(b, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(b.node, 'check_config', lambda _config: 1 / 0)
@@ -178,14 +168,13 @@ def test_a_fault_in_the_check_is_answered_and_the_node_lives(b, monkeypatch):
     assert b.set('sensor.height', 1.73).successful
 
 
-def test_local_calls_are_checked_too(b):
-    wrong = [Parameter('label.ground_tolerance', value=9.0)]
+def test_diagnostics_period_and_parameters_of_ros_itself_change_live(b):
+    assert b.set('use_sim_time', True).successful
+    assert b.set('use_sim_time', False).successful
+    # Calls in the process of the node are checked too.
+    wrong = [Parameter('diagnostics.period', value=0.0)]
     (result,) = b.in_executor(b.node.set_parameters, wrong)
     assert not result.successful
-    assert b.node.config == Config()
-
-
-def test_diagnostics_period_changes_live(b):
     assert b.set('diagnostics.period', 60.0).successful
     assert b.set('diagnostics.period', 0.1).successful
     b.diagnostics.wait(len(b.diagnostics.messages) + 3)
@@ -196,8 +185,8 @@ def test_diagnostics_period_changes_live(b):
 
 def dump(b):
     """The document that ``ros2 param dump`` writes: all parameters, sorted, nested."""
-    request = ListParameters.Request()
-    names = sorted(b.call(ListParameters, 'list_parameters', request).result.names)
+    request = srv.ListParameters.Request()
+    names = sorted(b.call(srv.ListParameters, 'list_parameters', request).result.names)
     tree = {}
     for name, value in values_of(b, names).items():
         *groups, leaf = name.split('.')
