@@ -128,17 +128,9 @@ class Collector:
 
 # Clouds
 
-POINT = np.dtype(
-    {
-        'names': ['intensity', 'x', 'y', 'z', 'ring', 'time'],
-        'formats': ['<f4', '<f4', '<f4', '<f4', '<u2', '<f8'],
-        'offsets': [0, 4, 8, 12, 16, 24],
-        'itemsize': 64,
-    }
-)
-"""A point as a driver sends it: x not first, gaps, further fields."""
-
-_CODES = {'f4': PointField.FLOAT32, 'f8': PointField.FLOAT64, 'u2': PointField.UINT16}
+_LAYOUT = {'names': ['intensity', *'xyz'], 'formats': 4 * ['<f4'], 'offsets': [0, 4, 8, 12]}
+POINT = np.dtype({**_LAYOUT, 'itemsize': 64})
+"""A point as a driver sends it: x not first, bytes that belong to no field."""
 
 
 def street(n_points, seed=0, n_invalid=0):
@@ -147,8 +139,7 @@ def street(n_points, seed=0, n_invalid=0):
     points = np.zeros(n_points, POINT)
     # Every byte means something, also those between the fields.
     points.view(np.uint8)[:] = rng.integers(0, 256, n_points * POINT.itemsize, dtype=np.uint8)
-    radius = rng.uniform(3.0, 40.0, n_points)
-    azimuth = rng.uniform(-np.pi, np.pi, n_points)
+    radius, azimuth = rng.uniform(3.0, 40.0, n_points), rng.uniform(-np.pi, np.pi, n_points)
     z = -1.73 + rng.normal(0.0, 0.02, n_points)
     is_wall = rng.random(n_points) < 0.3
     radius[is_wall] = rng.choice([8.0, 15.0, 25.0], is_wall.sum())
@@ -159,14 +150,14 @@ def street(n_points, seed=0, n_invalid=0):
     return points
 
 
-def to_message(points, stamp=(0, 0), frame='') -> PointCloud2:
+def to_message(points, stamp=(0, 0), frame=''):
     """Message of structured points."""
     message = PointCloud2(height=1, width=len(points), row_step=points.nbytes)
     message.header.stamp.sec, message.header.stamp.nanosec = stamp
     message.header.frame_id = frame
     message.fields = [
-        PointField(name=name, offset=offset, datatype=_CODES[kind.str[1:]], count=1)
-        for name, (kind, offset) in points.dtype.fields.items()
+        PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
+        for name, (_, offset) in points.dtype.fields.items()
     ]
     message.point_step = points.dtype.itemsize
     message.data = array('B', points.tobytes())
@@ -242,6 +233,18 @@ class Process:
         except subprocess.TimeoutExpired:
             self.popen.kill()
             self.popen.wait()
+
+
+def said_by(capfd, *texts):
+    """What the node in this process has written to stderr, once that holds all `texts`."""
+    said = []
+
+    def is_said():
+        said.append(capfd.readouterr().err)
+        return all(text in ''.join(said) for text in texts)
+
+    wait_for(is_said, f'{texts} on stderr')
+    return ''.join(said)
 
 
 # Talking to a node

@@ -127,17 +127,6 @@ def test_no_time_means_one_evaluation_and_nowhere_finite_is_a_failure():
     np.testing.assert_array_equal(learned.theta, truth)
 
 
-def test_printed_objective_runs_to_the_bounds_and_map_does_not():
-    inliers, truth = draw_inliers(7, n_segments=30)
-    space = space_about(truth, factor=1000.0)
-    printed, ours = (
-        np.exp(learn(inliers, space, truth, use_priors)[0].theta - truth)
-        for use_priors in (False, True)
-    )
-    assert printed[2] < 0.05
-    assert (ours > 0.3).all() and (ours < 3.0).all()
-
-
 @pytest.mark.parametrize(
     ('changes', 'n_free'),
     [

@@ -121,18 +121,6 @@ def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_rat
     assert len(found[0].r) == (~faces.has_occluded_base[candidates.tile]).sum()
 
 
-def test_the_candidates_drawn_hold_every_case():
-    """Slope breaks, and lines that do and do not continue, in the test above."""
-    at_break = continued = alone = 0
-    config = Config().replace(**{'lines.max_gap': 6.0, 'growth.min_bend_extent': 3.0})
-    for seed in range(40):
-        _, lines, _, continues = Reference().extract_lines(draw_candidates(seed), NO_FACES, config)
-        at_break += continues[lines.start[:-1]].sum()
-        continued += (continues[1:] & (lines.line[1:] == lines.line[:-1])).sum()
-        alone += (~continues).sum()
-    assert min(at_break, continued, alone) > 20
-
-
 KINK = np.arange(3.0, 23.0)
 CRITICAL = {
     'gap': (candidates_of([3, 4, 6, 50, 55], np.zeros(5)), [0, 0, 1, 2, 2]),

@@ -9,17 +9,9 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
+import ros_helpers as ros
 from cli_runner import run
-from ros_helpers import (
-    IN_NAMESPACE,
-    Process,
-    bench,
-    linked_process,
-    street,
-    to_message,
-    values_of,
-    wait_for,
-)
+from ros_helpers import street, to_message
 
 from gp_ground_seg import Config
 from gp_ground_seg.jit import HAVE_NUMBA, code_folder
@@ -44,7 +36,7 @@ def test_node_segments_while_its_code_is_compiled_and_then_changes_over(monkeypa
     # Never from the current folder: this would end the compiler, or the node.
     (tmp_path / 'numpy.py').write_text('raise SystemExit(3)')
     monkeypatch.chdir(tmp_path)
-    with linked_process(tmp_path, *FIXED, start=SAFE_START) as (node, link):
+    with ros.linked_process(tmp_path, *FIXED, start=SAFE_START) as (node, link):
         link.segment(message)
         assert FOLLOWS in node.log
         assert CHANGED not in node.log
@@ -55,7 +47,7 @@ def test_node_segments_while_its_code_is_compiled_and_then_changes_over(monkeypa
         assert STAYS not in node.log
         assert node.stop(signal.SIGINT)[0] == 0
     # All of it is there for the next start.
-    with Process(*IN_NAMESPACE, *FIXED, folder=tmp_path, start=SAFE_START) as node:
+    with ros.Process(*ros.IN_NAMESPACE, *FIXED, folder=tmp_path, start=SAFE_START) as node:
         node.wait_until_settled()
         assert 'compiling' not in node.log
 
@@ -77,7 +69,7 @@ def held_back(monkeypatch):
 @pytest.fixture
 def b(held_back):
     words = '-p', 'learning.mode:=first_frame', '-p', 'diagnostics.period:=0.1'
-    with bench(*words, settled=False) as one:
+    with ros.bench(*words, settled=False) as one:
         yield one
         held_back.set()
 
@@ -85,7 +77,7 @@ def b(held_back):
 def backend_after_a_cloud(b, n_seen):
     b.segment(to_message(street(1000)))
     status = b.wait_for_status('processing', lambda v, _: int(v['Clouds since startup']) >= n_seen)
-    values = values_of(status)
+    values = ros.values_of(status)
     return values['Backend'], int(values['Threads'])
 
 
@@ -111,7 +103,7 @@ def test_newest_parameters_win(b, held_back):
 def test_numpy_asked_for_meanwhile_stays(b, held_back):
     assert b.set('runtime.backend', 'numpy').successful
     held_back.set()
-    wait_for(lambda: b.node._is_compiled, 'compiled code')
+    ros.wait_for(lambda: b.node._is_compiled, 'compiled code')
     assert backend_after_a_cloud(b, 1)[0] == 'numpy'
     assert b.set('runtime.backend', 'auto').successful
     assert backend_after_a_cloud(b, 2)[0] == 'numba'
@@ -120,16 +112,8 @@ def test_numpy_asked_for_meanwhile_stays(b, held_back):
 def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, capfd):
     monkeypatch.setattr(warm_up, 'is_code_kept', lambda: False)
     monkeypatch.setattr(warm_up, '_COMPILE', "raise OSError('no space left')  # {path}")
-    log = ''
-    with bench(settled=False) as b:
-
-        def has_warned():
-            nonlocal log
-            log += capfd.readouterr().err
-            return STAYS in log
-
-        wait_for(has_warned, 'warning')
-        assert 'OSError: no space left' in log
+    with ros.bench(settled=False) as b:
+        assert 'OSError: no space left' in ros.said_by(capfd, STAYS)
         b.segment(to_message(street(1000)))
         assert b.node._segmenter.backend_name == 'numpy'
 

@@ -8,16 +8,7 @@ import ros_helpers as ros
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock_type import ClockType
 from rclpy.time import Time
-from ros_helpers import (
-    BEST_EFFORT,
-    NAMESPACE,
-    RELIABLE,
-    bench,
-    street,
-    to_message,
-    values_of,
-    wait_for,
-)
+from ros_helpers import NAMESPACE, street, to_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
@@ -31,9 +22,9 @@ def test_reliability_asked_for_is_kept(reliability):
     override = f'qos_overrides.{NAMESPACE}/points.subscription.reliability:={reliability}'
     depth = f'qos_overrides.{NAMESPACE}/points.subscription.depth:=9'
     message = to_message(street(1000))
-    with bench('-p', override, '-p', depth, *OFTEN) as b:
+    with ros.bench('-p', override, '-p', depth, *OFTEN) as b:
         b.segment(message)
-        b.publisher = b.probe.create_publisher(PointCloud2, 'points', BEST_EFFORT)
+        b.publisher = b.probe.create_publisher(PointCloud2, 'points', ros.BEST_EFFORT)
         b.wait_for_status('input', lambda v, _: v['Publishers'] == '2')
         b.publish_until(message, lambda: len(b.diagnostics.messages) > 15, 'a second of clouds')
         assert b.node._input.qos.reliability.name.lower() == reliability
@@ -71,7 +62,7 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch):
     points, resets, reset = street(3000), [], GroundSegmenter.reset
     monkeypatch.setattr(GroundSegmenter, 'reset', lambda s: [resets.append(1), reset(s)])
     limits = '-p', 'diagnostics.stale_after:=3.0', '-p', 'diagnostics.max_latency:=10.0'
-    with bench(*OFTEN, *limits) as b:
+    with ros.bench(*OFTEN, *limits) as b:
 
         def segment(*seconds):
             for second in seconds:
@@ -111,7 +102,7 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch):
     facts = ('subscribers', 'rate (Hz)', 'since startup')
     assert keys['output'] == [f'{topic} {fact}' for topic in topics for fact in facts]
 
-    values = {task: values_of(status) for task, status in tasks.items()}
+    values = {task: ros.values_of(status) for task, status in tasks.items()}
     # A stamp of 2011 is old, and nothing is wrong with that.
     assert float(values['input']['Age of last stamp (s)']) > 1e8
     expected = {
@@ -134,24 +125,24 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch):
 
 
 def test_simulated_time_that_jumps_back_resets_what_was_learned():
-    with bench(*OFTEN, '-p', 'use_sim_time:=true') as b:
+    with ros.bench(*OFTEN, '-p', 'use_sim_time:=true') as b:
 
         def wait_for_input(counter, value):
-            return values_of(b.wait_for_status('input', lambda v, _: v[counter] == value))
+            return ros.values_of(b.wait_for_status('input', lambda v, _: v[counter] == value))
 
         # Diagnostics come without a clock too.
         assert b.node.get_clock().ros_time_is_active
         b.segment(to_message(street(3000)))
         wait_for_input('Events since startup', '1')
-        publisher = b.probe.create_publisher(Clock, '/clock', RELIABLE)
-        wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of /clock')
+        publisher = b.probe.create_publisher(Clock, '/clock', ros.RELIABLE)
+        ros.wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of /clock')
 
         def tell(seconds):
             message = Clock()
             message.clock.sec = seconds
             publisher.publish(message)
             now = Time(seconds=seconds, clock_type=ClockType.ROS_TIME)
-            wait_for(lambda: b.node.get_clock().now() == now, f'time {seconds}')
+            ros.wait_for(lambda: b.node.get_clock().now() == now, f'time {seconds}')
 
         tell(1317383000)
         b.segment(to_message(street(3000), stamp=(1317382999, 500000000)))
@@ -167,7 +158,7 @@ def test_simulated_time_that_jumps_back_resets_what_was_learned():
 
 
 def test_nothing_is_loaded_for_numpy():
-    with bench('-p', 'runtime.backend:=numpy') as b:
+    with ros.bench('-p', 'runtime.backend:=numpy') as b:
         b.segment(to_message(street(1000)))
         assert not b.node._loader.is_started
 
@@ -177,7 +168,7 @@ def test_nothing_is_loaded_for_numpy():
 
 @pytest.fixture(scope='module')
 def b():
-    with bench(*OFTEN) as shared:
+    with ros.bench(*OFTEN) as shared:
         yield shared
 
 
@@ -218,14 +209,14 @@ def test_error_in_a_report_does_not_end_the_node(b, monkeypatch):
 def test_input_follows_the_reliability_of_its_publishers(b):
     message, count = to_message(street(1000)), len(b.ground.messages)
     b.in_executor(b.probe.destroy_publisher, b.publisher)
-    b.publisher = b.probe.create_publisher(PointCloud2, 'points', BEST_EFFORT)
+    b.publisher = b.probe.create_publisher(PointCloud2, 'points', ros.BEST_EFFORT)
     b.publish_until(message, lambda: len(b.ground.messages) > count, 'cloud of a driver')
-    assert b.node._input.qos.reliability == BEST_EFFORT.reliability
+    assert b.node._input.qos.reliability == ros.BEST_EFFORT.reliability
 
     # The driver ends, a bag is played: nothing of it may be lost.
     b.in_executor(b.probe.destroy_publisher, b.publisher)
-    b.publisher = b.probe.create_publisher(PointCloud2, 'points', RELIABLE)
-    reliable = RELIABLE.reliability
-    wait_for(lambda: b.node._input.qos.reliability == reliable, 'reliable subscription')
+    b.publisher = b.probe.create_publisher(PointCloud2, 'points', ros.RELIABLE)
+    reliable = ros.RELIABLE.reliability
+    ros.wait_for(lambda: b.node._input.qos.reliability == reliable, 'reliable subscription')
     b.wait_until_connected()
     b.segment(message)

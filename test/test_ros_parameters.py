@@ -271,14 +271,7 @@ def test_unknown_names_are_reported_and_not_declared(capfd):
         assert node.config == Config().replace(**{'sensor.height': 2.5})
         assert node.get_parameter('sensor.height').value == 2.5
         assert not node.has_parameter('lable.ground_tolerance')
-        log = ''
-
-        def said_both():
-            nonlocal log
-            log += capfd.readouterr().err
-            return 'did you mean label.ground_tolerance?' in log and '/nowhere' in log
-
-        ros.wait_for(said_both, 'warnings')
+        log = ros.said_by(capfd, 'did you mean label.ground_tolerance?', '/nowhere')
     assert log.count('is not used') == 2
     assert '  sensor.height: 2.5 m  (default auto)' in log
     assert '  sensor.roll: auto\n' in log

@@ -20,17 +20,7 @@ from cli_runner import run
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.serialization import serialize_message as bytes_of
-from ros_helpers import (
-    BEST_EFFORT,
-    NAMESPACE,
-    RELIABLE,
-    Process,
-    linked,
-    linked_process,
-    street,
-    to_message,
-    values_of,
-)
+from ros_helpers import NAMESPACE, street, to_message
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.cli.bags import scan_cloud
@@ -50,7 +40,7 @@ CONFIG = Config().replace(**PATIENT)
 
 def play(bag, *words, topic='/points'):
     to_node = ('--quiet', '--ros-args', '-r', f'{topic}:={NAMESPACE}/points')
-    return Process(str(bag), *words, *to_node, folder=bag.parent, start=ros.PLAY)
+    return ros.Process(str(bag), *words, *to_node, folder=bag.parent, start=ros.PLAY)
 
 
 @pytest.fixture
@@ -65,7 +55,7 @@ def drive(tmp_path):
 
 
 def test_a_bag_of_2011_shows_ok(drive, tmp_path):
-    with linked_process(tmp_path, *ros.given(PATIENT), sends=None) as (node, link):
+    with ros.linked_process(tmp_path, *ros.given(PATIENT), sends=None) as (node, link):
         with play(drive, '--rate', '1') as player:
             status = link.wait_for_status(
                 'input', lambda values, _: int(values['Events since startup']) >= 20
@@ -73,14 +63,14 @@ def test_a_bag_of_2011_shows_ok(drive, tmp_path):
             assert player.popen.wait(60.0) == 0, player.log
         link.ground.wait(30)
         link.obstacles.wait(30)
-        values = values_of(link.wait_for_status('processing', lambda *_: True))
+        values = ros.values_of(link.wait_for_status('processing', lambda *_: True))
         assert (values['Clouds since startup'], values['Dropped since startup']) == ('30', '0')
         stamps = [message.header.stamp for message in link.ground.messages]
         statuses = [s for array in link.diagnostics.messages for s in array.status]
     tasks = ('input', 'processing', 'model', 'output')
     expected = {(f'{link.node_name[1:]}: {task}', DiagnosticStatus.OK) for task in tasks}
     assert {(s.name, s.level) for s in statuses} == expected
-    assert float(values_of(status)['Age of last stamp (s)']) > 4e8
+    assert float(ros.values_of(status)['Age of last stamp (s)']) > 4e8
     times = [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps]
     assert len(times) == len(link.obstacles.messages) == 30
     assert all(later - earlier == 10**8 for earlier, later in itertools.pairwise(times))
@@ -91,7 +81,7 @@ def test_a_bag_in_a_loop_with_a_clock_resets_what_was_learned(tmp_path):
     bag = tmp_path / 'drive.mcap'
     write_ros2_bag(bag, 15)
     changes = {**PATIENT, 'use_sim_time': True, 'learning.mode': 'first_frame'}
-    with linked_process(tmp_path, *ros.given(changes), sends=None) as (node, link):
+    with ros.linked_process(tmp_path, *ros.given(changes), sends=None) as (node, link):
         with play(bag, '--loop', '--rate', '2', '--clock') as player:
             link.wait_for_status('input', lambda v, _: int(v['Time jumps since startup']) >= 2)
             link.wait_for_status('model', lambda v, _: int(v.get('Learned since startup', 0)) >= 3)
@@ -103,10 +93,10 @@ def test_a_bag_in_a_loop_with_a_clock_resets_what_was_learned(tmp_path):
     ages = []
     for report in reports:
         assert {status.level for status in report.values()} == {DiagnosticStatus.OK}
-        values = values_of(report['input'])
+        values = ros.values_of(report['input'])
         ages.append(values['Age of last stamp (s)'])
         n_rounds = 1 + int(values['Time jumps since startup'])
-        n_learned = int(values_of(report['model']).get('Learned since startup', 0))
+        n_learned = int(ros.values_of(report['model']).get('Learned since startup', 0))
         # Once in each round, on its first cloud, which may be still to come.
         assert n_learned in (n_rounds - 1, n_rounds)
     # On the simulated clock clouds of 2011 are new.
@@ -128,7 +118,7 @@ def test_a_bad_cloud_among_good_ones(tmp_path):
     good, bad = to_message(street(500), frame='lidar'), to_message(street(500), frame='broken')
     bad.fields[3].name = 'altitude'
     changes = {**PATIENT, 'diagnostics.recover_after': 0.5}
-    with linked_process(tmp_path, *ros.given(changes)) as (node, link):
+    with ros.linked_process(tmp_path, *ros.given(changes)) as (node, link):
         for k in range(1, 4):
             link.segment(good)
             link.publisher.publish(bad)
@@ -143,7 +133,7 @@ def test_a_bad_cloud_among_good_ones(tmp_path):
             ),
         )
         assert 'no field named z' in status.message
-        assert values_of(status)['Frame'] == 'broken'
+        assert ros.values_of(status)['Frame'] == 'broken'
         link.segment(good)
         status = link.wait_for_status(
             'input',
@@ -151,7 +141,7 @@ def test_a_bad_cloud_among_good_ones(tmp_path):
                 status.level == DiagnosticStatus.OK and values['Events since startup'] == '11'
             ),
         )
-        assert values_of(status)['Refused since startup'] == '4'
+        assert ros.values_of(status)['Refused since startup'] == '4'
         # Throttled: four bad clouds, one message with topic, frame and reason.
         (line,) = [line for line in node.log.splitlines() if 'ERROR' in line]
         assert f"cloud on {NAMESPACE}/points in frame 'broken' refused: " in line
@@ -165,7 +155,7 @@ def test_a_bad_cloud_among_good_ones(tmp_path):
 @pytest.fixture(scope='module')
 def node(tmp_path_factory):
     folder = tmp_path_factory.mktemp('node')
-    with Process(*ros.IN_NAMESPACE, *ros.given(PATIENT), folder=folder) as process:
+    with ros.Process(*ros.IN_NAMESPACE, *ros.given(PATIENT), folder=folder) as process:
         process.wait_until_settled()
         yield process
         assert process.stop(signal.SIGINT)[0] == 0
@@ -176,7 +166,7 @@ def node(tmp_path_factory):
 def test_clouds_of_two_megabytes_at_10_hz_all_come_back():
     message = to_message(street(30_000, n_invalid=100), frame='velo_link')
     assert len(message.data) == 1_920_000
-    with linked() as link:
+    with ros.linked() as link:
         next_time = time.monotonic()
         for k in range(20):
             message.header.stamp.sec = k
@@ -220,7 +210,7 @@ def test_frames_to_bag_to_player_to_node_and_back(source, tmp_path, request):
         bag, topic = simulated_bag(tmp_path)
     with BagReader(bag) as reader:
         sent = [decode_cloud(raw) for _, _, raw in reader.messages([topic])]
-    with linked(sends=None) as link, play(bag, topic=topic) as player:
+    with ros.linked(sends=None) as link, play(bag, topic=topic) as player:
         back = link.ground.wait(6), link.obstacles.wait(6)
         assert player.popen.wait(60.0) == 0, player.log
     segmenter = GroundSegmenter(CONFIG)
@@ -256,7 +246,7 @@ def test_a_storm_of_parameters_loses_no_cloud(drive):
             ('no.such_parameter', 1),
         ]
     )
-    with linked(sends=None) as link, play(drive, '--rate', '0.6') as player:
+    with ros.linked(sends=None) as link, play(drive, '--rate', '0.6') as player:
         link.ground.wait(3)
         n_before = len(link.ground.messages)
         n_during = []
@@ -296,8 +286,8 @@ while True:
 def test_best_effort_driver_with_the_large_segment_profile(tmp_path):
     profile = str(REPOSITORY / 'config' / 'fastdds_large_clouds.xml')
     environment = {**os.environ, **ros.ISOLATION, 'FASTRTPS_DEFAULT_PROFILES_FILE': profile}
-    with (tmp_path / 'driver.log').open('wb') as log, linked(sends=None) as link:
-        command = [sys.executable, '-c', DRIVER, NAMESPACE]
+    with (tmp_path / 'driver.log').open('wb') as log, ros.linked(sends=None) as link:
+        command = [sys.executable, '-c', DRIVER, ros.NAMESPACE]
         driver = subprocess.Popen(command, env=environment, stderr=log)
         try:
             link.ground.wait(5)
@@ -310,10 +300,10 @@ def test_best_effort_driver_with_the_large_segment_profile(tmp_path):
 
 
 @pytest.mark.usefixtures('node')
-@pytest.mark.parametrize('takes', [RELIABLE, BEST_EFFORT], ids=['to_reliable', 'to_best_effort'])
-@pytest.mark.parametrize('sends', [RELIABLE, BEST_EFFORT], ids=['reliable', 'best_effort'])
+@pytest.mark.parametrize('takes', ['RELIABLE', 'BEST_EFFORT'])
+@pytest.mark.parametrize('sends', ['RELIABLE', 'BEST_EFFORT'])
 def test_every_quality_of_service_is_served(sends, takes):
-    with linked(sends, takes) as link:
+    with ros.linked(getattr(ros, sends), getattr(ros, takes)) as link:
         link.publish_until(
             to_message(street(500)),
             lambda: link.ground.messages and link.obstacles.messages,

@@ -216,6 +216,7 @@ def test_times_come_from_the_clock_given_and_the_fit_report_counts(scan):
 def test_a_result_is_not_changed_by_the_next_scan(backend, scan):
     segmenter = GroundSegmenter(CONFIG, backend=backend)
     result = segmenter.segment(scan)
+    assert segmenter.estimate_pose(scan) == result.pose
     kept = {name: getattr(result, name).copy() for name in VALUES}
     groups = result.grid, result.candidates, result.lines, result.pseudo, result.surface
     before = [[np.copy(a) for a in group] for group in groups]
@@ -275,11 +276,6 @@ def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
     assert (segmenter.backend_name, is_closed) == ('numpy', [])
     segmenter.configure(CONFIG.replace(**{'runtime.n_threads': 1}))
     assert (segmenter.backend_name, is_closed) == (own, [True])
-
-
-def test_the_pose_alone_is_that_of_the_segmentation(backend, scan):
-    segmenter = GroundSegmenter(CONFIG, backend=backend)
-    assert segmenter.estimate_pose(scan) == segmenter.segment(scan).pose
 
 
 # Several callers
