@@ -22,9 +22,6 @@ from gp_ground_seg.frame import (
     PseudoInputs,
 )
 
-N_SLICES = 3
-
-
 # Polar grid (section II)
 
 
@@ -44,7 +41,7 @@ def place_of(x, y, grid):
 def lowest_of_cells(scan, config):
     """Lowest point of each cell; of equally low ones the nearest, then the first tile.
 
-    The density is the mean over slices of equal height of points over area.
+    The density is the mean over three slices of equal height of points over area.
     """
     members = {}
     for i in np.flatnonzero(scan.grid.cell >= 0):
@@ -55,9 +52,8 @@ def lowest_of_cells(scan, config):
         low, r, tile = min(zip(z, scan.grid.r[own], scan.tiles.tile[own], strict=True))
         segment, n = divmod(cell, scan.grid.n_bins)
         extent = max(max(z) - low, config.lines.min_density_extent)
-        piece = np.minimum((z - low) / extent * N_SLICES, N_SLICES - 1).astype(int)
-        number = np.bincount(piece, minlength=N_SLICES)
-        area = np.diff(scan.grid.edges)[n] * extent / N_SLICES
+        number = np.bincount(np.minimum((z - low) / extent * 3, 2).astype(int), minlength=3)
+        area = np.diff(scan.grid.edges)[n] * extent / 3
         rows.append((r, low, n, np.mean(number / area), tile))
         counts[segment] += 1
     r, z, own_bin, density, tile = np.array(rows, dtype=np.float64).reshape(-1, 5).T

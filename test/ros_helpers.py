@@ -8,6 +8,7 @@ import threading
 import time
 import warnings
 from array import array
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -50,11 +51,11 @@ RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def wait_for(condition, what, timeout=PATIENCE):
-    """Return as soon as `condition` holds; fail if it does not within `timeout` seconds."""
-    end = time.monotonic() + timeout
+def wait_for(condition, what):
+    """Return as soon as `condition` holds."""
+    end = time.monotonic() + PATIENCE
     while not condition():
-        assert time.monotonic() <= end, f'after {timeout:g} s still no {what}'
+        assert time.monotonic() <= end, f'after {PATIENCE:g} s still no {what}'
         time.sleep(0.005)
 
 
@@ -85,31 +86,27 @@ def spinning(context, *nodes):
     executor = SingleThreadedExecutor(context=context)
     for node in nodes:
         executor.add_node(node)
-    errors, done = [], threading.Event()
+    done = threading.Event()
 
     # executor.spin() would have to be ended by a shutdown from this thread, which takes
     # a handle away that a callback just finishing still triggers.
     def spin():
-        try:
+        with contextlib.suppress(ExternalShutdownException):
             while context.ok() and not done.is_set():
                 executor.spin_once(timeout_sec=0.05)
-        except ExternalShutdownException:
-            pass
-        except BaseException as error:
-            errors.append(error)
 
-    thread = threading.Thread(target=spin)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-        executor.shutdown()
-        for node in nodes:
-            node.destroy_node()
-    if errors:
-        raise errors[0]
+    with ThreadPoolExecutor(1) as pool:
+        spun = pool.submit(spin)
+        try:
+            yield
+        finally:
+            done.set()
+            error = spun.exception()
+            executor.shutdown()
+            for node in nodes:
+                node.destroy_node()
+        if error:
+            raise error
 
 
 class Collector:
@@ -237,14 +234,14 @@ class Process:
 
 def said_by(capfd, *texts):
     """What the node in this process has written to stderr, once that holds all `texts`."""
-    said = []
+    said = ['']
 
     def is_said():
-        said.append(capfd.readouterr().err)
-        return all(text in ''.join(said) for text in texts)
+        said[0] += capfd.readouterr().err
+        return all(text in said[0] for text in texts)
 
     wait_for(is_said, f'{texts} on stderr')
-    return ''.join(said)
+    return said[0]
 
 
 # Talking to a node
@@ -291,12 +288,7 @@ class Link:
 
     def publish_until(self, message, condition, what):
         """Publish a cloud over and over until `condition` holds."""
-
-        def publish_once():
-            self.publisher.publish(message)
-            return condition()
-
-        wait_for(publish_once, what)
+        wait_for(lambda: self.publisher.publish(message) or condition(), what)
 
     def set(self, name, value):
         """Result of ``ros2 param set``."""
@@ -323,15 +315,13 @@ class Link:
         `is_wanted` is called with its numbers and the status itself.
         """
         start, name = len(self.diagnostics.messages), f'{self.node_name[1:]}: {task}'
-        found = []
 
-        def look():
+        def found():
             statuses = (s for array in self.diagnostics.messages[start:] for s in array.status)
-            found[:] = [s for s in statuses if s.name == name and is_wanted(values_of(s), s)]
-            return found
+            return [s for s in statuses if s.name == name and is_wanted(values_of(s), s)]
 
-        wait_for(look, f'wanted status of {name}')
-        return found[0]
+        wait_for(found, f'wanted status of {name}')
+        return found()[0]
 
 
 class Bench(Link):
@@ -344,7 +334,7 @@ class Bench(Link):
         super().__init__(context)
 
     def wait_until_settled(self):
-        """Wait until it has the backend that it keeps: labels may differ by one or two."""
+        """As that of a `Process`."""
         has_to_load = choose_backend(self.node.config.runtime.backend) == 'numba'
         wait_for(lambda: self.node._is_compiled or not has_to_load, 'compiled backend')
 

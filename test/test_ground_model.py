@@ -63,24 +63,6 @@ def test_height_under_every_point_is_that_of_the_segmentation(segmented):
         height, std = one.at(points[:, 0], points[:, 1])
         np.testing.assert_allclose(height, found.ground_z, rtol=0, atol=tolerance)
         np.testing.assert_allclose(std, found.ground_std, rtol=0, atol=tolerance)
-
-
-def test_knots_are_exact(segmented):
-    _, found = segmented
-    model = rounded(GroundModel.of(found))
-    # All directions meet at a range of 0, and beyond the last knot there is nothing.
-    inner = slice(int(model.knots[0] == 0.0), -1)
-    azimuth = model.azimuth[:, None]
-    x, y = model.knots[inner] * np.cos(azimuth), model.knots[inner] * np.sin(azimuth)
-    height, std = model.at(x, y)
-    # A bin's far edge belongs to the next one, where rounding does not put it back.
-    has_next = np.isfinite(np.roll(model.height, -1, axis=1)[:, inner])
-    assert has_next.any()
-    for values, table in ((height, model.height), (std, model.std)):
-        expected = table[:, inner]
-        np.testing.assert_allclose(values[has_next], expected[has_next], rtol=0, atol=1e-9)
-        assert np.isnan(values[np.isnan(expected)]).all()
-    # The values themselves are those of the surface, to single precision.
     np.testing.assert_array_equal(np.float32(found.surface.mean), np.float32(model.height))
     np.testing.assert_array_equal(np.isnan(model.length_scale), np.isnan(found.log_length_scale))
 

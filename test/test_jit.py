@@ -143,15 +143,10 @@ def test_without_numba_nothing_is_compiled(program):
     assert program.run(NUMBA_DISABLE_JIT='1') == [42.0, 0, 0, False, None]
 
 
-@pytest.mark.parametrize(
-    ('mode', 'uid', 'reason'),
-    [
-        (0o755, 0, ''),
-        (0o700, 0, ''),
-        (0o757, 0, 'others can write'),
-        (0o755, 1, 'belongs to another user'),
-    ],
-)
+OTHERS = (0o757, 0, 'others can write'), (0o755, 1, 'belongs to another user')
+
+
+@pytest.mark.parametrize(('mode', 'uid', 'reason'), [(0o755, 0, ''), (0o700, 0, ''), *OTHERS])
 def test_whom_a_folder_belongs_to(tmp_path, mode, uid, reason):
     folder = tmp_path / 'code'
     folder.mkdir()

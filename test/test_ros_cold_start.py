@@ -81,23 +81,16 @@ def backend_after_a_cloud(b, n_seen):
     return values['Backend'], int(values['Threads'])
 
 
-def test_change_over_between_two_frames_keeps_what_was_learned(b, held_back):
+def test_change_over_keeps_what_was_learned_and_the_newest_parameters(b, held_back):
+    assert b.set('runtime.n_threads', 1).successful
+    assert b.set('label.ground_tolerance', 0.3).successful
     assert backend_after_a_cloud(b, 1)[0] == 'numpy'
     theta = b.node._segmenter._theta
     held_back.set()
     b.wait_until_settled()
-    assert backend_after_a_cloud(b, 2)[0] == 'numba'
-    assert b.node._segmenter._theta is theta
-
-
-def test_newest_parameters_win(b, held_back):
-    assert b.set('runtime.n_threads', 1).successful
-    assert b.set('label.ground_tolerance', 0.3).successful
-    assert backend_after_a_cloud(b, 1)[0] == 'numpy'
-    held_back.set()
-    b.wait_until_settled()
     assert backend_after_a_cloud(b, 2) == ('numba', 1)
     assert b.node._segmenter.config == b.node.config
+    assert b.node._segmenter._theta is theta
 
 
 def test_numpy_asked_for_meanwhile_stays(b, held_back):
