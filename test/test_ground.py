@@ -59,18 +59,6 @@ def test_surfaces_are_the_reference(backend, seed):
     np.testing.assert_allclose(found.std, expected.std, atol=1e-5)
 
 
-# Length-scales
-
-
-def test_equal_pseudo_inputs_give_that_length_scale_everywhere(backend):
-    frame = frame_of(hilly_scan(400), config_of())
-    theta = given_theta(frame, config_of())
-    theta[:, 5:] = 1.3
-    u = backend.estimate_surface(frame, theta, config_of())[1]
-    assert np.isfinite(u).any()
-    np.testing.assert_allclose(u[np.isfinite(u)], 1.3, rtol=1e-13)
-
-
 # Posterior
 
 

@@ -255,6 +255,7 @@ def test_while_compiling(tmp_path, number):
     [('numba', 2048, signal.SIGTERM), ('numpy', 512, signal.SIGINT)],
 )
 def test_within_a_long_segmentation(tmp_path, backend, n_segments, number):
+    """A thread ends what does not end itself: one call into compiled code takes seconds."""
     if backend == 'numba' and not HAVE_NUMBA:
         pytest.skip('numba is not installed')
     # A scan takes 5 s and more.
@@ -287,29 +288,6 @@ def test_under_load(tmp_path, numbers):
         for number in numbers[:-1]:
             node.popen.send_signal(number)
         assert_good_end(node, numbers[-1])
-
-
-DEAF = """
-import hashlib
-from gp_ground_seg.ros.lifecycle import stop_on_signals
-
-with stop_on_signals():
-    print('ready', flush=True)
-    # A minute in one call that lets other threads run, as compiled code does.
-    hashlib.pbkdf2_hmac('sha256', b'', b'', 200_000_000)
-"""
-
-
-def test_a_thread_ends_what_does_not_end_itself():
-    process = subprocess.Popen(
-        [sys.executable, '-c', DEAF],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    with process:
-        assert process.stdout.readline() == 'ready\n'
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(ros.PATIENCE) == 0
-        assert process.stderr.read() == ''
 
 
 UNDISTURBED = """

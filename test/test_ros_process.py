@@ -115,16 +115,18 @@ def test_a_bag_in_a_loop_with_a_clock_resets_what_was_learned(tmp_path):
 
 
 def test_a_bad_cloud_among_good_ones(tmp_path):
-    good, bad = to_message(street(500), frame='lidar'), to_message(street(500), frame='broken')
-    bad.fields[3].name = 'altitude'
+    good = to_message(street(500), frame='lidar')
+    bad = [to_message(street(500), frame='broken') for _ in range(4)]
+    bad[0].fields[3].name = bad[3].fields[3].name = 'altitude'
+    bad[1].data, bad[2].point_step = bad[1].data[:-1], 0
     changes = {**PATIENT, 'diagnostics.recover_after': 0.5}
     with ros.linked_process(tmp_path, *ros.given(changes)) as (node, link):
         for k in range(1, 4):
             link.segment(good)
-            link.publisher.publish(bad)
+            link.publisher.publish(bad[k - 1])
             link.segment(good)
             assert len(link.ground.messages) == 2 * k
-        link.publisher.publish(bad)
+        link.publisher.publish(bad[3])
         # Of the last of them: a good one in the same report would not take it back.
         status = link.wait_for_status(
             'input',

@@ -139,18 +139,13 @@ def test_the_roof_of_the_own_vehicle_is_not_the_ground():
     assert pose_of(points).height == pytest.approx(1.9, abs=0.05)
 
 
+THREE = np.array([[10.0, 0.0, -1.0], [0.0, 10.0, -1.0], [-10.0, 0.0, -1.0]])
+HUGE = np.full((50, 3), 1e200)
+FEW = THREE[:0], THREE * np.nan, THREE[:1], THREE, HUGE, -1e108 * HUGE
+
+
 @pytest.mark.filterwarnings('ignore:overflow')
-@pytest.mark.parametrize(
-    'points',
-    [
-        np.empty((0, 3)),
-        np.full((7, 3), np.nan),
-        np.array([[10.0, 0.0, -1.0]]),
-        np.array([[10.0, 0.0, -1.0], [0.0, 10.0, -1.0], [-10.0, 0.0, -1.0]]),
-        np.full((50, 3), 1e200),
-        np.full((50, 3), -1e308),
-    ],
-)
+@pytest.mark.parametrize('points', FEW)
 @pytest.mark.parametrize('backend', [NumbaBackend(1), NumpyBackend()], ids=lambda b: b.name)
 def test_too_few_points_to_determine_anything(points, backend):
     pose = segmenter(backend).estimate_pose(points)

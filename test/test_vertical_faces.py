@@ -45,16 +45,6 @@ def test_what_is_a_face(backend, name):
     assert (faces_of(backend, CORNER + xyz)[0] == is_face).all()
 
 
-def test_a_wall_of_any_direction_is_a_face(backend):
-    rng = np.random.default_rng(2)
-    for turn in np.linspace(0.0, np.pi, 9):
-        along, z = rng.uniform(-0.2, 0.2, 100), rng.uniform(-1.6, 0.0, 100)
-        wall = np.column_stack([10.25 + along * np.cos(turn), 5.25 + along * np.sin(turn), z])
-        found, _, scan = faces_of(backend, wall)
-        assert found.all()
-        assert list(scan.tiles.extremes[scan.tiles.tile[0]]) == [z.min(), z.max()]
-
-
 def wall(low=0.0, high=1.5, turn=0.3):
     """Rings of returns on a vertical plane, evenly spread over its height."""
     along, z = (
