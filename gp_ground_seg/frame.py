@@ -213,7 +213,8 @@ class GroundSurface(NamedTuple):
         values = []
         for table in (self.mean, self.std):
             level, slope = linear_pieces(self.knots, table)
-            value = level[cell] + slope[cell] * away
+            with np.errstate(invalid='ignore'):  # points outside may be infinitely far
+                value = level[cell] + slope[cell] * away
             value[outside] = np.nan
             values.append(value)
         return values[0], values[1]

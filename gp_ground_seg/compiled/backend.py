@@ -39,6 +39,7 @@ from gp_ground_seg.gp.latent import given_log_length_scales
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.pipeline.labels import square_units
 from gp_ground_seg.pipeline.points import copy_points, points_in
 
 
@@ -125,10 +126,9 @@ class NumbaBackend:
         take, thresholds = self._buffers.take, numbers_of(config.faces)
         n_tiles, n_parts = len(scan.tiles.extremes), self._workers.n_parts(len(scan.xyz))
         tile_to_row, row_to_tile = take('tile_rows', (2, n_tiles), np.int32)
-        # As much as could be needed; pages that are not used take no memory.
-        sums = take('face_sums', (n_parts, 2 * n_tiles, faces_.N_COLUMNS), np.float64)
+        n_tall = faces_.select_tall(scan.tiles, thresholds, tile_to_row, row_to_tile)
+        sums = take('face_sums', (n_parts, 2 * n_tall, faces_.N_COLUMNS), np.float64)
         room = faces_.FaceSums(tile_to_row, row_to_tile, sums)
-        n_tall = faces_.select_tall(scan.tiles, thresholds, room)
         self._workers.run(
             faces_.sum_returns,
             n_parts,
@@ -218,6 +218,7 @@ class NumbaBackend:
             take('pieces', (n_cells + 1, 2), np.float64),
             take('square_sums', (n_parts, n_cells + 1, 2), np.int64),
             take('band', (n_cells + 1,), np.float64),
+            square_units(n_points, config.label.obstacle_min_height),
         )
         result = Labelled(
             np.empty(n_points, dtype=np.uint8),

@@ -25,7 +25,6 @@ from gp_ground_seg.frame import (
 )
 from gp_ground_seg.jit import jit
 from gp_ground_seg.parameters.config import LabelConfig
-from gp_ground_seg.pipeline.labels import SQUARE_UNITS
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
@@ -46,11 +45,14 @@ class LabelRoom(NamedTuple):
         order does not matter, nor how the points are split.
     band : (M * n_bins + 1,) float64
         Largest height of ground [m].
+    units : float
+        Whole units of squared heights [1/m^2].
     """
 
     pieces: FloatArray
     sums: IntArray
     band: FloatArray
+    units: float
 
 
 @jit(entry=True)
@@ -94,7 +96,7 @@ def survey(
                 sums[c, 0] += OBSTACLE_FLAG
         elif h >= -min_height and not is_face[np.uintp(tile[i])]:
             sums[c, 0] += 1
-            sums[c, 1] += int(h * h * SQUARE_UNITS + 0.5)
+            sums[c, 1] += int(h * h * room.units + 0.5)
 
 
 @jit(entry=True)
@@ -121,7 +123,7 @@ def set_bands(n_parts: int, config: LabelConfig, room: LabelRoom, roughness: Flo
         for n in range(n_bins):
             count = max(number[n] + number[n + 1] + number[n + 2], 1)
             total = squares[n] + squares[n + 1] + squares[n + 2]
-            rough = math.sqrt(np.float64(total) / (SQUARE_UNITS * np.float64(count)))
+            rough = math.sqrt(np.float64(total) / (room.units * np.float64(count)))
             free = config.ground_tolerance + config.roughness_gain * rough
             beside = config.obstacle_tolerance + config.obstacle_roughness_gain * rough
             own = min(free, beside) if n_obstacles[n] > 0 else free

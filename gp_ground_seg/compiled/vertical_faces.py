@@ -38,7 +38,7 @@ class FaceSums(NamedTuple):
         First of the two rows of each occupied tile, or `NOT_TALL`.
     row_to_tile : (T,) int32
         Tile of each pair of rows.
-    sums : (n_parts, 2 * T, N_COLUMNS) float64
+    sums : (n_parts, rows, N_COLUMNS) float64
         Sums of each part.
     """
 
@@ -48,17 +48,19 @@ class FaceSums(NamedTuple):
 
 
 @jit(entry=True)
-def select_tall(tiles: Tiles, config: FacesConfig, room: FaceSums) -> int:
-    """Give each tall tile its rows; return the number of tall tiles."""
+def select_tall(
+    tiles: Tiles, config: FacesConfig, tile_to_row: CellArray, row_to_tile: CellArray
+) -> int:
+    """Give each tall tile its rows (see `FaceSums`); return the number of tall tiles."""
     extremes, n_tall = tiles.extremes, 0
     for tile in tiles.occupied:
         t = np.uintp(tile)
         if np.float64(extremes[t, 1]) - np.float64(extremes[t, 0]) > config.min_height:
-            room.tile_to_row[t] = 2 * n_tall
-            room.row_to_tile[n_tall] = tile
+            tile_to_row[t] = 2 * n_tall
+            row_to_tile[n_tall] = tile
             n_tall += 1
         else:
-            room.tile_to_row[t] = NOT_TALL
+            tile_to_row[t] = NOT_TALL
     return n_tall
 
 

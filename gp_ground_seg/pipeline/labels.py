@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -19,9 +21,8 @@ from gp_ground_seg.frame import (
 )
 from gp_ground_seg.parameters.config import Config, LabelConfig
 
-SQUARE_UNITS = 2.0**40
-"""Squared heights are rounded to multiples of 1 / this [1/m^2], so that the order in which they
-are summed does not matter."""
+FINEST_UNITS = 2.0**40
+"""Most of `square_units`."""
 
 
 def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Config) -> Labelled:
@@ -117,13 +118,24 @@ def local_roughness(
     cell = grid.cell[counts]
     size = grid.n_segments * grid.n_bins
     number = np.bincount(cell, minlength=size)
-    whole = np.floor(height[counts] ** 2 * SQUARE_UNITS + 0.5)
+    units = square_units(len(height), max_height)
+    whole = np.floor(height[counts] ** 2 * units + 0.5)
     squares = np.bincount(cell, weights=whole, minlength=size)
     near_number = sum_neighbourhood(number.reshape(grid.n_segments, -1))
     mean = sum_neighbourhood(squares.reshape(grid.n_segments, -1))
-    mean /= SQUARE_UNITS * np.maximum(near_number, 1.0)
+    mean /= units * np.maximum(near_number, 1.0)
     result: FloatArray = np.sqrt(mean)
     return result
+
+
+def square_units(n_points: int, max_height: float) -> float:
+    """Whole units that squared heights are rounded to [1/m^2].
+
+    The order in which whole numbers are summed does not matter. The sum over all points fits
+    into 63 bits even if each is `max_height` [m] from the surface.
+    """
+    largest = max(n_points, 1) * max_height**2
+    return min(FINEST_UNITS, 2.0 ** math.floor(62.0 - math.log2(largest)))
 
 
 def sum_neighbourhood(table: FloatArray | IntArray) -> FloatArray:

@@ -29,8 +29,10 @@ def take_points(points: npt.ArrayLike) -> PointArray:
     Raises
     ------
     PointCloudError
-        If the shape or type is another; the message holds both.
+        If the shape or type is another, or the array is masked.
     """
+    if isinstance(points, np.ma.MaskedArray):
+        raise PointCloudError('points are a masked array: pass points.filled(numpy.nan)')
     array = np.asarray(points)
     if array.ndim != 2 or array.shape[1] < 3:
         raise PointCloudError(
@@ -79,7 +81,7 @@ def single_precision(xyz: PointArray) -> PointArray:
     return single
 
 
-def finite_points(xyz: FloatArray) -> BoolArray:
+def finite_points(xyz: PointArray) -> BoolArray:
     """Which points (N, 3) have three finite coordinates, (N,) bool."""
     # Column by column: a reduction along rows of three takes ten times as long.
     finite: BoolArray = np.isfinite(xyz[:, 0])

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.frame import FloatArray
+from gp_ground_seg.pipeline.points import finite_points
 
-BoolArray = npt.NDArray[np.bool_]
 Direction = tuple[float, float, float]
 
 ENOUGH_POINTS = 20000
@@ -41,9 +41,10 @@ def vertical(roll: float, pitch: float) -> Direction:
 
 
 def rotate(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
-    """Points (N, 3) turned by a rotation (3, 3), in their own precision; finite ones stay finite.
+    """Points (N, 3) turned by a rotation (3, 3), in their own precision.
 
-    It is computed in double precision; rounded to single, a point 100 m away moves by 4 um.
+    Finite ones stay finite, others become NaN. It is computed in double precision; rounded to
+    single, a point 100 m away moves by 4 um.
     """
     largest = LARGEST[xyz.dtype.itemsize]
     x, y, z = np.clip(xyz, -largest, largest).T.astype(np.float64)
@@ -52,6 +53,7 @@ def rotate(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_Float]:
         # Not a matrix product: BLAS would wake its threads, which spin long after.
         for i, (a, b, c) in enumerate(matrix.tolist()):
             columns[i] = a * x + b * y + c * z
+    columns[:, ~finite_points(xyz)] = np.nan
     result: npt.NDArray[_Float] = columns.T
     return result
 
@@ -62,9 +64,13 @@ def rotate_sample(xyz: npt.NDArray[_Float], matrix: FloatArray) -> npt.NDArray[_
 
 
 def angles_of(up: FloatArray | Direction) -> tuple[float, float]:
-    """Roll and pitch [rad] of a sensor in whose frame the unit vector `up` (3,) points up."""
-    roll = math.atan2(up[1], up[2])
-    return rounded(roll), rounded(math.atan2(-up[0], math.hypot(up[1], up[2])))
+    """Roll and pitch [rad] of a sensor in whose frame the unit vector `up` (3,) points up.
+
+    Where rounding would decide it, the roll is 0 (x points up or down) or half a turn to the left.
+    """
+    across = math.hypot(up[1], up[2])
+    roll = rounded(math.atan2(up[1], up[2])) if across > 1e-4 else 0.0
+    return roll if roll > -rounded(math.pi) else -roll, rounded(math.atan2(-up[0], across))
 
 
 def rounded(value: float) -> float:

@@ -1,0 +1,77 @@
+"""Inputs and uses that once gave a wrong result, a crash or a hang."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
+
+
+def ring_scan(n=4000, seed=0, height=1.73):
+    """Level ground about the sensor."""
+    rng = np.random.default_rng(seed)
+    azimuth, r = rng.uniform(-np.pi, np.pi, n), rng.uniform(2.5, 30.0, n)
+    return np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full(n, -height)])
+
+
+@pytest.mark.parametrize('angles', [{'roll': 0.1, 'pitch': -0.2}, {'roll': 'auto'}])
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_points_at_infinity_are_unknown_under_any_tilt(backend, angles, dtype):
+    points = ring_scan()
+    if angles['roll'] == 'auto':
+        points[:, 2] += 0.2 * points[:, 1]  # a tilt that is found
+    bad = np.arange(0, len(points), 10)
+    points[bad, bad % 3] = np.tile([np.inf, -np.inf, np.nan, np.inf], 100)
+    config = Config().replace(**{f'sensor.{name}': value for name, value in angles.items()})
+    result = GroundSegmenter(config, backend=backend).segment(points.astype(dtype))
+    assert not result.pose.is_level
+    assert (result.label[bad] == Label.UNKNOWN).all()
+    assert (np.delete(result.label, bad) != Label.UNKNOWN).all()
+
+
+def test_many_points_in_one_spot_have_a_roughness(backend):
+    spot = np.tile([10.0, 0.0, -1.73], (260_000, 1))
+    spot[::2, 2] += 9.9
+    config = Config().replace(
+        **{'label.obstacle_min_height': 10.0, 'label.obstacle_max_height': 50.0}
+    )
+    result = GroundSegmenter(config, backend=backend).segment(np.vstack([ring_scan(), spot]))
+    assert np.isfinite(result.roughness).all()
+    assert result.roughness.max() == pytest.approx(9.9 * np.sqrt(0.5), rel=0.01)
+
+
+def test_masked_arrays_are_refused():
+    masked = np.ma.masked_greater(ring_scan(), 20.0)
+    with pytest.raises(PointCloudError, match='masked array: pass'):
+        GroundSegmenter().segment(masked)
+
+
+CHANGING = """
+import threading, time
+import numpy as np
+from gp_ground_seg import Config, GroundSegmenter
+points = np.asfortranarray(np.random.default_rng(0).uniform(-30.0, 30.0, (60_000, 3)))
+ended = threading.Event()
+def change():
+    rng = np.random.default_rng(1)
+    while not ended.is_set():
+        points[:, rng.integers(3)] = rng.choice([np.nan, np.inf, 1e300, -50.0, 0.0, 29.9])
+        points[:, rng.integers(3)] *= rng.uniform(-2.0, 2.0)
+thread = threading.Thread(target=change)
+thread.start()
+try:
+    with np.errstate(all='ignore'):
+        segmenter = GroundSegmenter(Config().replace(**{'runtime.n_threads': 2}))
+        end = time.monotonic() + 3.0
+        while time.monotonic() < end:
+            assert len(segmenter.segment(points).label) == len(points)
+finally:
+    ended.set()
+    thread.join()
+"""
+
+
+def test_an_array_that_changes_meanwhile_does_not_crash():
+    subprocess.run([sys.executable, '-c', CHANGING], check=True, timeout=180)
