@@ -94,12 +94,7 @@ NOISELESS[:2], NOISELESS_LATENT[4] = np.log([1e8, 1e-9]), -400.0
 
 @pytest.mark.parametrize(
     ('theta', 'changes'),
-    [
-        (NOISELESS, {}),
-        (TYPICAL, {'z': math.nan}),
-        (NOISELESS_LATENT, {'r_bar': 5.0}),
-    ],
-    ids=['no noise', 'not finite', 'no latent noise'],
+    [(NOISELESS, {}), (TYPICAL, {'z': math.nan}), (NOISELESS_LATENT, {'r_bar': 5.0})],
 )
 def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
     backend, theta, changes

@@ -17,13 +17,10 @@ def package():
     return ElementTree.parse(REPOSITORY / 'package.xml').getroot()
 
 
-def test_versions_agree(package):
+def test_package_xml_is_that_of_this_package(package):
     assert package.findtext('version') == gp_ground_seg.__version__
     changelog = (REPOSITORY / 'CHANGELOG.rst').read_text(encoding='utf-8')
     assert re.search(r'^(\d+\.\d+\.\d+|Forthcoming)\b', changelog, re.MULTILINE)
-
-
-def test_package_xml_is_an_ament_python_package(package):
     assert package.get('format') == '3'
     assert package.findtext('export/build_type') == 'ament_python'
     depends = {element.text for element in package.iter('exec_depend')}

@@ -16,7 +16,7 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter, parameter_value_to_python
 from ros_helpers import bench, street, to_message
 
-from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
+from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.parameters.config import find_spec, parameter_specs
 from gp_ground_seg.parameters.export import file_problems
 from gp_ground_seg.parameters.presets import PRESETS
@@ -275,11 +275,3 @@ def test_unknown_names_are_reported_and_not_declared(capfd):
     assert log.count('is not used') == 2
     assert '  sensor.height: 2.5 m  (default auto)' in log
     assert '  sensor.roll: auto\n' in log
-
-
-def test_constructor_raises_config_error():
-    with (
-        pytest.raises(ConfigError, match=r'sensor\.height = 99'),
-        ros.started_node('-p', 'sensor.height:=99.0'),
-    ):
-        pass

@@ -1,6 +1,7 @@
 """The segmenter: properties of its results, history, threads, forks, change of backend."""
 
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -87,20 +88,18 @@ def test_odd_clouds_work(backend, points):
         assert np.isnan(result.ground_z[0]) == (not is_low)
 
 
-@pytest.mark.parametrize(
-    ('points', 'words'),
-    [
-        (np.zeros(3), r'\(3,\)'),
-        (np.zeros((5, 2)), r'\(5, 2\)'),
-        (np.zeros((2, 5, 3)), r'\(2, 5, 3\)'),
-        (np.zeros((5, 3), dtype=np.int32), r'\(5, 3\).*int32'),
-        (np.array([['a', 'b', 'c']]), r'\(1, 3\)'),
-        (np.zeros((5, 3), dtype=complex), 'complex128'),
-    ],
-)
-def test_wrong_shapes_and_types_are_refused_with_the_shape(points, words):
-    with pytest.raises(PointCloudError, match=words):
-        SEGMENTER.segment(points)
+def test_wrong_shapes_and_types_are_refused_with_the_shape():
+    for points in (
+        np.zeros(3),
+        np.zeros((5, 2)),
+        np.zeros((2, 5, 3)),
+        np.array([['a', 'b', 'c']]),
+    ):
+        with pytest.raises(PointCloudError, match=re.escape(str(points.shape))):
+            SEGMENTER.segment(points)
+    for dtype in ('int32', 'complex128'):
+        with pytest.raises(PointCloudError, match=rf'\(5, 3\).*{dtype}'):
+            SEGMENTER.segment(np.zeros((5, 3), dtype))
     assert len(SEGMENTER.segment(hilly_scan(100)).label) == 100
 
 
