@@ -164,10 +164,8 @@ def test_a_preset_as_the_readme_has_it(tmp_path):
     (block,) = [block for block in blocks if 'config dump --preset' in block]
     *commands, node_command = block.splitlines()
     script = f'gp-ground-seg() {{ {sys.executable} -m gp_ground_seg "$@"; }}; set -e\n'
-    done = subprocess.run(
-        ['bash', '-c', script + '\n'.join(commands)],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    command = ['bash', '-c', script + '\n'.join(commands)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert 'my.yaml: good; ' in done.stdout
     program, *words = node_command.split()

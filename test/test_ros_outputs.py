@@ -75,10 +75,9 @@ def test_ground_model_gives_the_height_anywhere(b):
     found = received(b, '~/ground_model', message)
     assert found.header == message.header
     assert (found.height, found.width) == (CONFIG.grid.n_segments, CONFIG.grid.n_bins + 1)
-    assert [(f.name, f.datatype, f.count) for f in found.fields] == [
-        (name, PointField.FLOAT32, 1)
-        for name in ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
-    ]
+    names = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
+    layout = [(field.name, field.datatype, field.count) for field in found.fields]
+    assert layout == [(name, PointField.FLOAT32, 1) for name in names]
     expected = GroundSegmenter(CONFIG).segment(xyz_of(points))
     height, std = read_ground_model(found).at(points['x'], points['y'])
     np.testing.assert_allclose(height, expected.ground_z, rtol=0, atol=1e-4)
