@@ -81,16 +81,20 @@ def backend_after_a_cloud(b, n_seen):
     return values['Backend'], int(values['Threads'])
 
 
-def test_change_over_keeps_what_was_learned_and_the_newest_parameters(b, held_back):
-    assert b.set('runtime.n_threads', 1).successful
-    assert b.set('label.ground_tolerance', 0.3).successful
+@pytest.mark.parametrize('changes', [{}, {'runtime.n_threads': 1, 'label.ground_tolerance': 0.3}])
+def test_change_over_keeps_what_was_learned_and_the_newest_parameters(b, held_back, changes):
+    for name, value in changes.items():
+        assert b.set(name, value).successful
     assert backend_after_a_cloud(b, 1)[0] == 'numpy'
     theta = b.node._segmenter._theta
     held_back.set()
     b.wait_until_settled()
-    assert backend_after_a_cloud(b, 2) == ('numba', 1)
+    backend, n_threads = backend_after_a_cloud(b, 2)
+    assert backend == 'numba'
+    assert n_threads == 1 or not changes
     assert b.node._segmenter.config == b.node.config
-    assert b.node._segmenter._theta is theta
+    # Another number of threads begins anew.
+    assert (b.node._segmenter._theta is theta) == (not changes)
 
 
 def test_numpy_asked_for_meanwhile_stays(b, held_back):
