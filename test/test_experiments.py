@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from evaluation_samples import write_streets
+from evaluation_samples import write_frame, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -54,8 +54,8 @@ from gp_ground_seg.simulation import (
     SENSORS,
     VLP_16,
     Kind,
+    semantic_kitti_labels,
     simulate_scan,
-    write_semantic_kitti,
 )
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
@@ -294,11 +294,9 @@ def streets(tmp_path_factory):
     """Two frames of a simulated street, from KITTI's height."""
     root = tmp_path_factory.mktemp('streets')
     small = dataclasses.replace(HDL_64E, n_columns=500)
-    scans = (
-        simulate_scan(SCENES['kerb'](seed), small, np.random.default_rng(seed), time=0.1 * seed)
-        for seed in range(2)
-    )
-    write_semantic_kitti(scans, root, '00')
+    for seed in range(2):
+        scan = simulate_scan(SCENES['kerb'](seed), small, np.random.default_rng(seed))
+        write_frame(root, '00', seed, scan.points, semantic_kitti_labels(scan.kind))
     return labelled_frames(root)
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from evaluation_samples import real_kitti, street, write_frame, write_streets
+from evaluation_samples import street, write_frame, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -19,25 +19,25 @@ from gp_ground_seg.errors import DataError
 FLOATS = st.floats(width=32, allow_nan=True, allow_infinity=True)
 
 
-@given(hnp.arrays('<f4', st.tuples(st.integers(0, 20), st.just(4)), elements=FLOATS))
-def test_points_come_back_bit_for_bit(tmp_path_factory, points):
-    path = tmp_path_factory.mktemp('points') / 'a.bin'
-    path.write_bytes(points.tobytes())
-    read = read_points(path)
-    assert read.dtype == np.float32
-    assert read.shape == points.shape
+@given(
+    hnp.arrays('<f4', st.tuples(st.integers(0, 20), st.just(4)), elements=FLOATS),
+    hnp.arrays('<u4', st.integers(0, 20)),
+)
+def test_points_come_back_bit_for_bit_and_labels_are_the_lower_half(
+    tmp_path_factory, points, entries
+):
+    folder = tmp_path_factory.mktemp('frame')
+    (folder / 'a.bin').write_bytes(points.tobytes())
+    read = read_points(folder / 'a.bin')
+    assert (read.dtype, read.shape) == (np.float32, points.shape)
     assert read.tobytes() == points.tobytes()
     assert read.flags.writeable
+    (folder / 'a.label').write_bytes(entries.tobytes())
+    labels = read_labels(folder / 'a.label', len(entries))
+    assert labels.tolist() == [int(entry) % 65536 for entry in entries]
 
 
-@given(hnp.arrays('<u4', st.integers(0, 20)))
-def test_labels_are_the_lower_half(tmp_path_factory, entries):
-    path = tmp_path_factory.mktemp('labels') / 'a.label'
-    path.write_bytes(entries.tobytes())
-    assert read_labels(path, len(entries)).tolist() == [int(entry) % 65536 for entry in entries]
-
-
-def test_files_of_another_size_are_refused(tmp_path):
+def test_files_of_another_size_or_none_are_refused(tmp_path):
     path = tmp_path / 'a.bin'
     for n_bytes in (1, 15, 17, 100):
         path.write_bytes(bytes(n_bytes))
@@ -47,29 +47,28 @@ def test_files_of_another_size_are_refused(tmp_path):
         with pytest.raises(DataError, match=f'100 bytes, expected {4 * n_points} for {n_points}'):
             read_labels(path, n_points)
 
-
-@pytest.mark.parametrize('name', ['missing.bin', ''])
-def test_a_file_that_cannot_be_read_is_named(tmp_path, name):
-    with pytest.raises(DataError, match=str(tmp_path / name)):
-        read_points(tmp_path / name)
-    with pytest.raises(DataError, match=str(tmp_path / name)):
-        read_labels(tmp_path / name, 0)
+    for name in ('missing.bin', ''):
+        with pytest.raises(DataError, match=str(tmp_path / name)):
+            read_points(tmp_path / name)
+        with pytest.raises(DataError, match=str(tmp_path / name)):
+            read_labels(tmp_path / name, 0)
 
 
 def test_sequences_are_sorted_and_need_scans(tmp_path):
+    for root in (tmp_path, tmp_path / 'missing'):
+        with pytest.raises(DataError, match='no sequences/'):
+            list_sequences(root)
+        with pytest.raises(DataError, match='no sequences/'):
+            list_frames(root, '00')
     write_streets(tmp_path, s08=1, s00=1, s10=1)
     (tmp_path / 'sequences' / '03').mkdir()
     (tmp_path / 'sequences' / 'notes.txt').write_text('')
-    assert list_sequences(tmp_path) == ['00', '08', '10']
-    assert list_sequences(str(tmp_path)) == ['00', '08', '10']
-
-
-@pytest.mark.parametrize('name', ['', 'missing'])
-def test_a_root_without_sequences_is_refused(tmp_path, name):
-    with pytest.raises(DataError, match='no sequences/'):
-        list_sequences(tmp_path / name)
-    with pytest.raises(DataError, match='no sequences/'):
-        list_frames(tmp_path / name, '00')
+    assert list_sequences(tmp_path) == list_sequences(str(tmp_path)) == ['00', '08', '10']
+    with pytest.raises(DataError, match='sequences here: 00, 08, 10'):
+        list_frames(tmp_path, '01')
+    (tmp_path / 'sequences/00/velodyne/000000.bin').unlink()
+    with pytest.raises(DataError, match=r'no \.bin file'):
+        list_frames(tmp_path, '00')
 
 
 def test_frames_in_order_with_and_without_labels(tmp_path):
@@ -121,24 +120,3 @@ def test_scans_without_numbers_cannot_have_times(tmp_path):
     (folder / 'times.txt').write_text('0.0\n')
     with pytest.raises(DataError, match=r'first\.bin.*number'):
         list_frames(tmp_path, '00')
-
-
-def test_an_unknown_or_empty_sequence_is_refused(tmp_path):
-    write_streets(tmp_path, s00=1, s08=1)
-    with pytest.raises(DataError, match='sequences here: 00, 08'):
-        list_frames(tmp_path, '01')
-    (tmp_path / 'sequences/00/velodyne/000000.bin').unlink()
-    with pytest.raises(DataError, match=r'no \.bin file'):
-        list_frames(tmp_path, '00')
-
-
-def test_real_frames():
-    root = real_kitti()
-    sequence = list_sequences(root)[0]
-    frame = list_frames(root, sequence)[0]
-    points = read_points(frame.points_path)
-    assert 100_000 < len(points) < 140_000
-    assert np.isfinite(points).all()
-    assert np.linalg.norm(points[:, :3], axis=1).max() < 130.0
-    semantic = read_labels(frame.labels_path, len(points))
-    assert np.median(points[semantic == 40, 2]) == pytest.approx(-1.73, abs=0.15)

@@ -19,7 +19,7 @@ from gp_ground_seg.jit import JIT_ENABLED
 from gp_ground_seg.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
 from gp_ground_seg.pipeline.tilt import angles_of, rotate, rotation
 from gp_ground_seg.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan
-from gp_ground_seg.simulation import terrain as landforms
+from gp_ground_seg.simulation import scenes as landforms
 from gp_ground_seg.simulation.objects import floating_box, wall
 
 # Scans of 100,000 points, too many for the compiled twins as plain Python.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from cli_runner import error_line, run
-from evaluation_samples import write_streets
+from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
@@ -14,7 +14,7 @@ from gp_ground_seg.experiments.table1 import (
     is_candidate,
     table1,
 )
-from gp_ground_seg.simulation import HDL_32E, SCENES, simulate_scan, write_semantic_kitti
+from gp_ground_seg.simulation import HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
 
 SEGMENTS = (90, 91)
 ROAD = 40
@@ -25,7 +25,7 @@ def root(tmp_path_factory):
     """Rubble ahead, from segment 90 on."""
     folder = tmp_path_factory.mktemp('kitti')
     scan = simulate_scan(SCENES['road_then_rubble'](1), HDL_32E, np.random.default_rng(1), x=12.0)
-    write_semantic_kitti([scan], folder, '00')
+    write_frame(folder, '00', 0, scan.points, semantic_kitti_labels(scan.kind))
     return folder
 
 

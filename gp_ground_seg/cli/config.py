@@ -12,7 +12,7 @@ from gp_ground_seg.errors import DataError
 from gp_ground_seg.parameters import export
 from gp_ground_seg.parameters.config import Config, parameter_specs
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
-from gp_ground_seg.parameters.yaml_io import read_parameters
+from gp_ground_seg.parameters.schema import read_parameters
 
 EXIT_DIFFERENT = 1
 EXIT_WRONG = 2

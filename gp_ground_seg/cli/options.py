@@ -17,7 +17,7 @@ from gp_ground_seg.data.atomic_output import leftovers
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
-from gp_ground_seg.parameters.yaml_io import load_yaml
+from gp_ground_seg.parameters.schema import load_yaml
 
 DEFAULT_PRESET = 'default'
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import glob
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
+from gp_ground_seg.data.bag_files import is_bag_folder
 from gp_ground_seg.errors import DataError
 
 PARTIAL_MARK = '.partial-'
@@ -22,45 +22,30 @@ def leftovers(target: str | Path) -> list[Path]:
     return sorted(path.parent.glob(f'.{glob.escape(path.name)}{PARTIAL_MARK}*'))
 
 
-@contextmanager
-def staged_file(target: str | Path, *, force: bool) -> Iterator[Path]:
-    """Yield a path to write; the file takes the name `target` once the block ends well.
+def staged_file(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
+    """Return a path to write, for a ``with`` block; at its end the file is renamed to `target`.
 
-    Raises DataError if the target exists and `force` is false, is not a regular file, or cannot
-    be written.
+    The block raises DataError if the target exists and `force` is false, is not a regular file,
+    or cannot be written.
     """
-    path = Path(target).resolve()
 
-    def check() -> None:
+    def check(path: Path) -> None:
         if path.exists() and not path.is_file():
             raise DataError(f'{target}: is not a file, not replaced')
         _refuse_existing(path, target, force)
 
-    with _staging(path, target, check) as product:
-        yield product
-        check()
-        os.replace(product, path)
+    return _staged(target, check, os.replace)
 
 
-@contextmanager
-def staged_folder(
-    target: str | Path, *, force: bool, is_ours: Callable[[Path], bool]
-) -> Iterator[Path]:
-    """Yield a folder to create; it takes the name `target` once the block ends well.
+def staged_bag_folder(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
+    """Return the path of a folder to create, as `staged_file`; `force` replaces a rosbag2 only."""
 
-    With `force` a folder of that name is replaced, if `is_ours` says of it that it holds nothing
-    but such output. Raises DataError if it may not be replaced or cannot be written.
-    """
-    path = Path(target).resolve()
-
-    def check() -> None:
+    def check(path: Path) -> None:
         _refuse_existing(path, target, force)
-        if path.exists() and not is_ours(path):
+        if path.exists() and not is_bag_folder(path):
             raise DataError(f'{target}: is not a rosbag2 folder, not replaced; remove it yourself')
 
-    with _staging(path, target, check) as product:
-        yield product
-        check()
+    def place(product: Path, path: Path) -> None:
         # A folder cannot be replaced in one step: the old one is renamed, and back if need be.
         aside = product.with_name('replaced')
         existed = path.exists()
@@ -73,6 +58,8 @@ def staged_folder(
                 os.rename(aside, path)
             raise
 
+    return _staged(target, check, place)
+
 
 @contextmanager
 def staged_files(folder: str | Path, names: Sequence[str], *, force: bool) -> Iterator[Path]:
@@ -82,9 +69,8 @@ def staged_files(folder: str | Path, names: Sequence[str], *, force: bool) -> It
     files are moved one by one, each of them whole, beside what is there. Raises DataError if one
     of the files exists and `force` is false, or they cannot be written.
     """
-    path = Path(folder).resolve()
 
-    def check() -> None:
+    def check(path: Path) -> None:
         if path.exists() and not path.is_dir():
             raise DataError(f'{folder}: is a file, must be a folder')
         existing = [name for name in names if (path / name).exists()]
@@ -94,15 +80,16 @@ def staged_files(folder: str | Path, names: Sequence[str], *, force: bool) -> It
                 'files to write do); --force replaces them'
             )
 
-    with _staging(path, folder, check) as product:
-        product.mkdir()
-        yield product
-        check()
+    def place(product: Path, path: Path) -> None:
         if not path.exists():
             os.rename(product, path)
             return
         for name in names:
             os.replace(product / name, path / name)
+
+    with _staged(folder, check, place) as product:
+        product.mkdir()
+        yield product
 
 
 def _refuse_existing(path: Path, shown: str | Path, force: bool) -> None:
@@ -111,17 +98,21 @@ def _refuse_existing(path: Path, shown: str | Path, force: bool) -> None:
 
 
 @contextmanager
-def _staging(path: Path, shown: str | Path, check: Callable[[], None]) -> Iterator[Path]:
+def _staged(
+    target: str | Path, check: Callable[[Path], None], place: Callable[[Path, Path], None]
+) -> Iterator[Path]:
     """Path with the final name, in a hidden folder beside it that goes away in the end."""
-    check()
+    path = Path(target).resolve()
+    check(path)
     if not path.parent.is_dir():
-        raise DataError(f'{shown}: the folder {path.parent} does not exist')
-    folder: Path | None = None
+        raise DataError(f'{target}: the folder {path.parent} does not exist')
     try:
-        folder = Path(tempfile.mkdtemp(prefix=f'.{path.name}{PARTIAL_MARK}', dir=path.parent))
-        yield folder / path.name
+        with tempfile.TemporaryDirectory(
+            prefix=f'.{path.name}{PARTIAL_MARK}', dir=path.parent, ignore_cleanup_errors=True
+        ) as folder:
+            product = Path(folder, path.name)
+            yield product
+            check(path)
+            place(product, path)
     except OSError as error:
-        raise DataError(f'{shown}: cannot be written: {error.strerror or error}') from error
-    finally:
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+        raise DataError(f'{target}: cannot be written: {error.strerror or error}') from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import struct
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,17 +38,12 @@ class BagTopic:
     name: str
     msgtype: str  # as in ``sensor_msgs/msg/PointCloud2``
     definition: str  # text of the message definition, empty if unknown
-    type_hash: str  # RIHS01 hash of the type
+    type_hash: str  # RIHS01
     encoding: str = 'cdr'  # of the messages; ``cdr`` for all that ROS 2 writes itself
     qos: tuple[Any, ...] = ()  # offered by the publishers (``rosbags.interfaces.Qos``)
     n_messages: int = 0
     migrated: bool = False  # whether a ROS 1 type has other fields in ROS 2
     problem: str = ''  # why messages of ROS 1 cannot be converted, empty if they can
-
-    @property
-    def is_cloud(self) -> bool:
-        """Whether its messages are point clouds that can be read."""
-        return self.msgtype == POINT_CLOUD2 and self.encoding == 'cdr'
 
 
 def is_bag(path: str | Path) -> bool:
@@ -99,46 +95,34 @@ def check_sqlite_path(path: Path) -> None:
 
 
 def _check_sqlite_file(path: Path) -> None:
-    """Raise `DataError` where part of a sqlite file is cut off, or still in a journal.
-
-    sqlite reads what is missing from the last page as zeros, and rosbags ignores journals.
-    """
+    """Raise `DataError` where part of a sqlite file is cut off, or still in a journal."""
     check_sqlite_path(path)
     with path.open('rb') as file:
         header = file.read(100)
-    size, wanted = path.stat().st_size, 0
     # The format is that of https://www.sqlite.org/fileformat.html.
     if len(header) == 100 and header[24:28] == header[92:96]:
-        page_size = int.from_bytes(header[16:18], 'big')
+        page_size, n_pages = struct.unpack_from('>16xH10xI', header)
         # 65536 does not fit into the two bytes.
-        page_size = 65536 if page_size == 1 else page_size
-        wanted = page_size * int.from_bytes(header[28:32], 'big')
-    if size < wanted:
-        raise DataError(f'{path}: truncated, {size} bytes where its header says {wanted}')
-    for ending in ('-wal', '-journal'):
-        journal = path.with_name(path.name + ending)
+        size, wanted = path.stat().st_size, n_pages * (65536 if page_size == 1 else page_size)
+        if size < wanted:
+            raise DataError(f'{path}: truncated, {size} bytes where its header says {wanted}')
+    for journal in (path.with_name(path.name + ending) for ending in ('-wal', '-journal')):
         if journal.exists() and journal.stat().st_size > 0:
-            raise DataError(
-                f'{path}: was not closed, some of it is in {journal.name}; '
-                f'`sqlite3 {path.name} vacuum` completes it'
-            )
+            hint = f'`sqlite3 {path.name} vacuum` completes it'
+            raise DataError(f'{path}: was not closed, some of it is in {journal.name}; {hint}')
 
 
 def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
-    """Storage of a new bag: `wanted`, 'mcap' or 'sqlite3', or by default what the suffix says.
-
-    A path that ends in .mcap or .db3 is a single file, any other a folder, of MCAP by default.
-    Raises DataError if the two contradict, or the storage cannot hold that path.
-    """
+    """Storage of a new bag: `wanted`, or by its suffix; DataError if the two contradict."""
     suffix = Path(path).suffix
     if suffix == '.bag':
         raise DataError(f'{path}: only ROS 2 bags are written; use .mcap, .db3 or a folder name')
     implied = STORAGE_OF_SUFFIX.get(suffix)
-    if wanted is not None and implied is not None and wanted != implied:
-        raise DataError(
-            f'{path}: ends in {suffix}, which is not {wanted} ({SUFFIX_OF_STORAGE[wanted]})'
-        )
     storage = wanted or implied or 'mcap'
+    if implied not in (None, storage):
+        raise DataError(
+            f'{path}: ends in {suffix}, which is not {storage} ({SUFFIX_OF_STORAGE[storage]})'
+        )
     if storage == 'sqlite3':
         check_sqlite_path(Path(path))
     return storage
@@ -146,15 +130,12 @@ def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Raise what goes wrong while a bag is parsed as `DataError` with its path.
-
-    The parsers behind rosbags raise errors of many types (struct, apsw, lz4, asserts, ...).
-    """
+    """Raise what goes wrong while a bag is parsed as `DataError` with its path."""
     try:
         yield
     except GroundSegError:
         raise
-    except Exception as error:
+    except Exception as error:  # Of many types: struct, apsw, lz4, asserts, ...
         said = in_one_line(error)
         step = next((f' ({hint})' for key, hint in _NEXT_STEP.items() if key in said), '')
         raise DataError(f'{path}: cannot be read as a bag: {said}{step}') from error

@@ -9,13 +9,13 @@ import dataclasses
 import functools
 import importlib
 import os
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.data.atomic_output import staged_file, staged_folder
+from gp_ground_seg.data.atomic_output import staged_bag_folder, staged_file
 from gp_ground_seg.data.bag_files import (
     METADATA_FILE,
     POINT_CLOUD2,
@@ -25,16 +25,12 @@ from gp_ground_seg.data.bag_files import (
     BagTopic,
     check_is_bag,
     in_one_line,
-    is_bag_folder,
     reading,
     resolve_storage,
     storage_of,
     writing,
 )
 from gp_ground_seg.errors import DataError, MissingDependencyError
-
-FORMAT_VERSION = 9
-"""Of rosbag2's metadata, as Jazzy writes it."""
 
 _HEADER = 'std_msgs/msg/Header'
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
@@ -76,17 +72,9 @@ def _reliable_qos(durability: str) -> Any:
     from rosbags import interfaces as ros
 
     forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
-    return ros.Qos(
-        ros.QosHistory.KEEP_LAST,
-        10,
-        ros.QosReliability.RELIABLE,
-        ros.QosDurability[durability],
-        forever,
-        forever,
-        ros.QosLiveliness.AUTOMATIC,
-        forever,
-        avoid_ros_namespace_conventions=False,
-    )
+    history, liveliness = ros.QosHistory.KEEP_LAST, ros.QosLiveliness.AUTOMATIC
+    kind = ros.QosReliability.RELIABLE, ros.QosDurability[durability]
+    return ros.Qos(history, 10, *kind, forever, forever, liveliness, forever, False)
 
 
 @functools.cache
@@ -116,15 +104,9 @@ def _ros2_topic(connection: Any) -> BagTopic:
     elif text and not type_hash:
         with suppress(Exception):  # A definition rosbags cannot parse is copied all the same.
             type_hash = _parse_definition(text, msgtype).hash_rihs01(msgtype)
-    return BagTopic(
-        name=connection.topic,
-        msgtype=msgtype,
-        definition=text,
-        type_hash=type_hash or UNKNOWN_TYPE_HASH,
-        encoding=connection.ext.serialization_format,
-        qos=tuple(connection.ext.offered_qos_profiles),
-        n_messages=connection.msgcount,
-    )
+    encoding, qos = connection.ext
+    known_hash = type_hash or UNKNOWN_TYPE_HASH
+    return BagTopic(connection.topic, msgtype, text, known_hash, encoding, tuple(qos))
 
 
 def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
@@ -149,15 +131,10 @@ def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
         convert = functools.partial(
             migrate_bytes, source, target, old, new, {}, src_is2=False, dst_is2=True
         )
-    topic = BagTopic(
-        name=connection.topic,
-        msgtype=new,
-        definition=target.generate_msgdef(new, ros_version=2)[0],
-        type_hash=target.hash_rihs01(new),
-        qos=(_reliable_qos('TRANSIENT_LOCAL'),) if connection.ext.latching else (),
-        n_messages=connection.msgcount,
-        migrated=migrated,
-    )
+    definition, _ = target.generate_msgdef(new, ros_version=2)
+    type_hash = target.hash_rihs01(new)
+    qos = (_reliable_qos('TRANSIENT_LOCAL'),) if connection.ext.latching else ()
+    topic = BagTopic(connection.topic, new, definition, type_hash, qos=qos, migrated=migrated)
     return topic, convert
 
 
@@ -165,8 +142,7 @@ class BagReader:
     """A bag as ROS 2 topics with CDR messages, to be used in a ``with`` statement.
 
     `path` is a ROS 1 ``.bag``, whose messages are converted, a rosbag2 folder, ``.mcap`` or
-    ``.db3``. Raises DataError if there is no bag, or it cannot be read, and
-    MissingDependencyError if rosbags is not installed.
+    ``.db3``. Raises DataError if it cannot be read, MissingDependencyError without rosbags.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -174,6 +150,8 @@ class BagReader:
         from rosbags import rosbag1, rosbag2
 
         self.path = Path(path)
+        self.storage = storage_of(self.path)
+        """``ros1``, ``mcap`` or ``sqlite3``."""
         self._converters: dict[int, Callable[[bytes], Any]] = {}
         with ExitStack() as stack:
             with reading(self.path):
@@ -183,7 +161,10 @@ class BagReader:
                 reader.open()
             stack.callback(reader.close)
             self._reader = reader
-            self._topics = self._describe_topics()
+            connections = defaultdict(list)
+            for connection in reader.connections:
+                connections[connection.topic].append(connection)
+            self._topics = {name: self._describe(found) for name, found in connections.items()}
             self._open = stack.pop_all()
 
     def __enter__(self) -> BagReader:
@@ -195,11 +176,6 @@ class BagReader:
         self._open.close()
 
     @property
-    def storage(self) -> str:
-        """``ros1``, ``mcap`` or ``sqlite3``."""
-        return storage_of(self.path)
-
-    @property
     def topics(self) -> dict[str, str]:
         """Message type of each topic, as in ``sensor_msgs/msg/PointCloud2``."""
         return {name: topic.msgtype for name, topic in self._topics.items()}
@@ -207,7 +183,11 @@ class BagReader:
     @property
     def point_cloud_topics(self) -> list[str]:
         """Names of the PointCloud2 topics."""
-        return [name for name, topic in self._topics.items() if topic.is_cloud]
+        return [
+            name
+            for name, topic in self._topics.items()
+            if topic.msgtype == POINT_CLOUD2 and topic.encoding == 'cdr'
+        ]
 
     @property
     def migrated_topics(self) -> list[str]:
@@ -228,14 +208,10 @@ class BagReader:
         return self.topic(topic).n_messages
 
     def pick_point_cloud_topic(self, topic: str | None = None) -> str:
-        """Return `topic` if it is one of point clouds with messages, or the only such topic.
-
-        Raises DataError with the topics if there is none, or the choice is not clear.
-        """
+        """Return `topic` if it has point clouds, or the only one that has; else a DataError."""
         clouds = self.point_cloud_topics
         if topic is not None:
-            msgtype = self.topic(topic).msgtype
-            if msgtype != POINT_CLOUD2:
+            if (msgtype := self.topic(topic).msgtype) != POINT_CLOUD2:
                 raise DataError(
                     f'{self.path}: topic {topic} is of type {msgtype}, must be {POINT_CLOUD2}; '
                     f'such topics here: {", ".join(clouds) or "none"}'
@@ -245,8 +221,8 @@ class BagReader:
         if len(recorded) == 1:
             return recorded[0]
         if recorded:
-            problem = f'{len(recorded)} {POINT_CLOUD2} topics, choose one with --topic: '
-            problem += ', '.join(recorded)
+            listed = ', '.join(recorded)
+            problem = f'{len(recorded)} {POINT_CLOUD2} topics, choose one with --topic: {listed}'
         elif clouds:
             problem = f'no message on {", ".join(clouds)}'
         else:
@@ -256,22 +232,19 @@ class BagReader:
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, int, bytes]]:
         """Topic, recorded time [ns] and CDR bytes of each message, of all topics by default.
 
-        In order of their time; file after file in a split bag. Raises DataError if the bag is
-        damaged, a topic is unknown, or fewer messages can be read than the bag lists.
+        In order of their time; file after file in a split bag. Raises DataError if a topic is
+        unknown, the bag damaged, or its list of messages wrong.
         """
-        wanted = list(self._topics) if topics is None else list(dict.fromkeys(topics))
-        for name in wanted:
-            topic = self.topic(name)
+        wanted = {name: self.topic(name) for name in (self._topics if topics is None else topics)}
+        for name, topic in wanted.items():
             if topic.problem:
                 raise DataError(
                     f'{self.path}: topic {name} ({topic.msgtype}) has a message definition '
                     f'that cannot be converted from ROS 1: {topic.problem}'
                 )
-        expected = {name: self.n_messages(name) for name in wanted}
-        connections = [c for c in self._reader.connections if c.topic in expected]
+        connections = [c for c in self._reader.connections if c.topic in wanted]
         found: Counter[str] = Counter()
-        with reading(self.path):
-            source = iter(self._reader.messages(connections=connections) if connections else ())
+        source = iter(self._reader.messages(connections=connections) if connections else ())
         while True:
             # The caller's own errors, raised at the yield, must not pass through here.
             with reading(self.path):
@@ -283,55 +256,48 @@ class BagReader:
                 message = bytes(converter(raw) if converter else raw)
             found[connection.topic] += 1
             yield connection.topic, time, message
-        for name in wanted:
-            if found[name] != expected[name]:
+        for name, topic in wanted.items():
+            if found[name] != topic.n_messages:
                 raise DataError(
-                    f'{self.path}: topic {name} lists {expected[name]} messages, '
+                    f'{self.path}: topic {name} lists {topic.n_messages} messages, '
                     f'{found[name]} could be read; the bag is damaged, '
                     f'or its {METADATA_FILE} belongs to another one'
                 )
 
-    def _describe_topics(self) -> dict[str, BagTopic]:
-        topics: dict[str, BagTopic] = {}
-        for connection in self._reader.connections:
-            topic = self._describe(connection)
-            known = topics.setdefault(topic.name, topic)
-            if known.msgtype != topic.msgtype:
-                raise DataError(
-                    f'{self.path}: topic {topic.name} has messages of two types, '
-                    f'{known.msgtype} and {topic.msgtype}; one topic must have one type'
-                )
-            if known is not topic:
-                # Several publishers of one topic.
-                topics[topic.name] = dataclasses.replace(
-                    known,
-                    n_messages=known.n_messages + topic.n_messages,
-                    qos=tuple(dict.fromkeys(known.qos + topic.qos)),
-                    migrated=known.migrated or topic.migrated,
-                    problem=known.problem or topic.problem,
-                )
-        return topics
+    def _describe(self, connections: Sequence[Any]) -> BagTopic:
+        """Topic of several publishers."""
+        parts = [self._describe_one(connection) for connection in connections]
+        name, msgtypes = parts[0].name, list(dict.fromkeys(part.msgtype for part in parts))
+        if len(msgtypes) > 1:
+            raise DataError(
+                f'{self.path}: topic {name} has messages of two types, {msgtypes[0]} and '
+                f'{msgtypes[1]}; one topic must have one type'
+            )
+        return dataclasses.replace(
+            parts[0],
+            n_messages=sum(connection.msgcount for connection in connections),
+            qos=tuple(dict.fromkeys(qos for part in parts for qos in part.qos)),
+            migrated=any(part.migrated for part in parts),
+            problem=next((part.problem for part in parts if part.problem), ''),
+        )
 
-    def _describe(self, connection: Any) -> BagTopic:
+    def _describe_one(self, connection: Any) -> BagTopic:
         if self.storage != 'ros1':
             return _ros2_topic(connection)
         try:
             topic, self._converters[connection.id] = _ros1_topic(connection)
         except Exception as error:  # Reported when, and only if, the topic is read.
-            return BagTopic(
-                connection.topic, connection.msgtype, '', UNKNOWN_TYPE_HASH,
-                n_messages=connection.msgcount, problem=in_one_line(error),
-            )  # fmt: skip
+            name, msgtype, problem = connection.topic, connection.msgtype, in_one_line(error)
+            return BagTopic(name, msgtype, '', UNKNOWN_TYPE_HASH, problem=problem)
         return topic
 
 
 class BagWriter:
     """A new rosbag2 bag, in a ``with`` statement; written whole or not at all (`staged_file`).
 
-    `path` is a folder as ``ros2 bag record -o`` makes, or a single file, by its suffix; for
-    `storage` see `resolve_storage`. With `force` a bag of that name is replaced once the new one
-    is complete. Raises DataError if the path is taken or cannot be written, and
-    MissingDependencyError if rosbags is not installed.
+    `path` is a folder as ``ros2 bag record -o`` makes, or a single file, by its suffix; `storage`
+    see `resolve_storage`. With `force` a bag of that name is replaced. Raises DataError if the
+    path is taken or cannot be written, MissingDependencyError without rosbags.
     """
 
     def __init__(
@@ -355,14 +321,11 @@ class BagWriter:
                 file = folder / f'{folder.name}{SUFFIX_OF_STORAGE[self.storage]}'
                 stack.push(lambda kind, *_: os.rename(file, product) if kind is None else None)
             else:
-                folder = stack.enter_context(
-                    staged_folder(self.path, force=self._force, is_ours=is_bag_folder)
-                )
+                folder = stack.enter_context(staged_bag_folder(self.path, force=self._force))
             stack.enter_context(writing(self.path))
             plugin = StoragePlugin[self.storage.upper()]
-            self._writer = stack.enter_context(
-                Writer(folder, version=FORMAT_VERSION, storage_plugin=plugin)
-            )
+            # Version 9 is what Jazzy writes.
+            self._writer = stack.enter_context(Writer(folder, version=9, storage_plugin=plugin))
             self._open = stack.pop_all()
         return self
 
@@ -385,9 +348,6 @@ class BagWriter:
             )
 
     def write(self, topic: str, time: int, raw: bytes | memoryview) -> None:
-        """Append one message, CDR bytes, to a declared topic with its recorded `time` [ns].
-
-        Raises `DataError` if it cannot be written, as when the disk is full.
-        """
+        """Append one message, CDR bytes, to a declared topic with its recorded `time` [ns]."""
         with writing(self.path):
             self._writer.write(self._connections[topic], time, raw)

@@ -8,9 +8,9 @@ Source: sensor_msgs/msg/PointCloud2.msg, sensor_msgs/msg/PointField.msg.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ _DATATYPE_NAMES = {datatype: np.dtype(code).name.upper() for datatype, code in _
 _DATATYPES = {code: datatype for datatype, code in _CODES.items()}
 _FLOATS = (7, 8)
 _ALIGNMENT = 4
-"""The added columns start at a multiple of this within a point [bytes]."""
+"""Added columns start at a multiple of this within a point, or of their size [bytes]."""
 
 
 class CloudMessage(Protocol):
@@ -41,50 +41,30 @@ class CloudMessage(Protocol):
     is_dense: bool
 
 
-class Column(NamedTuple):
-    """Place of an added column: attributes of a ``sensor_msgs/PointField`` with count 1."""
-
-    name: str
-    offset: int
-    datatype: int
-
-
-class WiderCloud(NamedTuple):
-    """Points of a cloud with columns added, in the order given; rows are not padded."""
-
-    columns: tuple[Column, ...]
-    point_step: int
-    data: npt.NDArray[np.uint8]
+Cloud = TypeVar('Cloud', bound=CloudMessage)
 
 
 def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
-    """Coordinates of every point, row by row.
+    """Coordinates of every point, row by row, a copy in native byte order, (height * width, 3).
 
-    A copy in native byte order, (height * width, 3); float64 if any of the three is FLOAT64. Only
-    x, y and z are checked; other fields may be anything. As in PCL, a cloud of one row never uses
-    ``row_step``, and bytes after the last point are ignored. A cloud without points needs no
-    fields. Raises PointCloudError if the layout cannot hold what it claims.
+    float64 if any of the three is FLOAT64. Only x, y and z are checked. As in PCL, a cloud of one
+    row never uses ``row_step``, and bytes after the last point are ignored. A cloud without points
+    needs no fields. Raises PointCloudError if the layout cannot hold what it claims.
     """
     if cloud.height * cloud.width == 0:
         return np.empty((0, 3), dtype=np.float32)
     columns = _views(cloud, 'xyz', _FLOATS)
     wide = any(column.dtype.itemsize == 8 for column in columns)
-    # Each coordinate is contiguous, as the segmentation reads it.
-    xyz = np.empty((3, cloud.height, cloud.width), dtype=np.float64 if wide else np.float32)
     # Arbitrary bytes may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
-        for axis, column in enumerate(columns):
-            xyz[axis] = column
-    result: npt.NDArray[np.float32] | npt.NDArray[np.float64] = xyz.reshape(3, -1).T
+        # Each coordinate is contiguous, as the segmentation reads it.
+        xyz = np.stack(columns, dtype=np.float64 if wide else np.float32).reshape(3, -1)
+    result: npt.NDArray[np.float32] | npt.NDArray[np.float64] = xyz.T
     return result
 
 
 def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
-    """Values of the fields `names`, each (height, width), a copy in native byte order.
-
-    Raises PointCloudError if a field is missing, there twice, no single number or beyond the
-    point, or the layout cannot hold what it claims.
-    """
+    """Values of the fields `names`, each (height, width), a copy in native byte order."""
     views = _views(cloud, names, _CODES)
     return {
         name: view.astype(view.dtype.newbyteorder('='))
@@ -93,11 +73,7 @@ def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDA
 
 
 def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
-    """Every byte of the points where `mask`, (height * width,) bool, is true, in one row.
-
-    Raises PointCloudError if the layout cannot hold what it claims, or the mask has another
-    length.
-    """
+    """Every byte of the points where `mask`, (height * width,) bool, is true, in one row."""
     size = cloud.height * cloud.width
     if mask.shape != (size,) or mask.dtype != np.bool_:
         raise PointCloudError(
@@ -110,19 +86,21 @@ def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray
     return kept.view(np.uint8)
 
 
-def append_columns(cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]]) -> WiderCloud:
-    """Put columns behind the bytes of every point, at multiples of four bytes or of their size.
+def append_columns(
+    cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]]
+) -> tuple[list[tuple[str, int, int]], int, npt.NDArray[np.uint8]]:
+    """Put columns, (height * width,) of types that PointField knows, behind every point.
 
-    Columns, (height * width,) row by row, are of integer or float types that PointField knows and
-    are written in the byte order of the cloud; bytes between them are zero, padding of the rows is
-    gone. Raises PointCloudError if the layout cannot hold what it claims.
+    They are written in the byte order of the cloud; bytes between them are zero, padding of the
+    rows is gone. Returns name, offset and datatype of each, the new ``point_step`` and the data.
+    Raises PointCloudError if the layout cannot hold what it claims.
     """
     placed = []
     end = _round_up(cloud.point_step, _ALIGNMENT)
     for name, values in columns.items():
         itemsize = values.dtype.itemsize
         start = _round_up(end, itemsize)
-        placed.append(Column(name, start, _DATATYPES[f'{values.dtype.kind}{itemsize}']))
+        placed.append((name, start, _DATATYPES[f'{values.dtype.kind}{itemsize}']))
         end = start + itemsize
     step = _round_up(end, _ALIGNMENT)
     height, width = cloud.height, cloud.width
@@ -133,18 +111,17 @@ def append_columns(cloud: CloudMessage, columns: Mapping[str, npt.NDArray[Any]])
         np.ndarray((height, width), points.dtype, wide.data, 0, (width * step, step))[...] = points
         with np.errstate(over='ignore', invalid='ignore'):
             for name, offset, datatype in placed:
-                code = _byte_order(cloud) + _CODES[datatype]
-                target: npt.NDArray[Any] = np.ndarray((size,), code, wide.data, offset, (step,))
-                target[...] = columns[name]
-    return WiderCloud(tuple(placed), step, wide)
+                code = _code(cloud, datatype)
+                np.ndarray((size,), code, wide.data, offset, (step,))[...] = columns[name]
+    return placed, step, wide
 
 
 def _round_up(value: int, multiple: int) -> int:
     return -(-value // multiple) * multiple
 
 
-def _byte_order(cloud: CloudMessage) -> str:
-    return '>' if cloud.is_bigendian else '<'
+def _code(cloud: CloudMessage, datatype: int) -> str:
+    return f'{">" if cloud.is_bigendian else "<"}{_CODES[datatype]}'
 
 
 def _whole_points(cloud: CloudMessage) -> npt.NDArray[np.void]:
@@ -159,7 +136,7 @@ def _views(
     cloud: CloudMessage, names: Sequence[str], accepted: Collection[int]
 ) -> list[npt.NDArray[Any]]:
     """Fields `names` where they lie in the data, each (height, width), checked."""
-    shape = cloud.height, cloud.width
+    shape, strides = (cloud.height, cloud.width), (cloud.row_step, cloud.point_step)
     raw = _checked_bytes(cloud) if cloud.height * cloud.width else None
     views: list[npt.NDArray[Any]] = []
     for name in names:
@@ -171,72 +148,69 @@ def _views(
                 f'point cloud: {many} named {name}: must have exactly one; fields: {known}'
             )
         (field,) = matches
-        code = _byte_order(cloud) + _accepted_code(field, accepted, cloud.point_step)
-        view: npt.NDArray[Any] = (
-            np.empty(shape, code)
-            if raw is None
-            else np.ndarray(shape, code, raw, field.offset, (cloud.row_step, cloud.point_step))
+        _check_field(field, accepted, cloud.point_step)
+        code, offset = _code(cloud, field.datatype), field.offset
+        views.append(
+            np.empty(shape, code) if raw is None else np.ndarray(shape, code, raw, offset, strides)
         )
-        views.append(view)
     return views
 
 
-def _accepted_code(field: Any, accepted: Collection[int], point_step: int) -> str:
-    """Type code of a field, if it is one number of an accepted type within the point."""
+def _check_field(field: Any, accepted: Collection[int], point_step: int) -> None:
+    """Raise PointCloudError unless a field is one number of an accepted type within the point."""
+    problem = ''
     if field.datatype not in accepted:
         kind = _DATATYPE_NAMES.get(field.datatype, 'unknown')
         wanted = ' or '.join(f'{_DATATYPE_NAMES[datatype]} ({datatype})' for datatype in accepted)
-        raise PointCloudError(
-            f'point cloud: field {field.name} has datatype {field.datatype} ({kind}): '
-            f'must be {wanted}'
-        )
+        problem = f'has datatype {field.datatype} ({kind}): must be {wanted}'
     # Some old writers leave count at 0 and mean 1; PCL reads these too.
-    if field.count not in (0, 1):
-        raise PointCloudError(
-            f'point cloud: field {field.name} has count {field.count}: must be 1'
-        )
-    code = _CODES[field.datatype]
-    size = int(code[1])
-    if field.offset < 0 or field.offset + size > point_step:
-        raise PointCloudError(
-            f'point cloud: field {field.name} at offset {field.offset} of {size} bytes: '
-            f'must end within point_step {point_step}'
-        )
-    return code
+    elif field.count not in (0, 1):
+        problem = f'has count {field.count}: must be 1'
+    else:
+        size = int(_CODES[field.datatype][1])
+        if not 0 <= field.offset <= point_step - size:
+            problem = f'at offset {field.offset} of {size} bytes: '
+            problem += f'must end within point_step {point_step}'
+    if problem:
+        raise PointCloudError(f'point cloud: field {field.name} {problem}')
 
 
 def _checked_bytes(cloud: CloudMessage) -> npt.NDArray[np.uint8]:
     """Return the data as numbers, if all points lie within it without overlap."""
     height, width = cloud.height, cloud.width
-    point_step, row_step = cloud.point_step, cloud.row_step
-    if point_step < 1:
-        raise PointCloudError(f'point cloud: point_step {point_step}: must be at least 1 byte')
-    row_bytes = width * point_step
-    if height > 1 and row_step < row_bytes:
-        raise PointCloudError(
-            f'point cloud: row_step {row_step}: must be at least {row_bytes} '
-            f'(width {width} * point_step {point_step})'
-        )
+    point_step, row_step, row_bytes = cloud.point_step, cloud.row_step, width * cloud.point_step
     needed = (height - 1) * row_step + row_bytes
     raw = np.frombuffer(cloud.data, dtype=np.uint8)
-    if len(raw) < needed:
-        raise PointCloudError(
-            f'point cloud: data of {len(raw)} bytes: must be at least {needed} '
+    problem = ''
+    if point_step < 1:
+        problem = f'point_step {point_step}: must be at least 1 byte'
+    elif height > 1 and row_step < row_bytes:
+        problem = f'row_step {row_step}: must be at least {row_bytes} '
+        problem += f'(width {width} * point_step {point_step})'
+    elif len(raw) < needed:
+        problem = f'data of {len(raw)} bytes: must be at least {needed} '
+        problem += (
             f'(height {height}, width {width}, point_step {point_step}, row_step {row_step})'
         )
+    if problem:
+        raise PointCloudError(f'point cloud: {problem}')
     return raw
 
 
-def select_points(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> CloudMessage:
+def select_points(
+    cloud: Cloud,
+    mask: npt.NDArray[np.bool_],
+    as_data: Callable[[npt.NDArray[np.uint8]], Any] = lambda data: data,
+) -> Cloud:
     """Message of the points where `mask` is true: same header, same fields, one row.
 
-    ``is_dense`` says whether the kept points are all finite. `cloud` is a message of rosbags.
-    Raises as `select_rows` and `read_xyz` do.
+    ``is_dense`` says whether the kept points are all finite. `as_data` makes the bytes what the
+    message wants. Raises as `select_rows` and `read_xyz` do.
     """
-    data, width = select_rows(cloud, mask), int(np.count_nonzero(mask))
-    shape = {'height': 1, 'width': width, 'row_step': width * cloud.point_step}
-    message: Any = cloud
-    kept: CloudMessage = dataclasses.replace(message, **shape, data=data)
+    kept = copy(cloud)
+    kept.data = as_data(select_rows(cloud, mask))
+    kept.height, kept.width = 1, int(np.count_nonzero(mask))
+    kept.row_step = kept.width * cloud.point_step
     kept.is_dense = bool(np.isfinite(read_xyz(kept)).all())
     return kept
 
@@ -246,43 +220,35 @@ def stamp_of(cloud: CloudMessage) -> tuple[int, int]:
     return cloud.header.stamp.sec, cloud.header.stamp.nanosec
 
 
-def with_header(
-    cloud: CloudMessage, stamp: tuple[int, int], frame_id: str | None = None
-) -> CloudMessage:
+def with_header(cloud: Cloud, stamp: tuple[int, int], frame_id: str | None = None) -> Cloud:
     """Copy of a message of rosbags with another stamp, or frame too; the points are shared."""
-    header = _new_header(stamp, cloud.header.frame_id if frame_id is None else frame_id)
-    message: Any = cloud
-    copy: CloudMessage = dataclasses.replace(message, header=header)
-    return copy
+    moved = copy(cloud)
+    moved.header = _new_header(stamp, cloud.header.frame_id if frame_id is None else frame_id)
+    return moved
 
 
 def cloud_from_columns(
     stamp: tuple[int, int], frame_id: str, columns: Mapping[str, npt.NDArray[Any]]
 ) -> CloudMessage:
-    """Message with one float32 or uint32 field per column (N,), packed, in the given order.
-
-    `stamp` is in seconds and nanoseconds. Raises MissingDependencyError without rosbags.
-    """
+    """Message with one float32 or uint32 field per column (N,), packed; `stamp` in s and ns."""
     types = jazzy_types().types
     codes = {name: f'{values.dtype.kind}4' for name, values in columns.items()}
-    points = np.empty(
-        len(next(iter(columns.values()), ())),
-        dtype=[(name, f'<{code}') for name, code in codes.items()],
-    )
+    n_points = len(next(iter(columns.values()), ()))
+    points = np.empty(n_points, dtype=[(name, f'<{code}') for name, code in codes.items()])
     for name, values in columns.items():
         points[name] = values
     step = points.dtype.itemsize
     cloud: CloudMessage = types[POINT_CLOUD2](
         header=_new_header(stamp, frame_id),
         height=1,
-        width=len(points),
+        width=n_points,
         fields=[
             types['sensor_msgs/msg/PointField'](name, 4 * k, _DATATYPES[code], 1)
             for k, (name, code) in enumerate(codes.items())
         ],
         is_bigendian=False,
         point_step=step,
-        row_step=step * len(points),
+        row_step=step * n_points,
         data=np.frombuffer(points.tobytes(), np.uint8),
         is_dense=False,
     )
@@ -295,18 +261,13 @@ def _new_header(stamp: tuple[int, int], frame_id: str) -> Any:
 
 
 def decode_cloud(raw: bytes | memoryview) -> CloudMessage:
-    """Message of rosbags from its CDR bytes.
-
-    Raises PointCloudError if they are no PointCloud2, MissingDependencyError without rosbags.
-    """
+    """Message of rosbags from its CDR bytes; PointCloudError if they are no PointCloud2."""
     types = jazzy_types()
     try:
         cloud: CloudMessage = types.deserialize_cdr(raw, POINT_CLOUD2)
-    except Exception as error:
-        # The kind of error depends on where parsing went astray.
-        raise PointCloudError(
-            f'{len(raw)} bytes that are no {POINT_CLOUD2}: {in_one_line(error)}'
-        ) from error
+    except Exception as error:  # Its kind depends on where parsing went astray.
+        said = f'{len(raw)} bytes that are no {POINT_CLOUD2}: {in_one_line(error)}'
+        raise PointCloudError(said) from error
     return cloud
 
 

@@ -37,10 +37,7 @@ def list_sequences(root: str | Path) -> list[str]:
 
 
 def list_frames(root: str | Path, sequence: str) -> list[Frame]:
-    """Frames of one sequence, in order.
-
-    Raises DataError if the sequence is missing or empty, or times.txt does not fit it.
-    """
+    """Frames of one sequence, in order; DataError if there are none, or times.txt does not fit."""
     folder = Path(root) / 'sequences' / sequence
     if not (folder / 'velodyne').is_dir():
         known = ', '.join(list_sequences(root))
@@ -48,9 +45,8 @@ def list_frames(root: str | Path, sequence: str) -> list[Frame]:
     paths = sorted((folder / 'velodyne').glob('*.bin'))
     if not paths:
         raise DataError(f'{folder / "velodyne"}: no .bin file in it')
-    times = _read_times(folder / 'times.txt', paths)
     frames = []
-    for path, time in zip(paths, times, strict=True):
+    for path, time in zip(paths, _read_times(folder / 'times.txt', paths), strict=True):
         labels = folder / 'labels' / f'{path.stem}.label'
         frames.append(Frame(sequence, path.stem, path, labels if labels.exists() else None, time))
     return frames
@@ -78,29 +74,20 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
 
 
 def read_points(path: str | Path) -> npt.NDArray[np.float32]:
-    """Points of a KITTI ``.bin`` file: x, y, z [m] and intensity, (N, 4) float32.
-
-    Raises DataError if the file cannot be read or its size is not a whole number of points.
-    """
+    """Points of a KITTI ``.bin`` file, x, y, z [m], intensity, (N, 4); DataError if it is none."""
     data = _read_bytes(path)
     if len(data) % BYTES_PER_POINT:
-        raise DataError(
-            f'{path}: {len(data)} bytes is not a whole number of points '
-            f'({BYTES_PER_POINT} bytes each); truncated?'
-        )
+        problem = f'is not a whole number of points ({BYTES_PER_POINT} bytes each); truncated?'
+        raise DataError(f'{path}: {len(data)} bytes {problem}')
     return np.frombuffer(data, dtype='<f4').astype(np.float32).reshape(-1, 4)
 
 
 def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
-    """Semantic classes of a ``.label`` file, (n_points,) uint16.
-
-    Raises DataError if the file cannot be read or holds another number of labels.
-    """
+    """Semantic classes of a ``.label`` file, (n_points,); DataError if it has another number."""
     data = _read_bytes(path)
     if len(data) != 4 * n_points:
-        raise DataError(
-            f'{path}: {len(data)} bytes, expected {4 * n_points} for {n_points} points'
-        )
+        expected = f'expected {4 * n_points} for {n_points} points'
+        raise DataError(f'{path}: {len(data)} bytes, {expected}')
     return (np.frombuffer(data, dtype='<u4') & 0xFFFF).astype(np.uint16)
 
 

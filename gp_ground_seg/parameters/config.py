@@ -28,14 +28,12 @@ from gp_ground_seg.parameters.schema import (
 class SensorConfig:
     """Where the sensor is; auto = estimated from every scan (docs/pose.md)."""
 
-    height: float | Literal['auto'] = basic(
-        AUTO, (0.05, 20.0), 'height of the sensor above the ground it stands on', 'm')
-    roll: float | Literal['auto'] = basic(
-        AUTO, (-3.15, 3.15),
+    height: float | Literal['auto'] = basic(AUTO, (0.05, 20.0),
+        'height of the sensor above the ground it stands on', 'm')
+    roll: float | Literal['auto'] = basic(AUTO, (-3.15, 3.15),
         'roll of the sensor, positive with its left side up; auto = none unless it is clear',
         'rad')
-    pitch: float | Literal['auto'] = basic(
-        AUTO, (-1.58, 1.58),
+    pitch: float | Literal['auto'] = basic(AUTO, (-1.58, 1.58),
         'pitch of the sensor, positive with its nose down; auto = none unless it is clear', 'rad')
 
 
@@ -43,8 +41,7 @@ class SensorConfig:
 class FrameConfig:
     """Where the tilt of the sensor is taken from; the node only."""
 
-    level: str = basic(
-        'sensor', ('sensor', 'tf'),
+    level: str = basic('sensor', ('sensor', 'tf'),
         'where the tilt of the sensor is taken from: sensor.roll and sensor.pitch, or TF')
     base: str = basic('base_link', (), 'frame that is level to TF, with frame.level = tf')
 
@@ -55,14 +52,11 @@ class GridConfig:
 
     n_segments: int = basic(180, (4, 2048), 'angular segments of the radial grid', symbol='M')
     n_bins: int = advanced(80, (4, 1024), 'radial bins of each segment', symbol='N')
-    r_min: float = advanced(
-        2.0, (0.0, 50.0),
+    r_min: float = advanced(2.0, (0.0, 50.0),
         'horizontal range where the first bin starts; nearer points belong to that bin', 'm')
-    r_max: float = basic(
-        90.0, (1.0, 500.0),
+    r_max: float = basic(90.0, (1.0, 500.0),
         'horizontal range where the last bin ends; beyond it there is no model', 'm')
-    bin_growth: float = advanced(
-        1.5, (1.0, 4.0),
+    bin_growth: float = advanced(1.5, (1.0, 4.0),
         'exponent of the bin edges over range: 1 = equal bins, more = finer bins near the sensor')
 
 
@@ -70,24 +64,21 @@ class GridConfig:
 class LinesConfig:
     """Line extraction over the ground candidates of a segment."""
 
-    slope_tolerance: float = advanced(
-        0.1, (0.001, 1.0), 'change of slope that ends a line', 'rad', 'zeta_m')
-    offset_tolerance: float = advanced(
-        0.15, (0.005, 5.0),
+    slope_tolerance: float = advanced(0.1, (0.001, 1.0),
+        'change of slope that ends a line', 'rad', 'zeta_m')
+    offset_tolerance: float = advanced(0.15, (0.005, 5.0),
         "change of the line's height at the new point that ends a line", 'm', 'zeta_b')
-    max_line_distance: float = advanced(
-        0.10, (0.005, 5.0), 'distance of a point to the line that ends it', 'm', 'delta')
-    max_gap: float = advanced(
-        1.5, (0.05, 50.0),
+    max_line_distance: float = advanced(0.10, (0.005, 5.0),
+        'distance of a point to the line that ends it', 'm', 'delta')
+    max_gap: float = advanced(1.5, (0.05, 50.0),
         'horizontal gap to the next candidate that ends a line, next to the sensor', 'm')
-    max_gap_growth: float = advanced(
-        0.15, (0.0, 2.0), 'growth of the largest gap with range', 'm/m')
-    max_density_ratio: float = advanced(
-        8.0, (1.0, 1e6), 'ratio of the vertical densities of two successive bins that ends a line')
-    min_density_extent: float = advanced(
-        0.05, (0.001, 1.0), 'least height of a bin in its vertical density', 'm')
-    error_ratio: float = advanced(
-        1.0, (0.0001, 1e6),
+    max_gap_growth: float = advanced(0.15, (0.0, 2.0),
+        'growth of the largest gap with range', 'm/m')
+    max_density_ratio: float = advanced(8.0, (1.0, 1e6),
+        'ratio of the vertical densities of two successive bins that ends a line')
+    min_density_extent: float = advanced(0.05, (0.001, 1.0),
+        'least height of a bin in its vertical density', 'm')
+    error_ratio: float = advanced(1.0, (0.0001, 1e6),
         'variance of the height error over that of the range error in the line regression',
         symbol='lambda')
 
@@ -96,14 +87,13 @@ class LinesConfig:
 class LengthScaleConfig:
     """Length-scale of the observation process along a segment."""
 
-    model: str = advanced(
-        'latent', ('latent', 'line_gradient', 'constant'),
+    model: str = advanced('latent', ('latent', 'line_gradient', 'constant'),
         'where the length-scales come from: the latent process, the slopes of the extracted '
         'lines, or one constant')
     constant: float = advanced(10.0, (0.05, 200.0), 'length-scale of the constant model', 'm')
     gradient_gain: float = advanced(2.0, (0.05, 100.0), 'a in l = a log(1/|slope|)', 'm', 'a')
-    flat_gradient: float = advanced(
-        0.1, (0.0001, 0.9), 'slope below which a line counts as flat', symbol='g_def')
+    flat_gradient: float = advanced(0.1, (0.0001, 0.9),
+        'slope below which a line counts as flat', symbol='g_def')
     min: float = advanced(1.0, (0.05, 200.0), 'smallest length-scale', 'm')
     max: float = advanced(50.0, (0.05, 500.0), 'largest length-scale', 'm')
 
@@ -112,75 +102,63 @@ class LengthScaleConfig:
 class ObservationConfig:
     """Hyper-parameters of the observation process GP_z."""
 
-    sigma_f: float = advanced(
-        0.3, (0.001, 10.0),
+    sigma_f: float = advanced(0.3, (0.001, 10.0),
         'prior standard deviation of the ground height about its mean line', 'm', 'sigma_f')
-    sigma_n: float = advanced(
-        0.05, (0.001, 5.0),
+    sigma_n: float = advanced(0.05, (0.001, 5.0),
         'standard deviation of the height noise of a ground candidate', 'm', 'sigma_n')
-    slope_std: float = advanced(
-        0.05, (0.0, 2.0), "prior standard deviation of the mean line's slope; 0 = a level mean")
+    slope_std: float = advanced(0.05, (0.0, 2.0),
+        "prior standard deviation of the mean line's slope; 0 = a level mean")
 
 
 @dataclass(frozen=True)
 class LatentConfig:
     """Latent process GP_l over log length-scale, and its pseudo-inputs."""
 
-    sigma_f_bar: float = advanced(
-        0.9, (0.01, 100.0),
+    sigma_f_bar: float = advanced(0.9, (0.01, 100.0),
         'prior standard deviation of the log length-scale about its mean', symbol='sigma_f_bar')
-    sigma_l_bar: float = advanced(
-        2.0, (0.1, 500.0), 'length-scale of the latent process', 'm', 'sigma_l_bar')
-    sigma_n_bar: float = advanced(
-        0.25, (0.01, 100.0),
+    sigma_l_bar: float = advanced(2.0, (0.1, 500.0),
+        'length-scale of the latent process', 'm', 'sigma_l_bar')
+    sigma_n_bar: float = advanced(0.25, (0.01, 100.0),
         'standard deviation of the noise of the log length-scale', symbol='sigma_n_bar')
-    candidates_per_pseudo_input: float = advanced(
-        3.0, (1.0, 100.0),
+    candidates_per_pseudo_input: float = advanced(3.0, (1.0, 100.0),
         'ground candidates of a line for each pseudo-input: more = faster, less precise')
-    sloped_gradient: float = advanced(
-        0.1, (0.001, 10.0), 'slope from which a line counts as sloped')
-    steep_gradient: float = advanced(
-        0.4, (0.001, 100.0), 'slope from which a line counts as steep')
-    medium_extent: float = advanced(
-        1.5, (0.01, 200.0), 'extent from which a line counts as medium', 'm')
-    long_extent: float = advanced(
-        5.0, (0.01, 200.0), 'extent from which a line counts as long', 'm')
+    sloped_gradient: float = advanced(0.1, (0.001, 10.0),
+        'slope from which a line counts as sloped')
+    steep_gradient: float = advanced(0.4, (0.001, 100.0),
+        'slope from which a line counts as steep')
+    medium_extent: float = advanced(1.5, (0.01, 200.0),
+        'extent from which a line counts as medium', 'm')
+    long_extent: float = advanced(5.0, (0.01, 200.0),
+        'extent from which a line counts as long', 'm')
 
 
 @dataclass(frozen=True)
 class GrowthConfig:
     """Iterative growth of the inlier set (outlier rejection)."""
 
-    seed_range: float = advanced(
-        20.0, (0.5, 200.0),
+    seed_range: float = advanced(20.0, (0.5, 200.0),
         'horizontal range within which low candidates start the inlier set', 'm')
-    seed_height_tolerance: float = basic(
-        0.45, (0.01, 5.0), 'largest height of a seed above or below the expected ground', 'm')
-    max_std: float = advanced(
-        0.4, (0.001, 10.0),
+    seed_height_tolerance: float = basic(0.45, (0.01, 5.0),
+        'largest height of a seed above or below the expected ground', 'm')
+    max_std: float = advanced(0.4, (0.001, 10.0),
         'predictive standard deviation above which a candidate is not decided yet', 'm')
-    max_standardised_residual: float = advanced(
-        2.0, (0.1, 50.0),
+    max_standardised_residual: float = advanced(2.0, (0.1, 50.0),
         'residual over predictive standard deviation above which a candidate is an outlier')
-    max_standardised_depth: float = advanced(
-        7.0, (0.1, 200.0),
+    max_standardised_depth: float = advanced(7.0, (0.1, 200.0),
         'the same for a candidate below the prediction; obstacles lie only above')
-    max_line_slope: float = advanced(
-        1.0, (0.0, 10.0),
+    max_line_slope: float = advanced(1.0, (0.0, 10.0),
         'slope of a line of candidates up to which those that continue it from inliers join')
     min_line_size: int = advanced(4, (2, 10000), 'candidates that such a line needs at least')
-    min_bend_extent: float = advanced(
-        10.0, (0.1, 1000.0),
-        'length of a line from which on it joins where the line before it bends into it: '
-        'longer than what stands on the ground', 'm')
+    min_bend_extent: float = advanced(10.0, (0.1, 1000.0),
+        'length of a line from which on it joins where the line before it bends into it: longer '
+        'than what stands on the ground', 'm')
 
 
 @dataclass(frozen=True)
 class SurfaceConfig:
     """From the segments' surfaces to the surface of the frame."""
 
-    n_neighbours: int = advanced(
-        2, (0, 16),
+    n_neighbours: int = advanced(2, (0, 16),
         "segments on either side whose surfaces are fused with a segment's own; 0 = none")
 
 
@@ -188,50 +166,41 @@ class SurfaceConfig:
 class FacesConfig:
     """Vertical faces, whose bases lie within the tolerance of ground."""
 
-    cell_size: float = advanced(
-        0.5, (0.05, 10.0), 'side of the square tiles whose returns are judged together', 'm')
-    min_height: float = advanced(
-        0.5, (0.05, 100.0),
+    cell_size: float = advanced(0.5, (0.05, 10.0),
+        'side of the square tiles whose returns are judged together', 'm')
+    min_height: float = advanced(0.5, (0.05, 100.0),
         'height of the returns of a tile above its lowest from which it may be a face', 'm')
-    max_normal_z: float = advanced(
-        0.45, (0.0, 1.0),
+    max_normal_z: float = advanced(0.45, (0.0, 1.0),
         'vertical part of the unit normal up to which the returns of a tile are a vertical face')
-    tolerance: float = advanced(
-        0.1, (0.001, 100.0), 'largest height of a ground point above the base of a face', 'm')
-    max_foot_distance: float = advanced(
-        0.06, (0.0, 10.0),
-        'distance (root mean square) of the lowest returns of a face from its plane up to '
-        'which its base is occluded, with no ground seen before it; 0 = never', 'm')
-    max_foot_density: float = advanced(
-        3.0, (0.0, 1000.0),
-        'density over height of those returns, in multiples of that above them, up to which '
-        'they belong to the face: ground would pile up at one height')
+    tolerance: float = advanced(0.1, (0.001, 100.0),
+        'largest height of a ground point above the base of a face', 'm')
+    max_foot_distance: float = advanced(0.06, (0.0, 10.0),
+        'distance (root mean square) of the lowest returns of a face from its plane up to which '
+        'its base is occluded, with no ground seen before it; 0 = never', 'm')
+    max_foot_density: float = advanced(3.0, (0.0, 1000.0),
+        'density over height of those returns, in multiples of that above them, up to which they '
+        'belong to the face: ground would pile up at one height')
 
 
 @dataclass(frozen=True)
 class LabelConfig:
     """Labels from the distance to the surface."""
 
-    ground_tolerance: float = basic(
-        0.1, (0.001, 5.0),
+    ground_tolerance: float = basic(0.1, (0.001, 5.0),
         'largest height of a ground point above a smooth surface', 'm', 'zeta_g')
-    roughness_gain: float = advanced(
-        3.0, (0.0, 20.0), 'growth of that height in multiples of the local roughness')
-    below_tolerance: float = basic(
-        1.0, (0.001, 50.0),
+    roughness_gain: float = advanced(3.0, (0.0, 20.0),
+        'growth of that height in multiples of the local roughness')
+    below_tolerance: float = basic(1.0, (0.001, 50.0),
         'largest depth of a ground point below the surface; obstacles lie only above', 'm')
-    obstacle_tolerance: float = advanced(
-        0.05, (0.001, 5.0),
+    obstacle_tolerance: float = advanced(0.05, (0.001, 5.0),
         'largest height of a ground point above a smooth surface beside an obstacle (in its bin)',
         'm')
-    obstacle_roughness_gain: float = advanced(
-        1.0, (0.0, 20.0), 'growth of that height in multiples of the local roughness')
-    obstacle_min_height: float = advanced(
-        0.5, (0.01, 10.0),
+    obstacle_roughness_gain: float = advanced(1.0, (0.0, 20.0),
+        'growth of that height in multiples of the local roughness')
+    obstacle_min_height: float = advanced(0.5, (0.01, 10.0),
         'height above the surface from which a return is an obstacle however rough the ground',
         'm')
-    obstacle_max_height: float = advanced(
-        2.0, (0.02, 50.0),
+    obstacle_max_height: float = advanced(2.0, (0.02, 50.0),
         'height above the surface up to which a return shows an obstacle; higher ones overhang',
         'm')
 
@@ -240,39 +209,30 @@ class LabelConfig:
 class LearningConfig:
     """Learning of the hyper-parameters."""
 
-    mode: str = basic(
-        'every_frame', ('every_frame', 'every_k', 'first_frame', 'fixed'),
+    mode: str = basic('every_frame', ('every_frame', 'every_k', 'first_frame', 'fixed'),
         'when the hyper-parameters are learned; fixed = never, the values given here are used')
-    period: int = advanced(
-        10, (1, 10000), 'frames from one learning to the next in the mode every_k')
-    scope: str = advanced(
-        'frame', ('frame', 'segment'),
-        'frame = one set of hyper-parameters for the whole frame; segment = one for each '
-        'segment (slow, for comparison)')
-    segment_step: int = advanced(
-        3, (1, 60),
-        'for the scope frame: one of how many segments is learned from; neighbouring segments '
-        'see much the same ground')
-    objective: str = advanced(
-        'map', ('map', 'paper'),
+    period: int = advanced(10, (1, 10000),
+        'frames from one learning to the next in the mode every_k')
+    scope: str = advanced('frame', ('frame', 'segment'),
+        'frame = one set of hyper-parameters for the whole frame; segment = one for each segment '
+        '(slow, for comparison)')
+    segment_step: int = advanced(3, (1, 60),
+        'for the scope frame: one of how many segments is learned from; neighbouring segments see '
+        'much the same ground')
+    objective: str = advanced('map', ('map', 'paper'),
         'map = likelihood of the heights and priors; paper = as printed, which has no upper bound')
-    warm_start: bool = advanced(
-        False, (),
+    warm_start: bool = advanced(False, (),
         'start from the frame before: fewer evaluations, but the labels depend on the past')
-    max_evaluations: int = advanced(
-        4, (1, 1000), 'evaluations of the objective per frame; the best so far is used')
-    max_time: float = advanced(
-        0.0, (0.0, 60.0),
-        'time for the learning of a frame, after which the best so far is used; 0 = no limit; '
-        'the labels then depend on the speed of the machine', 's')
-    prior_std: float = advanced(
-        1.0, (0.01, 10.0),
+    max_evaluations: int = advanced(4, (1, 1000),
+        'evaluations of the objective per frame; the best so far is used')
+    max_time: float = advanced(0.0, (0.0, 60.0),
+        'time for the learning of a frame, after which the best so far is used; 0 = no limit; the '
+        'labels then depend on the speed of the machine', 's')
+    prior_std: float = advanced(1.0, (0.01, 10.0),
         'standard deviation of the log-normal priors about the values given here')
-    bound_factor: float = advanced(
-        20.0, (1.01, 1e6),
+    bound_factor: float = advanced(20.0, (1.01, 1e6),
         'largest factor by which a hyper-parameter may leave the value given here')
-    fixed: str = advanced(
-        'none', ('none', 'sigma_f_bar', 'latent', 'length_scales'),
+    fixed: str = advanced('none', ('none', 'sigma_f_bar', 'latent', 'length_scales'),
         'hyper-parameters that are not learned')
 
 
@@ -281,8 +241,7 @@ class RuntimeConfig:
     """How the work is done; nothing here changes a label."""
 
     n_threads: int = basic(0, (0, 256), 'threads of the compiled code; 0 = all cores, at most 4')
-    backend: str = advanced(
-        'auto', ('auto', 'numba', 'numpy'),
+    backend: str = advanced('auto', ('auto', 'numba', 'numpy'),
         'auto = compiled code where numba is installed, numpy otherwise; or either by name')
 
 
@@ -291,28 +250,23 @@ class DiagnosticsConfig:
     """Diagnostics of the node on /diagnostics."""
 
     period: float = advanced(1.0, (0.1, 60.0), 'time between two diagnostics messages', 's')
-    stale_after: float = advanced(
-        2.0, (0.1, 600.0), 'time without any cloud after which the input is reported STALE', 's')
-    max_latency: float = advanced(
-        0.1, (0.001, 10.0),
+    stale_after: float = advanced(2.0, (0.1, 600.0),
+        'time without any cloud after which the input is reported STALE', 's')
+    max_latency: float = advanced(0.1, (0.001, 10.0),
         'median time from arrival to publication above which processing is reported WARN', 's')
-    max_load: float = advanced(
-        0.95, (0.01, 100.0),
-        'median time per cloud, over the time between two clouds sent, above which processing '
-        'is reported WARN')
-    max_drop_ratio: float = advanced(
-        0.0, (0.0, 1.0),
-        'share of the clouds sent since the last report that may be dropped before processing '
-        'is reported WARN')
-    max_refused_ratio: float = advanced(
-        0.0, (0.0, 1.0),
-        'share of the clouds since the last report that may be refused with a WARN; above it, '
-        'and always when all are, the input is reported ERROR')
-    min_quality: float = advanced(
-        0.2, (0.0, 1.0),
+    max_load: float = advanced(0.95, (0.01, 100.0),
+        'median time per cloud, over the time between two clouds sent, above which processing is '
+        'reported WARN')
+    max_drop_ratio: float = advanced(0.0, (0.0, 1.0),
+        'share of the clouds sent since the last report that may be dropped before processing is '
+        'reported WARN')
+    max_refused_ratio: float = advanced(0.0, (0.0, 1.0),
+        'share of the clouds since the last report that may be refused with a WARN; above it, and '
+        'always when all are, the input is reported ERROR')
+    min_quality: float = advanced(0.2, (0.0, 1.0),
         'frame_quality of the newest cloud below which the model is reported WARN')
-    recover_after: float = advanced(
-        3.0, (0.0, 600.0), 'time that a level stays reported after its cause has gone', 's')
+    recover_after: float = advanced(3.0, (0.0, 600.0),
+        'time that a level stays reported after its cause has gone', 's')
 # fmt: on
 
 
@@ -328,10 +282,7 @@ _ASCENDING = (
 
 @dataclass(frozen=True)
 class Config(ParameterGroups):
-    """All parameters, immutable and valid by construction.
-
-    Raises ConfigError if a value has the wrong type, is out of range, or contradicts another.
-    """
+    """All parameters, immutable; ConfigError if a value is not accepted or contradicts another."""
 
     sensor: SensorConfig = SensorConfig()
     frame: FrameConfig = FrameConfig()

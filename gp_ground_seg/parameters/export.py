@@ -11,14 +11,17 @@ import yaml
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.parameters.presets import PRESETS
-from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue, check_typed
-from gp_ground_seg.parameters.yaml_io import ROS_NODE_KEY, ROS_PARAMETERS_KEY, read_parameters
+from gp_ground_seg.parameters.schema import (
+    AUTO,
+    ROS_NODE_KEY,
+    ROS_PARAMETERS_KEY,
+    ParameterSpec,
+    ParameterValue,
+    read_parameters,
+)
 
 README_PATH = 'README.md'
-README_BEGIN = '<!-- parameters:begin -->'
-README_END = '<!-- parameters:end -->'
-
-PAGE_PATH = 'docs/parameters.md'
+README_BEGIN, README_END = '<!-- parameters:begin -->', '<!-- parameters:end -->'
 
 _PAGE_HEAD = """\
 # All parameters
@@ -41,47 +44,33 @@ def to_yaml(config: Config, purpose: str = '', reasons: Mapping[str, str] | None
     """
     reasons = reasons or {}
     lines = [
-        *(_comment(purpose, 0) if purpose else ()),
+        *_comment(purpose, 0),
         '# Parameters of gp_ground_seg, as written by `gp-ground-seg config dump`. To use a copy:',
         '#   ros2 run gp_ground_seg ground_segmentation_node --ros-args --params-file my.yaml',
         '#   gp-ground-seg segment --config my.yaml ...',
         f'{ROS_NODE_KEY}:',
         f'{_INDENT}{ROS_PARAMETERS_KEY}:',
     ]
-    for group_name, values in config.nested().items():
+    for k, (group_name, values) in enumerate(config.nested().items()):
         about = (type(getattr(config, group_name)).__doc__ or '').strip()
-        blank = [] if lines[-1].endswith(f'{ROS_PARAMETERS_KEY}:') else ['']
-        lines += [*blank, *_comment(about, 2), f'{2 * _INDENT}{group_name}:']
+        lines += [*([''] if k else []), *_comment(about, 2), f'{2 * _INDENT}{group_name}:']
         for field_name, value in values.items():
             spec = find_spec(f'{group_name}.{field_name}')
-            lines += _comment(_explain(spec), 3)
+            facts = _accepted(spec) + (f' {spec.unit}' if spec.unit else '')
+            facts += f'; {spec.symbol} in the paper' if spec.symbol else ''
+            # The facts stay on one line.
+            lines += _comment(f'{spec.description} ' + f'[{facts}]'.replace(' ', _NBSP), 3)
             if spec.name in reasons:
                 default = f'(default {yaml_scalar(spec.default)})'.replace(' ', _NBSP)
                 lines += _comment(f'Here: {reasons[spec.name]} {default}', 3)
-            lines.append(f'{3 * _INDENT}{_entry(field_name, value)}')
+            lines.append(f'{3 * _INDENT}{field_name}: {yaml_scalar(value)}')
     return '\n'.join(lines) + '\n'
-
-
-def _entry(name: str, value: ParameterValue) -> str:
-    """``name: value`` as YAML, quoted where needed."""
-    text: str = yaml.safe_dump({name: value})
-    return text.strip()
-
-
-def _explain(spec: ParameterSpec) -> str:
-    facts = _accepted(spec) + (f' {spec.unit}' if spec.unit else '')
-    if spec.symbol:
-        facts += f'; {spec.symbol} in the paper'
-    # The facts stay on one line.
-    return f'{spec.description} ' + f'[{facts}]'.replace(' ', _NBSP)
 
 
 def _comment(text: str, depth: int) -> list[str]:
     prefix = depth * _INDENT + '# '
-    lines = textwrap.wrap(
-        text, _WIDTH, initial_indent=prefix, subsequent_indent=prefix, break_on_hyphens=False
-    )
-    return [line.replace(_NBSP, ' ') for line in lines]
+    lines = textwrap.wrap(text, _WIDTH - len(prefix), break_on_hyphens=False)
+    return [prefix + line.replace(_NBSP, ' ') for line in lines]
 
 
 def to_markdown_table(*, basic_only: bool = False) -> str:
@@ -100,8 +89,9 @@ def to_markdown_table(*, basic_only: bool = False) -> str:
 
 
 def yaml_scalar(value: ParameterValue) -> str:
-    """Write a value the way it is written in a parameter file."""
-    return _entry('x', value).removeprefix('x: ')
+    """Write a value the way it is written in a parameter file, quoted where needed."""
+    text: str = yaml.safe_dump({'x': value})
+    return text.strip().removeprefix('x: ')
 
 
 def _accepted(spec: ParameterSpec) -> str:
@@ -121,20 +111,20 @@ def generated_files(readme: str) -> dict[str, str]:
     The table of the basic parameters goes between the markers of `readme`, the text of README.md;
     raises DataError if the two are not there once each, in order.
     """
-    begin, end = readme.find(README_BEGIN), readme.find(README_END)
-    unique = readme.count(README_BEGIN) == 1 and readme.count(README_END) == 1
-    if not unique or end < begin:
+    head, begin, rest = readme.partition(README_BEGIN)
+    _, end, tail = rest.partition(README_END)
+    if not end or README_BEGIN in rest or readme.count(README_END) > 1:
         raise DataError(
             f'must hold the lines {README_BEGIN} and {README_END} once each, in this order; '
             'the parameter table goes between them'
         )
-    head = readme[: begin + len(README_BEGIN)]
     files = {
         f'config/{preset.name}.yaml': to_yaml(preset.config, preset.title, preset.reasons)
         for preset in PRESETS.values()
     }
-    files[README_PATH] = f'{head}\n\n{to_markdown_table(basic_only=True)}\n{readme[end:]}'
-    files[PAGE_PATH] = _PAGE_HEAD + to_markdown_table()
+    table = to_markdown_table(basic_only=True)
+    files[README_PATH] = f'{head}{begin}\n\n{table}\n{end}{tail}'
+    files['docs/parameters.md'] = _PAGE_HEAD + to_markdown_table()
     return files
 
 
@@ -152,15 +142,16 @@ def file_problems(path: str | Path) -> list[str]:
     for name, value in file.values.items():
         try:
             spec = find_spec(name)
-            check_typed(spec, value) if file.is_ros else spec.check(value)
+            spec.check_typed(value) if file.is_ros else spec.check(value)
         except ConfigError as error:
             problems.append(str(error))
-    if not problems:
-        try:
-            Config().replace(**file.values)
-        except ConfigError as error:
-            problems.append(str(error))
-    return problems
+    if problems:
+        return problems
+    try:
+        Config().replace(**file.values)
+    except ConfigError as error:
+        return [str(error)]
+    return []
 
 
 def differences(

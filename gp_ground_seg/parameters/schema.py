@@ -1,4 +1,4 @@
-"""Declarations of parameters: their form, the check of values, groups of them as one object."""
+"""Parameters: their declarations, the check of values, groups as one object, reading of files."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import difflib
 import functools
 import numbers
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import yaml
 
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.parameters.yaml_io import read_parameters
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -22,6 +23,10 @@ ParameterValue = bool | int | float | str
 
 AUTO: Literal['auto'] = 'auto'
 """What a number may be instead where its declaration says so: estimated from the scan."""
+ROS_NODE_KEY = '/**'
+ROS_PARAMETERS_KEY = 'ros__parameters'
+OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
+"""Parameters that every ROS node has."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +59,6 @@ class ParameterSpec:
         auto = f'{AUTO} or ' if self.auto else ''
         return f'{auto}{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
 
-    def _is_name(self, value: str) -> bool:
-        """Whether any name is accepted, and `value` is one: letters, digits and ``_-./``."""
-        return not self.choices and re.fullmatch(r'[\w\-./]+', value, re.ASCII) is not None
-
     def check(self, value: object) -> ParameterValue:
         """Return `value` in the declared type; ConfigError if it is of another or out of range."""
         if self.auto and isinstance(value, str) and value == AUTO:
@@ -66,11 +67,12 @@ class ParameterSpec:
             if isinstance(value, bool):
                 return value
         elif self.type is str:
-            if isinstance(value, str) and (value in self.choices or self._is_name(value)):
+            # A name is letters, digits and ``_-./``.
+            known = self.choices or re.findall(r'\A[\w\-./]+\Z', str(value), re.ASCII)
+            if isinstance(value, str) and value in known:
                 return value
         elif isinstance(value, numbers.Real) and not isinstance(value, bool):
-            assert self.minimum is not None
-            assert self.maximum is not None
+            assert self.minimum is not None and self.maximum is not None
             # The bounds are finite: NaN and the infinities are never within.
             if value <= self.maximum and not value < self.minimum:
                 if self.type is float:
@@ -79,14 +81,12 @@ class ParameterSpec:
                     return int(value)
         raise ConfigError(f'{self.name} = {value!r}: must be {self.accepted}')
 
-
-def check_typed(spec: ParameterSpec, value: object) -> ParameterValue:
-    """Return `value` as `ParameterSpec.check`, but refuse an integer for a number, as ROS does."""
-    if spec.type is float and isinstance(value, int) and not isinstance(value, bool):
-        raise ConfigError(
-            f'{spec.name} = {value}: must be {spec.accepted}, with a decimal point as in {value}.0'
-        )
-    return spec.check(value)
+    def check_typed(self, value: object) -> ParameterValue:
+        """Return `value` as `check`, but refuse an integer for a number, as ROS does."""
+        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
+            expected = f'{self.accepted}, with a decimal point as in {value}.0'
+            raise ConfigError(f'{self.name} = {value}: must be {expected}')
+        return self.check(value)
 
 
 def declare(
@@ -114,26 +114,23 @@ def declare(
 
 
 basic = functools.partial(declare, basic=True)
-"""Declares a parameter that is set for a robot."""
 advanced = functools.partial(declare, basic=False)
-"""Declares a parameter that is rarely set."""
 
 
 @dataclass(frozen=True)
 class ParameterGroups:
-    """Base of a frozen dataclass of groups of declared parameters; checks all values."""
+    """Base of a frozen dataclass of groups of declared parameters."""
 
     @classmethod
     @functools.cache
     def specs(cls) -> dict[str, ParameterSpec]:
         """Every declared parameter by its dotted name, in order of declaration."""
-        groups: dict[str, Any] = {group.name: group.default for group in dataclasses.fields(cls)}
-        specs = (
-            dataclasses.replace(entry.metadata['spec'], name=f'{name}.{entry.name}')
-            for name, group in groups.items()
-            for entry in dataclasses.fields(group)
-        )
-        return {spec.name: spec for spec in specs}
+        specs = {}
+        for group in dataclasses.fields(cls):
+            for entry in dataclasses.fields(group.default):  # type: ignore[arg-type]
+                name = f'{group.name}.{entry.name}'
+                specs[name] = dataclasses.replace(entry.metadata['spec'], name=name)
+        return specs
 
     @classmethod
     def find_spec(cls, name: str) -> ParameterSpec:
@@ -206,3 +203,93 @@ def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterVa
         group_name, field_name = name.split('.')
         result.setdefault(group_name, {})[field_name] = value
     return result
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, without two of its surprises (see `load_yaml`)."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse a key that is there twice; the last would win silently."""
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for key in keys:
+            if key != '<<' and keys.count(key) > 1:
+                raise ConfigError(f'{key}: given twice, from line {node.start_mark.line + 1} on')
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float',
+    re.compile(r'^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
+    list('-+.0123456789'),
+)
+
+
+def load_yaml(text: str) -> object:
+    """Read YAML, with 1e-3 a number as in ROS; a key given twice raises ConfigError."""
+    document: object = yaml.load(text, Loader=_Loader)
+    return document
+
+
+class ParameterFile(NamedTuple):
+    """Values of a parameter file by dotted names, unchecked."""
+
+    values: dict[str, object]
+    is_ros: bool  # whether it is in the form of ROS, where types are strict
+
+
+def read_parameters(path: str | Path) -> ParameterFile:
+    """Read a parameter file; ConfigError if it cannot be read or parsed, or gives a name twice."""
+    try:
+        document = load_yaml(Path(path).read_text(encoding='utf-8'))
+        values: dict[str, object] = {}
+        for name, value in _flatten(_unwrap_ros(document)):
+            if name in values:
+                raise ConfigError(f'{name}: given twice')
+            values[name] = value
+        return ParameterFile(values, isinstance(document, Mapping) and _is_ros(document))
+    except OSError as error:
+        raise ConfigError(error.strerror or str(error)) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError('not a text file') from error
+    except ConfigError:
+        raise
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        # A ValueError comes from what looks like a date and is none, as in 2011-99-99.
+        raise ConfigError(f'not valid YAML: {" ".join(str(error).split())}') from error
+
+
+def _unwrap_ros(document: object) -> Mapping[str, object]:
+    """Parameters of a ROS parameter file, or of a file of bare groups."""
+    if document is None:
+        return {}
+    if not isinstance(document, Mapping):
+        raise ConfigError('must be a mapping of parameter groups')
+    if not _is_ros(document):
+        return document
+    if len(document) != 1:
+        raise ConfigError(f'parameters of {len(document)} nodes; keep one, keyed {ROS_NODE_KEY}')
+    (node,) = document.values()
+    if not isinstance(node, Mapping) or not isinstance(node.get(ROS_PARAMETERS_KEY), Mapping):
+        raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
+    # Names that every ROS node has are no parameters of the segmentation.
+    return {
+        key: value
+        for key, value in node[ROS_PARAMETERS_KEY].items()
+        if key not in OF_EVERY_NODE and not str(key).startswith('qos_overrides')
+    }
+
+
+def _is_ros(document: Mapping[str, object]) -> bool:
+    return any(
+        str(key).startswith('/') or (isinstance(value, Mapping) and ROS_PARAMETERS_KEY in value)
+        for key, value in document.items()
+    )
+
+
+def _flatten(tree: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:
+    for key, value in tree.items():
+        name = f'{prefix}{key}'
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f'{name}.')
+        else:
+            yield name, value

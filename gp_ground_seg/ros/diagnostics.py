@@ -27,19 +27,17 @@ CLOUD_WINDOW = 100
 """Clouds over which percentiles are taken."""
 MIN_RATE_SPAN = 1.0
 """Shortest time from which the load is computed [s]: a burst is no rate."""
-
-
 Finding = tuple[Level, str]
 
 
 class InputFacts(NamedTuple):
-    """State of the input at the time of a report; `ros_time` is the node's clock [s]."""
+    """State of the input at the time of a report."""
 
     topic: str
     qos: str
     n_publishers: int
-    ros_time: float
-    is_simulated: bool = False
+    ros_time: float  # by the clock of the node [s]
+    is_simulated: bool = False  # that clock
 
 
 class InputTask:
@@ -59,7 +57,7 @@ class InputTask:
         """Count a cloud; `stamp` is the time in its header [s]."""
         if self._is_reported:
             self._n_recent = self._n_refused_recent = 0
-            self._is_reported = False
+        self._is_reported = False
         self._n_recent += 1
         self._last_arrival = now
         self._arrivals.count(now)
@@ -101,13 +99,13 @@ class InputTask:
         return Status('input', *self._judge(now, facts, limits), values)
 
     def _judge(self, now: float, facts: InputFacts, limits: DiagnosticsConfig) -> Finding:
-        silence, topic = now - self._last_arrival, facts.topic
+        silence = now - self._last_arrival
         n_received, n_refused = self._n_recent, self._n_refused_recent
         if silence > limits.stale_after:
             source = f'publishers: {facts.n_publishers}' if facts.n_publishers else 'nobody sends'
-            return Level.STALE, f'no cloud on {topic} for {silence:.1f} s ({source})'
+            return Level.STALE, f'no cloud on {facts.topic} for {silence:.1f} s ({source})'
         if n_received == 0:
-            return Level.OK, f'waiting for the first cloud on {topic}'
+            return Level.OK, f'waiting for the first cloud on {facts.topic}'
         # A stamp may be of any age: a recording is played at any time.
         if n_refused == 0:
             return Level.OK, 'receiving'
@@ -120,9 +118,8 @@ class ProcessingTask:
     """Latencies, load and losses."""
 
     def __init__(self) -> None:
-        self._latencies: deque[float] = deque(maxlen=CLOUD_WINDOW)
-        self._durations: deque[float] = deque(maxlen=CLOUD_WINDOW)
-        self._stages: deque[Mapping[str, float]] = deque(maxlen=CLOUD_WINDOW)
+        # Latency and duration of the newest clouds, and of their stages [s].
+        self._times: deque[tuple[float, float, Mapping[str, float]]] = deque(maxlen=CLOUD_WINDOW)
         self._sent = Rate()
         self._n_processed = self._n_dropped = 0
         self._n_sent_recent = self._n_dropped_recent = 0
@@ -136,22 +133,20 @@ class ProcessingTask:
         self._n_dropped_recent += n_lost
 
     def processed(self, duration: float, stages: Mapping[str, float], fit: FitReport) -> None:
-        """Count a cloud whose processing took `duration`, after a wait of ``queue`` [s].
-
-        `stages` are its steps [s], ``queue`` among them.
-        """
+        """Count a cloud processed in `duration` [s]; `stages` has its wait too, as ``queue``."""
         self._n_processed += 1
-        self._latencies.append(stages['queue'] + duration)
-        self._durations.append(duration)
-        self._stages.append(stages)
+        self._times.append((stages['queue'] + duration, duration, stages))
         self._backend, self._n_threads = fit.backend, fit.n_threads
 
     def load(self, now: float) -> float | None:
         """Time that the clouds sent in a second take to process [s/s]; None if unknown."""
         _, span, rate = self._sent.window(now)
-        if rate is None or not self._durations or span < MIN_RATE_SPAN:
+        if rate is None or not self._times or span < MIN_RATE_SPAN:
             return None
-        return rate * float(np.median(self._durations))
+        return rate * self._median(1)
+
+    def _median(self, k: int) -> float:
+        return float(np.median([times[k] for times in self._times]))
 
     def report(self, now: float, limits: DiagnosticsConfig) -> Status:
         """Judge the latest clouds, and the losses since the last report."""
@@ -160,22 +155,22 @@ class ProcessingTask:
         load = self.load(now)
         values = {
             'Clouds since startup': str(self._n_processed),
-            'Clouds in window': str(len(self._latencies)),
+            'Clouds in window': str(len(self._times)),
             'Dropped since startup': str(self._n_dropped),
             'Load (%)': _digits(None if load is None else 100.0 * load, '.1f'),
-            **_percentiles('Latency', self._latencies),
+            **_percentiles('Latency', [latency for latency, _, _ in self._times]),
         }
-        for stage in self._stages[-1] if self._stages else ():
-            times = [stages[stage] for stages in self._stages if stage in stages]
+        for stage in self._times[-1][2] if self._times else ():
+            times = [stages[stage] for _, _, stages in self._times if stage in stages]
             values.update(_percentiles(f'Stage {stage}', times))
         values.update({'Backend': self._backend, 'Threads': str(self._n_threads)})
         return Status('processing', level, message, values)
 
     def _judge(self, now: float, limits: DiagnosticsConfig) -> Finding:
-        if not self._latencies:
+        if not self._times:
             return Level.OK, 'no cloud processed yet'
-        latency = 1e3 * float(np.median(self._latencies))
-        duration, max_latency = 1e3 * float(np.median(self._durations)), 1e3 * limits.max_latency
+        latency, duration = 1e3 * self._median(0), 1e3 * self._median(1)
+        max_latency = 1e3 * limits.max_latency
         load = self.load(now)
         n_dropped, n_sent = self._n_dropped_recent, self._n_sent_recent
         faults = []
@@ -191,23 +186,18 @@ class ProcessingTask:
 
 
 def frame_quality(fit: FitReport, n_occupied: int, certainty: float) -> float:
-    """Return how reliable a frame is, from 0 to 1.
-
-    The product of three shares: segments with a model among the `n_occupied` that hold
-    candidates, inliers among the candidates, certainty of the labels (if not NaN).
-    """
+    """Return how reliable a frame is, 0 to 1: a product of shares (docs/diagnostics.md)."""
     if fit.status == 'failed' or not fit.n_candidates or not n_occupied:
         return 0.0
-    shares = min(1.0, fit.n_segments / n_occupied), fit.n_inliers / fit.n_candidates
-    return shares[0] * shares[1] * (1.0 if np.isnan(certainty) else certainty)
+    share = min(1.0, fit.n_segments / n_occupied) * (fit.n_inliers / fit.n_candidates)
+    return share * (1.0 if np.isnan(certainty) else certainty)
 
 
 class ModelTask:
     """The newest scan; its statistics are computed for a report only."""
 
-    def __init__(self) -> None:
-        self._newest: Segmentation | None = None
-        self._n_learned = 0
+    _newest: Segmentation | None = None
+    _n_learned = 0
 
     def segmented(self, segmentation: Segmentation) -> None:
         """Keep a scan."""
@@ -261,18 +251,18 @@ class ModelTask:
 
 
 def _pose_values(pose: SensorPose) -> dict[str, str]:
-    names = ('height', 'roll', 'pitch')
-    taken = [name for name in names if getattr(pose, f'{name}_estimated')]
+    taken = [name for name in ('height', 'roll', 'pitch') if getattr(pose, f'{name}_estimated')]
     seen = pose.measured
-    has_height, has_tilt = (seen.tells_height, seen.tells_tilt) if seen else (False, False)
+    height = seen.height if seen and seen.tells_height else None
+    roll, pitch = (seen.roll, seen.pitch) if seen and seen.tells_tilt else (None, None)
     return {
         'Sensor height (m)': f'{pose.height:.4f}',
         'Sensor roll (rad)': f'{pose.roll:.4f}',
         'Sensor pitch (rad)': f'{pose.pitch:.4f}',
         'Taken from the scan': ' '.join(taken) or 'nothing',
-        'Estimated height (m)': _digits(seen.height if seen and has_height else None, '.4f'),
-        'Estimated roll (rad)': _digits(seen.roll if seen and has_tilt else None, '.4f'),
-        'Estimated pitch (rad)': _digits(seen.pitch if seen and has_tilt else None, '.4f'),
+        'Estimated height (m)': _digits(height, '.4f'),
+        'Estimated roll (rad)': _digits(roll, '.4f'),
+        'Estimated pitch (rad)': _digits(pitch, '.4f'),
     }
 
 
@@ -304,11 +294,7 @@ State = tuple[InputFacts, Mapping[str, int]]
 
 
 class Diagnostics:
-    """The four tasks of `node`, published every ``diagnostics.period`` of a steady clock.
-
-    With ``use_sim_time``, a timer on the node's clock would not fire before the first
-    /clock, nor while a bag is paused. `limits` are the parameters ``diagnostics``.
-    """
+    """The four tasks of `node`, published every ``diagnostics.period``."""
 
     def __init__(self, node: Node, state: Callable[[], State], limits: DiagnosticsConfig) -> None:
         self.input = InputTask(time.monotonic())
@@ -316,6 +302,7 @@ class Diagnostics:
         self._node, self._state, self._limits = node, state, limits
         self._hysteresis: defaultdict[str, Hysteresis] = defaultdict(Hysteresis)
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        # Not the clock of the node: with use_sim_time it stands before the first /clock.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(limits.period, self._publish, clock=steady)
 
@@ -328,15 +315,14 @@ class Diagnostics:
 
     def report(self, now: float) -> list[Status]:
         """Return the status of each task."""
-        facts, n_subscribers = self._state()
+        (facts, n_subscribers), limits = self._state(), self._limits
         found = (
-            self.input.report(now, facts, self._limits),
-            self.processing.report(now, self._limits),
-            self.model.report(self._limits),
+            self.input.report(now, facts, limits),
+            self.processing.report(now, limits),
+            self.model.report(limits),
             self.output.report(now, n_subscribers),
         )
-        recover_after = self._limits.recover_after
-        return [self._hysteresis[s.task].hold(now, s, recover_after) for s in found]
+        return [self._hysteresis[s.task].hold(now, s, limits.recover_after) for s in found]
 
     def _publish(self) -> None:
         array = DiagnosticArray()

@@ -61,15 +61,8 @@ def ground_model_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointC
 def read_ground_model(cloud: PointCloud2) -> GroundModel:
     """Return the model in a cloud of ``~/ground_model``; `GroundModel.at` gives heights.
 
-    Parameters
-    ----------
-    cloud : PointCloud2
-        As published: rclpy's message, or one of the same attributes, as of rosbags.
-
-    Raises
-    ------
-    PointCloudError
-        If a field is missing, or the points are not such a grid (any more).
+    `cloud` is as published: rclpy's message, or one of the same attributes, as of rosbags. Raises
+    a PointCloudError if a field is missing, or the points are not such a grid (any more).
     """
     columns = read_columns(cloud, FIELDS)
     if columns['x'].size == 0:

@@ -1,15 +1,19 @@
-"""The input topic: clouds in any layout, losses, QoS that follows the publishers, time jumps."""
+"""The input: clouds, losses, QoS that follows the publishers, time jumps, tilt by TF."""
 
 from __future__ import annotations
 
+import functools
+import importlib
 import time
 from array import array
 from collections.abc import Callable, Mapping
 from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from builtin_interfaces.msg import Time as TimeMessage
+from geometry_msgs.msg import Quaternion
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -18,16 +22,17 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.data.point_cloud2 import read_xyz, select_rows
-from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.data import point_cloud2
+from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
+from gp_ground_seg.pipeline.tilt import angles_of
 
 INPUT_DEPTH = 5
 """Clouds that may wait to be processed: half a second of a LiDAR at 10 Hz."""
 OUTPUT_DEPTH = 20
-"""Clouds kept for repair: with stock Fast DDS, a lost fragment of a large cloud is sent again
-after up to 0.7 s on a busy machine; what is overwritten by then is lost."""
+"""Clouds kept for repair: Fast DDS may send a lost fragment again after 0.7 s only."""
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 REVIEW_PERIOD = 1.0
@@ -43,28 +48,6 @@ _CHOICES = {
 }
 
 
-def select_points(cloud: PointCloud2, mask: npt.NDArray[np.bool_]) -> PointCloud2:
-    """Return the points of `cloud` where `mask` is true, in order, as an unorganised cloud.
-
-    Header, fields, byte order, ``point_step`` and every byte of the points are those of the
-    input; ``is_dense`` tells whether all coordinates are finite. Raises as `select_rows`.
-    """
-    kept = select_rows(cloud, mask)
-    n_points = int(np.count_nonzero(mask))
-    selection = PointCloud2(
-        header=cloud.header,
-        height=1,
-        width=n_points,
-        fields=cloud.fields,
-        is_bigendian=cloud.is_bigendian,
-        point_step=cloud.point_step,
-        row_step=n_points * cloud.point_step,
-    )
-    selection.data = message_data(kept)
-    selection.is_dense = bool(np.isfinite(read_xyz(selection)).all())
-    return selection
-
-
 def message_data(values: npt.NDArray[Any]) -> array[int]:
     """Return the bytes of an array as the one type that rclpy takes without a look at each."""
     data = array('B')
@@ -72,17 +55,19 @@ def message_data(values: npt.NDArray[Any]) -> array[int]:
     return data
 
 
+select_points = functools.partial(point_cloud2.select_points, as_data=message_data)
+
+
 def check_overrides(given: Mapping[str, object]) -> None:
     """Raise a ConfigError if a ``qos_overrides`` parameter, of any topic, is not accepted."""
     for name, value in given.items():
-        policy = name.rpartition('.')[2]
-        if not name.startswith(QOS_OVERRIDES):
-            continue
+        policy, expected = name.rpartition('.')[2], ''
         if policy == 'depth' and not (type(value) is int and 1 <= value <= MAX_DEPTH):
-            raise ConfigError(f'{name} = {value!r}: must be an integer in [1, {MAX_DEPTH}]')
-        if policy in _CHOICES and value not in _CHOICES[policy]:
-            choices = ', '.join(_CHOICES[policy])
-            raise ConfigError(f'{name} = {value!r}: must be one of {choices}')
+            expected = f'an integer in [1, {MAX_DEPTH}]'
+        elif value not in _CHOICES.get(policy, (value,)):
+            expected = f'one of {", ".join(_CHOICES[policy])}'
+        if expected and name.startswith(QOS_OVERRIDES):
+            raise ConfigError(f'{name} = {value!r}: must be {expected}')
 
 
 def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
@@ -97,11 +82,9 @@ def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
 
 def in_words(profile: QoSProfile) -> str:
     """Return `profile` as in ``reliable, keep_last 5, volatile``."""
-    names = [
-        policy.name.lower()
-        for policy in (profile.reliability, profile.history, profile.durability)
-    ]
-    return f'{names[0]}, {names[1]} {profile.depth}, {names[2]}'
+    policies = profile.reliability, profile.history, profile.durability
+    reliability, history, durability = (policy.name.lower() for policy in policies)
+    return f'{reliability}, {history} {profile.depth}, {durability}'
 
 
 class SequenceGaps:
@@ -111,8 +94,7 @@ class SequenceGaps:
     lost on the way, or overwritten in a full queue while the node was busy.
     """
 
-    def __init__(self) -> None:
-        self._last: int | None = None
+    _last: int | None = None
 
     def reset(self) -> None:
         """Forget the last number: another publisher has its own count."""
@@ -126,23 +108,13 @@ class SequenceGaps:
         return number - last - 1
 
 
-class Arrival(NamedTuple):
-    """Time a cloud waited in this process [s], and clouds lost just before it.
-
-    The losses are 0 with several publishers, whose numbers cannot be told apart.
-    """
-
-    wait: float
-    n_lost: int
-
-
 class CloudSubscription:
     """Subscription that is best-effort if a publisher is, and reliable otherwise.
 
-    Large clouds need reliable delivery: a best-effort reader loses most of a replayed KITTI
-    bag with stock Fast DDS. A reliable reader gets nothing from a best-effort LiDAR driver.
-    Reliability given in ``qos_overrides``, by `is_given`, is kept for any publisher.
-    `callback` takes each cloud and its `Arrival`, in the executor of the node.
+    A best-effort reader loses most of a replayed KITTI bag with stock Fast DDS; a reliable one
+    gets nothing from a best-effort LiDAR driver. Reliability given in ``qos_overrides``, by
+    `is_given`, is kept for any publisher. `callback` takes each cloud, its wait in this process
+    [s] and the clouds lost before it: 0 with several publishers, whose numbers tell nothing.
     """
 
     def __init__(
@@ -150,7 +122,7 @@ class CloudSubscription:
         node: Node,
         topic: str,
         is_given: Callable[[str], bool],
-        callback: Callable[[PointCloud2, Arrival], None],
+        callback: Callable[[PointCloud2, float, int], None],
     ) -> None:
         self._node = node
         self._unresolved_topic = topic
@@ -159,8 +131,8 @@ class CloudSubscription:
         self._offered: dict[bytes, ReliabilityPolicy] = {}
         self.topic: str = node.resolve_topic_name(topic)
         self._is_pinned = is_given(f'qos_overrides.{self.topic}.subscription.reliability')
-        # A subscription destroyed within its own event is still used by the executor; a guard
-        # condition runs after all that became ready with the event.
+        # The executor still uses a subscription within its own event; a guard condition runs
+        # after all that became ready with it.
         self._review_soon = node.create_guard_condition(self._review)
         self._subscription = self._create(
             cloud_profile(INPUT_DEPTH), QoSOverridingOptions.with_default_policies()
@@ -177,7 +149,7 @@ class CloudSubscription:
 
     @property
     def n_publishers(self) -> int:
-        """Publishers of the topic, as of the last look."""
+        """Publishers, as of the last look."""
         return len(self._offered)
 
     def _create(self, profile: QoSProfile, overrides: QoSOverridingOptions | None) -> Subscription:
@@ -199,7 +171,7 @@ class CloudSubscription:
         n_lost = self._gaps.note(info.get('publication_sequence_number'))
         if n_lost and (self._look_at_publishers() or self.n_publishers != 1):
             n_lost = 0
-        self._callback(message, Arrival(wait, n_lost))
+        self._callback(message, wait, n_lost)
 
     def _on_incompatible(self, _event: object) -> None:
         if self._is_pinned:
@@ -225,11 +197,9 @@ class CloudSubscription:
         self._look_at_publishers()
         if not self._offered or self._is_pinned:
             return
-        is_best_effort = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
+        best_effort, reliable = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
         profile = copy(self.qos)
-        profile.reliability = (
-            ReliabilityPolicy.BEST_EFFORT if is_best_effort else ReliabilityPolicy.RELIABLE
-        )
+        profile.reliability = best_effort if best_effort in self._offered.values() else reliable
         if profile.reliability == self.qos.reliability:
             return
         self._node.get_logger().info(
@@ -243,8 +213,7 @@ class CloudSubscription:
 class StampWatch:
     """Detects from the stamps of clouds that time has jumped back."""
 
-    def __init__(self) -> None:
-        self._newest: float | None = None
+    _newest: float | None = None
 
     def reset(self) -> None:
         """Forget the newest stamp."""
@@ -292,3 +261,62 @@ class TimeJumps:
             throttle_duration_sec=LOG_PERIOD,
             throttle_time_source_type=self._steady,
         )
+
+
+def require_tf2() -> Any:
+    """Return the module tf2_ros; raise a MissingDependencyError if it is not installed."""
+    try:
+        return importlib.import_module('tf2_ros')
+    except ImportError as error:
+        raise MissingDependencyError(
+            f'frame.level = tf: needs tf2_ros, which cannot be imported ({error}): sudo apt '
+            'install ros-jazzy-tf2-ros-py, or use frame.level = sensor with sensor.roll and '
+            'sensor.pitch'
+        ) from error
+
+
+def tilt_of(rotation: Quaternion) -> tuple[float, float]:
+    """Return roll and pitch [rad] of a sensor frame that `rotation` turns into a level one."""
+    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
+    square = x * x + y * y + z * z + w * w
+    if not abs(square - 1.0) < 1e-3:
+        given = f'({x:g}, {y:g}, {z:g}, {w:g}) of length {square**0.5:g}'
+        raise PointCloudError(f'quaternion {given}: must be 1')
+    # Third row of its matrix: the level frame's z axis in the sensor frame.
+    up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), square - 2.0 * (x * x + y * y)])
+    return angles_of(up / np.linalg.norm(up))
+
+
+class TfTilt:
+    """Listens to TF in the executor of `node`."""
+
+    def __init__(self, node: Node) -> None:
+        self._tf2_ros = require_tf2()
+        # Without the node: given one, the buffer clears itself at jumps of the node's clock,
+        # and in some releases raises an error there that ends the executor. See `reset`.
+        self._buffer = self._tf2_ros.Buffer()
+        self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
+
+    def tilt(self, frame: str, stamp: TimeMessage, base: str) -> tuple[float, float]:
+        """Return roll and pitch [rad] of `frame` in `base`; PointCloudError if TF has them not.
+
+        The transform is that of the time `stamp`, or the newest if there is none for it: a
+        sensor is fixed to its vehicle, and waiting for TF would delay every cloud.
+        """
+        try:
+            try:
+                found = self._buffer.lookup_transform(base, frame, Time.from_msg(stamp))
+            except self._tf2_ros.ExtrapolationException:
+                found = self._buffer.lookup_transform(base, frame, Time())
+        except self._tf2_ros.TransformException as error:
+            way = f'from its frame {frame!r} to frame.base = {base!r}'
+            raise PointCloudError(f'no transform {way}: {error}') from error
+        return tilt_of(found.transform.rotation)
+
+    def reset(self) -> None:
+        """Forget all transforms, as after a jump in time."""
+        self._buffer.clear()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._listener.unregister()

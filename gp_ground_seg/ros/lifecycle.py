@@ -1,7 +1,7 @@
 """Start and end of a ROS process: arguments, transport, signals.
 
-ROS is imported by the functions that need it, so that the signals of a process can be
-handled before that, which takes half a second.
+ROS is imported by the functions that need it: that takes half a second, in which the signals of
+the process can be handled already.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -22,21 +22,16 @@ from typing import Any
 import yaml
 
 from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyError
-from gp_ground_seg.parameters.yaml_io import load_yaml
+from gp_ground_seg.parameters.schema import load_yaml
 
 HIGHEST_DOMAIN = 232
 
 
 def initialize(words: Sequence[str]) -> None:
-    """Initialise rclpy with a command line, the program's name first; no signal handlers.
-
-    Raises a ConfigError if the ROS arguments or a parameter file cannot be read.
-    """
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
+    """Initialise rclpy with a command line; raises a ConfigError if that cannot be read."""
     from rclpy.utilities import remove_ros_args
 
-    check_surroundings(words)
+    _check_surroundings(words)
     with start_errors():
         other_words = remove_ros_args(list(words))[1:]
     parser = argparse.ArgumentParser(
@@ -46,8 +41,16 @@ def initialize(words: Sequence[str]) -> None:
         epilog='example: %(prog)s --ros-args -r points:=/lidar --params-file vlp16.yaml',
     )
     parser.parse_args(other_words)
+    _init(words)
+
+
+def _init(words: Sequence[str], context: Any = None) -> None:
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
     with start_errors():
-        rclpy.init(args=list(words), signal_handler_options=SignalHandlerOptions.NO)
+        options = SignalHandlerOptions.NO
+        rclpy.init(args=list(words), context=context, signal_handler_options=options)
 
 
 @contextmanager
@@ -65,17 +68,12 @@ def start_errors() -> Iterator[None]:
         raise ConfigError(text if kind == 'RCLError' else f'{kind}: {text}') from error
 
 
-def check_surroundings(words: Sequence[str]) -> None:
-    """Raise a ConfigError for what rcl takes without a word, or ends the process for.
-
-    These are parameter files that are not text, hold no parameters or give one twice, and a
-    ``ROS_DOMAIN_ID`` for which DDS has no ports.
-    """
+def _check_surroundings(words: Sequence[str]) -> None:
+    """Raise a ConfigError for what rcl takes without a word, or ends the process for."""
     domain = os.environ.get('ROS_DOMAIN_ID', '')
     if domain.isdecimal() and int(domain) > HIGHEST_DOMAIN:
         raise ConfigError(f'ROS_DOMAIN_ID = {domain}: must be an integer in [0, {HIGHEST_DOMAIN}]')
-    paths = (path for flag, path in itertools.pairwise(words) if flag == '--params-file')
-    for path in paths:
+    for path in (path for flag, path in itertools.pairwise(words) if flag == '--params-file'):
         with contextlib.suppress(OSError, yaml.YAMLError, RecursionError):
             try:
                 document = load_yaml(Path(path).read_text(encoding='utf-8'))
@@ -99,8 +97,6 @@ def needing_ros(command: str) -> Iterator[None]:
         ) from error
 
 
-# --- Transport
-
 _PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _TRANSPORT_VARIABLES = (
     _PROFILE_VARIABLE, 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS',
@@ -113,8 +109,8 @@ MIN_SHARED_MEMORY = 128 << 20
 def large_cloud_transport() -> Iterator[None]:
     """Name the Fast DDS profile for large clouds, if the user has chosen none.
 
-    It holds for this process, if ROS is used for the first time within the block, and for
-    those started within it. Without it, clouds above 0.5 MB are sent in pieces, which get lost.
+    For processes started, and ROS used for the first time, within the block. Without it, clouds
+    above 0.5 MB are sent in pieces, which get lost.
     """
     profile = _find_profile()
     is_chosen = any(os.environ.get(name) for name in _TRANSPORT_VARIABLES)
@@ -144,8 +140,6 @@ def _free_shared_memory() -> int:
     return status.f_bavail * status.f_frsize
 
 
-# --- Signals
-
 GRACE = 0.5
 """Time from the signal to the end of the process, if the work does not end before [s]."""
 _STOPS = (signal.SIGINT, signal.SIGTERM)
@@ -155,49 +149,45 @@ _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class StopRequest:
     """Whether a signal to end the process has come."""
 
-    def __init__(self) -> None:
-        self.made = False
+    made = False
 
     def note(self, _number: int, _frame: FrameType | None) -> None:
-        """Set `made`.
-
-        An exception here would come out of any running code: rclpy's bindings turn it into
-        another one, the compiler and destructors print and swallow it.
-        """
+        """Set `made`; an exception would come out of any running code, or be swallowed there."""
         self.made = True
 
 
-class _Watchdog:
-    """Ends the process with code 0 if it does not end within `GRACE` of a signal.
+@contextmanager
+def _watchdog() -> Iterator[None]:
+    """End the process with code 0 if the block does not end within `GRACE` of a signal.
 
     Python calls its handlers between two steps of the main thread, and the next step may be
     seconds away, behind a long computation. The number of a signal is written to a pipe at
     once, where a thread waits for it.
     """
+    done = threading.Event()
+    read_end, write_end = os.pipe()
+    os.set_blocking(write_end, False)
 
-    def __init__(self) -> None:
-        self._done = threading.Event()
-        self._read_end, self._write_end = os.pipe()
-        os.set_blocking(self._write_end, False)
-        self._before = signal.set_wakeup_fd(self._write_end, warn_on_full_buffer=False)
-        self._thread = threading.Thread(target=self._watch, name='signals', daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        self._done.set()
-        signal.set_wakeup_fd(self._before)
-        os.close(self._write_end)
-        self._thread.join()
-        os.close(self._read_end)
-
-    def _watch(self) -> None:
+    def watch() -> None:
         with contextlib.suppress(OSError):
-            while number := os.read(self._read_end, 1):
+            while number := os.read(read_end, 1):
                 if number[0] in _STOPS:
                     break
-        # At the end of the pipe too; then `_done` is set.
-        if not self._done.wait(GRACE):
+        # At the end of the pipe too; then `done` is set.
+        if not done.wait(GRACE):
             os._exit(0)
+
+    before = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+    thread = threading.Thread(target=watch, name='signals', daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        signal.set_wakeup_fd(before)
+        os.close(write_end)
+        thread.join()
+        os.close(read_end)
 
 
 @contextmanager
@@ -209,29 +199,37 @@ def stop_on_signals() -> Iterator[StopRequest]:
     must not break the clean-up. In other threads than the main one nothing is changed.
     """
     request = StopRequest()
-    if threading.current_thread() is not threading.main_thread():
+    if not _is_main_thread():
         yield request
         return
-    watchdog = _Watchdog()
-    before = {number: signal.signal(number, request.note) for number in _STOPS}
-    try:
+    with _watchdog(), _handling(_STOPS, request.note, lambda: not request.made):
         yield request
+
+
+def _is_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
+@contextmanager
+def _handling(
+    numbers: Iterable[signal.Signals],
+    handler: Callable[[int, FrameType | None], None],
+    is_over: Callable[[], bool] = lambda: True,
+) -> Iterator[None]:
+    """Handle signals within the block; the handlers before are back after it if `is_over`."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
     finally:
-        if not request.made:
-            _restore(before)
-        watchdog.close()
-
-
-def _restore(handlers: dict[signal.Signals, Any]) -> None:
-    for number, handler in handlers.items():
-        signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        for number, earlier in before.items() if is_over() else ():
+            signal.signal(number, signal.SIG_DFL if earlier is None else earlier)
 
 
 class Session:
-    """The node of a command, and the time it spends waiting; made by `ros_session`.
+    """The node of a command, without services and /rosout, and the time it spends waiting."""
 
-    `node` has no parameter services and does not log to /rosout.
-    """
+    _is_interrupted = False
+    _is_held_back = False
 
     def __init__(self, node: Any) -> None:
         from rclpy.executors import SingleThreadedExecutor
@@ -239,8 +237,6 @@ class Session:
         self.node = node
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
-        self._is_interrupted = False
-        self._is_held_back = False
 
     def sleep(self, seconds: float) -> None:
         """Wait without handling messages; as exact as the system's clock is."""
@@ -268,12 +264,12 @@ class Session:
             self._is_held_back = False
 
     def close(self) -> None:
-        """Destroy the node, which tells the network that it goes."""
+        """Destroy the node."""
         self._executor.shutdown()
         self.node.destroy_node()
 
     def check(self, cause: Exception | None = None) -> None:
-        """Raise KeyboardInterrupt once interrupted; `cause` is the exception it came out as.
+        """Raise KeyboardInterrupt once interrupted, `cause` being what the interrupt came out as.
 
         Python swallows an exception that a signal raises within a destructor or a callback:
         long loops call this now and then.
@@ -291,41 +287,29 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
     """
     import rclpy
     from rclpy.context import Context
-    from rclpy.signals import SignalHandlerOptions
 
-    check_surroundings(ros_args)
+    _check_surroundings(ros_args)
     context = Context()
-    with start_errors():
-        options = SignalHandlerOptions.NO
-        rclpy.init(args=[name, *ros_args], context=context, signal_handler_options=options)
+    _init([name, *ros_args], context)
     try:
         with start_errors():
             node = rclpy.create_node(
                 name, context=context, start_parameter_services=False, enable_rosout=False
             )
-        session = Session(node)
-        try:
-            with _signals_to(session):
-                yield session
-        finally:
-            session.close()
+        with contextlib.closing(Session(node)) as session, _signals_to(session):
+            yield session
     finally:
         rclpy.try_shutdown(context=context)
 
 
 @contextmanager
 def _signals_to(session: Session) -> Iterator[None]:
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     # What is ignored on purpose, as by nohup, stays so.
     heeded = [number for number in _INTERRUPTS if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, session.interrupt) for number in heeded}
-    try:
-        yield
-    except Exception as error:
-        # An interrupt within rclpy's bindings may come out of them as another exception.
-        session.check(error)
-        raise
-    finally:
-        _restore(before)
+    with _handling(heeded if _is_main_thread() else (), session.interrupt):
+        try:
+            yield
+        except Exception as error:
+            # An interrupt within rclpy's bindings may come out of them as another exception.
+            session.check(error)
+            raise

@@ -19,28 +19,22 @@ from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.errors import GroundSegError, PointCloudError
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.points import single_precision
+from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
 from gp_ground_seg.ros.input import (
     LOG_PERIOD,
-    Arrival,
     CloudSubscription,
+    TfTilt,
     TimeJumps,
     in_words,
-)
-from gp_ground_seg.ros.lifecycle import (
-    initialize,
-    large_cloud_transport,
-    start_errors,
-    stop_on_signals,
+    require_tf2,
 )
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
-from gp_ground_seg.ros.tf_tilt import TfTilt, require_tf2
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader, LibraryLog
 from gp_ground_seg.segmenter import GroundSegmenter
 
 NODE_NAME = 'ground_segmentation_node'
-INPUT_TOPIC = 'points'
 LONGEST_WAIT = 0.1
 """Time after which a signal is seen at the latest [s]."""
 
@@ -56,10 +50,8 @@ class GroundSegmentationNode(ConfiguredNode):
     for it, is made meanwhile, and takes over between two clouds.
 
     Latency is the time between the arrival of a cloud in this process and the publication of
-    the results, its wait in the queue included. Clouds are counted as dropped where the
-    publisher's own numbering has a hole, see `SequenceGaps`.
-    Options are those of `rclpy.node.Node`. Raises a ConfigError if a given parameter is not
-    accepted.
+    the results, its wait in the queue included. Options are those of `rclpy.node.Node`. Raises
+    a ConfigError if a given parameter is not accepted.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -82,9 +74,9 @@ class GroundSegmentationNode(ConfiguredNode):
     def _start(self) -> None:
         logger = self.get_logger()
         logger.info(f'effective configuration:\n{describe(self.config)}')
-        with start_errors():
+        with lifecycle.start_errors():
             self._outputs = OutputPublishers(self)
-            self._input = CloudSubscription(self, INPUT_TOPIC, self.is_given, self._on_cloud)
+            self._input = CloudSubscription(self, 'points', self.is_given, self._on_cloud)
         self._follow_tf(self.config)
         self._time_jumps = TimeJumps(self, self._on_time_jump)
         self._diagnostics = Diagnostics(self, self._state, self.config.diagnostics)
@@ -128,9 +120,9 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _follow_tf(self, config: Config) -> None:
         """Listen to TF while the parameters ask for it."""
-        if config.frame.level == 'tf' and self._tf is None:
-            self._tf = TfTilt(self)
-        elif config.frame.level != 'tf' and self._tf is not None:
+        if config.frame.level == 'tf':
+            self._tf = self._tf or TfTilt(self)
+        elif self._tf is not None:
             self._tf.close()
             self._tf = None
 
@@ -149,14 +141,14 @@ class GroundSegmentationNode(ConfiguredNode):
         self._segmenter.close()
         self._library_log.close()
 
-    def _on_cloud(self, cloud: PointCloud2, arrival: Arrival) -> None:
+    def _on_cloud(self, cloud: PointCloud2, wait: float, n_lost: int) -> None:
         start = time.monotonic()
         stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
         fields = [field.name for field in cloud.fields]
         health = self._diagnostics
         self._time_jumps.note(stamp)
         health.input.arrived(start, stamp, cloud.header.frame_id, fields)
-        health.processing.arrived(start, arrival.n_lost)
+        health.processing.arrived(start, n_lost)
         try:
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
@@ -170,7 +162,7 @@ class GroundSegmentationNode(ConfiguredNode):
             self._refuse(cloud, f'{type(error).__name__}: {error}')
         else:
             end = time.monotonic()
-            stages = {'queue': arrival.wait, **segmentation.timings, 'publish': end - segmented}
+            stages = {'queue': wait, **segmentation.timings, 'publish': end - segmented}
             health.processing.processed(end - start, stages, segmentation.fit)
             health.model.segmented(segmentation)
             health.output.published(end, topics)
@@ -193,29 +185,21 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _state(self) -> tuple[InputFacts, dict[str, int]]:
         clock = self.get_clock()
-        facts = InputFacts(
-            topic=self._input.topic,
-            qos=in_words(self._input.qos),
-            n_publishers=self._input.n_publishers,
-            ros_time=1e-9 * clock.now().nanoseconds,
-            is_simulated=clock.ros_time_is_active,
-        )
+        topic, qos, n_publishers = self._input.topic, self._input.qos, self._input.n_publishers
+        now, is_simulated = 1e-9 * clock.now().nanoseconds, clock.ros_time_is_active
+        facts = InputFacts(topic, in_words(qos), n_publishers, now, is_simulated)
         return facts, self._outputs.n_subscribers()
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT, SIGTERM or a shutdown of its context; return an exit code.
-
-    `args` are the words after the program's name, those of the process by default. The code
-    is 0, or 2 for an error at start, reported in one line.
-    """
+    """Run the node until a signal or a shutdown; return 0, or 2 for an error at start."""
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None
-    with stop_on_signals() as stop:
+    with lifecycle.stop_on_signals() as stop:
         try:
             # Both outputs at once are more than stock Fast DDS sends without loss.
-            with large_cloud_transport():
-                initialize(words)
+            with lifecycle.large_cloud_transport():
+                lifecycle.initialize(words)
                 node = GroundSegmentationNode()
             executor = SingleThreadedExecutor()
             executor.add_node(node)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2, PointField
@@ -29,30 +29,22 @@ MAX_PROFILES = 60
 MAX_KNOTS = 24
 N_STD = 2.0
 """Half width of the band in standard deviations."""
-LINE_WIDTH = 0.04
-"""[m]."""
+LINE_WIDTH = 0.04  # [m]
 BAND_COLOUR = (0.75, 0.75, 0.75, 0.35)
 
 
 class Output(NamedTuple):
-    """One output topic, relative; an optional one is built only while it has a subscriber.
-
-    `build` makes the message from the input cloud, its segmentation and the parameters.
-    """
+    """One output topic, and how its message is made from the input, its result, the parameters."""
 
     topic: str
     message_type: type
     build: Callable[[PointCloud2, Segmentation, Config], Any]
-    is_optional: bool
+    is_optional: bool  # built only while it has a subscriber
 
 
 def labelled_names(taken: Iterable[str]) -> dict[str, str]:
-    """Return the name of each of `LABELLED_FIELDS` in a cloud whose fields are `taken`.
-
-    A field of the input keeps its name; ours gets ``gp_`` in front, as often as needed.
-    """
-    used = set(taken)
-    names = {}
+    """Return the names of `LABELLED_FIELDS` beside those `taken`: ours get ``gp_`` in front."""
+    used, names = set(taken), {}
     for field in LABELLED_FIELDS:
         name = field
         while name in used:
@@ -68,42 +60,32 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
     Header, order, shape and every byte of every point are the input's; padding of the rows is
     left out. ``is_dense`` tells whether the coordinates and all added values are finite.
     """
-    names = labelled_names(field.name for field in cloud.fields)
-    columns: dict[str, npt.NDArray[np.uint8] | npt.NDArray[np.float32]] = {}
-    is_dense = bool(np.isfinite(read_xyz(cloud)).all())
-    for field, name in names.items():
-        values = getattr(segmentation, field)
+    columns = {}
+    for field, name in labelled_names(field.name for field in cloud.fields).items():
+        columns[name] = getattr(segmentation, field)
         if field != 'label':
             with np.errstate(over='ignore'):
-                values = values.astype(np.float32, copy=False)
-            is_dense = is_dense and bool(np.isfinite(values).all())
-        columns[name] = values
-    wide = append_columns(cloud, columns)
+                columns[name] = columns[name].astype(np.float32, copy=False)
+    placed, step, data = append_columns(cloud, columns)
     added = [
         PointField(name=name, offset=offset, datatype=datatype, count=1)
-        for name, offset, datatype in wide.columns
+        for name, offset, datatype in placed
     ]
-    message = PointCloud2(
-        header=cloud.header,
-        height=cloud.height,
-        width=cloud.width,
-        fields=[*cloud.fields, *added],
-        is_bigendian=cloud.is_bigendian,
-        point_step=wide.point_step,
-        row_step=cloud.width * wide.point_step,
-        is_dense=is_dense,
-    )
-    message.data = message_data(wide.data)
+    message = copy(cloud)
+    message.fields = [*cloud.fields, *added]
+    message.point_step, message.row_step = step, cloud.width * step
+    message.data = message_data(data)
+    known = read_xyz(cloud), *columns.values()
+    message.is_dense = all(bool(np.isfinite(values).all()) for values in known)
     return message
 
 
 def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> Any:
     """Return the ground model as a MarkerArray in the frame of `cloud`.
 
-    ``profiles``: ground height over range, coloured by length-scale from
-    ``length_scale.min`` (dark blue) to ``length_scale.max`` (pale yellow), grey where
-    there is none. ``band``: two standard deviations about it, vertical. Neither is drawn
-    where the standard deviation is above ``label.ground_tolerance``.
+    ``profiles``: ground height over range, coloured by length-scale from ``length_scale.min``
+    to ``length_scale.max``. ``band``: two standard deviations about it, vertical. Neither is
+    drawn where the standard deviation is above ``label.ground_tolerance``.
     """
     from visualization_msgs.msg import Marker, MarkerArray
 
@@ -117,9 +99,8 @@ def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> A
     ends = np.stack([left, left + 1], axis=-1).ravel()
     profiles = _marker(cloud, 'profiles', Marker.LINE_LIST, points.reshape(-1, 3), ends)
     profiles.scale.x = LINE_WIDTH
-    rgb = length_scale_colours(
-        model.length_scale[grid], config.length_scale.min, config.length_scale.max
-    )
+    limits = config.length_scale.min, config.length_scale.max
+    rgb = length_scale_colours(model.length_scale[grid], *limits)
     profiles.colors = _colours(rgb.reshape(-1, 3)[ends])
 
     upper = points.size // 3
@@ -133,7 +114,7 @@ def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> A
 
 
 def _thin(count: int, most: int) -> IntArray:
-    """Return up to `most` indices below `count`, evenly spread, with the first and the last."""
+    """Up to `most` indices below `count`, evenly spread, with the first and the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
@@ -148,10 +129,10 @@ def _marker(
     marker = Marker(header=cloud.header, ns=name, id=0, type=kind, action=action)
     marker.pose.orientation.w = 1.0
     # Pieces share the messages of their vertices: making them takes most of the time.
-    used = {}
-    for k in np.unique(index).tolist():
-        x, y, z = vertices[k].tolist()
-        used[k] = Point(x=x, y=y, z=z)
+    used = {
+        k: Point(**dict(zip('xyz', vertices[k].tolist(), strict=True)))
+        for k in np.unique(index).tolist()
+    }
     marker.points = [used[k] for k in index.tolist()]
     return marker
 
@@ -160,10 +141,8 @@ def _colours(rgb: FloatArray) -> list[Any]:
     """Return the message of each colour (N, 3); similar ones share one."""
     from std_msgs.msg import ColorRGBA
 
-    keys = [tuple(row) for row in np.rint(rgb * 50.0).astype(int).tolist()]
-    shared = {
-        (r, g, b): ColorRGBA(r=r / 50.0, g=g / 50.0, b=b / 50.0, a=1.0) for r, g, b in set(keys)
-    }
+    keys = [tuple(row) for row in (np.rint(rgb * 50.0) / 50.0).tolist()]
+    shared = {(r, g, b): ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in set(keys)}
     return [shared[key] for key in keys]
 
 
@@ -202,28 +181,21 @@ class OutputPublishers:
                 '(sudo apt install ros-jazzy-visualization-msgs)'
             )
         self._renamed: dict[str, str] = {}
-        self._publishers = [
-            (
-                output,
-                node.create_publisher(
-                    output.message_type,
-                    output.topic,
-                    cloud_profile(),
-                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-                ),
+        overrides = QoSOverridingOptions.with_default_policies()
+        self._publishers = []
+        for output in outputs:
+            kind, topic = output.message_type, output.topic
+            publisher = node.create_publisher(
+                kind, topic, cloud_profile(), qos_overriding_options=overrides
             )
-            for output in outputs
-        ]
+            self._publishers.append((output, publisher))
 
     def n_subscribers(self) -> dict[str, int]:
         """Return the number of subscribers of each topic."""
         return {p.topic_name: p.get_subscription_count() for _, p in self._publishers}
 
     def publish(self, cloud: PointCloud2, segmentation: Segmentation, config: Config) -> list[str]:
-        """Publish all outputs of one cloud, or none if one of them cannot be built.
-
-        Returns the topics published to.
-        """
+        """Publish all outputs of a cloud, or none if one cannot be built; return their topics."""
         wanted = [
             (output, publisher)
             for output, publisher in self._publishers

@@ -5,20 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import SetParametersResult as Result
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
 
 from gp_ground_seg.errors import ConfigError, GroundSegError
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.parameters.schema import ParameterSpec, check_typed
-from gp_ground_seg.parameters.yaml_io import OF_EVERY_NODE
+from gp_ground_seg.parameters.schema import OF_EVERY_NODE, ParameterSpec
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.lifecycle import start_errors
 
@@ -37,30 +32,23 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
         dynamic_typing=spec.auto,
     )
     # No step: rclpy would refuse every value off the grid.
+    low, high = spec.minimum, spec.maximum
     if spec.type is float:
-        result.floating_point_range = [
-            FloatingPointRange(from_value=spec.minimum, to_value=spec.maximum)
-        ]
+        result.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
     elif spec.type is int:
-        assert spec.minimum is not None and spec.maximum is not None
-        result.integer_range = [
-            IntegerRange(from_value=int(spec.minimum), to_value=int(spec.maximum))
-        ]
+        assert low is not None and high is not None
+        result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
     return result
 
 
 def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
-    """Return `config` with those of the `parameters` that it declares.
-
-    Raises a ConfigError if a value has another type, is out of range or contradicts another.
-    """
-    return config.replace(
-        **{
-            parameter.name: check_typed(find_spec(parameter.name), parameter.value)
-            for parameter in parameters
-            if parameter.name in _OWN_NAMES
-        }
-    )
+    """Return `config` with those of the `parameters` that it declares, if they are accepted."""
+    values = {
+        parameter.name: find_spec(parameter.name).check_typed(parameter.value)
+        for parameter in parameters
+        if parameter.name in _OWN_NAMES
+    }
+    return config.replace(**values)
 
 
 def describe(config: Config) -> str:
@@ -75,10 +63,7 @@ def describe(config: Config) -> str:
 
 
 class _ParameterService(ParameterService):  # type: ignore[misc]
-    """rclpy's parameter services, of which ``set_parameters`` works in any order.
-
-    If another rclpy calls its method by another name, its own order is back.
-    """
+    """rclpy's services; ``set_parameters`` works in any order, while its method has this name."""
 
     def __init__(self, node: Node) -> None:
         self._set_atomically = node.set_parameters_atomically
@@ -92,18 +77,18 @@ class _ParameterService(ParameterService):  # type: ignore[misc]
 
 def set_in_any_order(
     parameters: Sequence[Parameter],
-    set_atomically: Callable[[list[Parameter]], SetParametersResult],
-) -> list[SetParametersResult]:
+    set_atomically: Callable[[list[Parameter]], Result],
+) -> list[Result]:
     """Set as many parameters as can be set; return the result of each.
 
-    ``ros2 param load`` sends a whole file at once, and rclpy sets its values one by one: one
-    that contradicts a value still to come would be refused. Here all are tried together; if
-    that fails, one by one, and the refused ones again after every round that set any.
+    ``ros2 param load`` sends a whole file at once; set one by one, as rclpy does, a value that
+    contradicts one still to come would be refused. Here all are tried together; if that fails,
+    one by one, and the refused ones again after every round that set any.
     """
     together = set_atomically(list(parameters))
     if together.successful:
         return [together] * len(parameters)
-    results: dict[int, SetParametersResult] = {}
+    results: dict[int, Result] = {}
     pending = list(range(len(parameters)))
     while pending:
         results.update({k: set_atomically([parameters[k]]) for k in pending})
@@ -117,9 +102,8 @@ def set_in_any_order(
 class ConfiguredNode(Node):  # type: ignore[misc]
     """A node, with the options of `rclpy.node.Node`, whose ROS parameters are a `Config`.
 
-    Values set at run time are checked as a whole before anything changes, then given to
-    `apply_config` between two callbacks. Raises a ConfigError if a parameter file or ``-p``
-    gives a value that is not accepted.
+    Values set at run time are checked as a whole before anything changes. Raises a ConfigError
+    if a parameter file or ``-p`` gives a value that is not accepted.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
@@ -131,11 +115,9 @@ class ConfiguredNode(Node):  # type: ignore[misc]
                 start_parameter_services=False,
                 **options,
             )
-        given = {
-            parameter_name: parameter
-            for parameter_name, parameter in self.get_parameters_by_prefix('').items()
-            if parameter_name not in OF_EVERY_NODE
-        }
+        given = self.get_parameters_by_prefix('')
+        for inherited in OF_EVERY_NODE:
+            given.pop(inherited, None)
         # rclpy logs the error and goes on.
         use_sim_time = self.get_parameter('use_sim_time').value
         if not isinstance(use_sim_time, bool):
@@ -173,35 +155,30 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         for name in sorted(self._given_names):
             if self.has_parameter(name):
                 continue
-            is_override = name.startswith(QOS_OVERRIDES)
-            reason = 'no such topic or policy here' if is_override else _unknown(name)
+            reason = _unknown(name)
+            if name.startswith(QOS_OVERRIDES):
+                reason = 'no such topic or policy here'
             self.get_logger().warning(f'parameter {name} is not used: {reason}')
 
-    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set all or none, as the services do.
-
-        Checked before rclpy does, whose reasons for a wrong type or an unknown name do not
-        contain the name.
-        """
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> Result:
+        """Set all or none; checked before rclpy does, whose reasons do not contain the name."""
         for parameter in parameter_list:
             if parameter.name not in _OWN_NAMES and not self.has_parameter(parameter.name):
-                return SetParametersResult(successful=False, reason=_unknown(parameter.name))
+                return Result(successful=False, reason=_unknown(parameter.name))
         result = self._on_set(parameter_list)
-        if not result.successful:
-            return result
-        return super().set_parameters_atomically(parameter_list)
+        return super().set_parameters_atomically(parameter_list) if result.successful else result
 
-    def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
+    def _on_set(self, parameters: list[Parameter]) -> Result:
         # An exception out of here would end the executor and leave the caller waiting.
+        reason = ''
         try:
             self.check_config(changed(self._config, parameters))
         except GroundSegError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            reason = str(error)
         except Exception as error:
             reason = f'{type(error).__name__}: {error}'
             self.get_logger().error(f'parameters could not be checked: {reason}')
-            return SetParametersResult(successful=False, reason=reason)
-        return SetParametersResult(successful=True)
+        return Result(successful=not reason, reason=reason)
 
     def _post_set(self, parameters: list[Parameter]) -> None:
         try:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
@@ -41,20 +42,18 @@ class TrackedPublisher:
     as undelivered once newer ones take their place or their subscribers are gone.
     """
 
+    n_sent = n_pending = _n_missed = 0
+    has_best_effort_subscriber = False
+
     def __init__(self, node: Node, topic: str) -> None:
         self._node = node
         self._publisher = node.create_publisher(PointCloud2, topic, cloud_profile(DEPTH))
         self.topic: str = self._publisher.topic_name
-        self.n_sent = 0
-        self.n_pending = 0
-        self.has_best_effort_subscriber = False
-        self._n_missed = 0
 
     @property
     def n_subscribers(self) -> int:
         """Subscribers that can receive."""
-        n: int = self._publisher.get_subscription_count()
-        return n
+        return int(self._publisher.get_subscription_count())
 
     @property
     def n_undelivered(self) -> int:
@@ -85,26 +84,28 @@ class TrackedPublisher:
 
     def look_at_subscribers(self) -> None:
         """Note whether there is a best-effort one, whose losses stay unknown."""
-        for entry in self._node.get_subscriptions_info_by_topic(self.topic):
-            if entry.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT:
-                self.has_best_effort_subscriber = True
+        self.has_best_effort_subscriber |= any(
+            entry.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+            for entry in self._node.get_subscriptions_info_by_topic(self.topic)
+        )
 
 
 class PlayOptions(NamedTuple):
-    """Speed (1 = as recorded), what is left out and what is played [s], and how."""
+    """What is played, and how."""
 
-    rate: float = 1.0
-    start: float = 0.0
-    duration: float | None = None
-    loop: bool = False
-    clock: bool = False
+    rate: float  # 1 = as recorded
+    start: float  # left out [s]
+    duration: float | None  # played [s]
+    loop: bool
+    clock: bool
 
 
 class Player:
-    """Publishes the PointCloud2 `topics` of a bag, reliably, as the bytes that were recorded.
+    """Publishes PointCloud2 `topics` of a bag as recorded; `pause` waits at most that long [s]."""
 
-    `pause` waits for at most the given time [s]; it is called when there is nothing to send.
-    """
+    _first_sent: float | None = None
+    _last_sent = _worst_delay = 0.0
+    _n_late = 0
 
     def __init__(
         self,
@@ -121,10 +122,6 @@ class Player:
         # Reliable serves both kinds of subscribers.
         profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
         self._clock = node.create_publisher(Clock, '/clock', profile) if options.clock else None
-        self._first_sent: float | None = None
-        self._last_sent = 0.0
-        self._n_late = 0
-        self._worst_delay = 0.0
 
     def topics_without_subscriber(self) -> list[str]:
         """Return the topics, as remapped, that have no subscriber."""
@@ -141,13 +138,7 @@ class Player:
         return True
 
     def play(self, on_cloud: Callable[[], object] = lambda: None) -> None:
-        """Play, and call `on_cloud` before each cloud is sent; see `summary`.
-
-        Raises
-        ------
-        DataError
-            If the bag is damaged, or has no cloud in the time given.
-        """
+        """Play, and call `on_cloud` before each cloud is sent; DataError if there is none."""
         start = self._play_once(time.monotonic(), on_cloud)
         while self._options.loop:
             start = self._play_once(start, on_cloud)
@@ -167,9 +158,9 @@ class Player:
         publishers = self._publishers.values()
         for publisher in publishers:
             publisher.update()
-        n_sent = sum(p.n_sent for p in publishers)
         if self._first_sent is None:
             return ''
+        n_sent = sum(p.n_sent for p in publishers)
         n_topics = sum(p.n_sent > 0 for p in publishers)
         seconds = self._last_sent - self._first_sent
         rate = f' ({(n_sent / n_topics - 1) / seconds:.2f} Hz)' if seconds > 0.0 else ''
@@ -203,19 +194,18 @@ class Player:
         return start + (span + (span / n_periods if n_periods else LONE_PERIOD)) / rate
 
     def _clouds(self) -> Iterator[tuple[str, int, bytes]]:
-        options = self._options
+        start, duration = self._options.start, self._options.duration
         origin = None
-        for topic, recorded, raw in self._bag.messages(list(self._publishers)):
+        for topic, recorded, raw in self._bag.messages(self._publishers):
             origin = recorded if origin is None else origin
             offset = 1e-9 * (recorded - origin)
-            if offset < options.start:
-                continue
-            if options.duration is not None and offset >= options.start + options.duration:
+            if duration is not None and offset >= start + duration:
                 return
-            yield topic, recorded, raw
+            if offset >= start:
+                yield topic, recorded, raw
 
     def _nothing_to_play(self) -> str:
-        times = [recorded for _, recorded, _ in self._bag.messages(list(self._publishers))]
+        times = [recorded for _, recorded, _ in self._bag.messages(self._publishers)]
         span = 1e-9 * (max(times) - min(times)) if times else 0.0
         return (
             f'no cloud in the time asked for (from {self._options.start:g} s on); '
@@ -235,9 +225,7 @@ class Player:
 
     def _publish_time(self, nanoseconds: int) -> None:
         if self._clock is not None:
-            message = Clock()
-            message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 10**9)
-            self._clock.publish(message)
+            self._clock.publish(Clock(clock=Time(nanoseconds=nanoseconds).to_msg()))
 
     def _send(self, topic: str, raw: bytes, due: float) -> None:
         publisher = self._publishers[topic]

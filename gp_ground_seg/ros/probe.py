@@ -20,14 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.data.point_cloud2 import (
-    CloudMessage,
-    cloud_from_columns,
-    decode_cloud,
-    encode_cloud,
-    stamp_of,
-    with_header,
-)
+from gp_ground_seg.data import point_cloud2
+from gp_ground_seg.data.point_cloud2 import CloudMessage, encode_cloud, stamp_of
 from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.ros.lifecycle import Session, large_cloud_transport, ros_session
@@ -49,8 +43,9 @@ _PROBE_PERIOD = 0.2
 _COUNTERS = ('Clouds since startup', 'Dropped since startup')
 _STOP_TIMEOUT = 5.0
 _HIGHEST_DOMAIN = 101  # ports above meet those that Linux hands out
-_NETWORK_VARIABLES = ('ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY')
-_NETWORK = (*_NETWORK_VARIABLES, 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')
+_NETWORK = (
+    'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+)  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -65,18 +60,13 @@ def private_network() -> Iterator[None]:
     try:
         yield
     finally:
-        for name, value in kept.items():
+        for name in _NETWORK:
             os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
+        os.environ.update({name: value for name, value in kept.items() if value is not None})
 
 
 class NodeProcess:
-    """``python -m gp_ground_seg node`` in a second process, for a ``with`` statement.
-
-    `log` is the file for its output, `ros_args` follows ``--ros-args``, and a signal raises
-    no exception within ``uninterrupted()``.
-    """
+    """A node in a second process, for a ``with`` statement; its output goes to the file `log`."""
 
     def __init__(
         self,
@@ -109,16 +99,18 @@ class NodeProcess:
             self._process.kill()
             self._process.wait()
 
-    def log_tail(self, n_lines: int = 20) -> str:
+    def _said(self) -> str:
+        return self._log.read_text(encoding='utf-8', errors='replace')
+
+    def log_tail(self) -> str:
         """Return the last lines of its output."""
-        text = self._log.read_text(encoding='utf-8', errors='replace')
-        return '\n'.join(text.splitlines()[-n_lines:])
+        return '\n'.join(self._said().splitlines()[-20:])
 
     def is_settled(self) -> bool:
         """Return whether it has the backend that it keeps."""
         from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS
 
-        said = self._log.read_text(encoding='utf-8', errors='replace')
+        said = self._said()
         return FOLLOWS not in said or CHANGED in said or STAYS in said
 
     def check(self) -> None:
@@ -148,12 +140,11 @@ def memory(pid: int) -> tuple[int, int]:
     """Return the memory that a process holds now, and the most it ever held [bytes]."""
     path = Path('/proc', str(pid), 'status')
     try:
-        lines = path.read_text(encoding='ascii', errors='replace').splitlines()
+        status = path.read_text(encoding='ascii', errors='replace')
     except OSError as error:
-        raise GroundSegError(
-            f'{path}: {error.strerror}; memory is measured on Linux only'
-        ) from None
-    values = dict(line.partition(':')[::2] for line in lines)
+        hint = 'memory is measured on Linux only'
+        raise GroundSegError(f'{path}: {error.strerror}; {hint}') from None
+    values = dict(line.partition(':')[::2] for line in status.splitlines())
     now, peak = (1024 * int(values[key].split()[0]) for key in ('VmRSS', 'VmHWM'))
     return now, peak
 
@@ -179,14 +170,14 @@ def restamped(clouds: Iterable[CloudMessage], start: int) -> Iterator[CloudMessa
     """Yield `clouds` over and over, with stamps from the second `start` on."""
     for k, cloud in enumerate(itertools.cycle(clouds)):
         seconds, nanoseconds = divmod(k * PERIOD_NS, 10**9)
-        yield with_header(cloud, (start + seconds, nanoseconds))
+        yield point_cloud2.with_header(cloud, (start + seconds, nanoseconds))
 
 
 class Probe:
     """Sends clouds to a node, receives its results reliably, and matches them by stamp.
 
-    `on_back` is called with a cloud that was sent and its results, when both are back;
-    `n_stray` counts the results that belong to no cloud sent, or came a second time.
+    `on_back` is called with a cloud and its results, when both are back; `n_stray` counts the
+    results that belong to no cloud sent, or came a second time.
     """
 
     def __init__(
@@ -210,12 +201,8 @@ class Probe:
         session.node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnosed, 10)
 
     def connect(self, node: NodeProcess, timeout: float = START_TIMEOUT) -> None:
-        """Send empty clouds until both topics have answered and the node is settled.
-
-        Discovery takes its time, each way on its own: only a result proves the connection.
-        Raises a GroundSegError if that takes longer than `timeout` [s], or the node ends.
-        """
-        empty = cloud_from_columns((0, 0), _PROBE_FRAME, {})
+        """Send empty clouds until both topics have answered and the node is settled."""
+        empty = point_cloud2.cloud_from_columns((0, 0), _PROBE_FRAME, {})
         end, next_time, trip = time.monotonic() + timeout, 0.0, Trip(0)
         for cloud in restamped([empty], 1):
             while time.monotonic() < next_time:
@@ -273,7 +260,7 @@ class Probe:
         return processed, dropped
 
     def _send(self, cloud: CloudMessage, raw: bytes | None = None) -> Trip:
-        raw = encode_cloud(cloud) if raw is None else raw
+        raw = raw or encode_cloud(cloud)
         trip = Trip(time.time_ns())
         self._waiting[stamp_of(cloud)] = trip, cloud, {}
         self._publisher.publish(raw)
@@ -289,7 +276,8 @@ class Probe:
         self._waiting.clear()
 
     def _receive(self, topic: str, raw: bytes, info: dict[str, Any]) -> None:
-        self.arrived(topic, decode_cloud(raw), info.get('received_timestamp') or time.time_ns())
+        cloud, now = point_cloud2.decode_cloud(raw), info.get('received_timestamp')
+        self.arrived(topic, cloud, now or time.time_ns())
 
     def arrived(self, topic: str, cloud: CloudMessage, now: int) -> None:
         """Take a result on `topic` that arrived at the system time `now` [ns]."""
@@ -313,12 +301,7 @@ class Probe:
 
 
 def rate_result(asked: float, trips: Sequence[Trip], n_dropped: int) -> dict[str, Any]:
-    """Return the statistics of clouds sent at a rate of `asked` [Hz], times in seconds.
-
-    ``sent`` is the rate that was reached; ``is_accounted`` whether the node reported as
-    dropped, `n_dropped`, what did not come back; ``is_bounded`` whether the latency did not
-    grow from the second quarter to the last. NaN if nothing came back.
-    """
+    """Return the statistics of clouds sent at a rate of `asked` [Hz]; times in seconds."""
     latency = np.array([trip.latency for trip in trips])
     quarter = len(trips) // 4
     early = _percentile(latency[quarter : 2 * quarter], 50)
@@ -346,13 +329,10 @@ def _percentile(latency: FloatArray, q: float) -> float:
 
 
 def memory_result(resident: Sequence[int], peak: int) -> dict[str, float]:
-    """Return the growth of the memory after each cloud, from at least ten values [bytes].
-
-    ``start`` and ``end`` are the medians of the tenth after the first one and of the last.
-    """
-    share = len(resident) // 10
-    start = float(np.median(resident[share : 2 * share]))
-    end = float(np.median(resident[-share:]))
-    n_clouds = len(resident)
+    """Return memory near the start and at the end of ten values or more [bytes]; its growth."""
+    n_clouds, share = len(resident), len(resident) // 10
+    start, end = (
+        float(np.median(part)) for part in (resident[share : 2 * share], resident[-share:])
+    )
     growth = end / start - 1.0
     return {'n_clouds': n_clouds, 'start': start, 'end': end, 'peak': peak, 'growth': growth}

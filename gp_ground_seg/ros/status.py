@@ -60,10 +60,7 @@ class Rate:
         self._events.append((now, n))
 
     def window(self, now: float) -> tuple[int, float, float | None]:
-        """Return the events in the window, the time they span [s], and their rate [Hz].
-
-        The rate is None with less than two times.
-        """
+        """Return events in the window, the time they span [s], their rate [Hz] if they do."""
         while self._events and now - self._events[0][0] > RATE_WINDOW:
             self._events.popleft()
         n_events = sum(n for _, n in self._events)

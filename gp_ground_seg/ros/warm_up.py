@@ -41,15 +41,16 @@ class BackendLoader:
     called in the thread when the backend is there or cannot be made; not after `stop`.
     """
 
+    error = ''
+    seconds = 0.0
+    _backend: Backend | None = None
+    _is_stopped = False
+    _compiler: subprocess.Popen[bytes] | None = None
+    _thread: threading.Thread | None = None
+
     def __init__(self, on_done: Callable[[], None]) -> None:
-        self.error = ''
-        self.seconds = 0.0
         self._on_done = on_done
-        self._backend: Backend | None = None
         self._lock = threading.Lock()
-        self._is_stopped = False
-        self._compiler: subprocess.Popen[bytes] | None = None
-        self._thread: threading.Thread | None = None
 
     @property
     def is_started(self) -> bool:
@@ -78,8 +79,7 @@ class BackendLoader:
         self.stop()
         if self._thread is not None:
             self._thread.join()
-        backend = self.take_backend()
-        if backend is not None:
+        if (backend := self.take_backend()) is not None:
             backend.close()
 
     def _run(self, config: Config) -> None:
@@ -101,21 +101,17 @@ class BackendLoader:
     def _compile(self) -> None:
         """Compile in a child process; raise a RuntimeError if that fails."""
         environment = dict(os.environ)
-        if 'NUMBA_CACHE_DIR' in environment:
-            environment['NUMBA_CACHE_DIR'] = os.path.abspath(environment['NUMBA_CACHE_DIR'])
+        if cache := environment.get('NUMBA_CACHE_DIR'):
+            environment['NUMBA_CACHE_DIR'] = os.path.abspath(cache)
         # Nothing is imported from the current folder, which may be any.
         path = [entry for entry in sys.path if os.path.isabs(entry)]
         with self._lock:
             if self._is_stopped:
                 return
             self._compiler = subprocess.Popen(
-                [sys.executable, '-c', _COMPILE.format(path=path)],
-                cwd='/',
-                env=environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-            )
+                [sys.executable, '-c', _COMPILE.format(path=path)], cwd='/', env=environment,
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+            )  # fmt: skip
         with self._compiler:
             assert self._compiler.stderr is not None
             said = self._compiler.stderr.read().decode(errors='replace').strip()

@@ -16,14 +16,14 @@ from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.simulation.terrain import Terrain
 
 KindArray: TypeAlias = npt.NDArray[np.uint8]
+IntArray: TypeAlias = npt.NDArray[np.intp]
 Interval: TypeAlias = tuple[FloatArray, FloatArray]
-Size: TypeAlias = tuple[float, float, float]
-"""Length, width and height [m]."""
+Size: TypeAlias = tuple[float, float, float]  # length, width, height [m]
 
 BURIED_DEPTH = 3.0
 """How far standing solids reach below the ground at their centre, so that none hovers [m]."""
-WALL_PANEL = 4.0
-"""Longest panel of a wall; each stands on its own piece of ground [m]."""
+WALL_PANEL, WALL_THICKNESS = 4.0, 0.3
+"""Longest panel of a wall, each on its own piece of ground, and its thickness [m]."""
 SMALLEST_RATE = 1e-12
 """Stands in for a zero component of a unit vector; keeps 0 / 0 out of the slab tests."""
 
@@ -50,12 +50,11 @@ _CLASS_AND_REFLECTANCE: dict[Kind, tuple[int, float]] = {
     Kind.REFLECTION: (1, 0.05),  # outlier
     Kind.VEGETATION: (70, 0.3),  # vegetation
 }
-SEMANTIC_KITTI_CLASS = {kind: entry[0] for kind, entry in _CLASS_AND_REFLECTANCE.items()}
 
 
 def semantic_kitti_labels(kind: KindArray) -> npt.NDArray[np.uint32]:
     """Class in SemanticKITTI of each `Kind` code, (N,) uint32, as ``.label`` files hold them."""
-    return np.array(list(SEMANTIC_KITTI_CLASS.values()), dtype=np.uint32)[kind]
+    return np.array([label for label, _ in _CLASS_AND_REFLECTANCE.values()], dtype=np.uint32)[kind]
 
 
 def reflectance(kind: KindArray) -> npt.NDArray[np.float64]:
@@ -72,22 +71,14 @@ class Solid(ABC):
     y: float
     bottom: float
     top: float
-
-    @property
-    @abstractmethod
-    def radius(self) -> float:
-        """Radius of the vertical cylinder around it [m]."""
+    radius: float  # of the vertical cylinder around it
 
     @abstractmethod
     def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
         """Ranges between which rays are inside its outline, seen from above."""
 
     def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
-        """Range [m] at which each ray enters the solid, (R,).
-
-        `origin` [m] and `direction`, unit vectors, are (R, 3). Infinite where a ray misses the
-        solid or starts inside.
-        """
+        """Range [m] at which each ray (R, 3) enters the solid, infinite if it does not, (R,)."""
         result = np.full(len(direction), np.inf)
         offset = origin - np.array([self.x, self.y, 0.0])
         dx, dy = direction[:, 0], direction[:, 1]
@@ -111,11 +102,6 @@ class Box(Solid):
     width: float
     yaw: float
 
-    @property
-    def radius(self) -> float:
-        """Half the diagonal [m]."""
-        return 0.5 * math.hypot(self.length, self.width)
-
     def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         enter, leave = np.full(len(offset), -np.inf), np.full(len(offset), np.inf)
@@ -130,18 +116,11 @@ class Box(Solid):
 class Cylinder(Solid):
     """Upright cylinder."""
 
-    cylinder_radius: float
-
-    @property
-    def radius(self) -> float:
-        """Radius [m]."""
-        return self.cylinder_radius
-
     def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
         xy, rate = offset[:, :2], direction[:, :2]
         a = np.maximum(np.sum(rate * rate, axis=1), SMALLEST_RATE**2)
         half_b = np.sum(xy * rate, axis=1)
-        c = np.sum(xy * xy, axis=1) - self.cylinder_radius**2
+        c = np.sum(xy * xy, axis=1) - self.radius**2
         discriminant = half_b**2 - a * c
         root = np.sqrt(np.maximum(discriminant, 0.0))
         miss = discriminant < 0.0
@@ -166,57 +145,52 @@ def nearest_solid(
     """
     distance = np.full(len(direction), np.inf)
     kind = np.zeros(len(direction), dtype=np.uint8)
-    fan = _Fan(origin, direction) if origin.ndim == 1 else None
     starts = np.broadcast_to(origin, direction.shape)
-    everything = np.arange(len(direction))
+    azimuth = np.arctan2(direction[:, 1], direction[:, 0])
+    order = np.argsort(azimuth)
+    azimuth = azimuth[order]
     for solid in solids:
-        rays = everything if fan is None else fan.towards(solid)
+        rays = order if origin.ndim > 1 else order[_find_towards(solid, origin, azimuth)]
         entry = solid.entry(starts[rays], direction[rays])
         nearer = entry < distance[rays]
         distance[rays[nearer]], kind[rays[nearer]] = entry[nearer], solid.kind
     return distance, kind
 
 
-class _Fan:
-    """Rays from one point, sorted by azimuth: a solid is compared with those towards it only."""
+def _find_towards(solid: Solid, origin: FloatArray, azimuth: FloatArray) -> IntArray:
+    """Return indices into the ascending `azimuth` of rays from `origin` that may meet a solid."""
+    dx, dy = solid.x - origin[0], solid.y - origin[1]
+    distance = math.hypot(dx, dy)
+    if distance <= solid.radius:
+        return np.arange(len(azimuth))
+    # A hair more than the tangents, for rounding.
+    half = math.asin(solid.radius / distance) + 1e-9
+    turns = math.atan2(dy, dx) + np.array([-2.0 * math.pi, 0.0, 2.0 * math.pi])
+    starts, ends = (np.searchsorted(azimuth, turns + side) for side in (-half, half))
+    return np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
 
-    def __init__(self, origin: FloatArray, direction: FloatArray) -> None:
-        azimuth = np.arctan2(direction[:, 1], direction[:, 0])
-        self._order = np.argsort(azimuth)
-        self._azimuth = azimuth[self._order]
-        self._origin = origin
 
-    def towards(self, solid: Solid) -> npt.NDArray[np.intp]:
-        """Rays whose azimuth may meet the solid."""
-        dx, dy = solid.x - self._origin[0], solid.y - self._origin[1]
-        distance = math.hypot(dx, dy)
-        if distance <= solid.radius:
-            return self._order
-        # A hair more than the tangents, for rounding.
-        half = math.asin(solid.radius / distance) + 1e-9
-        middle = math.atan2(dy, dx)
-        turns = np.array([-2.0 * math.pi, 0.0, 2.0 * math.pi])
-        starts = np.searchsorted(self._azimuth, middle - half + turns)
-        ends = np.searchsorted(self._azimuth, middle + half + turns)
-        return np.concatenate(
-            [self._order[start:end] for start, end in zip(starts, ends, strict=True)]
-        )
+def _box(
+    kind: Kind, x: float, y: float, heights: tuple[float, float], size: Size, yaw: float
+) -> Box:
+    length, width, _ = size
+    return Box(kind, x, y, *heights, 0.5 * math.hypot(length, width), length, width, yaw)
 
 
 def standing_box(
     terrain: Terrain, x: float, y: float, size: Size, yaw: float = 0.0, kind: Kind = Kind.BOX
 ) -> Box:
     """Box that stands on the terrain."""
-    ground, (length, width, height) = float(terrain.height(x, y)), size
-    return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, length, width, yaw)
+    ground = float(terrain.height(x, y))
+    return _box(kind, x, y, (ground - BURIED_DEPTH, ground + size[2]), size, yaw)
 
 
 def floating_box(
     terrain: Terrain, x: float, y: float, size: Size, clearance: float, kind: Kind = Kind.OVERHANG
 ) -> Box:
     """Box that floats `clearance` [m] over the terrain."""
-    bottom, (length, width, height) = float(terrain.height(x, y)) + clearance, size
-    return Box(kind, x, y, bottom, bottom + height, length, width, yaw=0.0)
+    bottom = float(terrain.height(x, y)) + clearance
+    return _box(kind, x, y, (bottom, bottom + size[2]), size, 0.0)
 
 
 def pole(
@@ -243,16 +217,12 @@ def truck(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Box, 
 
 
 def wall(
-    terrain: Terrain,
-    start: tuple[float, float],
-    end: tuple[float, float],
-    height: float,
-    thickness: float = 0.3,
+    terrain: Terrain, start: tuple[float, float], end: tuple[float, float], height: float
 ) -> tuple[Box, ...]:
     """Wall from `start` to `end` (x, y) [m], in panels that follow the ground."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     n_panels = max(1, math.ceil(math.hypot(dx, dy) / WALL_PANEL))
-    size = (math.hypot(dx, dy) / n_panels, thickness, height)
+    size = (math.hypot(dx, dy) / n_panels, WALL_THICKNESS, height)
     middles = (np.arange(n_panels) + 0.5) / n_panels
     yaw = math.atan2(dy, dx)
     return tuple(
@@ -263,6 +233,5 @@ def wall(
 
 def tree(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
     """Tree: a trunk and a floating crown."""
-    crown, clearance = 3.0, 2.5
-    trunk = pole(terrain, x, y, clearance + 0.5, 0.18)
-    return trunk, floating_box(terrain, x, y, (crown, crown, crown), clearance, Kind.VEGETATION)
+    trunk = pole(terrain, x, y, height=3.0, radius=0.18)
+    return trunk, floating_box(terrain, x, y, (3.0, 3.0, 3.0), 2.5, Kind.VEGETATION)

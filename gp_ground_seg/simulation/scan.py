@@ -1,36 +1,110 @@
-"""Scans of a scene: one turn of the sensor, a drive, a SemanticKITTI sequence."""
+"""LiDARs, spinning or without rings; their scans of a scene, and drives through it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
-from gp_ground_seg.data.atomic_output import staged_folder
-from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.frame import FloatArray
-from gp_ground_seg.simulation.objects import (
-    Kind,
-    KindArray,
-    nearest_solid,
-    reflectance,
-    semantic_kitti_labels,
-)
-from gp_ground_seg.simulation.raycast import first_hit
+from gp_ground_seg.simulation.objects import Kind, KindArray, nearest_solid, reflectance
 from gp_ground_seg.simulation.scenes import Scene
-from gp_ground_seg.simulation.sensor import SensorModel
-from gp_ground_seg.simulation.terrain import Terrain
+from gp_ground_seg.simulation.terrain import Terrain, first_hit
 
 FRAME_PERIOD = 0.1
 """Time of one turn of the sensor [s]."""
 REFLECTION_MIN_DEPTH = 0.1
-"""A mirrored point less deep below the ground than this is the road itself to any sensor [m]."""
+"""A mirrored point less deep below the ground than this is the road itself [m]."""
 INTENSITY_STD = 0.05
 PLUMB_LINE = 200.0
 """How far above a point the search for the ground below it starts, for a tilted sensor [m]."""
+
+# Multiples of these fill the unit square evenly: the powers of the plastic number, the
+# two-dimensional counterpart of the golden ratio.
+_PLASTIC = 1.32471795724474602596
+_STRIDES = np.array([1.0 / _PLASTIC, 1.0 / _PLASTIC**2])
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """A spinning LiDAR and how it is mounted."""
+
+    name: str
+    elevations: tuple[float, ...]  # of each beam [rad], highest first
+    n_columns: int  # firings per turn
+    min_range: float  # nothing nearer is reported [m]
+    max_range: float  # nor anything farther [m]
+    range_std: float  # standard deviation of the range noise, along the ray [m]
+    height: float  # above the ground under the sensor [m]
+    dropout: float = 0.02  # probability that a return is lost
+    # Tilt against the level vehicle [rad] (REP-103):
+    roll: float = 0.0  # positive lowers the right side
+    pitch: float = 0.0  # positive lowers the nose
+
+    def directions(self, phase: float) -> FloatArray:
+        """Return the unit vectors of all rays in the sensor frame, (R, 3).
+
+        Ring by ring from the highest beam down; within a ring counter-clockwise from the
+        azimuth `phase` [rad], 0 = straight ahead, as in KITTI's files.
+        """
+        turn = phase + np.arange(self.n_columns) * (2.0 * math.pi / self.n_columns)
+        azimuth, elevation = np.broadcast_arrays(turn, np.asarray(self.elevations)[:, None])
+        flat = np.cos(elevation)
+        rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
+        return rays.reshape(-1, 3)
+
+    def rotation(self) -> FloatArray:
+        """Matrix (3, 3) from the sensor frame to that of the level vehicle."""
+        matrix: FloatArray = Rotation.from_euler('YX', [self.pitch, self.roll]).as_matrix()
+        return matrix
+
+
+@dataclass(frozen=True)
+class ScatterModel(SensorModel):
+    """A LiDAR without rings: rays fill the field between two `elevations`; `n_columns` is 1."""
+
+    n_points: int = 20_000  # rays of one scan
+
+    def directions(self, phase: float) -> FloatArray:
+        """Return the unit vectors of all rays, (n_points, 3); `phase` changes all of them."""
+        turns = phase / (2.0 * math.pi)
+        spread = (np.arange(self.n_points)[:, None] * _STRIDES + [turns, 7.0 * turns]) % 1.0
+        azimuth = 2.0 * math.pi * spread[:, 0]
+        high, low = np.sin(self.elevations)
+        # Evenly over the sphere, not over the angle.
+        up = high + (low - high) * spread[:, 1]
+        flat = np.sqrt(1.0 - up**2)
+        rays: FloatArray = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up])
+        return rays
+
+
+def _beams(*blocks: tuple[float, float, int]) -> tuple[float, ...]:
+    """Elevations [rad] of blocks of evenly spaced beams: (highest, lowest [deg], number)."""
+    degrees = np.concatenate([np.linspace(high, low, n) for high, low, n in blocks])
+    return tuple(np.radians(degrees).tolist())
+
+
+# Fields of view, ranges and accuracies are those of the makers' data sheets, columns those at
+# 10 turns a second. Heights are typical mounts: KITTI's car for the HDL-64E, nuScenes' roof for
+# the HDL-32E, field robots for the VLP-16 and the Mid-360.
+HDL_64E, HDL_32E, VLP_16, OS1_128 = (
+    SensorModel(name, _beams(*blocks), n_columns, nearest, farthest, range_std, height)
+    for name, blocks, n_columns, nearest, farthest, range_std, height in (
+        ('hdl-64e', ((2.0, -8.33, 32), (-8.83, -24.33, 32)), 2000, 0.9, 120.0, 0.02, 1.73),
+        ('hdl-32e', ((10.67, -30.67, 32),), 2170, 0.9, 100.0, 0.02, 1.84),
+        ('vlp-16', ((15.0, -15.0, 16),), 1800, 0.5, 100.0, 0.03, 0.8),
+        ('os1-128', ((22.5, -22.5, 128),), 1024, 0.8, 120.0, 0.015, 1.8),
+    )
+)
+MID_360 = ScatterModel(
+    'mid-360', (math.radians(52.0), math.radians(-7.0)), 1, 0.1, 40.0, range_std=0.02, height=0.5
+)
+SENSORS = {sensor.name: sensor for sensor in (HDL_64E, HDL_32E, VLP_16, OS1_128, MID_360)}
+"""The preset sensors by name."""
 
 
 @dataclass(frozen=True)
@@ -41,23 +115,15 @@ class SimulatedScan:
     return are absent.
     """
 
-    points: npt.NDArray[np.float32]
-    """x forward, y left, z up in the sensor frame [m], intensity in [0, 1], (N, 4)."""
-    ring: npt.NDArray[np.uint16]
-    """Beam of each point, 0 = highest, (N,)."""
-    is_ground: npt.NDArray[np.bool_]
-    """Whether the ray hit the terrain, (N,)."""
+    points: npt.NDArray[np.float32]  # (N, 4) x forward, y left, z up [m], intensity in [0, 1]
+    is_ground: npt.NDArray[np.bool_]  # (N,) whether the ray hit the terrain
+    # (N,) exact height of the terrain under (or over) each point along the sensor's z axis, sensor
+    # frame [m]; over a vertical step that of one side.
     ground_z: FloatArray
-    """Exact terrain height under (or over) each point along the sensor's z axis, sensor frame [m],
-    (N,). Over a vertical step it is that of one side."""
-    kind: KindArray
-    """`Kind` that the ray hit, (N,)."""
-    time: float
-    """Time since the start of the drive [s]."""
-    position: FloatArray
-    """Position of the sensor in the world [m], (3,)."""
-    rotation: FloatArray
-    """Matrix (3, 3) that turns vectors of the sensor frame into the world's."""
+    kind: KindArray  # (N,) `Kind` that the ray hit
+    time: float  # since the start of the drive [s]
+    position: FloatArray  # (3,) of the sensor in the world [m]
+    rotation: FloatArray  # (3, 3) turns vectors of the sensor frame into the world's
 
 
 def simulate_scan(
@@ -65,26 +131,21 @@ def simulate_scan(
     sensor: SensorModel,
     rng: np.random.Generator,
     x: float = 0.0,
-    y: float = 0.0,
-    yaw: float = 0.0,
     time: float = 0.0,
 ) -> SimulatedScan:
-    """Scan the scene from one place.
+    """Scan the scene at `time` [s] from the place `x` [m] of the drive.
 
-    The vehicle is at `x`, `y` [m], heads to `yaw` [rad], and the sensor is `sensor.height` above
-    the ground there. Every ray has its own random numbers, drawn from `rng` whether or not it hits
-    anything: the same generator state gives the same noise in another scene. `time` [s] is only
-    passed on to the scan.
+    Every ray has its own random numbers, drawn from `rng` whether or not it hits anything: the
+    same generator state gives the same noise in another scene.
     """
-    n_rays = sensor.n_rays
-    phase = rng.uniform(0.0, 2.0 * np.pi / sensor.n_columns)
+    beams = sensor.directions(rng.uniform(0.0, 2.0 * np.pi / sensor.n_columns))
+    n_rays = len(beams)
     mirror_draw, drop_draw = rng.random(n_rays), rng.random(n_rays)
     range_noise, intensity_noise = rng.standard_normal(n_rays), rng.standard_normal(n_rays)
 
-    beams = sensor.directions(phase)
-    rotation = sensor.rotation(yaw)
+    rotation = sensor.rotation()
     direction = beams @ rotation.T
-    position = np.array([x, y, float(scene.terrain.height(x, y)) + sensor.height])
+    position = np.array([x, 0.0, float(scene.terrain.height(x, 0.0)) + sensor.height])
     origin = np.broadcast_to(position, direction.shape)
 
     distance = first_hit(scene.terrain, origin, direction, sensor.max_range)
@@ -95,25 +156,15 @@ def simulate_scan(
     _mirror(scene, origin, direction, distance, kind, mirror_draw)
 
     measured = distance + sensor.range_std * range_noise
-    kept = np.flatnonzero(
-        (measured >= sensor.min_range)
-        & (measured <= sensor.max_range)
-        & (drop_draw >= sensor.dropout)
-    )
+    is_in_range = (measured >= sensor.min_range) & (measured <= sensor.max_range)
+    kept = np.flatnonzero(is_in_range & (drop_draw >= sensor.dropout))
     kind = kind[kept]
     points = np.empty((len(kept), 4), dtype=np.float32)
     points[:, :3] = beams[kept] * measured[kept, None]
     points[:, 3] = np.clip(reflectance(kind) + INTENSITY_STD * intensity_noise[kept], 0.0, 1.0)
-    return SimulatedScan(
-        points=points,
-        ring=sensor.rings()[kept],
-        is_ground=kind == Kind.TERRAIN,
-        ground_z=ground_below(scene.terrain, points, position, rotation),
-        kind=kind,
-        time=time,
-        position=position,
-        rotation=rotation,
-    )
+    ground_z = _ground_below(scene.terrain, points, position, rotation)
+    is_ground = kind == Kind.TERRAIN
+    return SimulatedScan(points, is_ground, ground_z, kind, time, position, rotation)
 
 
 def _mirror(
@@ -124,11 +175,7 @@ def _mirror(
     kind: KindArray,
     draw: FloatArray,
 ) -> None:
-    """Move hits on wet road to the mirror images of solids, in place.
-
-    The measured range is the length of the whole path of the light, so that the image is
-    straight on along the ray, below the ground.
-    """
+    """Move hits on wet road, in place, to the mirror images of solids, farther along the ray."""
     ray = np.flatnonzero((kind == Kind.TERRAIN) & np.isfinite(distance))
     foot = origin[ray] + distance[ray, None] * direction[ray]
     reflectivity = np.zeros(len(ray))
@@ -150,14 +197,10 @@ def _mirror(
     distance[ray[deep]], kind[ray[deep]] = total[deep], Kind.REFLECTION
 
 
-def ground_below(
+def _ground_below(
     terrain: Terrain, points: npt.NDArray[np.floating], position: FloatArray, rotation: FloatArray
 ) -> FloatArray:
-    """Exact terrain height along the sensor's z axis under each point, sensor frame, (N,) [m].
-
-    `points`, (N, >= 3) [m], are in the sensor frame; see `SimulatedScan` for the others. Where a
-    tilted axis meets the terrain more than once, it is the highest.
-    """
+    """`SimulatedScan.ground_z`; where a tilted axis meets the terrain often, the highest."""
     local = points[:, :3].astype(np.float64)
     world = local @ rotation.T + position
     up = rotation[:, 2]
@@ -173,56 +216,9 @@ def ground_below(
 def simulate_drive(
     scene: Scene, sensor: SensorModel, n_frames: int, speed: float, seed: int
 ) -> Iterator[SimulatedScan]:
-    """Drive along x from the origin at `speed` [m/s], ten scans a second.
-
-    The sensor stays `sensor.height` above the ground under it and does not follow its slope.
-    `seed` is that of all noise; the scene has its own. Raises ConfigError if a value is out of
-    range.
-    """
-    if n_frames < 1 or not np.isfinite(speed):
-        raise ConfigError(
-            f'drive: n_frames = {n_frames}, speed = {speed}: must be >= 1 and finite'
-        )
+    """Drive along x from the origin at `speed` [m/s], ten scans a second; `seed` is of noise."""
     rng = np.random.default_rng(seed)
     return (
         simulate_scan(scene, sensor, rng, x=speed * k * FRAME_PERIOD, time=k * FRAME_PERIOD)
         for k in range(n_frames)
     )
-
-
-def write_semantic_kitti(scans: Iterable[SimulatedScan], root: str | Path, sequence: str) -> Path:
-    """Write ``root/sequences/<sequence>/{velodyne/*.bin, labels/*.label, times.txt}``.
-
-    The sequence appears whole or not at all; missing parent folders are made. Returns its folder.
-    Raises DataError if the name is not that of a folder, the sequence exists, there is no scan,
-    or the folder cannot be written.
-    """
-    root = Path(root)
-    if not sequence or sequence in ('.', '..') or Path(sequence).name != sequence:
-        raise DataError(f'sequence {sequence!r}: must be the name of one folder')
-    target = root / 'sequences' / sequence
-    if target.exists() or target.is_symlink():
-        raise DataError(f'{target}: exists; remove it or choose another sequence')
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f'{target}: {error.strerror or error}') from error
-    with staged_folder(target, force=False, is_ours=lambda _: False) as folder:
-        _write(scans, folder)
-    return target
-
-
-def _write(scans: Iterable[SimulatedScan], folder: Path) -> None:
-    (folder / 'velodyne').mkdir(parents=True)
-    (folder / 'labels').mkdir()
-    times = []
-    for k, scan in enumerate(scans):
-        points = scan.points.astype('<f4')
-        labels = semantic_kitti_labels(scan.kind).astype('<u4')
-        (folder / 'velodyne' / f'{k:06d}.bin').write_bytes(points.tobytes())
-        (folder / 'labels' / f'{k:06d}.label').write_bytes(labels.tobytes())
-        times.append(scan.time)
-    if not times:
-        raise DataError(f'sequence {folder.name}: no scan to write')
-    text = ''.join(f'{time:e}\n' for time in times)
-    (folder / 'times.txt').write_text(text, encoding='utf-8')

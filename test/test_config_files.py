@@ -1,0 +1,263 @@
+"""Parameter files: those made from the declarations, presets, checks and comparison."""
+
+import dataclasses
+import os
+import re
+from collections import Counter
+from contextlib import closing
+
+import numpy as np
+import pytest
+import yaml
+from cli_runner import error_line, run
+from config_samples import configs
+from conftest import REPOSITORY
+from hypothesis import given, settings
+
+from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
+from gp_ground_seg.parameters.config import parameter_specs
+from gp_ground_seg.parameters.export import (
+    README_BEGIN,
+    README_END,
+    file_problems,
+    generated_files,
+    to_markdown_table,
+    to_yaml,
+)
+from gp_ground_seg.parameters.presets import PRESETS, find_preset
+from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
+
+GENERATE = 'run: python -m gp_ground_seg config generate'
+
+
+@settings(max_examples=40)
+@given(configs())
+def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
+    """ROS parameters are typed: 2 is not a double, and 1e-05 without a point is no number."""
+    path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
+    path.write_text(to_yaml(config), encoding='utf-8')
+    assert Config.from_yaml(path) == config
+    assert file_problems(path) == []
+    document = yaml.safe_load(path.read_text())
+    assert document == {'/**': {'ros__parameters': config.nested()}}
+    for spec in parameter_specs():
+        group, name = spec.name.split('.')
+        value = document['/**']['ros__parameters'][group][name]
+        assert type(value) is spec.type or (spec.auto and value == 'auto')
+
+
+def test_every_parameter_is_explained_above_it():
+    lines = to_yaml(Config()).splitlines()
+    assert max(len(line) for line in lines) <= 99
+    assert all(line == line.rstrip() for line in lines)
+    specs = iter(parameter_specs())
+    words = ''
+    for line in (line for line in lines if line.startswith('      ')):
+        if line[6] == '#':
+            words += line.strip(' #') + ' '
+            continue
+        spec = next(specs)
+        assert line.startswith(f'      {spec.name.split(".")[1]}: ')
+        assert all(part in words for part in (spec.description, spec.unit, spec.symbol))
+        if spec.type in (int, float):
+            assert f'{spec.minimum:.10g} to {spec.maximum:.10g}' in words
+        else:
+            expected = ['true or false'] if spec.type is bool else spec.choices or ['[a name]']
+            assert all(choice in words for choice in expected)
+        words = ''
+    assert next(specs, None) is None
+
+
+def test_generated_files_are_up_to_date():
+    files = generated_files((REPOSITORY / 'README.md').read_text(encoding='utf-8'))
+    assert set(files) == {
+        'README.md', 'docs/parameters.md', *(f'config/{name}.yaml' for name in PRESETS)
+    }  # fmt: skip
+    for name, text in files.items():
+        assert (REPOSITORY / name).read_text(encoding='utf-8') == text, GENERATE
+    assert {f'config/{path.name}' for path in (REPOSITORY / 'config').glob('*.yaml')} <= set(files)
+
+
+def test_tables_have_a_row_for_each_parameter(capsys):
+    assert run('config', 'table') == 0
+    table = capsys.readouterr().out
+    header, rule, *rows = table.splitlines()
+    assert set(rule) <= set('| -')
+    assert len(rows) == len(parameter_specs())
+    for row, spec in zip(rows, parameter_specs(), strict=True):
+        cells = row.replace(r'\|', '\0').split('|')
+        assert len(cells) == len(header.split('|'))
+        cells = [cell.strip().replace('\0', '|') for cell in cells[1:-1]]
+        assert cells[0] == f'`{spec.name}`'
+        assert yaml.safe_load(cells[1].strip('`')) == spec.default
+        symbol = f'`{spec.symbol}`' if spec.symbol else ''
+        assert cells[3:] == [spec.unit, symbol, spec.description]
+    # README.md has the basic ones, the page all of them.
+    files = generated_files(f'{README_BEGIN}{README_END}')
+    assert files['docs/parameters.md'].endswith(table)
+    is_basic = [spec.basic for spec in parameter_specs()]
+    basic = [row for row, wanted in zip(rows, is_basic, strict=True) if wanted]
+    assert [row for row in files['README.md'].splitlines() if row.startswith('| `')] == basic
+
+
+def test_generate_rewrites_what_is_generated_and_nothing_else(tmp_path, capsys):
+    readme = tmp_path / 'README.md'
+    head, tail = '# Title — ünïcode\r\n\r\ntext\n', '\n\nmore\n'
+    readme.write_bytes(f'{head}{README_BEGIN}\nold\n{README_END}{tail}'.encode())
+    n_files = 2 + len(PRESETS)
+    assert run('config', 'generate', tmp_path) == 0
+    assert capsys.readouterr().out.count('rewritten') == n_files
+    text = readme.read_bytes().decode()
+    table = to_markdown_table(basic_only=True)
+    assert text == f'{head}{README_BEGIN}\n\n{table}\n{README_END}{tail}'
+    for name, preset in PRESETS.items():
+        assert Config.from_yaml(tmp_path / 'config' / f'{name}.yaml') == preset.config
+
+    def times():
+        return {path: os.stat(path).st_mtime_ns for path in tmp_path.rglob('*')}
+
+    before = times()
+    assert run('config', 'generate', tmp_path) == 0
+    assert capsys.readouterr().out.count('unchanged') == n_files
+    assert times() == before
+    assert len([path for path in before if path.is_file()]) == n_files
+
+
+@pytest.mark.parametrize('marks', ['', 'b', 'e', 'eb', 'bbe', 'bee', None])
+def test_generate_needs_a_readme_with_its_markers(tmp_path, capsys, marks):
+    path, message = tmp_path / 'README.md', 'name the root of a checkout'
+    if marks is not None:
+        message = f'{path}: must hold the lines {README_BEGIN} and {README_END} once each'
+        path.write_text('\n'.join({'b': README_BEGIN, 'e': README_END}[mark] for mark in marks))
+    before = [(file, file.read_text()) for file in tmp_path.iterdir()]
+    assert run('config', 'generate', tmp_path) == 2
+    assert message in error_line(capsys)
+    assert [(file, file.read_text()) for file in tmp_path.iterdir()] == before
+
+
+def test_the_presets_are_those_promised_and_another_is_refused(capsys):
+    assert run('config', 'presets') == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(PRESETS)
+    assert list(PRESETS) == ['default', 'paper', 'hdl64', 'hdl32', 'vlp16', 'os1_128', 'mid360']
+    assert PRESETS['default'].config == Config()
+    with pytest.raises(ConfigError, match=r"'vlp-16'; did you mean vlp16\? \(there are default,"):
+        find_preset('vlp-16')
+
+
+@pytest.mark.parametrize('preset', PRESETS.values(), ids=lambda preset: preset.name)
+def test_a_dumped_preset_is_its_file_with_a_reason_for_every_override(preset, capsys):
+    assert run('config', 'dump', '--preset', preset.name) == 0
+    text = (REPOSITORY / 'config' / f'{preset.name}.yaml').read_text(encoding='utf-8')
+    assert capsys.readouterr().out == text, GENERATE
+    words = ' '.join(re.sub(r'^\s*#', '', line).strip() for line in text.splitlines())
+    words = ' '.join(words.split())
+    assert preset.purpose in words
+    for name, (value, reason) in preset.overrides.items():
+        assert preset.config[name] == value
+        assert reason
+        assert f'Here: {reason} (default ' in words
+
+
+def test_the_paper_preset_has_none_of_our_departures():
+    """What docs/algorithm.md says switches a departure back is switched back."""
+    text = (REPOSITORY / 'docs' / 'algorithm.md').read_text(encoding='utf-8')
+    cells = [line.split('|')[2] for line in text.splitlines() if line.startswith('| **')]
+    settings = ' '.join(re.findall(r'`([^`]+)`', ' '.join(cells))).split()
+    # The paper learns L-bar; keeping the first guess is no switch back.
+    switches = [s.split('=') for s in settings if not s.startswith('learning.fixed')]
+    assert len(switches) >= 7
+    paper = PRESETS['paper'].config
+    for name, value in switches:
+        assert str(paper[name]) in (value, f'{value}.0'), f'{name} of the preset paper'
+    label, growth = paper.label, paper.growth
+    assert label.ground_tolerance == label.obstacle_tolerance == label.below_tolerance
+    assert paper.faces.min_height > label.obstacle_max_height
+    assert growth.max_standardised_depth == growth.max_standardised_residual
+
+
+def test_check_says_everything_at_once(tmp_path, capsys):
+    path = tmp_path / 'my.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters:\n    use_sim_time: true\n'
+        '    lable: {ground_tolerance: 0.2}\n'
+        '    label: {ground_tolerance: 9.0}\n'
+        '    sensor: {height: 2}\n'
+        '    grid: {n_segments: many}\n'
+    )
+    good = tmp_path / 'good.yaml'
+    good.write_text('label: {ground_tolerance: 0.15}\nsensor: {height: 2}\n')
+    assert run('config', 'check', path, good) == 2
+    out, err = capsys.readouterr()
+    lines = err.splitlines()
+    assert len(lines) == 4
+    assert all(line.startswith(f'{path}: ') for line in lines)
+    assert 'did you mean label.ground_tolerance?' in lines[0]
+    assert 'label.ground_tolerance = 9.0: must be a number in [0.001, 5] m' in lines[1]
+    assert 'with a decimal point as in 2.0' in lines[2]
+    assert "grid.n_segments = 'many'" in lines[3]
+    n = len(parameter_specs())
+    assert out == f'{good}: good; 2 of {n} parameters given, 2 differ from the defaults\n'
+    for text, problem in (
+        ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
+        ('grid: [', 'not valid YAML'),
+        ('a: 1\na: 2', 'given twice'),
+    ):
+        good.write_text(text)
+        (found,) = file_problems(good)
+        assert problem in found
+    (found,) = file_problems(tmp_path / 'missing.yaml')
+    assert 'No such file' in found
+
+
+def test_diff_of_files_and_presets(tmp_path, capsys):
+    path = tmp_path / 'my.yaml'
+    path.write_text('learning: {mode: fixed}\nlabel: {ground_tolerance: 0.15}\n')
+    assert run('config', 'diff', 'default', path) == 1
+    assert capsys.readouterr().out == (
+        f'label.ground_tolerance: {Config().label.ground_tolerance} -> 0.15 m\n'
+        f'learning.mode: {Config().learning.mode} -> fixed\n'
+    )
+    assert run('config', 'diff', path, path) == 0
+    assert run('config', 'diff', 'default', REPOSITORY / 'config' / 'default.yaml') == 0
+    assert capsys.readouterr().out == ''
+    assert run('config', 'diff', 'default', 'vlp17') == 2
+    assert 'vlp17: No such file' in capsys.readouterr().err
+
+
+def test_file_goes_over_preset_and_setting_over_file(tmp_path, capsys):
+    path = tmp_path / 'my.yaml'
+    path.write_text('grid: {n_bins: 77, n_segments: 66}\n')
+    words = '--preset', 'paper', '--config', path, '--set', 'grid.n_segments=55'
+    assert run('config', 'dump', *words) == 0
+    text = capsys.readouterr().out
+    path.write_text(text)
+    expected = PRESETS['paper'].config.replace(**{'grid.n_bins': 77, 'grid.n_segments': 55})
+    assert Config.from_yaml(path) == expected
+    assert 'Here: one zeta_g for all' in text
+    # That is why the preset has 120 bins; these are others.
+    assert 'Here: N in section IV' not in text
+    assert 'Preset paper' not in text
+    assert run('segment', 'x.bin', '--preset', 'velodyne') == 2
+    assert run('config', 'dump', '--set', 'sensor.hight=2.5') == 2
+
+
+@pytest.mark.parametrize(
+    ('name', 'sensor'),
+    [('hdl64', 'hdl-64e'), ('hdl32', 'hdl-32e'), ('vlp16', 'vlp-16'), ('os1_128', 'os1-128'),
+     ('mid360', 'mid-360')],
+)  # fmt: skip
+def test_presets_fit_their_sensors(name, sensor):
+    """Ground IoU on two simulated scenes each, level and sloped."""
+    config = PRESETS[name].config
+    # A preset knows the sensor, not where it is mounted.
+    assert set(dataclasses.astuple(config.sensor)) == {'auto'}
+    with closing(GroundSegmenter(config)) as segmenter:
+        for scene in ('flat', 'slope'):
+            both = Counter()
+            for seed in (0, 1):
+                rng = np.random.default_rng(seed)
+                scan = simulate_scan(SCENES[scene](seed), SENSORS[sensor], rng)
+                found = segmenter.segment(scan.points).label == Label.GROUND
+                both['common'] += int((found & scan.is_ground).sum())
+                both['either'] += int((found | scan.is_ground).sum())
+            assert 100.0 * both['common'] / both['either'] >= 95.0, scene
