@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gp_ground_seg.frame import Candidates, FloatArray, Frame, IntArray
+from gp_ground_seg.frame import FloatArray, Frame, IntArray
 from gp_ground_seg.gp.kernels import squared_exponential
 from gp_ground_seg.gp.linalg import Padded, add_noise, batches
 from gp_ground_seg.parameters.config import LengthScaleConfig
@@ -66,73 +66,30 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
 def given_log_length_scales(
     frame: Frame, length_scale: LengthScaleConfig
 ) -> tuple[FloatArray, FloatArray]:
-    """Log length-scales without a latent process; returns as `latent_log_length_scales`."""
-    candidates, knots = frame.candidates, frame.knots
+    """Log length-scales without a latent process; returns as `latent_log_length_scales`.
+
+    One constant, or those of the lines: linear between the candidates.
+    """
+    candidates, knots, n_knots = frame.candidates, frame.knots, n_wanted_knots(frame)
     if length_scale.model == 'constant':
         u = np.full(len(candidates.r), np.log(length_scale.constant))
     else:
         of_lines = line_gradient_length_scale(frame.lines.slope, length_scale)
         u = np.log(of_lines)[frame.lines.line]
-    at_knots = interpolate_along_segments(candidates, u, knots)
-    is_wanted = np.arange(len(knots)) < n_wanted_knots(frame)[:, None]
-    return u, np.where(is_wanted, at_knots, np.nan)
+    at_knots = np.full((len(n_knots), len(knots)), np.nan)
+    for m in np.flatnonzero(n_knots):
+        own, n = slice(candidates.offsets[m], candidates.offsets[m + 1]), n_knots[m]
+        at_knots[m, :n] = np.interp(knots[:n], candidates.r[own], u[own])
+    return u, at_knots
 
 
 def line_gradient_length_scale(slope: FloatArray, length_scale: LengthScaleConfig) -> FloatArray:
-    """Length-scale of lines with the given slopes (Chen et al. 2014, method "Z").
+    """Length-scale of lines of these slopes, (Q,) [m] (Chen et al. 2014, method "Z").
 
-    ``l = a log(1 / max(|slope|, flat_gradient))``, kept within the bounds.
-    A line of one point has no slope (NaN) and gets the smallest length-scale.
-
-    Parameters
-    ----------
-    slope : (Q,) float64
-        Slope dz/dr of each line.
-    length_scale : LengthScaleConfig
-        Gain, flat slope and bounds.
-
-    Returns
-    -------
-    (Q,) float64
-        Length-scales [m].
+    ``l = a log(1 / max(|slope|, flat_gradient))``, kept within the bounds. A line of one point
+    has no slope (NaN) and gets the smallest length-scale.
     """
     steepness = np.maximum(np.abs(slope), length_scale.flat_gradient)
     value = -length_scale.gradient_gain * np.log(steepness)
     value = np.where(np.isnan(slope), length_scale.min, value)
     return np.clip(value, length_scale.min, length_scale.max)
-
-
-def interpolate_along_segments(
-    candidates: Candidates, value: FloatArray, knots: FloatArray
-) -> FloatArray:
-    """Linear interpolation of a value of the candidates over range.
-
-    Parameters
-    ----------
-    candidates : Candidates
-        Ground candidates, C in M segments.
-    value : (C,) float64
-        Value at each candidate.
-    knots : (K,) float64
-        Ranges [m] wanted in every segment.
-
-    Returns
-    -------
-    (M, K) float64
-        Constant beyond the first and last candidate of a segment; NaN in
-        segments that have none.
-    """
-    n_segments = len(candidates.offsets) - 1
-    result = np.full((n_segments, len(knots)), np.nan)
-    occupied = np.flatnonzero(np.diff(candidates.offsets))
-    if len(occupied) == 0 or len(knots) == 0:
-        return result
-    # One call for all segments: they are laid end to end on one axis.
-    stride = 2.0 * max(float(candidates.r.max()), float(knots.max())) + 1.0
-    first = candidates.r[candidates.offsets[occupied]]
-    last = candidates.r[candidates.offsets[occupied + 1] - 1]
-    inside = np.clip(knots, first[:, None], last[:, None])
-    position = inside + occupied[:, None] * stride
-    axis = candidates.r + candidates.segment * stride
-    result[occupied] = np.interp(position.ravel(), axis, value).reshape(position.shape)
-    return result
