@@ -13,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from gp_ground_seg.frame import FloatArray, Label
 from gp_ground_seg.parameters.config import DiagnosticsConfig
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import FitReport, Segmentation
+from gp_ground_seg.ros.input import STEADY_CLOCK
 from gp_ground_seg.ros.status import Hysteresis, Level, Rate, Status
 
 CLOUD_WINDOW = 100
@@ -302,9 +301,7 @@ class Diagnostics:
         self._node, self._state, self._limits = node, state, limits
         self._hysteresis: defaultdict[str, Hysteresis] = defaultdict(Hysteresis)
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        # Not the clock of the node: with use_sim_time it stands before the first /clock.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(limits.period, self._publish, clock=steady)
+        self._timer = node.create_timer(limits.period, self._publish, clock=STEADY_CLOCK)
 
     def configure(self, limits: DiagnosticsConfig) -> None:
         """Use `limits` from now on; with another period, the next report comes after it."""

@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import Quaternion
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
 
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
@@ -35,12 +35,12 @@ OUTPUT_DEPTH = 20
 """Clouds kept for repair: Fast DDS may send a lost fragment again after 0.7 s only."""
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
-REVIEW_PERIOD = 1.0
-"""Time between two looks at the publishers [s]."""
 JUMP_TOLERANCE = 0.5
 """Stamps may be that much out of order [s]: several sensors on one topic are no jump."""
-LOG_PERIOD = 5.0
-"""Shortest time between two messages of the same kind [s]."""
+STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
+"""For timers and throttled messages: the clock of a node may stand or jump."""
+THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
+"""Options of messages that may come with every cloud."""
 
 _CHOICES = {
     'reliability': ('reliable', 'best_effort', 'best_available', 'system_default'),
@@ -72,19 +72,13 @@ def check_overrides(given: Mapping[str, object]) -> None:
 
 def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
     """Return the default of a cloud topic: reliable, volatile, the newest `depth` clouds."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return QoSProfile(depth=depth)
 
 
 def in_words(profile: QoSProfile) -> str:
     """Return `profile` as in ``reliable, keep_last 5, volatile``."""
-    policies = profile.reliability, profile.history, profile.durability
-    reliability, history, durability = (policy.name.lower() for policy in policies)
-    return f'{reliability}, {history} {profile.depth}, {durability}'
+    reliability, history, durability = profile.reliability, profile.history, profile.durability
+    return f'{reliability.name}, {history.name} {profile.depth}, {durability.name}'.lower()
 
 
 class SequenceGaps:
@@ -138,14 +132,18 @@ class CloudSubscription:
             cloud_profile(INPUT_DEPTH), QoSOverridingOptions.with_default_policies()
         )
         # The event can come before the publisher is listed, and there is no event for the end
-        # of the last best-effort publisher.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(REVIEW_PERIOD, self._review_soon.trigger, clock=steady)
+        # of the last best-effort publisher: they are looked at every second too.
+        node.create_timer(1.0, self._review_soon.trigger, clock=STEADY_CLOCK)
 
     @property
     def qos(self) -> QoSProfile:
         """Quality of service in use."""
         return self._subscription.qos_profile
+
+    @property
+    def qos_words(self) -> str:
+        """`qos` as in ``reliable, keep_last 5, volatile``."""
+        return in_words(self.qos)
 
     @property
     def n_publishers(self) -> int:
@@ -177,7 +175,7 @@ class CloudSubscription:
         if self._is_pinned:
             self._node.get_logger().error(
                 f'a publisher of {self.topic} does not offer what qos_overrides asks for '
-                f'({in_words(self.qos)}): nothing will arrive from it'
+                f'({self.qos_words}): nothing will arrive from it'
             )
         self._review_soon.trigger()
 
@@ -198,10 +196,11 @@ class CloudSubscription:
         if not self._offered or self._is_pinned:
             return
         best_effort, reliable = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+        wanted = best_effort if best_effort in self._offered.values() else reliable
         profile = copy(self.qos)
-        profile.reliability = best_effort if best_effort in self._offered.values() else reliable
-        if profile.reliability == self.qos.reliability:
+        if profile.reliability == wanted:
             return
+        profile.reliability = wanted
         self._node.get_logger().info(
             f'subscribing {in_words(profile)} to {self.topic}, as its publishers offer'
         )
@@ -234,7 +233,6 @@ class TimeJumps:
         self._node = node
         self._on_jump = on_jump
         self._stamps = StampWatch()
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         threshold = JumpThreshold(
             min_forward=None, min_backward=Duration(seconds=-JUMP_TOLERANCE), on_clock_change=False
         )
@@ -245,8 +243,7 @@ class TimeJumps:
 
     def note(self, stamp: float) -> None:
         """Take the `stamp` of a cloud [s]."""
-        jump = self._stamps.note(stamp)
-        if jump:
+        if jump := self._stamps.note(stamp):
             self._jumped(jump)
 
     def _clock_jumped(self, jump: TimeJump) -> None:
@@ -258,8 +255,7 @@ class TimeJumps:
         self._on_jump()
         self._node.get_logger().info(
             f'time jumped back by {seconds:.1f} s: what earlier clouds taught is forgotten',
-            throttle_duration_sec=LOG_PERIOD,
-            throttle_time_source_type=self._steady,
+            **THROTTLED,
         )
 
 
@@ -297,15 +293,16 @@ class TfTilt:
         self._buffer = self._tf2_ros.Buffer()
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
-    def tilt(self, frame: str, stamp: TimeMessage, base: str) -> tuple[float, float]:
-        """Return roll and pitch [rad] of `frame` in `base`; PointCloudError if TF has them not.
+    def tilt(self, header: Header, base: str) -> tuple[float, float]:
+        """Return roll and pitch [rad] of a cloud in `base`; PointCloudError if TF has them not.
 
-        The transform is that of the time `stamp`, or the newest if there is none for it: a
+        The transform is that of its stamp, or the newest if there is none for it: a
         sensor is fixed to its vehicle, and waiting for TF would delay every cloud.
         """
+        frame = header.frame_id
         try:
             try:
-                found = self._buffer.lookup_transform(base, frame, Time.from_msg(stamp))
+                found = self._buffer.lookup_transform(base, frame, Time.from_msg(header.stamp))
             except self._tf2_ros.ExtrapolationException:
                 found = self._buffer.lookup_transform(base, frame, Time())
         except self._tf2_ros.TransformException as error:

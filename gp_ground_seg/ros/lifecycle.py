@@ -101,8 +101,7 @@ _PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _TRANSPORT_VARIABLES = (
     _PROFILE_VARIABLE, 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS',
 )  # fmt: skip
-MIN_SHARED_MEMORY = 128 << 20
-"""Free shared memory below which the profile is not used: four segments [bytes]."""
+MIN_SHARED_MEMORY = 128 << 20  # four segments of the profile [bytes]
 
 
 @contextmanager
@@ -158,12 +157,9 @@ class StopRequest:
 
 @contextmanager
 def _watchdog() -> Iterator[None]:
-    """End the process with code 0 if the block does not end within `GRACE` of a signal.
-
-    Python calls its handlers between two steps of the main thread, and the next step may be
-    seconds away, behind a long computation. The number of a signal is written to a pipe at
-    once, where a thread waits for it.
-    """
+    """End the process with code 0 if the block does not end within `GRACE` of a signal."""
+    # Python calls its handlers between two steps of the main thread, and the next may be seconds
+    # away. The number of a signal is written to a pipe at once, where a thread waits for it.
     done = threading.Event()
     read_end, write_end = os.pipe()
     os.set_blocking(write_end, False)
@@ -194,9 +190,8 @@ def _watchdog() -> Iterator[None]:
 def stop_on_signals() -> Iterator[StopRequest]:
     """Have SIGINT and SIGTERM within the block noted in the `StopRequest` that it yields.
 
-    If the block does not end soon after, the process does, with code 0. After the first
-    signal both stay ignored: a terminal and ``ros2 launch`` both send one, and the second
-    must not break the clean-up. In other threads than the main one nothing is changed.
+    After the first signal both stay ignored: a terminal and ``ros2 launch`` both send one, and
+    the second must not break the clean-up. In other threads than the main one nothing is changed.
     """
     request = StopRequest()
     if not _is_main_thread():
@@ -269,11 +264,8 @@ class Session:
         self.node.destroy_node()
 
     def check(self, cause: Exception | None = None) -> None:
-        """Raise KeyboardInterrupt once interrupted, `cause` being what the interrupt came out as.
-
-        Python swallows an exception that a signal raises within a destructor or a callback:
-        long loops call this now and then.
-        """
+        """Raise KeyboardInterrupt once interrupted; `cause` is what the interrupt came out as."""
+        # Python swallows what a signal raises within a destructor: long loops call this.
         if self._is_interrupted:
             raise KeyboardInterrupt from cause
 
@@ -296,20 +288,19 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
             node = rclpy.create_node(
                 name, context=context, start_parameter_services=False, enable_rosout=False
             )
-        with contextlib.closing(Session(node)) as session, _signals_to(session):
-            yield session
+        # What is ignored on purpose, as by nohup, stays so.
+        heeded = [
+            n for n in _INTERRUPTS if _is_main_thread() and signal.getsignal(n) != signal.SIG_IGN
+        ]
+        with (
+            contextlib.closing(Session(node)) as session,
+            _handling(heeded, session.interrupt),
+        ):
+            try:
+                yield session
+            except Exception as error:
+                # An interrupt within rclpy's bindings may come out of them as another exception.
+                session.check(error)
+                raise
     finally:
         rclpy.try_shutdown(context=context)
-
-
-@contextmanager
-def _signals_to(session: Session) -> Iterator[None]:
-    # What is ignored on purpose, as by nohup, stays so.
-    heeded = [number for number in _INTERRUPTS if signal.getsignal(number) != signal.SIG_IGN]
-    with _handling(heeded if _is_main_thread() else (), session.interrupt):
-        try:
-            yield
-        except Exception as error:
-            # An interrupt within rclpy's bindings may come out of them as another exception.
-            session.check(error)
-            raise

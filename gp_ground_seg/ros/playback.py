@@ -6,12 +6,13 @@ Written here because ``ros2 bag play`` does not come with the wheels of ROS.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import ReliabilityPolicy
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
@@ -29,15 +30,11 @@ SLICE = 0.02
 """Longest wait in one piece [s]: /clock and acknowledgements are served in between."""
 DELIVERY_TIMEOUT = 5.0
 """How long the last clouds may take to be acknowledged [s]; Fast DDS asks every 3 s."""
-LONE_PERIOD = 0.1
-"""Pause before a bag of a single cloud is played again [s]."""
 
 
 class TrackedPublisher:
-    """Publisher of serialised clouds that counts those that were not delivered.
+    """Publisher of serialised clouds that counts those not acknowledged by a reliable subscriber.
 
-    A cloud is delivered when every reliable subscriber has acknowledged it. What a slow
-    subscriber then pushes out of its own queue, or a best-effort one receives, is not known.
     The middleware tells only whether *all* clouds sent so far are acknowledged. Others count
     as undelivered once newer ones take their place or their subscribers are gone.
     """
@@ -73,13 +70,11 @@ class TrackedPublisher:
 
     def update(self) -> None:
         """Take note of what has been acknowledged since the last time."""
-        if self.n_pending == 0:
-            return
         # First: without subscribers everything is "acknowledged".
         if self.n_subscribers == 0:
             self._n_missed += self.n_pending
             self.n_pending = 0
-        elif self._publisher.wait_for_all_acked(Duration(seconds=0)):
+        elif self.n_pending and self._publisher.wait_for_all_acked(Duration(seconds=0)):
             self.n_pending = 0
 
     def look_at_subscribers(self) -> None:
@@ -119,9 +114,8 @@ class Player:
         self._options = options
         self._pause = pause
         self._publishers = {topic: TrackedPublisher(node, topic) for topic in topics}
-        # Reliable serves both kinds of subscribers.
-        profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-        self._clock = node.create_publisher(Clock, '/clock', profile) if options.clock else None
+        # Reliable, which serves both kinds of subscribers.
+        self._clock = node.create_publisher(Clock, '/clock', 1) if options.clock else None
 
     def topics_without_subscriber(self) -> list[str]:
         """Return the topics, as remapped, that have no subscriber."""
@@ -172,12 +166,11 @@ class Player:
 
     def _play_once(self, start: float, on_cloud: Callable[[], object]) -> float:
         """Play from the monotonic time `start` on; return when the next round has to start."""
-        rate = self._options.rate
-        first = last = None
-        n_clouds = dict.fromkeys(self._publishers, 0)
+        rate, first, last = self._options.rate, 0, 0
+        n_clouds: Counter[str] = Counter()
         # The next cloud is read right after one was sent: there is time for it then.
         for topic, recorded, raw in self._clouds():
-            if first is None or last is None:
+            if not n_clouds:
                 first = last = recorded
                 start = max(start, time.monotonic())
             # The parts of a split bag may overlap.
@@ -187,11 +180,17 @@ class Player:
             on_cloud()
             self._send(topic, raw, due)
             n_clouds[topic] += 1
-        if first is None or last is None:
-            raise DataError(f'{self._bag.path}: {self._nothing_to_play()}')
-        n_periods = max(n_clouds.values()) - 1
-        span = 1e-9 * (last - first)
-        return start + (span + (span / n_periods if n_periods else LONE_PERIOD)) / rate
+        if not n_clouds:
+            times = [recorded for _, recorded, _ in self._bag.messages(self._publishers)]
+            span = 1e-9 * (max(times) - min(times)) if times else 0.0
+            raise DataError(
+                f'{self._bag.path}: no cloud in the time asked for (from '
+                f'{self._options.start:g} s on); the last of its {len(times)} clouds is at '
+                f'{span:.3f} s'
+            )
+        n_periods, span = max(n_clouds.values()) - 1, 1e-9 * (last - first)
+        # A bag of a single cloud begins again after 0.1 s.
+        return start + (span + (span / n_periods if n_periods else 0.1)) / rate
 
     def _clouds(self) -> Iterator[tuple[str, int, bytes]]:
         start, duration = self._options.start, self._options.duration
@@ -203,14 +202,6 @@ class Player:
                 return
             if offset >= start:
                 yield topic, recorded, raw
-
-    def _nothing_to_play(self) -> str:
-        times = [recorded for _, recorded, _ in self._bag.messages(self._publishers)]
-        span = 1e-9 * (max(times) - min(times)) if times else 0.0
-        return (
-            f'no cloud in the time asked for (from {self._options.start:g} s on); '
-            f'the last of its {len(times)} clouds is at {span:.3f} s'
-        )
 
     def _wait_until(self, due: float, recorded: int) -> None:
         """Wait until a monotonic time [s]; at it, the time of the bag is `recorded` [ns]."""
@@ -233,8 +224,7 @@ class Player:
             publisher.look_at_subscribers()
         now = time.monotonic()
         publisher.publish(raw)
-        if self._first_sent is None:
-            self._first_sent = now
+        self._first_sent = now if self._first_sent is None else self._first_sent
         self._last_sent = now
         self._n_late += now - due > LATE
         self._worst_delay = max(self._worst_delay, now - due)

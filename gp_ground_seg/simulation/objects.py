@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.frame import FloatArray
+from gp_ground_seg.frame import FloatArray, IntArray
 from gp_ground_seg.simulation.terrain import Terrain
 
 KindArray: TypeAlias = npt.NDArray[np.uint8]
-IntArray: TypeAlias = npt.NDArray[np.intp]
 Interval: TypeAlias = tuple[FloatArray, FloatArray]
 Size: TypeAlias = tuple[float, float, float]  # length, width, height [m]
 
@@ -26,18 +25,8 @@ WALL_PANEL, WALL_THICKNESS = 4.0, 0.3
 """Longest panel of a wall, each on its own piece of ground, and its thickness [m]."""
 SMALLEST_RATE = 1e-12
 """Stands in for a zero component of a unit vector; keeps 0 / 0 out of the slab tests."""
-
-
-class Kind(IntEnum):
-    """What a ray hit."""
-
-    TERRAIN = 0
-    BOX = 1
-    WALL = 2
-    POLE = 3
-    OVERHANG = 4
-    REFLECTION = 5
-    VEGETATION = 6
+Kind = IntEnum('Kind', 'TERRAIN BOX WALL POLE OVERHANG REFLECTION VEGETATION', start=0)
+"""What a ray hit."""
 
 
 # In order of the codes: class in SemanticKITTI, and share of the light that comes back.
@@ -170,19 +159,13 @@ def _find_towards(solid: Solid, origin: FloatArray, azimuth: FloatArray) -> IntA
     return np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
 
 
-def _box(
-    kind: Kind, x: float, y: float, heights: tuple[float, float], size: Size, yaw: float
-) -> Box:
-    length, width, _ = size
-    return Box(kind, x, y, *heights, 0.5 * math.hypot(length, width), length, width, yaw)
-
-
 def standing_box(
     terrain: Terrain, x: float, y: float, size: Size, yaw: float = 0.0, kind: Kind = Kind.BOX
 ) -> Box:
     """Box that stands on the terrain."""
-    ground = float(terrain.height(x, y))
-    return _box(kind, x, y, (ground - BURIED_DEPTH, ground + size[2]), size, yaw)
+    length, width, height = size
+    ground, radius = float(terrain.height(x, y)), 0.5 * math.hypot(length, width)
+    return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, radius, length, width, yaw)
 
 
 def floating_box(
@@ -190,7 +173,8 @@ def floating_box(
 ) -> Box:
     """Box that floats `clearance` [m] over the terrain."""
     bottom = float(terrain.height(x, y)) + clearance
-    return _box(kind, x, y, (bottom, bottom + size[2]), size, 0.0)
+    box = standing_box(terrain, x, y, size, kind=kind)
+    return replace(box, bottom=bottom, top=bottom + size[2])
 
 
 def pole(

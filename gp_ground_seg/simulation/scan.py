@@ -59,8 +59,7 @@ class SensorModel:
 
     def rotation(self) -> FloatArray:
         """Matrix (3, 3) from the sensor frame to that of the level vehicle."""
-        matrix: FloatArray = Rotation.from_euler('YX', [self.pitch, self.roll]).as_matrix()
-        return matrix
+        return np.asarray(Rotation.from_euler('YX', [self.pitch, self.roll]).as_matrix())
 
 
 @dataclass(frozen=True)
@@ -78,8 +77,7 @@ class ScatterModel(SensorModel):
         # Evenly over the sphere, not over the angle.
         up = high + (low - high) * spread[:, 1]
         flat = np.sqrt(1.0 - up**2)
-        rays: FloatArray = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up])
-        return rays
+        return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up])
 
 
 def _beams(*blocks: tuple[float, float, int]) -> tuple[float, ...]:
@@ -205,12 +203,10 @@ def _ground_below(
     world = local @ rotation.T + position
     up = rotation[:, 2]
     if up[2] == 1.0:
-        below: FloatArray = terrain.height(world[:, 0], world[:, 1]) - position[2]
-        return below
+        return np.asarray(terrain.height(world[:, 0], world[:, 1]) - position[2])
     down = np.broadcast_to(-up, world.shape)
     fall = first_hit(terrain, world + PLUMB_LINE * up, down, 2.0 * PLUMB_LINE)
-    ground_z: FloatArray = local[:, 2] + PLUMB_LINE - fall
-    return ground_z
+    return np.asarray(local[:, 2] + PLUMB_LINE - fall)
 
 
 def simulate_drive(

@@ -12,14 +12,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.frame import FloatArray
-
-OptionalArray: TypeAlias = FloatArray | None
 
 TOLERANCE = 1e-9
 """Height above the terrain at which a ray has met it; length of a piece of no width [m]."""
@@ -37,7 +35,9 @@ class Terrain(ABC):
     """A surface z(x, y)."""
 
     @abstractmethod
-    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
+    def along(
+        self, at: FloatArray, direction: FloatArray, piece: FloatArray | None = None
+    ) -> Along:
         """Terrain below points `at` (R, 2) [m] that move by `direction` (R, 2).
 
         `piece`, (R, 2), are points inside the smooth piece to use, continued to `at`; by default
@@ -77,16 +77,14 @@ class Profile(Terrain):
     anchor: FloatArray  # (B + 1,) reference u of each piece [m]
     coefficients: FloatArray  # (B + 1, 3) c0 [m], c1, c2 [1/m] of each piece
 
-    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
+    def along(
+        self, at: FloatArray, direction: FloatArray, piece: FloatArray | None = None
+    ) -> Along:
         """See `Terrain.along`."""
         axis = self._axis
         u, du = at @ axis, direction @ axis
-        if len(self.edges):
-            k = self.piece_index(at if piece is None else piece)
-            anchor, (c0, c1, c2) = self.anchor[k], self.coefficients[k].T
-        else:
-            anchor, (c0, c1, c2) = self.anchor[0], self.coefficients[0]
-        v = u - anchor
+        k = self.piece_index(at if piece is None else piece)
+        v, (c0, c1, c2) = u - self.anchor[k], self.coefficients[k].T
         return Along(c0 + v * (c1 + v * c2), du * (c1 + 2.0 * c2 * v), 2.0 * c2 * du**2)
 
     def piece_index(self, at: FloatArray) -> npt.NDArray[np.intp]:
@@ -111,7 +109,9 @@ class Waves(Terrain):
     phases: FloatArray  # (n,) [rad]
     envelope: Profile
 
-    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
+    def along(
+        self, at: FloatArray, direction: FloatArray, piece: FloatArray | None = None
+    ) -> Along:
         """See `Terrain.along`."""
         factor, factor_slope, _ = self.envelope.along(at, direction, piece)
         # A smooth road, most of what a sensor sees, has no waves to add up.
@@ -161,22 +161,10 @@ def first_hit(
     terrain: Terrain, origin: FloatArray, direction: FloatArray, max_range: float
 ) -> FloatArray:
     """Range [m] at which each ray (R, 3) first meets the terrain, infinite beyond `max_range`."""
-    entry = np.zeros(len(origin))
-    ceiling = terrain.ceiling()
+    start, ceiling = np.zeros(len(origin)), terrain.ceiling()
     if ceiling is not terrain:
         # Free space above all waves is crossed in a few steps.
-        entry = _march(ceiling, origin, direction, entry, max_range)
-    return _march(terrain, origin, direction, entry, max_range)
-
-
-def _march(
-    terrain: Terrain,
-    origin: FloatArray,
-    direction: FloatArray,
-    start: FloatArray,
-    max_range: float,
-) -> FloatArray:
-    """As `first_hit`, from the ranges `start` on (infinite = no hit)."""
+        start = first_hit(ceiling, origin, direction, max_range)
     hit = np.full(len(origin), np.inf)
     ray = np.flatnonzero(start <= max_range)
     ends = _piece_ends(terrain, origin[ray], direction[ray], max_range)
@@ -223,7 +211,5 @@ def _piece_ends(
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         crossing = distance / rate
     ahead = (crossing > 0.0) & (crossing < max_range)
-    ends = np.pad(
-        np.where(ahead, crossing, max_range), ((0, 0), (0, 1)), constant_values=max_range
-    )
-    return np.sort(ends, axis=1)
+    last = np.full((len(rate), 1), max_range)
+    return np.sort(np.hstack([np.where(ahead, crossing, max_range), last]), axis=1)
