@@ -22,10 +22,8 @@ from gp_ground_seg.result import FitReport, Segmentation
 from gp_ground_seg.ros.input import STEADY_CLOCK
 from gp_ground_seg.ros.status import Hysteresis, Level, Rate, Status
 
-CLOUD_WINDOW = 100
-"""Clouds over which percentiles are taken."""
-MIN_RATE_SPAN = 1.0
-"""Shortest time from which the load is computed [s]: a burst is no rate."""
+CLOUD_WINDOW = 100  # clouds over which percentiles are taken
+MIN_RATE_SPAN = 1.0  # shortest time from which the load is computed [s]: a burst is no rate
 Finding = tuple[Level, str]
 
 

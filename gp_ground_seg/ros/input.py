@@ -29,8 +29,7 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
 from gp_ground_seg.pipeline.tilt import angles_of
 
-INPUT_DEPTH = 5
-"""Clouds that may wait to be processed: half a second of a LiDAR at 10 Hz."""
+INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
 OUTPUT_DEPTH = 20
 """Clouds kept for repair: Fast DDS may send a lost fragment again after 0.7 s only."""
 MAX_DEPTH = 10_000

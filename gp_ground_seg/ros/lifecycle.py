@@ -139,8 +139,7 @@ def _free_shared_memory() -> int:
     return status.f_bavail * status.f_frsize
 
 
-GRACE = 0.5
-"""Time from the signal to the end of the process, if the work does not end before [s]."""
+GRACE = 0.5  # time from the signal to the end of the process, if the work does not end before [s]
 _STOPS = (signal.SIGINT, signal.SIGTERM)
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

@@ -131,7 +131,8 @@ class GroundSegmentationNode(ConfiguredNode):
         try:
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
-            tilt = self._tf and self._tf.tilt(cloud.header, self.config.frame.base)
+            base = self.config.frame.base
+            tilt = None if self._tf is None else self._tf.tilt(cloud.header, base)
             segmentation = self._segmenter.segment(points, tilt)
             segmented = time.monotonic()
             topics = self._outputs.publish(cloud, segmentation, self.config)

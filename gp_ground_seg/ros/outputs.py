@@ -27,9 +27,7 @@ LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'p_ground')
 # apart by eye, so that a viewer costs the node less than the segmentation itself.
 MAX_PROFILES = 60
 MAX_KNOTS = 24
-N_STD = 2.0
-"""Half width of the band in standard deviations."""
-LINE_WIDTH = 0.04  # [m]
+N_STD = 2.0  # half width of the band in standard deviations
 BAND_COLOUR = (0.75, 0.75, 0.75, 0.35)
 
 
@@ -97,7 +95,7 @@ def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> A
 
     ends = np.stack([left, left + 1], axis=-1).ravel()
     profiles = _marker(cloud, 'profiles', Marker.LINE_LIST, points.reshape(-1, 3), ends)
-    profiles.scale.x = LINE_WIDTH
+    profiles.scale.x = 0.04  # [m]
     limits = config.length_scale.min, config.length_scale.max
     rgb = length_scale_colours(model.length_scale[grid], *limits)
     profiles.colors = _colours(rgb.reshape(-1, 3)[ends])

@@ -76,9 +76,10 @@ class _ParameterService(ParameterService):  # type: ignore[misc]
 
     def _set_parameters_callback(self, request: Any, response: Any) -> Any:
         parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
-        together = self._set_atomically(parameters)
-        results, n_refused = [together] * len(parameters), len(parameters) + 1
-        while n_refused > (n_refused := sum(not result.successful for result in results)):
+        results = [self._set_atomically(parameters)] * len(parameters)
+        n_left = len(parameters) + 1
+        while (n_refused := sum(not result.successful for result in results)) < n_left:
+            n_left = n_refused
             results = [
                 result if result.successful else self._set_atomically([parameter])
                 for parameter, result in zip(parameters, results, strict=True)

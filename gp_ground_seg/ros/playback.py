@@ -24,10 +24,8 @@ from gp_ground_seg.ros.input import cloud_profile
 DEPTH = 100
 """Clouds kept until they are acknowledged: small ones are so a few at a time, and lost pieces of
 large ones can take 3 s with stock Fast DDS."""
-LATE = 0.02
-"""A cloud that is sent more than this after its time is late [s]."""
-SLICE = 0.02
-"""Longest wait in one piece [s]: /clock and acknowledgements are served in between."""
+LATE = 0.02  # a cloud that is sent more than this after its time is late [s]
+SLICE = 0.02  # longest wait in one piece [s]: /clock and acknowledgements are served in between
 DELIVERY_TIMEOUT = 5.0
 """How long the last clouds may take to be acknowledged [s]; Fast DDS asks every 3 s."""
 

@@ -15,11 +15,9 @@ from gp_ground_seg.simulation.objects import Kind, KindArray, nearest_solid, ref
 from gp_ground_seg.simulation.scenes import Scene
 from gp_ground_seg.simulation.terrain import Terrain, first_hit
 
-FRAME_PERIOD = 0.1
-"""Time of one turn of the sensor [s]."""
+FRAME_PERIOD = 0.1  # time of one turn of the sensor [s]
 REFLECTION_MIN_DEPTH = 0.1
 """A mirrored point less deep below the ground than this is the road itself [m]."""
-INTENSITY_STD = 0.05
 PLUMB_LINE = 200.0
 """How far above a point the search for the ground below it starts, for a tilted sensor [m]."""
 
@@ -159,7 +157,7 @@ def simulate_scan(
     kind = kind[kept]
     points = np.empty((len(kept), 4), dtype=np.float32)
     points[:, :3] = beams[kept] * measured[kept, None]
-    points[:, 3] = np.clip(reflectance(kind) + INTENSITY_STD * intensity_noise[kept], 0.0, 1.0)
+    points[:, 3] = np.clip(reflectance(kind) + 0.05 * intensity_noise[kept], 0.0, 1.0)
     ground_z = _ground_below(scene.terrain, points, position, rotation)
     is_ground = kind == Kind.TERRAIN
     return SimulatedScan(points, is_ground, ground_z, kind, time, position, rotation)

@@ -17,8 +17,7 @@ from gp_ground_seg.simulation.terrain import Profile, Terrain, Waves
 N_WAVES = 8
 N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
 """Scattered solids, and their distance from the drive [m], which leaves its lane free."""
-URBAN_X = (-80.0, 160.0)
-"""Where the street of the urban scene begins and ends [m]."""
+URBAN_X = (-80.0, 160.0)  # where the street of the urban scene begins and ends [m]
 
 
 def rough(

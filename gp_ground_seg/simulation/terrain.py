@@ -12,13 +12,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.frame import FloatArray
 
+OptionalArray: TypeAlias = FloatArray | None
 TOLERANCE = 1e-9
 """Height above the terrain at which a ray has met it; length of a piece of no width [m]."""
 
@@ -35,9 +36,7 @@ class Terrain(ABC):
     """A surface z(x, y)."""
 
     @abstractmethod
-    def along(
-        self, at: FloatArray, direction: FloatArray, piece: FloatArray | None = None
-    ) -> Along:
+    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
         """Terrain below points `at` (R, 2) [m] that move by `direction` (R, 2).
 
         `piece`, (R, 2), are points inside the smooth piece to use, continued to `at`; by default
@@ -77,9 +76,7 @@ class Profile(Terrain):
     anchor: FloatArray  # (B + 1,) reference u of each piece [m]
     coefficients: FloatArray  # (B + 1, 3) c0 [m], c1, c2 [1/m] of each piece
 
-    def along(
-        self, at: FloatArray, direction: FloatArray, piece: FloatArray | None = None
-    ) -> Along:
+    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
         """See `Terrain.along`."""
         axis = self._axis
         u, du = at @ axis, direction @ axis
@@ -109,9 +106,7 @@ class Waves(Terrain):
     phases: FloatArray  # (n,) [rad]
     envelope: Profile
 
-    def along(
-        self, at: FloatArray, direction: FloatArray, piece: FloatArray | None = None
-    ) -> Along:
+    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
         """See `Terrain.along`."""
         factor, factor_slope, _ = self.envelope.along(at, direction, piece)
         # A smooth road, most of what a sensor sees, has no waves to add up.
@@ -144,8 +139,7 @@ class Waves(Terrain):
         edges, anchor = self.envelope.edges, self.envelope.anchor
         near = c0 + c1 * (np.concatenate([anchor[:1], edges]) - anchor)
         far = c0 + c1 * (np.concatenate([edges, anchor[-1:]]) - anchor)
-        factors: FloatArray = np.maximum(near, far)
-        return factors
+        return np.asarray(np.maximum(near, far))
 
     def breaks(self) -> FloatArray:
         """Edges of the envelope, (B, 3)."""
