@@ -71,7 +71,6 @@ def _topic_of(types: Any, name: str, msgtype: str, qos: tuple[Any, ...]) -> BagT
 
 
 def _reliable_qos(durability: str) -> Any:
-    require_rosbags()
     from rosbags import interfaces as ros
 
     forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
@@ -112,11 +111,7 @@ def _ros2_topic(connection: Any) -> BagTopic:
 
 
 def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
-    """Topic of a ROS 1 connection, and a function that converts its messages to CDR.
-
-    Where ROS 2 Jazzy has the type in the same layout, or not at all, only a header's ``seq``
-    goes. Else the message is migrated: fields of one name keep their value, new ones are zero.
-    """
+    """Topic of a ROS 1 connection, and a function that converts its messages to CDR."""
     from rosbags.convert.converter import is_same_wireformat, migrate_bytes
     from rosbags.typesys import Stores, get_typestore
 
@@ -128,6 +123,7 @@ def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
         target = get_typestore(Stores.EMPTY)
         target.register({**source.fielddefs, _HEADER: header})
     convert: Callable[[bytes], Any] = functools.partial(target.ros1_to_cdr, typename=new)
+    # In the same layout only a header's ``seq`` goes; else fields of one name keep their value.
     migrated = not is_same_wireformat(source, target, old, new)
     if migrated:
         convert = functools.partial(
@@ -150,8 +146,7 @@ class BagReader(AbstractContextManager['BagReader']):
         from rosbags import rosbag1, rosbag2
 
         self.path = Path(path)
-        self.storage = storage_of(self.path)
-        """``ros1``, ``mcap`` or ``sqlite3``."""
+        self.storage = storage_of(self.path)  # ``ros1``, ``mcap`` or ``sqlite3``
         self._converters: dict[int, Callable[[bytes], Any]] = {}
         with ExitStack() as stack:
             with reading(self.path):

@@ -23,8 +23,7 @@ _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'
 _DATATYPE_NAMES = {datatype: np.dtype(code).name.upper() for datatype, code in _CODES.items()}
 _DATATYPES = {code: datatype for datatype, code in _CODES.items()}
 _FLOATS = (7, 8)
-_ALIGNMENT = 4
-"""Added columns start at a multiple of this within a point, or of their size [bytes]."""
+_ALIGNMENT = 4  # added columns start at a multiple of this in a point, or of their size [bytes]
 
 
 class CloudMessage(Protocol):
@@ -81,6 +80,7 @@ def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray
         )
     if size == 0:
         return np.empty(0, dtype=np.uint8)
+    # Whole points are 10 times as fast to move as bytes.
     points = _view(cloud, f'V{cloud.point_step}').reshape(-1)
     return points.take(np.flatnonzero(mask)).view(np.uint8)
 
@@ -161,10 +161,7 @@ def _check_field(field: Any, accepted: Collection[int], point_step: int) -> None
 
 
 def _view(cloud: CloudMessage, code: str, offset: int = 0) -> npt.NDArray[Any]:
-    """Type `code` at an offset within each point, (height, width); checks that all points fit.
-
-    Whole points, as opaque elements, are 10 times as fast to move as bytes.
-    """
+    """Type `code` at an offset within each point, (height, width); checks that all points fit."""
     height, width = cloud.height, cloud.width
     point_step, row_step, row_bytes = cloud.point_step, cloud.row_step, width * cloud.point_step
     if height * width == 0:

@@ -1,7 +1,4 @@
-"""What the node reports on /diagnostics: four tasks, each held at its worst level for a while.
-
-Times ``now`` are those of a steady clock [s].
-"""
+"""Four tasks on /diagnostics, held at their worst level; ``now`` is on a steady clock [s]."""
 
 from __future__ import annotations
 

@@ -30,12 +30,10 @@ from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloud
 from gp_ground_seg.pipeline.tilt import angles_of
 
 INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
-OUTPUT_DEPTH = 20
-"""Clouds kept for repair: Fast DDS may send a lost fragment again after 0.7 s only."""
+OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
-JUMP_TOLERANCE = 0.5
-"""Stamps may be that much out of order [s]: several sensors on one topic are no jump."""
+JUMP_TOLERANCE = 0.5  # stamps of several sensors on one topic may be that much out of order [s]
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers and throttled messages: the clock of a node may stand or jump."""
 THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
@@ -81,10 +79,9 @@ def in_words(profile: QoSProfile) -> str:
 
 
 class SequenceGaps:
-    """Counts messages of one publisher that did not arrive.
+    """Counts messages of one publisher, numbered 1, 2, 3 ... by it, that did not arrive.
 
-    The middleware numbers a publisher's messages 1, 2, 3 ...: a hole is a message that was
-    lost on the way, or overwritten in a full queue while the node was busy.
+    They were lost on the way, or overwritten in a full queue while the node was busy.
     """
 
     _last: int | None = None
@@ -161,8 +158,8 @@ class CloudSubscription:
 
     def _receive(self, message: PointCloud2, info: dict[str, Any]) -> None:
         # Both are stamps of the system clock; 0 where the middleware gives none.
-        received = info.get('received_timestamp') or 0
-        wait = max(0.0, 1e-9 * (time.time_ns() - received)) if received > 0 else 0.0
+        now = time.time_ns()
+        wait = max(0.0, 1e-9 * (now - (info.get('received_timestamp') or now)))
         if not self._offered:
             self._look_at_publishers()
         n_lost = self._gaps.note(info.get('publication_sequence_number'))
@@ -184,9 +181,8 @@ class CloudSubscription:
             bytes(entry.endpoint_gid): entry.qos_profile.reliability
             for entry in self._node.get_publishers_info_by_topic(self.topic)
         }
-        has_changed = offered.keys() != self._offered.keys()
-        self._offered = offered
-        if has_changed:
+        before, self._offered = self._offered, offered
+        if has_changed := offered.keys() != before.keys():
             self._gaps.reset()
         return has_changed
 
@@ -293,16 +289,13 @@ class TfTilt:
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
     def tilt(self, header: Header, base: str) -> tuple[float, float]:
-        """Return roll and pitch [rad] of a cloud in `base`; PointCloudError if TF has them not.
-
-        The transform is that of its stamp, or the newest if there is none for it: a
-        sensor is fixed to its vehicle, and waiting for TF would delay every cloud.
-        """
+        """Return roll and pitch [rad] of a cloud in `base`; PointCloudError if TF has them not."""
         frame = header.frame_id
         try:
             try:
                 found = self._buffer.lookup_transform(base, frame, Time.from_msg(header.stamp))
             except self._tf2_ros.ExtrapolationException:
+                # The newest: a sensor is fixed to its vehicle, and waiting would delay the cloud.
                 found = self._buffer.lookup_transform(base, frame, Time())
         except self._tf2_ros.TransformException as error:
             way = f'from its frame {frame!r} to frame.base = {base!r}'

@@ -1,7 +1,6 @@
 """Start and end of a ROS process: arguments, transport, signals.
 
-ROS is imported by the functions that need it: that takes half a second, in which the signals of
-the process can be handled already.
+Functions import ROS themselves, which takes half a second: signals are handled meanwhile.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ import argparse
 import contextlib
 import itertools
 import os
+import shutil
 import signal
 import threading
 import time
@@ -106,10 +106,9 @@ MIN_SHARED_MEMORY = 128 << 20  # four segments of the profile [bytes]
 
 @contextmanager
 def large_cloud_transport() -> Iterator[None]:
-    """Name the Fast DDS profile for large clouds, if the user has chosen none.
+    """Name the Fast DDS profile for large clouds to ROS, first used in the block, and children.
 
-    For processes started, and ROS used for the first time, within the block. Without it, clouds
-    above 0.5 MB are sent in pieces, which get lost.
+    Unless the user has chosen one. Without it, clouds above 0.5 MB lose pieces on the way.
     """
     profile = _find_profile()
     is_chosen = any(os.environ.get(name) for name in _TRANSPORT_VARIABLES)
@@ -133,10 +132,9 @@ def _find_profile() -> Path | None:
 
 def _free_shared_memory() -> int:
     try:
-        status = os.statvfs('/dev/shm')
+        return shutil.disk_usage('/dev/shm').free
     except OSError:
         return 0
-    return status.f_bavail * status.f_frsize
 
 
 GRACE = 0.5  # time from the signal to the end of the process, if the work does not end before [s]
@@ -193,15 +191,11 @@ def stop_on_signals() -> Iterator[StopRequest]:
     the second must not break the clean-up. In other threads than the main one nothing is changed.
     """
     request = StopRequest()
-    if not _is_main_thread():
+    if threading.current_thread() is not threading.main_thread():
         yield request
         return
     with _watchdog(), _handling(_STOPS, request.note, lambda: not request.made):
         yield request
-
-
-def _is_main_thread() -> bool:
-    return threading.current_thread() is threading.main_thread()
 
 
 @contextmanager
@@ -287,10 +281,9 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
             node = rclpy.create_node(
                 name, context=context, start_parameter_services=False, enable_rosout=False
             )
+        is_main = threading.current_thread() is threading.main_thread()
         # What is ignored on purpose, as by nohup, stays so.
-        heeded = [
-            n for n in _INTERRUPTS if _is_main_thread() and signal.getsignal(n) != signal.SIG_IGN
-        ]
+        heeded = [n for n in _INTERRUPTS if is_main and signal.getsignal(n) != signal.SIG_IGN]
         with (
             contextlib.closing(Session(node)) as session,
             _handling(heeded, session.interrupt),

@@ -32,13 +32,10 @@ class GroundSegmentationNode(ConfiguredNode):
     """Subscribes to ``points``, publishes ``ground``, ``obstacles`` and /diagnostics.
 
     Each output keeps the header and every field of the input, bit for bit; a finite point
-    is in exactly one of the two clouds, another one in neither. Parameters are those of
-    `gp_ground_seg.parameters.config`; a change takes effect with the next cloud.
-
-    The first clouds are segmented with numpy. The compiled backend, if the parameters ask
-    for it, is made meanwhile, and takes over between two clouds.
-    Options are those of `rclpy.node.Node`. Raises a ConfigError if a given parameter is not
-    accepted.
+    is in exactly one of the two clouds, another one in neither. The first clouds are segmented
+    with numpy; the compiled backend, if wanted, is made meanwhile. A changed parameter takes
+    effect with the next cloud. Options are those of `rclpy.node.Node`. Raises a ConfigError if
+    a given parameter is not accepted.
     """
 
     def __init__(self, **options: Any) -> None:

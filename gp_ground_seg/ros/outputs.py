@@ -25,8 +25,7 @@ LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'p_ground')
 
 # rclpy takes some microseconds for each vertex: the markers are thinned to what can be told
 # apart by eye, so that a viewer costs the node less than the segmentation itself.
-MAX_PROFILES = 60
-MAX_KNOTS = 24
+MAX_PROFILES, MAX_KNOTS = 60, 24
 N_STD = 2.0  # half width of the band in standard deviations
 BAND_COLOUR = (0.75, 0.75, 0.75, 0.35)
 

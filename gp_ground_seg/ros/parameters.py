@@ -174,9 +174,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
                 self.apply_config(config)
                 self._config = config
         except Exception as error:
-            self.get_logger().error(
-                f'parameters could not be applied: {type(error).__name__}: {error}'
-            )
+            reason = f'{type(error).__name__}: {error}'
+            self.get_logger().error(f'parameters could not be applied: {reason}')
 
 
 def _unknown(name: str) -> str:

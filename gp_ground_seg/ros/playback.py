@@ -1,7 +1,4 @@
-"""Plays the clouds of a bag at the times they were recorded.
-
-Written here because ``ros2 bag play`` does not come with the wheels of ROS.
-"""
+"""Plays the clouds of a bag as recorded; ``ros2 bag play`` does not come with ROS by pip."""
 
 from __future__ import annotations
 
@@ -21,13 +18,10 @@ from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.ros.input import cloud_profile
 
-DEPTH = 100
-"""Clouds kept until they are acknowledged: small ones are so a few at a time, and lost pieces of
-large ones can take 3 s with stock Fast DDS."""
+DEPTH = 100  # clouds kept until acknowledged: with stock Fast DDS that can take 3 s
 LATE = 0.02  # a cloud that is sent more than this after its time is late [s]
 SLICE = 0.02  # longest wait in one piece [s]: /clock and acknowledgements are served in between
-DELIVERY_TIMEOUT = 5.0
-"""How long the last clouds may take to be acknowledged [s]; Fast DDS asks every 3 s."""
+DELIVERY_TIMEOUT = 5.0  # of the last clouds [s]; Fast DDS asks for lost ones every 3 s
 
 
 class TrackedPublisher:
@@ -57,6 +51,8 @@ class TrackedPublisher:
 
     def publish(self, raw: bytes) -> None:
         """Send one cloud of CDR bytes."""
+        if self.n_sent == 0:
+            self.look_at_subscribers()
         self.update()
         if self.n_subscribers == 0 or self.n_pending == DEPTH:
             # Not received by any; or it takes the place of the oldest in a full queue.
@@ -217,10 +213,7 @@ class Player:
             self._clock.publish(Clock(clock=Time(nanoseconds=nanoseconds).to_msg()))
 
     def _send(self, topic: str, raw: bytes, due: float) -> None:
-        publisher = self._publishers[topic]
-        if publisher.n_sent == 0:
-            publisher.look_at_subscribers()
-        now = time.monotonic()
+        publisher, now = self._publishers[topic], time.monotonic()
         publisher.publish(raw)
         self._first_sent = now if self._first_sent is None else self._first_sent
         self._last_sent = now

@@ -26,8 +26,7 @@ from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.ros.lifecycle import Session, large_cloud_transport, ros_session
 
-INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'
-"""Topics of the node, without any remapping."""
+INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'  # topics of the node
 START_TIMEOUT = 300.0  # time the node has to start, and to compile on a slow machine [s]
 SILENCE = 2.0  # time without a cloud after which what is still missing is lost [s]
 STEADY_FACTOR, STEADY_MARGIN = 1.5, 0.02
@@ -157,8 +156,7 @@ class Trip:
         return np.nan if self.back is None else 1e-9 * (self.back - self.sent)
 
 
-Results = dict[str, CloudMessage]
-"""What came back of a cloud, by topic."""
+Results = dict[str, CloudMessage]  # what came back of a cloud, by topic
 
 
 def restamped(clouds: Iterable[CloudMessage], start: int) -> Iterator[CloudMessage]:

@@ -16,10 +16,8 @@ from gp_ground_seg.simulation.scenes import Scene
 from gp_ground_seg.simulation.terrain import Terrain, first_hit
 
 FRAME_PERIOD = 0.1  # time of one turn of the sensor [s]
-REFLECTION_MIN_DEPTH = 0.1
-"""A mirrored point less deep below the ground than this is the road itself [m]."""
-PLUMB_LINE = 200.0
-"""How far above a point the search for the ground below it starts, for a tilted sensor [m]."""
+REFLECTION_MIN_DEPTH = 0.1  # a mirrored point less deep below the ground is the road itself [m]
+PLUMB_LINE = 200.0  # of a tilted sensor: the search for the ground starts that far above [m]
 
 # Multiples of these fill the unit square evenly: the powers of the plastic number, the
 # two-dimensional counterpart of the golden ratio.
