@@ -52,7 +52,7 @@ def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.fl
     """
     if cloud.height * cloud.width == 0:
         return np.empty((0, 3), dtype=np.float32)
-    columns = _views(cloud, 'xyz', _FLOATS)
+    columns = list(_views(cloud, 'xyz', _FLOATS).values())
     wide = any(column.dtype.itemsize == 8 for column in columns)
     # Arbitrary bytes may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
@@ -63,11 +63,8 @@ def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.fl
 
 def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     """Values of the fields `names`, each (height, width), a copy in native byte order."""
-    views = _views(cloud, names, _CODES)
-    return {
-        name: view.astype(view.dtype.newbyteorder('='))
-        for name, view in zip(names, views, strict=True)
-    }
+    views = _views(cloud, names, _CODES).items()
+    return {name: view.astype(view.dtype.newbyteorder('=')) for name, view in views}
 
 
 def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
@@ -125,9 +122,9 @@ def _code(cloud: CloudMessage, datatype: int) -> str:
 
 def _views(
     cloud: CloudMessage, names: Sequence[str], accepted: Collection[int]
-) -> list[npt.NDArray[Any]]:
+) -> dict[str, npt.NDArray[Any]]:
     """Fields `names` where they lie in the data, each (height, width), checked."""
-    views = []
+    views = {}
     _view(cloud, 'u1')  # the layout before the fields
     for name in names:
         matches = [field for field in cloud.fields if field.name == name]
@@ -139,7 +136,7 @@ def _views(
             )
         (field,) = matches
         _check_field(field, accepted, cloud.point_step)
-        views.append(_view(cloud, _code(cloud, field.datatype), field.offset))
+        views[name] = _view(cloud, _code(cloud, field.datatype), field.offset)
     return views
 
 

@@ -31,7 +31,7 @@ class TrackedPublisher:
     as undelivered once newer ones take their place or their subscribers are gone.
     """
 
-    n_sent = n_pending = _n_missed = 0
+    n_sent = n_pending = n_missed = 0
     has_best_effort_subscriber = False
 
     def __init__(self, node: Node, topic: str) -> None:
@@ -44,11 +44,6 @@ class TrackedPublisher:
         """Subscribers that can receive."""
         return int(self._publisher.get_subscription_count())
 
-    @property
-    def n_undelivered(self) -> int:
-        """Clouds without a subscriber, or not acknowledged by every reliable one."""
-        return self._n_missed + self.n_pending
-
     def publish(self, raw: bytes) -> None:
         """Send one cloud of CDR bytes."""
         if self.n_sent == 0:
@@ -56,7 +51,7 @@ class TrackedPublisher:
         self.update()
         if self.n_subscribers == 0 or self.n_pending == DEPTH:
             # Not received by any; or it takes the place of the oldest in a full queue.
-            self._n_missed += 1
+            self.n_missed += 1
         else:
             self.n_pending += 1
         self._publisher.publish(raw)
@@ -66,7 +61,7 @@ class TrackedPublisher:
         """Take note of what has been acknowledged since the last time."""
         # First: without subscribers everything is "acknowledged".
         if self.n_subscribers == 0:
-            self._n_missed += self.n_pending
+            self.n_missed += self.n_pending
             self.n_pending = 0
         elif self.n_pending and self._publisher.wait_for_all_acked(Duration(seconds=0)):
             self.n_pending = 0
@@ -134,8 +129,8 @@ class Player:
 
     @property
     def n_undelivered(self) -> int:
-        """Clouds not delivered up to now, see `TrackedPublisher`."""
-        return sum(p.n_undelivered for p in self._publishers.values())
+        """Clouds without a subscriber, or not acknowledged by every reliable one."""
+        return sum(p.n_missed + p.n_pending for p in self._publishers.values())
 
     def best_effort_topics(self) -> list[str]:
         """Return the topics with subscribers that may have lost clouds unnoticed."""

@@ -30,8 +30,7 @@ INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'  # topics of the n
 START_TIMEOUT = 300.0  # time the node has to start, and to compile on a slow machine [s]
 SILENCE = 2.0  # time without a cloud after which what is still missing is lost [s]
 STEADY_FACTOR, STEADY_MARGIN = 1.5, 0.02
-"""By how much the latency of the last quarter may exceed that of the second one, in which the
-queue of the node has filled [1, s]."""
+"""How far latency may grow from the second quarter, which fills the queue, to the last [1, s]."""
 
 _PROBE_FRAME = 'gp_ground_seg_probe'
 _PROBE_PERIOD = 0.2

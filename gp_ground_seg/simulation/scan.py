@@ -98,7 +98,6 @@ MID_360 = ScatterModel(
     'mid-360', (math.radians(52.0), math.radians(-7.0)), 1, 0.1, 40.0, range_std=0.02, height=0.5
 )
 SENSORS = {sensor.name: sensor for sensor in (HDL_64E, HDL_32E, VLP_16, OS1_128, MID_360)}
-"""The preset sensors by name."""
 
 
 @dataclass(frozen=True)

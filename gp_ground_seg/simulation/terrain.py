@@ -20,8 +20,7 @@ import numpy.typing as npt
 from gp_ground_seg.frame import FloatArray
 
 OptionalArray: TypeAlias = FloatArray | None
-TOLERANCE = 1e-9
-"""Height above the terrain at which a ray has met it; length of a piece of no width [m]."""
+TOLERANCE = 1e-9  # height at which a ray has met the terrain; length of an empty piece [m]
 
 
 class Along(NamedTuple):
