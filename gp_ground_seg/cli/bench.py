@@ -74,10 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.data is None) == (arguments.record is None):
         raise DataError('bench: name either DATA to measure on or --from FILE')
     with staged_options(arguments, 'json', 'plot') as parts:
-        if arguments.record is not None:
-            document = read_record(arguments.record)
-        else:
-            document = _measure(arguments)
+        document = read_record(arguments.record) if arguments.record else _measure(arguments)
         if 'json' in parts:
             report.write_json(document, parts['json'])
         if 'plot' in parts:
@@ -150,10 +147,8 @@ def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[B
         raise DataError(f'--topic: is for bags, which {source} is not')
     else:
         if any(source.glob('sequences/*/velodyne')):
-            names = list_sequences(source)
-            paths = {
-                name: [one.points_path for one in list_frames(source, name)] for name in names
-            }
+            frames_of = {name: list_frames(source, name) for name in list_sequences(source)}
+            paths = {name: [one.points_path for one in own] for name, own in frames_of.items()}
         else:
             paths = {source.stem: find_scans(source)}
         frames = [
@@ -204,23 +199,21 @@ def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
 def bench_text(document: dict[str, Any]) -> str:
     """Lay out a `gp_ground_seg.evaluation.benchmark.bench_document` for the terminal."""
     cases = document['cases']
-    footer = (
-        report.parameters_line(document['config_changes']),
-        report.machine_line(document['environment']),
-    )
+    parameters = report.parameters_line(document['config_changes'])
+    machine = report.machine_line(document['environment'])
     stages = [Column(name, '.2f') for name in cases[0]['stages_ms']]
     by_stage = Table(
         [Column('stage, median [ms]'), *stages],
         [[case['name'], *case['stages_ms'].values()] for case in cases],
     )
-    parts = [_case_table(document).text(), by_stage.text(), '\n'.join(map(report.fold, footer))]
-    return '\n\n'.join(parts)
+    footer = f'{report.fold(parameters)}\n{report.fold(machine)}'
+    return '\n\n'.join([_case_table(document).text(), by_stage.text(), footer])
 
 
 def _case_table(document: dict[str, Any]) -> Table:
     cases, peer = document['cases'], document['baseline_ms']
     n_points = document['n_points']
-    median, largest = (f'{round(n_points[key]):_d}'.replace('_', ' ') for key in ('median', 'max'))
+    median, largest = (Column('', '_d').show(round(n_points[key])) for key in ('median', 'max'))
     rows: list[list[Cell]] = [[c['name'], c['ms']['median'], c['ms']['p99']] for c in cases]
     columns = [Column('time per frame, reading left out')]
     columns += [Column('median [ms]', '.2f'), Column('p99 [ms]', '.2f')]

@@ -16,11 +16,18 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
-from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, stamp_of
+from gp_ground_seg.data.point_cloud2 import (
+    CloudMessage,
+    decode_cloud,
+    encode_cloud,
+    read_xyz,
+    stamp_of,
+)
 from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
 from gp_ground_seg.evaluation.evaluate import labelled_frames
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
+from gp_ground_seg.evaluation.report import Column
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.scan import plot_birds_eye
 from gp_ground_seg.ros.lifecycle import needing_ros
@@ -154,7 +161,7 @@ def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> tuple[bo
         label[part['index'][part['index'] < len(points)]] = value
     back = np.concatenate([ground, obstacles])
     back = back[np.argsort(back['index'], kind='stable')]
-    finite = np.isfinite(_xyz(points)).all(axis=1)
+    finite = np.isfinite(read_xyz(sent)).all(axis=1)
     return back.tobytes() == points[finite].tobytes(), label
 
 
@@ -162,10 +169,6 @@ def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
     """Return the points of a `numbered_cloud` as a structured array, (N,)."""
     names = ('x', 'y', 'z', 'intensity', 'label', 'index')
     return np.frombuffer(cloud.data, [(n, '<f4' if k < 4 else '<u4') for k, n in enumerate(names)])
-
-
-def _xyz(points: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    return np.stack([points['x'], points['y'], points['z']], axis=1)
 
 
 class Tally:
@@ -187,9 +190,8 @@ class Tally:
         if number is None:
             return
         is_exact, label = check_scan(sent, results)
-        points = _records(sent)
-        xyz = _xyz(points)
-        truth = GROUNDGRID.truth(points['label'], xyz[:, 2])
+        xyz = read_xyz(sent)
+        truth = GROUNDGRID.truth(_records(sent)['label'], xyz[:, 2])
         self.n_points += int(np.isfinite(xyz).all(axis=1).sum())
         self.n_faulty += not is_exact
         self.confusion += count_confusion(label, truth)
@@ -211,7 +213,7 @@ def result_text(
     )
     lines = [
         f'scans    {result["n_sent"]} sent, {result["n_back"]} back, {result["n_lost"]} lost',
-        f'points   {_thousands(tally.n_points)} of these scans: {partition}',
+        f'points   {Column("", "_d").show(tally.n_points)} of these scans: {partition}',
         f'labels   ground IoU {iou}, precision {precision}, recall {recall} (against {truth})',
         f'latency  median {1e3 * result["p50"]:.1f} ms, 99 % within {1e3 * result["p99"]:.1f} ms, '
         'from sending a scan to having both clouds',
@@ -230,7 +232,6 @@ def result_text(
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
     if importlib.util.find_spec('matplotlib') is None:
-        # Said now, not after everything else is done.
         raise MissingDependencyError('the demo draws with matplotlib: pip install matplotlib')
     sequence = arguments.sequence
     if arguments.kitti is not None:
@@ -305,7 +306,3 @@ def sustainable_rate(cloud: CloudMessage, probe: Probe) -> float:
     rate = float(f'{COMFORTABLE_LOAD / seconds:.1g}')
     print(f'      a scan takes {1e3 * seconds:.0f} ms here and now: playing {rate:g} per second')
     return rate
-
-
-def _thousands(number: int) -> str:
-    return f'{number:_}'.replace('_', ' ')
