@@ -49,14 +49,13 @@ RUN_LENGTH = 10
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'bench', DESCRIPTION, EXAMPLES)
-    number: dict[str, Any] = {'metavar': 'N', 'type': options.positive}
     file = {'metavar': 'FILE'}
     options.add(
         parser,
         ('data', 'scans or a bag', {'metavar': 'DATA', 'nargs': '?'}),
         ('--frames', 'frames, in runs of ten spread over the data (default: %(default)s)',
-         {**number, 'default': 60}),
-        ('--passes', 'go over the frames so often', {**number, 'default': 1}),
+         {**options.NUMBER, 'default': 60}),
+        ('--passes', 'go over the frames so often', {**options.NUMBER, 'default': 1}),
         ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
         ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
@@ -74,7 +73,8 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.data is None) == (arguments.record is None):
         raise DataError('bench: name either DATA to measure on or --from FILE')
     with staged_options(arguments, 'json', 'plot') as parts:
-        document = read_record(arguments.record) if arguments.record else _measure(arguments)
+        given = arguments.record
+        document = _measure(arguments) if given is None else read_record(given)
         if 'json' in parts:
             report.write_json(document, parts['json'])
         if 'plot' in parts:

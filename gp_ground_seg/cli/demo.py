@@ -89,7 +89,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--kitti', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'}),
         ('--sequence', 'sequence of it, as in 00 (default: the first)', {'metavar': 'S'}),
         ('--frames', 'scans to play, at most (default: %(default)s)',
-         {'metavar': 'N', 'type': options.positive, 'default': 30}),
+         {**options.NUMBER, 'default': 30}),
         ('--rate', rate, {'metavar': 'HZ', 'type': options.above_zero}),
         ('--output', 'folder for what is written (default: %(default)s)',
          {'metavar': 'DIR', 'default': 'demo_output'}),
@@ -182,7 +182,7 @@ class Tally:
         self._numbers = {stamp: k for k, stamp in enumerate(stamps)}
         self.n_points = self.n_faulty = 0
         self.confusion = Confusion()
-        self.picture: tuple[int, npt.NDArray[np.float32], Labels, Labels] | None = None
+        self.picture: tuple[int, npt.NDArray[np.floating], Labels, Labels] | None = None
 
     def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
         """Check a scan that came back, and add it; other clouds are trials."""

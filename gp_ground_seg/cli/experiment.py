@@ -24,7 +24,7 @@ DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 
 OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
-SEEDS = ('--seeds', 'simulated scenes of each kind', {'metavar': 'N', 'type': options.positive})
+SEEDS = ('--seeds', 'simulated scenes of each kind', options.NUMBER)
 SCENE_LIST = (
     '--scenes', f'simulated scenes, some of {",".join(SCENES)} (default: all)',
     {'metavar': 'LIST', 'type': options.some_of(SCENES)},
@@ -45,7 +45,7 @@ SEGMENTS = (
 )  # fmt: skip
 REPEATS = (
     '--repeats', 'timed runs of each method (default: %(default)s)',
-    {'metavar': 'N', 'type': options.positive, 'default': 9},
+    {**options.NUMBER, 'default': 9},
 )  # fmt: skip
 
 
