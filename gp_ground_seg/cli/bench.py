@@ -34,7 +34,6 @@ Let nothing else run meanwhile.
 
 DATA is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
 """
-
 EXAMPLES = """\
   gp-ground-seg bench KITTI_ROOT
   gp-ground-seg bench drive.mcap --frames 20 --threads 1

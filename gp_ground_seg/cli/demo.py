@@ -57,7 +57,6 @@ MAX_LOAD, COMFORTABLE_LOAD = 0.9, 0.6
 """Share of the time that the node may need: above the first the rate is lowered."""
 N_TRIALS, TRIAL_TIMEOUT = 5, 60.0
 """Scans sent one by one to see that, and the longest time one may take [s]."""
-EXIT_FAILED = 1
 
 DESCRIPTION = """\
 See it work, with no data at hand: simulate a short drive along a street, write it
@@ -134,20 +133,17 @@ def kitti_drive(root: str | Path, sequence: str, n_frames: int) -> Drive:
 def numbered_cloud(
     points: npt.NDArray[np.float32], semantic: npt.NDArray[np.integer], stamp: int
 ) -> CloudMessage:
-    """Return a cloud whose points carry their class (``label``) and their number (``index``).
-
-    The node keeps every field: they come back with each point.
-    """
+    """Return a cloud whose points carry their class (``label``) and their number (``index``)."""
     index = np.arange(len(points), dtype=np.uint32)
     label = semantic.astype(np.uint32)
     return scan_cloud(points, stamp, FRAME_ID, label=label, index=index)
 
 
 def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> tuple[bool, Labels]:
-    """Compare a `numbered_cloud` with the clouds on `GROUND` and `OBSTACLES` that came back.
+    """Compare a `numbered_cloud` with the clouds that came back.
 
-    Returns whether each finite point came back once, in one of the two clouds, with every byte,
-    and nothing else did; and the `Label` (N,) by the cloud a point came back in.
+    Returns whether each finite point came back once, with every byte, and nothing else did; and
+    the `Label` (N,) by the cloud a point came back in.
     """
     points, clouds = _records(sent), (results[GROUND], results[OBSTACLES])
     label = np.full(len(points), Label.UNKNOWN, dtype=np.uint8)
@@ -172,16 +168,13 @@ def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
 
 
 class Tally:
-    """Sums over the scans of the given `stamps` that came back.
-
-    `picture` is the middle scan or the nearest before it: its number, places (N, 3), labels and
-    true labels of its points.
-    """
+    """Sums over the scans of the given `stamps` that came back."""
 
     def __init__(self, stamps: Sequence[tuple[int, int]]) -> None:
         self._numbers = {stamp: k for k, stamp in enumerate(stamps)}
         self.n_points = self.n_faulty = 0
         self.confusion = Confusion()
+        # Middle scan or nearest before it: number, places (N, 3), labels and true labels.
         self.picture: tuple[int, npt.NDArray[np.floating], Labels, Labels] | None = None
 
     def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
@@ -262,7 +255,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(f'\n{text}\n')
     print(f'picture  {folder / PICTURE}  one of the scans from above, and the errors in it')
     print(f'bag      {folder / BAG}  what was played; `gp-ground-seg play` plays it again')
-    return 0 if is_good else EXIT_FAILED
+    return 0 if is_good else 1
 
 
 def _write(drive: Drive, path: Path, session: Session) -> list[tuple[int, int]]:

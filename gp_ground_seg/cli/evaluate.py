@@ -23,10 +23,10 @@ from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.charts import plot_reliability
 
-DESCRIPTION = (
-    'Segment labelled frames and score the labels in both conventions of the field: precision, '
-    'recall, F1, accuracy, IoU, time per frame.'
-)
+DESCRIPTION = """\
+Segment labelled frames and score the labels in both conventions of the field: precision,
+recall, F1, accuracy, IoU, time per frame.
+"""
 EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08 --json scores.json

@@ -26,7 +26,6 @@ SCAN = """\
 Draw a scan as RViz would show the node's topics: ground, obstacles, and the ground
 model as profiles with twice its standard deviation, coloured by length-scale.
 """
-
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
   gp-ground-seg plot scan --simulate road_then_rubble -o scan.png
@@ -36,7 +35,6 @@ SCAN_EXAMPLES = """\
 ABOVE = """\
 Draw a scan from above: ground and obstacles; with --labels the errors beside it.
 """
-
 ABOVE_EXAMPLES = """\
   gp-ground-seg plot above velodyne/000000.bin --labels labels/000000.label -o errors.png
 """
@@ -46,7 +44,6 @@ The paper's Figure 1 for any scan and segment: points, ground candidates, the li
 through them with their critical points, the inliers, and the estimated ground with
 twice its standard deviation; below it the length-scale and its pseudo-inputs.
 """
-
 SEGMENT_EXAMPLES = """\
   gp-ground-seg plot segment 000000.bin --segment 157 -o segment.png
   gp-ground-seg plot segment 000000.bin --azimuth 0 -o ahead.pdf
@@ -79,14 +76,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--sensor', sensor, {'choices': SENSORS, 'default': 'hdl-64e'}),
         ('--seed', 'of the simulated scene (default: %(default)s)', {**number, 'default': 0}),
     )
-    above = options.new_parser(
-        pictures, 'above', ABOVE, ABOVE_EXAMPLES, 'a scan and its errors from above'
-    )
+    purpose = 'a scan and its errors from above'
+    above = options.new_parser(pictures, 'above', ABOVE, ABOVE_EXAMPLES, purpose)
     options.add(above, scan, labels)
 
-    segment = options.new_parser(
-        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side'
-    )
+    purpose = 'a segment from the side'
+    segment = options.new_parser(pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, purpose)
     metres, degrees = {'metavar': 'R', 'type': float}, {'metavar': 'DEG', 'type': float}
     shown = ('--max-range', 'range shown [m] (default: all candidates)', metres)
     options.add(segment, scan, labels, shown)
@@ -97,10 +92,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     for picture in (view, above, segment):
         endings = ('.png', '.pdf') if picture is segment else ('.png',)
-        output = {'metavar': 'OUT', 'required': True}
-        options.add(
-            picture, ('-o --output', f'{" or ".join(endings)} file', output), options.FORCE
-        )
+        output = (f'{" or ".join(endings)} file', {'metavar': 'OUT', 'required': True})
+        options.add(picture, ('-o --output', *output), options.FORCE)
         options.add_config(picture)
         picture.set_defaults(run=run, endings=endings)
 

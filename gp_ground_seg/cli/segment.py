@@ -47,7 +47,6 @@ Messages of ROS 1 are converted to ROS 2.
 Nothing is overwritten without --force. Output is written under a hidden name
 (.NAME.partial-...) and takes its name when it is complete.
 """
-
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
@@ -63,7 +62,6 @@ with velodyne/ in it. Each scan is judged by itself. Support is the share of the
 low points on the plane that was found, residual their distance to it. With enough
 scans of level ground the medians are values to set: docs/pose.md.
 """
-
 POSE_EXAMPLES = """\
   gp-ground-seg pose 000000.bin
   gp-ground-seg pose KITTI_ROOT/sequences/00
@@ -114,7 +112,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
     config = options.read_config(arguments)
     source = Path(arguments.input)
-    holds_bag = is_bag(source) or _holds_bag_files(source)
+    holds_bag = is_bag(source)
+    if source.is_dir() and not any(source.glob('*.bin')):
+        # A folder of bag files and no scans: `BagReader` says what is missing there.
+        holds_bag |= any(child.suffix in BAG_SUFFIXES for child in source.iterdir())
     scans = [] if holds_bag else find_scans(source)
     kind, foreign = ('scans', ['raw']) if holds_bag else ('bags', FOR_BAGS)
     for name in foreign:
@@ -140,13 +141,6 @@ def run(arguments: argparse.Namespace) -> int:
         f'written to {target}'
     )
     return 0
-
-
-def _holds_bag_files(source: Path) -> bool:
-    """Whether a folder holds bag files and no scans: `BagReader` says what is missing there."""
-    if not source.is_dir() or any(source.glob('*.bin')):
-        return False
-    return any(child.suffix in BAG_SUFFIXES for child in source.iterdir())
 
 
 def _default_output(source: Path) -> Path:

@@ -102,13 +102,13 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
     """Every number of each scan of each method; heights in metres, angles in radians."""
     rows = []
     scans = [(score.name, scan) for score in scores for scan in score.scans]
+    of_labels = ('tp', 'fp', 'fn', 'tn', *RATIOS)
     of_height = ('n_points', 'n_without_model', 'rmse', 'median_absolute', 'bias', 'smse')
     for method, scan in scans:
         row: dict[str, Any] = {'method': method, 'sequence': scan.sequence}
         row |= {'index': scan.index, 'seconds': scan.seconds}
         for key, confusion in scan.confusions.items():
-            for name in ('tp', 'fp', 'fn', 'tn', *RATIOS):
-                row[f'{key}_{name}'] = getattr(confusion, name)
+            row |= {f'{key}_{name}': getattr(confusion, name) for name in of_labels}
         if scan.height is not None:
             row |= {f'{name}_all': getattr(scan.height, name) for name in of_height}
         if scan.calibration is not None:

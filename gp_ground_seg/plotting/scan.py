@@ -57,8 +57,7 @@ def plot_scan_view(
 
     Ground and obstacles of `points`, (N, >=3) [m], and on them profiles of the ground model with
     two standard deviations, coloured by length-scale: what the node's topics show in RViz.
-    ``length_scale.min`` and ``max`` end the colours; ground less certain than
-    ``label.ground_tolerance`` is not drawn. Raises PointCloudError if another scan was segmented.
+    Ground less certain than ``label.ground_tolerance`` is not drawn.
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=segmentation.label)
@@ -163,7 +162,6 @@ def plot_birds_eye(
     """Draw points (N, >=3) [m] from above by their `Label`, as a PNG, replacing the file `path`.
 
     With the true labels, UNKNOWN where a point does not count, a second panel shows the errors.
-    Raises PointCloudError if the shapes do not fit together.
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=label, truth=truth)

@@ -60,8 +60,7 @@ def plot_segment(
 
     `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
     labels, UNKNOWN where a point does not count; `max_range` [m] is by default a little more than
-    that of the last candidate. The file `path`, a PDF or else a PNG, is replaced. Raises
-    PointCloudError or ConfigError if shapes do not fit, or segment or range are not accepted.
+    that of the last candidate. The file `path`, a PDF or else a PNG, is replaced.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     style.check_lengths(len(z), result=result.label, truth=truth)
