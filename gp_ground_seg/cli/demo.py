@@ -14,15 +14,10 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
+from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
-from gp_ground_seg.data.point_cloud2 import (
-    CloudMessage,
-    decode_cloud,
-    encode_cloud,
-    read_xyz,
-    stamp_of,
-)
+from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, read_xyz
 from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
 from gp_ground_seg.evaluation.evaluate import labelled_frames
@@ -179,7 +174,7 @@ class Tally:
 
     def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
         """Check a scan that came back, and add it; other clouds are trials."""
-        number = self._numbers.get(stamp_of(sent))
+        number = self._numbers.get(point_cloud2.stamp_of(sent))
         if number is None:
             return
         is_exact, label = check_scan(sent, results)

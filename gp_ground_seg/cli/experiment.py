@@ -146,8 +146,8 @@ def _scenes(arguments: argparse.Namespace) -> Report:
         preset = arguments.preset or variants.PRESET_OF[sensor]
         configs[sensor] = options.read_config(argparse.Namespace(**{**given, 'preset': preset}))
     scenes, seeds = arguments.scenes or list(SCENES), arguments.seeds or 3
-    with_peer = not arguments.no_peer
-    return variants.score_scenes(configs, scenes, seeds, with_peer, options.progress('scenes'))
+    bar = options.progress('scenes')
+    return variants.score_scenes(configs, scenes, seeds, not arguments.no_peer, bar)
 
 
 def _cross_validation(arguments: argparse.Namespace) -> Report:

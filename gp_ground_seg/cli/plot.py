@@ -143,8 +143,7 @@ def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.float32], s
 
 def _segment_number(arguments: argparse.Namespace, config: Config) -> int:
     if arguments.azimuth is None:
-        number: int = arguments.segment
-        return number
+        return int(arguments.segment)
     if not math.isfinite(arguments.azimuth):
         raise DataError(f'--azimuth {arguments.azimuth}: must be a number of degrees')
     return segment_at(math.radians(arguments.azimuth), config.grid.n_segments)

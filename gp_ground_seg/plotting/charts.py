@@ -18,6 +18,7 @@ STAGE_COLOURS = (
     style.VIOLET,
 )  # fmt: skip
 REFERENCE_COLOUR = '#3B4046'
+POOLED_COLOUR = style.BLUE
 
 # Inches: the bar chart, a bar, and what is above and below all bars.
 BARS_WIDTH, BAR, AROUND = 10.0, 0.55, 1.9
@@ -76,7 +77,7 @@ def plot_reliability(sequences: Mapping[str, Any], path: str | Path, title: str)
     upper.tick_params(labelbottom=False)
     upper.plot([0, 1], [0, 1], color=REFERENCE_COLOUR, linestyle='--', linewidth=1, label='ideal')
     thin = {'color': '#9AA1A9', 'linewidth': 1, 'marker': '.'}
-    thick = {'color': style.BLUE, 'linewidth': 2, 'marker': 'o', 'label': 'all'}
+    thick = {'color': POOLED_COLOUR, 'linewidth': 2, 'marker': 'o', 'label': 'all'}
     for one, look in (*((part, thin) for part in parts), (pooled, thick)):
         enough = one.n_points >= MIN_POINTS
         mean, share = (one.by_bin(sums)[enough] for sums in (one.sum_p, one.n_ground))
