@@ -123,8 +123,6 @@ class Collector:
         return self.messages
 
 
-# Clouds
-
 _LAYOUT = {'names': ['intensity', *'xyz'], 'formats': 4 * ['<f4'], 'offsets': [0, 4, 8, 12]}
 POINT = np.dtype({**_LAYOUT, 'itemsize': 64})
 """A point as a driver sends it: x not first, bytes that belong to no field."""
@@ -171,8 +169,6 @@ def rows_of(message):
     data, step = bytes(message.data), message.point_step
     return [data[start : start + step] for start in range(0, len(data), step)]
 
-
-# The node as a process
 
 ENTRY_POINT = ('-c', 'import sys; from gp_ground_seg.cli.node import main; sys.exit(main())')
 """What the installed executable does."""
@@ -242,9 +238,6 @@ def said_by(capfd, *texts):
 
     wait_for(is_said, f'{texts} on stderr')
     return said[0]
-
-
-# Talking to a node
 
 
 def values_of(status):

@@ -162,9 +162,6 @@ def test_docs_show_the_record():
     assert f'```text\n{bench_text(read_record(docs / "performance.json"))}\n```' in text
 
 
-# The command.
-
-
 @pytest.fixture(scope='module')
 def scans(tmp_path_factory):
     folder = tmp_path_factory.mktemp('scans')

@@ -42,9 +42,6 @@ COMMAND = (sys.executable, '-m', 'gp_ground_seg', 'demo')
 PATIENCE = 120.0
 
 
-# --- what comes back, compared to what was sent
-
-
 def sent_cloud(n=40, seed=0, stamp=5_000_000_007):
     """A scan of road 40 and car 10, half and half, one outlier 1, one point not finite."""
     rng = np.random.default_rng(seed)
@@ -128,9 +125,6 @@ def test_every_fault_is_found():
         assert not check_scan(cloud, {GROUND: first, OBSTACLES: second})[0]
 
 
-# --- counts over a drive
-
-
 def trips(*latencies):
     """Trips of scans sent every 0.1 s, None = lost."""
     sent = [(1000 + k * 10**8, latency) for k, latency in enumerate(latencies)]
@@ -176,9 +170,6 @@ def test_what_failed_is_said(rate, n_stray, is_good, words):
     result = rate_result(rate, trips(*latencies), 0)
     text, found = result_text(tally, result, n_stray, 'the truth')
     assert (found, words in text) == (is_good, True)
-
-
-# --- the whole command
 
 
 def gone(pid):
@@ -270,9 +261,6 @@ def test_refused_options(rclpy, tmp_path, capsys):
         with pytest.raises(SystemExit, match='2'):
             main(['demo', *words])
         assert words[0] in capsys.readouterr().err
-
-
-# --- its parts
 
 
 @pytest.mark.parametrize(

@@ -205,9 +205,6 @@ def test_note_on_migrated_topic(tmp_path, capsys):
     assert capsys.readouterr().err == ''
 
 
-# --- scans --------------------------------------------------------------------------------
-
-
 def expected_labels(segmenter, k, ground=40, obstacle=99):
     label = segmenter.segment(samples.scan(k)).label
     return np.select([label == Label.GROUND, label == Label.OBSTACLE], [ground, obstacle], 0)
@@ -317,9 +314,6 @@ def test_progress_bar_on_a_terminal(tmp_path, monkeypatch, words, shown):
     monkeypatch.setattr('sys.stderr', terminal)
     assert segment(tmp_path / 'velodyne', *words) == 0
     assert ('segment:' in terminal.getvalue()) == ('/3 [' in terminal.getvalue()) == shown
-
-
-# --- killed, interrupted, disk full -------------------------------------------------------
 
 
 @pytest.fixture(scope='module')

@@ -227,9 +227,6 @@ def test_patchworkpp_on_real_frames_scores_as_measured_elsewhere(kitti):
     assert score.pooled('groundgrid').iou == pytest.approx(0.9515, abs=0.001)
 
 
-# The command.
-
-
 @pytest.fixture(scope='module')
 def root(tmp_path_factory):
     return write_streets(tmp_path_factory.mktemp('kitti'), s00=2, s08=1)

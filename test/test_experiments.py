@@ -46,9 +46,6 @@ def frames(tmp_path_factory):
     return labelled_frames(write_streets(tmp_path_factory.mktemp('kitti'), s00=2, s08=1))
 
 
-# Variants.
-
-
 def test_only_what_the_ray_hit_of_the_terrain_is_ground():
     scan = load_simulated(SimulatedFrame('hdl-64e', 'urban', 0, 0.0))
     made = simulate_scan(SCENES['urban'](0), HDL_64E, np.random.default_rng(0))
@@ -56,9 +53,6 @@ def test_only_what_the_ray_hit_of_the_terrain_is_ground():
     ground = scan.truths['exact'] == Label.GROUND
     np.testing.assert_array_equal(ground, made.kind == Kind.TERRAIN)
     np.testing.assert_array_equal(~ground, scan.truths['exact'] == Label.OBSTACLE)
-
-
-# Ablation.
 
 
 def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(frames):
@@ -83,9 +77,6 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     report = ablation.compare_models(frames, load_simulated, Config())
     constant, gradient, latent = (row['rmse'] for row in report.tables['models'].json())
     assert latent < 0.9 * min(constant, gradient)
-
-
-# Departures.
 
 
 @pytest.mark.parametrize('departure', ablation.DEPARTURES, ids=lambda one: one.title)
@@ -129,8 +120,6 @@ def test_lists_that_cannot_be(departures, message):
     with pytest.raises(ConfigError, match=message):
         ablation.compare_departures([], departures, Config())
 
-
-# Cross-validation.
 
 GRID = {'a': [0, 1, 2], 'b': [0, 1, 2]}
 
@@ -202,9 +191,6 @@ def test_scores_of_the_search_are_those_of_evaluate(frames):
         ablation.cross_validate(frames[:2], FAR, {name: [15.0]})
 
 
-# Simulated scenes.
-
-
 def test_every_sensor_has_a_preset_of_its_height():
     assert set(PRESET_OF) == set(SENSORS)
     for sensor, preset in PRESET_OF.items():
@@ -251,9 +237,6 @@ def test_behind_is_said():
 
     (note,) = variants.scene_table(score(90, 80, 70), score(89, 81, 70)).notes
     assert note == 'ahead of Patchwork++ on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
-
-
-# Sensor pose.
 
 
 @pytest.fixture(scope='module')

@@ -33,8 +33,6 @@ def close_to(pixels, colour, tolerance=0.005):
     return np.abs(pixels[..., :3] - np.array(to_rgb(colour))).max(axis=-1) < tolerance
 
 
-# --- from above ---------------------------------------------------------------------------
-
 SQUARE, LEFT, RIGHT, TOP = inches(scan.SQUARE, scan.LEFT, scan.RIGHT, scan.ABOVE)
 PANEL = LEFT + SQUARE + RIGHT
 
@@ -150,9 +148,6 @@ def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeyp
     assert not (tmp_path / 'b.png').exists()
 
 
-# --- in perspective -----------------------------------------------------------------------
-
-
 def test_camera_projects_as_a_camera_does():
     forward = np.subtract(TARGET, CAMERA)
     forward /= np.linalg.norm(forward)
@@ -216,9 +211,6 @@ def test_command_draws_a_scan_from_above(tmp_path):
     assert missed[1] > 500
 
 
-# --- charts -------------------------------------------------------------------------------
-
-
 def test_bars_are_as_long_as_the_stages(tmp_path):
     cases = {f'case {k}': {'first': 10.0 * k, 'second': 30.0} for k in range(1, 5)}
     path = tmp_path / 'bars.png'
@@ -256,8 +248,6 @@ def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
     with pytest.raises(PointCloudError, match='no scored point'):
         charts.plot_reliability({'all': found}, tmp_path / 'b.png', '')
 
-
-# --- colours of length-scales -------------------------------------------------------------
 
 # Brettel-style full loss of one cone, as linear maps in linear RGB (Machado et al. 2009).
 DEFICIENCIES = {

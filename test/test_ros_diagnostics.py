@@ -51,9 +51,6 @@ def process(statistics, latencies):
     return statistics
 
 
-# Gaps and jumps
-
-
 @given(st.lists(st.booleans(), min_size=1))
 def test_gaps_count_what_is_missing_between_arrivals(is_received):
     gaps = SequenceGaps()
@@ -75,9 +72,6 @@ def test_a_stamp_far_behind_the_newest_is_a_jump(stamps):
         newest = stamp if is_jump or newest is None else max(newest, stamp)
     watch.reset()
     assert watch.note(-100.0) == 0.0
-
-
-# Rates and levels
 
 
 @given(st.lists(st.tuples(times, st.integers(1, 4)), min_size=1))
@@ -130,9 +124,6 @@ def test_every_task_is_reported_and_holds_its_own_level():
     assert second.message == 'receiving; 1.0 s ago: every cloud refused: no field named z'
     arrive(diagnostics.input, 4.5)
     assert diagnostics.report(5.0)[0].level == Level.OK
-
-
-# Input
 
 
 def test_input_waits_then_is_stale_and_recovers():
@@ -198,9 +189,6 @@ def test_refusals_are_an_error_above_their_limit(are_refused, max_ratio):
     assert report.values['Refused since startup'] == str(sum(are_refused))
 
 
-# Processing
-
-
 def test_processing_percentiles_in_milliseconds_and_a_slow_median():
     assert ProcessingTask().report(0.0, LIMITS).message == 'no cloud processed yet'
     statistics = process(ProcessingTask(), [0.001 * k for k in range(101)])
@@ -254,9 +242,6 @@ def test_load_is_work_over_the_time_between_clouds_sent(period, duration, n_lost
     if not 0.899 < load < 0.901:
         assert report.level == (Level.WARN if load > 0.9 else Level.OK)
     assert float(report.values['Load (%)']) == pytest.approx(100.0 * load, abs=0.051)
-
-
-# Model
 
 
 def status_of(points, limits=LIMITS, **changes):
@@ -319,9 +304,6 @@ def test_quality_is_a_share(n_segments, n_occupied, n_inliers, n_more, certainty
     assert frame_quality(fit, n_occupied, 0.5 * certainty) <= quality
     if status == 'failed' or not n_segments or not n_inliers:
         assert quality == 0.0
-
-
-# Output
 
 
 def test_output_lists_every_topic():

@@ -114,9 +114,6 @@ def test_missing_ros_is_said_in_one_line():
     assert "pip install 'gp_ground_seg[ros]'" in line
 
 
-# What is right
-
-
 def test_two_nodes_side_by_side_read_their_parts_of_one_file(tmp_path):
     """Each has its own parameters and topics; the second is told to be quiet."""
     path = tmp_path / 'both.yaml'
@@ -303,9 +300,6 @@ assert signal.set_wakeup_fd(-1) == -1
 def test_without_a_signal_all_is_as_before():
     done = run_python('-c', UNDISTURBED)
     assert (done.returncode, done.stderr) == (0, '')
-
-
-# Signals to the commands that talk to a node
 
 
 @pytest.fixture

@@ -251,9 +251,6 @@ def test_changes_during_playback_lose_no_frame(b):
     assert b.node.config.label.ground_tolerance == tolerances[-1]
 
 
-# At the start
-
-
 @pytest.mark.parametrize('name', PRESETS)
 def test_node_starts_with_every_shipped_file(name):
     path = REPOSITORY / 'config' / f'{name}.yaml'

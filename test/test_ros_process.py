@@ -51,9 +51,6 @@ def drive(tmp_path):
     return tmp_path / 'drive.mcap'
 
 
-# Nodes of their own
-
-
 def test_a_bag_of_2011_shows_ok(drive, tmp_path):
     with ros.linked_process(tmp_path, *ros.given(PATIENT), sends=None) as (node, link):
         with play(drive, '--rate', '1') as player:

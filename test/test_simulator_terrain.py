@@ -202,9 +202,6 @@ def test_waves_have_the_rms_asked_for_and_rubble_starts_where_the_road_ends():
     assert np.std(ground.height(x + 120.0, y)) > 0.1
 
 
-# Solids.
-
-
 def inside(solid, points):
     """Obvious twin of `Solid.entry`: whether points lie in the solid."""
     x, y = points[..., 0] - solid.x, points[..., 1] - solid.y
