@@ -17,26 +17,13 @@ import pytest
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.demo import Tally, check_scan, numbered_cloud, result_text
 from gp_ground_seg.cli.main import main
+from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.data.point_cloud2 import (
-    decode_cloud,
-    read_xyz,
-    select_points,
-    stamp_of,
-    with_header,
-)
+from gp_ground_seg.data.point_cloud2 import read_xyz, select_points, stamp_of
 from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.frame import Label
-from gp_ground_seg.ros import lifecycle
-from gp_ground_seg.ros.probe import (
-    GROUND,
-    INPUT,
-    OBSTACLES,
-    NodeProcess,
-    Trip,
-    private_network,
-    rate_result,
-)
+from gp_ground_seg.ros import lifecycle, probe
+from gp_ground_seg.ros.probe import GROUND, OBSTACLES, NodeProcess, private_network, rate_result
 
 COMMAND = (sys.executable, '-m', 'gp_ground_seg', 'demo')
 PATIENCE = 120.0
@@ -113,8 +100,8 @@ def test_every_fault_is_found():
     forged = [flipped(ground, 24 * 7 + byte) for byte in range(24)]
     forged += [select_points(ground, ~chosen(20, 4)), joined(ground, again)]
     for change in (
-        {'header': with_header(cloud, (5, 8)).header},
-        {'header': with_header(ground, (5, 7), 'map').header},
+        {'header': point_cloud2.with_header(cloud, (5, 8)).header},
+        {'header': point_cloud2.with_header(ground, (5, 7), 'map').header},
         {'fields': cloud.fields[:-1]},
         {'data': ground.data[:-1]},
     ):
@@ -128,7 +115,7 @@ def test_every_fault_is_found():
 def trips(*latencies):
     """Trips of scans sent every 0.1 s, None = lost."""
     sent = [(1000 + k * 10**8, latency) for k, latency in enumerate(latencies)]
-    return [Trip(t, None if late is None else t + round(1e9 * late)) for t, late in sent]
+    return [probe.Trip(t, None if late is None else t + round(1e9 * late)) for t, late in sent]
 
 
 def test_counts_and_words():
@@ -214,7 +201,9 @@ def test_demo_without_data(rclpy, tmp_path):
     assert files == ['birds_eye.png', 'drive.mcap', 'node.log']
     assert (folder / 'birds_eye.png').read_bytes().startswith(b'\x89PNG')
     with BagReader(folder / 'drive.mcap') as bag:
-        n_points = sum(decode_cloud(raw).width for _, _, raw in bag.messages([INPUT]))
+        n_points = sum(
+            point_cloud2.decode_cloud(raw).width for _, _, raw in bag.messages([probe.INPUT])
+        )
     assert f'{n_points:,}'.replace(',', ' ') + ' of these scans' in said
     (error,) = run_demo(tmp_path, '--frames', 4).splitlines()
     assert '--force' in error

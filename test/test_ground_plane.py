@@ -10,16 +10,8 @@ from gp_ground_seg import Config
 from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.frame import Candidates
-from gp_ground_seg.pipeline.ground_plane import (
-    MIN_CELLS,
-    N_RINGS,
-    N_SECTORS,
-    RING_EDGES,
-    fit_plane,
-    lowest_points,
-    segment_directions,
-    solve_plane,
-)
+from gp_ground_seg.pipeline import ground_plane
+from gp_ground_seg.pipeline.ground_plane import N_SECTORS, RING_EDGES, fit_plane
 from gp_ground_seg.pipeline.tilt import rotation
 
 BACKENDS = NumpyBackend(), NumbaBackend(1)
@@ -67,8 +59,8 @@ def slow_lowest(candidates):
 
 
 def assert_lowest(candidates):
-    cells = lowest_points(candidates)
-    cosine, sine = segment_directions(len(candidates.offsets) - 1)
+    cells = ground_plane.lowest_points(candidates)
+    cosine, sine = ground_plane.segment_directions(len(candidates.offsets) - 1)
     expected = [(s, z, r, r * cosine[m], r * sine[m]) for s, z, r, m in slow_lowest(candidates)]
     assert list(zip(cells.sector, cells.z, cells.r, cells.x, cells.y, strict=True)) == expected
 
@@ -83,13 +75,15 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
     if a is not None:
         np.testing.assert_allclose(a, b, atol=1e-9)
         assert 0.0 < a.support <= 1.0
-        assert a.n_support <= a.n_cells <= N_SECTORS * N_RINGS
+        assert a.n_support <= a.n_cells <= N_SECTORS * ground_plane.N_RINGS
 
 
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)
 def test_no_plane(backend):
     few = random_candidates(0, 1, 40, 1.0)
-    few = Candidates(*(a[: MIN_CELLS - 1] for a in few[:4]), np.array([0, 2]), few.tile[:2])
+    few = Candidates(
+        *(a[: ground_plane.MIN_CELLS - 1] for a in few[:4]), np.array([0, 2]), few.tile[:2]
+    )
     assert backend.fit_plane(few, 0.5) is None
     above = random_candidates(1, 90, 20, 1.0)
     assert backend.fit_plane(above, 0.5) is not None
@@ -99,10 +93,12 @@ def test_no_plane(backend):
 
 def test_moments_that_determine_no_plane_or_no_slope():
     before = 1.5, 0.1, -0.2
-    assert solve_plane((0.0,) * 9, before) == before
+    assert ground_plane.solve_plane((0.0,) * 9, before) == before
     x, y = 2.0, 3.0
     one = 1.0, x, y, x * x, x * y, y * y, -1.0, -x, -y
-    assert solve_plane(one, before) == pytest.approx((1.0 + 0.1 * x - 0.2 * y, 0.1, -0.2))
+    assert ground_plane.solve_plane(one, before) == pytest.approx(
+        (1.0 + 0.1 * x - 0.2 * y, 0.1, -0.2)
+    )
 
 
 def test_a_refinement_that_leaves_the_ground_is_not_used(monkeypatch):
