@@ -20,7 +20,7 @@ from gp_ground_seg.cli import bench as command
 from gp_ground_seg.cli.bench import RUN_LENGTH, bench_text, load_frames, read_record, runs
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation import benchmark
-from gp_ground_seg.evaluation.benchmark import BenchFrame, FrameTime, bench_cases, run_cases
+from gp_ground_seg.evaluation.benchmark import FrameTime, bench_cases, bench_document, run_cases
 from gp_ground_seg.evaluation.evaluate import PATCHWORKPP
 from gp_ground_seg.evaluation.report import describe_environment
 
@@ -57,7 +57,7 @@ class Ruler(HeightRule):
 
 def frames_of(*sequences, n_points=300):
     return [
-        BenchFrame(name, str(k), with_intensity(hilly_scan(n_points, seed=k)))
+        benchmark.BenchFrame(name, str(k), with_intensity(hilly_scan(n_points, seed=k)))
         for name, n in sequences
         for k in range(n)
     ]
@@ -135,9 +135,7 @@ def recorded(ours, peers):
         FrameTime(frame, a, {'grid': 0.25 * a, 'label': 0.5 * a}, b, fit)
         for frame, a, b in zip(frames, ours, peers, strict=True)
     ]
-    return benchmark.bench_document(
-        {'only': times}, NUMPY, describe_environment(), PATCHWORKPP, 'frames'
-    )
+    return bench_document({'only': times}, NUMPY, describe_environment(), PATCHWORKPP, 'frames')
 
 
 def test_ratios_pair_each_frame_with_its_baseline():

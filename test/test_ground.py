@@ -82,26 +82,6 @@ def test_the_oracle_is_the_conditional_of_the_joint_gaussian(seed, n, slope_std)
     np.testing.assert_allclose(found, mean + conditional(latent, values - mean)[0], atol=1e-9)
 
 
-def test_noise_free_candidates_are_interpolated_with_no_uncertainty(backend):
-    config = config_of('constant').replace(**{'length_scale.constant': 1.0})
-    r, z = np.arange(3.0, 15.0), 0.05 * np.sin(np.arange(12.0))
-    frame = frame_of(np.column_stack([r, 0.01 * r, z - 1.73]), config)
-    # Knots where the candidates are.
-    places = frame.candidates.r
-    frame = frame._replace(
-        candidates=frame.candidates._replace(bin=np.arange(len(r))),
-        knots=np.append(places, places[-1] + 1.0),
-        continues_line=np.ones(len(r), dtype=bool),
-    )
-    theta = given_theta(frame, config)
-    theta[:, 1] = np.log(1e-6)
-    surface, _ = backend.estimate_surface(frame, theta, config)
-    m = frame.candidates.segment[0]
-    assert surface.inlier.all()
-    np.testing.assert_allclose(surface.mean[m, :-1], z - 1.73, atol=1e-6)
-    np.testing.assert_allclose(surface.std[m, :-1], 0.0, atol=1e-4)
-
-
 def grow_line(backend, z, r=None, continues=(), slope_std=0.05, **bounds):
     """Inliers, knots, mean and std of one segment; up to 5.5 m low candidates are seeds."""
     r = np.arange(3.0, 3.0 + len(z)) if r is None else np.asarray(r, dtype=float)
@@ -126,13 +106,6 @@ def test_growth_follows_ground_and_leaves_obstacles_out(backend):
 def test_without_a_seed_there_is_no_model(backend):
     inlier, knots, _, _ = grow_line(backend, np.full(5, 5.0))
     assert inlier == [] and len(knots) == 0
-
-
-def test_looser_bounds_take_more(backend):
-    z = np.where(np.arange(20) % 4 == 3, 0.35, 0.0)
-    limits = {'max_standardised_residual': 1.0}, {'max_standardised_residual': 8.0}
-    strict, loose = (grow_line(backend, z, **limit)[0] for limit in limits)
-    assert set(strict) < set(loose) == set(range(20))
 
 
 def test_growth_stops_where_the_surface_is_uncertain(backend):
@@ -167,21 +140,3 @@ def test_a_line_is_followed_from_inliers_on(backend):
     inlier, knots, mean, _ = grow_line(backend, z, continues=range(5, 14))
     assert inlier == list(range(14))
     assert mean[np.searchsorted(knots, 14.0)] > 1.0
-
-
-def test_a_segment_without_a_model_gets_its_neighbours(backend):
-    config = config_of(n_neighbours=1)
-    xyz = hilly_scan(fewer(4000, 1000))
-    frame = frame_of(xyz[xyz[:, 1] > 0.0], config)
-    theta = given_theta(frame, config)
-    fused, alone = (
-        backend.estimate_surface(frame, theta, config.replace(**{'surface.n_neighbours': n}))[0]
-        for n in (1, 0)
-    )
-    has_model, had_model = (np.isfinite(s.mean[:, 5]) for s in (fused, alone))
-    beside = np.roll(had_model, 1) | np.roll(had_model, -1)
-    np.testing.assert_array_equal(has_model, had_model | beside)
-    (m, *_) = np.flatnonzero(has_model & ~had_model)
-    source = m - 1 if had_model[m - 1] else (m + 1) % len(had_model)
-    assert fused.mean[m, 5] == pytest.approx(alone.mean[source, 5])
-    assert fused.std[m, 5] > alone.std[source, 5]

@@ -11,7 +11,7 @@ from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.frame import Candidates
 from gp_ground_seg.pipeline import ground_plane
-from gp_ground_seg.pipeline.ground_plane import N_SECTORS, RING_EDGES, fit_plane
+from gp_ground_seg.pipeline.ground_plane import MIN_CELLS, N_SECTORS, RING_EDGES, solve_plane
 from gp_ground_seg.pipeline.tilt import rotation
 
 BACKENDS = NumpyBackend(), NumbaBackend(1)
@@ -81,9 +81,7 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)
 def test_no_plane(backend):
     few = random_candidates(0, 1, 40, 1.0)
-    few = Candidates(
-        *(a[: ground_plane.MIN_CELLS - 1] for a in few[:4]), np.array([0, 2]), few.tile[:2]
-    )
+    few = Candidates(*(a[: MIN_CELLS - 1] for a in few[:4]), np.array([0, 2]), few.tile[:2])
     assert backend.fit_plane(few, 0.5) is None
     above = random_candidates(1, 90, 20, 1.0)
     assert backend.fit_plane(above, 0.5) is not None
@@ -93,18 +91,16 @@ def test_no_plane(backend):
 
 def test_moments_that_determine_no_plane_or_no_slope():
     before = 1.5, 0.1, -0.2
-    assert ground_plane.solve_plane((0.0,) * 9, before) == before
+    assert solve_plane((0.0,) * 9, before) == before
     x, y = 2.0, 3.0
     one = 1.0, x, y, x * x, x * y, y * y, -1.0, -x, -y
-    assert ground_plane.solve_plane(one, before) == pytest.approx(
-        (1.0 + 0.1 * x - 0.2 * y, 0.1, -0.2)
-    )
+    assert solve_plane(one, before) == pytest.approx((1.0 + 0.1 * x - 0.2 * y, 0.1, -0.2))
 
 
 def test_a_refinement_that_leaves_the_ground_is_not_used(monkeypatch):
     candidates = BACKENDS[0].build_grid(cluttered_plane(0, 1.5, 0.0, 0.0), Config()).candidates
     monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (99.0, 0.0, 0.0))
-    assert fit_plane(candidates, 0.5).height == pytest.approx(1.5, abs=0.1)
+    assert ground_plane.fit_plane(candidates, 0.5).height == pytest.approx(1.5, abs=0.1)
     # Nor is a plane that no point lies on.
     monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (19.0, 0.0, 0.0))
-    assert fit_plane(candidates, 0.5) is None
+    assert ground_plane.fit_plane(candidates, 0.5) is None

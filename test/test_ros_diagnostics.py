@@ -17,14 +17,12 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 import ros_helpers  # noqa: F401  imports type support without its warnings
 
 from gp_ground_seg.ros import diagnostics
-from gp_ground_seg.ros.diagnostics import InputTask, ModelTask, OutputTask, ProcessingTask
+from gp_ground_seg.ros.diagnostics import InputFacts, InputTask, ModelTask, ProcessingTask
 from gp_ground_seg.ros.input import JUMP_TOLERANCE, SequenceGaps, StampWatch
 from gp_ground_seg.ros.status import RATE_WINDOW, Hysteresis, Level, Rate, Status
 
 LIMITS = DiagnosticsConfig(stale_after=2.0, max_latency=0.1)
-FACTS = diagnostics.InputFacts(
-    '/points', 'reliable, keep_last 5, volatile', n_publishers=1, ros_time=1000.5
-)
+FACTS = InputFacts('/points', 'reliable, keep_last 5, volatile', n_publishers=1, ros_time=1000.5)
 NO_FIT = GroundSegmenter().segment(np.zeros((0, 3))).fit
 
 times = st.floats(0.0, 5.0)
@@ -300,7 +298,7 @@ def test_quality_is_a_share(n_segments, n_occupied, n_inliers, n_more, certainty
 
 
 def test_output_lists_every_topic():
-    statistics = OutputTask()
+    statistics = diagnostics.OutputTask()
     assert statistics.report(0.0, {'/ground': 0}).message == 'nobody subscribes'
     for k in range(5):
         statistics.published(0.2 * k, ['/ground'])

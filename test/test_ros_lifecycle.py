@@ -12,6 +12,7 @@ from conftest import REPOSITORY
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
 import ros_helpers as ros
+from cli_runner import children, is_running, stat_words
 from rcl_interfaces.srv import GetParameters
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 from sensor_msgs.msg import PointCloud2
@@ -180,26 +181,9 @@ def test_a_preset_as_the_readme_has_it(tmp_path):
 # Signals to the node: it ends with code 0, soon, whatever it is doing.
 
 
-def stat_words(pid):
-    with open(f'/proc/{pid}/stat', encoding='ascii') as stat:
-        return stat.read().rsplit(')', 1)[1].split()
-
-
 def cpu_seconds(pid):
     words = stat_words(pid)
     return (int(words[11]) + int(words[12])) / os.sysconf('SC_CLK_TCK')
-
-
-def is_running(pid):
-    try:
-        return stat_words(pid)[0] != 'Z'
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def children(pid):
-    found = [int(name) for name in os.listdir('/proc') if name.isdigit()]
-    return [one for one in found if is_running(one) and int(stat_words(one)[1]) == pid]
 
 
 def heeds_sigterm(process):
