@@ -26,7 +26,7 @@ TERRAINS = {
     'kerb_vertical': landforms.kerb(4.0, 0.15, face_width=0.0),
     'ditch': landforms.ditch(0.3, 8.0, 4.0, 1.5, 1.0),
     'crest': landforms.crest(8.0, 10.0, 0.1, 6.0),
-    'steps': polyline(0.0, [(3, 0), (3, 0.8), (3.01, -0.2), (5, -0.2), (12, 0.8), (12, -1)], 0.1),
+    'steps': polyline(0.0, [(3, 0), (3, 0.8), (3.3, -0.2), (5, -0.2), (12, 0.8), (12, -1)], 0.1),
     'walls': polyline(2.0, [(3, -1), (10, -1), (10, 0.8), (10.3, 0.8), (10.3, 0)], -0.2),
     'rough': landforms.rough(np.random.default_rng(3), rms=0.2, wavelengths=(0.7, 9.0)),
     'road_then_rubble': landforms.smooth_then_rough(np.random.default_rng(4), 9.0, 3.0),
