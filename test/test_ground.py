@@ -82,6 +82,26 @@ def test_the_oracle_is_the_conditional_of_the_joint_gaussian(seed, n, slope_std)
     np.testing.assert_allclose(found, mean + conditional(latent, values - mean)[0], atol=1e-9)
 
 
+def test_noise_free_candidates_are_interpolated_with_no_uncertainty(backend):
+    config = config_of('constant').replace(**{'length_scale.constant': 1.0})
+    r, z = np.arange(3.0, 15.0), 0.05 * np.sin(np.arange(12.0))
+    frame = frame_of(np.column_stack([r, 0.01 * r, z - 1.73]), config)
+    # Knots where the candidates are.
+    places = frame.candidates.r
+    frame = frame._replace(
+        candidates=frame.candidates._replace(bin=np.arange(len(r))),
+        knots=np.append(places, places[-1] + 1.0),
+        continues_line=np.ones(len(r), dtype=bool),
+    )
+    theta = given_theta(frame, config)
+    theta[:, 1] = np.log(1e-6)
+    surface, _ = backend.estimate_surface(frame, theta, config)
+    m = frame.candidates.segment[0]
+    assert surface.inlier.all()
+    np.testing.assert_allclose(surface.mean[m, :-1], z - 1.73, atol=1e-6)
+    np.testing.assert_allclose(surface.std[m, :-1], 0.0, atol=1e-4)
+
+
 def grow_line(backend, z, r=None, continues=(), slope_std=0.05, **bounds):
     """Inliers, knots, mean and std of one segment; up to 5.5 m low candidates are seeds."""
     r = np.arange(3.0, 3.0 + len(z)) if r is None else np.asarray(r, dtype=float)
@@ -106,6 +126,13 @@ def test_growth_follows_ground_and_leaves_obstacles_out(backend):
 def test_without_a_seed_there_is_no_model(backend):
     inlier, knots, _, _ = grow_line(backend, np.full(5, 5.0))
     assert inlier == [] and len(knots) == 0
+
+
+def test_looser_bounds_take_more(backend):
+    z = np.where(np.arange(20) % 4 == 3, 0.35, 0.0)
+    limits = {'max_standardised_residual': 1.0}, {'max_standardised_residual': 8.0}
+    strict, loose = (grow_line(backend, z, **limit)[0] for limit in limits)
+    assert set(strict) < set(loose) == set(range(20))
 
 
 def test_growth_stops_where_the_surface_is_uncertain(backend):
