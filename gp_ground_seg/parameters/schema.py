@@ -206,13 +206,21 @@ def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterVa
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, without two of its surprises (see `load_yaml`)."""
+    """PyYAML's safe loader, without three of its surprises (see `load_yaml`)."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()  # type: ignore[no-untyped-call]
+            line = event.start_mark.line + 1
+            raise ConfigError(f'line {line}: aliases (*name) are not accepted')
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse a key that is there twice; the last would win silently."""
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         for key in keys:
-            if key != '<<' and keys.count(key) > 1:
+            if keys.count(key) > 1:
                 raise ConfigError(f'{key}: given twice, from line {node.start_mark.line + 1} on')
         return super().construct_mapping(node, deep)
 
@@ -225,7 +233,7 @@ _Loader.add_implicit_resolver(
 
 
 def load_yaml(text: str) -> object:
-    """Read YAML, with 1e-3 a number as in ROS; a key given twice raises ConfigError."""
+    """Read YAML, with 1e-3 a number as in ROS; an alias or a key given twice: ConfigError."""
     document: object = yaml.load(text, Loader=_Loader)
     return document
 
