@@ -1,10 +1,8 @@
 """The stages as loops that read like the paper: slow oracles of both backends.
 
-`Reference` has the methods of `gp_ground_seg.backend.Backend`; shapes and units are those of
-its values. One point, one tile or one segment at a time; each fit is made anew.
+Shapes and units are those of `gp_ground_seg.backend.Backend`, which `Reference` implements. One
+point, one tile or one segment at a time; each fit is made anew.
 """
-
-from __future__ import annotations
 
 import math
 
@@ -22,39 +20,7 @@ from gp_ground_seg.frame import (
     Labelled,
     Lines,
     PseudoInputs,
-    Scan,
 )
-
-N_SLICES = 3
-
-
-class Reference(NumpyBackend):
-    """Plain loops; cells and the plane of the ground are those of the numpy backend."""
-
-    name = 'reference'
-
-    def build_grid(self, xyz, config):
-        scan = super().build_grid(xyz, config)
-        return scan._replace(candidates=lowest_of_cells(scan, config))
-
-    def find_faces(self, scan, config):
-        return find_faces(scan, config)
-
-    def extract_lines(self, candidates, faces, config):
-        shows_ground = np.array([not faces.has_occluded_base[t] for t in candidates.tile], bool)
-        kept = candidates.where(shows_ground)
-        lines = extract_lines(kept, config.lines)
-        return kept, lines, pseudo_inputs(kept, lines, config), continues_line(kept, lines, config)
-
-    def log_likelihood(self, theta, inliers, slope_std, latent_terms):
-        return log_likelihood(theta, inliers, slope_std, latent_terms)
-
-    def estimate_surface(self, frame, theta, config, segment_step=1):
-        return estimate_surface(frame, theta, config, segment_step)
-
-    def label_points(self, scan, faces, surface, config):
-        return label_points(scan, faces, surface, config)
-
 
 # Polar grid (section II)
 
@@ -65,18 +31,17 @@ def place_of(x, y, grid):
     steps = np.arange(grid.n_bins + 1) / grid.n_bins
     edges = grid.r_min + (grid.r_max - grid.r_min) * steps**grid.bin_growth
     # The origin counts as lying on +x, also where its x is -0.
-    turn = (
-        math.atan2(y, x if x != 0.0 or y != 0.0 else 1.0) / (2.0 * math.pi) + 0.5
-    ) * grid.n_segments
+    angle = math.atan2(y, x) if x != 0.0 or y != 0.0 else 0.0
+    turn = (angle / (2.0 * math.pi) + 0.5) * grid.n_segments
     if not r < edges[-1]:
         return None, turn
     return next(n for n in range(grid.n_bins) if r < edges[n + 1]), turn
 
 
-def lowest_of_cells(scan: Scan, config) -> Candidates:
+def lowest_of_cells(scan, config):
     """Lowest point of each cell; of equally low ones the nearest, then the first tile.
 
-    The density is the mean over slices of equal height of points over area.
+    The density is the mean over three slices of equal height of points over area.
     """
     members = {}
     for i in np.flatnonzero(scan.grid.cell >= 0):
@@ -87,9 +52,8 @@ def lowest_of_cells(scan: Scan, config) -> Candidates:
         low, r, tile = min(zip(z, scan.grid.r[own], scan.tiles.tile[own], strict=True))
         segment, n = divmod(cell, scan.grid.n_bins)
         extent = max(max(z) - low, config.lines.min_density_extent)
-        piece = np.minimum((z - low) / extent * N_SLICES, N_SLICES - 1).astype(int)
-        number = np.bincount(piece, minlength=N_SLICES)
-        area = np.diff(scan.grid.edges)[n] * extent / N_SLICES
+        number = np.bincount(np.minimum((z - low) / extent * 3, 2).astype(int), minlength=3)
+        area = np.diff(scan.grid.edges)[n] * extent / 3
         rows.append((r, low, n, np.mean(number / area), tile))
         counts[segment] += 1
     r, z, own_bin, density, tile = np.array(rows, dtype=np.float64).reshape(-1, 5).T
@@ -100,7 +64,7 @@ def lowest_of_cells(scan: Scan, config) -> Candidates:
 # Vertical faces
 
 
-def find_faces(scan: Scan, config) -> Faces:
+def find_faces(scan, config):
     """Tall tiles whose returns have a level normal; of those, faces down to the lowest return."""
     faces, limit = config.faces, config.label.obstacle_max_height
     result = Faces(*np.zeros((2, len(scan.tiles.extremes)), dtype=bool))
@@ -145,7 +109,7 @@ def fit_line(r, z, error_ratio):
     return scale * direction[1] / direction[0], r.mean(), z.mean()
 
 
-def extract_lines(candidates: Candidates, lines) -> Lines:
+def extract_lines(candidates, lines):
     """Lines between critical points."""
     r, z, density = candidates.r, candidates.z, candidates.density
     ids, slopes, starts = [], [], [0]
@@ -181,7 +145,7 @@ def _is_critical(start, new, r, z, density, lines):
     )
 
 
-def pseudo_inputs(candidates: Candidates, lines: Lines, config) -> PseudoInputs:
+def pseudo_inputs(candidates, lines, config):
     """One pseudo-input in the middle of each of equal shares of a line's candidates."""
     latent, limits = config.latent, config.length_scale
     r_bar, classes, places, extents = [], [], [], [[] for _ in range(9)]
@@ -199,23 +163,15 @@ def pseudo_inputs(candidates: Candidates, lines: Lines, config) -> PseudoInputs:
             classes.append(3 * tilt + length)
             places.append(place)
     everything = [value for own in extents for value in own] or [math.log(limits.min)]
-    return PseudoInputs(
-        np.array(r_bar),
-        np.array(classes, np.int64),
-        np.array([sum(p < o for p in places) for o in candidates.offsets], np.int64),
-        np.array([np.mean(own or everything) for own in extents]),
-    )
+    offsets = np.array([sum(p < o for p in places) for o in candidates.offsets], np.int64)
+    means = np.array([np.mean(own or everything) for own in extents])
+    return PseudoInputs(np.array(r_bar), np.array(classes, np.int64), offsets, means)
 
 
-def continues_line(candidates: Candidates, lines: Lines, config):
+def continues_line(candidates, lines, config):
     """Candidates of lines that are long and flat, or start at a slope break."""
-    r, z, growth, result = (
-        candidates.r,
-        candidates.z,
-        config.growth,
-        np.zeros(len(lines.line), bool),
-    )
-    tolerance = config.lines.offset_tolerance
+    r, z, result = candidates.r, candidates.z, np.zeros(len(lines.line), bool)
+    growth, tolerance = config.growth, config.lines.offset_tolerance
     for q, slope in enumerate(lines.slope):
         first, stop = lines.start[q], lines.start[q + 1]
         if not abs(slope) <= growth.max_line_slope:
@@ -229,10 +185,8 @@ def continues_line(candidates: Candidates, lines: Lines, config):
         over_last = z[own].mean() + slope * (r[first - 1] - r[own].mean()) - z[first - 1]
         over_first = z[first] - z[first - 1] - before * (r[first] - r[first - 1])
         # The two lines intersect in the gap between them, up to the tolerance.
-        if (over_last <= tolerance and over_first >= -tolerance) or (
-            over_last >= -tolerance and over_first <= tolerance
-        ):
-            result[own] = True
+        signs = (over_last, over_first), (-over_last, -over_first)
+        result[own] |= any(a <= tolerance and b >= -tolerance for a, b in signs)
     return result
 
 
@@ -283,7 +237,7 @@ def log_length_scales(frame, theta, config, m):
     slope = frame.lines.slope[frame.lines.line[own]]
     value = -limits.gradient_gain * np.log(np.maximum(np.abs(slope), limits.flat_gradient))
     u = np.log(np.clip(np.where(np.isnan(slope), 0.0, value), limits.min, limits.max))
-    if config.length_scale.model == 'constant':
+    if limits.model == 'constant':
         u = np.full(len(r), math.log(limits.constant))
     return u, np.interp(knots, r, u)
 
@@ -318,9 +272,10 @@ def estimate_surface(frame, theta, config, segment_step=1):
             joining &= ~chosen
         inlier[own] = chosen
         if chosen.any():
-            at = frame.knots[: len(u_star)], np.exp(u_star), sigma_f, sigma_n, slope_std
-            mean[m, : len(u_star)], variance = posterior(*data, *at)
-            std[m, : len(u_star)] = np.sqrt(variance)
+            wanted = slice(len(u_star))
+            at = frame.knots[wanted], np.exp(u_star), sigma_f, sigma_n, slope_std
+            mean[m, wanted], variance = posterior(*data, *at)
+            std[m, wanted] = np.sqrt(variance)
     mean, std = fuse(mean, std, frame.knots, config.surface.n_neighbours, slope_std)
     return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u
 
@@ -360,7 +315,7 @@ def log_likelihood(theta, inliers, slope_std, latent_terms):
 
 
 def _log_likelihood(theta, inliers, slope_std, latent_terms):
-    """Sum over the segments; letters are those of the paper."""
+    """Value of equation 19; letters are those of the paper."""
     sigma_f, sigma_n, *latent = np.exp(theta[:5])
     value = 0.0
     for m in range(len(inliers.offsets) - 1):
@@ -423,3 +378,23 @@ def label_points(scan, faces, surface, config):
         if margin[i] >= 0.0:
             result[i] = Label.GROUND
     return Labelled(result, height, margin, roughness)
+
+
+class Reference(NumpyBackend):
+    """Plain loops; cells and the plane of the ground are those of the numpy backend."""
+
+    name = 'reference'
+    find_faces = staticmethod(find_faces)
+    log_likelihood = staticmethod(log_likelihood)
+    estimate_surface = staticmethod(estimate_surface)
+    label_points = staticmethod(label_points)
+
+    def build_grid(self, xyz, config):
+        scan = super().build_grid(xyz, config)
+        return scan._replace(candidates=lowest_of_cells(scan, config))
+
+    def extract_lines(self, candidates, faces, config):
+        shows_ground = np.array([not faces.has_occluded_base[t] for t in candidates.tile], bool)
+        kept = candidates.where(shows_ground)
+        lines = extract_lines(kept, config.lines)
+        return kept, lines, pseudo_inputs(kept, lines, config), continues_line(kept, lines, config)

@@ -1,7 +1,5 @@
 """Real nodes, real DDS: what the ROS tests share."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess
@@ -10,9 +8,7 @@ import threading
 import time
 import warnings
 from array import array
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -26,11 +22,8 @@ with warnings.catch_warnings():
     import rosidl_generator_py  # noqa: F401
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import SetParametersResult
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
-from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -39,7 +32,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg.backend import choose_backend
-from gp_ground_seg.ros.node import GroundSegmentationNode, main
+from gp_ground_seg.ros.node import NODE_NAME, GroundSegmentationNode, main
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS
 
 PATIENCE = 120.0
@@ -58,114 +51,92 @@ RELIABLE = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def wait_for(condition: Callable[[], bool], what: str, timeout: float = PATIENCE) -> None:
-    """Return as soon as `condition` holds; fail if it does not within `timeout` seconds."""
-    end = time.monotonic() + timeout
+def wait_for(condition, what):
+    """Return as soon as `condition` holds."""
+    end = time.monotonic() + PATIENCE
     while not condition():
-        if time.monotonic() > end:
-            raise AssertionError(f'after {timeout:g} s still no {what}')
+        assert time.monotonic() <= end, f'after {PATIENCE:g} s still no {what}'
         time.sleep(0.005)
 
 
 @contextlib.contextmanager
-def isolated_context(args: list[str] | None = None) -> Iterator[Context]:
-    """A context of our own domain, on this machine only."""
-    before = {name: os.environ.get(name) for name in ISOLATION}
-    os.environ.update(ISOLATION)
-    context = Context()
-    try:
-        rclpy.init(context=context, args=args or [], domain_id=DOMAIN_ID)
-        yield context
-    finally:
-        rclpy.try_shutdown(context=context)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def isolated(**changes):
+    """The environment of our own domain, on this machine only."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {**ISOLATION, **changes}.items():
+            patch.setenv(name, value)
+        yield
 
 
 @contextlib.contextmanager
-def spinning(context: Context, *nodes: Node) -> Iterator[SingleThreadedExecutor]:
+def isolated_context():
+    """A context of that domain."""
+    context = Context()
+    with isolated():
+        try:
+            rclpy.init(context=context, args=[], domain_id=DOMAIN_ID)
+            yield context
+        finally:
+            rclpy.try_shutdown(context=context)
+
+
+@contextlib.contextmanager
+def spinning(context, *nodes):
     """Spin `nodes` in a thread, then destroy them; an exception of a callback is raised here."""
     executor = SingleThreadedExecutor(context=context)
     for node in nodes:
         executor.add_node(node)
-    errors: list[BaseException] = []
     done = threading.Event()
 
     # executor.spin() would have to be ended by a shutdown from this thread, which takes
     # a handle away that a callback just finishing still triggers.
-    def spin() -> None:
-        try:
+    def spin():
+        with contextlib.suppress(ExternalShutdownException):
             while context.ok() and not done.is_set():
                 executor.spin_once(timeout_sec=0.05)
-        except ExternalShutdownException:
-            pass
-        except BaseException as error:
-            errors.append(error)
 
-    thread = threading.Thread(target=spin)
-    thread.start()
-    try:
-        yield executor
-    finally:
-        done.set()
-        thread.join()
-        executor.shutdown()
-        for node in nodes:
-            node.destroy_node()
-    if errors:
-        raise errors[0]
+    with ThreadPoolExecutor(1) as pool:
+        spun = pool.submit(spin)
+        try:
+            yield
+        finally:
+            done.set()
+            error = spun.exception()
+            executor.shutdown()
+            for node in nodes:
+                node.destroy_node()
+        if error:
+            raise error
 
 
 class Collector:
     """Keeps the messages of a topic."""
 
-    def __init__(self, node: Node, message_type: type, topic: str, qos: QoSProfile = RELIABLE):
-        self.messages: list = []
-        self.subscription = node.create_subscription(
-            message_type, topic, self.messages.append, qos
-        )
+    def __init__(self, node, message_type, topic, qos=RELIABLE):
+        self.messages = []
+        take = self.messages.append
+        self.subscription = node.create_subscription(message_type, topic, take, qos)
 
-    def wait(self, count: int) -> list:
-        wait_for(lambda: len(self.messages) >= count, f'message {count} on {self.topic}')
+    def wait(self, count):
+        what = f'message {count} on {self.subscription.topic_name}'
+        wait_for(lambda: len(self.messages) >= count, what)
         return self.messages
 
-    @property
-    def topic(self) -> str:
-        return self.subscription.topic_name
 
-    @property
-    def n_publishers(self) -> int:
-        return self.subscription.get_publisher_count()
+# Clouds
 
-
-def parameter_message(name: str, value: object) -> ParameterMessage:
-    return Parameter(name, value=value).to_parameter_msg()
+_LAYOUT = {'names': ['intensity', *'xyz'], 'formats': 4 * ['<f4'], 'offsets': [0, 4, 8, 12]}
+POINT = np.dtype({**_LAYOUT, 'itemsize': 64})
+"""A point as a driver sends it: x not first, bytes that belong to no field."""
 
 
-POINT = np.dtype(
-    {
-        'names': ['intensity', 'x', 'y', 'z', 'ring', 'time'],
-        'formats': ['<f4', '<f4', '<f4', '<f4', '<u2', '<f8'],
-        'offsets': [0, 4, 8, 12, 16, 24],
-        'itemsize': 64,
-    }
-)
-"""A point as a driver sends it: x not first, gaps, further fields."""
-
-_CODES = {'f4': PointField.FLOAT32, 'f8': PointField.FLOAT64, 'u2': PointField.UINT16}
-
-
-def street(n_points: int, seed: int = 0, n_invalid: int = 0) -> np.ndarray:
+def street(n_points, seed=0, n_invalid=0):
     """Level ground 1.73 m below the sensor with walls and poles on it, as structured points."""
     rng = np.random.default_rng(seed)
     points = np.zeros(n_points, POINT)
     # Every byte means something, also those between the fields.
     points.view(np.uint8)[:] = rng.integers(0, 256, n_points * POINT.itemsize, dtype=np.uint8)
-    radius = rng.uniform(3.0, 40.0, n_points)
-    azimuth = rng.uniform(-np.pi, np.pi, n_points)
+    radius, azimuth = rng.uniform(3.0, 40.0, n_points), rng.uniform(-np.pi, np.pi, n_points)
     z = -1.73 + rng.normal(0.0, 0.02, n_points)
     is_wall = rng.random(n_points) < 0.3
     radius[is_wall] = rng.choice([8.0, 15.0, 25.0], is_wall.sum())
@@ -176,234 +147,251 @@ def street(n_points: int, seed: int = 0, n_invalid: int = 0) -> np.ndarray:
     return points
 
 
-def to_message(
-    points: np.ndarray, stamp: tuple[int, int] = (0, 0), frame: str = ''
-) -> PointCloud2:
+def to_message(points, stamp=(0, 0), frame=''):
     """Message of structured points."""
-    message = PointCloud2()
+    message = PointCloud2(height=1, width=len(points), row_step=points.nbytes)
     message.header.stamp.sec, message.header.stamp.nanosec = stamp
     message.header.frame_id = frame
-    message.height, message.width = 1, len(points)
     message.fields = [
-        PointField(name=name, offset=offset, datatype=_CODES[kind.str[1:]], count=1)
-        for name, (kind, offset) in points.dtype.fields.items()
+        PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
+        for name, (_, offset) in points.dtype.fields.items()
     ]
     message.point_step = points.dtype.itemsize
-    message.row_step = points.nbytes
-    data = array('B')
-    data.frombytes(points.tobytes())
-    message.data = data
+    message.data = array('B', points.tobytes())
     return message
 
 
-def xyz_of(points: np.ndarray) -> np.ndarray:
+def xyz_of(points):
     """Coordinates of structured points, (N, 3) float32."""
     return np.stack([points[axis] for axis in 'xyz'], axis=-1)
 
 
-def rows_of(message: PointCloud2) -> list[bytes]:
+def rows_of(message):
     """The bytes of each point of an unorganised cloud."""
     data, step = bytes(message.data), message.point_step
     return [data[start : start + step] for start in range(0, len(data), step)]
 
 
+# The node as a process
+
 ENTRY_POINT = ('-c', 'import sys; from gp_ground_seg.cli.node import main; sys.exit(main())')
 """What the installed executable does."""
 MODULE = ('-m', 'gp_ground_seg', 'node')
 PLAY = ('-m', 'gp_ground_seg', 'play')
+IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}')
+
+
+def given(values):
+    """Words that give parameters their values."""
+    return [word for k, v in values.items() for word in ('-p', f'{k}:={str(v).lower()}')]
 
 
 class Process:
     """The node in a process of its own, as a user starts it."""
 
-    def __init__(
-        self,
-        *words: str,
-        folder: Path,
-        start: tuple[str, ...] = ENTRY_POINT,
-        command: list[str] | None = None,
-        **environment: str,
-    ) -> None:
+    def __init__(self, *words, folder, start=ENTRY_POINT, command=None, **environment):
         self._log = folder / f'node_{time.monotonic_ns()}.log'
         with self._log.open('wb') as log:
             self.popen = subprocess.Popen(
                 command or [sys.executable, *start, *words],
-                stdout=subprocess.DEVNULL,
-                stderr=log,
                 env={**os.environ, **ISOLATION, **environment},
-            )
+                stdout=subprocess.DEVNULL, stderr=log,
+            )  # fmt: skip
 
     @property
-    def log(self) -> str:
+    def log(self):
         """What it wrote to stderr so far."""
         return self._log.read_text()
 
-    def wait_until_ready(self) -> None:
-        self._wait_for_log('listening to')
+    def wait_until_ready(self, text='listening to'):
+        wait_for(lambda: text in self.log or self.popen.poll() is not None, f'{text!r} in the log')
+        assert self.popen.poll() is None, self.log
 
-    def wait_until_settled(self) -> None:
+    def wait_until_settled(self):
         """Wait until it has the backend that it keeps: labels may differ by one or two."""
         self.wait_until_ready()
         if FOLLOWS in self.log:
-            self._wait_for_log(CHANGED)
+            self.wait_until_ready(CHANGED)
 
-    def _wait_for_log(self, text: str) -> None:
-        wait_for(
-            lambda: text in self.log or self.popen.poll() is not None, f'{text!r} of the node'
-        )
-        assert self.popen.poll() is None, self.log
-
-    def stop(self, number: int) -> tuple[int, float]:
+    def stop(self, number):
         """Send a signal; return exit code and seconds until the end."""
         start = time.monotonic()
         self.popen.send_signal(number)
         code = self.popen.wait(PATIENCE)
         return code, time.monotonic() - start
 
-    def __enter__(self) -> Process:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_error: object) -> None:
-        if self.popen.poll() is None:
-            self.popen.terminate()
-            try:
-                self.popen.wait(10.0)
-            except subprocess.TimeoutExpired:
-                self.popen.kill()
-                self.popen.wait()
+    def __exit__(self, *_error):
+        self.popen.terminate()
+        try:
+            self.popen.wait(10.0)
+        except subprocess.TimeoutExpired:
+            self.popen.kill()
+            self.popen.wait()
 
 
-IsWanted = Callable[[dict[str, str], DiagnosticStatus], bool]
-"""Of the values of a status, and the status."""
+def said_by(capfd, *texts):
+    """What the node in this process has written to stderr, once that holds all `texts`."""
+    said = ['']
+
+    def is_said():
+        said[0] += capfd.readouterr().err
+        return all(text in said[0] for text in texts)
+
+    wait_for(is_said, f'{texts} on stderr')
+    return said[0]
 
 
-def wait_for_status(
-    diagnostics: Collector, node_name: str, task: str, is_wanted: IsWanted
-) -> DiagnosticStatus:
-    """Return the first status of a node's `task`, from now on, that is wanted."""
-    start = len(diagnostics.messages)
-    found: list[DiagnosticStatus] = []
-    name = f'{node_name[1:]}: {task}'
-
-    def look() -> bool:
-        for array_message in diagnostics.messages[start:]:
-            for status in array_message.status:
-                if status.name == name and is_wanted(values_of(status), status):
-                    found.append(status)
-                    return True
-        return False
-
-    wait_for(look, f'wanted status of {name}')
-    return found[0]
+# Talking to a node
 
 
-def values_of(status: DiagnosticStatus) -> dict[str, str]:
+def values_of(status):
     """The numbers of a status."""
     return {entry.key: entry.value for entry in status.values}
 
 
+def parameter_messages(values):
+    return [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+
+
 class Link:
-    """What this process sends to the node of another process, and gets back from it."""
+    """What this process sends to a node of our namespace, and gets back from it.
 
-    def __init__(self, context: Context, qos: QoSProfile = RELIABLE) -> None:
-        self.probe = Node('probe', context=context, namespace=NAMESPACE)
-        self.publisher = self.probe.create_publisher(PointCloud2, 'points', qos)
-        self.ground = Collector(self.probe, PointCloud2, 'ground')
-        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles')
-
-    def wait_until_connected(self) -> None:
-        wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription')
-        for collector in (self.ground, self.obstacles):
-            wait_for(lambda c=collector: c.n_publishers == 1, f'publisher of {collector.topic}')
-
-
-class Bench:
-    """The node under test in this process, and a probe that talks to it.
-
-    Attributes
-    ----------
-    node, probe : Node
-        Both spin in a thread.
-    publisher : Publisher
-        Reliable, on ``points``.
-    ground, obstacles, diagnostics : Collector
-        What the node said.
+    Publishes on ``points``, unless `sends` is None: then another program does.
     """
 
-    def __init__(self, context: Context, words: tuple[str, ...]) -> None:
-        cli_args = ['--ros-args', *words]
-        self.node = GroundSegmentationNode(
-            context=context, namespace=NAMESPACE, cli_args=cli_args, use_global_arguments=False
-        )
+    node_name = f'{NAMESPACE}/{NODE_NAME}'
+
+    def __init__(self, context, sends=RELIABLE, takes=RELIABLE):
         self.probe = Node('probe', context=context, namespace=NAMESPACE)
-        self.publisher = self.probe.create_publisher(PointCloud2, 'points', RELIABLE)
-        self.ground = Collector(self.probe, PointCloud2, 'ground')
-        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles')
+        self.publisher = sends and self.probe.create_publisher(PointCloud2, 'points', sends)
+        self.ground = Collector(self.probe, PointCloud2, 'ground', takes)
+        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles', takes)
         self.diagnostics = Collector(self.probe, DiagnosticArray, '/diagnostics')
-        self._clients: dict[str, Client] = {}
+        self._clients = {}
 
-    def wait_until_connected(self) -> None:
-        wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription')
+    def wait_until_connected(self):
+        if self.publisher:
+            wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription')
         for collector in (self.ground, self.obstacles, self.diagnostics):
-            wait_for(lambda c=collector: c.n_publishers == 1, f'publisher of {collector.topic}')
-        # With the backend that it keeps: labels may differ by one or two.
-        has_to_load = choose_backend(self.node.config.runtime.backend) == 'numba'
-        wait_for(lambda: self.node._is_compiled or not has_to_load, 'compiled backend')
+            one = collector.subscription
+            wait_for(lambda s=one: s.get_publisher_count() == 1, f'publisher of {one.topic_name}')
 
-    def in_executor(self, function: Callable[..., object], *arguments: object) -> object:
-        """Result of a call made between two waits, where entities may safely go."""
-        task = self.node.executor.create_task(function, *arguments)
-        wait_for(task.done, 'turn of the executor')
-        return task.result()
-
-    def segment(self, *messages: PointCloud2) -> tuple[PointCloud2, PointCloud2]:
+    def segment(self, *messages):
         """Publish clouds; return the outputs of the last one."""
         count = len(self.ground.messages) + len(messages)
         for message in messages:
             self.publisher.publish(message)
         return self.ground.wait(count)[-1], self.obstacles.wait(count)[-1]
 
-    def set(self, name: str, value: object) -> SetParametersResult:
-        """Result of ``ros2 param set``."""
-        request = SetParameters.Request(parameters=[parameter_message(name, value)])
-        return self.call(SetParameters, 'set_parameters', request).results[0]
+    def publish_until(self, message, condition, what):
+        """Publish a cloud over and over until `condition` holds."""
+        wait_for(lambda: self.publisher.publish(message) or condition(), what)
 
-    def call(self, service_type: type, name: str, request: object) -> Any:
+    def set(self, name, value):
+        """Result of ``ros2 param set``."""
+        return self.load({name: value})[0]
+
+    def load(self, values):
+        """Results of setting all values at once, in their order, as ``ros2 param load`` does."""
+        request = SetParameters.Request(parameters=parameter_messages(values))
+        return self.call(SetParameters, 'set_parameters', request).results
+
+    def call(self, service_type, name, request):
         """Response of a service of the node."""
+        name = f'{self.node_name}/{name}'
         if name not in self._clients:
-            full_name = f'{self.node.get_name()}/{name}'
-            self._clients[name] = self.probe.create_client(service_type, full_name)
-            wait_for(self._clients[name].service_is_ready, f'service {full_name}')
+            self._clients[name] = self.probe.create_client(service_type, name)
+            wait_for(self._clients[name].service_is_ready, f'service {name}')
         future = self._clients[name].call_async(request)
         wait_for(future.done, f'answer of {name}')
         return future.result()
 
-    def wait_for_status(self, task: str, is_wanted: IsWanted) -> DiagnosticStatus:
-        """Return the first status of `task`, from now on, that is wanted."""
-        return wait_for_status(
-            self.diagnostics, self.node.get_fully_qualified_name(), task, is_wanted
-        )
+    def wait_for_status(self, task, is_wanted):
+        """Return the first status of the node's `task`, from now on, that is wanted.
+
+        `is_wanted` is called with its numbers and the status itself.
+        """
+        start, name = len(self.diagnostics.messages), f'{self.node_name[1:]}: {task}'
+
+        def found():
+            statuses = (s for array in self.diagnostics.messages[start:] for s in array.status)
+            return [s for s in statuses if s.name == name and is_wanted(values_of(s), s)]
+
+        wait_for(found, f'wanted status of {name}')
+        return found()[0]
+
+
+class Bench(Link):
+    """The node under test in this process, beside the probe that talks to it."""
+
+    def __init__(self, context, *words):
+        cli_args = ['--ros-args', '-r', f'__ns:={NAMESPACE}', *words]
+        self.node = GroundSegmentationNode(context=context, cli_args=cli_args)
+        self.node_name = self.node.get_fully_qualified_name()
+        super().__init__(context)
+
+    def wait_until_settled(self):
+        """As that of a `Process`."""
+        has_to_load = choose_backend(self.node.config.runtime.backend) == 'numba'
+        wait_for(lambda: self.node._is_compiled or not has_to_load, 'compiled backend')
+
+    def in_executor(self, function, *arguments):
+        """Result of a call made between two waits, where entities may safely go."""
+        task = self.node.executor.create_task(function, *arguments)
+        wait_for(task.done, 'turn of the executor')
+        return task.result()
 
 
 @contextlib.contextmanager
-def bench(*words: str) -> Iterator[Bench]:
+def bench(*words, settled=True):
     """A connected `Bench`, the node started with ``--ros-args words``."""
     with isolated_context() as context:
-        result = Bench(context, words)
-        with spinning(context, result.node, result.probe):
-            result.wait_until_connected()
-            yield result
+        b = Bench(context, *words)
+        with spinning(context, b.node, b.probe):
+            b.wait_until_connected()
+            if settled:
+                b.wait_until_settled()
+            yield b
 
 
-def start_error(capfd: pytest.CaptureFixture[str], *words: str) -> str:
+@contextlib.contextmanager
+def linked(sends=RELIABLE, takes=RELIABLE):
+    """A connected `Link` to a node of another process."""
+    with isolated_context() as context:
+        link = Link(context, sends, takes)
+        with spinning(context, link.probe):
+            link.wait_until_connected()
+            yield link
+
+
+@contextlib.contextmanager
+def linked_process(folder, *words, sends=RELIABLE, **environment):
+    """A `Process` in our namespace, and a `Link` to it."""
+    with Process(*IN_NAMESPACE, *words, folder=folder, **environment) as node:
+        node.wait_until_ready()
+        with linked(sends) as link:
+            yield node, link
+
+
+@contextlib.contextmanager
+def started_node(*words):
+    """The node alone in this process, started with ``--ros-args words``."""
+    with isolated_context() as context:
+        node = GroundSegmentationNode(context=context, cli_args=['--ros-args', *words])
+        with spinning(context, node):
+            yield node
+
+
+def start_error(capfd, *words):
     """Line that the node ends with when it refuses to start with ``--ros-args words``."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in ISOLATION.items():
-            patch.setenv(name, os.environ.get(name, value) if name == 'ROS_DOMAIN_ID' else value)
+    # The domain may be what is wrong.
+    with isolated(ROS_DOMAIN_ID=os.environ.get('ROS_DOMAIN_ID', str(DOMAIN_ID))):
         assert main(['--ros-args', *words]) == 2
     said = capfd.readouterr()
-    assert said.out == ''
-    assert 'Traceback' not in said.err
+    assert said.out == '' and 'Traceback' not in said.err
     line = said.err.splitlines()[-1]
     assert line.startswith('ground_segmentation_node: error: ')
     return line

@@ -1,31 +1,35 @@
-"""Time per frame: alternation, sizes, ratios, record."""
+"""Time per frame: alternation, ratios, record; the command `bench` on real files."""
 
 import itertools
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
+from bag_samples import scan, write_ros1_bag, write_ros2_bag
+from cli_runner import error_line, run
 from conftest import REPOSITORY, hilly_scan
 from evaluation_samples import HeightRule
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.image import imread
 
 from gp_ground_seg import Config
-from gp_ground_seg.cli.bench import RUN_LENGTH, bench_text, read_record, runs
+from gp_ground_seg.cli import bench as command
+from gp_ground_seg.cli.bench import RUN_LENGTH, bench_text, load_frames, read_record, runs
+from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation.benchmark import (
     BenchFrame,
     FrameTime,
     bench_cases,
     bench_document,
-    merged_groups,
     run_cases,
-    spread,
-    time_growth,
 )
-from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.methods import PATCHWORKPP
+from gp_ground_seg.evaluation.evaluate import PATCHWORKPP
+from gp_ground_seg.evaluation.report import describe_environment
 
+QUICK = ('--threads', '1', '--set', 'grid.n_segments=24')
 NUMPY = Config().replace(
     **{'runtime.backend': 'numpy', 'grid.n_segments': 8, 'learning.max_evaluations': 1}
 )
@@ -71,7 +75,7 @@ def with_intensity(points):
 def test_every_case_runs_on_every_frame_beside_its_own_baseline():
     rulers = []
 
-    def make(_):
+    def make():
         rulers.append(Ruler(clock))
         rulers[-1].journal = []
         return rulers[-1]
@@ -100,7 +104,7 @@ def test_half_of_the_time_the_baseline_goes_first():
     journal = []
     clock = Clock(journal)
     cases = {'only': NUMPY.replace(**{'learning.mode': 'fixed'})}
-    run_cases(frames_of(('a', 4)), cases, lambda _: Ruler(clock), clock=clock)
+    run_cases(frames_of(('a', 4)), cases, lambda: Ruler(clock), clock=clock)
     warm_up, letters = journal[:7], ''.join(journal[7:]).replace('Rb', '')
     assert warm_up == ['t'] * 5 + ['b', 't']
     baseline, ours = 'tbt', 'tt'
@@ -117,43 +121,16 @@ def test_a_new_sequence_forgets_the_one_before():
 
 
 @given(st.integers(1, 500), st.integers(1, 100))
-def test_spread_is_even_and_runs_hold_successive_frames(n_available, n_wanted):
-    found = spread(n_available, n_wanted)
-    assert len(found) == min(n_available, n_wanted)
-    steps = np.diff([-1, *found, n_available])
-    assert (steps > 0).all()
-    if len(found) > 1:
-        assert np.ptp(steps[1:-1]) <= 1
+def test_runs_are_spread_and_hold_successive_frames(n_available, n_wanted):
     taken = runs('a', n_available, n_wanted)
     numbers = [k for _, k in taken]
     assert min(n_available, n_wanted) - RUN_LENGTH < len(taken) <= min(n_available, n_wanted)
     assert numbers == sorted(set(numbers)) and numbers[-1] < n_available
     for (name, k), (after, next_k) in itertools.pairwise(taken):
         assert name != after or next_k == k + 1
-
-
-def test_merged_clouds_are_of_one_sequence_each():
-    groups = merged_groups(frames_of(('a', 5), ('b', 3), ('c', 8)))
-    assert [[frame.sequence + frame.index for frame in group] for group in groups] == [
-        ['a0', 'a1', 'a2', 'a3'], ['c0', 'c1', 'c2', 'c3'], ['c4', 'c5', 'c6', 'c7'],
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize(('n_frames', 'n_most'), [(4, 1200), (1, 300)])
-def test_series_grow_in_what_they_are_named_after(n_frames, n_most):
-    rows = time_growth(frames_of(('a', n_frames)), NUMPY, clock=Clock())
-    sizes = {}
-    for row in rows:
-        sizes.setdefault(row['series'], []).append(row['size'])
-        # Every measurement takes one tick of this clock.
-        assert row['fixed_ratio'] == row['every_frame_ratio'] == 1.0
-        assert row['fixed_ms'] == row['every_frame_ms'] == 1000.0
-    assert list(sizes) == ['points', 'grid.n_segments', 'grid.n_bins', 'pseudo-inputs']
-    assert sizes['points'] == [n for n in (38, 75, 150, 300, 600, 1200) if n <= n_most]
-    assert sizes['grid.n_segments'] == [8, 16, 32]  # a grid of 2 or 4 segments is not accepted
-    for found in sizes.values():
-        assert found == sorted(found)
-        assert found[-1] > 2 * found[0]
+    length = min(RUN_LENGTH, n_wanted)
+    steps = np.diff(numbers[::length])
+    assert n_available <= n_wanted or len(steps) < 2 or np.ptp(steps) <= length
 
 
 def recorded(ours, peers):
@@ -163,9 +140,7 @@ def recorded(ours, peers):
         FrameTime(frame, a, {'grid': 0.25 * a, 'label': 0.5 * a}, b, fit)
         for frame, a, b in zip(frames, ours, peers, strict=True)
     ]
-    return bench_document(
-        {'only': times}, [], NUMPY, describe_environment(), PATCHWORKPP, 'frames'
-    )
+    return bench_document({'only': times}, NUMPY, describe_environment(), PATCHWORKPP, 'frames')
 
 
 def test_ratios_pair_each_frame_with_its_baseline():
@@ -185,3 +160,145 @@ def test_docs_show_the_record():
     docs = REPOSITORY / 'docs'
     text = (docs / 'performance.md').read_text(encoding='utf-8')
     assert f'```text\n{bench_text(read_record(docs / "performance.json"))}\n```' in text
+
+
+# The command.
+
+
+@pytest.fixture(scope='module')
+def scans(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('scans')
+    for k in range(5):
+        scan(k).tofile(folder / f'{k:06d}.bin')
+    return folder
+
+
+@pytest.fixture(scope='module')
+def record(scans, tmp_path_factory):
+    path = tmp_path_factory.mktemp('record') / 'bench.json'
+    assert run('bench', scans, '--threads', '1,2', '--numpy', '--json', path) == 0
+    return path
+
+
+def test_record_holds_machine_cases_stages_and_series(record, scans):
+    document = json.loads(record.read_text())
+    assert document['data'] == scans.name
+    assert document['n_frames'] == 5
+    environment = document['environment']
+    assert environment['cpu']
+    assert {'numpy', 'numba', 'scipy', 'pypatchworkpp'} <= set(environment['versions'])
+    assert [(c['mode'], c['backend'], c['n_threads']) for c in document['cases']] == [
+        ('fixed', 'numba', 1), ('fixed', 'numba', 2),
+        ('every_frame', 'numba', 1), ('every_frame', 'numba', 2), ('every_frame', 'numpy', 1),
+    ]  # fmt: skip
+    for case in document['cases']:
+        assert len(case['frames']) == 5
+        assert all(frame['ms'] > 0 and frame['baseline_ms'] > 0 for frame in case['frames'])
+        assert {'grid', 'learning', 'label', 'rest'} <= set(case['stages_ms'])
+        assert all(case['stages_ms'][stage] > 0 for stage in ('grid', 'label'))
+        assert case['ratio']['median'] > 0
+
+
+def test_a_record_shows_what_measuring_showed(record, scans, capsys, tmp_path):
+    assert run('bench', scans, *QUICK, '--json', tmp_path / 'bench.json') == 0
+    measured = capsys.readouterr().out
+    assert 'Patchwork++' in measured
+    assert run('bench', '--from', tmp_path / 'bench.json') == 0
+    assert capsys.readouterr().out == measured
+    assert run('bench', '--from', record) == 0
+    shown = capsys.readouterr().out
+    assert max(len(line) for line in shown.splitlines()) <= 100
+
+
+def write_sequences(root):
+    for name in ('00', '01'):
+        folder = root / 'sequences' / name / 'velodyne'
+        folder.mkdir(parents=True)
+        for k in range(2):
+            scan(k).tofile(folder / f'{k:06d}.bin')
+
+
+@pytest.mark.parametrize(
+    ('name', 'write', 'expected'),
+    [
+        ('drive.mcap', lambda path: write_ros2_bag(path, n_clouds=3), [0, 1, 2]),
+        ('drive.bag', lambda path: write_ros1_bag(path, n_clouds=3), [0, 1, 2]),
+        ('scan.bin', lambda path: scan(0).tofile(path), [0]),
+        ('root', write_sequences, [0, 1, 0, 1]),
+    ],
+)
+def test_frames_come_from_whatever_holds_scans(name, write, expected, tmp_path):
+    write(tmp_path / name)
+    frames = load_frames(tmp_path / name, 60)
+    for frame, k in zip(frames, expected, strict=True):
+        assert frame.points.dtype == np.float32
+        np.testing.assert_array_equal(frame.points[:, :3], scan(k)[:, :3])
+    assert len({frame.sequence for frame in frames}) == (2 if name == 'root' else 1)
+
+
+def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
+    for k in range(45):
+        scan(k, n_ground=20, n_wall=5).tofile(tmp_path / f'{k:06d}.bin')
+    frames = load_frames(tmp_path, 20)
+    assert [int(frame.index) for frame in frames] == [*range(10, 20), *range(30, 40)]
+    names = [f'{tmp_path.name}:{start}' for start in (10, 30)]
+    assert [frame.sequence for frame in frames] == 10 * names[:1] + 10 * names[1:]
+
+
+@pytest.mark.parametrize(
+    ('words', 'says'),
+    [
+        ((), 'either DATA'),
+        (('DATA', '--from', 'x.json'), 'either DATA'),
+        (('nowhere',), 'no such file'),
+        (('DATA', '--topic', '/points'), 'is for bags'),
+        (('DATA', '--threads', '0'), '--threads 0'),
+        (('DATA', '--threads', 'two'), '--threads two'),
+        (('DATA', '--set', 'grid.n_segments=0'), 'grid.n_segments'),
+        (('--from', 'nowhere.json'), 'nowhere.json'),
+        (('--from', 'OTHER'), 'not a record'),
+        (('DATA', '--json', 'OTHER'), 'exists already'),
+        (('DATA', '--plot', 'OTHER'), 'exists already'),
+        (('EMPTY',), 'no point'),
+    ],
+)
+def test_what_is_wrong_is_said(scans, words, says, tmp_path, capsys):
+    other, empty = tmp_path / 'other.json', tmp_path / 'empty.bin'
+    other.write_text('{"cases": []}')
+    empty.touch()
+    named = {'DATA': scans, 'OTHER': other, 'EMPTY': empty}
+    assert run('bench', *(named.get(word, word) for word in words)) == 2
+    assert says in error_line(capsys)
+    assert other.read_text() == '{"cases": []}'
+
+
+def test_a_broken_cloud_of_a_bag_is_named(tmp_path, monkeypatch):
+    def refuse(_):
+        raise PointCloudError('no field x')
+
+    monkeypatch.setattr('gp_ground_seg.cli.bench.decode_cloud', refuse)
+    write_ros2_bag(tmp_path / 'drive.mcap', n_clouds=2)
+    with pytest.raises(DataError, match=r'drive\.mcap: message 0 of topic .*: no field x'):
+        load_frames(tmp_path / 'drive.mcap', 60)
+
+
+def test_without_the_baseline_there_are_no_ratios(scans, monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, 'pypatchworkpp', None)
+    assert run('bench', scans, *QUICK, '--json', tmp_path / 'a.json') == 0
+    assert 'pip install pypatchworkpp' in capsys.readouterr().err
+    document = json.loads((tmp_path / 'a.json').read_text())
+    assert document['baseline'] is document['baseline_ms'] is None
+    assert 'ratio' not in document['cases'][0]
+
+
+def test_the_picture_leaves_out_cases_without_compiled_code(record, tmp_path, monkeypatch):
+    assert run('bench', '--from', record, '--plot', tmp_path / 'a.png') == 0
+    assert imread(tmp_path / 'a.png').shape[2] == 4
+    drawn = []
+    monkeypatch.setattr(
+        command, 'plot_stage_bars', lambda cases, path, *_: drawn.append((cases, path.touch()))
+    )
+    assert run('bench', '--from', record, '--plot', tmp_path / 'bars.png') == 0
+    cases = json.loads(record.read_text())['cases']
+    compiled = {case['name']: case['stages_ms'] for case in cases if case['backend'] == 'numba'}
+    assert drawn == [(compiled, None)] and len(compiled) < len(cases)

@@ -21,7 +21,7 @@ from ros_helpers import BEST_EFFORT, ISOLATION, PATIENCE, isolated_context, spin
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.cli import bags, options
+from gp_ground_seg.cli import options
 from gp_ground_seg.cli.main import main
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
@@ -72,6 +72,11 @@ def listening(*topics, qos=RELIABLE):
             yield listener
 
 
+def drive(folder, n_clouds, **options):
+    write_ros2_bag(folder / 'drive.mcap', n_clouds, **options)
+    return folder / 'drive.mcap'
+
+
 def play(*words):
     return main(['play', *(str(word) for word in words)])
 
@@ -89,8 +94,7 @@ def recorded(bag, topic):
 
 
 def test_every_byte_at_the_recorded_times(tmp_path, capsys, monkeypatch):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 8)
+    bag = drive(tmp_path, 8)
     told = []
     tell = playback.Player._publish_time
     monkeypatch.setattr(
@@ -128,8 +132,7 @@ def test_every_byte_at_the_recorded_times(tmp_path, capsys, monkeypatch):
 
 
 def test_part_of_a_bag(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 10)
+    bag = drive(tmp_path, 10)
     with listening('/points') as listener:
         assert play(bag, '--start', 0.25, '--duration', 0.3, '--rate', 5, '--quiet') == 0
         wait_for(lambda: len(listener.clouds['/points']) == 3, 'last cloud')
@@ -145,8 +148,7 @@ def test_part_of_a_bag(tmp_path, capsys):
 
 
 def test_which_topics(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 2, topics=('/front', '/rear'))
+    bag = drive(tmp_path, 2, topics=('/front', '/rear'))
     with listening('/front', '/rear') as listener:
         assert play(bag, '--quiet') == 2
         assert 'choose one with --topic: /front, /rear' in capsys.readouterr().err
@@ -179,8 +181,7 @@ def test_bag_of_ros_1_on_another_topic(tmp_path, capsys):
 
 
 def test_nobody_listens(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 3)
+    bag = drive(tmp_path, 3)
     with isolated_context():
         assert play(bag, '--wait', 0.2, '--quiet') == 2
         assert capsys.readouterr().err == (
@@ -193,16 +194,17 @@ def test_nobody_listens(tmp_path, capsys):
 
 
 def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 2)
+    bag = drive(tmp_path, 2)
     is_said = threading.Event()
 
+    tell = options.note
+
     def note(text):
-        options.note(text)
+        tell(text)
         if text.startswith('waiting'):
             is_said.set()
 
-    monkeypatch.setattr(bags, 'note', note)
+    monkeypatch.setattr(options, 'note', note)
     with isolated_context() as context:
         node = Node('late', context=context)
         clouds = []
@@ -221,8 +223,7 @@ def test_waits_and_says_so(tmp_path, capsys, monkeypatch):
 
 
 def test_subscriber_that_leaves(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 20)
+    bag = drive(tmp_path, 20)
     with listening('/points') as listener:
 
         def leave():
@@ -242,52 +243,38 @@ def test_subscriber_that_leaves(tmp_path, capsys):
 
 
 def test_best_effort_subscriber(tmp_path, capsys):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 2)
+    bag = drive(tmp_path, 2)
     with listening('/points', qos=BEST_EFFORT) as listener:
         assert play(bag) == 0
         wait_for(lambda: len(listener.clouds['/points']) == 2, 'last cloud')
     assert '/points has a best-effort subscriber' in capsys.readouterr().err
 
 
-class Program:
-    """The command in a process of its own, `lines` of its output as they come."""
-
-    def __init__(self, *words, code=('-m', 'gp_ground_seg', 'play')):
-        self.popen = subprocess.Popen(
-            [sys.executable, *code, *map(str, words)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **ISOLATION},
-        )
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_error):
-        self.popen.kill()
-        self.popen.communicate()
-
-    def end(self, number):
-        """Send a signal; return exit code, output, errors."""
-        self.popen.send_signal(number)
-        output, errors = self.popen.communicate(timeout=PATIENCE)
-        return self.popen.returncode, output, errors
+@contextlib.contextmanager
+def program(*words, code=('-m', 'gp_ground_seg', 'play')):
+    """The command in a process of its own."""
+    with subprocess.Popen(
+        [sys.executable, *code, *map(str, words)], env={**os.environ, **ISOLATION}, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_loop_until_interrupted(tmp_path, number):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 3)
+    bag = drive(tmp_path, 3)
     with (
         listening('/points') as listener,
-        Program(bag, '--loop', '--rate', 2, '--clock') as program,
+        program(bag, '--loop', '--rate', 2, '--clock') as process,
     ):
         wait_for(lambda: len(listener.clouds['/points']) >= 7, 'third round')
-        code, output, errors = program.end(number)
+        process.send_signal(number)
+        output, errors = process.communicate(timeout=PATIENCE)
         wait_for(lambda: listener.subscriptions[0].get_publisher_count() == 0, 'farewell')
-    assert code == 130
+    assert process.returncode == 130
     assert errors.splitlines()[-1] == 'gp-ground-seg: interrupted'
     assert 'Traceback' not in errors
     numbers = SUMMARY.fullmatch(output).groups()
@@ -340,27 +327,23 @@ def test_subscriber_that_is_killed(tmp_path, capsys, monkeypatch):
     bag = tmp_path / 'drive.mcap'
     n_clouds = playback.DEPTH + 50
     write_ros2_bag(bag, n_clouds)
-    with Program(code=('-c', SUBSCRIBER)) as subscriber, isolated_context():
+    with program(code=('-c', SUBSCRIBER)) as subscriber, isolated_context():
         assert play(bag, '--quiet', '--rate', 10, '--wait', PATIENCE) == 1
-        assert subscriber.popen.wait(PATIENCE) == -signal.SIGKILL
+        assert subscriber.wait(PATIENCE) == -signal.SIGKILL
     n_sent, *_, n_undelivered = summary(capsys)
     assert n_sent == n_clouds
     # More than still wait in the queue: those that were pushed out of it count as well.
     assert playback.DEPTH < n_undelivered <= n_clouds
 
 
-def test_without_ros(tmp_path):
-    bag = tmp_path / 'drive.mcap'
-    write_ros2_bag(bag, 1)
-    code = (
-        'import sys; sys.modules["rclpy"] = None; from gp_ground_seg.cli.main import main; '
-        'sys.exit(main(sys.argv[1:]))'
-    )
-    result = subprocess.run(
-        [sys.executable, '-c', code, 'play', str(bag)], capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 2
-    (line,) = result.stderr.splitlines()
+def test_without_ros(tmp_path, capsys, monkeypatch):
+    write_ros2_bag(tmp_path / 'drive.mcap', 1)
+    for name in [name for name in sys.modules if name.startswith('gp_ground_seg.ros.playback')]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr('gp_ground_seg.ros.playback')
+    monkeypatch.setitem(sys.modules, 'rclpy.duration', None)
+    assert play(tmp_path / 'drive.mcap') == 2
+    (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('gp-ground-seg: error: play needs ROS 2, which cannot be imported')
     assert "pip install 'gp_ground_seg[ros]'" in line
 
@@ -368,20 +351,14 @@ def test_without_ros(tmp_path):
 @pytest.mark.parametrize(
     'words',
     [
-        ('--rate', '0'),
-        ('--rate', '-1'),
-        ('--rate', 'nan'),
-        ('--start', '-1'),
-        ('--duration', 'inf'),
-        ('--wait', 'soon'),
-        ('--wait', '1', '--no-wait'),
-        ('--all', '--topic', '/points'),
+        '--rate 0', '--rate -1', '--rate nan', '--start -1', '--duration inf', '--wait soon',
+        '--wait 1 --no-wait', '--all --topic /points',
     ],
-)
+)  # fmt: skip
 def test_refused_options(words, tmp_path, capsys):
     with pytest.raises(SystemExit, match='2'):
-        play(tmp_path / 'drive.mcap', *words)
-    assert words[0] in capsys.readouterr().err
+        play(tmp_path / 'drive.mcap', *words.split())
+    assert words.split()[0] in capsys.readouterr().err
 
 
 def test_no_bag(tmp_path, capsys):

@@ -3,14 +3,11 @@
 import dataclasses
 import math
 import re
-import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
 from cli_runner import error_line, run
 
-from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.pipeline.tilt import rotation
 from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_scan
 
@@ -50,7 +47,9 @@ def test_a_height_given_is_contradicted(tmp_path, capsys):
     assert 'a.bin: sensor.height = 2.5: the ground near the sensor is 1.2' in said
 
 
-def test_a_scan_that_does_not_tell(tmp_path, capsys):
+def test_a_scan_that_does_not_tell_and_one_that_is_not_there(tmp_path, capsys):
+    assert run('pose', tmp_path / 'a.bin') == 2
+    assert 'no such file' in error_line(capsys)
     np.zeros((3, 4), dtype='<f4').tofile(tmp_path / 'a.bin')
     assert run('pose', tmp_path / 'a.bin') == 0
     assert 'set sensor.height' in capsys.readouterr().out
@@ -66,16 +65,3 @@ def test_segment_names_the_scan_that_it_refuses(tmp_path, capsys):
     roll, pitch = (re.search(rf'sensor\.{n} to (\S+)', said)[1] for n in ('roll', 'pitch'))
     assert run(*words, '--set', f'sensor.roll={roll}', '--set', f'sensor.pitch={pitch}') == 0
     assert (tmp_path / 'a.label').exists()
-
-
-def test_input_that_is_not_there(tmp_path, capsys):
-    assert run('pose', tmp_path / 'none.bin') == 2
-    assert 'no such file' in error_line(capsys)
-
-
-def test_commands_of_the_docs_are_accepted():
-    text = (Path(__file__).parents[1] / 'docs' / 'pose.md').read_text(encoding='utf-8')
-    commands = re.findall(r'`gp-ground-seg (.*?)`', text)
-    assert {words.split()[0] for words in commands} == {'pose', 'experiment'}
-    for words in commands:
-        build_parser(words.split()[0]).parse_args(shlex.split(words))

@@ -1,26 +1,32 @@
-"""Methods over labelled frames: which frames, in which order, with which scores."""
+"""Methods over labelled frames: order and scores; the command `evaluate`: tables and files."""
 
 import itertools
+import json
 import math
 import sys
 
 import numpy as np
 import pypatchworkpp
 import pytest
-from evaluation_samples import HeightRule, real_kitti, street, write_frame, write_streets
+from cli_runner import error_line, run
+from evaluation_samples import HeightRule, street, write_frame, write_streets
+from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation.evaluate import (
     MethodScore,
+    OurMethod,
+    PatchworkppMethod,
     ScanScore,
     labelled_frames,
     load_kitti,
     pool,
     score_methods,
 )
-from gp_ground_seg.evaluation.methods import OurMethod, PatchworkppMethod
 from gp_ground_seg.evaluation.metrics import (
+    RATIOS,
     ClassCount,
     Confusion,
     class_errors,
@@ -35,9 +41,8 @@ def evaluate(root, *methods, **options):
 
 
 def score_of(sequence, confusion, seconds=0.0, **stages):
-    return ScanScore(
-        sequence, '0', seconds, stages, {'groundgrid': confusion}, classes={40: ClassCount(4, 3)}
-    )
+    classes = {40: ClassCount(4, 3)}
+    return ScanScore(sequence, '0', seconds, stages, {'groundgrid': confusion}, classes=classes)
 
 
 def test_pooling_sums_counts_and_does_not_average_ratios():
@@ -53,12 +58,9 @@ def test_pooling_sums_counts_and_does_not_average_ratios():
 
 
 def test_times():
-    frames = (
-        score_of('00', Confusion(), 0.010, grid=0.004, label=0.001),
-        score_of('00', Confusion(), 0.020, grid=0.006, label=0.003),
-        score_of('00', Confusion(), 0.090, grid=0.050, label=0.002),
-    )
-    score = MethodScore('x', frames)
+    times = ((0.010, 0.004, 0.001), (0.020, 0.006, 0.003), (0.090, 0.050, 0.002))
+    frames = (score_of('00', Confusion(), s, grid=grid, label=label) for s, grid, label in times)
+    score = MethodScore('x', tuple(frames))
     assert (score.seconds(), score.seconds(max)) == (0.020, 0.090)
     assert score.median_stages == {'grid': 0.006, 'label': 0.002}
     assert math.isnan(MethodScore('x', ()).seconds())
@@ -68,28 +70,14 @@ def test_labelled_frames_of_all_and_of_some(tmp_path):
     write_streets(tmp_path, s00=2, s08=1)
     found = [(f.sequence, f.index) for f in labelled_frames(tmp_path)]
     assert found == [('00', '000000'), ('00', '000001'), ('08', '000000')]
-    assert [f.sequence for f in labelled_frames(tmp_path, ['08', '00'])] == ['08', '00', '00']
-
-
-@pytest.mark.parametrize(
-    ('sequences', 'message'),
-    [
-        (['00', '4', '99'], 'no sequence 4, 99; sequences here: 00, 08'),
-        ([], 'no sequence asked for; sequences here: 00, 08'),
-        (['00', '08', '00'], 'named twice'),
-        (['../sequences/00'], 'no sequence ../sequences/00'),
-    ],
-)
-def test_sequences_that_cannot_be(tmp_path, sequences, message):
-    write_streets(tmp_path, s00=1, s08=1)
-    with pytest.raises(DataError, match=message):
-        labelled_frames(tmp_path, sequences)
+    names = ['08', '00', '08']
+    assert [f.sequence for f in labelled_frames(tmp_path, names)] == ['08', '00', '00']
 
 
 def test_frames_without_labels_are_named(tmp_path):
     write_streets(tmp_path, s00=1, s11=1)
     write_frame(tmp_path, '11', 5, street()[0])
-    with pytest.raises(DataError, match=r'1 of 2 frames of sequence 11 .*000005.*labelled: 00'):
+    with pytest.raises(DataError, match='frames of sequence 11 have no labels, as 000005'):
         labelled_frames(tmp_path)
     assert len(labelled_frames(tmp_path, ['00'])) == 1
 
@@ -124,18 +112,33 @@ def test_scores_of_a_rule_known_by_hand(tmp_path):
     assert (score.classes[0], score.classes[70]) == (ClassCount(50, 50), ClassCount(500, 200))
     # The rule has a surface at its height.
     expected = height_error(points[road, 2].astype(float), np.full(n_road, -1.5))
-    assert score.height() == expected
+    assert score.height == expected
 
 
-def test_errors_of_classes_and_of_rings_are_all_errors(tmp_path):
-    write_streets(tmp_path, s00=2)
-    misses, invents = evaluate(tmp_path, HeightRule('misses', -1.72), HeightRule('invents', -1.0))
+class GuessedProbabilities(HeightRule):
+    """A height rule that also gives a probability, by height."""
+
+    def probability(self):
+        return np.clip(-0.5 - self.points[:, 2], 0.0, 1.0).astype(np.float32)
+
+
+def test_errors_of_classes_and_of_rings_are_all_errors_and_sequences_are_pooled(tmp_path):
+    write_streets(tmp_path, s00=2, s08=1)
+    rules = HeightRule('misses', -1.72), GuessedProbabilities('invents', -1.0)
+    misses, invents = evaluate(tmp_path, *rules)
     assert misses.confusion.fn > 0 and invents.confusion.fp > 0
     for score in (misses, invents):
         found = class_errors(score.classes)
         assert sum(one.missed for one in found) == score.confusion.fn
         assert sum(one.false for one in found) == score.confusion.fp
         assert sum(score.rings, Confusion()) == score.confusion
+    assert misses.calibration is None
+    parts, pooled = [invents.of(s).calibration for s in ('00', '08')], invents.calibration
+    n_scored = sum(ring.points for ring in invents.rings)
+    assert pooled.n_total == sum(part.n_total for part in parts) == n_scored
+    mean = sum(part.brier * part.n_total for part in parts) / n_scored
+    assert pooled.brier == pytest.approx(mean)
+    assert invents.ece == pooled.ece
 
 
 def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path):
@@ -167,8 +170,8 @@ def test_ours_is_the_library(tmp_path):
         ground = scan.truths['groundgrid'] == Label.GROUND
         error = (result.ground_z - scan.points[:, 2])[ground]
         error = error[np.isfinite(error)]
-        assert scored.heights['all'].rmse == pytest.approx(np.sqrt(np.mean(error**2)))
-        assert scored.heights['all'].median_absolute == pytest.approx(np.median(np.abs(error)))
+        assert scored.height.rmse == pytest.approx(np.sqrt(np.mean(error**2)))
+        assert scored.height.median_absolute == pytest.approx(np.median(np.abs(error)))
         assert 'total' not in scored.stages
         assert 0.0 < sum(scored.stages.values()) <= scored.seconds
         assert scored.pose.height == result.pose.height
@@ -207,19 +210,173 @@ def test_the_peer_has_the_height_of_its_sensor():
 
 def test_the_surface_of_the_peer_is_that_of_its_planes():
     scan, method = run_peer('slope', 'hdl-64e')
-    near = scan.parts['all'] & (np.hypot(*scan.points[:, :2].T) < 15.0)
-    error = (method.ground_z() - scan.ground_z)[near]
+    near = scan.is_ground & (np.hypot(*scan.points[:, :2].T) < 15.0)
+    error = (method.result().ground_z - scan.ground_z)[near]
     assert np.sqrt(np.mean(error**2)) < 0.02
     method = PatchworkppMethod()
     method.run(np.zeros((0, 4), dtype=np.float32))
-    method._points = np.zeros((3, 4))
-    assert np.isnan(method.ground_z()).all()
+    assert method.result().ground_z.shape == (0,)
 
 
-def test_patchworkpp_on_real_frames_scores_as_measured_elsewhere():
+def test_patchworkpp_on_real_frames_scores_as_measured_elsewhere(kitti):
     """A check of our scoring by a number that is not ours: 95.15 % on these 60 frames."""
-    frames = labelled_frames(real_kitti(), ['00', '01', '03', '05', '08', '10'])
+    frames = labelled_frames(kitti, ['00', '01', '03', '05', '08', '10'])
     frames = [frame for frame in frames if int(frame.index) < 10]
     (score,) = score_methods(frames, load_kitti, [PatchworkppMethod()])
     assert len(score.scans) == 60
     assert score.pooled('groundgrid').iou == pytest.approx(0.9515, abs=0.001)
+
+
+# The command.
+
+
+@pytest.fixture(scope='module')
+def root(tmp_path_factory):
+    return write_streets(tmp_path_factory.mktemp('kitti'), s00=2, s08=1)
+
+
+@pytest.fixture(scope='module')
+def evaluated(root, tmp_path_factory):
+    """Files of a run beside Patchwork++."""
+    folder = tmp_path_factory.mktemp('evaluated')
+    options = ('--json', 'a.json'), ('--reliability', 'a.png')
+    words = [word for option, name in options for word in (option, folder / name)]
+    assert run('evaluate', root, *words, '--worst', 2, '--peer', 'patchworkpp') == 0
+    return folder
+
+
+def test_tables_hold_the_sums_of_the_frames(root, evaluated, capsys):
+    run('evaluate', root, '--peer', 'patchworkpp')
+    output, errors = capsys.readouterr()
+    assert errors == ''  # no progress where standard error is no terminal
+    lines = output.splitlines()
+    assert max(map(len, lines)) <= 100
+    document = json.loads((evaluated / 'a.json').read_text())
+    frames = document['rows']
+    for key, name in itertools.product(('groundgrid', 'patchwork'), ('00', '08', 'all')):
+        ours, its = (
+            Confusion(*(
+                sum(f[f'{key}_{n}'] for f in frames
+                    if f['method'] == method and name in (f['sequence'], 'all'))
+                for n in ('tp', 'fp', 'fn', 'tn')
+            ))
+            for method in ('gp_ground_seg', 'patchworkpp')
+        )  # fmt: skip
+        (row,) = (row for row in document[key] if row['sequence'] == name)
+        assert row['frames'] == {'00': 2, '08': 1, 'all': 3}[name]
+        assert [row[ratio] for ratio in RATIOS] == [getattr(ours, ratio) for ratio in RATIOS]
+        assert row['patchworkpp_iou'] == its.iou
+        assert row['difference_to_patchworkpp'] == ours.iou - its.iou
+        shown = f'{100 * ours.iou:.2f}  {100 * its.iou:15.2f}  {100 * (ours.iou - its.iou):+10.2f}'
+        assert any(line.startswith(name) and line.endswith(shown) for line in lines)
+    headline = f'IoU {100 * document["groundgrid"][-1]["iou"]:.2f} %, Patchwork++ '
+    assert output.startswith(headline)
+    times = {row['method']: row for row in document['times']}
+    seconds = [f['seconds'] for f in frames if f['method'] == 'patchworkpp']
+    assert times['Patchwork++']['median'] == pytest.approx(np.median(seconds))
+    ratio = times['gp_ground_seg']['median'] / times['Patchwork++']['median']
+    assert times['Patchwork++']['ratio'] == pytest.approx(ratio)
+    assert document['environment']['versions']['pypatchworkpp']
+    assert document['n_threads'] >= 1
+    for row in frames:
+        assert row['points'] == len(street()[0])
+        assert row['main_error_class'] in ('road', 'building')
+        # Pose and state of learning are those of our method only.
+        assert (row.get('status') in ('converged', 'budget')) == (row['method'] != 'patchworkpp')
+
+
+def test_classes_rings_and_probabilities(evaluated):
+    document = json.loads((evaluated / 'a.json').read_text())
+    classes = {row['class']: row for row in document['classes']}
+    assert (classes['road']['counts_as'], classes['road']['points']) == ('ground', 12_000)
+    assert classes['building']['counts_as'] == 'obstacle'
+    assert classes['building']['missed'] is classes['road']['false'] is None
+    assert {classes[n]['counts_as'] for n in ('vegetation', 'unlabelled')} == {'left out'}
+    assert classes['vegetation']['share_of_errors'] is None
+    for name in ('share_of_points', 'share_of_errors'):
+        assert sum(row[name] or 0.0 for row in classes.values()) == pytest.approx(1.0)
+    ious = sorted(
+        f['groundgrid_iou'] for f in document['rows'] if f['method'] == 'gp_ground_seg'
+    )  # fmt: skip
+    assert [row['iou'] for row in document['worst']] == ious[:2]
+    assert {row['most errors on'] for row in document['worst']} <= {'road', 'building'}
+    assert imread(evaluated / 'a.png').shape[2] == 4
+    rings = {row['range']: row for row in document['rings']}
+    assert rings['> 50 m']['iou'] is rings['> 50 m']['patchworkpp_iou'] is None
+    assert sum(row['share_of_errors'] for row in rings.values()) == pytest.approx(1.0)
+    pooled = document['probabilities'][-1]
+    bins = [row for row in document['reliability'] if row['sequence'] == 'all']
+    assert sum(row['points'] for row in bins) == pooled['points']
+    gaps = [
+        row['points'] * abs(row['share_ground'] - row['mean_p']) for row in bins if row['points']
+    ]
+    assert sum(gaps) / pooled['points'] == pytest.approx(pooled['ece'])
+
+
+def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
+    settings = ['label.ground_tolerance=0.011', 'sensor.height=1.7', 'growth.seed_range=19.5']
+    settings += ['runtime.n_threads=1', 'lines.max_gap=1.25', 'grid.r_max=15.0']
+    run('evaluate', root, '--json', tmp_path / 'a.json')
+    words = [f'--set={setting}' for setting in settings]
+    run('evaluate', root, '--json', tmp_path / 'b.json', *words)
+    a, b = (json.loads((tmp_path / f'{name}.json').read_text()) for name in 'ab')
+    assert a['config_changes'] == {}
+    assert b['config_changes']['label.ground_tolerance'] == 0.011
+    assert b['n_threads'] == 1
+    assert b['groundgrid'][-1]['recall'] < a['groundgrid'][-1]['recall']
+    output = capsys.readouterr().out
+    assert 'Patchwork++' not in output
+    assert 'parameters: defaults' in output
+    assert all(setting in output for setting in settings)
+    assert max(len(line) for line in output.splitlines() if 'every number' not in line) <= 100
+
+
+@pytest.mark.parametrize('option', ['--json', '--reliability'])
+def test_files_are_not_overwritten_without_force(root, tmp_path, option, monkeypatch, capsys):
+    target = tmp_path / 'mine'
+    target.write_text('mine')
+    with monkeypatch.context() as patched:
+        patched.setattr(runner, 'read_points', None)  # refused before any frame is read
+        assert run('evaluate', root, option, target) == 2
+    assert '--force' in error_line(capsys)
+    assert target.read_text() == 'mine'
+    assert run('evaluate', root, option, target, '--force') == 0
+    assert target.read_bytes() != b'mine'
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_run_that_fails_leaves_nothing(tmp_path, capsys):
+    root = write_streets(tmp_path / 'kitti', s00=2)
+    broken = root / 'sequences/00/velodyne/000001.bin'
+    broken.write_bytes(broken.read_bytes()[:-3])
+    (tmp_path / 'out').mkdir()
+    assert run('evaluate', root, '--json', tmp_path / 'out' / 'scores.json') == 2
+    assert '000001.bin' in capsys.readouterr().err
+    assert list((tmp_path / 'out').iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('words', 'message'),
+    [
+        (['--sequences', '07'], 'no sequence 07; sequences here: 00, 08'),
+        (['--sequences', ','], 'no sequence asked for; sequences here: 00, 08'),
+        (['--sequences', '../sequences/00'], 'no sequence ../sequences/00'),
+        (['--set', 'label.ground_tolerence=1'], 'label.ground_tolerance'),
+        (['--json', '/no/such/folder/x.json'], '/no/such/folder'),
+    ],
+)
+def test_errors_are_said(root, words, message, capsys):
+    assert run('evaluate', root, *words) == 2
+    assert message in error_line(capsys)
+
+
+def test_frames_without_a_scored_point_and_a_root_without_sequences(tmp_path, capsys):
+    root = write_streets(tmp_path / 'kitti', s00=1)
+    label = root / 'sequences/00/labels/000000.label'
+    label.write_bytes(bytes(len(label.read_bytes())))  # all unlabelled
+    assert run('evaluate', root, '--worst', 2) == 0
+    capsys.readouterr()
+    for wrong, message in ((root, 'no scored point'), (tmp_path, 'SemanticKITTI layout')):
+        assert run('evaluate', wrong, '--reliability', tmp_path / 'a.png') == 2
+        assert message in error_line(capsys)
+    assert not (tmp_path / 'a.png').exists()

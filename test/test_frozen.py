@@ -28,14 +28,12 @@ def summaries(folder: Path, **changes: object) -> Iterator[tuple[str, dict]]:
     with closing(GroundSegmenter(Config().replace(**changes))) as segmenter:
         for path in sorted(folder.glob('sequences/*/velodyne/*.bin')):
             result = segmenter.segment(read_points(path))
-            yield (
-                f'{path.parts[-3]}/{path.stem}',
-                {
-                    'labels': hashlib.sha256(result.label.tobytes()).hexdigest()[:16],
-                    'ground': int(np.count_nonzero(result.label == Label.GROUND)),
-                    'p_ground': float(np.nanmean(result.p_ground, dtype=np.float64)),
-                },
-            )
+            summary = {
+                'labels': hashlib.sha256(result.label.tobytes()).hexdigest()[:16],
+                'ground': int(np.count_nonzero(result.label == Label.GROUND)),
+                'p_ground': float(np.nanmean(result.p_ground, dtype=np.float64)),
+            }
+            yield f'{path.parts[-3]}/{path.stem}', summary
 
 
 @pytest.mark.parametrize('n_threads', [1, 2, 4])

@@ -5,14 +5,12 @@ import os
 import stat
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
 from unittest.mock import patch
 
 import pytest
 
 from gp_ground_seg import jit as jit_module
-from gp_ground_seg.jit import jit
 
 MODULE = """
 from gp_ground_seg.jit import JIT_ENABLED, code_folder, is_code_kept, jit, keep_code
@@ -81,63 +79,53 @@ def test_code_is_compiled_once_and_then_loaded(program):
     assert program.stderr == ''
 
 
-def damage_with_zeros(program):
-    (code,) = (e for e in program.entries if e.suffix == '.nbc')
-    content = bytearray(code.read_bytes())
-    content[4096:8192] = bytes(len(content[4096:8192]))
-    code.write_bytes(content)
+def code(program):
+    return next(entry for entry in program.entries if entry.suffix == '.nbc')
 
 
-def truncate(program):
-    for entry in program.entries:
-        entry.write_bytes(entry.read_bytes()[:100])
+def index(program):
+    return next(entry for entry in program.entries if entry.suffix == '.nbi')
 
 
-def remove_code(program):
-    (code,) = (e for e in program.entries if e.suffix == '.nbc')
-    code.unlink()
-
-
-def plant_pickle(program):
+def pickle(program):
     """An index that is a pickle of a stranger's call."""
-    (index,) = (e for e in program.entries if e.suffix == '.nbi')
-    victim = program.folder / 'ran'
-    index.write_bytes(b"cos\nsystem\n(S'touch " + str(victim).encode() + b"'\ntR.")
+    return b"cos\nsystem\n(S'touch " + str(program.folder / 'ran').encode() + b"'\ntR."
 
 
-def plant_beside(program):
-    (program.entries[0].parent / f'other.py3{sys.version_info[1]}.nbi').write_bytes(b'cos\n')
+def zeros(path):
+    content = path.read_bytes()
+    path.write_bytes(content[:4096] + bytes(len(content[4096:8192])) + content[8192:])
 
 
-def empty_stamp(program):
-    program.stamp.write_bytes(b'')
+def of_other_sources(path):
+    path.write_text(json.dumps(json.loads(path.read_text()) | {'sources': 'other'}))
 
 
-def stamp_of_other_sources(program):
-    stamp = json.loads(program.stamp.read_text())
-    program.stamp.write_text(json.dumps(stamp | {'sources': 'other'}))
+DAMAGES = {
+    'zeros in the code': lambda p: zeros(code(p)),
+    'code cut off': lambda p: code(p).write_bytes(code(p).read_bytes()[:100]),
+    'index cut off': lambda p: index(p).write_bytes(index(p).read_bytes()[:100]),
+    'no code': lambda p: code(p).unlink(),
+    'planted index': lambda p: index(p).write_bytes(pickle(p)),
+    'another index': lambda p: index(p).with_stem(f'other.py3{sys.version_info[1]}').touch(),
+    'empty stamp': lambda p: p.stamp.write_bytes(b''),
+    'stamp of other sources': lambda p: of_other_sources(p.stamp),
+    'no stamp': lambda p: p.stamp.unlink(),
+}
 
 
-def no_stamp(program):
-    program.stamp.unlink()
-
-
-@pytest.mark.parametrize(
-    'damage',
-    [damage_with_zeros, truncate, remove_code, plant_pickle, plant_beside, empty_stamp,
-     stamp_of_other_sources, no_stamp],
-)  # fmt: skip
-def test_code_that_does_not_fit_its_stamp_is_compiled_again(program, damage):
+def test_code_that_does_not_fit_its_stamp_is_compiled_again(program):
     program.run()
-    damage(program)
-    assert program.run()[:4] == COMPILED
-    assert program.run()[:4] == LOADED
+    for name, damage in DAMAGES.items():
+        damage(program)
+        assert program.run()[:4] == COMPILED, name
+        assert program.run()[:4] == LOADED, name
     assert not (program.folder / 'ran').exists()
 
 
 def test_a_folder_that_others_can_write_to_is_not_used(program):
     program.run()
-    plant_pickle(program)
+    DAMAGES['planted index'](program)
     program.entries[0].parent.chmod(0o777)
     assert program.run() == [42.0, 0, 1, False, None]
     assert 'others can write to' in program.stderr
@@ -155,15 +143,10 @@ def test_without_numba_nothing_is_compiled(program):
     assert program.run(NUMBA_DISABLE_JIT='1') == [42.0, 0, 0, False, None]
 
 
-@pytest.mark.parametrize(
-    ('mode', 'uid', 'reason'),
-    [
-        (0o755, 0, ''),
-        (0o700, 0, ''),
-        (0o757, 0, 'others can write'),
-        (0o755, 1, 'belongs to another user'),
-    ],
-)
+OTHERS = (0o757, 0, 'others can write'), (0o755, 1, 'belongs to another user')
+
+
+@pytest.mark.parametrize(('mode', 'uid', 'reason'), [(0o755, 0, ''), (0o700, 0, ''), *OTHERS])
 def test_whom_a_folder_belongs_to(tmp_path, mode, uid, reason):
     folder = tmp_path / 'code'
     folder.mkdir()
@@ -192,26 +175,12 @@ def test_of_groups_only_the_users_own_may_write(tmp_path):
             assert jit_module._others_can_write(status) is expected
 
 
-def test_options_of_compiled_functions():
-    @jit(fastmath=True)
-    def part(x):
-        return x + 1.0
+def test_the_digest_covers_every_file_that_compiled_code_is_made_from(tmp_path):
+    before, real = jit_module._stamp(tmp_path)['sources'], Path.read_bytes
+    for name in ('numerics.py', 'config.py', 'jit.py', 'frame.py'):
 
-    @jit()
-    def whole(x):
-        return 2.0 * part(x)
+        def read(path, name=name):
+            return real(path) + b'#' * (path.name == name)
 
-    assert whole(1.0) == 4.0
-
-
-def test_source_shows_its_module(tmp_path):
-    """The digest covers every file that compiled code is made from."""
-    before = jit_module._stamp(tmp_path)['sources']
-    changed = textwrap.dedent((jit_module._PACKAGE / 'compiled' / 'numerics.py').read_text()) + '#'
-    real = Path.read_bytes
-
-    def read(path):
-        return changed.encode() if path.name == 'numerics.py' else real(path)
-
-    with patch.object(Path, 'read_bytes', read):
-        assert jit_module._stamp(tmp_path)['sources'] != before
+        with patch.object(Path, 'read_bytes', read):
+            assert jit_module._stamp(tmp_path)['sources'] != before

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 import reference
-from conftest import sharing
 
 from gp_ground_seg.frame import Inliers
 
@@ -68,20 +67,10 @@ def test_value_and_gradient_are_those_of_the_reference(backend, name, latent_ter
     expected_value, numeric = expected(name, latent_terms, bars)
     assert value == pytest.approx(expected_value, rel=1e-8, abs=1e-6)
     # A component far smaller than the others is only as exact as their rounding.
-    floor = (1e-3 if bars == 'some' else 1e-4) * np.abs(numeric).max()
+    floor = 1e-4 * np.abs(numeric).max()
     error = np.abs(gradient - numeric) / np.maximum(np.abs(numeric), floor)
     assert error.max() <= 1e-6
     assert bars != 'none' or not gradient[2:].any()
-
-
-def test_threads_do_not_change_a_bit():
-    inliers, results = random_inliers(3, n_segments=40), []
-    for n_threads in (1, 2, 3):
-        with sharing(n_threads) as backend:
-            results.append(backend.log_likelihood(TYPICAL, inliers, 0.05, True))
-    for value, gradient in results[1:]:
-        assert value == results[0][0]
-        np.testing.assert_array_equal(gradient, results[0][1])
 
 
 def test_the_printed_objective_has_no_upper_bound_and_ours_does_not_move(backend):
@@ -105,12 +94,7 @@ NOISELESS[:2], NOISELESS_LATENT[4] = np.log([1e8, 1e-9]), -400.0
 
 @pytest.mark.parametrize(
     ('theta', 'changes'),
-    [
-        (NOISELESS, {}),
-        (TYPICAL, {'z': math.nan}),
-        (NOISELESS_LATENT, {'r_bar': 5.0}),
-    ],
-    ids=['no noise', 'not finite', 'no latent noise'],
+    [(NOISELESS, {}), (TYPICAL, {'z': math.nan}), (NOISELESS_LATENT, {'r_bar': 5.0})],
 )
 def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
     backend, theta, changes
@@ -121,18 +105,6 @@ def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
         value, gradient = model.log_likelihood(theta, inliers, 0.0, False)
         assert value == -np.inf
         assert not gradient.any()
-
-
-def test_equal_pseudo_inputs_give_the_stationary_objective(backend):
-    inliers = random_inliers(9)
-    theta = TYPICAL.copy()
-    theta[5:] = 1.3
-    stationary = inliers._replace(
-        log_length_scale=np.full(len(inliers.r), 1.3),
-        bar_offsets=np.zeros_like(inliers.offsets),
-    )
-    a, b = (backend.log_likelihood(theta, i, 0.05, False)[0] for i in (inliers, stationary))
-    assert a == pytest.approx(b, rel=1e-12)
 
 
 def test_with_one_length_scale_it_is_scikit_learns_regression(backend):

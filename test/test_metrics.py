@@ -1,4 +1,4 @@
-"""Conventions, counts, ratios, rings, classes and height errors, against loops and by hand."""
+"""Conventions, counts, ratios, rings, classes, probabilities, height errors: by loops and hand."""
 
 import itertools
 import math
@@ -8,38 +8,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from sklearn.calibration import calibration_curve
+from sklearn.metrics import brier_score_loss
 
 from gp_ground_seg import Label
-from gp_ground_seg.evaluation.metrics import (
-    CONVENTIONS,
-    GROUNDGRID,
-    LOW_VEGETATION_Z,
-    PATCHWORK,
-    RATIOS,
-    RING_EDGES,
-    RING_TITLES,
-    ClassCount,
-    Confusion,
-    SemanticClass,
-    class_errors,
-    class_name,
-    count_classes,
-    count_confusion,
-    count_rings,
-    height_error,
-    pool_height_errors,
-)
+from gp_ground_seg.errors import PointCloudError
+from gp_ground_seg.evaluation import metrics
+from gp_ground_seg.evaluation.metrics import GROUNDGRID, ClassCount, Confusion
 
 GROUND_NUMBERS = {40, 44, 48, 49, 60, 72}
 ANY_LABEL = st.sampled_from([0, 1, 2])
 ANY_LABELS = hnp.arrays(np.uint8, st.integers(0, 60), elements=ANY_LABEL)
 
 
-@pytest.mark.parametrize('convention', CONVENTIONS, ids=lambda c: c.key)
+@pytest.mark.parametrize('convention', metrics.CONVENTIONS, ids=lambda c: c.key)
 def test_ground_classes_are_ground_and_unlabelled_is_left_out(convention):
-    for number in SemanticClass:
-        if number == SemanticClass.VEGETATION:
-            continue
+    for number in metrics.CLASS_NAMES.keys() - {70}:
         expected = Label.GROUND if number in GROUND_NUMBERS else Label.OBSTACLE
         for z in (-5.0, -1.3, 0.0, 3.0):
             (truth,) = convention.truth(np.array([number]), np.array([z]))
@@ -47,13 +31,15 @@ def test_ground_classes_are_ground_and_unlabelled_is_left_out(convention):
 
 
 def test_vegetation_by_convention_and_unknown_numbers():
-    z = np.array([np.nextafter(LOW_VEGETATION_Z, -9), LOW_VEGETATION_Z, -1.29, np.nan])
+    z = np.array(
+        [np.nextafter(metrics.LOW_VEGETATION_Z, -9), metrics.LOW_VEGETATION_Z, -1.29, np.nan]
+    )
     semantic = np.full(4, 70)
-    assert pytest.approx(-1.2975) == LOW_VEGETATION_Z
+    assert pytest.approx(-1.2975) == metrics.LOW_VEGETATION_Z
     assert GROUNDGRID.truth(semantic, z).tolist() == [Label.UNKNOWN] * 4
-    assert PATCHWORK.truth(semantic, z).tolist() == [Label.GROUND] + [Label.OBSTACLE] * 3
+    assert metrics.PATCHWORK.truth(semantic, z).tolist() == [Label.GROUND] + [Label.OBSTACLE] * 3
     assert GROUNDGRID.truth(np.array([77, 65535]), np.zeros(2)).tolist() == [Label.OBSTACLE] * 2
-    assert [class_name(n) for n in (49, 259, 77)] == [
+    assert [metrics.class_name(n) for n in (49, 259, 77)] == [
         'other ground', 'moving other vehicle', 'class 77',
     ]  # fmt: skip
 
@@ -63,7 +49,7 @@ def test_ratios_by_hand():
     assert (confusion.precision, confusion.recall, confusion.iou) == (6 / 8, 6 / 10, 6 / 12)
     assert confusion.f1 == pytest.approx(2 * 0.75 * 0.6 / 1.35)
     assert confusion.accuracy == 14 / 20
-    assert all(math.isnan(getattr(Confusion(), name)) for name in RATIOS)
+    assert all(math.isnan(getattr(Confusion(), name)) for name in metrics.RATIOS)
     only_obstacles = Confusion(tn=5)
     assert math.isnan(only_obstacles.iou)
     assert only_obstacles.accuracy == 1.0
@@ -77,14 +63,14 @@ def test_counts_against_a_loop(label, data):
         if true_label != Label.UNKNOWN:  # an unknown label is scored as an obstacle
             counts[given_label == Label.GROUND, true_label == Label.GROUND] += 1
     pairs = ((True, True), (True, False), (False, True), (False, False))
-    assert count_confusion(label, truth) == Confusion(*(counts[pair] for pair in pairs))
+    assert metrics.count_confusion(label, truth) == Confusion(*(counts[pair] for pair in pairs))
 
 
 @given(ANY_LABELS, st.data())
 def test_class_counts_against_a_loop(label, data):
     numbers = st.sampled_from([0, 40, 70, 259, 65535])
     semantic = data.draw(hnp.arrays(np.uint16, len(label), elements=numbers))
-    counts = count_classes(label, semantic)
+    counts = metrics.count_classes(label, semantic)
     assert list(counts) == sorted(set(semantic.tolist()))
     for number, count in counts.items():
         of_it = label[semantic == number]
@@ -93,7 +79,9 @@ def test_class_counts_against_a_loop(label, data):
 
 def test_class_errors_by_hand():
     counts = {40: ClassCount(10, 7), 50: ClassCount(9, 4), 70: ClassCount(8, 8)}
-    found = [(one.number, one.missed, one.false, one.errors) for one in class_errors(counts)]
+    found = [
+        (one.number, one.missed, one.false, one.errors) for one in metrics.class_errors(counts)
+    ]
     assert found == [(50, 0, 4, 4), (40, 3, 0, 3), (70, 0, 0, 0)]
 
 
@@ -105,24 +93,99 @@ POINTS = hnp.arrays(
 @given(POINTS, st.data())
 def test_rings_against_a_loop(xy, data):
     label, truth = (data.draw(hnp.arrays(np.uint8, len(xy), elements=ANY_LABEL)) for _ in 'ab')
-    rings = count_rings(label, truth, xy)
-    assert len(rings) == len(RING_TITLES) == len(RING_EDGES) - 1
+    rings = metrics.count_rings(label, truth, xy)
+    assert len(rings) == len(metrics.RING_TITLES) == len(metrics.RING_EDGES) - 1
     for k, ring in enumerate(rings):
         reach = [math.hypot(*map(float, p)) for p in xy]
-        inside = np.array([RING_EDGES[k] <= r < RING_EDGES[k + 1] for r in reach], bool)
-        assert ring == count_confusion(label[inside], truth[inside])
-    assert sum(rings, Confusion()) == count_confusion(label, truth)
+        inside = np.array(
+            [metrics.RING_EDGES[k] <= r < metrics.RING_EDGES[k + 1] for r in reach], bool
+        )
+        assert ring == metrics.count_confusion(label[inside], truth[inside])
+    assert sum(rings, Confusion()) == metrics.count_confusion(label, truth)
 
 
 def test_rings_hold_their_inner_edge_and_no_point_without_a_range():
     xy = np.array([[0, 0], [10, 0], [0, -50], [3e3, 0], [np.nan, 1], [np.inf, 0]], np.float32)
     ones = np.ones(6, dtype=np.uint8)
-    assert [ring.tp for ring in count_rings(ones, ones, xy)] == [1, 1, 0, 0, 0, 2]
-    assert (RING_TITLES[0], RING_TITLES[-1]) == ('0-10 m', '> 50 m')
+    assert [ring.tp for ring in metrics.count_rings(ones, ones, xy)] == [1, 1, 0, 0, 0, 2]
+    assert (metrics.RING_TITLES[0], metrics.RING_TITLES[-1]) == ('0-10 m', '> 50 m')
+
+
+PROBABILITY = st.one_of(
+    st.floats(0.0, 1.0, width=32), st.sampled_from([0.0, 1.0, 0.5, 0.001, 0.999, math.nan])
+)
+TRUTHS = st.sampled_from([Label.UNKNOWN, Label.GROUND, Label.OBSTACLE])
+
+
+def draw(data, n):
+    p = data.draw(hnp.arrays(np.float32, n, elements=PROBABILITY))
+    return p, data.draw(hnp.arrays(np.uint8, n, elements=TRUTHS))
+
+
+def slow(p, truth):
+    """ECE and Brier score, point by point."""
+    bins = {k: [] for k in range(metrics.N_BINS)}
+    for one, true_label in zip(p.astype(float), truth, strict=True):
+        if true_label != Label.UNKNOWN and not math.isnan(one):
+            k = max(k for k in range(metrics.N_BINS) if metrics.BIN_EDGES[k] <= one)
+            bins[k].append((one, true_label == Label.GROUND))
+    squares = [(q - y) ** 2 for pairs in bins.values() for q, y in pairs]
+    gaps = [abs(sum(y for _, y in pairs) - sum(q for q, _ in pairs)) for pairs in bins.values()]
+    n = len(squares)
+    return (sum(gaps) / n, sum(squares) / n) if n else (math.nan, math.nan)
+
+
+@given(st.integers(0, 40), st.integers(0, 40), st.data())
+def test_probabilities_against_a_loop_and_those_of_frames_add_up(n, m, data):
+    (p, truth), (q, other) = draw(data, n), draw(data, m)
+    found = metrics.count_calibration(p, truth) + metrics.count_calibration(q, other)
+    p, truth = np.concatenate([p, q]), np.concatenate([truth, other])
+    assert (found.ece, found.brier) == pytest.approx(slow(p, truth), nan_ok=True, abs=1e-12)
+    assert found.n_total == ((truth != Label.UNKNOWN) & ~np.isnan(p)).sum()
+    both = metrics.count_calibration(p, truth)
+    assert (found.n_points.tolist(), found.n_ground.tolist()) == (
+        both.n_points.tolist(), both.n_ground.tolist(),
+    )  # fmt: skip
+
+
+def synthetic(n=20_000, seed=0, power=1.0):
+    """Probabilities p; the truth is ground with probability p ** power."""
+    rng = np.random.default_rng(seed)
+    p = rng.beta(0.3, 0.3, n).astype(np.float32)
+    ground = rng.random(n) < p.astype(float) ** power
+    return p, np.where(ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
+
+
+@pytest.mark.parametrize('power', [1.0, 3.0])
+def test_probabilities_against_scikit_learn(power):
+    p, truth = synthetic(power=power)
+    found = metrics.count_calibration(p, truth)
+    ground = truth == Label.GROUND
+    assert found.brier == pytest.approx(brier_score_loss(ground, p.astype(float)), rel=1e-12)
+    share, mean = calibration_curve(ground, p.astype(float), n_bins=metrics.N_BINS)
+    np.testing.assert_allclose(found.by_bin(found.sum_p), mean, rtol=1e-9)
+    np.testing.assert_allclose(found.by_bin(found.n_ground), share, rtol=1e-9)
+
+
+def test_true_probabilities_have_no_calibration_error_and_wrong_ones_do():
+    assert metrics.count_calibration(*synthetic()).ece < 0.01
+    # E[p - p^3] of Beta(a, a): 1/2 - a (a+1) (a+2) / (2a (2a+1) (2a+2)).
+    assert metrics.count_calibration(*synthetic(power=3.0)).ece == pytest.approx(0.1406, abs=0.01)
+
+
+def test_the_last_bin_holds_certainty():
+    certain = metrics.count_calibration(np.array([1.0, 0.0]), np.array([1, 2], dtype=np.uint8))
+    assert (certain.ece, certain.brier, certain.n_points[-1]) == (0.0, 0.0, 1)
+
+
+@pytest.mark.parametrize('p', [[0.5, 1.01], [-0.01, 0.5], [0.5, np.inf], [0.5]])
+def test_what_is_no_probability_is_refused(p):
+    with pytest.raises(PointCloudError, match='p_ground'):
+        metrics.count_calibration(np.array(p), np.array([1, 2], dtype=np.uint8))
 
 
 def test_height_error_by_hand():
-    error = height_error(np.array([0.0, 1.0, 2.0, 5.0]), np.array([0.5, 1.0, 1.0, np.nan]))
+    error = metrics.height_error(np.array([0.0, 1.0, 2.0, 5.0]), np.array([0.5, 1.0, 1.0, np.nan]))
     assert (error.n_points, error.n_without_model) == (3, 1)
     assert error.rmse == pytest.approx(math.sqrt(1.25 / 3))
     assert error.bias == pytest.approx(-0.5 / 3)
@@ -133,9 +196,9 @@ def test_height_error_by_hand():
 @pytest.mark.parametrize(
     'error',
     [
-        height_error(np.empty(0), np.empty(0)),
-        height_error(np.ones(2), np.full(2, np.nan)),
-        pool_height_errors([]),
+        metrics.height_error(np.empty(0), np.empty(0)),
+        metrics.height_error(np.ones(2), np.full(2, np.nan)),
+        metrics.pool_height_errors([]),
     ],
 )
 def test_height_error_of_nothing(error):
@@ -152,7 +215,7 @@ HEIGHTS = hnp.arrays(
 @given(HEIGHTS, HEIGHTS)
 def test_pooled_height_errors_are_those_of_all_points(first, second):
     frames = [first, second]
-    pooled = pool_height_errors([height_error(*frame.T) for frame in frames])
+    pooled = metrics.pool_height_errors([metrics.height_error(*frame.T) for frame in frames])
     both = np.concatenate(frames)
     difference = both[:, 1] - both[:, 0]
     assert pooled.n_points == len(both)

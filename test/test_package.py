@@ -12,15 +12,15 @@ from test_layout import PACKAGE, ROS, imports, parse
 import gp_ground_seg
 
 
-def test_versions_agree():
-    package = ElementTree.parse(REPOSITORY / 'package.xml').getroot()
+@pytest.fixture
+def package():
+    return ElementTree.parse(REPOSITORY / 'package.xml').getroot()
+
+
+def test_package_xml_is_that_of_this_package(package):
     assert package.findtext('version') == gp_ground_seg.__version__
     changelog = (REPOSITORY / 'CHANGELOG.rst').read_text(encoding='utf-8')
     assert re.search(r'^(\d+\.\d+\.\d+|Forthcoming)\b', changelog, re.MULTILINE)
-
-
-def test_package_xml_is_an_ament_python_package():
-    package = ElementTree.parse(REPOSITORY / 'package.xml').getroot()
     assert package.get('format') == '3'
     assert package.findtext('export/build_type') == 'ament_python'
     depends = {element.text for element in package.iter('exec_depend')}
@@ -37,8 +37,7 @@ IN_ORDER = re.compile(
 )
 
 
-def test_package_xml_follows_its_schema():
-    package = ElementTree.parse(REPOSITORY / 'package.xml').getroot()
+def test_package_xml_follows_its_schema(package):
     assert IN_ORDER.fullmatch(''.join(f'{element.tag} ' for element in package))
     for element in package:
         # A token: no space around it, none doubled, no line break.

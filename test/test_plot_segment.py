@@ -96,13 +96,8 @@ def test_line_ends_by_hand(slope, ends):
 
 def test_everything_is_drawn(draw, scan, tmp_path, capsys):
     upper, lower = draw('--labels', scan.with_suffix('.label'))
-    for colour in (
-        TRUE_GROUND_COLOUR,
-        colours.TRUTH_COLOURS['true obstacle'][1],
-        colours.POINT_COLOUR,
-        colours.INLIER_COLOUR,
-        colours.SURFACE_COLOUR,
-    ):
+    truths = [colour for _, colour in colours.TRUTH_COLOURS.values()]
+    for colour in (*truths, colours.INLIER_COLOUR, colours.SURFACE_COLOUR):
         assert count(upper, colour) > 10, colour
     assert count(lower, colours.PSEUDO_INPUT_COLOUR) > 30
     assert count(lower, colours.SURFACE_COLOUR) > 300
@@ -139,8 +134,8 @@ def test_what_is_drawn_is_the_result():
     points = hilly_scan()
     result = GroundSegmenter().segment(points)
     above, below = Figure().subplots(2)
-    view = SegmentView(result, points[:, 2], SEGMENT, None)
-    view.draw_heights(above, 40.0)
+    view = SegmentView(result, SEGMENT)
+    view.draw_ground(above)
     view.draw_length_scale(below, 40.0, with_pseudo_inputs=True)
 
     drawn = {line.get_label().split(' (')[0]: line for line in above.lines}
@@ -172,16 +167,6 @@ def test_segments_with_nothing_to_see(tmp_path, points):
     for truth in (result.label, None):
         plot_segment(result, Config(), points, SEGMENT, path, truth, title=r'$\none _ %')
         assert imread(path).ndim == 3
-
-
-def test_an_existing_file_is_kept_without_force(scan, draw, tmp_path, capsys):
-    picture = tmp_path / 'a.png'
-    picture.write_text('mine')
-    assert run('plot', 'segment', scan, '--segment', SEGMENT, '-o', picture) == 2
-    assert '--force' in error_line(capsys)
-    assert picture.read_text() == 'mine'
-    draw('--force')
-    assert list(tmp_path.iterdir()) == [picture]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +12,17 @@ from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
-from gp_ground_seg.plotting import birds_eye, charts, style
-from gp_ground_seg.plotting.birds_eye import COLOURS, SheetPanel, plot_birds_eye, plot_error_sheet
-from gp_ground_seg.plotting.perspective import CAMERA, TARGET, ZOOM, plot_scan_view, project
+from gp_ground_seg.evaluation.metrics import Calibration
+from gp_ground_seg.plotting import charts, scan, style
+from gp_ground_seg.plotting.scan import (
+    CAMERA,
+    TARGET,
+    ZOOM,
+    plot_birds_eye,
+    plot_scan_view,
+    project,
+)
+from gp_ground_seg.plotting.scan import COLOURS_ABOVE as COLOURS
 
 
 def inches(*lengths):
@@ -28,7 +35,7 @@ def close_to(pixels, colour, tolerance=0.005):
 
 # --- from above ---------------------------------------------------------------------------
 
-SQUARE, LEFT, RIGHT, _, TOP, _ = inches(*birds_eye.SINGLE)
+SQUARE, LEFT, RIGHT, TOP = inches(scan.SQUARE, scan.LEFT, scan.RIGHT, scan.ABOVE)
 PANEL = LEFT + SQUARE + RIGHT
 
 
@@ -42,16 +49,15 @@ def repeat(values, n=4000):
     return np.repeat(values, n).astype(np.uint8)
 
 
-def where(path, colour, top=TOP, left=LEFT, side=SQUARE):
+def where(path, colour, left=LEFT):
     """Centre [m] (x forward, y left) and number of the pixels of a colour in a square."""
-    rows, columns = np.nonzero(
-        close_to(imread(path)[top : top + side, left : left + side], colour)
-    )
+    square = imread(path)[TOP : TOP + SQUARE, left : left + SQUARE]
+    rows, columns = np.nonzero(close_to(square, colour))
     if not len(rows):
         return None, 0
     # The median: here and there an edge of a letter or ring is of nearly the same grey.
     centre = np.array([np.median(rows), np.median(columns)])
-    return birds_eye.EXTENT * (1.0 - 2.0 * centre / side), len(rows)
+    return scan.EXTENT * (1.0 - 2.0 * centre / SQUARE), len(rows)
 
 
 def test_labels_and_errors_are_where_the_points_are(tmp_path):
@@ -84,15 +90,15 @@ def test_labels_and_errors_are_where_the_points_are(tmp_path):
 def test_counts_are_in_the_titles():
     label = np.array([0, 1, 1, 2, 2, 2], dtype=np.uint8)
     truth = np.array([1, 1, 2, 1, 2, 0], dtype=np.uint8)
-    titles = [birds_eye._label_panel(label)[0], birds_eye._label_panel(label[1:])[0]]
+    titles = [scan._label_panel(label)[0], scan._label_panel(label[1:])[0]]
     assert titles == [
         '6 points: 2 ground, 3 obstacle, 1 unknown',
         '5 points: 2 ground, 3 obstacle',
     ]
-    errors, layers = birds_eye._error_panel(label, truth)
+    errors, layers = scan._error_panel(label, truth)
     assert errors == '1 false ground, 2 missed ground, IoU 25.00 %'
     np.testing.assert_array_equal(sum(layer.chosen.astype(int) for layer in layers), 1)
-    assert birds_eye._error_panel(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
+    assert scan._error_panel(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
 
 
 @pytest.mark.parametrize('points', [np.zeros((0, 3)), np.full((3, 4), np.nan), np.zeros((1, 3))])
@@ -106,13 +112,9 @@ def test_clouds_with_nothing_to_see(tmp_path, points):
 
 def test_colours_differ_in_grey_too():
     """Ground and obstacles must be told apart in print and with any colour vision."""
-
-    def grey(colour):
-        return np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))
-
-    assert grey(COLOURS['ground']) - grey(COLOURS['obstacle']) > 0.3
-    for error in ('false ground', 'missed ground'):
-        assert grey(COLOURS['right']) - grey(COLOURS[error]) > 0.25
+    grey = {name: np.dot(to_rgb(c), (0.2126, 0.7152, 0.0722)) for name, c in COLOURS.items()}
+    assert grey['ground'] - grey['obstacle'] > 0.3
+    assert grey['right'] - max(grey['false ground'], grey['missed ground']) > 0.25
 
 
 @pytest.mark.parametrize(
@@ -135,9 +137,9 @@ def test_bad_input_is_said(tmp_path, keywords, error, message):
 def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeypatch):
     script = (
         'import sys, numpy as np\n'
-        'from gp_ground_seg.plotting import birds_eye, charts, perspective, segment\n'
+        'from gp_ground_seg.plotting import charts, scan, segment\n'
         'assert "matplotlib" not in sys.modules\n'
-        'birds_eye.plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
+        'scan.plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
         'assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules\n'
     )
     words = [sys.executable, '-c', script, str(tmp_path / 'a.png')]
@@ -146,30 +148,6 @@ def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeyp
     with pytest.raises(MissingDependencyError, match='matplotlib'):
         plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), tmp_path / 'b.png')
     assert not (tmp_path / 'b.png').exists()
-
-
-def test_sheet_shows_each_kind_of_point_where_it_is(tmp_path):
-    corners = {
-        'right ground': (30, 30, 1, 1),
-        'right obstacle': (30, -30, 2, 2),
-        'missed ground': (-10, 30, 2, 1),
-        'false ground': (-30, -32, 1, 2),
-        'not scored': (-40, 10, 1, 0),
-    }
-    points = np.concatenate([patch(x, y, half=4.0) for x, y, *_ in corners.values()])
-    label, truth = (repeat([corner[k] for corner in corners.values()]) for k in (2, 3))
-    panel = SheetPanel('title $x', 'subtitle', points, label, truth)
-    plot_error_sheet([panel] * 4, tmp_path / 'a.png', 'all')
-    # Second row, first column: the fourth scan.
-    side, left, _, below, above, title = birds_eye.SHEET
-    top = title + birds_eye.SHEET_LEGEND + above + side + below + above
-    for name, (x, y, *_) in corners.items():
-        square = dict(zip(('top', 'left', 'side'), inches(top, left, side), strict=True))
-        centre, n = where(tmp_path / 'a.png', COLOURS[name], **square)
-        assert n > 1000, name
-        assert centre == pytest.approx((x, y), abs=1.0), name
-    with pytest.raises(PointCloudError, match=r'truth of shape \(3,\) for 20000 points'):
-        plot_error_sheet([panel._replace(truth=truth[:3])], tmp_path / 'b.png', 'all')
 
 
 # --- in perspective -----------------------------------------------------------------------
@@ -227,6 +205,17 @@ def test_command_draws_a_scan_and_keeps_what_is_there(tmp_path, capsys):
     assert path.read_bytes() != before
 
 
+def test_command_draws_a_scan_from_above(tmp_path):
+    points = np.column_stack([hilly_scan(8000), np.zeros(8000)]).astype('<f4')
+    points.tofile(tmp_path / 'a.bin')
+    np.full(8000, 40, '<u4').tofile(tmp_path / 'a.label')
+    for words, n_panels in (([], 1), (['--labels', tmp_path / 'a.label', '--force'], 2)):
+        assert run('plot', 'above', tmp_path / 'a.bin', '-o', tmp_path / 'a.png', *words) == 0
+        assert imread(tmp_path / 'a.png').shape[1] == n_panels * PANEL
+    missed = where(tmp_path / 'a.png', COLOURS['missed ground'], left=LEFT + PANEL)
+    assert missed[1] > 500
+
+
 # --- charts -------------------------------------------------------------------------------
 
 
@@ -245,26 +234,18 @@ def test_bars_are_as_long_as_the_stages(tmp_path):
     np.testing.assert_allclose(found / found[0], [1, 2, 3, 4], rtol=0.05)
     assert second.max() == pytest.approx(3 * found[0], rel=0.05)
     assert lengths(charts.REFERENCE_COLOUR).max() < 3
-    with pytest.raises(DataError, match='exists already'):
-        charts.plot_stage_bars(cases, path, 'title')
-    charts.plot_stage_bars(cases, path, 'title', baseline=('other', 80.0), force=True)
+    charts.plot_stage_bars(cases, path, 'title', baseline=('other', 80.0))
     column = close_to(imread(path), charts.REFERENCE_COLOUR, 0.02).sum(axis=0)
     assert column.max() > 50  # A dashed line from top to bottom.
-
-
-def curve(p, share):
-    edges = np.linspace(0.0, 1.0, len(p) + 1)
-    assert ((edges[:-1] <= p) & (p <= edges[1:])).all()
-    counts = np.full(len(p), 1000)
-    return SimpleNamespace(n_points=counts, mean_p=p, share_ground=share, ece=0.1, brier=0.2)
 
 
 def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
     """By the pixels of the pooled line: the mean of right minus up in the square."""
     p = np.linspace(0.0, 1.0, 21)[:-1] + 0.025
     for power, low, high in ((1.0, -0.02, 0.02), (3.0, 0.15, 0.35)):  # p - p^3: 0.25 on average
-        found = curve(p, p**power)
-        charts.plot_reliability(found, {'00': found, '08': found}, tmp_path / 'a.png', 'title')
+        found = Calibration(np.full(20, 1000), 1000 * p**power, 1000 * p, 0.2)
+        sequences = dict.fromkeys(('00', '08', 'all'), found)
+        charts.plot_reliability(sequences, tmp_path / 'a.png', 'title')
         top, left, side = inches(charts.TITLE, charts.LEFT, charts.SQUARE)
         square = imread(tmp_path / 'a.png')[top : top + side, left : left + side]
         line = close_to(square, charts.POOLED_COLOUR, 0.02)
@@ -273,7 +254,7 @@ def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
         assert low < np.mean(rows - (side - columns)) / side < high
     found.n_points[:] = 0
     with pytest.raises(PointCloudError, match='no scored point'):
-        charts.plot_reliability(found, {}, tmp_path / 'b.png', '')
+        charts.plot_reliability({'all': found}, tmp_path / 'b.png', '')
 
 
 # --- colours of length-scales -------------------------------------------------------------
@@ -281,22 +262,13 @@ def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
 # Brettel-style full loss of one cone, as linear maps in linear RGB (Machado et al. 2009).
 DEFICIENCIES = {
     'none': np.eye(3),
-    'protanopia': [
-        [0.152286, 1.052583, -0.204868],
-        [0.114503, 0.786281, 0.099216],
-        [-0.003882, -0.048116, 1.051998],
-    ],
-    'deuteranopia': [
-        [0.367322, 0.860646, -0.227968],
-        [0.280085, 0.672501, 0.047413],
-        [-0.011820, 0.042940, 0.968881],
-    ],
-    'tritanopia': [
-        [1.255528, -0.076749, -0.178779],
-        [-0.078411, 0.930809, 0.147602],
-        [0.004733, 0.691367, 0.303900],
-    ],
-}
+    'protanopia': [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+                   [-0.003882, -0.048116, 1.051998]],
+    'deuteranopia': [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+                     [-0.011820, 0.042940, 0.968881]],
+    'tritanopia': [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
+                   [0.004733, 0.691367, 0.303900]],
+}  # fmt: skip
 
 
 @pytest.mark.parametrize('name', DEFICIENCIES)

@@ -13,7 +13,9 @@ from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.compiled.polar_grid import grid_geometry
 from gp_ground_seg.frame import OUTSIDE
 from gp_ground_seg.parameters.config import GridConfig
-from gp_ground_seg.pipeline.polar_grid import bin_edges
+from gp_ground_seg.pipeline.polar_grid import azimuth_key, bin_edges
+
+PLACE = st.floats(-120, 120)
 
 
 def config_of(cell_size=0.5, **grid):
@@ -35,13 +37,7 @@ def assert_same_scan(found, expected):
 
 
 @settings(max_examples=fewer(100, 10))
-@given(
-    st.floats(-120, 120),
-    st.floats(-120, 120),
-    st.integers(4, 50),
-    st.integers(4, 50),
-    st.floats(1.0, 3.0),
-)
+@given(PLACE, PLACE, st.integers(4, 50), st.integers(4, 50), st.floats(1.0, 3.0))
 def test_cell_of_a_point(backend, x, y, n_segments, n_bins, growth):
     config = config_of(n_segments=n_segments, n_bins=n_bins, bin_growth=growth)
     grid = backend.build_grid(np.array([[x, y, 0.0]]), config).grid
@@ -58,6 +54,14 @@ def test_cell_of_a_point(backend, x, y, n_segments, n_bins, growth):
         assert grid.segment[0] == int(turn)
 
 
+@given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi), st.floats(0.01, 1e3))
+def test_azimuth_key_grows_with_the_angle(one, other, r):
+    first, second = azimuth_key(r * np.cos([one, other]), r * np.sin([one, other]))
+    assert 0.0 <= first <= 4.0
+    if one + 1e-9 < other:
+        assert first < second
+
+
 def test_edges_span_the_range_and_grow():
     edges = bin_edges(GridConfig(n_bins=10, r_min=1.0, r_max=101.0, bin_growth=2.0))
     assert (edges[0], edges[-1]) == (1.0, 101.0)
@@ -72,14 +76,11 @@ def test_both_sides_of_the_negative_x_axis(backend):
 @pytest.mark.filterwarnings('ignore:overflow')
 @settings(max_examples=fewer(100, 5))
 @given(
-    st.integers(0, 10_000),
-    st.sampled_from([0, 1, 400]),
-    st.floats(1.0, 3.0),
-    st.integers(4, 60),
-    st.sampled_from([np.float32, np.float64]),
+    st.integers(0, 10_000), st.sampled_from([0, 1, 400]), st.sampled_from([np.float32, np.float64])
 )
-def test_cells_tiles_and_candidates_are_the_reference(backend, seed, n, growth, n_bins, dtype):
-    xyz = hilly_scan(n, seed=seed)
+def test_cells_tiles_and_candidates_are_the_reference(backend, seed, n, dtype):
+    rng, xyz = np.random.default_rng(seed), hilly_scan(n, seed=seed)
+    growth, n_bins = float(rng.uniform(1.0, 3.0)), int(rng.integers(4, 61))
     xyz[::7] = np.round(xyz[::7])  # equal heights, points on edges and axes
     xyz[::50, seed % 3] = np.nan
     # Infinite, or far away near the limit of single precision.
@@ -97,17 +98,6 @@ def test_cells_tiles_and_candidates_are_the_reference(backend, seed, n, growth, 
         own = candidates.bin[candidates.segment == m]
         assert (np.diff(own) > 0).all()
         assert n_edges == (own[-1] + 2 if len(own) else 0)
-
-
-@pytest.mark.parametrize('n_turned', [1, 7, 90])
-def test_rotating_the_scan_by_segments_shifts_the_segments(backend, n_turned):
-    xyz = hilly_scan(2000, seed=3)
-    c, s = np.cos(n_turned * 2 * np.pi / 180), np.sin(n_turned * 2 * np.pi / 180)
-    turned = xyz @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
-    # A copy: the numba backend sorts the next scan into the same arrays.
-    before = backend.build_grid(xyz, Config()).grid.segment.copy()
-    after = backend.build_grid(turned, Config()).grid.segment
-    np.testing.assert_array_equal(after, (before + n_turned) % 180)
 
 
 def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
@@ -129,7 +119,6 @@ def test_nothing_of_one_scan_shows_in_the_next(n_threads):
         (n, other, np.float64), (n, Config(), np.float64), (n, Config(), np.float32),
         (0, Config(), np.float32), (2 * n, Config(), np.float64), (n, Config(), np.float64),
     ]  # fmt: skip
-    n_faces = 0
     with sharing(n_threads) as backend:
         for seed, (n_points, config, dtype) in enumerate(scans):
             xyz = hilly_scan(n_points, seed=seed).astype(dtype)
@@ -140,5 +129,3 @@ def test_nothing_of_one_scan_shows_in_the_next(n_threads):
             faces, same = backend.find_faces(found, config), fresh.find_faces(expected, config)
             np.testing.assert_array_equal(faces.is_face, same.is_face)
             np.testing.assert_array_equal(faces.has_occluded_base, same.has_occluded_base)
-            n_faces += faces.is_face.sum()
-    assert n_faces > 0

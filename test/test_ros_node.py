@@ -1,275 +1,20 @@
-"""The node in this process: what goes in, what comes out."""
+"""The node in this process: what goes in, what comes out, what it says of itself."""
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
+import ros_helpers as ros
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock_type import ClockType
 from rclpy.time import Time
-from ros_helpers import (
-    BEST_EFFORT,
-    NAMESPACE,
-    POINT,
-    RELIABLE,
-    Bench,
-    Collector,
-    bench,
-    isolated_context,
-    rows_of,
-    spinning,
-    street,
-    to_message,
-    wait_for,
-    xyz_of,
-)
+from ros_helpers import NAMESPACE, street, to_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.ros.node import GroundSegmentationNode
+from gp_ground_seg import GroundSegmenter, Label
 
 OFTEN = ('-p', 'diagnostics.period:=0.1', '-p', 'diagnostics.recover_after:=0.3')
-
-
-def assert_partition(message, points, ground, obstacles):
-    """Every finite point, bit for bit and in order, in the cloud of its label."""
-    label = GroundSegmenter().segment(xyz_of(points)).label
-    rows = rows_of(to_message(points))
-    for part, wanted in ((ground, Label.GROUND), (obstacles, Label.OBSTACLE)):
-        kept = [row for row, found in zip(rows, label, strict=True) if found == wanted]
-        assert rows_of(part) == kept
-        assert part.header == message.header
-        assert part.fields == message.fields
-        assert (part.height, part.width) == (1, len(kept))
-        assert part.point_step == message.point_step
-        assert part.row_step == len(kept) * message.point_step
-        assert not part.is_bigendian
-        assert part.is_dense
-    assert ground.width + obstacles.width == np.isfinite(xyz_of(points)).all(axis=1).sum()
-
-
-def test_every_finite_point_is_in_exactly_one_cloud_bit_for_bit():
-    points = street(20_000, n_invalid=200)
-    message = to_message(points, stamp=(1317383, 123456789), frame='velo_link')
-    with bench() as b:
-        ground, obstacles = b.segment(message)
-        assert min(ground.width, obstacles.width) > 1000
-        assert_partition(message, points, ground, obstacles)
-
-
-def test_odd_layouts():
-    points = street(6000)
-    with bench() as b:
-        message = to_message(points)
-        # Organised, rows padded with bytes that must not show up.
-        message.height, message.width = 60, 100
-        message.row_step = 100 * POINT.itemsize + 7
-        rows = bytes(message.data)
-        row_bytes = 100 * POINT.itemsize
-        message.data = b''.join(
-            rows[start : start + row_bytes] + b'padding'
-            for start in range(0, len(rows), row_bytes)
-        )
-        ground, obstacles = b.segment(message)
-        assert_partition(message, points, ground, obstacles)
-
-        # Big-endian doubles, z first.
-        swapped = np.zeros(6000, np.dtype([('z', '>f8'), ('y', '>f8'), ('x', '>f8')]))
-        for axis in 'xyz':
-            swapped[axis] = points[axis]
-        message = to_message(swapped)
-        message.is_bigendian = True
-        ground, obstacles = b.segment(message)
-        label = GroundSegmenter().segment(xyz_of(points)).label
-        assert bytes(ground.data) == swapped[label == Label.GROUND].tobytes()
-        assert bytes(obstacles.data) == swapped[label == Label.OBSTACLE].tobytes()
-        assert ground.is_bigendian
-        assert obstacles.is_bigendian
-
-
-def test_clouds_with_nothing_in_them_give_two_empty_clouds():
-    with bench() as b:
-        invalid = street(50, n_invalid=50)
-        for points in (street(0), invalid):
-            message = to_message(points, stamp=(5, 6), frame='lidar')
-            for part in b.segment(message):
-                assert (part.height, part.width, len(part.data)) == (1, 0, 0)
-                assert part.header == message.header
-                assert part.fields == message.fields
-
-
-def test_bad_cloud_is_refused_and_the_next_one_processed():
-    points = street(3000)
-    bad = to_message(points, frame='bad_frame')
-    bad.fields[3].name = 'height'
-    with bench(*OFTEN) as b:
-        b.publisher.publish(bad)
-        status = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.ERROR)
-        assert 'no field named z' in status.message
-        values = {entry.key: entry.value for entry in status.values}
-        assert values['Frame'] == 'bad_frame'
-        assert values['Refused since startup'] == '1'
-
-        message = to_message(points)
-        assert_partition(message, points, *b.segment(message))
-        assert len(b.ground.messages) == 1
-        b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
-
-
-def test_error_inside_the_library_does_not_end_the_node(monkeypatch):
-    message = to_message(street(3000))
-    with bench(*OFTEN) as b:
-        with monkeypatch.context() as patch:
-            patch.setattr(GroundSegmenter, 'segment', lambda *_: 1 / 0)
-            b.publisher.publish(message)
-            status = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.ERROR)
-            assert 'ZeroDivisionError' in status.message
-        b.segment(message)
-
-
-def test_diagnostics_of_a_stream():
-    message = to_message(street(3000), stamp=(1317383000, 0), frame='velo_link')
-    limits = '-p', 'diagnostics.stale_after:=3.0', '-p', 'diagnostics.max_latency:=10.0'
-    with bench(*OFTEN, *limits) as b:
-        stale = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.STALE)
-        assert f'{NAMESPACE}/points' in stale.message
-        for _ in range(3):
-            b.segment(message)
-        status = b.wait_for_status('processing', lambda v, _: v['Clouds since startup'] == '3')
-        assert status.level == DiagnosticStatus.OK
-        values = {entry.key: entry.value for entry in status.values}
-        assert 0.0 < float(values['Latency p50 (ms)']) <= float(values['Latency p99 (ms)'])
-        assert values['Dropped since startup'] == '0'
-        assert values['Backend'] in ('numba', 'numpy')
-        assert int(values['Threads']) >= 1
-
-        b.segment(message)
-        # A stamp of 2011 is old, and nothing is wrong with that.
-        status = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
-        values = {entry.key: entry.value for entry in status.values}
-        assert float(values['Age of last stamp (s)']) > 1e8
-        assert values['Fields'] == ' '.join(POINT.names)
-        assert values['QoS'] == 'reliable, keep_last 5, volatile'
-        assert values['Publishers'] == '1'
-        assert values['Clock'] == 'system time'
-        status = b.wait_for_status('model', lambda v, _: 'frame_quality' in v)
-        assert status.level == DiagnosticStatus.OK
-        values = {entry.key: entry.value for entry in status.values}
-        assert 0.2 < float(values['frame_quality']) <= 1.0
-        assert 0.3 < float(values['Ground fraction']) < 1.0
-        status = b.wait_for_status('output', lambda *_: True)
-        values = {entry.key: entry.value for entry in status.values}
-        assert values[f'{NAMESPACE}/ground subscribers'] == '1'
-        assert values[f'{NAMESPACE}/obstacles since startup'] == '4'
-        assert b.set('diagnostics.max_latency', 0.001).successful
-        b.wait_for_status('processing', lambda _, s: s.level == DiagnosticStatus.WARN)
-
-
-def test_diagnostics_come_without_a_clock_under_sim_time():
-    with bench(*OFTEN, '-p', 'use_sim_time:=true') as b:
-        assert b.node.get_clock().ros_time_is_active
-        b.segment(to_message(street(3000)))
-        b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
-
-
-def test_error_in_a_report_does_not_end_the_node(monkeypatch):
-    with bench(*OFTEN) as b:
-        monkeypatch.setattr(b.node, '_outputs', None)
-        status = b.wait_for_status('diagnostics', lambda *_: True)
-        assert status.level == DiagnosticStatus.ERROR
-        assert 'NoneType' in status.message
-        monkeypatch.undo()
-        b.wait_for_status('output', lambda *_: True)
-
-
-def test_stamps_that_jump_back_reset_what_was_learned(monkeypatch):
-    points = street(3000)
-    resets = []
-    reset = GroundSegmenter.reset
-    with bench(*OFTEN) as b:
-        monkeypatch.setattr(GroundSegmenter, 'reset', lambda s: [resets.append(1), reset(s)])
-        for seconds in (100, 101, 102):
-            b.segment(to_message(points, stamp=(seconds, 0)))
-        assert resets == []
-        for seconds in (100, 101, 100):
-            b.segment(to_message(points, stamp=(seconds, 0)))
-        status = b.wait_for_status('input', lambda v, _: v['Time jumps since startup'] == '2')
-        assert status.level == DiagnosticStatus.OK
-        assert resets == [1, 1]
-
-
-def test_simulated_time_that_jumps_back_resets_what_was_learned():
-    with bench(*OFTEN, '-p', 'use_sim_time:=true') as b:
-        publisher = b.probe.create_publisher(Clock, '/clock', RELIABLE)
-        wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of /clock')
-
-        def tell(seconds):
-            message = Clock()
-            message.clock.sec = seconds
-            publisher.publish(message)
-            now = Time(seconds=seconds, clock_type=ClockType.ROS_TIME)
-            wait_for(lambda: b.node.get_clock().now() == now, f'time {seconds}')
-
-        tell(1317383000)
-        b.segment(to_message(street(3000), stamp=(1317382999, 500000000)))
-        # A stamp of 2011 is half a second old: ages are on the node's clock.
-        status = b.wait_for_status('input', lambda v, _: v['Events since startup'] == '1')
-        values = {entry.key: entry.value for entry in status.values}
-        assert values['Age of last stamp (s)'] == '0.500'
-        assert values['Clock'] == 'simulated, from /clock'
-        tell(1317382000)
-        b.wait_for_status('input', lambda v, _: v['Time jumps since startup'] == '1')
-        # The first cloud of the next round: the same jump.
-        b.segment(to_message(street(3000), stamp=(1317382000, 0)))
-        status = b.wait_for_status('input', lambda v, _: v['Events since startup'] == '2')
-        values = {entry.key: entry.value for entry in status.values}
-        assert values['Time jumps since startup'] == '1'
-
-
-def test_drops_are_counted_exactly():
-    message = to_message(street(20_000))
-    with bench(*OFTEN, '-p', f'qos_overrides.{NAMESPACE}/points.subscription.depth:=1') as b:
-        b.segment(message)
-        for _ in range(29):
-            b.publisher.publish(message)
-
-        def all_accounted_for(values, _status):
-            return int(values['Clouds since startup']) + int(values['Dropped since startup']) == 30
-
-        status = b.wait_for_status('processing', all_accounted_for)
-        values = {entry.key: entry.value for entry in status.values}
-        assert int(values['Dropped since startup']) > 0
-        assert int(values['Clouds since startup']) == len(b.ground.wait(2))
-
-
-def publish_until(publisher, message, condition, what):
-    def publish_once():
-        publisher.publish(message)
-        return condition()
-
-    wait_for(publish_once, what)
-
-
-def test_input_follows_the_reliability_of_its_publishers():
-    message = to_message(street(1000))
-    with bench() as b:
-        b.in_executor(b.probe.destroy_publisher, b.publisher)
-        driver = b.probe.create_publisher(PointCloud2, 'points', BEST_EFFORT)
-        publish_until(driver, message, lambda: b.ground.messages, 'cloud of a best-effort driver')
-        assert b.node._input.qos.reliability == BEST_EFFORT.reliability
-
-        # The driver ends, a bag is played: nothing of it may be lost.
-        b.in_executor(b.probe.destroy_publisher, driver)
-        player = b.probe.create_publisher(PointCloud2, 'points', RELIABLE)
-        wait_for(
-            lambda: b.node._input.qos.reliability == RELIABLE.reliability, 'reliable subscription'
-        )
-        wait_for(lambda: player.get_subscription_count() == 1, 'match')
-        count = len(b.ground.messages)
-        player.publish(message)
-        b.ground.wait(count + 1)
 
 
 @pytest.mark.parametrize('reliability', ['reliable', 'best_effort'])
@@ -277,79 +22,24 @@ def test_reliability_asked_for_is_kept(reliability):
     override = f'qos_overrides.{NAMESPACE}/points.subscription.reliability:={reliability}'
     depth = f'qos_overrides.{NAMESPACE}/points.subscription.depth:=9'
     message = to_message(street(1000))
-    with bench('-p', override, '-p', depth, *OFTEN) as b:
+    with ros.bench('-p', override, '-p', depth, *OFTEN) as b:
         b.segment(message)
-        driver = b.probe.create_publisher(PointCloud2, 'points', BEST_EFFORT)
+        b.publisher = b.probe.create_publisher(PointCloud2, 'points', ros.BEST_EFFORT)
         b.wait_for_status('input', lambda v, _: v['Publishers'] == '2')
-        publish_until(
-            driver, message, lambda: len(b.diagnostics.messages) > 15, 'a second of clouds'
-        )
+        b.publish_until(message, lambda: len(b.diagnostics.messages) > 15, 'a second of clouds')
         assert b.node._input.qos.reliability.name.lower() == reliability
         assert b.node._input.qos.depth == 9
 
 
-def test_two_nodes_side_by_side():
-    message = to_message(street(1000))
-    with isolated_context() as context:
-        b = Bench(context, ('-r', '__node:=front', '-p', 'label.ground_tolerance:=0.5'))
-        rear = GroundSegmentationNode(
-            context=context,
-            namespace=f'{NAMESPACE}/rear',
-            cli_args=['--ros-args', '-r', 'points:=cloud', '-r', 'ground:=floor'],
-        )
-        floor = Collector(b.probe, PointCloud2, 'rear/floor')
-        publisher = b.probe.create_publisher(PointCloud2, 'rear/cloud', RELIABLE)
-        assert b.node.get_name() == 'front'
-        with spinning(context, b.node, b.probe, rear):
-            wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription')
-            wait_for(lambda: floor.n_publishers == 1, 'floor')
-            publisher.publish(message)
-            floor.wait(1)
-            wait_for(lambda: b.publisher.get_subscription_count() == 1, 'subscription')
-            b.publisher.publish(message)
-            b.ground.wait(1)
-            assert len(floor.messages) == 1
-        assert b.node.config.label.ground_tolerance == 0.5
-        assert rear.config.label == Config().label
-
-
-def test_names_of_the_diagnostics():
-    """Dashboards read them: tasks, keys and their order are part of the interface."""
-    times = [
-        f'{name} p{percent} (ms)'
-        for name in ('Latency', *(f'Stage {stage}' for stage in STAGES))
-        for percent in (50, 95, 99)
-    ]
-    with bench(*OFTEN) as b:
-        b.segment(to_message(street(3000)))
-        tasks = {
-            task: b.wait_for_status(task, lambda v, _, key=key: v.get(key) not in (None, '0'))
-            for task, key in FIRST_COUNTERS.items()
-        }
-        node_name = b.node.get_fully_qualified_name()
-    keys = {task: [entry.key for entry in status.values] for task, status in tasks.items()}
-    assert {status.hardware_id for status in tasks.values()} == {'none'}
-    assert keys['input'] == INPUT_KEYS.split('; ')
-    assert sorted(keys['processing']) == sorted([*PROCESSING_KEYS.split('; '), *times])
-    model = [key for key in keys['model'] if not key.startswith('theta ')]
-    assert model == MODEL_KEYS.split('; ')
-    assert len(keys['model']) > len(model)
-    topics = [f'{NAMESPACE}/ground', f'{NAMESPACE}/obstacles'] + [
-        f'{node_name}/{name}' for name in ('labeled', 'ground_model', 'markers')
-    ]
-    facts = ('subscribers', 'rate (Hz)', 'since startup')
-    assert keys['output'] == [f'{topic} {fact}' for topic in topics for fact in facts]
-
-
-FIRST_COUNTERS = {
-    'input': 'Events since startup',
-    'processing': 'Clouds since startup',
-    'model': 'Candidates',
-    'output': f'{NAMESPACE}/ground since startup',
-}
+# Names are part of the interface: dashboards read tasks, keys and their order.
 STAGES = (
     'queue', 'grid', 'pose', 'faces', 'lines', 'learning', 'surface', 'label', 'total', 'publish',
 )  # fmt: skip
+TIMES = [
+    f'{name} p{percent} (ms)'
+    for name in ('Latency', *(f'Stage {stage}' for stage in STAGES))
+    for percent in (50, 95, 99)
+]
 INPUT_KEYS = (
     'Topic; Publishers; QoS; Events since startup; Events in window; Duration of window (s); '
     'Actual frequency (Hz); Time since last cloud (s); Age of last stamp (s); Clock; '
@@ -366,3 +56,167 @@ MODEL_KEYS = (
     'Learning mode; Learned since startup; Optimiser status; Evaluations; At bound; '
     'Objective per candidate'
 )
+
+
+def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch):
+    points, resets, reset = street(3000), [], GroundSegmenter.reset
+    monkeypatch.setattr(GroundSegmenter, 'reset', lambda s: [resets.append(1), reset(s)])
+    limits = '-p', 'diagnostics.stale_after:=3.0', '-p', 'diagnostics.max_latency:=10.0'
+    with ros.bench(*OFTEN, *limits) as b:
+
+        def segment(*seconds):
+            for second in seconds:
+                b.segment(to_message(points, (1317383000 + second, 0), 'velo_link'))
+
+        def wait_for_counter(task, counter, value):
+            return b.wait_for_status(task, lambda v, _: v.get(counter) == value)
+
+        stale = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.STALE)
+        assert f'{NAMESPACE}/points' in stale.message
+        segment(0, 1, 2)
+        assert resets == []
+        segment(0, 1, 0)
+        b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
+        tasks = {
+            'input': wait_for_counter('input', 'Events since startup', '6'),
+            'processing': wait_for_counter('processing', 'Clouds since startup', '6'),
+            'model': wait_for_counter('model', 'Learned since startup', '6'),
+            'output': wait_for_counter('output', f'{NAMESPACE}/ground since startup', '6'),
+        }
+        assert resets == [1, 1]
+        assert b.set('diagnostics.max_latency', 0.001).successful
+        b.wait_for_status('processing', lambda _, s: s.level == DiagnosticStatus.WARN)
+        node_name = b.node_name
+
+    for status in tasks.values():
+        assert (status.level, status.hardware_id) == (DiagnosticStatus.OK, 'none')
+    keys = {task: [entry.key for entry in status.values] for task, status in tasks.items()}
+    assert keys['input'] == INPUT_KEYS.split('; ')
+    assert sorted(keys['processing']) == sorted([*PROCESSING_KEYS.split('; '), *TIMES])
+    model = [key for key in keys['model'] if not key.startswith('theta ')]
+    assert model == MODEL_KEYS.split('; ')
+    assert len(keys['model']) > len(model)
+    topics = [f'{NAMESPACE}/ground', f'{NAMESPACE}/obstacles'] + [
+        f'{node_name}/{name}' for name in ('labeled', 'ground_model', 'markers')
+    ]
+    facts = ('subscribers', 'rate (Hz)', 'since startup')
+    assert keys['output'] == [f'{topic} {fact}' for topic in topics for fact in facts]
+
+    values = {task: ros.values_of(status) for task, status in tasks.items()}
+    # A stamp of 2011 is old, and nothing is wrong with that.
+    assert float(values['input']['Age of last stamp (s)']) > 1e8
+    expected = {
+        'Fields': ' '.join(ros.POINT.names),
+        'QoS': 'reliable, keep_last 5, volatile',
+        'Publishers': '1',
+        'Clock': 'system time',
+        'Time jumps since startup': '2',
+    }
+    assert expected.items() <= values['input'].items()
+    latency = [float(values['processing'][f'Latency p{percent} (ms)']) for percent in (50, 99)]
+    assert 0.0 < latency[0] <= latency[1]
+    assert values['processing']['Dropped since startup'] == '0'
+    assert values['processing']['Backend'] in ('numba', 'numpy')
+    assert int(values['processing']['Threads']) >= 1
+    assert 0.2 < float(values['model']['frame_quality']) <= 1.0
+    assert 0.3 < float(values['model']['Ground fraction']) < 1.0
+    assert values['output'][f'{NAMESPACE}/ground subscribers'] == '1'
+    assert values['output'][f'{NAMESPACE}/obstacles since startup'] == '6'
+
+
+def test_simulated_time_that_jumps_back_resets_what_was_learned():
+    with ros.bench(*OFTEN, '-p', 'use_sim_time:=true') as b:
+
+        def wait_for_input(counter, value):
+            return ros.values_of(b.wait_for_status('input', lambda v, _: v[counter] == value))
+
+        # Diagnostics come without a clock too.
+        assert b.node.get_clock().ros_time_is_active
+        b.segment(to_message(street(3000)))
+        wait_for_input('Events since startup', '1')
+        publisher = b.probe.create_publisher(Clock, '/clock', ros.RELIABLE)
+        ros.wait_for(lambda: publisher.get_subscription_count() == 1, 'subscription of /clock')
+
+        def tell(seconds):
+            message = Clock()
+            message.clock.sec = seconds
+            publisher.publish(message)
+            now = Time(seconds=seconds, clock_type=ClockType.ROS_TIME)
+            ros.wait_for(lambda: b.node.get_clock().now() == now, f'time {seconds}')
+
+        tell(1317383000)
+        b.segment(to_message(street(3000), stamp=(1317382999, 500000000)))
+        # A stamp of 2011 is half a second old: ages are on the node's clock.
+        values = wait_for_input('Events since startup', '2')
+        assert values['Age of last stamp (s)'] == '0.500'
+        assert values['Clock'] == 'simulated, from /clock'
+        tell(1317382000)
+        wait_for_input('Time jumps since startup', '1')
+        # The first cloud of the next round: the same jump.
+        b.segment(to_message(street(3000), stamp=(1317382000, 0)))
+        assert wait_for_input('Events since startup', '3')['Time jumps since startup'] == '1'
+
+
+def test_nothing_is_loaded_for_numpy():
+    with ros.bench('-p', 'runtime.backend:=numpy') as b:
+        b.segment(to_message(street(1000)))
+        assert not b.node._loader.is_started
+
+
+# One node for all that follows: it would hear the clouds of others
+
+
+@pytest.fixture(scope='module')
+def b():
+    with ros.bench(*OFTEN) as shared:
+        yield shared
+
+
+def test_every_finite_point_is_in_exactly_one_cloud_bit_for_bit(b):
+    """In order, with the default configuration; layouts are tested with a smaller grid."""
+    points = street(20_000, n_invalid=200)
+    message = to_message(points, stamp=(1317383, 123456789), frame='velo_link')
+    parts = b.segment(message)
+    labels = GroundSegmenter().segment(ros.xyz_of(points)).label
+    for part, wanted in zip(parts, (Label.GROUND, Label.OBSTACLE), strict=True):
+        pairs = zip(ros.rows_of(message), labels, strict=True)
+        assert ros.rows_of(part) == [row for row, label in pairs if label == wanted]
+        assert part.width > 1000
+        assert part.header == message.header
+        assert part.fields == message.fields
+    assert parts[0].width + parts[1].width == 19_800
+
+
+def test_error_inside_the_library_does_not_end_the_node(b, monkeypatch):
+    message = to_message(street(3000))
+    with monkeypatch.context() as patch:
+        patch.setattr(GroundSegmenter, 'segment', lambda *_: 1 / 0)
+        b.publisher.publish(message)
+        status = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.ERROR)
+        assert 'ZeroDivisionError' in status.message
+    b.segment(message)
+
+
+def test_error_in_a_report_does_not_end_the_node(b, monkeypatch):
+    monkeypatch.setattr(b.node, '_outputs', None)
+    status = b.wait_for_status('diagnostics', lambda *_: True)
+    assert status.level == DiagnosticStatus.ERROR
+    assert 'NoneType' in status.message
+    monkeypatch.undo()
+    b.wait_for_status('output', lambda *_: True)
+
+
+def test_input_follows_the_reliability_of_its_publishers(b):
+    message, count = to_message(street(1000)), len(b.ground.messages)
+    b.in_executor(b.probe.destroy_publisher, b.publisher)
+    b.publisher = b.probe.create_publisher(PointCloud2, 'points', ros.BEST_EFFORT)
+    b.publish_until(message, lambda: len(b.ground.messages) > count, 'cloud of a driver')
+    assert b.node._input.qos.reliability == ros.BEST_EFFORT.reliability
+
+    # The driver ends, a bag is played: nothing of it may be lost.
+    b.in_executor(b.probe.destroy_publisher, b.publisher)
+    b.publisher = b.probe.create_publisher(PointCloud2, 'points', ros.RELIABLE)
+    reliable = ros.RELIABLE.reliability
+    ros.wait_for(lambda: b.node._input.qos.reliability == reliable, 'reliable subscription')
+    b.wait_until_connected()
+    b.segment(message)

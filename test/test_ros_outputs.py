@@ -7,17 +7,8 @@ import pytest
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
-from ros_helpers import (
-    POINT,
-    Collector,
-    bench,
-    isolated_context,
-    spinning,
-    street,
-    to_message,
-    wait_for,
-    xyz_of,
-)
+import ros_helpers as ros
+from ros_helpers import said_by, street, to_message, wait_for, xyz_of
 from sensor_msgs.msg import PointCloud2, PointField
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -25,111 +16,47 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.data.point_cloud2 import read_columns
 from gp_ground_seg.ros import outputs
 from gp_ground_seg.ros.ground_model import read_ground_model
-from gp_ground_seg.ros.node import GroundSegmentationNode
+from gp_ground_seg.ros.node import NODE_NAME
 from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
 from gp_ground_seg.ros.outputs import labelled_names
 
-NODE = 'ground_segmentation_node'
-OPTIONAL = {
-    '~/labeled': PointCloud2,
-    '~/ground_model': PointCloud2,
-    '~/markers': MarkerArray,
-}
-
-
-def columns_of(message, *names):
-    return read_columns(message, names)
-
-
-@pytest.fixture(scope='module')
-def shared_bench():
-    with bench('-p', 'learning.mode:=fixed') as b:
-        yield b
-
-
+OPTIONAL = {'~/labeled': PointCloud2, '~/ground_model': PointCloud2, '~/markers': MarkerArray}
 CONFIG = Config().replace(**{'learning.mode': 'fixed'})
 
 
-def listen(b, topic):
-    """Collector of an optional topic; its publisher knows of it."""
-    publisher = next(p for o, p in b.node._outputs._publishers if o.topic == topic)
-    wait_for(lambda: publisher.get_subscription_count() == 0, f'end of earlier ears of {topic}')
-    collector = Collector(b.probe, OPTIONAL[topic], topic.replace('~', NODE))
-    wait_for(lambda: publisher.get_subscription_count() == 1, f'ear of {topic}')
-    return collector
+@pytest.fixture(scope='module')
+def b():
+    with ros.bench('-p', 'learning.mode:=fixed') as shared:
+        yield shared
 
 
 def received(b, topic, message):
     """What the optional topic says of one cloud."""
-    collector = listen(b, topic)
+    publisher = next(p for o, p in b.node._outputs._publishers if o.topic == topic)
+    wait_for(lambda: publisher.get_subscription_count() == 0, f'end of earlier ears of {topic}')
+    collector = ros.Collector(b.probe, OPTIONAL[topic], topic.replace('~', NODE_NAME))
+    wait_for(lambda: publisher.get_subscription_count() == 1, f'ear of {topic}')
     b.segment(message)
     answer = collector.wait(1)[0]
     b.in_executor(b.probe.destroy_subscription, collector.subscription)
     return answer
 
 
-def test_labelled_cloud_has_every_byte_of_the_input_and_our_columns(shared_bench):
-    points = street(6000, n_invalid=60)
-    rows = points.reshape(60, 100)
-    message = to_message(points, stamp=(17, 23), frame='velo_link')
-    # Organised, with padded rows.
-    padded = np.zeros((60, rows.nbytes // 60 + 5), np.uint8)
-    padded[:, :-5] = rows.view(np.uint8).reshape(60, -1)
-    message.height, message.width, message.row_step = 60, 100, padded.shape[1]
-    message.data = padded.tobytes()
-    found = received(shared_bench, '~/labeled', message)
-
-    assert found.header == message.header
-    assert (found.height, found.width) == (60, 100)
-    assert found.fields[: len(message.fields)] == message.fields
-    assert [field.name for field in found.fields[len(message.fields) :]] == list(FIELDS)
-    assert found.row_step == 100 * found.point_step
-    raw = np.frombuffer(found.data, np.uint8).reshape(6000, found.point_step)
-    np.testing.assert_array_equal(
-        raw[:, : POINT.itemsize], points.view(np.uint8).reshape(6000, -1)
-    )
-    expected = GroundSegmenter(CONFIG).segment(xyz_of(points))
-    columns = columns_of(found, *FIELDS)
-    assert columns['label'].dtype == np.uint8
-    for name in FIELDS:
-        wanted = getattr(expected, name)
-        if name != 'label':
-            assert columns[name].dtype == np.float32
-            wanted = wanted.astype(np.float32)
-        np.testing.assert_array_equal(columns[name].ravel(), wanted)
-    assert not found.is_dense
-
-
-def test_names_that_the_input_has_already_stay_its_own(shared_bench, capfd):
+def test_names_that_the_input_has_already_stay_its_own(b, capfd):
     points = street(500)
-    renamed = points.astype(
-        np.dtype(
-            {
-                'names': ['label', 'x', 'y', 'z', 'ring', 'height'],
-                'formats': [POINT.fields[name][0] for name in POINT.names],
-                'offsets': [POINT.fields[name][1] for name in POINT.names],
-                'itemsize': POINT.itemsize,
-            }
-        )
-    )
+    message = to_message(points)
+    message.fields[0].name = 'label'
     capfd.readouterr()
-    message = to_message(renamed)
-    found = received(shared_bench, '~/labeled', message)
-    received(shared_bench, '~/labeled', message)
+    found = received(b, '~/labeled', message)
+    received(b, '~/labeled', message)
     names = [field.name for field in found.fields]
-    assert names == [*renamed.dtype.names, 'gp_label', 'gp_height', *FIELDS[2:]]
+    own = [field.name for field in message.fields]
+    assert names == [*own, 'gp_label', *FIELDS[1:]]
+    columns = read_columns(found, ['gp_label', 'label'])
     expected = GroundSegmenter(CONFIG).segment(xyz_of(points))
-    np.testing.assert_array_equal(columns_of(found, 'gp_label')['gp_label'][0], expected.label)
-    np.testing.assert_array_equal(columns_of(found, 'label')['label'][0], renamed['label'])
-    said = ''
-
-    def is_said():
-        nonlocal said
-        said += capfd.readouterr().err
-        return 'in ~/labeled ours is gp_height' in said
-
-    wait_for(is_said, 'warning')
-    assert said.count('ours is gp_label') == 1
+    np.testing.assert_array_equal(columns['gp_label'][0], expected.label)
+    np.testing.assert_array_equal(columns['label'][0], points['intensity'])
+    assert said_by(capfd, 'in ~/labeled ours is gp_label').count('gp_label') == 1
 
 
 def test_names_are_free_however_often_a_cloud_comes_round():
@@ -142,37 +69,28 @@ def test_names_are_free_however_often_a_cloud_comes_round():
         taken += names.values()
 
 
-def test_empty_cloud_is_labelled_too(shared_bench):
-    message = to_message(street(0), stamp=(1, 2), frame='lidar')
-    found = received(shared_bench, '~/labeled', message)
-    assert (found.height, found.width, len(found.data)) == (1, 0, 0)
-    assert found.is_dense
-    assert [field.name for field in found.fields] == [*POINT.names, *FIELDS]
-
-
-def test_ground_model_gives_the_height_anywhere(shared_bench):
+def test_ground_model_gives_the_height_anywhere(b):
     points = street(6000)
     message = to_message(points, stamp=(17, 23), frame='velo_link')
-    found = received(shared_bench, '~/ground_model', message)
+    found = received(b, '~/ground_model', message)
     assert found.header == message.header
     assert (found.height, found.width) == (CONFIG.grid.n_segments, CONFIG.grid.n_bins + 1)
-    assert [(f.name, f.datatype, f.count) for f in found.fields] == [
-        (name, PointField.FLOAT32, 1)
-        for name in ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
-    ]
+    names = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
+    layout = [(field.name, field.datatype, field.count) for field in found.fields]
+    assert layout == [(name, PointField.FLOAT32, 1) for name in names]
     expected = GroundSegmenter(CONFIG).segment(xyz_of(points))
     height, std = read_ground_model(found).at(points['x'], points['y'])
     np.testing.assert_allclose(height, expected.ground_z, rtol=0, atol=1e-4)
     np.testing.assert_allclose(std, expected.ground_std, rtol=0, atol=1e-4)
-    columns = columns_of(found, 'range', 'roll', 'pitch')
+    columns = read_columns(found, ['range', 'roll', 'pitch'])
     assert np.isfinite(columns['range']).all()
     assert not columns['roll'].any()
 
 
-def test_markers_draw_profiles_and_band(shared_bench):
+def test_markers_draw_profiles_and_band(b):
     points = street(6000)
     message = to_message(points, stamp=(17, 23), frame='velo_link')
-    profiles, band = received(shared_bench, '~/markers', message).markers
+    profiles, band = received(b, '~/markers', message).markers
     for marker, kind in ((profiles, Marker.LINE_LIST), (band, Marker.TRIANGLE_LIST)):
         assert marker.header == message.header
         assert (marker.type, marker.action) == (kind, Marker.ADD)
@@ -184,7 +102,8 @@ def test_markers_draw_profiles_and_band(shared_bench):
     assert {color.a for color in profiles.colors} == {1.0}
     found = GroundSegmenter(CONFIG).segment(xyz_of(points)).surface
     at_ends = np.hypot(lines[..., 0], lines[..., 1])
-    np.testing.assert_allclose(at_ends, found.knots[np.searchsorted(found.knots, at_ends - 1e-6)])
+    knot = np.searchsorted(found.knots, at_ends - 1e-6)
+    np.testing.assert_allclose(at_ends, found.knots[knot])
     # Two triangles: lower left, lower right, upper left; lower right, upper right, upper left.
     lower, upper = corners[:, [0, 1]], corners[:, [5, 4]]
     np.testing.assert_array_equal(corners[:, [3, 2]], np.stack([lower[:, 1], upper[:, 0]], axis=1))
@@ -194,19 +113,17 @@ def test_markers_draw_profiles_and_band(shared_bench):
     assert half.max() <= 2 * CONFIG.label.ground_tolerance
     turn = np.arctan2(lines[..., 1], lines[..., 0]) / (2 * np.pi) + 0.5
     segment = np.floor(turn * CONFIG.grid.n_segments).astype(int)
-    knot = np.searchsorted(found.knots, at_ends - 1e-6)
     np.testing.assert_allclose(half, 2 * found.std[segment, knot])
     np.testing.assert_allclose(lines[..., 2], found.mean[segment, knot])
 
 
-def test_markers_without_a_model_are_taken_away(shared_bench):
-    answer = received(shared_bench, '~/markers', to_message(street(0)))
+def test_markers_without_a_model_are_taken_away(b):
+    answer = received(b, '~/markers', to_message(street(0)))
     assert [marker.action for marker in answer.markers] == [Marker.DELETE] * 2
     assert not any(marker.points for marker in answer.markers)
 
 
-def test_nothing_is_built_that_nobody_subscribes_to(shared_bench, monkeypatch):
-    b = shared_bench
+def test_nothing_is_built_that_nobody_subscribes_to(b, monkeypatch):
     built = []
 
     def counted(output):
@@ -220,33 +137,29 @@ def test_nothing_is_built_that_nobody_subscribes_to(shared_bench, monkeypatch):
     rows = [(counted(output), publisher) for output, publisher in b.node._outputs._publishers]
     monkeypatch.setattr(b.node._outputs, '_publishers', rows)
     message = to_message(street(500))
-    b.segment(message)
-    assert built == ['ground', 'obstacles']
     for topic in OPTIONAL:
         built.clear()
         received(b, topic, message)
         assert built == ['ground', 'obstacles', topic]
         publisher = next(p for o, p in rows if o.topic == topic)
         wait_for(lambda p=publisher: p.get_subscription_count() == 0, 'nobody')
-    built.clear()
-    b.segment(message)
-    assert built == ['ground', 'obstacles']
+        built.clear()
+        b.segment(message)
+        assert built == ['ground', 'obstacles']
 
 
 def test_quality_of_service_of_every_output_can_be_overridden():
     topics = [o.topic for o in (*outputs.CLOUD_OUTPUTS, *outputs.marker_outputs())]
     assert set(topics) == {'ground', 'obstacles', *OPTIONAL}
-    words = ['--ros-args']
+    values = {}
     for topic in topics:
-        name = topic.replace('~', f'/{NODE}') if topic[0] == '~' else f'/{topic}'
-        words += ['-p', f'qos_overrides.{name}.publisher.depth:=3']
-        words += ['-p', f'qos_overrides.{name}.publisher.reliability:=best_effort']
-    with isolated_context() as context:
-        node = GroundSegmentationNode(context=context, cli_args=words)
-        with spinning(context, node):
-            for _, publisher in node._outputs._publishers:
-                assert publisher.qos_profile.depth == 3
-                assert publisher.qos_profile.reliability.name == 'BEST_EFFORT'
+        name = '/' + topic.replace('~', NODE_NAME)
+        values[f'qos_overrides.{name}.publisher.depth'] = 3
+        values[f'qos_overrides.{name}.publisher.reliability'] = 'best_effort'
+    with ros.started_node(*ros.given(values)) as node:
+        for _, publisher in node._outputs._publishers:
+            assert publisher.qos_profile.depth == 3
+            assert publisher.qos_profile.reliability.name == 'BEST_EFFORT'
 
 
 def test_without_visualization_msgs_the_node_says_so_and_works(monkeypatch, capfd):
@@ -254,18 +167,10 @@ def test_without_visualization_msgs_the_node_says_so_and_works(monkeypatch, capf
         if name.split('.')[0] == 'visualization_msgs':
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'visualization_msgs', None)
-    with isolated_context() as context:
-        node = GroundSegmentationNode(
-            context=context, cli_args=['--ros-args', '-r', '__ns:=/bare']
-        )
-        with spinning(context, node):
-            topics = [publisher.topic_name for _, publisher in node._outputs._publishers]
-    assert topics == [
-        '/bare/ground',
-        '/bare/obstacles',
-        f'/bare/{NODE}/labeled',
-        f'/bare/{NODE}/ground_model',
-    ]
+    with ros.started_node('-r', '__ns:=/bare') as node:
+        topics = [publisher.topic_name for _, publisher in node._outputs._publishers]
+    own = f'/bare/{NODE_NAME}'
+    assert topics == ['/bare/ground', '/bare/obstacles', f'{own}/labeled', f'{own}/ground_model']
     said = capfd.readouterr().err
     assert 'no topic ~/markers: visualization_msgs' in said
     assert 'ros-jazzy-visualization-msgs' in said

@@ -3,26 +3,23 @@
 import numpy as np
 import pytest
 import yaml
+from config_samples import configs
+from conftest import REPOSITORY
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
+import ros_helpers as ros
+from rcl_interfaces import srv
 from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter, parameter_value_to_python
-from ros_helpers import (
-    bench,
-    isolated_context,
-    parameter_message,
-    spinning,
-    street,
-    to_message,
-    wait_for,
-    xyz_of,
-)
+from ros_helpers import bench, street, to_message
 
-from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
+from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.parameters.config import find_spec, parameter_specs
-from gp_ground_seg.ros.node import GroundSegmentationNode
+from gp_ground_seg.parameters.export import file_problems
+from gp_ground_seg.parameters.presets import PRESETS
 
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL,
@@ -30,28 +27,43 @@ TYPES = {
     float: ParameterType.PARAMETER_DOUBLE,
     str: ParameterType.PARAMETER_STRING,
 }
+SPECS = parameter_specs()
+OWN = [spec.name for spec in SPECS]
 
 
-def values_of(b):
-    names = [spec.name for spec in parameter_specs()]
-    response = b.call(GetParameters, 'get_parameters', GetParameters.Request(names=names))
+@pytest.fixture(scope='module')
+def shared():
+    with bench() as one:
+        assert values_of(one) == Config().flat()
+        yield one
+
+
+@pytest.fixture
+def b(shared):
+    """The shared node, whatever the test before has left, with the defaults."""
+    assert_loaded(shared, Config())
+    return shared
+
+
+def assert_loaded(b, config):
+    """Load a configuration over any other."""
+    assert all(result.successful for result in b.load(config.flat()))
+    assert b.node.config == config
+
+
+def values_of(b, names=OWN):
+    response = b.call(srv.GetParameters, 'get_parameters', srv.GetParameters.Request(names=names))
     values = [parameter_value_to_python(value) for value in response.values]
     return dict(zip(names, values, strict=True))
 
 
-def n_ground(points, **changes):
-    config = Config().replace(**changes)
-    label = GroundSegmenter(config).segment(xyz_of(points)).label
-    return int((label == Label.GROUND).sum())
+def described(b, names):
+    request = srv.DescribeParameters.Request(names=names)
+    return b.call(srv.DescribeParameters, 'describe_parameters', request).descriptors
 
 
-def test_every_parameter_is_described_with_type_range_unit_and_symbol():
-    specs = parameter_specs()
-    with bench() as b:
-        request = DescribeParameters.Request(names=[spec.name for spec in specs])
-        descriptors = b.call(DescribeParameters, 'describe_parameters', request).descriptors
-        assert values_of(b) == Config().flat()
-    for spec, descriptor in zip(specs, descriptors, strict=True):
+def test_every_parameter_is_described_with_type_range_unit_and_symbol(b):
+    for spec, descriptor in zip(SPECS, described(b, OWN), strict=True):
         assert descriptor.name == spec.name
         assert descriptor.type == TYPES[type(spec.default)]
         assert not descriptor.read_only
@@ -67,43 +79,40 @@ def test_every_parameter_is_described_with_type_range_unit_and_symbol():
             assert accepted.step == 0
 
 
-def test_a_change_takes_effect_with_the_next_cloud():
+def n_ground(points, config):
+    label = GroundSegmenter(config).segment(ros.xyz_of(points)).label
+    return int((label == Label.GROUND).sum())
+
+
+def test_a_change_takes_effect_with_the_next_cloud(b):
     points = street(5000)
     message = to_message(points)
-    with bench() as b:
-        assert b.segment(message)[0].width == n_ground(points)
-        for name, value in (
-            ('label.ground_tolerance', 0.01),
-            ('grid.n_segments', 8),
-            ('runtime.n_threads', 1),
-            ('runtime.backend', 'numpy'),
-        ):
-            before = b.node.config
-            assert b.set(name, value).successful
-            assert b.node.config == before.replace(**{name: value})
-            expected = n_ground(points, **b.node.config.flat())
-            assert b.segment(message)[0].width == expected
-        assert n_ground(points) != n_ground(points, **{'label.ground_tolerance': 0.01})
+    assert b.segment(message)[0].width == n_ground(points, Config())
+    for name, value in (
+        ('label.ground_tolerance', 0.01),
+        ('grid.n_segments', 8),
+        ('runtime.n_threads', 1),
+        ('runtime.backend', 'numpy'),
+    ):
+        before = b.node.config
+        assert b.set(name, value).successful
+        assert b.node.config == before.replace(**{name: value})
+        assert b.segment(message)[0].width == n_ground(points, b.node.config)
+    narrow = Config().replace(**{'label.ground_tolerance': 0.01})
+    assert n_ground(points, Config()) != n_ground(points, narrow)
+
+
+HEIGHT = 'must be auto or a number in [0.05, 20] m'
 
 
 @pytest.mark.parametrize(
     ('name', 'value', 'reason'),
     [
-        ('sensor.height', 30.0, 'sensor.height = 30.0: must be auto or a number in [0.05, 20] m'),
-        (
-            'sensor.height',
-            float('nan'),
-            'sensor.height = nan: must be auto or a number in [0.05, 20] m',
-        ),
-        (
-            'sensor.height',
-            2,
-            'sensor.height = 2: must be auto or a number in [0.05, 20] m, with a decimal ',
-        ),
-        ('sensor.height', '2', "sensor.height = '2': must be auto or a number in [0.05, 20] m"),
-        ('sensor.height', True, 'sensor.height = True: must be auto or a number in [0.05, 20] m'),
+        ('sensor.height', 30.0, f'sensor.height = 30.0: {HEIGHT}'),
+        ('sensor.height', float('nan'), f'sensor.height = nan: {HEIGHT}'),
+        ('sensor.height', 2, f'sensor.height = 2: {HEIGHT}, with a decimal '),
+        ('sensor.height', '2', f"sensor.height = '2': {HEIGHT}"),
         ('sensor.height', [1.0], 'sensor.height = '),
-        ('sensor.height', None, 'sensor.height = None: must be auto or a number in [0.05, 20] m'),
         ('grid.n_segments', 3, 'grid.n_segments = 3: must be an integer in [4, 2048]'),
         ('grid.n_segments', 90.0, 'grid.n_segments = 90.0: must be an integer in [4, 2048]'),
         ('runtime.backend', 'gpu', "runtime.backend = 'gpu': must be one of auto, numba, numpy"),
@@ -111,68 +120,19 @@ def test_a_change_takes_effect_with_the_next_cloud():
         ('lable.ground_tolerance', 0.1, 'did you mean label.ground_tolerance?'),
     ],
 )
-def test_a_bad_value_is_refused_with_a_reason_and_changes_nothing(
-    shared_bench, name, value, reason
-):
-    b = shared_bench
-    before = values_of(b)
+def test_a_bad_value_is_refused_with_a_reason_and_changes_nothing(b, name, value, reason):
     result = b.set(name, value)
     assert not result.successful
     assert reason in result.reason
-    assert values_of(b) == before == b.node.config.flat()
-
-
-@pytest.fixture(scope='module')
-def shared_bench():
-    with bench() as b:
-        yield b
-
-
-def test_several_at_once_are_all_taken_or_none(shared_bench):
-    b = shared_bench
-    before = values_of(b)
-
-    def set_all(**values):
-        messages = [parameter_message(f'grid.{name}', value) for name, value in values.items()]
-        request = SetParametersAtomically.Request(parameters=messages)
-        return b.call(SetParametersAtomically, 'set_parameters_atomically', request).result
-
-    refused = set_all(n_segments=90, r_min=40.0, r_max=30.0)
-    assert not refused.successful
-    assert 'grid.r_min = 40: must be below grid.r_max = 30' in refused.reason
-    assert values_of(b) == before
-    # Neither of these could come alone after the other way round.
-    assert set_all(r_min=40.0, r_max=49.0).successful
-    assert set_all(r_max=30.0, r_min=1.0).successful
-    assert values_of(b) == {**before, 'grid.r_min': 1.0, 'grid.r_max': 30.0}
-    assert set_all(r_max=before['grid.r_max'], r_min=before['grid.r_min']).successful
-
-
-def test_parameters_of_ros_itself_pass_through(shared_bench):
-    b = shared_bench
-    assert b.set('use_sim_time', True).successful
-    assert b.set('use_sim_time', False).successful
-
-
-def test_a_fault_in_the_check_is_answered_and_the_node_lives(shared_bench, monkeypatch):
-    b = shared_bench
-    with monkeypatch.context() as patch:
-        patch.setattr(b.node, 'check_config', lambda _config: 1 / 0)
-        result = b.set('sensor.height', 1.0)
-        assert not result.successful
-        assert 'ZeroDivisionError' in result.reason
-    assert b.set('sensor.height', 1.73).successful
-    assert b.set('sensor.height', 'auto').successful
+    assert values_of(b) == b.node.config.flat() == Config().flat()
 
 
 @pytest.mark.parametrize('name', ['sensor.height', 'sensor.roll', 'sensor.pitch'])
-def test_a_number_or_auto_is_taken_and_nothing_else(shared_bench, name):
-    b = shared_bench
+def test_a_number_or_auto_is_taken_and_nothing_else(b, name):
     for value in (0.5, 'auto', 0.7, 0.6, 'auto'):
         assert b.set(name, value).successful
         assert values_of(b)[name] == value == b.node.config[name]
-        request = DescribeParameters.Request(names=[name])
-        (found,) = b.call(DescribeParameters, 'describe_parameters', request).descriptors
+        (found,) = described(b, [name])
         assert found.type == TYPES[type(value)]
         assert found.floating_point_range[0].to_value == find_spec(name).maximum
     for value in ('Auto', 'automatic', '', '0.5', 1, True, 99.0, -99.0, float('inf'), [0.5], None):
@@ -183,43 +143,104 @@ def test_a_number_or_auto_is_taken_and_nothing_else(shared_bench, name):
         assert values_of(b)[name] == 'auto'
 
 
-def test_auto_survives_dump_and_load(shared_bench, tmp_path):
-    """`ros2 param dump` writes what `get` returns; `load` sets it again, value by value."""
-    b = shared_bench
-    for height in (1.2, 'auto'):
-        assert b.set('sensor.height', height).successful
-        path = tmp_path / 'dump.yaml'
-        path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values_of(b)}}))
-        assert Config.from_yaml(path) == b.node.config
-        for name, value in yaml.safe_load(path.read_text())['/**']['ros__parameters'].items():
-            assert b.set(name, value).successful, name
-        assert b.node.config == Config().replace(**{'sensor.height': height})
+def test_several_at_once_are_all_taken_or_none(b):
+    def set_all(**values):
+        messages = ros.parameter_messages({f'grid.{name}': v for name, v in values.items()})
+        request = srv.SetParametersAtomically.Request(parameters=messages)
+        return b.call(srv.SetParametersAtomically, 'set_parameters_atomically', request).result
+
+    refused = set_all(n_segments=90, r_min=40.0, r_max=30.0)
+    assert not refused.successful
+    assert 'grid.r_min = 40: must be below grid.r_max = 30' in refused.reason
+    assert values_of(b) == Config().flat()
+    # Neither of these could come alone after the other way round.
+    assert set_all(r_min=40.0, r_max=49.0).successful
+    assert set_all(r_max=30.0, r_min=1.0).successful
+    assert values_of(b) == {**Config().flat(), 'grid.r_min': 1.0, 'grid.r_max': 30.0}
 
 
-def test_local_calls_are_checked_too(shared_bench):
-    b = shared_bench
-    (result,) = b.in_executor(
-        b.node.set_parameters, [Parameter('label.ground_tolerance', value=9.0)]
-    )
+def test_a_fault_in_the_check_is_answered_and_the_node_lives(b, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(b.node, 'check_config', lambda _config: 1 / 0)
+        result = b.set('sensor.height', 1.0)
+        assert not result.successful
+        assert 'ZeroDivisionError' in result.reason
+    assert b.set('sensor.height', 1.73).successful
+
+
+def test_diagnostics_period_and_parameters_of_ros_itself_change_live(b):
+    assert b.set('use_sim_time', True).successful
+    assert b.set('use_sim_time', False).successful
+    # Calls in the process of the node are checked too.
+    wrong = [Parameter('diagnostics.period', value=0.0)]
+    (result,) = b.in_executor(b.node.set_parameters, wrong)
     assert not result.successful
-    assert b.node.config == Config()
-
-
-def test_diagnostics_period_changes_live(shared_bench):
-    b = shared_bench
     assert b.set('diagnostics.period', 60.0).successful
     assert b.set('diagnostics.period', 0.1).successful
-    count = len(b.diagnostics.messages)
-    b.diagnostics.wait(count + 3)
-    assert b.set('diagnostics.period', 1.0).successful
+    b.diagnostics.wait(len(b.diagnostics.messages) + 3)
 
 
-def test_hundred_changes_during_playback_lose_no_frame(shared_bench):
-    b = shared_bench
+# Whole files, as `ros2 param dump` and `load` write and send them
+
+
+def dump(b):
+    """The document that ``ros2 param dump`` writes: all parameters, sorted, nested."""
+    request = srv.ListParameters.Request()
+    names = sorted(b.call(srv.ListParameters, 'list_parameters', request).result.names)
+    tree = {}
+    for name, value in values_of(b, names).items():
+        *groups, leaf = name.split('.')
+        branch = tree
+        for group in groups:
+            branch = branch.setdefault(group, {})
+        branch[leaf] = value
+    return {b.node_name: {'ros__parameters': tree}}
+
+
+@settings(max_examples=40)
+@given(config=configs(), order=st.permutations(OWN))
+def test_any_configuration_can_be_loaded_over_any_other_in_any_order(shared, config, order):
+    # Hundreds of threads made and ended for nothing; TF may not be installed.
+    plain = {'runtime.n_threads': 1, 'runtime.backend': 'auto', 'frame.level': 'sensor'}
+    config = config.replace(**plain)
+    values = {name: config[name] for name in order}
+    assert all(result.successful for result in shared.load(values))
+    assert shared.node.config == config
+
+
+@pytest.mark.parametrize('height', [1.2, 'auto'])
+def test_what_is_dumped_is_what_runs_and_can_be_given_at_start(b, tmp_path, height):
+    config = PRESETS['vlp16'].config.replace(**{'sensor.height': height})
+    assert_loaded(b, config)
+    path = tmp_path / 'dumped.yaml'
+    path.write_text(yaml.safe_dump(dump(b)))
+    # Our own tools read it, use_sim_time, qos_overrides and all.
+    assert file_problems(path) == []
+    assert Config.from_yaml(path) == config
+    namespace, _, name = b.node_name.rpartition('/')
+    words = '-r', f'__ns:={namespace}', '-r', f'__node:={name}', '--params-file', str(path)
+    with ros.started_node(*words) as node:
+        assert node.config == config
+
+
+def test_one_bad_value_of_a_file_is_refused_and_the_others_taken(b):
+    assert b.set('grid.r_max', 30.0).successful
+    # r_min can only come after r_max, which stands behind it.
+    asked = {'grid.r_min': 40.0, 'label.ground_tolerance': 9.0, 'grid.r_max': 50.0}
+    results = b.load(asked)
+    assert [result.successful for result in results] == [True, False, True]
+    assert 'label.ground_tolerance = 9.0: must be' in results[1].reason
+    assert b.node.config == Config().replace(**{'grid.r_min': 40.0, 'grid.r_max': 50.0})
+
+
+def test_changes_during_playback_lose_no_frame(b):
     message = to_message(street(2000))
-    tolerances = np.linspace(0.05, 0.5, 100)
     before = len(b.ground.messages)
+    for name in ('vlp16', 'paper', 'default'):
+        b.publisher.publish(message)
+        assert_loaded(b, PRESETS[name].config)
     assert b.set('learning.mode', 'fixed').successful
+    tolerances = np.linspace(0.05, 0.5, 97)
     for k, tolerance in enumerate(tolerances):
         b.publisher.publish(message)
         is_bad = k % 10 == 9
@@ -227,39 +248,30 @@ def test_hundred_changes_during_playback_lose_no_frame(shared_bench):
         assert result.successful != is_bad
     b.ground.wait(before + 100)
     b.obstacles.wait(before + 100)
-    assert b.node.config.label.ground_tolerance == tolerances[98]
-    for name in ('learning.mode', 'label.ground_tolerance'):
-        assert b.set(name, Config()[name]).successful
+    assert b.node.config.label.ground_tolerance == tolerances[-1]
+
+
+# At the start
+
+
+@pytest.mark.parametrize('name', PRESETS)
+def test_node_starts_with_every_shipped_file(name):
+    path = REPOSITORY / 'config' / f'{name}.yaml'
+    with ros.started_node('--params-file', str(path), '-r', '__ns:=/any') as node:
+        assert node.config == PRESETS[name].config
 
 
 def test_unknown_names_are_reported_and_not_declared(capfd):
-    words = [
-        '--ros-args',
-        *('-p', 'lable.ground_tolerance:=0.3'),
-        *('-p', 'qos_overrides./nowhere.subscription.depth:=3'),
-        *('-p', 'sensor.height:=2.5'),
-    ]
-    with isolated_context() as context:
-        node = GroundSegmentationNode(context=context, cli_args=words)
-        with spinning(context, node):
-            assert node.config == Config().replace(**{'sensor.height': 2.5})
-            assert node.get_parameter('sensor.height').value == 2.5
-            assert not node.has_parameter('lable.ground_tolerance')
-            log = ''
-
-            def said_both():
-                nonlocal log
-                log += capfd.readouterr().err
-                return 'did you mean label.ground_tolerance?' in log and '/nowhere' in log
-
-            wait_for(said_both, 'warnings')
+    words = {
+        'lable.ground_tolerance': 0.3,
+        'qos_overrides./nowhere.subscription.depth': 3,
+        'sensor.height': 2.5,
+    }
+    with ros.started_node(*ros.given(words)) as node:
+        assert node.config == Config().replace(**{'sensor.height': 2.5})
+        assert node.get_parameter('sensor.height').value == 2.5
+        assert not node.has_parameter('lable.ground_tolerance')
+        log = ros.said_by(capfd, 'did you mean label.ground_tolerance?', '/nowhere')
     assert log.count('is not used') == 2
     assert '  sensor.height: 2.5 m  (default auto)' in log
     assert '  sensor.roll: auto\n' in log
-
-
-def test_constructor_raises_config_error():
-    with isolated_context() as context, pytest.raises(ConfigError, match=r'sensor\.height = 99'):
-        GroundSegmentationNode(
-            context=context, cli_args=['--ros-args', '-p', 'sensor.height:=99.0']
-        )

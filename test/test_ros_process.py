@@ -1,5 +1,6 @@
-"""The node in a process of its own: transport, signals, command line."""
+"""The node, drivers and players, each a process: what comes back, what the diagnostics say."""
 
+import itertools
 import os
 import signal
 import subprocess
@@ -7,73 +8,265 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
+pytest.importorskip('rosbags', reason='rosbags is not installed')
 
-from rclpy.node import Node
-from ros_helpers import (
-    BEST_EFFORT,
-    ISOLATION,
-    MODULE,
-    NAMESPACE,
-    Collector,
-    Link,
-    Process,
-    isolated_context,
-    rows_of,
-    spinning,
-    street,
-    to_message,
-    wait_for,
-    xyz_of,
-)
-from sensor_msgs.msg import PointCloud2
+import ros_helpers as ros
+from bag_samples import START, write_ros2_bag
+from cli_runner import run
+from conftest import REPOSITORY
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.serialization import serialize_message as bytes_of
+from ros_helpers import NAMESPACE, street, to_message
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.cli.bags import scan_cloud
+from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
+from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_drive
 
-# These tests are about transport, signals and words: the cheapest model will do.
-CHEAP = Config().replace(**{'learning.mode': 'fixed'})
-IN_NAMESPACE = ('--ros-args', '-r', f'__ns:={NAMESPACE}', '-p', 'learning.mode:=fixed')
-REPOSITORY = Path(__file__).parents[1]
-PROFILE = REPOSITORY / 'config' / 'fastdds_large_clouds.xml'
+# A busy machine must not look like a fault; everything else may.
+PATIENT = {
+    'diagnostics.period': 0.2,
+    'diagnostics.stale_after': 60.0,
+    'diagnostics.max_latency': 10.0,
+    'diagnostics.max_load': 100.0,
+}
+CONFIG = Config().replace(**PATIENT)
 
 
-def test_clouds_of_two_megabytes_at_10_hz_all_come_back(tmp_path):
-    points = street(30_000, n_invalid=100)
-    message = to_message(points, frame='velo_link')
+def play(bag, *words, topic='/points'):
+    to_node = ('--quiet', '--ros-args', '-r', f'{topic}:={NAMESPACE}/points')
+    return ros.Process(str(bag), *words, *to_node, folder=bag.parent, start=ros.PLAY)
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """A bag of 30 clouds of 2011."""
+    assert START < 1_320_000_000 * 10**9
+    write_ros2_bag(tmp_path / 'drive.mcap', 30)
+    return tmp_path / 'drive.mcap'
+
+
+# Nodes of their own
+
+
+def test_a_bag_of_2011_shows_ok(drive, tmp_path):
+    with ros.linked_process(tmp_path, *ros.given(PATIENT), sends=None) as (node, link):
+        with play(drive, '--rate', '1') as player:
+            status = link.wait_for_status(
+                'input', lambda values, _: int(values['Events since startup']) >= 20
+            )
+            assert player.popen.wait(60.0) == 0, player.log
+        link.ground.wait(30)
+        link.obstacles.wait(30)
+        values = ros.values_of(link.wait_for_status('processing', lambda *_: True))
+        assert (values['Clouds since startup'], values['Dropped since startup']) == ('30', '0')
+        stamps = [message.header.stamp for message in link.ground.messages]
+        statuses = [s for array in link.diagnostics.messages for s in array.status]
+    tasks = ('input', 'processing', 'model', 'output')
+    expected = {(f'{link.node_name[1:]}: {task}', DiagnosticStatus.OK) for task in tasks}
+    assert {(s.name, s.level) for s in statuses} == expected
+    assert float(ros.values_of(status)['Age of last stamp (s)']) > 4e8
+    times = [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps]
+    assert len(times) == len(link.obstacles.messages) == 30
+    assert all(later - earlier == 10**8 for earlier, later in itertools.pairwise(times))
+    assert 'WARN' not in node.log
+
+
+def test_a_bag_in_a_loop_with_a_clock_resets_what_was_learned(tmp_path):
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 15)
+    changes = {**PATIENT, 'use_sim_time': True, 'learning.mode': 'first_frame'}
+    with ros.linked_process(tmp_path, *ros.given(changes), sends=None) as (node, link):
+        with play(bag, '--loop', '--rate', '2', '--clock') as player:
+            link.wait_for_status('input', lambda v, _: int(v['Time jumps since startup']) >= 2)
+            link.wait_for_status('model', lambda v, _: int(v.get('Learned since startup', 0)) >= 3)
+            assert player.popen.poll() is None, player.log
+        reports = [
+            {status.name.rpartition(' ')[2]: status for status in array.status}
+            for array in link.diagnostics.messages
+        ]
+    ages = []
+    for report in reports:
+        assert {status.level for status in report.values()} == {DiagnosticStatus.OK}
+        values = ros.values_of(report['input'])
+        ages.append(values['Age of last stamp (s)'])
+        n_rounds = 1 + int(values['Time jumps since startup'])
+        n_learned = int(ros.values_of(report['model']).get('Learned since startup', 0))
+        # Once in each round, on its first cloud, which may be still to come.
+        assert n_learned in (n_rounds - 1, n_rounds)
+    # On the simulated clock clouds of 2011 are new.
+    known = [float(age) for age in ages if age != 'unknown']
+    assert known
+    assert max(map(abs, known)) < 5.0
+    # Rounds of less than a second: not said each time.
+    times = [
+        float(line.split('[')[2].rstrip('] '))
+        for line in node.log.splitlines()
+        if 'time jumped back by 1.' in line
+    ]
+    assert times
+    assert all(later - earlier > 4.9 for earlier, later in itertools.pairwise(times))
+    assert 'WARN' not in node.log
+
+
+def test_a_bad_cloud_among_good_ones(tmp_path):
+    good = to_message(street(500), frame='lidar')
+    bad = [to_message(street(500), frame='broken') for _ in range(4)]
+    bad[0].fields[3].name = bad[3].fields[3].name = 'altitude'
+    bad[1].data, bad[2].point_step = bad[1].data[:-1], 0
+    changes = {**PATIENT, 'diagnostics.recover_after': 0.5}
+    with ros.linked_process(tmp_path, *ros.given(changes)) as (node, link):
+        for k in range(1, 4):
+            link.segment(good)
+            link.publisher.publish(bad[k - 1])
+            link.segment(good)
+            assert len(link.ground.messages) == 2 * k
+        link.publisher.publish(bad[3])
+        # Of the last of them: a good one in the same report would not take it back.
+        status = link.wait_for_status(
+            'input',
+            lambda values, status: (
+                status.level == DiagnosticStatus.ERROR and values['Events since startup'] == '10'
+            ),
+        )
+        assert 'no field named z' in status.message
+        assert ros.values_of(status)['Frame'] == 'broken'
+        link.segment(good)
+        status = link.wait_for_status(
+            'input',
+            lambda values, status: (
+                status.level == DiagnosticStatus.OK and values['Events since startup'] == '11'
+            ),
+        )
+        assert ros.values_of(status)['Refused since startup'] == '4'
+        # Throttled: four bad clouds, one message with topic, frame and reason.
+        (line,) = [line for line in node.log.splitlines() if 'ERROR' in line]
+        assert f"cloud on {NAMESPACE}/points in frame 'broken' refused: " in line
+        assert 'no field named z' in line
+        assert node.stop(signal.SIGINT)[0] == 0
+
+
+# One node for all that follows
+
+
+@pytest.fixture(scope='module')
+def node(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('node')
+    with ros.Process(*ros.IN_NAMESPACE, *ros.given(PATIENT), folder=folder) as process:
+        process.wait_until_settled()
+        yield process
+        assert process.stop(signal.SIGINT)[0] == 0
+        assert 'Traceback' not in process.log
+
+
+@pytest.mark.usefixtures('node')
+def test_clouds_of_two_megabytes_at_10_hz_all_come_back():
+    message = to_message(street(30_000, n_invalid=100), frame='velo_link')
     assert len(message.data) == 1_920_000
-    with Process(*IN_NAMESPACE, folder=tmp_path) as node, isolated_context() as context:
-        node.wait_until_settled()
-        link = Link(context)
-        with spinning(context, link.probe):
-            link.wait_until_connected()
-            next_time = time.monotonic()
-            for k in range(20):
-                message.header.stamp.sec = k
-                link.publisher.publish(message)
-                next_time += 0.1
-                time.sleep(max(0.0, next_time - time.monotonic()))
-                # Slower only where the machine is too busy for 10 Hz: more than the queue of
-                # the node can hold would rightly be dropped.
-                link.ground.wait(k - 3)
-            link.ground.wait(20)
-            link.obstacles.wait(20)
-            time_stamps = [
-                [part.header.stamp.sec for part in collector.messages]
-                for collector in (link.ground, link.obstacles)
-            ]
-            assert time_stamps == [list(range(20))] * 2
+    with ros.linked() as link:
+        next_time = time.monotonic()
+        for k in range(20):
+            message.header.stamp.sec = k
+            link.publisher.publish(message)
+            next_time += 0.1
+            time.sleep(max(0.0, next_time - time.monotonic()))
+            # Slower only where the machine is too busy for 10 Hz: more than the queue of
+            # the node can hold would rightly be dropped.
+            link.ground.wait(k - 3)
+        for parts in (link.ground.wait(20), link.obstacles.wait(20)):
+            assert [part.header.stamp.sec for part in parts] == list(range(20))
 
-    label = GroundSegmenter(CHEAP).segment(xyz_of(points)).label
-    rows = rows_of(message)
-    for collector, wanted in ((link.ground, Label.GROUND), (link.obstacles, Label.OBSTACLE)):
-        expected = [row for row, found in zip(rows, label, strict=True) if found == wanted]
-        for part in collector.messages:
-            assert part.fields == message.fields
-            assert part.header.frame_id == 'velo_link'
-            assert rows_of(part) == expected
 
+def simulated_bag(folder):
+    """A street, some points of which are not finite."""
+    rng = np.random.default_rng(0)
+    with BagWriter(folder / 'drive.mcap') as bag:
+        bag.add_topic(cloud_topic('/points'))
+        for scan in simulate_drive(SCENES['urban'](5), HDL_64E, 6, 8.0, 5):
+            points = scan.points.astype(np.float32)
+            points[rng.choice(len(points), 100, replace=False), 2] = rng.choice(
+                [np.nan, np.inf, -np.inf], 100
+            )
+            stamp = 1_600_000_000_123_456_789 + round(1e9 * scan.time)
+            bag.write('/points', stamp, encode_cloud(scan_cloud(points, stamp, 'velo_link')))
+    return folder / 'drive.mcap', '/points'
+
+
+def kitti_bag(folder, kitti):
+    assert run('kitti-to-bag', kitti, '--sequence', '08', folder / 'drive', '--count', 6) == 0
+    return folder / 'drive', '/kitti/velo/pointcloud'
+
+
+@pytest.mark.usefixtures('node')
+@pytest.mark.parametrize('source', ['simulated', 'kitti'])
+def test_frames_to_bag_to_player_to_node_and_back(source, tmp_path, request):
+    """Order, header, layout and every byte: the clouds are the selection by the labels."""
+    if source == 'kitti':
+        bag, topic = kitti_bag(tmp_path, request.getfixturevalue('kitti'))
+    else:
+        bag, topic = simulated_bag(tmp_path)
+    with BagReader(bag) as reader:
+        sent = [decode_cloud(raw) for _, _, raw in reader.messages([topic])]
+    with ros.linked(sends=None) as link, play(bag, topic=topic) as player:
+        back = link.ground.wait(6), link.obstacles.wait(6)
+        assert player.popen.wait(60.0) == 0, player.log
+    segmenter = GroundSegmenter(CONFIG)
+    for cloud, *parts in zip(sent, *back, strict=True):
+        label, finite = segmenter.segment(read_xyz(cloud)).label, np.isfinite(read_xyz(cloud))
+        assert sum(part.width for part in parts) == np.count_nonzero(finite.all(axis=1))
+        for value, part in zip((Label.GROUND, Label.OBSTACLE), parts, strict=True):
+            wanted, found = select_points(cloud, label == value), decode_cloud(bytes_of(part))
+            assert found.width > 0
+            assert bytes(found.data) == bytes(wanted.data)
+            for name in ('header', 'fields', 'point_step', 'height', 'width'):
+                assert getattr(found, name) == getattr(wanted, name)
+    segmenter.close()
+
+
+@pytest.mark.usefixtures('node')
+def test_a_storm_of_parameters_loses_no_cloud(drive):
+    good = itertools.cycle(
+        [
+            ('label.ground_tolerance', 0.3),
+            ('grid.n_segments', 90),
+            ('runtime.n_threads', 1),
+            ('label.ground_tolerance', 0.2),
+            ('grid.n_segments', 180),
+            ('runtime.n_threads', 2),
+        ]
+    )
+    bad = itertools.cycle(
+        [
+            ('label.ground_tolerance', 99.0),
+            ('grid.n_segments', 'many'),
+            ('grid.r_max', 1.5),
+            ('no.such_parameter', 1),
+        ]
+    )
+    with ros.linked(sends=None) as link, play(drive, '--rate', '0.6') as player:
+        link.ground.wait(3)
+        n_before = len(link.ground.messages)
+        n_during = []
+        for k in range(100):
+            name, value = next(bad if k % 5 == 4 else good)
+            result = link.set(name, value)
+            assert result.successful == (k % 5 != 4), result.reason
+            assert result.successful or name in result.reason
+            n_during.append(len(link.ground.messages))
+        # They came while clouds did; on a busy machine the last ones come later.
+        assert n_before < n_during[-1]
+        assert n_during[20] < 30
+        assert player.popen.wait(60.0) == 0, player.log
+        assert len(link.ground.wait(30)) == len(link.obstacles.wait(30)) == 30
+        assert all(result.successful for result in link.load(CONFIG.flat()))
+
+
+# Best-effort publishers last: the node is best-effort itself while it knows of one.
 
 # Sends best-effort clouds of 1.9 MB until it is ended; its domain is that of the environment.
 DRIVER = f"""
@@ -91,79 +284,30 @@ while True:
 """
 
 
+@pytest.mark.usefixtures('node')
 def test_best_effort_driver_with_the_large_segment_profile(tmp_path):
-    environment = {
-        **os.environ,
-        **ISOLATION,
-        'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE),
-    }
-    with Process(*IN_NAMESPACE, folder=tmp_path) as node, isolated_context() as context:
-        node.wait_until_ready()
-        probe = Node('probe', context=context, namespace=NAMESPACE)
-        ground = Collector(probe, PointCloud2, 'ground')
-        with (tmp_path / 'driver.log').open('wb') as log:
-            driver = subprocess.Popen(
-                [sys.executable, '-c', DRIVER, NAMESPACE], env=environment, stderr=log
-            )
+    profile = str(REPOSITORY / 'config' / 'fastdds_large_clouds.xml')
+    environment = {**os.environ, **ros.ISOLATION, 'FASTRTPS_DEFAULT_PROFILES_FILE': profile}
+    with (tmp_path / 'driver.log').open('wb') as log, ros.linked(sends=None) as link:
+        command = [sys.executable, '-c', DRIVER, ros.NAMESPACE]
+        driver = subprocess.Popen(command, env=environment, stderr=log)
         try:
-            with spinning(context, probe):
-                ground.wait(5)
+            link.ground.wait(5)
             assert driver.poll() is None
         finally:
             driver.kill()
             driver.wait()
-        # Fast DDS only warns about a profile that it cannot read, and goes on without.
-        assert 'XML' not in (tmp_path / 'driver.log').read_text()
-        assert 'best_effort' in node.log
+    # Fast DDS only warns about a profile that it cannot read, and goes on without.
+    assert 'XML' not in (tmp_path / 'driver.log').read_text()
 
 
-def test_best_effort_driver_with_small_clouds(tmp_path):
-    message = to_message(street(2000))
-    with Process(*IN_NAMESPACE, folder=tmp_path) as node, isolated_context() as context:
-        node.wait_until_ready()
-        link = Link(context, BEST_EFFORT)
-
-        def publish_until_answered():
-            link.publisher.publish(message)
-            return len(link.ground.messages) >= 5
-
-        with spinning(context, link.probe):
-            wait_for(publish_until_answered, 'answer to a best-effort driver')
-
-
-def test_command_line_hands_ros_arguments_on(tmp_path):
-    words = ('--ros-args', '-p', 'label.ground_tolerance:=0.3', '-r', f'__ns:={NAMESPACE}')
-    with Process(*words, folder=tmp_path, start=MODULE) as node:
-        node.wait_until_ready()
-        default = Config().label.ground_tolerance
-        assert f'label.ground_tolerance: 0.3 m  (default {default})' in node.log
-        assert f'listening to {NAMESPACE}/points' in node.log
-        assert node.stop(signal.SIGTERM)[0] == 0
-
-
-@pytest.mark.parametrize(
-    ('words', 'complaint'),
-    [
-        (('config', 'dump', '--ros-args', '-p', 'a:=1'), '--ros-args: this command takes none'),
-        (('node', 'nonsense'), 'nonsense'),
-        (('node', '--ros-args', '--', 'nonsense'), 'nonsense'),
-    ],
-)
-def test_words_that_nobody_takes_are_refused(words, complaint):
-    result = subprocess.run(
-        [sys.executable, '-m', 'gp_ground_seg', *words], capture_output=True, text=True, timeout=60
-    )
-    assert result.returncode == 2
-    assert complaint in result.stderr
-    assert 'Traceback' not in result.stderr
-
-
-def test_missing_ros_is_said_in_one_line():
-    hide = "import sys; sys.modules['rclpy'] = None; "
-    code = hide + 'from gp_ground_seg.cli.node import main; sys.exit(main())'
-    result = subprocess.run(
-        [sys.executable, '-c', code], capture_output=True, text=True, timeout=60
-    )
-    assert result.returncode == 2
-    assert len(result.stderr.splitlines()) == 1
-    assert "pip install 'gp_ground_seg[ros]'" in result.stderr
+@pytest.mark.usefixtures('node')
+@pytest.mark.parametrize('takes', ['RELIABLE', 'BEST_EFFORT'])
+@pytest.mark.parametrize('sends', ['RELIABLE', 'BEST_EFFORT'])
+def test_every_quality_of_service_is_served(sends, takes):
+    with ros.linked(getattr(ros, sends), getattr(ros, takes)) as link:
+        link.publish_until(
+            to_message(street(500)),
+            lambda: link.ground.messages and link.obstacles.messages,
+            'clouds',
+        )

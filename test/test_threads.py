@@ -60,11 +60,6 @@ def test_an_error_is_raised_after_all_parts_have_ended(workers, failing):
     assert sorted(ended) == sorted({0, 1, 2} - {failing})
 
 
-def test_small_clouds_are_not_split(workers):
-    assert workers.n_parts(threads.MIN_POINTS_TO_SPLIT) == 3
-    assert workers.n_parts(threads.MIN_POINTS_TO_SPLIT - 1) == 1
-
-
 @pytest.mark.parametrize('n_started', [0, 1])
 def test_one_thread_does_it_where_none_can_be_started(workers, n_started):
     real, started = threading.Thread.start, []
@@ -85,20 +80,14 @@ def test_one_thread_does_it_where_none_can_be_started(workers, n_started):
         assert not thread.is_alive()
 
 
-def test_threads_end_and_start_again(workers):
-    before = threading.active_count()
-    for _ in range(2):
-        workers.run(lambda part: None, 3)
-        assert threading.active_count() == before + 2
-        workers.close()
-        assert threading.active_count() == before
-
-
 def test_number_of_threads():
     with patch.object(threads, 'JIT_ENABLED', True):
         for n_cores, expected in ((1, 1), (2, 2), (64, threads.DEFAULT_MAX_THREADS)):
             with patch.object(os, 'sched_getaffinity', lambda pid, n=n_cores: set(range(n))):
                 assert Workers(0).n_threads == expected
         assert Workers(7).n_threads == 7
+        # Small clouds are not split.
+        assert Workers(7).n_parts(threads.MIN_POINTS_TO_SPLIT) == 7
+        assert Workers(7).n_parts(threads.MIN_POINTS_TO_SPLIT - 1) == 1
     with patch.object(threads, 'JIT_ENABLED', False):
         assert Workers(7).n_threads == 1

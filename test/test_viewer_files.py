@@ -8,13 +8,8 @@ import yaml
 from conftest import REPOSITORY
 
 NODE = '/ground_segmentation_node'
-TOPICS = {
-    '/ground',
-    '/obstacles',
-    f'{NODE}/labeled',
-    f'{NODE}/ground_model',
-    f'{NODE}/markers',
-}
+OPTIONAL = {f'{NODE}/{name}' for name in ('labeled', 'ground_model', 'markers')}
+TOPICS = {'/ground', '/obstacles', *OPTIONAL}
 
 
 def test_topics_are_those_of_the_node():

@@ -35,11 +35,8 @@ def run(tmp_path, mode, **environment):
     np.save(tmp_path / 'points.npy', points)
     done = subprocess.run(
         [sys.executable, '-c', SCRIPT, mode, tmp_path / 'points.npy', tmp_path / 'result.npz'],
-        capture_output=True,
-        text=True,
-        env={**os.environ, **environment},
-        check=False,
-    )
+        env={**os.environ, **environment}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     result, expected = np.load(tmp_path / 'result.npz'), GroundSegmenter().segment(points)
     np.testing.assert_array_equal(result['label'], expected.label)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.cli.options import count, new_parser, note, note_leftovers, progress_bar
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
@@ -73,73 +73,47 @@ exit code: 0, 1 if clouds were not delivered (always 0 with --no-wait), 2 for an
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
-    parser = new_parser(subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES)
-    parser.add_argument('root', metavar='ROOT', help='folder with sequences/ in it')
-    parser.add_argument('output', metavar='OUT', help='folder, .mcap or .db3 file to write')
-    parser.add_argument('--sequence', metavar='S', required=True, help='sequence, as in 00')
-    parser.add_argument(
-        '--format',
-        choices=('mcap', 'sqlite3'),
-        help='storage (default: by the name of OUT, else mcap)',
+    parser = options.new_parser(subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES)
+    storage = 'storage (default: by the name of OUT, else mcap)'
+    options.add(
+        parser,
+        ('root', 'folder with sequences/ in it', {'metavar': 'ROOT'}),
+        ('output', 'folder, .mcap or .db3 file to write', {'metavar': 'OUT'}),
+        ('--sequence', 'sequence, as in 00', {'metavar': 'S', 'required': True}),
+        ('--format', storage, {'choices': ('mcap', 'sqlite3')}),
+        ('--start', 'scans to skip (default: 0)', {'metavar': 'N', 'type': int, 'default': 0}),
+        ('--count', 'scans to write (default: all)', {'metavar': 'N', 'type': int}),
+        options.FORCE,
+        options.QUIET,
     )
-    parser.add_argument(
-        '--start', metavar='N', type=int, default=0, help='scans to skip (default: 0)'
-    )
-    parser.add_argument('--count', metavar='N', type=int, help='scans to write (default: all)')
-    parser.add_argument('--force', action='store_true', help='replace a bag that exists')
-    parser.add_argument('--quiet', action='store_true', help='no progress bar, no notes')
     parser.set_defaults(run=run_convert)
 
-    parser = new_parser(subparsers, 'play', PLAY_DESCRIPTION, PLAY_EXAMPLES)
-    parser.add_argument('bag', metavar='BAG', help='bag to play')
-    which = parser.add_mutually_exclusive_group()
-    which.add_argument(
-        '--topic', metavar='T', action='append',
-        help='PointCloud2 topic to play (may be repeated; default: the only one)',
+    parser = options.new_parser(subparsers, 'play', PLAY_DESCRIPTION, PLAY_EXAMPLES)
+    seconds = {'metavar': 'S', 'type': partial(options.above_zero, or_zero=True)}
+    options.add(
+        parser,
+        ('bag', 'bag to play', {'metavar': 'BAG'}),
+        ('--rate', 'speed, 2 = twice as fast as recorded (default: 1)',
+         {'metavar': 'R', 'type': options.above_zero, 'default': 1.0}),
+        ('--loop', 'begin again at the end, until Ctrl-C', options.FLAG),
+        ('--clock', "publish the bag's time on /clock, 50 Hz (for use_sim_time)", options.FLAG),
+        ('--start', 'skip the first S seconds', {**seconds, 'default': 0.0}),
+        ('--duration', 'play S seconds only', {'metavar': 'S', 'type': options.above_zero}),
+        options.QUIET,
     )  # fmt: skip
-    which.add_argument('--all', action='store_true', help='play all PointCloud2 topics')
-    parser.add_argument(
-        '--rate', metavar='R', type=above_zero, default=1.0,
-        help='speed, 2 = twice as fast as recorded (default: 1)',
+    options.add(
+        parser.add_mutually_exclusive_group(),
+        ('--topic', 'PointCloud2 topic to play (may be repeated; default: the only one)',
+         {'metavar': 'T', 'action': 'append'}),
+        ('--all', 'play all PointCloud2 topics', options.FLAG),
     )  # fmt: skip
-    parser.add_argument('--loop', action='store_true', help='begin again at the end, until Ctrl-C')
-    parser.add_argument(
-        '--clock', action='store_true',
-        help="publish the bag's time on /clock, 50 times a second (for use_sim_time)",
+    options.add(
+        parser.add_mutually_exclusive_group(),
+        ('--wait', 'give up without a subscriber within S seconds (default: wait until there is '
+         'one)', seconds),
+        ('--no-wait', 'start at once, with or without a subscriber', options.FLAG),
     )  # fmt: skip
-    parser.add_argument(
-        '--start', metavar='S', type=not_negative, default=0.0, help='skip the first S seconds'
-    )
-    parser.add_argument('--duration', metavar='S', type=above_zero, help='play S seconds only')
-    waiting = parser.add_mutually_exclusive_group()
-    waiting.add_argument(
-        '--wait', metavar='S', type=not_negative,
-        help='give up without a subscriber within S seconds (default: wait until there is one)',
-    )  # fmt: skip
-    waiting.add_argument(
-        '--no-wait', action='store_true', help='start at once, with or without a subscriber'
-    )
-    parser.add_argument('--quiet', action='store_true', help='no progress bar, no notes')
     parser.set_defaults(run=run_play, accepts_ros_args=True)
-
-
-def not_negative(text: str) -> float:
-    """Read a number of at least 0."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not (math.isfinite(number) and number >= 0.0):
-        raise argparse.ArgumentTypeError(f'{text!r}: must be a number, at least 0')
-    return number
-
-
-def above_zero(text: str) -> float:
-    """Read a number above 0."""
-    number = not_negative(text)
-    if number == 0.0:
-        raise argparse.ArgumentTypeError(f'{text}: must be above 0')
-    return number
 
 
 def scan_cloud(
@@ -159,11 +133,11 @@ def run_convert(arguments: argparse.Namespace) -> int:
     stamps = [_nanoseconds(frame) for frame in frames]
     target = Path(arguments.output)
     if not arguments.quiet:
-        note_leftovers(target)
+        options.note_leftovers(target)
     n_points = 0
     with (
         BagWriter(target, storage=arguments.format, force=arguments.force) as bag,
-        progress_bar(len(frames), quiet=arguments.quiet, title='kitti-to-bag') as bar,
+        options.progress('kitti-to-bag', quiet=arguments.quiet)(total=len(frames)) as bar,
     ):
         bag.add_topic(cloud_topic(TOPIC))
         for frame, stamp in zip(frames, stamps, strict=True):
@@ -175,21 +149,19 @@ def run_convert(arguments: argparse.Namespace) -> int:
             n_points += len(points)
             bar.update()
     n_labelled = sum(frame.labels_path is not None for frame in frames)
-    print(
-        f'{count(len(frames), "frame")} ({n_labelled} with labels), {count(n_points, "point")}, '
-        f'{1e-9 * (stamps[-1] - stamps[0]):.1f} s, written to {target}'
-    )
+    n_frames, n_all = options.count(len(frames), 'frame'), options.count(n_points, 'point')
+    seconds = 1e-9 * (stamps[-1] - stamps[0])
+    print(f'{n_frames} ({n_labelled} with labels), {n_all}, {seconds:.1f} s, written to {target}')
     return 0
 
 
 def _choose(frames: Sequence[Frame], arguments: argparse.Namespace) -> Sequence[Frame]:
-    start, wanted = arguments.start, arguments.count
-    where = f'sequence {arguments.sequence}: {count(len(frames), "scan")} there'
+    start = arguments.start
+    where = f'sequence {arguments.sequence}: {options.count(len(frames), "scan")} there'
     if not 0 <= start < len(frames):
         raise DataError(f'--start {start}: must be in [0, {len(frames) - 1}]; {where}')
     left = len(frames) - start
-    if wanted is None:
-        return frames[start:]
+    wanted = left if arguments.count is None else arguments.count
     if not 1 <= wanted <= left:
         raise DataError(f'--count {wanted}: must be in [1, {left}] from scan {start} on; {where}')
     return frames[start : start + wanted]
@@ -210,28 +182,31 @@ def run_play(arguments: argparse.Namespace) -> int:
     with needing_ros('play'):
         from gp_ground_seg.ros.playback import Player, PlayOptions
 
-    options = PlayOptions(
+    how = PlayOptions(
         arguments.rate, arguments.start, arguments.duration, arguments.loop, arguments.clock
     )
     with BagReader(arguments.bag) as bag:
         topics = _choose_topics(bag, arguments)
         others = [f'{name} ({kind})' for name, kind in bag.topics.items() if name not in topics]
         if others and not arguments.quiet:
-            note(f'not played: {", ".join(others)}')
+            options.note(f'not played: {", ".join(others)}')
         n_clouds = sum(bag.n_messages(topic) for topic in topics)
         with large_cloud_transport(), ros_session('bag_player', arguments.ros_args) as session:
-            player = Player(session.node, bag, topics, session.sleep, options)
+            player = Player(session.node, bag, topics, session.sleep, how)
             if not arguments.no_wait:
                 _wait_for_subscribers(player, arguments)
             try:
                 # With --loop there is no end to show progress towards, only a count.
-                with progress_bar(
-                    0 if arguments.loop else n_clouds, quiet=arguments.quiet, title='play'
-                ) as bar:
+                total = 0 if arguments.loop else n_clouds
+                with options.progress('play', quiet=arguments.quiet)(total=total) as bar:
                     player.play(bar.update)
             finally:
                 # After an interrupt, too: with --loop it is the only end.
-                _print_summary(player, arguments)
+                if summary := player.summary():
+                    print(summary, flush=True)
+                    lossy = [] if arguments.quiet else player.best_effort_topics()
+                    for topic in lossy:
+                        options.note(f'{topic} has a best-effort subscriber, losses unknown')
     return EXIT_UNDELIVERED if player.n_undelivered and not arguments.no_wait else 0
 
 
@@ -239,9 +214,8 @@ def _choose_topics(bag: BagReader, arguments: argparse.Namespace) -> list[str]:
     if arguments.all:
         topics = [name for name in bag.point_cloud_topics if bag.n_messages(name)]
         return topics or [bag.pick_point_cloud_topic()]
-    if arguments.topic:
-        return [bag.pick_point_cloud_topic(name) for name in dict.fromkeys(arguments.topic)]
-    return [bag.pick_point_cloud_topic()]
+    chosen = dict.fromkeys(arguments.topic or [None])
+    return [bag.pick_point_cloud_topic(name) for name in chosen]
 
 
 def _wait_for_subscribers(player: Player, arguments: argparse.Namespace) -> None:
@@ -251,17 +225,9 @@ def _wait_for_subscribers(player: Player, arguments: argparse.Namespace) -> None
     lonely = ', '.join(player.topics_without_subscriber())
     if limit is None or limit > SILENT_WAIT:
         if not arguments.quiet:
-            note(f'waiting for a subscriber of {lonely}')
+            options.note(f'waiting for a subscriber of {lonely}')
         if player.wait_for_subscribers(None if limit is None else limit - SILENT_WAIT):
             return
     raise GroundSegError(
         f'no subscriber of {lonely} within {limit:g} s; --no-wait plays without one'
     )
-
-
-def _print_summary(player: Player, arguments: argparse.Namespace) -> None:
-    summary = player.summary()
-    if summary:
-        print(summary, flush=True)
-        for topic in player.best_effort_topics() if not arguments.quiet else ():
-            note(f'{topic} has a best-effort subscriber; clouds it lost are not counted')

@@ -9,32 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.cli.evaluate import add_json_options, progress, staged_options
-from gp_ground_seg.cli.options import (
-    add_config_options,
-    config_from_options,
-    new_parser,
-    note,
-    positive,
-)
+from gp_ground_seg.cli import options
+from gp_ground_seg.cli.evaluate import staged_options
 from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.bag_files import is_bag
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
-from gp_ground_seg.evaluation.benchmark import (
-    MODES,
-    BenchFrame,
-    bench_cases,
-    bench_document,
-    run_cases,
-    spread,
-    time_growth,
-)
-from gp_ground_seg.evaluation.environment import describe_environment, parameters_line
-from gp_ground_seg.evaluation.methods import PATCHWORKPP, TITLES, PatchworkppMethod
-from gp_ground_seg.evaluation.table import Cell, Column, Table, fold, write_json
+from gp_ground_seg.evaluation import report
+from gp_ground_seg.evaluation.benchmark import BenchFrame, bench_cases, bench_document, run_cases
+from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, TITLES, PatchworkppMethod
+from gp_ground_seg.evaluation.report import Cell, Column, Table
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.plotting.charts import plot_stage_bars
@@ -51,7 +37,7 @@ DATA is a folder with sequences/*/velodyne below it, a scan, a folder of scans, 
 
 EXAMPLES = """\
   gp-ground-seg bench KITTI_ROOT
-  gp-ground-seg bench drive.mcap --frames 20 --quick
+  gp-ground-seg bench drive.mcap --frames 20 --threads 1
   gp-ground-seg bench KITTI_ROOT --set grid.n_segments=120 --json mine.json
   gp-ground-seg bench --from mine.json --plot stages.png
 """
@@ -62,30 +48,24 @@ RUN_LENGTH = 10
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = new_parser(subparsers, 'bench', DESCRIPTION, EXAMPLES)
-    parser.add_argument('data', metavar='DATA', nargs='?', help='scans or a bag')
-    parser.add_argument(
-        '--frames', metavar='N', type=positive, default=60,
-        help='frames, in runs of ten spread over the data (default: %(default)s)',
+    parser = options.new_parser(subparsers, 'bench', DESCRIPTION, EXAMPLES)
+    number: dict[str, Any] = {'metavar': 'N', 'type': options.positive}
+    file = {'metavar': 'FILE'}
+    options.add(
+        parser,
+        ('data', 'scans or a bag', {'metavar': 'DATA', 'nargs': '?'}),
+        ('--frames', 'frames, in runs of ten spread over the data (default: %(default)s)',
+         {**number, 'default': 60}),
+        ('--passes', 'go over the frames so often', {**number, 'default': 1}),
+        ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
+        ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
+        ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
+        ('--plot', 'draw the stages as a PNG', file),
+        ('--numpy', 'time learning without compiled code as well', options.FLAG),
+        options.TO_JSON,
+        options.FORCE,
     )  # fmt: skip
-    parser.add_argument(
-        '--passes', metavar='N', type=positive, default=1, help='go over the frames so often'
-    )
-    for name, metavar, what in (
-        ('--from', 'FILE', 'show what --json wrote, measure nothing'),
-        ('--threads', 'LIST', 'numbers of threads, as in 1,4 (default: 1 and all)'),
-        ('--topic', 'T', 'PointCloud2 topic of a bag'),
-        ('--plot', 'FILE', 'draw the stages as a PNG'),
-    ):
-        dest = 'record' if name == '--from' else None
-        parser.add_argument(name, metavar=metavar, help=what, dest=dest)
-    for name, what in (
-        ('--numpy', 'time learning without compiled code as well'),
-        ('--quick', 'no growth with size, no merged clouds'),
-    ):
-        parser.add_argument(name, action='store_true', help=what)
-    add_json_options(parser)
-    add_config_options(parser)
+    options.add_config(parser)
     parser.set_defaults(run=run)
 
 
@@ -93,31 +73,28 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure or read a record; write the files, print the tables."""
     if (arguments.data is None) == (arguments.record is None):
         raise DataError('bench: name either DATA to measure on or --from FILE')
-    if arguments.record is not None:
-        document = read_record(arguments.record)
-    else:
-        with staged_options(arguments, 'json') as parts:
+    with staged_options(arguments, 'json', 'plot') as parts:
+        if arguments.record is not None:
+            document = read_record(arguments.record)
+        else:
             document = _measure(arguments)
-            if 'json' in parts:
-                write_json(document, parts['json'])
+        if 'json' in parts:
+            report.write_json(document, parts['json'])
+        if 'plot' in parts:
+            _plot(document, parts['plot'])
     print(bench_text(document))
-    if arguments.plot is not None:
-        _plot(document, arguments)
     return 0
 
 
-def _plot(document: dict[str, Any], arguments: argparse.Namespace) -> None:
+def _plot(document: dict[str, Any], path: Path) -> None:
     # Without compiled code a frame takes so long that the others would be but slivers.
     cases = [case for case in document['cases'] if case['backend'] == 'numba']
-    peer = document['baseline_ms']
-    title = (
-        f'{document["n_frames"]} frames of {document["data"]}, '
-        f'{round(document["n_points"]["median"] / 1000)} 000 points each, '
-        f'{document["environment"]["cpu"]}'
-    )
+    cpu = document['environment']['cpu']
+    title = f'{document["n_frames"]} frames of {document["data"]}, {cpu}'
     bars = {case['name']: case['stages_ms'] for case in cases or document['cases']}
+    peer = document['baseline_ms']
     line = (TITLES[document['baseline']], peer['median']) if peer else None
-    plot_stage_bars(bars, arguments.plot, title, line, force=arguments.force)
+    plot_stage_bars(bars, path, title, line)
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
@@ -126,32 +103,30 @@ def read_record(path: str | Path) -> dict[str, Any]:
         document = json.loads(Path(path).read_text(encoding='utf-8'))
     except (OSError, ValueError) as error:
         raise DataError(f'{path}: cannot be read: {error}') from error
-    if not isinstance(document, dict) or not {'cases', 'growth', 'baseline'} <= set(document):
+    if not isinstance(document, dict) or not {'cases', 'baseline'} <= set(document):
         raise DataError(f'{path}: not a record of `gp-ground-seg bench --json`')
     return document
 
 
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    config = config_from_options(arguments)
-    environment = describe_environment('pypatchworkpp')
-    threads = _threads(arguments.threads, config, environment.n_cores)
-    cases = bench_cases(config, threads, with_numpy=arguments.numpy)
+    config = options.read_config(arguments)
+    environment = report.describe_environment('pypatchworkpp')
+    threads = _threads(arguments.threads, config, environment['n_cores'])
     try:
         PatchworkppMethod()
         baseline = PATCHWORKPP
     except MissingDependencyError:
-        note('no ratios without the baseline: pip install pypatchworkpp')
+        options.note('no ratios without the baseline: pip install pypatchworkpp')
         baseline = None
-    frames = load_frames(Path(arguments.data), arguments.frames, arguments.topic)
     measured = run_cases(
-        frames, cases, (lambda _: PatchworkppMethod()) if baseline else None, arguments.passes,
-        progress=progress('frames'),
-    )  # fmt: skip
-    growth = []
-    if not arguments.quick:
-        growth = time_growth(frames, config, progress=progress('sizes', 'size'))
+        load_frames(Path(arguments.data), arguments.frames, arguments.topic),
+        bench_cases(config, threads, with_numpy=arguments.numpy),
+        PatchworkppMethod if baseline else None,
+        arguments.passes,
+        progress=options.progress('bench'),
+    )
     data = Path(arguments.data).resolve().name
-    return bench_document(measured, growth, config, environment, baseline, data)
+    return bench_document(measured, config, environment, baseline, data)
 
 
 def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
@@ -159,21 +134,14 @@ def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
         return [1]
     if text is None:
         return sorted({1, n_cores})
-    try:
-        threads = [int(word) for word in text.split(',')]
-    except ValueError:
-        threads = []
-    if not threads or min(threads) < 1 or len(set(threads)) < len(threads):
+    threads = [int(word) if word.isdecimal() else 0 for word in text.split(',')]
+    if min(threads) < 1 or len(set(threads)) < len(threads):
         raise DataError(f'--threads {text}: must be different whole numbers from 1, as in 1,4')
     return threads
 
 
 def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[BenchFrame]:
-    """Read at most about `n_frames` frames into memory, in runs spread over all there are.
-
-    `source` is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
-    Raises DataError if there is nothing to read there, or no point in it.
-    """
+    """Read about `n_frames` frames of DATA; DataError if there is no point in any."""
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
     if is_bag(source):
@@ -224,9 +192,10 @@ def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
     if n_available <= n_wanted:
         return [(name, k) for k in range(n_available)]
     length = min(RUN_LENGTH, n_wanted)
-    starts = [length * k for k in spread(n_available // length, n_wanted // length)]
+    n_places, n_runs = n_available // length, n_wanted // length
+    starts = [length * ((2 * k + 1) * n_places // (2 * n_runs)) for k in range(n_runs)]
     return [
-        (name if len(starts) == 1 else f'{name}:{start}', k)
+        (name if n_runs == 1 else f'{name}:{start}', k)
         for start in starts
         for k in range(start, start + length)
     ]
@@ -234,18 +203,18 @@ def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
 
 def bench_text(document: dict[str, Any]) -> str:
     """Lay out a `gp_ground_seg.evaluation.benchmark.bench_document` for the terminal."""
-    run = document['environment']
-    versions = ', '.join(f'{name} {v or "absent"}' for name, v in run['versions'].items())
+    cases = document['cases']
     footer = (
-        parameters_line(document['config_changes']),
-        f'machine: {run["cpu"]}, {run["n_cores"]} cores for this process',
-        f'versions: Python {run["python"]}, {versions}',
-        f'commit: {run["commit"] or "unknown"}',
+        report.parameters_line(document['config_changes']),
+        report.machine_line(document['environment']),
     )
-    tables = [_case_table(document), _stage_table(document['cases'])]
-    if document['growth']:
-        tables.append(_growth_table(document['growth']))
-    return '\n\n'.join([*(table.text() for table in tables), '\n'.join(map(fold, footer))])
+    stages = [Column(name, '.2f') for name in cases[0]['stages_ms']]
+    by_stage = Table(
+        [Column('stage, median [ms]'), *stages],
+        [[case['name'], *case['stages_ms'].values()] for case in cases],
+    )
+    parts = [_case_table(document).text(), by_stage.text(), '\n'.join(map(report.fold, footer))]
+    return '\n\n'.join(parts)
 
 
 def _case_table(document: dict[str, Any]) -> Table:
@@ -266,21 +235,3 @@ def _case_table(document: dict[str, Any]) -> Table:
         f'at most {largest}'
     )
     return Table(columns, rows, title, n_sums=1 if peer else 0)
-
-
-def _stage_table(cases: list[dict[str, Any]]) -> Table:
-    stages = [Column(name, '.2f') for name in cases[0]['stages_ms']]
-    rows = [[case['name'], *case['stages_ms'].values()] for case in cases]
-    return Table([Column('stage, median [ms]'), *stages], rows)
-
-
-def _growth_table(growth: list[dict[str, Any]]) -> Table:
-    columns = {'series': Column('growth with'), 'size': Column('size', '_.0f')}
-    for mode, title in MODES.items():
-        columns[f'{mode}_ms'] = Column(f'{title} [ms]', '.2f')
-        columns[f'{mode}_ratio'] = Column('/ default', '.2f')
-    title = (
-        'One thread; times over those of the same frames with the parameters given. More points '
-        'than a frame has are two and four successive frames laid over one another'
-    )
-    return Table([*columns.values()], [[row[key] for key in columns] for row in growth], title)

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from gp_ground_seg.cli.options import add_config_options, config_from_options, new_parser
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.parameters import export
@@ -37,16 +37,11 @@ Print the parameters that differ. A and B are parameter files or names of preset
 Exit code 1 if any differ, as that of diff(1).
 """
 
-GENERATE = """\
-Rewrite the files of the presets in config/, docs/parameters.md and the table of README.md
-from gp_ground_seg/parameters.
-"""
-
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its own commands."""
     description = 'Show the parameters, their units and ranges.'
-    parser = new_parser(subparsers, 'config', description, EXAMPLES)
+    parser = options.new_parser(subparsers, 'config', description, EXAMPLES)
     commands = parser.add_subparsers(metavar='WHAT', required=True)
     added = {}
     for name, run, purpose, text in (
@@ -55,22 +50,26 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('diff', run_diff, 'compare two parameter files or presets', DIFF),
         ('presets', run_presets, 'list the presets and what they are for', ''),
         ('table', run_table, 'print every parameter as a Markdown table', ''),
-        ('generate', run_generate, 'for developers: rewrite generated files', GENERATE),
+        (
+            'generate',
+            run_generate,
+            'rewrite config/*.yaml and the tables of README.md and docs/',
+            '',
+        ),
     ):
         added[name] = commands.add_parser(name, help=purpose, description=text or purpose)
         added[name].set_defaults(run=run)
-    add_config_options(added['dump'])
+    options.add_config(added['dump'])
     added['check'].add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
     for side in 'ab':
         added['diff'].add_argument(side, metavar=side.upper(), help='parameter file or preset')
-    added['generate'].add_argument(
-        'root', metavar='REPO_ROOT', nargs='?', default='.', help='the checkout (default: here)'
-    )
+    root = {'metavar': 'REPO_ROOT', 'nargs': '?', 'default': '.'}
+    options.add(added['generate'], ('root', 'the checkout (default: here)', root))
 
 
 def run_dump(arguments: argparse.Namespace) -> int:
     """Print the parameters as YAML, with the preset's reasons for the values it has given."""
-    config = config_from_options(arguments)
+    config = options.read_config(arguments)
     preset = find_preset(arguments.preset)
     title = preset.title if config == preset.config else ''
     kept = [name for name in preset.reasons if config[name] == preset.config[name]]

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import itertools
-import math
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,17 +12,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.cli.bags import above_zero, scan_cloud
-from gp_ground_seg.cli.options import count, new_parser, positive, progress_bar
+from gp_ground_seg.cli import options
+from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, stamp_of
 from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
 from gp_ground_seg.evaluation.evaluate import labelled_frames
-from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confusion
+from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
 from gp_ground_seg.frame import Label
-from gp_ground_seg.plotting.birds_eye import plot_birds_eye
+from gp_ground_seg.plotting.scan import plot_birds_eye
 from gp_ground_seg.ros.lifecycle import needing_ros
 from gp_ground_seg.ros.probe import (
     GROUND,
@@ -44,17 +42,14 @@ BAG, PICTURE, LOG = 'drive.mcap', 'birds_eye.png', 'node.log'
 FRAME_ID = 'lidar'
 EPOCH = 1_700_000_000
 """Second at which every drive starts: the same drive gives the same bag."""
-SEED = 3
-SPEED = 8.0
-"""Of the simulated drive [m/s]."""
-DEFAULT_FRAMES = 30
+SEED, SPEED = 3, 8.0
+"""Of the simulated drive; the second [m/s]."""
 RATE = 10.0
 """Scans per second [Hz]."""
-MAX_LOAD, COMFORTABLE_LOAD = 0.9, 0.7
+MAX_LOAD, COMFORTABLE_LOAD = 0.9, 0.6
 """Share of the time that the node may need: above the first the rate is lowered."""
-N_TRIALS = 5
-TRIAL_TIMEOUT = 60.0
-"""Longest time one scan may take [s]."""
+N_TRIALS, TRIAL_TIMEOUT = 5, 60.0
+"""Scans sent one by one to see that, and the longest time one may take [s]."""
 EXIT_FAILED = 1
 
 DESCRIPTION = """\
@@ -70,33 +65,29 @@ EXAMPLES = f"""\
   gp-ground-seg demo --frames 100 --rate 20 --output big_demo
   gp-ground-seg demo --kitti KITTI_ROOT --sequence 08
 
-Writes into the output folder: {BAG} (what was played), {PICTURE}, {LOG}.
-exit code: 0, 1 if a scan was lost or a point did not come back as it should, 2 for an
+Writes into the output folder: {BAG} (what was played), {PICTURE} (ground,
+obstacles and the errors of one scan), {LOG} (what the node said).
+
+exit code: 0, 1 if scans were lost or came back otherwise than they should, 2 for an
 error, 130 when interrupted
 """
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = new_parser(subparsers, 'demo', DESCRIPTION, EXAMPLES)
-    parser.add_argument('--kitti', metavar='ROOT', help='folder in SemanticKITTI layout')
-    parser.add_argument(
-        '--sequence', metavar='S', help='sequence of it, as in 00 (default: the first)'
-    )
-    parser.add_argument(
-        '--frames', metavar='N', type=positive, default=DEFAULT_FRAMES,
-        help=f'scans to play, at most (default: {DEFAULT_FRAMES})',
+    parser = options.new_parser(subparsers, 'demo', DESCRIPTION, EXAMPLES)
+    rate = f'scans per second (default: {RATE:g}, or what this machine can do if that is less)'
+    options.add(
+        parser,
+        ('--kitti', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'}),
+        ('--sequence', 'sequence of it, as in 00 (default: the first)', {'metavar': 'S'}),
+        ('--frames', 'scans to play, at most (default: %(default)s)',
+         {'metavar': 'N', 'type': options.positive, 'default': 30}),
+        ('--rate', rate, {'metavar': 'HZ', 'type': options.above_zero}),
+        ('--output', 'folder for what is written (default: %(default)s)',
+         {'metavar': 'DIR', 'default': 'demo_output'}),
+        options.FORCE,
     )  # fmt: skip
-    parser.add_argument(
-        '--rate', metavar='HZ', type=above_zero,
-        help=f'scans per second (default: {RATE:g}, as most LiDARs; less if this machine is '
-        'too slow for that)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--output', metavar='DIR', default='demo_output',
-        help='folder for what is written (default: demo_output)',
-    )  # fmt: skip
-    parser.add_argument('--force', action='store_true', help='replace the files of another demo')
     parser.set_defaults(run=run)
 
 
@@ -145,59 +136,26 @@ def numbered_cloud(
     return scan_cloud(points, stamp, FRAME_ID, label=label, index=index)
 
 
-class ScanCheck(NamedTuple):
-    """A scan that went through the node.
+def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> tuple[bool, Labels]:
+    """Compare a `numbered_cloud` with the clouds on `GROUND` and `OBSTACLES` that came back.
 
-    Of the `n_points` finite points sent each must come back once, in one of the two clouds.
-    `n_altered` came back but were not sent: with another byte, not finite, or in a cloud of
-    another header or layout. `label` (N,) is the `Label` by the cloud a point came back in,
-    `truth` (N,) that of the GroundGrid convention; `points` (N, 4) are x, y, z [m], intensity.
+    Returns whether each finite point came back once, in one of the two clouds, with every byte,
+    and nothing else did; and the `Label` (N,) by the cloud a point came back in.
     """
-
-    n_points: int
-    n_missing: int
-    n_repeated: int
-    n_altered: int
-    label: npt.NDArray[np.uint8]
-    truth: npt.NDArray[np.uint8]
-    points: npt.NDArray[np.float32]
-
-
-def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> ScanCheck:
-    """Compare a `numbered_cloud` with the clouds on `GROUND` and `OBSTACLES` that came back."""
-    points = _records(sent)
-    n = len(points)
-    xyz = np.stack([points['x'], points['y'], points['z']], axis=1)
-    finite = np.isfinite(xyz).all(axis=1)
-    times_back = np.zeros(n, dtype=np.int64)
-    label = np.full(n, Label.UNKNOWN, dtype=np.uint8)
-    n_altered = 0
-    for value, topic in ((Label.GROUND, GROUND), (Label.OBSTACLE, OBSTACLES)):
-        cloud = results[topic]
-        back = _records(cloud) if _is_alike(sent, cloud) else points[:0]
-        index = np.minimum(back['index'].astype(np.int64), n - 1)
-        # Opaque bytes: NaN equals NaN.
-        kind = f'V{points.itemsize}'
-        is_good = (back.view(kind) == points[index].view(kind)) & finite[index]
-        n_altered += cloud.height * cloud.width - int(np.count_nonzero(is_good))
-        times_back += np.bincount(index[is_good], minlength=n)
-        label[index[is_good]] = value
-    return ScanCheck(
-        n_points=int(np.count_nonzero(finite)),
-        n_missing=int(np.count_nonzero(finite & (times_back == 0))),
-        n_repeated=int(np.count_nonzero(times_back > 1)),
-        n_altered=n_altered,
-        label=label,
-        truth=GROUNDGRID.truth(points['label'], xyz[:, 2]),
-        points=np.column_stack([xyz, points['intensity']]),
-    )
-
-
-def _is_alike(sent: CloudMessage, back: CloudMessage) -> bool:
-    names = ('header', 'fields', 'point_step', 'is_bigendian')
-    return all(getattr(sent, name) == getattr(back, name) for name in names) and (
-        len(back.data) == back.height * back.width * back.point_step
-    )
+    points, clouds = _records(sent), (results[GROUND], results[OBSTACLES])
+    label = np.full(len(points), Label.UNKNOWN, dtype=np.uint8)
+    for cloud in clouds:
+        names = ('header', 'fields', 'point_step', 'is_bigendian')
+        is_whole = len(cloud.data) == cloud.height * cloud.width * cloud.point_step
+        if not is_whole or any(getattr(sent, name) != getattr(cloud, name) for name in names):
+            return False, label
+    ground, obstacles = map(_records, clouds)
+    for value, part in ((Label.GROUND, ground), (Label.OBSTACLE, obstacles)):
+        label[part['index'][part['index'] < len(points)]] = value
+    back = np.concatenate([ground, obstacles])
+    back = back[np.argsort(back['index'], kind='stable')]
+    finite = np.isfinite(_xyz(points)).all(axis=1)
+    return back.tobytes() == points[finite].tobytes(), label
 
 
 def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
@@ -206,51 +164,54 @@ def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
     return np.frombuffer(cloud.data, [(n, '<f4' if k < 4 else '<u4') for k, n in enumerate(names)])
 
 
+def _xyz(points: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    return np.stack([points['x'], points['y'], points['z']], axis=1)
+
+
 class Tally:
     """Sums over the scans of the given `stamps` that came back.
 
-    `picture` is the check, and the number, of the middle scan or the nearest before it.
+    `picture` is the middle scan or the nearest before it: its number, places (N, 3), labels and
+    true labels of its points.
     """
 
     def __init__(self, stamps: Sequence[tuple[int, int]]) -> None:
         self._numbers = {stamp: k for k, stamp in enumerate(stamps)}
-        self.counts = dict.fromkeys(('n_points', 'n_missing', 'n_repeated', 'n_altered'), 0)
+        self.n_points = self.n_faulty = 0
         self.confusion = Confusion()
-        self.picture: tuple[ScanCheck, int] | None = None
+        self.picture: tuple[int, npt.NDArray[np.float32], Labels, Labels] | None = None
 
     def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
         """Check a scan that came back, and add it; other clouds are trials."""
         number = self._numbers.get(stamp_of(sent))
         if number is None:
             return
-        check = check_scan(sent, results)
-        for name in self.counts:
-            self.counts[name] += getattr(check, name)
-        self.confusion += count_confusion(check.label, check.truth)
+        is_exact, label = check_scan(sent, results)
+        points = _records(sent)
+        xyz = _xyz(points)
+        truth = GROUNDGRID.truth(points['label'], xyz[:, 2])
+        self.n_points += int(np.isfinite(xyz).all(axis=1).sum())
+        self.n_faulty += not is_exact
+        self.confusion += count_confusion(label, truth)
         if self.picture is None or number <= len(self._numbers) // 2:
-            self.picture = check, number
+            self.picture = number, xyz, label, truth
 
 
 def result_text(
     tally: Tally, result: dict[str, Any], n_stray: int, truth: str
 ) -> tuple[str, bool]:
     """Return the result in plain words, and whether all scans came back as they should."""
-    counts, wanted = tally.counts, result['asked']
-    is_exact = not (any(list(counts.values())[1:]) or n_stray)
-    missing, repeated, altered = (_thousands(n) for n in list(counts.values())[1:])
-    partition = (
-        'each is in exactly one of the two clouds, not a byte changed'
-        if is_exact
-        else f'{missing} missing, {repeated} more than once, {altered} changed or never sent; '
-        f'{n_stray} clouds too many'
-    )
-    scores = tally.confusion
+    wanted, scores = result['asked'], tally.confusion
+    is_exact = not (tally.n_faulty or n_stray)
+    partition = 'each is in exactly one of the two clouds, not a byte changed'
+    if not is_exact:
+        partition = f'not so in {tally.n_faulty} scans; {n_stray} clouds too many'
     iou, precision, recall = (
         f'{100.0 * value:.2f} %' for value in (scores.iou, scores.precision, scores.recall)
     )
     lines = [
         f'scans    {result["n_sent"]} sent, {result["n_back"]} back, {result["n_lost"]} lost',
-        f'points   {_thousands(counts["n_points"])} of these scans: {partition}',
+        f'points   {_thousands(tally.n_points)} of these scans: {partition}',
         f'labels   ground IoU {iou}, precision {precision}, recall {recall} (against {truth})',
         f'latency  median {1e3 * result["p50"]:.1f} ms, 99 % within {1e3 * result["p99"]:.1f} ms, '
         'from sending a scan to having both clouds',
@@ -270,10 +231,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
     if importlib.util.find_spec('matplotlib') is None:
         # Said now, not after everything else is done.
-        raise MissingDependencyError(
-            "the demo draws with matplotlib: pip install 'gp_ground_seg[plot]'"
-        )
-    drive = _choose_drive(arguments)
+        raise MissingDependencyError('the demo draws with matplotlib: pip install matplotlib')
+    sequence = arguments.sequence
+    if arguments.kitti is not None:
+        sequence = sequence or list_sequences(arguments.kitti)[0]
+        drive = kitti_drive(arguments.kitti, sequence, arguments.frames)
+    elif sequence is not None:
+        raise DataError(f'--sequence {sequence}: goes with --kitti ROOT')
+    else:
+        drive = simulated_drive(arguments.frames)
     folder = Path(arguments.output)
     with (
         staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
@@ -282,20 +248,15 @@ def run(arguments: argparse.Namespace) -> int:
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)
-        start = time.monotonic()
         probe = Probe(session, tally.add)
         probe.connect(node)
-        _detail(f'its compiled code was there after {time.monotonic() - start:.1f} s more')
         result = _play(part / BAG, drive.n_frames, arguments.rate, probe)
         node.check()
         if tally.picture is None:
-            raise GroundSegError(
-                f'none of {count(drive.n_frames, "scan")} came back; the last words of the '
-                f'node:\n{node.log_tail()}'
-            )
-        check, number = tally.picture
+            raise GroundSegError(f'no scan came back; the node said:\n{node.log_tail()}')
+        number, xyz, label, truth = tally.picture
         title = f'{drive.name}, scan {number + 1} of {drive.n_frames}'
-        plot_birds_eye(check.points, check.label, part / PICTURE, truth=check.truth, title=title)
+        plot_birds_eye(xyz, label, part / PICTURE, truth, title)
     text, is_good = result_text(tally, result, probe.n_stray, drive.truth)
     print(f'\n{text}\n')
     print(f'picture  {folder / PICTURE}  one of the scans from above, and the errors in it')
@@ -303,37 +264,19 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if is_good else EXIT_FAILED
 
 
-def _choose_drive(arguments: argparse.Namespace) -> Drive:
-    sequence = arguments.sequence
-    if arguments.kitti is None:
-        if sequence is not None:
-            raise DataError(f'--sequence {sequence}: goes with --kitti ROOT')
-        return simulated_drive(arguments.frames)
-    if sequence is None:
-        sequence = list_sequences(arguments.kitti)[0]
-    return kitti_drive(arguments.kitti, sequence, arguments.frames)
-
-
 def _write(drive: Drive, path: Path, session: Session) -> list[tuple[int, int]]:
     """Write the drive as a bag; return the stamps of its scans."""
-    scans = count(drive.n_frames, 'scan')
+    scans = options.count(drive.n_frames, 'scan')
     print(f'[1/3] writing {scans} as a bag: {drive.name}; meanwhile the node starts', flush=True)
-    start = time.monotonic()
-    stamps, n_points = [], 0
-    with (
-        progress_bar(drive.n_frames, quiet=False, title='scans') as bar,
-        BagWriter(path) as bag,
-    ):
+    stamps = []
+    with options.progress('scans')(total=drive.n_frames) as bar, BagWriter(path) as bag:
         bag.add_topic(cloud_topic(INPUT))
         for points, semantic, seconds in drive.scans:
             stamp = EPOCH * 10**9 + round(seconds * 1e9)
             bag.write(INPUT, stamp, encode_cloud(numbered_cloud(points, semantic, stamp)))
-            n_points += len(points)
             stamps.append(divmod(stamp, 10**9))
             session.check()
             bar.update()
-    seconds, size = time.monotonic() - start, path.stat().st_size / 1e6
-    _detail(f'{_thousands(n_points)} points, {size:.0f} MB, took {seconds:.1f} s')
     return stamps
 
 
@@ -343,12 +286,9 @@ def _play(path: Path, n_frames: int, wanted: float | None, probe: Probe) -> dict
         rate = wanted or sustainable_rate(
             next(decode_cloud(raw) for _, _, raw in bag.messages([INPUT])), probe
         )
-        print(
-            f'[3/3] playing the bag to the node, {rate:g} scans per second, and receiving both '
-            'clouds',
-            flush=True,
-        )
-        with progress_bar(n_frames, quiet=False, title='scans') as bar:
+        what = f'playing the bag to the node, {rate:g} scans per second'
+        print(f'[3/3] {what}, and receiving both clouds', flush=True)
+        with options.progress('scans')(total=n_frames) as bar:
             clouds = (decode_cloud(raw) for _, _, raw in bag.messages([INPUT]))
             return rate_result(rate, probe.paced(clouds, rate, bar.update), 0)
 
@@ -360,21 +300,11 @@ def sustainable_rate(cloud: CloudMessage, probe: Probe) -> float:
     seconds = float(np.median([trip.latency for trip in trips]))
     if seconds < MAX_LOAD / RATE:
         return RATE
-    if math.isnan(seconds):
+    if np.isnan(seconds):
         raise GroundSegError(f'no answer to a scan within {TRIAL_TIMEOUT:g} s')
-    # Of the next lower numbers of one digit.
-    rate = COMFORTABLE_LOAD / seconds
-    unit = 10.0 ** math.floor(math.log10(rate))
-    rate = min(RATE, math.floor(round(rate / unit, 6)) * unit)
-    _detail(
-        f'a scan takes {1e3 * seconds:.0f} ms here and now: playing {rate:g} per second '
-        f'instead of {RATE:g}'
-    )
+    rate = float(f'{COMFORTABLE_LOAD / seconds:.1g}')
+    print(f'      a scan takes {1e3 * seconds:.0f} ms here and now: playing {rate:g} per second')
     return rate
-
-
-def _detail(text: str) -> None:
-    print(f'      {text}', flush=True)
 
 
 def _thousands(number: int) -> str:

@@ -4,59 +4,23 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import math
 import statistics
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
-from gp_ground_seg.cli.options import (
-    add_config_options,
-    config_from_options,
-    count,
-    new_parser,
-    positive,
-)
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.semantic_kitti import Frame
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.calibration import BIN_EDGES, N_BINS, THRESHOLDS, Calibration
-from gp_ground_seg.evaluation.environment import describe_environment, parameters_line
-from gp_ground_seg.evaluation.evaluate import (
-    KnownScan,
-    MethodScore,
-    Progress,
-    ScanScore,
-    labelled_frames,
-    load_kitti,
-    score_methods,
-)
-from gp_ground_seg.evaluation.methods import (
-    OURS,
-    PATCHWORKPP,
-    Method,
-    OurMethod,
-    PatchworkppMethod,
-)
-from gp_ground_seg.evaluation.metrics import (
-    CONVENTIONS,
-    GROUNDGRID,
-    RATIOS,
-    RING_TITLES,
-    Convention,
-    Labels,
-    class_errors,
-    class_name,
-    ratio,
-)
-from gp_ground_seg.evaluation.table import Cell, Column, Table, fold, milliseconds, percent
+from gp_ground_seg.evaluation import evaluate as methods
+from gp_ground_seg.evaluation import metrics
+from gp_ground_seg.evaluation import report as tables
+from gp_ground_seg.evaluation.evaluate import MethodScore
+from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
-from gp_ground_seg.plotting.birds_eye import SheetPanel, plot_error_sheet
 from gp_ground_seg.plotting.charts import plot_reliability
 
 DESCRIPTION = (
@@ -68,93 +32,74 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08 --json scores.json
   gp-ground-seg evaluate KITTI_ROOT --set label.ground_tolerance=0.15
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
-  gp-ground-seg evaluate KITTI_ROOT --sheet worst.png --worst 9
+  gp-ground-seg evaluate KITTI_ROOT --worst 9
   gp-ground-seg evaluate KITTI_ROOT --reliability reliability.png
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI).
 """
 
-FRAME_OPTIONS: dict[str, dict[str, Any]] = {
-    'sequences': {'metavar': 'LIST', 'help': 'sequences, as in 00,08 (default: all there are)'},
-    'frame_step': {
-        'metavar': 'N', 'type': positive, 'help': 'every Nth frame of a sequence only'
-    },
-}  # fmt: skip
-N_WORST, MAX_WORST = 6, 60
-LEAST_SHARE = 0.01
-"""Classes with a smaller share of the errors of a frame are not named on the sheet."""
+ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
+OF_FRAMES = (
+    ('--sequences', 'sequences, as in 00,08 (default: all there are)', {'metavar': 'LIST'}),
+    (
+        '--frame-step',
+        'every Nth frame of a sequence only',
+        {'metavar': 'N', 'type': options.positive},
+    ),
+)
 COUNTS_AS = {Label.GROUND: 'ground', Label.OBSTACLE: 'obstacle', Label.UNKNOWN: 'left out'}
 RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
-
-Scored = tuple[KnownScan, ScanScore, Labels]
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
-    parser = new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
-    parser.add_argument('root', metavar='ROOT', help='folder in SemanticKITTI layout')
-    for name, options in FRAME_OPTIONS.items():
-        parser.add_argument(f'--{name.replace("_", "-")}', **options)
-    for name, what in (
-        ('--sheet', 'draw the worst frames from above, errors coloured (PNG)'),
-        ('--reliability', 'draw share of ground over p_ground (PNG)'),
-    ):
-        parser.add_argument(name, metavar='FILE', help=what)
-    parser.add_argument(
-        '--worst', metavar='N', type=positive,
-        help=f'frames on the sheet (default: {N_WORST}, at most {MAX_WORST})',
-    )  # fmt: skip
-    parser.add_argument(
-        '--peer', choices=(PATCHWORKPP,), help='run this one on the same frames, alternately'
+    parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
+    reliability = 'draw share of ground over p_ground (PNG)'
+    worst = {'metavar': 'N', 'type': options.positive}
+    options.add(
+        parser,
+        ROOT,
+        *OF_FRAMES,
+        ('--worst', 'list the N frames with the lowest IoU', worst),
+        ('--reliability', reliability, {'metavar': 'FILE'}),
+        (
+            '--peer',
+            'run this one on the same frames, alternately',
+            {'choices': (methods.PATCHWORKPP,)},
+        ),
+        options.TO_JSON,
+        options.FORCE,
     )
-    add_json_options(parser)
-    add_config_options(parser)
+    options.add_config(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate, write the files, print the tables."""
-    config = config_from_options(arguments)
-    if arguments.worst is not None and arguments.sheet is None:
-        raise DataError('--worst: is for --sheet only')
-    n_worst = arguments.worst or N_WORST
-    if n_worst > MAX_WORST:
-        raise DataError(f'--worst {n_worst}: must be at most {MAX_WORST}')
-    worst: list[Scored] = []
-
-    def keep_worst(method: str, scan: KnownScan, score: ScanScore, label: Labels) -> None:
-        if method == OURS and score.confusion.tp + score.confusion.errors:
-            worst.append((scan, score, label))
-            worst.sort(key=lambda one: one[1].confusion.iou)
-            del worst[n_worst:]
-
-    files = {
-        'json': 'every number', 'sheet': 'worst frames', 'reliability': 'reliability diagram',
-    }  # fmt: skip
+    config = options.read_config(arguments)
+    files = {'json': 'every number', 'reliability': 'reliability diagram'}
     with staged_options(arguments, *files) as parts, ExitStack() as stack:
         frames = frames_from_options(arguments)
-        methods: list[Method] = [stack.enter_context(closing(OurMethod(config)))]
+        chosen: list[methods.Method] = [stack.enter_context(closing(methods.OurMethod(config)))]
         if arguments.peer is not None:
-            methods.append(PatchworkppMethod())
-        scores = score_methods(
-            frames, load_kitti, methods,
-            observe=keep_worst if 'sheet' in parts else None, progress=progress('evaluate'),
-        )  # fmt: skip
+            chosen.append(methods.PatchworkppMethod())
+        bar = options.progress('evaluate')
+        scores = methods.score_methods(frames, methods.load_kitti, chosen, progress=bar)
         report = make_report(
-            score_tables(scores), scores, config,
+            score_tables(scores, arguments.worst), scores, config,
             data=arguments.root, reliability=reliability_rows(scores[0]),
             stages={score.name: score.median_stages for score in scores},
         )  # fmt: skip
-        environment = describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
+        environment = tables.describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
         if 'json' in parts:
             report.write(parts['json'], environment)
-        if 'sheet' in parts:
-            _draw_sheet(worst, len(frames), parts['sheet'])
         if 'reliability' in parts:
-            _draw_reliability(scores[0], parts['reliability'])
+            sequences = _calibrations(scores[0])
+            title = f'Reliability, {len(frames)} frames'
+            plot_reliability(sequences, parts['reliability'], title)
     print('\n\n'.join([_headline(scores), *(table.text() for table in report.tables.values())]))
-    print(f'\n{fold(parameters_line(report.facts["config_changes"]))}')
-    print(fold(environment.machine(report.fit.n_threads, report.fit.backend)))
+    print(f'\n{tables.fold(tables.parameters_line(report.facts["config_changes"]))}')
+    print(tables.fold(tables.machine_line(environment, report.fit)))
     for name in parts:
         print(f'{files[name]}: {getattr(arguments, name)}')
     return 0
@@ -164,20 +109,19 @@ def _headline(scores: Sequence[MethodScore]) -> str:
     ious = [f'{one.title} {100.0 * one.iou:.2f} %' for one in scores]
     times = [f'{one.title} {1e3 * one.seconds():.1f} ms' for one in scores]
     frames, sequences = len(scores[0].scans), len(scores[0].sequences)
-    pooled = f'{count(frames, "frame")} of {count(sequences, "sequence")}'
-    return (
-        f'IoU {", ".join(ious).removeprefix(OURS).strip()}  (GroundGrid convention, {pooled})\n'
-        f'{", ".join(times).removeprefix(OURS).strip()} per frame  (median)'
-    )
+    pooled = f'{options.count(frames, "frame")} of {options.count(sequences, "sequence")}'
+    iou, seconds = (', '.join(own).removeprefix(methods.OURS).strip() for own in (ious, times))
+    return f'IoU {iou}  (GroundGrid convention, {pooled})\n{seconds} per frame  (median)'
 
 
-def score_tables(scores: Sequence[MethodScore]) -> dict[str, Table]:
+def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str, Table]:
     """Tables of an evaluation by name, ours first in `scores`."""
     return {
-        **{one.key: _convention_table(scores, one) for one in CONVENTIONS},
+        **{one.key: _convention_table(scores, one) for one in metrics.CONVENTIONS},
         'rings': _ring_table(scores),
         'classes': _class_table(scores[0]),
         'probabilities': _calibration_table(scores[0]),
+        **({'worst': _worst_table(scores[0], n_worst)} if n_worst else {}),
         'times': _time_table(scores),
     }
 
@@ -190,20 +134,20 @@ def _peer_columns(peers: Sequence[MethodScore]) -> list[Column]:
     return columns
 
 
-def _with_peers(iou: float, peers: Iterator[float]) -> list[Cell]:
-    return [cell for its in peers for cell in (its, iou - its)]
+def _with_peers(iou: float, peers: Sequence[metrics.Confusion]) -> list[Cell]:
+    return [cell for its in peers for cell in (its.iou, iou - its.iou)]
 
 
-def _convention_table(scores: Sequence[MethodScore], convention: Convention) -> Table:
+def _convention_table(scores: Sequence[MethodScore], convention: metrics.Convention) -> Table:
     rows = []
     for parts in zip(*(score.by_sequence() for score in scores), strict=True):
         found, *its = (own.pooled(convention.key) for _, own in parts)
         sequence, ours = parts[0]
         row: list[Cell] = [sequence, len(ours.scans)]
-        row += [getattr(found, name) for name in RATIOS]
-        rows.append([*row, *_with_peers(found.iou, (one.iou for one in its))])
+        row += [getattr(found, name) for name in metrics.RATIOS]
+        rows.append([*row, *_with_peers(found.iou, its)])
     columns = [Column('sequence'), Column('frames', 'd')]
-    columns += [percent(RATIO_TITLES.get(name, name), name) for name in RATIOS]
+    columns += [percent(RATIO_TITLES.get(name, name), name) for name in metrics.RATIOS]
     title = f'{convention.title} convention: {convention.rule}  [%]'
     return Table([*columns, *_peer_columns(scores[1:])], rows, title, n_sums=1)
 
@@ -213,9 +157,9 @@ def _ring_table(scores: Sequence[MethodScore]) -> Table:
     columns += [percent('of errors', 'share_of_errors'), percent('precision'), percent('recall')]
     n_errors = scores[0].confusion.errors
     rows = [
-        [title, ring.points, ring.errors, ratio(ring.errors, n_errors), ring.precision,
-         ring.recall, ring.iou, *_with_peers(ring.iou, (one.iou for one in its))]
-        for title, ring, *its in zip(RING_TITLES, *(s.rings for s in scores), strict=True)
+        [title, ring.points, ring.errors, metrics.ratio(ring.errors, n_errors), ring.precision,
+         ring.recall, ring.iou, *_with_peers(ring.iou, its)]
+        for title, ring, *its in zip(metrics.RING_TITLES, *(s.rings for s in scores), strict=True)
     ]  # fmt: skip
     columns = [*columns, percent('IoU', 'iou'), *_peer_columns(scores[1:])]
     return Table(columns, rows, 'Horizontal range (GroundGrid convention)  [%]')
@@ -223,19 +167,19 @@ def _ring_table(scores: Sequence[MethodScore]) -> Table:
 
 def _class_table(score: MethodScore) -> Table:
     """Classes by what they count as, and in that by their number of errors."""
-    found = class_errors(score.classes)
+    found = metrics.class_errors(score.classes)
     n_errors = score.confusion.errors
     n_points = sum(one.n_points for one in found)
     rows: list[list[Cell]] = [
         [
-            class_name(one.number),
+            metrics.class_name(one.number),
             COUNTS_AS[one.truth],
             one.n_points,
             one.n_points / n_points,
             one.n_ground / one.n_points,
             one.missed / one.n_points if one.truth is Label.GROUND else None,
             one.false / one.n_points if one.truth is Label.OBSTACLE else None,
-            None if one.truth is Label.UNKNOWN else ratio(one.errors, n_errors),
+            None if one.truth is Label.UNKNOWN else metrics.ratio(one.errors, n_errors),
         ]
         for one in sorted(found, key=lambda one: list(COUNTS_AS).index(one.truth))
     ]
@@ -249,24 +193,38 @@ def _class_table(score: MethodScore) -> Table:
     return Table(columns, rows, title)
 
 
+def _calibrations(score: MethodScore) -> dict[str, metrics.Calibration]:
+    """Return the sums by sequence and of all; our method has probabilities for every scan."""
+    parts = score.by_sequence()
+    return {name: own.calibration for name, own in parts if own.calibration is not None}
+
+
 def _calibration_table(score: MethodScore) -> Table:
     """Errors of the probabilities by sequence and pooled."""
-    rows: list[list[Cell]] = []
-    for sequence, own in score.by_sequence():
-        found = _calibration(own)
-        best = found.confusion_at(found.best_step).iou if found.n_total else None
-        threshold = float(THRESHOLDS[found.best_step]) if found.n_total else None
-        cells = [found.n_total, found.ece, found.brier, own.iou, best, threshold]
-        rows.append([sequence, *cells])
+    rows: list[list[Cell]] = [
+        [name, one.n_total, one.ece, one.brier] for name, one in _calibrations(score).items()
+    ]
     columns = [Column('sequence'), Column('points', '_d'), Column('ECE', '.4f', 'ece')]
-    columns += [Column('Brier', '.4f', 'brier'), percent('IoU of labels', 'iou')]
-    columns += [percent('best IoU', 'best_iou'), Column('at p_ground', '.3f', 'best_threshold')]
     title = (
-        f'Probabilities (GroundGrid convention): expected calibration error over {N_BINS} bins, '
-        'Brier score; IoU [%] of the labels, and if ground were all points from the best '
-        'threshold on'
+        'Probabilities (GroundGrid convention): expected calibration error over '
+        f'{metrics.N_BINS} bins, Brier score'
     )
-    return Table(columns, rows, title, n_sums=1)
+    return Table([*columns, Column('Brier', '.4f', 'brier')], rows, title, n_sums=1)
+
+
+def _worst_table(score: MethodScore, n_worst: int) -> Table:
+    """Frames with the lowest IoU, and the class that costs them most."""
+    rows: list[list[Cell]] = []
+    known = [scan for scan in score.scans if not math.isnan(scan.confusion.iou)]
+    for scan in sorted(known, key=lambda scan: scan.confusion.iou)[:n_worst]:
+        found, (main, *_) = scan.confusion, metrics.class_errors(scan.classes)
+        share = metrics.ratio(main.errors, found.errors)
+        cells: list[Cell] = [found.iou, found.fp, found.fn, metrics.class_name(main.number), share]
+        rows.append([scan.sequence, scan.index, *cells])
+    columns = [Column('sequence'), Column('frame'), percent('IoU', 'iou')]
+    columns += [Column('false', '_d'), Column('missed', '_d'), Column('most errors on')]
+    title = 'Frames with the lowest IoU (GroundGrid convention)  [%]'
+    return Table([*columns, percent('of errors', 'share_of_errors')], rows, title)
 
 
 def _time_table(scores: Sequence[MethodScore]) -> Table:
@@ -275,91 +233,43 @@ def _time_table(scores: Sequence[MethodScore]) -> Table:
         [one.title, one.seconds(), one.seconds(statistics.fmean), ours / one.seconds()]
         for one in scores
     ]
-    columns = [Column('method'), milliseconds('median'), milliseconds('mean')]
+    columns = [Column('method'), tables.milliseconds('median'), tables.milliseconds('mean')]
     columns.append(Column('ours / this', '.2f', 'ratio'))
     stages = ', '.join(f'{name} {1e3 * s:.1f}' for name, s in scores[0].median_stages.items())
     return Table(columns, rows, 'Time per frame, reading left out  [ms]', [f'stages: {stages}'])
 
 
-def _calibration(score: MethodScore) -> Calibration:
-    assert score.calibration is not None, 'our method has probabilities'
-    return score.calibration
-
-
 def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
     """Share of ground and mean probability in each bin of probability, by sequence and pooled."""
     rows = []
-    for sequence, own in score.by_sequence():
-        found = _calibration(own)
-        bins = zip(itertools.pairwise(BIN_EDGES.tolist()), found.n_points.tolist(),
-                   found.mean_p.tolist(), found.share_ground.tolist(), strict=True)  # fmt: skip
-        for (low, high), n, mean, share in bins:
-            row = {'sequence': sequence, 'from': low, 'to': high, 'points': n}
-            rows.append({**row, 'mean_p': mean, 'share_ground': share})
+    for sequence, found in _calibrations(score).items():
+        bins = (found.n_points, found.by_bin(found.sum_p), found.by_bin(found.n_ground))
+        values = zip(metrics.BIN_EDGES[:-1], metrics.BIN_EDGES[1:], *bins, strict=True)
+        keys = ('from', 'to', 'points', 'mean_p', 'share_ground')
+        for row in values:
+            named = zip(keys, (value.item() for value in row), strict=True)
+            rows.append({'sequence': sequence, **dict(named)})
     return rows
-
-
-def _draw_sheet(worst: Sequence[Scored], n_frames: int, path: Path) -> None:
-    """Draw frames with their errors."""
-    if not worst:
-        raise DataError(f'no sheet of worst frames: nothing to score in {n_frames} frames')
-    panels = []
-    for scan, score, label in worst:
-        confusion = score.confusion
-        # The classes with most errors, as in ``missed terrain 68 %, false building 16 %``.
-        causes = ', '.join(
-            f'{"missed" if one.missed else "false"} {class_name(one.number)} '
-            f'{one.errors / confusion.errors:.0%}'
-            for one in class_errors(score.classes)[:3]
-            if one.errors > LEAST_SHARE * confusion.errors
-        )
-        errors = f'{confusion.fp} false, {confusion.fn} missed: {causes}'
-        title = f'{scan.sequence} / {scan.index}    IoU {100.0 * confusion.iou:.2f} %'
-        subtitle = errors if confusion.errors else 'no errors'
-        truth = scan.truths[GROUNDGRID.key]
-        panels.append(SheetPanel(title, subtitle, scan.points, label, truth))
-    title = f'Worst {len(worst)} of {n_frames} frames, GroundGrid convention; x up, y left [m]'
-    plot_error_sheet(panels, path, title)
-
-
-def _draw_reliability(score: MethodScore, path: Path) -> None:
-    sequences = {name: _calibration(score.of(name)) for name in score.sequences}
-    title = f'Reliability, {len(score.scans)} frames'
-    plot_reliability(_calibration(score), sequences, path, title)
 
 
 # What `experiment` and `bench` share with this command.
 
 
-def add_json_options(parser: argparse.ArgumentParser) -> None:
-    """Add ``--json FILE`` and ``--force``."""
-    parser.add_argument('--json', metavar='FILE', help='write every number to this file as well')
-    parser.add_argument('--force', action='store_true', help='overwrite the files written')
-
-
 def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
-    """Labelled frames of the options, grouped by sequence; errors as `labelled_frames`."""
+    """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
-    frames = labelled_frames(arguments.root, chosen)
+    frames = methods.labelled_frames(arguments.root, chosen)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]
 
 
 @contextmanager
 def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
-    """Yield a path to write for each of the options `names` that is given.
-
-    The files take their names when the block ends well; DataError if one cannot be written.
-    """
+    """Yield a path for each of the options given; the files appear when the block ends well."""
     with ExitStack() as stack:
         yield {
             name: stack.enter_context(staged_file(path, force=arguments.force))
             for name in names
             if (path := getattr(arguments, name)) is not None
         }
-
-
-def progress(title: str, unit: str = 'frame') -> Progress:
-    """Wrap items in a progress bar on standard error, if that is a terminal."""
-    return partial(tqdm, unit=unit, desc=title, file=sys.stderr, disable=None, leave=False)

@@ -7,67 +7,53 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from gp_ground_seg.cli.evaluate import (
-    FRAME_OPTIONS,
-    add_json_options,
-    frames_from_options,
-    progress,
-    staged_options,
-)
-from gp_ground_seg.cli.options import (
-    add_config_options,
-    config_from_options,
-    parse_setting,
-    positive,
-    some_of,
-)
+from gp_ground_seg.cli import options
+from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, staged_options
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.environment import describe_environment
-from gp_ground_seg.evaluation.table import fold
-from gp_ground_seg.experiments import ablation, sensor_pose, simulated_scenes
-from gp_ground_seg.experiments.cross_validation import cross_validate
+from gp_ground_seg.evaluation.evaluate import load_kitti
+from gp_ground_seg.evaluation.report import Report, describe_environment, fold, machine_line
+from gp_ground_seg.experiments import ablation, sensor_pose, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
-from gp_ground_seg.experiments.variants import Report
+from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
 from gp_ground_seg.parameters.schema import ParameterValue
 from gp_ground_seg.simulation import SCENES, SENSORS
 
+Option = tuple[str, str, dict[str, Any]]
+
 DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 
-OF_FRAMES, OF_SIMULATED = tuple(FRAME_OPTIONS), ('seeds', 'scenes')
-OPTIONS: dict[str, dict[str, Any]] = {
-    'root': {'metavar': 'ROOT', 'help': 'folder in SemanticKITTI layout'},
-    'simulated': {'action': 'store_true', 'help': 'simulated scans instead of ROOT'},
-    **FRAME_OPTIONS,
-    'seeds': {'metavar': 'N', 'type': positive, 'help': 'simulated scenes of each kind'},
-    'scenes': {
-        'metavar': 'LIST', 'type': some_of(SCENES),
-        'help': f'simulated scenes, some of {",".join(SCENES)} (default: all)',
-    },
-    'sensors': {
-        'metavar': 'LIST', 'type': some_of(SENSORS),
-        'help': f'some of {",".join(SENSORS)} (default: {",".join(DEFAULT_SENSORS)})',
-    },
-    'no_peer': {'action': 'store_true', 'help': 'leave Patchwork++ out'},
-    'switch': {
-        'metavar': 'TITLE: NAME=VALUE ...', 'action': 'append',
-        'help': 'measure this departure instead, and the parameters that switch it off '
-                '(may be repeated)',
-    },
-    'frames': {
-        'metavar': 'SEQ/IDX:SEG,SEG', 'nargs': '+',
-        'help': f'frames and segments (default: {" ".join(DEFAULT_CHOICES)})',
-    },
-    'repeats': {
-        'metavar': 'N', 'type': positive, 'help': 'timed runs of each method (default: 9)'
-    },
-}  # fmt: skip
+OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
+SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
+SEEDS = ('--seeds', 'simulated scenes of each kind', {'metavar': 'N', 'type': options.positive})
+SCENE_LIST = (
+    '--scenes', f'simulated scenes, some of {",".join(SCENES)} (default: all)',
+    {'metavar': 'LIST', 'type': options.some_of(SCENES)},
+)  # fmt: skip
+SENSOR_LIST = (
+    '--sensors', f'some of {",".join(SENSORS)} (default: {",".join(DEFAULT_SENSORS)})',
+    {'metavar': 'LIST', 'type': options.some_of(SENSORS)},
+)  # fmt: skip
+NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
+SWITCH = (
+    '--switch',
+    'measure this departure instead, and the parameters that switch it off (may be repeated)',
+    {'metavar': 'TITLE: NAME=VALUE ...', 'action': 'append'},
+)
+SEGMENTS = (
+    '--frames', f'frames and segments (default: {" ".join(DEFAULT_CHOICES)})',
+    {'metavar': 'SEQ/IDX:SEG,SEG', 'nargs': '+', 'default': DEFAULT_CHOICES},
+)  # fmt: skip
+REPEATS = (
+    '--repeats', 'timed runs of each method (default: %(default)s)',
+    {'metavar': 'N', 'type': options.positive, 'default': 9},
+)  # fmt: skip
 
 
 class Experiment(NamedTuple):
-    """An experiment: what it is for, the `OPTIONS` it has, and how it is run."""
+    """An experiment: what it is for, its options, and how it is run."""
 
     description: str
-    options: tuple[str, ...]
+    options: tuple[Option, ...]
     run: Callable[[argparse.Namespace], Report]
 
 
@@ -86,15 +72,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             description=experiment.description,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        for option in experiment.options:
-            if option == 'root':
-                is_optional = 'simulated' in experiment.options
-                own.add_argument('root', nargs='?' if is_optional else None, **OPTIONS[option])
-            else:
-                own.add_argument(_flag(option), **OPTIONS[option])
-        own.add_argument('--markdown', action='store_true', help='print the tables as Markdown')
-        add_json_options(own)
-        add_config_options(own)
+        markdown = ('--markdown', 'print the tables as Markdown', options.FLAG)
+        options.add(own, *experiment.options, markdown, options.TO_JSON, options.FORCE)
+        options.add_config(own)
         own.set_defaults(run=run)
         if name == 'scenes':
             own.set_defaults(preset=None)
@@ -103,52 +83,51 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, write the file, print the tables."""
     experiment = EXPERIMENTS[arguments.experiment]
-    if 'simulated' in experiment.options:
+    if SIMULATED in experiment.options:
         _check_source(arguments)
     with staged_options(arguments, 'json') as parts:
         report = experiment.run(arguments)
         has_peer = not getattr(arguments, 'no_peer', True)
         environment = describe_environment(*(['pypatchworkpp'] if has_peer else []))
         if 'json' in parts:
-            options = {name: getattr(arguments, name) for name in experiment.options}
+            options = {name: getattr(arguments, name) for name in map(_name, experiment.options)}
             report.facts.update(experiment=arguments.experiment, options=options)
             report.write(parts['json'], environment)
     tables = report.tables.values()
     print('\n\n'.join(t.markdown() if arguments.markdown else t.text() for t in tables))
-    machine = environment.machine(report.fit.n_threads, report.fit.backend)
+    machine = machine_line(environment, report.fit)
     print(f'\n{machine if arguments.markdown else fold(machine)}')
     return 0
 
 
-def _flag(option: str) -> str:
-    return f'--{option.replace("_", "-")}'
+def _name(option: Option) -> str:
+    return option[0].lstrip('-').replace('-', '_')
 
 
 def _check_source(arguments: argparse.Namespace) -> None:
     """Refuse options that contradict one another."""
     if arguments.simulated == (arguments.root is not None):
         raise DataError(f'{arguments.experiment}: give either ROOT or --simulated')
-    for name in OF_FRAMES if arguments.simulated else OF_SIMULATED:
-        if getattr(arguments, name, None) is not None:
+    for option in OF_FRAMES if arguments.simulated else (SEEDS, SCENE_LIST):
+        if getattr(arguments, _name(option), None) is not None:
             kind = 'labelled frames' if arguments.simulated else '--simulated'
-            raise DataError(f'{_flag(name)}: is for {kind} only')
+            raise DataError(f'{option[0]}: is for {kind} only')
 
 
 def _ablation(arguments: argparse.Namespace) -> Report:
-    config = config_from_options(arguments)
-    if arguments.simulated:
-        bar = progress('ablation', 'scan')
-        return ablation.compare_models_simulated(arguments.seeds or 10, config, bar)
-    return ablation.compare_models(frames_from_options(arguments), config, progress('ablation'))
+    config, bar = options.read_config(arguments), options.progress('ablation')
+    if not arguments.simulated:
+        return ablation.compare_models(frames_from_options(arguments), load_kitti, config, bar)
+    seeds = arguments.seeds or 10
+    frames = simulated_frames(['hdl-64e'], [ablation.SCENE], seeds, ablation.PLACES)
+    return ablation.compare_models(frames, load_simulated, config, bar)
 
 
 def _departures(arguments: argparse.Namespace) -> Report:
-    config = config_from_options(arguments)
-    departures = [parse_departure(text) for text in arguments.switch or []]
-    return ablation.compare_departures(
-        frames_from_options(arguments), departures or ablation.DEPARTURES, config,
-        progress('departures'),
-    )  # fmt: skip
+    config = options.read_config(arguments)
+    chosen = [parse_departure(text) for text in arguments.switch or []] or ablation.DEPARTURES
+    frames = frames_from_options(arguments)
+    return ablation.compare_departures(frames, chosen, config, options.progress('departures'))
 
 
 def parse_departure(text: str) -> ablation.Departure:
@@ -157,27 +136,25 @@ def parse_departure(text: str) -> ablation.Departure:
     settings = switch.split()
     if not title.strip() or not settings:
         raise ConfigError(f'--switch {text!r}: must be TITLE: NAME=VALUE ...')
-    return ablation.Departure(title.strip(), dict(map(parse_setting, settings)))
+    return ablation.Departure(title.strip(), dict(map(options.parse_setting, settings)))
 
 
 def _scenes(arguments: argparse.Namespace) -> Report:
+    given = vars(arguments)
     configs = {}
     for sensor in arguments.sensors or DEFAULT_SENSORS:
-        preset = arguments.preset or simulated_scenes.PRESET_OF[sensor]
-        configs[sensor] = config_from_options(
-            argparse.Namespace(**{**vars(arguments), 'preset': preset})
-        )
-    return simulated_scenes.score_scenes(
-        configs, arguments.scenes or list(SCENES), arguments.seeds or 3,
-        not arguments.no_peer, progress('scenes', 'scan'),
-    )  # fmt: skip
+        preset = arguments.preset or variants.PRESET_OF[sensor]
+        configs[sensor] = options.read_config(argparse.Namespace(**{**given, 'preset': preset}))
+    scenes, seeds = arguments.scenes or list(SCENES), arguments.seeds or 3
+    with_peer = not arguments.no_peer
+    return variants.score_scenes(configs, scenes, seeds, with_peer, options.progress('scenes'))
 
 
 def _cross_validation(arguments: argparse.Namespace) -> Report:
     grid, fixed = split_settings(arguments.settings)
-    config = config_from_options(argparse.Namespace(**{**vars(arguments), 'settings': fixed}))
-    bar = progress('cross-validation')
-    return cross_validate(frames_from_options(arguments), config, grid, bar)
+    config = options.read_config(argparse.Namespace(**{**vars(arguments), 'settings': fixed}))
+    bar = options.progress('cross-validation')
+    return ablation.cross_validate(frames_from_options(arguments), config, grid, bar)
 
 
 def split_settings(settings: Sequence[str]) -> tuple[dict[str, list[ParameterValue]], list[str]]:
@@ -195,39 +172,36 @@ def split_settings(settings: Sequence[str]) -> tuple[dict[str, list[ParameterVal
         if name.strip() in grid:
             raise ConfigError(f'--set {setting}: {name.strip()} is searched twice')
         words = [word for word in text.split(',') if word]
-        grid[name.strip()] = [parse_setting(f'{name}={word}')[1] for word in words]
+        grid[name.strip()] = [options.parse_setting(f'{name}={word}')[1] for word in words]
     if not grid:
         raise ConfigError('cross-validation: nothing to choose, give --set NAME=VALUE,VALUE,...')
     return grid, fixed
 
 
 def _sensor_pose(arguments: argparse.Namespace) -> Report:
-    config = config_from_options(arguments)
-    if arguments.simulated:
-        scenes, bar = arguments.scenes or list(SCENES), progress('sensor-pose', 'scan')
-        return sensor_pose.score_simulated_poses(
-            arguments.seeds or 1, config, scenes, progress=bar
-        )
-    return sensor_pose.score_poses(frames_from_options(arguments), config, progress('sensor-pose'))
+    config, bar = options.read_config(arguments), options.progress('sensor-pose')
+    if not arguments.simulated:
+        frames, mounts = frames_from_options(arguments), sensor_pose.MOUNTS
+        return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, bar)
+    scenes, mounts = arguments.scenes or list(SCENES), sensor_pose.SIMULATED_MOUNTS
+    scans = simulated_frames(DEFAULT_SENSORS, scenes, arguments.seeds or 1, (0.0,))
+    return sensor_pose.score_poses(scans, sensor_pose.load_mounted, mounts, config, bar)
 
 
 def _table1(arguments: argparse.Namespace) -> Report:
-    config = config_from_options(arguments)
-    try:
-        choices = [Choice.parse(word) for word in arguments.frames or DEFAULT_CHOICES]
-    except ValueError as error:
-        raise DataError(f'--frames {error}') from error
-    return table1(arguments.root, choices, config, arguments.repeats or 9, progress('table1'))
+    config, bar = options.read_config(arguments), options.progress('table1')
+    choices = [Choice.parse(word) for word in arguments.frames]
+    return table1(arguments.root, choices, config, arguments.repeats, bar)
 
 
 EXPERIMENTS = {
     'ablation': Experiment(
         """\
-Compare length-scale models and ways to learn. On labelled frames: a constant length-scale,
-the gradients of the lines (Z), and the latent process (Z-L); with --simulated on a smooth
-road that ends in rubble, by exact heights.
+Compare length-scale models and ways to learn: a constant length-scale, the gradients of the
+lines (Z), and the latent process (Z-L), on labelled frames; with --simulated on a smooth
+road that ends in rubble, by exact labels and heights.
 """,
-        ('root', 'simulated', *OF_FRAMES, 'seeds'),
+        (OPTIONAL_ROOT, SIMULATED, *OF_FRAMES, SEEDS),
         _ablation,
     ),
     'departures': Experiment(
@@ -236,7 +210,7 @@ Undo one departure from the paper after the other. They are the rows of
 gp_ground_seg/experiments/ablation.py; --switch measures another without touching it:
   --switch 'tight gate: growth.max_std=1'
 """,
-        ('root', *OF_FRAMES, 'switch'),
+        (ROOT, *OF_FRAMES, SWITCH),
         _departures,
     ),
     'scenes': Experiment(
@@ -245,7 +219,7 @@ Score simulated scans by exact labels and heights, beside Patchwork++. Each sens
 parameters of its preset unless --preset names one for all; Patchwork++ has its published
 parameters and the true height of the sensor.
 """,
-        ('sensors', 'scenes', 'seeds', 'no_peer'),
+        (SENSOR_LIST, SCENE_LIST, SEEDS, NO_PEER),
         _scenes,
     ),
     'cross-validation': Experiment(
@@ -254,23 +228,23 @@ Choose parameters on all sequences but one, and score them on that one. Paramete
 several values are searched by pooled IoU, one after the other until no change of one is
 better: --set label.ground_tolerance=0.05,0.1
 """,
-        ('root', *OF_FRAMES),
+        (ROOT, *OF_FRAMES),
         _cross_validation,
     ),
     'sensor-pose': Experiment(
         """\
 Compare the segmentation with height and tilt of the sensor told and estimated. On labelled
-frames of KITTI's car as they are, turned by 3 degrees, and turned over; with --simulated
-from three sensors at four heights.
+frames of KITTI's car as they are, and turned by 3 degrees; with --simulated from three
+sensors at four heights.
 """,
-        ('root', 'simulated', *OF_FRAMES, *OF_SIMULATED),
+        (OPTIONAL_ROOT, SIMULATED, *OF_FRAMES, SEEDS, SCENE_LIST),
         _sensor_pose,
     ),
     'table1': Experiment(
         """\
 Measure the paper's Table I on segments of labelled frames.
 """,
-        ('root', 'frames', 'repeats'),
+        (ROOT, SEGMENTS, REPEATS),
         _table1,
     ),
 }

@@ -9,7 +9,6 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import NamedTuple
 
 from gp_ground_seg import __version__
 from gp_ground_seg.errors import GroundSegError
@@ -21,47 +20,31 @@ EXIT_INTERRUPTED = 130
 ROS_ARGS = '--ros-args'
 
 
-class Command(NamedTuple):
-    """A command: its module in `gp_ground_seg.cli`, and what it is for."""
-
-    module: str
-    purpose: str
-
-
-# The `add_parser(subparsers)` of a module declares its command or commands: their options, and
-# the default `run`, a function of the parsed arguments that returns an exit code. A command that
-# sets the default `accepts_ros_args` finds `ros_args` in them. Only the module of the command at
-# hand is imported: all of them take a second.
+# Module in `gp_ground_seg.cli` and purpose of each command. The `add_parser(subparsers)` of a
+# module declares its commands: their options, and the default `run`, a function of the parsed
+# arguments that returns an exit code. One that sets the default `accepts_ros_args` finds them in
+# `ros_args`. Only the module of the command at hand is imported: all of them take a second.
 COMMANDS = {
-    'segment': Command('segment', 'label scans, or split the clouds of a bag'),
-    'evaluate': Command('evaluate', 'score against SemanticKITTI labels'),
-    'bench': Command('bench', 'time the segmentation by stage, beside Patchwork++'),
-    'experiment': Command('experiment', 'repeat an experiment of docs/, such as ablation'),
-    'plot': Command('plot', 'draw a scan in perspective, or a segment of it from the side'),
-    'pose': Command('pose', 'estimate height and tilt of the sensor from scans'),
-    'kitti-to-bag': Command('bags', 'write a KITTI sequence as a rosbag2'),
-    'play': Command('bags', "publish a bag's clouds as they were recorded"),
-    'demo': Command('demo', 'see it work, no data needed'),
-    'config': Command('config', 'write, check and compare parameter files'),
-    'node': Command('node', 'run the ROS 2 node'),
-    'node-bench': Command('node', 'latency, losses and memory of the node'),
-    'warm-up': Command('node', 'compile beforehand what the first start would compile'),
+    'segment': ('segment', 'label scans, or split the clouds of a bag'),
+    'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
+    'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
+    'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
+    'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
+    'pose': ('segment', 'estimate height and tilt of the sensor from scans'),
+    'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),
+    'play': ('bags', "publish a bag's clouds as they were recorded"),
+    'demo': ('demo', 'see it work, no data needed'),
+    'config': ('config', 'write, check and compare parameter files'),
+    'node': ('node', 'run the ROS 2 node'),
+    'node-bench': ('node', 'latency, losses and memory of the node'),
+    'warm-up': ('node', 'compile beforehand what the first start would compile'),
 }
 
 EXAMPLES = """\
 examples:
   gp-ground-seg demo                             see it work, no data needed
-  gp-ground-seg segment scan.bin                 label one KITTI scan
   gp-ground-seg segment drive.mcap -o out.mcap   ground and obstacle clouds of a bag
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
-  gp-ground-seg pose scan.bin                    how high and how tilted is the sensor?
-  gp-ground-seg bench KITTI_ROOT                 time per frame by stage, beside Patchwork++
-  gp-ground-seg plot segment scan.bin --azimuth 0 -o ahead.png
-  gp-ground-seg plot scan --simulate urban -o scan.png
-  gp-ground-seg experiment table1 KITTI_ROOT     the paper's Table I
-  gp-ground-seg experiment scenes                simulated scenes, beside Patchwork++
-  gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 00 drive.mcap
-  gp-ground-seg play drive.mcap --clock
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud
 """
 
@@ -77,7 +60,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     parser.add_argument('--version', action='version', version=__version__)
     subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
     if command is not None:
-        module = COMMANDS[command].module
+        module = COMMANDS[command][0]
         importlib.import_module(f'gp_ground_seg.cli.{module}').add_parser(subparsers)
     else:
         for name, (_, purpose) in COMMANDS.items():

@@ -8,34 +8,27 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gp_ground_seg.cli.options import count, new_parser, note, progress_bar
+from gp_ground_seg.cli import options
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
 from gp_ground_seg.ros.lifecycle import needing_ros, stop_on_signals
 
 if TYPE_CHECKING:
     from gp_ground_seg.data.point_cloud2 import CloudMessage
-    from gp_ground_seg.ros.probe import NodeProcess, Probe, Trip
+    from gp_ground_seg.ros.probe import Trip
 
 N_SIMULATED = 10
 RATES = '10,20,50'
 FEWEST = 10
 EXIT_MISSED = 1
 
-LOSSLESS_RATE = 20.0
-"""Up to this rate nothing may be lost [Hz]."""
-PUNCTUAL_RATE = 10.0
-"""Up to this rate the 99th percentile of latency has a limit [Hz]."""
-MAX_P99 = 0.1
-"""That limit [s]."""
-MAX_PEAK = 350e6
-"""Limit of memory [bytes]."""
-MAX_GROWTH = 0.02
-"""Limit of its growth [1]."""
+# Goals: up to which rates nothing is lost and latency is limited [Hz], that limit [s], most memory
+# [bytes], and its largest growth [1].
+LOSSLESS_RATE, PUNCTUAL_RATE = 20.0, 10.0
+MAX_P99, MAX_PEAK, MAX_GROWTH = 0.1, 350e6, 0.02
 
 NODE_EXAMPLES = """\
   gp-ground-seg node
@@ -73,52 +66,36 @@ WARM_UP_EXAMPLES = """\
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands; what follows ``--ros-args`` is left to ROS or the node."""
     description = 'Run the ROS 2 node: points in, ground and obstacles out.'
-    parser = new_parser(subparsers, 'node', description, NODE_EXAMPLES)
+    parser = options.new_parser(subparsers, 'node', description, NODE_EXAMPLES)
     parser.usage = 'gp-ground-seg node [--ros-args ...]'
     parser.set_defaults(run=lambda a: start(a.ros_args), accepts_ros_args=True)
 
-    parser = new_parser(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES)
+    parser = options.new_parser(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES)
     parser.set_defaults(run=run_warm_up)
 
-    parser = new_parser(subparsers, 'node-bench', BENCH_DESCRIPTION, BENCH_EXAMPLES)
-    parser.add_argument('data', metavar='DATA', nargs='?', help='scans or a bag')
-    parser.add_argument('--topic', metavar='T', help='PointCloud2 topic of a bag')
-    parser.add_argument(
-        '--clouds', metavar='N', type=_number, default=30,
-        help='different clouds, sent over and over (default: %(default)s)',
+    parser = options.new_parser(subparsers, 'node-bench', BENCH_DESCRIPTION, BENCH_EXAMPLES)
+    number: dict[str, Any] = {'metavar': 'N', 'type': partial(options.positive, least=FEWEST)}
+    options.add(
+        parser,
+        ('data', 'scans or a bag', {'metavar': 'DATA', 'nargs': '?'}),
+        ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
+        ('--clouds', 'different clouds, sent over and over (default: %(default)s)',
+         {**number, 'default': 30}),
+        ('--rates', 'clouds per second, one after the other (default: %(default)s)',
+         {'metavar': 'LIST', 'type': _rates, 'default': RATES}),
+        ('--frames', 'clouds sent at each rate (default: %(default)s)',
+         {**number, 'default': 600}),
+        ('--memory-frames', 'clouds sent one by one; 0 = leave memory out (default: %(default)s)',
+         {'metavar': 'N', 'type': int, 'default': 2000}),
+        options.TO_JSON,
+        options.FORCE,
+        options.QUIET,
     )  # fmt: skip
-    parser.add_argument(
-        '--rates', metavar='LIST', type=_rates, default=RATES,
-        help='clouds per second, one after the other (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--frames', metavar='N', type=_number, default=600,
-        help='clouds sent at each rate (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument(
-        '--memory-frames', metavar='N', type=int, default=2000,
-        help='clouds sent one by one; 0 = leave memory out (default: %(default)s)',
-    )  # fmt: skip
-    parser.add_argument('--json', metavar='FILE', help='write every number to this file as well')
-    parser.add_argument('--force', action='store_true', help='overwrite the JSON file')
-    parser.add_argument('--quiet', action='store_true', help='no progress')
     parser.set_defaults(run=run_bench, accepts_ros_args=True)
 
 
-def _number(text: str) -> int:
-    if not text.isdecimal() or int(text) < FEWEST:
-        raise argparse.ArgumentTypeError(f'{text!r}: must be a whole number, at least {FEWEST}')
-    return int(text)
-
-
 def _rates(text: str) -> list[float]:
-    try:
-        rates = [float(word) for word in text.split(',')]
-    except ValueError:
-        rates = []
-    if not rates or not all(0.1 <= rate <= 1000.0 for rate in rates):
-        raise argparse.ArgumentTypeError(f'{text!r}: must be numbers from 0.1 to 1000, as {RATES}')
-    return rates
+    return [options.above_zero(word) for word in text.split(',')]
 
 
 def start(words: Sequence[str]) -> int:
@@ -159,20 +136,14 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
 
 def run_bench(arguments: argparse.Namespace) -> int:
     """Measure, print the table."""
-    from gp_ground_seg.data.atomic_output import staged_file
-    from gp_ground_seg.evaluation.environment import describe_environment
-    from gp_ground_seg.evaluation.table import write_json
+    from gp_ground_seg.cli.evaluate import staged_options
+    from gp_ground_seg.evaluation.report import describe_environment, write_json
 
-    if arguments.memory_frames and arguments.memory_frames < FEWEST:
-        raise DataError(
-            f'--memory-frames {arguments.memory_frames}: must be 0 or at least {FEWEST}'
-        )
+    n_memory = arguments.memory_frames
+    if n_memory and n_memory < FEWEST:
+        raise DataError(f'--memory-frames {n_memory}: must be 0 or at least {FEWEST}')
     clouds = _load_clouds(arguments)
-    with ExitStack() as stack:
-        part = None
-        if arguments.json is not None:
-            # Around the measurement: a target that is refused is so before the work.
-            part = stack.enter_context(staged_file(arguments.json, force=arguments.force))
+    with staged_options(arguments, 'json') as parts:
         rates, memory = _measure(arguments, clouds)
         document = {
             'source': {
@@ -180,16 +151,17 @@ def run_bench(arguments: argparse.Namespace) -> int:
                 'n_clouds': len(clouds),
                 'mean_points': sum(cloud.width for cloud in clouds) / len(clouds),
                 'mean_bytes': sum(len(cloud.data) for cloud in clouds) / len(clouds),
-                'node_arguments': list(itertools.islice(arguments.ros_args, 1, None)),
-                'title': count(len(clouds), 'cloud'),
+                'node_arguments': arguments.ros_args[1:],
             },
-            'rates': [{**rate, 'goals': _rate_goals(rate)} for rate in rates],
-            'memory': {**memory, 'goals': _memory_goals(memory)} if memory else None,
-            'environment': asdict(describe_environment()),
+            'rates': rates,
+            'memory': memory or None,
+            'environment': describe_environment(),
         }
-        if part is not None:
-            write_json(document, part)
-    missed = _goals_missed(document)
+        if 'json' in parts:
+            write_json(document, parts['json'])
+    goals = {f'{rate["asked"]:g} Hz': rate['goals'] for rate in rates}
+    goals['memory'] = memory.get('goals', {})
+    missed = [f'{where}: {goal}' for where, own in goals.items() for goal in own if not own[goal]]
     print(_text(document, missed))
     return EXIT_MISSED if missed else 0
 
@@ -211,60 +183,50 @@ def _load_clouds(arguments: argparse.Namespace) -> list[CloudMessage]:
 
 
 def _measure(
-    arguments: argparse.Namespace, clouds: Sequence[CloudMessage]
-) -> tuple[list[dict[str, Any]], dict[str, float]]:
+    arguments: argparse.Namespace, different: Sequence[CloudMessage]
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the results at each rate, and those of memory, if wanted."""
-    from gp_ground_seg.ros.probe import Probe, probed_node, restamped
+    from gp_ground_seg.ros import probe as probing
 
-    stamped = restamped(clouds, 1_700_000_000)
+    quiet, words = arguments.quiet, arguments.ros_args[1:]
+    n, n_memory = arguments.frames, arguments.memory_frames
+    stamped = probing.restamped(different, 1_700_000_000)
     with (
         tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
         needing_ros('node-bench'),
-        probed_node(Path(folder, 'log'), 'node_bench', arguments.ros_args[1:]) as (node, session),
+        probing.probed_node(Path(folder, 'log'), 'node_bench', words) as (node, session),
     ):
-        probe = Probe(session, lambda *_: None)
-        if not arguments.quiet:
-            note('waiting for the node; it compiles when it runs the first time')
+        probe = probing.Probe(session, lambda *_: None)
+        if not quiet:
+            options.note('waiting for the node; it compiles when it runs the first time')
         probe.connect(node)
-        rates = [_at_rate(probe, stamped, rate, arguments) for rate in arguments.rates]
+        rates = []
+        for rate in arguments.rates:
+            _, dropped_before = probe.counters()
+            with options.progress(f'{rate:g} Hz', quiet=quiet)(total=n) as bar:
+                trips = probe.paced(itertools.islice(stamped, n), rate, bar.update)
+            _, dropped = probe.counters()
+            found = probing.rate_result(rate, trips, dropped - dropped_before)
+            rates.append({**found, 'goals': _rate_goals(found)})
         node.check()
-        memory = _memory(probe, stamped, node, arguments) if arguments.memory_frames else {}
-    return rates, memory
-
-
-def _at_rate(
-    probe: Probe, clouds: Any, rate: float, arguments: argparse.Namespace
-) -> dict[str, Any]:
-    from gp_ground_seg.ros.probe import rate_result
-
-    n = arguments.frames
-    with progress_bar(n, quiet=arguments.quiet, title=f'{rate:g} Hz') as bar:
-        _, dropped_before = probe.counters()
-        trips = probe.paced(itertools.islice(clouds, n), rate, bar.update)
-        _, dropped = probe.counters()
-    return rate_result(rate, trips, dropped - dropped_before)
-
-
-def _memory(
-    probe: Probe, clouds: Any, node: NodeProcess, arguments: argparse.Namespace
-) -> dict[str, float]:
-    from gp_ground_seg.ros.probe import memory, memory_result
-
-    n = arguments.memory_frames
-    resident: list[int] = []
-    with progress_bar(n, quiet=arguments.quiet, title='memory') as bar:
+        resident: list[int] = []
 
         def watch(trip: Trip) -> None:
             if trip.back is None:
                 node.check()
-                raise GroundSegError(
-                    f'no answer to a cloud; the last words of the node:\n{node.log_tail()}'
-                )
-            resident.append(memory(node.pid)[0])
-            bar.update()
+                raise GroundSegError(f'no answer to a cloud; the node said:\n{node.log_tail()}')
+            resident.append(probing.memory(node.pid)[0])
 
-        probe.one_by_one(itertools.islice(clouds, n), watch)
-    return memory_result(resident, memory(node.pid)[1])
+        clouds = itertools.islice(stamped, n_memory)
+        probe.one_by_one(options.progress('memory', quiet=quiet)(clouds, total=n_memory), watch)
+        if not n_memory:
+            return rates, {}
+        memory = probing.memory_result(resident, probing.memory(node.pid)[1])
+        goals = {
+            f'peak below {MAX_PEAK / 1e6:.0f} MB': memory['peak'] < MAX_PEAK,
+            f'growth at most {MAX_GROWTH:.0%}': memory['growth'] <= MAX_GROWTH,
+        }
+        return rates, {**memory, 'goals': goals}
 
 
 def _rate_goals(rate: dict[str, Any]) -> dict[str, bool]:
@@ -280,22 +242,8 @@ def _rate_goals(rate: dict[str, Any]) -> dict[str, bool]:
     return goals
 
 
-def _memory_goals(memory: dict[str, float]) -> dict[str, bool]:
-    return {
-        f'peak below {MAX_PEAK / 1e6:.0f} MB': memory['peak'] < MAX_PEAK,
-        f'growth at most {MAX_GROWTH:.0%}': memory['growth'] <= MAX_GROWTH,
-    }
-
-
-def _goals_missed(document: dict[str, Any]) -> list[str]:
-    goals = [(f'{rate["asked"]:g} Hz', rate['goals']) for rate in document['rates']]
-    if document['memory']:
-        goals.append(('memory', document['memory']['goals']))
-    return [f'{where}: {goal}' for where, row in goals for goal, met in row.items() if not met]
-
-
 def _text(document: dict[str, Any], missed: Sequence[str]) -> str:
-    from gp_ground_seg.evaluation.table import Column, Table
+    from gp_ground_seg.evaluation.report import Column, Table
 
     columns = {
         'asked': Column('Rate [Hz]', 'g'),
@@ -312,8 +260,8 @@ def _text(document: dict[str, Any], missed: Sequence[str]) -> str:
     rows = [[rate[key] for key in columns] for rate in document['rates']]
     source, environment, memory = (document[k] for k in ('source', 'environment', 'memory'))
     parts = [
-        f'{source["data"]}: {source["title"]} of {source["mean_points"]:.0f} points, '
-        f'{source["mean_bytes"] / 1e6:.2f} MB, on average\n'
+        f'{source["data"]}: {options.count(source["n_clouds"], "cloud")} of '
+        f'{source["mean_points"]:.0f} points, {source["mean_bytes"] / 1e6:.2f} MB, on average\n'
         f'{environment["cpu"]}, {environment["n_cores"]} cores',
         Table(list(columns.values()), rows).text(),
     ]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import logging
+import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,10 @@ from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.parameters.schema import load_yaml
 
 DEFAULT_PRESET = 'default'
+FLAG = {'action': 'store_true'}
+FORCE = ('--force', 'replace output that exists', FLAG)
+QUIET = ('--quiet', 'no progress bar, no notes', FLAG)
+TO_JSON = ('--json', 'write every number to this file as well', {'metavar': 'FILE'})
 
 
 def new_parser(
@@ -39,11 +45,28 @@ def new_parser(
     )
 
 
-def positive(word: str) -> int:
+def add(parser: argparse._ActionsContainer, *options: tuple[str, str, dict[str, Any]]) -> None:
+    """Add options: names, help, and what else `add_argument` takes."""
+    for names, text, more in options:
+        parser.add_argument(*names.split(), help=text, **more)
+
+
+def positive(word: str, least: int = 1) -> int:
     """Whole number, at least 1."""
-    number = int(word) if word.isdecimal() else 0
-    if number < 1:
-        raise argparse.ArgumentTypeError(f'{word!r}: must be a whole number, at least 1')
+    if not word.isdecimal() or int(word) < least:
+        raise argparse.ArgumentTypeError(f'{word!r}: must be a whole number, at least {least}')
+    return int(word)
+
+
+def above_zero(text: str, or_zero: bool = False) -> float:
+    """Read a number above 0."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not (math.isfinite(number) and (number > 0.0 or (or_zero and number == 0.0))):
+        wanted = 'at least' if or_zero else 'above'
+        raise argparse.ArgumentTypeError(f'{text!r}: must be a number, {wanted} 0')
     return number
 
 
@@ -63,18 +86,20 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
     return parse
 
 
-def add_config_options(parser: argparse.ArgumentParser) -> None:
+def add_config(parser: argparse.ArgumentParser) -> None:
     """Add ``--preset NAME``, ``--config FILE`` and ``--set NAME=VALUE``."""
     presets = f'parameters of a sensor: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})'
-    parser.add_argument('--preset', metavar='NAME', default=DEFAULT_PRESET, help=presets)
-    parser.add_argument('--config', metavar='FILE', help='parameter file (YAML), over the preset')
-    parser.add_argument(
-        '--set', metavar='NAME=VALUE', action='append', default=[], dest='settings',
-        help='one parameter, as in --set label.ground_tolerance=0.15 (may be repeated)',
-    )  # fmt: skip
+    setting = 'one parameter, as in --set label.ground_tolerance=0.15 (may be repeated)'
+    repeated = {'action': 'append', 'default': [], 'dest': 'settings'}
+    add(
+        parser,
+        ('--preset', presets, {'metavar': 'NAME', 'default': DEFAULT_PRESET}),
+        ('--config', 'parameter file (YAML), over the preset', {'metavar': 'FILE'}),
+        ('--set', setting, {'metavar': 'NAME=VALUE', **repeated}),
+    )
 
 
-def config_from_options(arguments: argparse.Namespace) -> Config:
+def read_config(arguments: argparse.Namespace) -> Config:
     """Return the preset, changed by the file, changed by the settings."""
     config = find_preset(arguments.preset).config
     if arguments.config:
@@ -128,9 +153,7 @@ def count(number: int, noun: str) -> str:
     return f'{number} {noun}' if number == 1 else f'{number} {noun}s'
 
 
-def progress_bar(total: int, *, quiet: bool, title: str) -> tqdm[Any]:
-    """Return a progress bar over frames on standard error, silent where that is no terminal."""
+def progress(title: str, *, quiet: bool = False, unit: str = 'frame') -> partial[tqdm[Any]]:
+    """Progress bar of items, or of a `total`, on standard error if that is a terminal."""
     disable = True if quiet else None  # None: where it is no terminal.
-    return tqdm(
-        total=total, desc=title, unit='frame', file=sys.stderr, disable=disable, leave=False
-    )
+    return partial(tqdm, desc=title, unit=unit, file=sys.stderr, disable=disable, leave=False)

@@ -1,4 +1,4 @@
-"""``plot scan`` and ``plot segment``: pictures of a segmented scan."""
+"""``plot``: pictures of a segmented scan: in perspective, from above, one segment of it."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ import argparse
 import math
 from contextlib import closing
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from gp_ground_seg.cli.options import add_config_options, config_from_options, new_parser
+from gp_ground_seg.cli import options
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.metrics import GROUNDGRID
-from gp_ground_seg.plotting.perspective import plot_scan_view
+from gp_ground_seg.evaluation.metrics import GROUNDGRID, Labels
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.plotting.scan import plot_birds_eye, plot_scan_view
 from gp_ground_seg.plotting.segment import plot_segment, segment_at
+from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 
@@ -27,6 +31,14 @@ SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
   gp-ground-seg plot scan --simulate road_then_rubble -o scan.png
   gp-ground-seg plot scan --simulate urban --sensor vlp-16 --preset vlp16 -o scan.png
+"""
+
+ABOVE = """\
+Draw a scan from above: ground and obstacles; with --labels the errors beside it.
+"""
+
+ABOVE_EXAMPLES = """\
+  gp-ground-seg plot above velodyne/000000.bin --labels labels/000000.label -o errors.png
 """
 
 SEGMENT = """\
@@ -46,98 +58,127 @@ Segments are numbered counter-clockwise from straight behind.
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the command and its two pictures."""
-    description = 'Draw a segmented scan: in perspective, or one segment from the side.'
-    parser = new_parser(subparsers, 'plot', description, SCAN_EXAMPLES + SEGMENT_EXAMPLES)
+    """Declare the command and its pictures."""
+    description = 'Draw a segmented scan: in perspective, from above, or one segment of it.'
+    examples = SCAN_EXAMPLES + ABOVE_EXAMPLES + SEGMENT_EXAMPLES
+    parser = options.new_parser(subparsers, 'plot', description, examples)
     pictures = parser.add_subparsers(metavar='PICTURE', required=True)
+    number: dict[str, Any] = {'metavar': 'N', 'type': int}
+    scan = ('input', 'KITTI scan (.bin)', {'metavar': 'INPUT'})
+    labels = ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'})
 
-    scan = new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
-    source = scan.add_mutually_exclusive_group(required=True)
-    source.add_argument('input', metavar='INPUT', nargs='?', help='KITTI scan (.bin)')
-    source.add_argument('--simulate', metavar='SCENE', choices=SCENES, help=', '.join(SCENES))
-    sensor = 'sensor of the simulated scan (default: %(default)s)'
-    scan.add_argument('--sensor', choices=SENSORS, default='hdl-64e', help=sensor)
-    seed = 'of the simulated scene (default: %(default)s)'
-    scan.add_argument('--seed', metavar='N', type=int, default=0, help=seed)
-    scan.set_defaults(run=run_scan)
-
-    segment = new_parser(
-        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'one segment of a scan from the side'
+    view = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
+    options.add(
+        view.add_mutually_exclusive_group(required=True),
+        (*scan[:2], {'metavar': 'INPUT', 'nargs': '?'}),
+        ('--simulate', ', '.join(SCENES), {'metavar': 'SCENE', 'choices': SCENES}),
     )
-    segment.add_argument('input', metavar='INPUT', help='KITTI scan (.bin)')
-    which = segment.add_mutually_exclusive_group(required=True)
-    for group, option, metavar, kind, text in (
-        (which, '--segment', 'M', int, 'number of the segment'),
-        (which, '--azimuth', 'DEG', float, 'the one that looks there, 90 = left'),
-        (segment, '--labels', 'FILE', str, 'colour the points by these labels'),
-        (segment, '--max-range', 'R', float, 'range shown [m] (default: all candidates)'),
+    sensor = 'sensor of the simulated scan (default: %(default)s)'
+    options.add(
+        view,
+        ('--sensor', sensor, {'choices': SENSORS, 'default': 'hdl-64e'}),
+        ('--seed', 'of the simulated scene (default: %(default)s)', {**number, 'default': 0}),
+    )
+    above = options.new_parser(
+        pictures, 'above', ABOVE, ABOVE_EXAMPLES, 'a scan and its errors from above'
+    )
+    options.add(above, scan, labels)
+
+    segment = options.new_parser(
+        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side'
+    )
+    metres, degrees = {'metavar': 'R', 'type': float}, {'metavar': 'DEG', 'type': float}
+    shown = ('--max-range', 'range shown [m] (default: all candidates)', metres)
+    options.add(segment, scan, labels, shown)
+    options.add(
+        segment.add_mutually_exclusive_group(required=True),
+        ('--segment', 'number of the segment', number),
+        ('--azimuth', 'the one that looks there, 90 = left', degrees),
+    )
+    for picture, draw, endings in (
+        (view, _draw_view, ('.png',)),
+        (above, _draw_above, ('.png',)),
+        (segment, _draw_segment, ('.png', '.pdf')),
     ):
-        group.add_argument(option, metavar=metavar, type=kind, help=text)
-    segment.set_defaults(run=run_segment)
-
-    for picture, kinds in ((scan, '.png'), (segment, '.png or .pdf')):
-        picture.add_argument('-o', '--output', metavar='OUT', required=True, help=f'{kinds} file')
-        picture.add_argument('--force', action='store_true', help='overwrite the file')
-        add_config_options(picture)
-
-
-def run_scan(arguments: argparse.Namespace) -> int:
-    """Segment the scan and draw all of it."""
-    config = config_from_options(arguments)
-    if Path(arguments.output).suffix != '.png':
-        raise DataError(f'{arguments.output}: must end in .png')
-    _refuse_existing(arguments)
-    if arguments.input is not None:
-        points, title = read_points(arguments.input), Path(arguments.input).name
-    elif arguments.seed < 0:
-        raise DataError(f'--seed {arguments.seed}: must not be negative')
-    else:
-        scene, rng = (
-            SCENES[arguments.simulate](arguments.seed),
-            np.random.default_rng(arguments.seed),
+        output = {'metavar': 'OUT', 'required': True}
+        options.add(
+            picture, ('-o --output', f'{" or ".join(endings)} file', output), options.FORCE
         )
-        points = simulate_scan(scene, SENSORS[arguments.sensor], rng).points
-        title = f'simulated {arguments.sensor}: {arguments.simulate}'
+        options.add_config(picture)
+        picture.set_defaults(run=run, draw=draw, endings=endings)
+
+
+class Segmented(NamedTuple):
+    """A scan, its name, its true labels if known, parameters and result."""
+
+    points: npt.NDArray[np.float32]
+    title: str
+    truth: Labels | None
+    config: Config
+    result: Segmentation
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Segment the scan and draw it."""
+    config = options.read_config(arguments)
+    path = Path(arguments.output)
+    if path.suffix.lower() not in arguments.endings:
+        raise DataError(f'{path}: must end in {" or ".join(arguments.endings)}')
+    if path.exists() and not arguments.force:
+        raise DataError(f'{path}: exists already; --force replaces it')
+    points, title = _simulate(arguments) if arguments.input is None else _read(arguments.input)
+    truth = None
+    if getattr(arguments, 'labels', None) is not None:
+        truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
     with closing(GroundSegmenter(config)) as segmenter:
         result = segmenter.segment(points)
-    plot_scan_view(points, result, config, arguments.output, title)
-    print(f'{len(points)} points, written to {arguments.output}')
+    said = arguments.draw(arguments, Segmented(points, title, truth, config, result))
+    print(f'{said}, written to {path}')
     return 0
 
 
-def run_segment(arguments: argparse.Namespace) -> int:
-    """Segment the scan and draw one segment of it."""
-    config = config_from_options(arguments)
-    segment: int = arguments.segment
+def _read(path: str) -> tuple[npt.NDArray[np.float32], str]:
+    """Points of a file, and its name as in ``00/000005``."""
+    scan = Path(path)
+    folder = scan.resolve().parent
+    title = f'{folder.parent.name}/{scan.stem}' if folder.name == 'velodyne' else scan.name
+    return read_points(scan), title
+
+
+def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.float32], str]:
+    if arguments.seed < 0:
+        raise DataError(f'--seed {arguments.seed}: must not be negative')
+    scene, rng = SCENES[arguments.simulate], np.random.default_rng(arguments.seed)
+    points = simulate_scan(scene(arguments.seed), SENSORS[arguments.sensor], rng).points
+    return points, f'simulated {arguments.sensor}: {arguments.simulate}'
+
+
+def _draw_view(arguments: argparse.Namespace, scan: Segmented) -> str:
+    plot_scan_view(scan.points, scan.result, scan.config, arguments.output, scan.title)
+    return f'{len(scan.points)} points'
+
+
+def _draw_above(arguments: argparse.Namespace, scan: Segmented) -> str:
+    plot_birds_eye(scan.points, scan.result.label, arguments.output, scan.truth, scan.title)
+    return f'{len(scan.points)} points'
+
+
+def _draw_segment(arguments: argparse.Namespace, scan: Segmented) -> str:
+    segment, result = arguments.segment, scan.result
     if arguments.azimuth is not None:
         if not math.isfinite(arguments.azimuth):
             raise DataError(f'--azimuth {arguments.azimuth}: must be a number of degrees')
-        segment = segment_at(math.radians(arguments.azimuth), config.grid.n_segments)
-    _refuse_existing(arguments)
-    points = read_points(arguments.input)
-    truth = None
-    if arguments.labels is not None:
-        semantic = read_labels(arguments.labels, len(points))
-        truth = GROUNDGRID.truth(semantic, points[:, 2])
-    with closing(GroundSegmenter(config)) as segmenter:
-        result = segmenter.segment(points)
-    scan = Path(arguments.input)
-    folder = scan.resolve().parent
-    title = f'{folder.parent.name}/{scan.stem}' if folder.name == 'velodyne' else scan.name
+        segment = segment_at(math.radians(arguments.azimuth), scan.config.grid.n_segments)
     plot_segment(
-        result, config, points, segment, arguments.output, truth, title, arguments.max_range
+        result, scan.config, scan.points, segment, arguments.output, scan.truth, scan.title,
+        arguments.max_range,
+    )  # fmt: skip
+    own, pseudo = (
+        slice(*offsets[segment : segment + 2])
+        for offsets in (result.candidates.offsets, result.pseudo.offsets)
     )
-    own = slice(*result.candidates.offsets[segment : segment + 2])
-    pseudo = slice(*result.pseudo.offsets[segment : segment + 2])
-    print(
+    return (
         f'segment {segment}: {own.stop - own.start} candidates, '
         f'{int(result.surface.inlier[own].sum())} inliers, {pseudo.stop - pseudo.start} '
-        f'pseudo-inputs, written to {arguments.output}'
+        'pseudo-inputs'
     )
-    return 0
-
-
-def _refuse_existing(arguments: argparse.Namespace) -> None:
-    """Refuse early, before the scan is segmented."""
-    if Path(arguments.output).exists() and not arguments.force:
-        raise DataError(f'{arguments.output}: exists already; --force replaces it')

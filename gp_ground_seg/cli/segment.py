@@ -1,8 +1,9 @@
-"""``segment``: label scans on disk, or split the clouds of a bag."""
+"""``segment``: label scans, or split the clouds of a bag; ``pose``: height and tilt."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import statistics
 from collections.abc import Iterator, Sequence
@@ -12,14 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.options import count, note, note_leftovers, progress_bar
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE, is_bag
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.frame import Label
+from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
 
@@ -53,6 +55,21 @@ EXAMPLES = """\
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
 """
 
+POSE_DESCRIPTION = """\
+Estimate from scans how high the sensor is and how it is tilted.
+
+INPUT is a .bin scan (float32 x, y, z, intensity), a folder of them, or a sequence
+with velodyne/ in it. Each scan is judged by itself. Support is the share of the
+low points on the plane that was found, residual their distance to it. With enough
+scans of level ground the medians are values to set: docs/pose.md.
+"""
+
+POSE_EXAMPLES = """\
+  gp-ground-seg pose 000000.bin
+  gp-ground-seg pose KITTI_ROOT/sequences/00
+  gp-ground-seg pose scans --set sensor.height=1.2      does it agree?
+"""
+
 GROUND_TOPIC, OBSTACLES_TOPIC = '/ground', '/obstacles'
 """Topics of the clouds in the output, unless others are given."""
 
@@ -65,41 +82,43 @@ _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the command."""
+    """Declare the commands."""
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
-    parser.add_argument('input', metavar='INPUT', help='scan, folder of scans, or bag')
     output = (
         'for scans a folder, or a .label file for a single scan; for bags a folder, or a '
         '.mcap or .db3 file (default: INPUT with _ground added, beside it)'
     )
-    parser.add_argument('-o', '--output', metavar='OUT', help=output)
-    parser.add_argument('--force', action='store_true', help='replace output that exists')
-    parser.add_argument('--quiet', action='store_true', help='no progress bar, no notes')
-    options.add_config_options(parser)
-    scans = parser.add_argument_group('for scans')
+    options.add(
+        parser,
+        ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
+        ('-o --output', output, {'metavar': 'OUT'}),
+        options.FORCE,
+        options.QUIET,
+    )
+    options.add_config(parser)
     raw = 'write 0 unknown, 1 ground, 2 obstacle as labels'
-    scans.add_argument('--raw', action='store_true', help=raw)
-    bags = parser.add_argument_group('for bags')
-    for option, text in (
-        ('--topic', 'PointCloud2 topic (default: the only one there is)'),
-        ('--ground-topic', f'topic of the ground (default: {GROUND_TOPIC})'),
-        ('--obstacles-topic', f'topic of the obstacles (default: {OBSTACLES_TOPIC})'),
-    ):
-        bags.add_argument(option, metavar='T', help=text)
-    drop = 'leave this topic out of the output (may be repeated)'
-    bags.add_argument('--drop', metavar='T', action='append', default=[], help=drop)
+    options.add(parser.add_argument_group('for scans'), ('--raw', raw, options.FLAG))
     storage = 'storage of the output (default: by its name, else as the input; mcap for ROS 1)'
-    bags.add_argument('--format', choices=SUFFIX_OF_STORAGE, help=storage)
+    topic, several = {'metavar': 'T'}, {'metavar': 'T', 'action': 'append', 'default': []}
+    options.add(
+        parser.add_argument_group('for bags'),
+        ('--topic', 'PointCloud2 topic (default: the only one there is)', topic),
+        ('--ground-topic', f'topic of the ground (default: {GROUND_TOPIC})', topic),
+        ('--obstacles-topic', f'topic of the obstacles (default: {OBSTACLES_TOPIC})', topic),
+        ('--drop', 'leave this topic out of the output (may be repeated)', several),
+        ('--format', storage, {'choices': SUFFIX_OF_STORAGE}),
+    )
     parser.set_defaults(run=run)
 
-
-_Counts = tuple[int, int, float]
-"""Points, those of them that are ground, and seconds of one frame."""
+    parser = options.new_parser(subparsers, 'pose', POSE_DESCRIPTION, POSE_EXAMPLES)
+    options.add(parser, ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}))
+    options.add_config(parser)
+    parser.set_defaults(run=run_pose)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
-    config = options.config_from_options(arguments)
+    config = options.read_config(arguments)
     source = Path(arguments.input)
     holds_bag = is_bag(source) or _holds_bag_files(source)
     scans = [] if holds_bag else find_scans(source)
@@ -114,15 +133,19 @@ def run(arguments: argparse.Namespace) -> int:
             frames = _segment_bag(target, arguments, segmenter)
         else:
             frames = _segment_scans(scans, target, arguments, segmenter)
-    all_points, all_ground, seconds = zip(*frames, strict=True)
-    n_points, n_ground = sum(all_points), sum(all_ground)
+    n_points = sum(frame[0] for frame in frames)
+    n_ground = sum(frame[1] for frame in frames)
     share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
-    time = statistics.median(seconds)
+    time = statistics.median(frame[2] for frame in frames)
     print(
-        f'{count(len(frames), "frame")}, {count(n_points, "point")}, {share}, '
+        f'{options.count(len(frames), "frame")}, {options.count(n_points, "point")}, {share}, '
         f'{1e3 * time:.1f} ms per frame (median, segmentation only), written to {target}'
     )
     return 0
+
+
+_Counts = tuple[int, int, float]
+"""Points, those of them that are ground, and seconds of one frame."""
 
 
 def _count(result: Segmentation) -> _Counts:
@@ -146,10 +169,7 @@ def _default_output(source: Path) -> Path:
 
 
 def find_scans(source: Path) -> list[Path]:
-    """Return the .bin files that a file, folder, sequence or KITTI raw drive stands for, in order.
-
-    Raises `DataError` if there is none; the message says what was expected.
-    """
+    """Return the .bin files of a file, folder, sequence or KITTI raw drive, or raise DataError."""
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
     if source.is_file():
@@ -162,11 +182,11 @@ def find_scans(source: Path) -> list[Path]:
     for name in _SCAN_FOLDERS:
         if scans := sorted((source / name).glob('*.bin')):
             return scans
-    sequences = sorted(path.parent.name for path in source.glob('sequences/*/velodyne'))
+    sequences = sorted(path.parent for path in source.glob('sequences/*/velodyne'))
     hint = ''
     if sequences:
-        first = source / 'sequences' / sequences[0]
-        hint = f'; give one of its sequences ({", ".join(sequences)}), as in {first}'
+        names = ', '.join(path.name for path in sequences)
+        hint = f'; give one of its sequences ({names}), as in {sequences[0]}'
     raise DataError(f'{source}: no .bin file in it, and not a rosbag2 folder{hint}')
 
 
@@ -178,10 +198,10 @@ def _segment_scans(
     codes = sorted(Label) if arguments.raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
     code = np.array(codes, dtype='<u4')
     if not arguments.quiet:
-        note_leftovers(target)
+        options.note_leftovers(target)
     with (
         _label_files(scans, target, arguments) as label_paths,
-        progress_bar(len(scans), quiet=arguments.quiet, title='segment') as bar,
+        options.progress('segment', quiet=arguments.quiet)(total=len(scans)) as bar,
     ):
         for scan, label_path in zip(scans, label_paths, strict=True):
             try:
@@ -231,16 +251,13 @@ def _segment_bag(
         if storage is None and target.suffix not in BAG_SUFFIXES and bag.storage != 'ros1':
             storage = bag.storage
         if not arguments.quiet:
-            note_leftovers(target)
-            for name in bag.migrated_topics:
-                if name in copied:
-                    note(
-                        f'topic {name}: {bag.topics[name]} has other fields in ROS 2; those of '
-                        'the same name are kept, new ones are zero'
-                    )
+            options.note_leftovers(target)
+            for name in set(bag.migrated_topics) & set(copied):
+                kind = bag.topics[name]
+                options.note(f'topic {name}: {kind} has other fields in ROS 2; new ones are zero')
         with (
             BagWriter(target, storage=storage, force=arguments.force) as output,
-            progress_bar(bag.n_messages(topic), quiet=arguments.quiet, title='segment') as bar,
+            options.progress('segment', quiet=arguments.quiet)(total=bag.n_messages(topic)) as bar,
         ):
             for name in copied:
                 output.add_topic(bag.topic(name))
@@ -272,9 +289,67 @@ def _check_output_topics(source: Path, topics: tuple[str, str], copied: list[str
         if not _TOPIC_NAME.fullmatch(name):
             raise DataError(f'{option} {name}: must be a full topic name, as in {GROUND_TOPIC}')
         if name in copied:
-            raise DataError(
-                f'{source}: has a topic {name} already; choose another with {option}, '
-                f'or leave that one out with --drop {name}'
-            )
+            choices = f'choose another with {option}, or leave that one out with --drop {name}'
+            raise DataError(f'{source}: has a topic {name} already; {choices}')
     if topics[0] == topics[1]:
         raise DataError(f'--obstacles-topic {topics[1]}: is the topic of the ground as well')
+
+
+DEGREES = math.degrees(1.0)
+POSE_COLUMNS = (
+    Column('scan'),
+    Column('height [m]', '.2f'),
+    Column('roll [deg]', '+.2f', scale=DEGREES),
+    Column('pitch [deg]', '+.2f', scale=DEGREES),
+    percent('support [%]', form='.0f'),
+    Column('residual [m]', '.3f'),
+    Column('used as'),
+)
+
+
+def run_pose(arguments: argparse.Namespace) -> int:
+    """Print a line for each scan, and the medians."""
+    poses, rows, notes = [], [], []
+    with closing(GroundSegmenter(options.read_config(arguments))) as segmenter:
+        for scan in find_scans(Path(arguments.input)):
+            try:
+                pose = segmenter.estimate_pose(read_points(scan))
+            except PointCloudError as error:
+                notes.append(f'{scan.name}: refused: {error}')
+                continue
+            poses.append(pose)
+            rows.append(_pose_row(scan.name, pose))
+            notes += [f'{scan.name}: {line}' for line in pose.contradictions]
+    if poses:
+        print(Table(POSE_COLUMNS, rows).text())
+        notes.insert(0, _pose_summary(poses))
+    print('\n'.join(notes))
+    return 0
+
+
+def _pose_row(name: str, pose: SensorPose) -> list[Cell]:
+    """Return what was measured, where the scan tells it, and the values used."""
+    used = f'height {pose.height:.2f}'
+    if not pose.height_estimated:
+        used = f'height {pose.height:g} (not measured)'
+    if not pose.is_level:
+        used += f', roll {math.degrees(pose.roll):.1f} pitch {math.degrees(pose.pitch):.1f}'
+    found = pose.measured
+    if found is None or not found.tells_height:
+        return [name, *5 * [None], used]
+    tilt = (found.roll, found.pitch) if found.tells_tilt else (None, None)
+    return [name, found.height, *tilt, found.plane.support, found.plane.residual, used]
+
+
+def _pose_summary(poses: list[SensorPose]) -> str:
+    """Return the medians over the scans that tell, as parameters."""
+    found = [pose.measured for pose in poses if pose.measured is not None]
+    heights = [one.height for one in found if one.tells_height]
+    tilts = [(one.roll, one.pitch) for one in found if one.tells_tilt]
+    if not heights:
+        return 'no scan shows enough ground to tell the height: set sensor.height'
+    words = f'median of {len(heights)}: sensor.height={statistics.median(heights):.2f}'
+    if tilts:
+        roll, pitch = (statistics.median(angles) for angles in zip(*tilts, strict=True))
+        words += f' sensor.roll={roll:.3f} sensor.pitch={pitch:.3f} [m, rad]'
+    return words

@@ -1,49 +1,37 @@
-"""Time per frame by stage, alternately with a baseline, and its growth with the problem."""
+"""Time per frame by stage, alternately with a baseline."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.environment import Environment, changed_parameters
-from gp_ground_seg.evaluation.evaluate import Progress
-from gp_ground_seg.evaluation.methods import Method, OurMethod
+from gp_ground_seg.evaluation.evaluate import Method, OurMethod, Progress
+from gp_ground_seg.evaluation.report import changed_parameters
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.schema import ParameterValue
 from gp_ground_seg.result import FitReport
-
-Points = npt.NDArray[np.float32]
 
 MODES = {'fixed': 'theta fixed', 'every_frame': 'learning'}
 """Values of ``learning.mode`` that are timed, and their titles."""
-N_MERGED = 4
-"""Largest number of successive frames that are merged to one cloud."""
-N_GROWTH_FRAMES, N_GROWTH_RUNS = 6, 3
 
 
 @dataclass(frozen=True)
 class BenchFrame:
     """A cloud in memory, (N, 4) x, y, z [m] and intensity.
 
-    What is temporal starts anew with each sequence. The baseline runs on `baseline_points`
-    where there are some.
+    What is temporal starts anew with each sequence.
     """
 
     sequence: str
     index: str
-    points: Points
-    baseline_points: Points | None = None
+    points: npt.NDArray[np.float32]
 
 
 class FrameTime(NamedTuple):
@@ -59,14 +47,6 @@ class FrameTime(NamedTuple):
     def ratio(self) -> float:
         """Time over that of the baseline."""
         return self.seconds / self.baseline
-
-
-class Growth(NamedTuple):
-    """Parameters changed, or a share of the points of a frame; above 1, of successive ones."""
-
-    series: str
-    changes: dict[str, ParameterValue]
-    share: float = 1.0
 
 
 def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> dict[str, Config]:
@@ -87,7 +67,7 @@ def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> 
 def run_cases(
     frames: Sequence[BenchFrame],
     cases: Mapping[str, Config],
-    make_baseline: Callable[[str], Method] | None = None,
+    make_baseline: Callable[[], Method] | None = None,
     n_passes: int = 1,
     clock: Callable[[], float] = time.perf_counter,
     progress: Progress = iter,
@@ -99,26 +79,18 @@ def run_cases(
     is the first, changes from frame to frame. Before the first frame counts, each has
     run on it: compilation and first allocations are not its speed.
 
-    Parameters
-    ----------
-    frames : sequence of BenchFrame
-        At least one, grouped by sequence.
-    cases : mapping of str to Config
-        What to time, by title, such as ``learning, 1 thread``.
-    make_baseline : callable, optional
-        Makes the baseline of a case, which sees every frame as often as the case does.
+    `frames` are grouped by sequence; `cases` are what to time, by title, such as ``learning, 1
+    thread``; `make_baseline` makes the baseline of each, which sees every frame as often.
     """
     names = list(cases)
     with ExitStack() as stack:
         pairs: list[tuple[OurMethod, Method | None]] = []
         for name in names:
             ours = stack.enter_context(closing(OurMethod(cases[name])))
-            baseline = make_baseline(name) if make_baseline is not None else None
-            if baseline is not None:
-                stack.enter_context(closing(baseline))
+            baseline = make_baseline() if make_baseline is not None else None
             pairs.append((ours, baseline))
             for method in (ours, ours, baseline):  # does not count
-                _time(method, frames[0], clock, method is baseline)
+                _time(method, frames[0], clock)
         times: dict[str, list[FrameTime]] = {name: [] for name in names}
         sequence = None
         for k, frame in enumerate(progress([*frames] * n_passes)):
@@ -128,120 +100,26 @@ def run_cases(
                 for method in order:
                     if method is not None and frame.sequence != sequence:
                         method.reset()
-                seconds = [_time(method, frame, clock, method is baseline) for method in order]
-                result = ours.result()
-                assert result.fit is not None
+                seconds = [_time(method, frame, clock) for method in order]
                 own, other = seconds[order.index(ours)], seconds[order.index(baseline)]
-                found = FrameTime(frame, own, result.stages, other, result.fit)
+                found = FrameTime(frame, own, ours.stages, other, ours.last.fit)
                 times[names[j % len(names)]].append(found)
             sequence = frame.sequence
     return times
 
 
-def _time(
-    method: Method | None, frame: BenchFrame, clock: Callable[[], float], is_baseline: bool
-) -> float:
+def _time(method: Method | None, frame: BenchFrame, clock: Callable[[], float]) -> float:
     if method is None:
         return math.nan
-    points = frame.points
-    if is_baseline and frame.baseline_points is not None:
-        points = frame.baseline_points
     start = clock()
-    method.run(points)
+    method.run(frame.points)
     return clock() - start
-
-
-def spread(n_available: int, n_wanted: int) -> list[int]:
-    """Return the indices of `n_wanted` items, or of all there are, spread evenly."""
-    n = min(n_available, n_wanted)
-    return [(2 * k + 1) * n_available // (2 * n) for k in range(n)]
-
-
-def merged_groups(frames: Sequence[BenchFrame]) -> list[list[BenchFrame]]:
-    """Group `N_MERGED` successive frames of a sequence each; a rest is left out."""
-    groups = []
-    for _, sequence in groupby(frames, key=lambda frame: frame.sequence):
-        own = list(sequence)
-        groups += [own[k : k + N_MERGED] for k in range(0, len(own) - N_MERGED + 1, N_MERGED)]
-    return groups
-
-
-def growth_sizes(config: Config) -> list[Growth]:
-    """Sizes to time: factors of the parameters given, as far as they are accepted."""
-    sizes = [Growth('points', {}, share) for share in (0.125, 0.25, 0.5, 1.0, 2.0, 4.0)]
-    for name in ('grid.n_segments', 'grid.n_bins'):
-        given = config[name]
-        assert isinstance(given, int)
-        sizes += [Growth(name, {name: round(f * given)}) for f in (0.25, 0.5, 1.0, 2.0, 4.0)]
-    # The most first: many candidates for each pseudo-input leave few of them.
-    name = 'latent.candidates_per_pseudo_input'
-    sizes += [Growth('pseudo-inputs', {name: n}) for n in (12.0, 6.0, 3.0, 1.5, 1.0)]
-
-    def is_accepted(size: Growth) -> bool:
-        try:
-            config.replace(**size.changes)
-        except ConfigError:
-            return False
-        return True
-
-    return [size for size in sizes if is_accepted(size)]
-
-
-def time_growth(
-    frames: Sequence[BenchFrame],
-    config: Config,
-    clock: Callable[[], float] = time.perf_counter,
-    progress: Progress = iter,
-) -> list[dict[str, Any]]:
-    """Time one size after the other, each beside one frame under `config`, on one thread.
-
-    Up to six groups of successive frames are used, spread evenly; sizes that need more frames
-    than there are are left out. A row has series and size, and by mode the median time [ms] and
-    the median ratio to the time of the frame as it is.
-    """
-    groups = merged_groups(frames) or [[frame] for frame in frames]
-    chosen = [groups[k] for k in spread(len(groups), N_GROWTH_FRAMES)]
-    given = {
-        mode: config.replace(**{'learning.mode': mode, 'runtime.n_threads': 1}) for mode in MODES
-    }
-    rows = []
-    for size in progress(growth_sizes(config)):
-        if size.share > min(map(len, chosen)):
-            continue
-        clouds = [
-            BenchFrame(group[0].sequence, group[0].index, _share_of(group, size.share),
-                       baseline_points=group[0].points)
-            for group in chosen
-        ]  # fmt: skip
-        cases = {mode: one.replace(**size.changes) for mode, one in given.items()}
-        found = run_cases(clouds, cases, lambda mode: OurMethod(given[mode]), N_GROWTH_RUNS, clock)
-        counts = {
-            'points': statistics.median(len(cloud.points) for cloud in clouds),
-            'pseudo-inputs': statistics.median(t.fit.n_pseudo_inputs for t in found['fixed']),
-            **size.changes,
-        }
-        row: dict[str, Any] = {'series': size.series, 'size': counts[size.series]}
-        for mode, times in found.items():
-            row[f'{mode}_ms'] = _ms(statistics.median(one.seconds for one in times))
-            row[f'{mode}_ratio'] = round(statistics.median(one.ratio for one in times), 4)
-        rows.append(row)
-    return rows
-
-
-def _share_of(group: Sequence[BenchFrame], share: float) -> Points:
-    """So many times the points of the first frame, by random rows or further frames."""
-    if share >= 1.0:  # unregistered
-        return np.concatenate([frame.points for frame in group[: round(share)]])
-    points = group[0].points
-    rows = np.random.default_rng(0).permutation(len(points))[: round(share * len(points))]
-    return points[np.sort(rows)]
 
 
 def bench_document(
     cases: Mapping[str, Sequence[FrameTime]],
-    growth: list[dict[str, Any]],
     config: Config,
-    environment: Environment,
+    environment: dict[str, Any],
     baseline: str | None,
     data: str,
 ) -> dict[str, Any]:
@@ -258,11 +136,10 @@ def bench_document(
         'n_frames': len({(one.frame.sequence, one.frame.index) for one in times}),
         'n_points': {'median': statistics.median(points), 'max': max(points)},
         'config_changes': changed_parameters(config),
-        'environment': dataclasses.asdict(environment),
+        'environment': environment,
         'baseline': baseline,
         'baseline_ms': _spread(peer) if baseline else None,
         'cases': [_case(name, own, baseline is not None) for name, own in cases.items()],
-        'growth': growth,
     }
 
 

@@ -1,19 +1,21 @@
-"""Methods over scans whose truth is known: scores by scan, and their sums."""
+"""Methods over scans whose truth is known: ours and Patchwork++, scores by scan, their sums."""
 
 from __future__ import annotations
 
-import functools
+import contextlib
 import math
-import operator
+import os
 import statistics
+import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import KDTree
 
 from gp_ground_seg.data.semantic_kitti import (
     Frame,
@@ -22,87 +24,177 @@ from gp_ground_seg.data.semantic_kitti import (
     read_labels,
     read_points,
 )
-from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.evaluation.calibration import Calibration, count_calibration
-from gp_ground_seg.evaluation.methods import TITLES, Method
-from gp_ground_seg.evaluation.metrics import (
-    CONVENTIONS,
-    GROUNDGRID,
-    ClassCount,
-    Confusion,
-    HeightError,
-    Labels,
-    count_classes,
-    count_confusion,
-    count_rings,
-    height_error,
-    pool_height_errors,
-)
-from gp_ground_seg.frame import BoolArray, Label
+from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.evaluation import metrics
+from gp_ground_seg.evaluation.metrics import CONVENTIONS, GROUNDGRID, Confusion, Labels
+from gp_ground_seg.frame import BoolArray, FloatArray, Label
+from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import FitReport
+from gp_ground_seg.segmenter import GroundSegmenter
+
+OURS = 'gp_ground_seg'
+PATCHWORKPP = 'patchworkpp'
+TITLES = {PATCHWORKPP: 'Patchwork++'}
+"""Names of methods in tables, where they differ from those in files."""
 
 ALL = 'all'
 Progress = Callable[[Sequence[Any]], Iterable[Any]]
 """Wraps items to show how far the work is, as tqdm does."""
+Points = npt.NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """What a method says of a scan."""
+
+    label: Labels  # (N,)
+    ground_z: FloatArray  # (N,) height of the ground under each point [m]; NaN = no model
+    p_ground: npt.NDArray[np.floating] | None = None  # (N,), where it has probabilities
+    stages: dict[str, float] = field(default_factory=dict)  # seconds
+    pose: SensorPose | None = None
+    fit: FitReport | None = None
+
+
+class Method(Protocol):
+    """Something that labels scans, one sequence after the other."""
+
+    name: str
+
+    def reset(self) -> None:
+        """Forget what was learned from earlier scans."""
+
+    def run(self, points: Points) -> None:
+        """Segment a scan of (N, 4) x, y, z, intensity: the part that is timed."""
+
+    def result(self) -> MethodResult:
+        """Return the result of the last scan."""
+
+
+class OurMethod:
+    """`GroundSegmenter` as a method; `last` is its last result."""
+
+    def __init__(self, config: Config, name: str = OURS) -> None:
+        self.name = name
+        self._segmenter = GroundSegmenter(config)
+
+    def reset(self) -> None:
+        """Forget what was learned."""
+        self._segmenter.reset()
+
+    def run(self, points: Points) -> None:
+        """Segment a scan."""
+        self.last = self._segmenter.segment(points)
+
+    @property
+    def stages(self) -> dict[str, float]:
+        """Seconds of each stage of the last scan."""
+        timings = self.last.timings
+        return {stage: timings[stage] for stage in timings if stage != 'total'}
+
+    def result(self) -> MethodResult:
+        """Return all there is of the last scan."""
+        last = self.last
+        return MethodResult(
+            last.label, last.ground_z, last.p_ground, self.stages, last.pose, last.fit
+        )
+
+    def close(self) -> None:
+        """End the worker threads."""
+        self._segmenter.close()
+
+
+class PatchworkppMethod:
+    """Patchwork++ (Lee, Lim, Myung, IROS 2022) from PyPI, with its published parameters.
+
+    Its thresholds adapt over a sequence. The published sensor height [m], that of KITTI, is its
+    default. Raises MissingDependencyError if pypatchworkpp is not installed.
+    """
+
+    name = PATCHWORKPP
+
+    def __init__(self, sensor_height: float | None = None) -> None:
+        try:
+            import pypatchworkpp
+        except ImportError as error:
+            raise MissingDependencyError('patchworkpp: pip install pypatchworkpp') from error
+        self._module = pypatchworkpp
+        self._sensor_height = sensor_height
+        self.reset()
+
+    def reset(self) -> None:
+        """Start anew with its default thresholds."""
+        with _c_stdout_silenced():  # it greets on standard output, which is for tables
+            parameters = self._module.Parameters()
+            if self._sensor_height is not None:
+                parameters.sensor_height = self._sensor_height
+            self._uprightness = float(parameters.uprightness_thr)
+            self._estimator = self._module.patchworkpp(parameters)
+
+    def run(self, points: Points) -> None:
+        """Segment a scan."""
+        self._points = points
+        self._estimator.estimateGround(points)
+
+    def result(self) -> MethodResult:
+        """Labels, and the plane of the nearest upright patch: it has no surface of its own."""
+        label = np.full(len(self._points), Label.OBSTACLE, dtype=np.uint8)
+        label[self._estimator.getGroundIndices()] = Label.GROUND
+        centre = np.asarray(self._estimator.getCenters(), dtype=np.float64).reshape(-1, 3)
+        normal = np.asarray(self._estimator.getNormals(), dtype=np.float64).reshape(-1, 3)
+        upright = np.abs(normal[:, 2]) > self._uprightness
+        centre, normal = centre[upright], normal[upright]
+        if not len(centre):
+            return MethodResult(label, np.full(len(label), np.nan))
+        xy = self._points[:, :2].astype(np.float64)
+        _, nearest = KDTree(centre[:, :2]).query(xy)
+        centre, normal = centre[nearest], normal[nearest]
+        fall = np.sum((xy - centre[:, :2]) * normal[:, :2], axis=1) / normal[:, 2]
+        return MethodResult(label, np.asarray(centre[:, 2] - fall))
+
+
+@contextlib.contextmanager
+def _c_stdout_silenced() -> Iterator[None]:
+    """Keep what C++ code writes to standard output away from it."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    try:
+        with open(os.devnull, 'wb') as sink:
+            os.dup2(sink.fileno(), 1)
+            yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 @dataclass(frozen=True)
 class KnownScan:
-    """A scan of N points whose truth is known.
+    """A scan of N points whose truth is known."""
 
-    Attributes
-    ----------
-    sequence, index : str
-        Sequence, or another group of scans that belong together; name within it.
-    points : (N, >=3) float
-        x, y, z [m], and intensity.
-    truths : dict of str to (N,) uint8
-        True `Label` by key of the convention, the one that counts first; UNKNOWN where a
-        point does not count.
-    semantic, ground_z : (N,) int or None, (N,) float or None
-        Semantic classes and true height of the ground [m], if known.
-    parts : dict of str to (N,) bool
-        Points under which the surface is compared with `ground_z`, by name of the part.
-    """
-
-    sequence: str
-    index: str
-    points: npt.NDArray[Any]
+    sequence: str  # or another group of scans that belong together
+    index: str  # name within it
+    points: npt.NDArray[Any]  # (N, >=3) x, y, z [m], and intensity
     truths: dict[str, Labels]
-    semantic: npt.NDArray[np.integer] | None = None
-    ground_z: npt.NDArray[np.floating] | None = None
-    parts: dict[str, BoolArray] = field(default_factory=dict)
+    """True `Label` (N,) by convention, the one that counts first; UNKNOWN does not count."""
+    semantic: npt.NDArray[np.integer] | None = None  # (N,) classes, if known
+    ground_z: npt.NDArray[np.floating] | None = None  # (N,) true height of the ground [m]
+    is_ground: BoolArray | None = None  # (N,) points under which the surface is compared with it
 
 
 @dataclass(frozen=True)
 class ScanScore:
-    """How one method did on one scan.
-
-    Attributes
-    ----------
-    seconds, stages : float, dict of str to float
-        Time of the segmentation without reading, and by stage if the method measures it.
-    confusions : dict of str to Confusion
-        By key of the convention, the one that counts first.
-    heights, classes : dict of str to HeightError, dict of int to ClassCount
-        By part of the ground, and by number of the semantic class, as far as they are known.
-    rings : tuple of Confusion
-        By `RING_TITLES`.
-    calibration, pose, fit : Calibration, SensorPose, FitReport or None
-        Where the method has probabilities; of our own method.
-    """
+    """How one method did on one scan."""
 
     sequence: str
     index: str
-    seconds: float
-    stages: dict[str, float] = field(default_factory=dict)
-    confusions: dict[str, Confusion] = field(default_factory=dict)
-    heights: dict[str, HeightError] = field(default_factory=dict)
-    classes: dict[int, ClassCount] = field(default_factory=dict)
-    rings: tuple[Confusion, ...] = ()
-    calibration: Calibration | None = None
-    pose: SensorPose | None = None
+    seconds: float  # without reading
+    stages: dict[str, float] = field(default_factory=dict)  # seconds, if the method tells them
+    confusions: dict[str, Confusion] = field(default_factory=dict)  # as `KnownScan.truths`
+    height: metrics.HeightError | None = None  # where the truth is known
+    classes: dict[int, metrics.ClassCount] = field(default_factory=dict)
+    rings: tuple[Confusion, ...] = ()  # by `RING_TITLES`
+    calibration: metrics.Calibration | None = None  # where the method has probabilities
+    pose: SensorPose | None = None  # of our own method
     fit: FitReport | None = None
 
     @property
@@ -113,7 +205,7 @@ class ScanScore:
 
 @dataclass(frozen=True)
 class MethodScore:
-    """How one method, or one variant of ours, did on all scans, in the order of the scans."""
+    """How one method, or one variant of ours, did on all scans, in their order."""
 
     name: str
     scans: tuple[ScanScore, ...]
@@ -128,10 +220,8 @@ class MethodScore:
         """Names of the sequences, in order."""
         return list(dict.fromkeys(scan.sequence for scan in self.scans))
 
-    def of(self, *sequences: str | None) -> MethodScore:
-        """Return the part of some sequences; None stands for all."""
-        if None in sequences:
-            return self
+    def of(self, *sequences: str) -> MethodScore:
+        """Return the part of some sequences."""
         return MethodScore(self.name, tuple(s for s in self.scans if s.sequence in sequences))
 
     def by_sequence(self) -> list[tuple[str, MethodScore]]:
@@ -155,15 +245,16 @@ class MethodScore:
     @property
     def ece(self) -> float:
         """Expected calibration error; NaN without probabilities."""
-        calibration = self.calibration
-        return math.nan if calibration is None else calibration.ece
+        return math.nan if self.calibration is None else self.calibration.ece
 
     @property
-    def classes(self) -> dict[int, ClassCount]:
+    def classes(self) -> dict[int, metrics.ClassCount]:
         """Sum of the counts by class, by ascending class number."""
         numbers = sorted({number for scan in self.scans for number in scan.classes})
         counts = {n: [s.classes[n] for s in self.scans if n in s.classes] for n in numbers}
-        return {n: ClassCount(*map(sum, zip(*own, strict=True))) for n, own in counts.items()}
+        return {
+            n: metrics.ClassCount(*map(sum, zip(*own, strict=True))) for n, own in counts.items()
+        }
 
     @property
     def rings(self) -> tuple[Confusion, ...]:
@@ -172,15 +263,17 @@ class MethodScore:
         return tuple(sum(ring, Confusion()) for ring in by_ring)
 
     @property
-    def calibration(self) -> Calibration | None:
+    def calibration(self) -> metrics.Calibration | None:
         """Sum over the scans; None unless every scan has one."""
         found = [scan.calibration for scan in self.scans if scan.calibration is not None]
-        complete = found and len(found) == len(self.scans)
-        return functools.reduce(operator.add, found) if complete else None
+        if not found or len(found) < len(self.scans):
+            return None
+        return sum(found[1:], found[0])
 
-    def height(self, part: str = ALL) -> HeightError:
-        """Pooled height error of a part of the ground."""
-        return pool_height_errors([scan.heights[part] for scan in self.scans])
+    @property
+    def height(self) -> metrics.HeightError:
+        """Pooled height error."""
+        return metrics.pool_height_errors([s.height for s in self.scans if s.height is not None])
 
     def seconds(self, average: Callable[[list[float]], float] = statistics.median) -> float:
         """Average time per scan; NaN without scans."""
@@ -201,45 +294,34 @@ def pool(name: str, scores: Iterable[MethodScore]) -> MethodScore:
 def labelled_frames(root: str | Path, sequences: Sequence[str] | None = None) -> list[Frame]:
     """Frames of the named sequences, or of all, in order.
 
-    Raises DataError if a sequence is not there or named twice, or a frame has no labels.
+    Raises DataError if a sequence is not there, or a frame has no labels.
     """
     known = list_sequences(root)
-    chosen = known if sequences is None else list(sequences)
+    chosen = list(dict.fromkeys(known if sequences is None else sequences))
     unknown = [name for name in chosen if name not in known]
     if unknown or not chosen:
         problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
         raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
-    if len(set(chosen)) < len(chosen):
-        raise DataError(f'sequences {", ".join(chosen)}: one is named twice')
-    frames = {name: list_frames(root, name) for name in chosen}
-    bare = {name: [f for f in found if f.labels_path is None] for name, found in frames.items()}
-    labelled = ','.join(name for name in chosen if not bare[name])
-    for name, missing in bare.items():
-        if missing:
-            raise DataError(
-                f'{root}: {len(missing)} of {len(frames[name])} frames of sequence {name} have no '
-                f'labels, the first is {missing[0].index}; wholly labelled: {labelled or "none"}'
-            )
-    return [frame for found in frames.values() for frame in found]
+    frames = []
+    for name in chosen:
+        own = list_frames(root, name)
+        bare = [frame.index for frame in own if frame.labels_path is None]
+        if bare:
+            raise DataError(f'{root}: frames of sequence {name} have no labels, as {bare[0]}')
+        frames += own
+    return frames
 
 
 def load_kitti(frame: Frame) -> KnownScan:
-    """Read a labelled frame; the ground whose height counts is what is labelled ground.
-
-    Raises DataError if it has no labels, or a file cannot be read or does not fit.
-    """
+    """Read a labelled frame; the ground whose height counts is what is labelled ground."""
     if frame.labels_path is None:
         raise DataError(f'{frame.points_path}: has no labels')
     points = read_points(frame.points_path)
     semantic = read_labels(frame.labels_path, len(points))
     z = points[:, 2].astype(np.float64)
     truths = {one.key: one.truth(semantic, points[:, 2]) for one in CONVENTIONS}
-    parts = {ALL: truths[GROUNDGRID.key] == Label.GROUND}
-    return KnownScan(frame.sequence, frame.index, points, truths, semantic, z, parts)
-
-
-Observer = Callable[[str, KnownScan, ScanScore, Labels], None]
-"""Called as a scan is scored with the name of the method, the scan, its score, its labels."""
+    is_ground = truths[GROUNDGRID.key] == Label.GROUND
+    return KnownScan(frame.sequence, frame.index, points, truths, semantic, z, is_ground)
 
 
 def score_methods(
@@ -248,29 +330,16 @@ def score_methods(
     methods: Sequence[Method],
     *,
     each_alone: bool = False,
-    observe: Observer | None = None,
     clock: Callable[[], float] = time.perf_counter,
     progress: Progress = iter,
 ) -> list[MethodScore]:
     """Run methods alternately on the same scans and score each run, in the order of `methods`.
 
     Which method goes first changes from scan to scan. Before the first scan counts, each method
-    has run on it once: compilation and first allocations are not its speed. One scan at a time
-    is in memory. Methods are reset before each sequence, or with `each_alone` before each scan.
-
-    Parameters
-    ----------
-    items, load : sequence, callable
-        What is loaded, such as frames, grouped by sequence, and by what.
-    methods : sequence of Method
-        Each with a name of its own.
-    observe, clock, progress : callable
-        Sees each scan as it is scored; source of seconds; wraps the items.
-
-    Raises
-    ------
-    PointCloudError
-        If a method refuses a scan; what `load` raises is passed on.
+    has run on it once: compilation and first allocations are not its speed. `items`, grouped by
+    sequence, are loaded one by one. Methods, each with a name of its own, are reset before each
+    sequence, or with `each_alone` before each scan. Raises PointCloudError if a method refuses a
+    scan.
     """
     scores: dict[str, list[ScanScore]] = {method.name: [] for method in methods}
     sequence = None
@@ -286,11 +355,7 @@ def score_methods(
                 method.reset()
             start = clock()
             _run(method, scan)
-            seconds = clock() - start
-            score, label = _score(scan, method, seconds)
-            scores[method.name].append(score)
-            if observe is not None:
-                observe(method.name, scan, score, label)
+            scores[method.name].append(_score(scan, method, clock() - start))
     return [MethodScore(name, tuple(found)) for name, found in scores.items()]
 
 
@@ -301,25 +366,25 @@ def _run(method: Method, scan: KnownScan) -> None:
         raise PointCloudError(f'{scan.sequence}/{scan.index}: {method.name}: {error}') from error
 
 
-def _score(scan: KnownScan, method: Method, seconds: float) -> tuple[ScanScore, Labels]:
+def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
     result = method.result()
     label, p_ground = result.label, result.p_ground
     truth = next(iter(scan.truths.values()))
-    heights = {}
-    if scan.ground_z is not None and scan.parts:
-        z, estimate = scan.ground_z, method.ground_z()
-        heights = {name: height_error(z[own], estimate[own]) for name, own in scan.parts.items()}
-    score = ScanScore(
+    height = None
+    if scan.ground_z is not None:
+        height = metrics.height_error(
+            scan.ground_z[scan.is_ground], result.ground_z[scan.is_ground]
+        )
+    return ScanScore(
         scan.sequence,
         scan.index,
         seconds,
         result.stages,
-        {key: count_confusion(label, one) for key, one in scan.truths.items()},
-        heights,
-        {} if scan.semantic is None else count_classes(label, scan.semantic),
-        count_rings(label, truth, scan.points),
-        None if p_ground is None else count_calibration(p_ground, truth),
+        {key: metrics.count_confusion(label, one) for key, one in scan.truths.items()},
+        height,
+        {} if scan.semantic is None else metrics.count_classes(label, scan.semantic),
+        metrics.count_rings(label, truth, scan.points),
+        None if p_ground is None else metrics.count_calibration(p_ground, truth),
         result.pose,
         result.fit,
     )
-    return score, label

@@ -1,18 +1,19 @@
-"""What counts as ground, and how labels and heights are scored against the truth."""
+"""What counts as ground; labels, probabilities and heights scored against the truth."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.frame import Label
+from gp_ground_seg.errors import PointCloudError
+from gp_ground_seg.frame import FloatArray, Label
 
 Labels = npt.NDArray[np.uint8]
 
@@ -26,6 +27,10 @@ RING_TITLES = tuple(
     for low, high in itertools.pairwise(RING_EDGES)
 )
 
+BIN_EDGES = np.linspace(0.0, 1.0, 16)
+"""Edges of the bins of probability in the expected calibration error."""
+N_BINS = len(BIN_EDGES) - 1
+
 SENSOR_HEIGHT = 1.73
 """Height of the sensor [m] in SemanticKITTI. The truth is a property of the data:
 it must not move with ``sensor.height``, which is a parameter of the method."""
@@ -33,75 +38,32 @@ LOW_VEGETATION_Z = -0.75 * SENSOR_HEIGHT
 """Height [m, sensor frame] below which Patchwork's evaluation counts vegetation as ground."""
 
 
-class SemanticClass(IntEnum):
-    """Class of a point in SemanticKITTI (Behley et al., ICCV 2019), low 16 bits of a label."""
-
-    UNLABELLED = 0
-    OUTLIER = 1
-    CAR = 10
-    BICYCLE = 11
-    BUS = 13
-    MOTORCYCLE = 15
-    ON_RAILS = 16
-    TRUCK = 18
-    OTHER_VEHICLE = 20
-    PERSON = 30
-    BICYCLIST = 31
-    MOTORCYCLIST = 32
-    ROAD = 40
-    PARKING = 44
-    SIDEWALK = 48
-    OTHER_GROUND = 49
-    BUILDING = 50
-    FENCE = 51
-    OTHER_STRUCTURE = 52
-    LANE_MARKING = 60
-    VEGETATION = 70
-    TRUNK = 71
-    TERRAIN = 72
-    POLE = 80
-    TRAFFIC_SIGN = 81
-    OTHER_OBJECT = 99
-    MOVING_CAR = 252
-    MOVING_BICYCLIST = 253
-    MOVING_PERSON = 254
-    MOVING_MOTORCYCLIST = 255
-    MOVING_ON_RAILS = 256
-    MOVING_BUS = 257
-    MOVING_TRUCK = 258
-    MOVING_OTHER_VEHICLE = 259
-
-
-GROUND_CLASSES = (
-    SemanticClass.ROAD,
-    SemanticClass.PARKING,
-    SemanticClass.SIDEWALK,
-    SemanticClass.OTHER_GROUND,
-    SemanticClass.LANE_MARKING,
-    SemanticClass.TERRAIN,
-)
+CLASS_NAMES = {
+    0: 'unlabelled', 1: 'outlier', 10: 'car', 11: 'bicycle', 13: 'bus', 15: 'motorcycle',
+    16: 'on rails', 18: 'truck', 20: 'other vehicle', 30: 'person', 31: 'bicyclist',
+    32: 'motorcyclist', 40: 'road', 44: 'parking', 48: 'sidewalk', 49: 'other ground',
+    50: 'building', 51: 'fence', 52: 'other structure', 60: 'lane marking', 70: 'vegetation',
+    71: 'trunk', 72: 'terrain', 80: 'pole', 81: 'traffic sign', 99: 'other object',
+    252: 'moving car', 253: 'moving bicyclist', 254: 'moving person',
+    255: 'moving motorcyclist', 256: 'moving on rails', 257: 'moving bus', 258: 'moving truck',
+    259: 'moving other vehicle',
+}  # fmt: skip
+"""Classes of SemanticKITTI (Behley et al., ICCV 2019), the low 16 bits of a label."""
+UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
+GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
 
 
 def class_name(number: int) -> str:
     """Name of a class in words; ``class 77`` where SemanticKITTI has no such number."""
-    try:
-        return SemanticClass(number).name.lower().replace('_', ' ')
-    except ValueError:
-        return f'class {number}'
+    return CLASS_NAMES.get(number, f'class {number}')
 
 
 @dataclass(frozen=True)
 class Convention:
     """A way to read semantic classes as ground and not ground.
 
-    Attributes
-    ----------
-    key, title, rule : str
-        Name in files, name in tables, and what it does, in a few words.
-    left_out : tuple of int
-        Classes whose points do not count.
-    low_vegetation_z : float
-        Vegetation below this height [m, sensor frame] is ground.
+    Its name in files, in tables, and what it does; the classes whose points do not count; and
+    the height [m, sensor frame] below which vegetation is ground.
     """
 
     key: str
@@ -116,17 +78,14 @@ class Convention:
         `semantic` (N,) are classes, `z` (N,) heights in the sensor frame [m].
         """
         ground = np.isin(semantic, GROUND_CLASSES)
-        ground |= (semantic == SemanticClass.VEGETATION) & (z < self.low_vegetation_z)
+        ground |= (semantic == VEGETATION) & (z < self.low_vegetation_z)
         truth = np.where(ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
         truth[np.isin(semantic, self.left_out)] = Label.UNKNOWN
         return truth
 
 
 GROUNDGRID = Convention(
-    'groundgrid',
-    'GroundGrid',
-    'vegetation left out',
-    (SemanticClass.UNLABELLED, SemanticClass.OUTLIER, SemanticClass.VEGETATION),
+    'groundgrid', 'GroundGrid', 'vegetation left out', (UNLABELLED, OUTLIER, VEGETATION)
 )
 """Steinke et al., "GroundGrid: LiDAR Point Cloud Ground Segmentation and Terrain Estimation",
 RA-L 2024. Our headline."""
@@ -135,7 +94,7 @@ PATCHWORK = Convention(
     'patchwork',
     'Patchwork',
     f'vegetation below {LOW_VEGETATION_Z:.2f} m is ground, above it an obstacle',
-    (SemanticClass.UNLABELLED, SemanticClass.OUTLIER),
+    (UNLABELLED, OUTLIER),
     LOW_VEGETATION_Z,
 )
 """Lim et al., "Patchwork: Concentric Zone-Based Region-Wise Ground Segmentation With Ground
@@ -156,9 +115,8 @@ class Confusion:
 
     def __add__(self, other: Confusion) -> Confusion:
         """Add the counts of both."""
-        return Confusion(
-            self.tp + other.tp, self.fp + other.fp, self.fn + other.fn, self.tn + other.tn
-        )
+        names = ('tp', 'fp', 'fn', 'tn')
+        return Confusion(*(getattr(self, name) + getattr(other, name) for name in names))
 
     @property
     def precision(self) -> float:
@@ -212,10 +170,9 @@ def count_confusion(label: Labels, truth: Labels) -> Confusion:
 def count_rings(
     label: Labels, truth: Labels, points: npt.NDArray[np.floating]
 ) -> tuple[Confusion, ...]:
-    """Compare as `count_confusion` by horizontal range, one `Confusion` for each ring.
+    """Compare by horizontal range of `points` (N, >=2) [m], one `Confusion` for each ring.
 
-    `points` (N, >=2) are x, y, ... in the sensor frame [m]; one without a finite range is in
-    no ring.
+    A point without a finite range is in no ring.
     """
     x, y = points[:, :2].astype(np.float64).T
     reach = np.hypot(x, y)
@@ -245,7 +202,7 @@ def count_classes(label: Labels, semantic: npt.NDArray[np.integer]) -> dict[int,
 
 
 class ClassErrors(NamedTuple):
-    """Points of one class: what they count as, and the ground missed and invented on them."""
+    """Points of a class: what they count as, and the ground missed and invented on them."""
 
     number: int
     truth: Label
@@ -272,19 +229,83 @@ def class_errors(classes: Mapping[int, ClassCount]) -> list[ClassErrors]:
 
 
 @dataclass(frozen=True)
-class HeightError:
-    """Errors of the surface under points whose ground height is known; over no points NaN.
+class Calibration:
+    """Probabilities of ground against the truth, as sums; ratios over nothing are NaN.
 
     Attributes
     ----------
-    n_points, n_without_model : int
-        Points with a surface, which count, and points without one, which do not.
-    sum_error, sum_squared_error : float
-        Sum of estimate minus truth [m], and of its squares [m^2].
-    sum_squared_deviation : float
-        Of the true heights from their mean [m^2]; pooled, from the mean of each frame.
-    median_absolute : float
-        Median distance of the estimate from the truth [m]; pooled, the median over the frames.
+    n_points, n_ground, sum_p : (N_BINS,) array
+        Points with a probability, those of them that are ground, and the sum of their
+        probabilities, by bin of it; a bin holds its lower edge, the last one 1 as well.
+    sum_squared_error : float
+        Sum of (probability - truth)^2, truth 1 for ground and 0 for obstacles.
+    """
+
+    n_points: npt.NDArray[np.int64]
+    n_ground: npt.NDArray[np.int64]
+    sum_p: FloatArray
+    sum_squared_error: float
+
+    def __add__(self, other: Calibration) -> Calibration:
+        """Add the sums of both."""
+        names = [field.name for field in dataclasses.fields(self)]
+        return Calibration(*(getattr(self, name) + getattr(other, name) for name in names))
+
+    @property
+    def n_total(self) -> int:
+        """Points with a probability."""
+        return int(self.n_points.sum())
+
+    def by_bin(self, sums: npt.NDArray[Any]) -> FloatArray:
+        """Return `n_ground` or `sum_p` over the points of each bin, (N_BINS,)."""
+        return np.where(self.n_points > 0, sums, np.nan) / np.maximum(self.n_points, 1)
+
+    @property
+    def ece(self) -> float:
+        """Expected calibration error: mean over points of their bin's |share of ground - mean p|.
+
+        Guo et al., "On Calibration of Modern Neural Networks", ICML 2017, for the
+        probability of one class of two.
+        """
+        return ratio(float(np.abs(self.n_ground - self.sum_p).sum()), self.n_total)
+
+    @property
+    def brier(self) -> float:
+        """Brier score, the mean of (p - truth)^2."""
+        return ratio(self.sum_squared_error, self.n_total)
+
+
+def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Calibration:
+    """Compare probabilities of ground, (N,), with true labels, (N,).
+
+    Points whose probability is NaN or whose truth is UNKNOWN do not count. Raises
+    PointCloudError if the lengths differ or a probability is outside [0, 1].
+    """
+    if p_ground.shape != truth.shape:
+        raise PointCloudError(
+            f'p_ground of shape {p_ground.shape} for {len(truth)} points: must be ({len(truth)},)'
+        )
+    known = ~np.isnan(p_ground)
+    if not ((p_ground[known] >= 0.0) & (p_ground[known] <= 1.0)).all():
+        raise PointCloudError('p_ground: a probability is outside [0, 1]')
+    known &= (truth == Label.GROUND) | (truth == Label.OBSTACLE)
+    ground, p = truth[known] == Label.GROUND, p_ground[known].astype(np.float64)
+    bin_of = np.searchsorted(BIN_EDGES[1:-1], p, side='right')
+    return Calibration(
+        n_points=np.bincount(bin_of, minlength=N_BINS),
+        n_ground=np.bincount(bin_of[ground], minlength=N_BINS),
+        sum_p=np.bincount(bin_of, p, minlength=N_BINS).astype(np.float64),
+        sum_squared_error=float(np.sum((p - ground) ** 2)),
+    )
+
+
+@dataclass(frozen=True)
+class HeightError:
+    """Errors of the surface under points whose ground height is known; over no points NaN.
+
+    Points with a surface, which count, and without one, which do not; sums of estimate minus
+    truth [m], of its squares, and of the squared deviations of the truth from its mean in the
+    frame [m^2]; median distance of the two [m], pooled the median over the frames.
     """
 
     n_points: int
@@ -330,11 +351,6 @@ def height_error(
 def pool_height_errors(errors: Sequence[HeightError]) -> HeightError:
     """Sum up the errors of several frames."""
     medians = [one.median_absolute for one in errors if one.n_points]
-    return HeightError(
-        n_points=sum(one.n_points for one in errors),
-        n_without_model=sum(one.n_without_model for one in errors),
-        sum_error=math.fsum(one.sum_error for one in errors),
-        sum_squared_error=math.fsum(one.sum_squared_error for one in errors),
-        sum_squared_deviation=math.fsum(one.sum_squared_deviation for one in errors),
-        median_absolute=float(np.median(medians)) if medians else math.nan,
-    )
+    *names, _median = (field.name for field in dataclasses.fields(HeightError))
+    sums = {name: sum(getattr(one, name) for one in errors) for name in names}
+    return HeightError(**sums, median_absolute=float(np.median(medians)) if medians else math.nan)

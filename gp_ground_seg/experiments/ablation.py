@@ -1,4 +1,4 @@
-"""Ablations: length-scale models, ways to learn, and each departure from the paper undone."""
+"""What settings are worth: length-scale models, departures from the paper, cross-validation."""
 
 from __future__ import annotations
 
@@ -6,24 +6,14 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from gp_ground_seg.data.semantic_kitti import Frame
-from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.evaluate import ALL, KnownScan, MethodScore, Progress, load_kitti
-from gp_ground_seg.evaluation.table import Column, Row, Table, centimetres, milliseconds, percent
-from gp_ground_seg.experiments.variants import (
-    Changes,
-    Report,
-    SimulatedFrame,
-    load_simulated,
-    make_report,
-    refuse_changed,
-    score_variants,
-    simulated_frames,
-)
+from gp_ground_seg.errors import ConfigError, DataError
+from gp_ground_seg.evaluation import report
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, load_kitti, pool
+from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
+from gp_ground_seg.experiments.variants import Changes, make_report, refuse_changed, score_variants
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.simulation import SCENES
+from gp_ground_seg.parameters.schema import ParameterValue
 
 _FIXED: Changes = {'learning.mode': 'fixed'}
 _WHOLE_FRAME: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'frame'}
@@ -41,25 +31,11 @@ MODELS: dict[str, Changes] = {
     'Z-L, learned per segment': {**_LATENT, **_PER_SEGMENT},
     'Z-L, learned over the frame': {**_LATENT, **_WHOLE_FRAME},
 }
-"""Length-scale models and ways to learn on labelled frames; the last one is the paper's."""
-
-SIMULATED_MODELS: dict[str, Changes] = {
-    **{
-        f'constant, {length:g} m': {**_CONSTANT, 'length_scale.constant': length, **_WHOLE_FRAME}
-        for length in (10.0, 5.0, 2.0, 1.0)
-    },
-    'line gradient': {**_GRADIENT, **_WHOLE_FRAME},
-    'latent, not learned': {**_LATENT, **_FIXED},
-    'latent': {**_LATENT, **_WHOLE_FRAME},
-}
-"""The same on simulated scans. A constant cannot be learned: several are given, so that the
-best of them is known in hindsight."""
+"""Length-scale models and ways to learn; the last one is the paper's."""
 
 SCENE = 'road_then_rubble'
 PLACES = (0.0, 6.0, 12.0)
-"""Where the sensor stands on the road [m]; the rubble begins at 14 to 20 m."""
-STRETCHES = (ALL, 'smooth', 'rubble')
-"""All ground, the road before the rubble begins, and the rubble where it has its full height."""
+"""Where the sensor stands on the simulated road [m]; the rubble begins at 14 to 20 m."""
 
 
 class Departure(NamedTuple):
@@ -107,73 +83,34 @@ DEPARTURES: tuple[Departure, ...] = (
 
 AS_GIVEN = 'as given'
 
+Choice = dict[str, ParameterValue]
+"""A value for each parameter that is searched, by dotted name."""
+Grid = Mapping[str, Sequence[ParameterValue]]
 
-def compare_models(frames: Sequence[Frame], config: Config, progress: Progress = iter) -> Report:
-    """Score `MODELS` on labelled frames; ConfigError if `config` sets what they set."""
-    scores = _score_models(MODELS, frames, load_kitti, config, progress)
+
+def compare_models(
+    items: Sequence[Any],
+    load: Callable[[Any], KnownScan],
+    config: Config,
+    progress: Progress = iter,
+) -> Report:
+    """Score `MODELS` on scans; ConfigError if `config` sets what they set."""
+    refuse_changed(config, {name for changes in MODELS.values() for name in changes})
+    variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
+    scores = score_variants(items, load, variants, progress=progress)
     rows: list[Row] = [
         [
             (Column('method'), one.name),
             (percent('IoU [%]', 'iou'), one.iou),
-            *_worst(one),
-            (centimetres('RMSE [cm]', 'rmse'), one.height().rmse),
-            (centimetres('median [cm]', 'median_absolute'), one.height().median_absolute),
-            (Column('SMSE', '.5f', 'smse'), one.height().smse),
-            (milliseconds('ms', 'seconds'), one.seconds()),
+            *_worst_and_rmse(one),
+            (report.centimetres('median [cm]', 'median_absolute'), one.height.median_absolute),
+            (Column('SMSE', '.5f', 'smse'), one.height.smse),
+            (report.milliseconds('ms', 'seconds'), one.seconds()),
         ]
         for one in scores
     ]
-    title = f'{_frames_title(frames)}; heights under points labelled ground'
+    title = f'{_counted(scores[0])}; heights under true ground'
     return make_report({'models': Table.of(rows, title=title)}, scores, config, changes=MODELS)
-
-
-def compare_models_simulated(n_seeds: int, config: Config, progress: Progress = iter) -> Report:
-    """Score `SIMULATED_MODELS` by exact heights on a smooth road that ends in rubble.
-
-    Each seed is a scene of its own, seen by an HDL-64E from `PLACES`. Raises as `compare_models`.
-    """
-    frames = simulated_frames(['hdl-64e'], [SCENE], n_seeds, PLACES)
-    scores = _score_models(SIMULATED_MODELS, frames, load_stretches, config, progress)
-    rows: list[Row] = [
-        [
-            (Column('length-scale'), one.name),
-            *(
-                (centimetres(f'{title}, {part}', f'{key}_{part}'), getattr(one.height(part), key))
-                for title, key in (('RMSE', 'rmse'), ('median', 'median_absolute'))
-                for part in STRETCHES
-            ),
-            (milliseconds('ms', 'seconds'), one.seconds()),
-        ]
-        for one in scores
-    ]
-    title = (
-        f'{len(frames)} simulated scans of {n_seeds} scenes, road then rubble, HDL-64E; '
-        'errors against the exact ground [cm]'
-    )
-    tables = {'models': Table.of(rows, title=title)}
-    return make_report(tables, scores, config, changes=SIMULATED_MODELS)
-
-
-def _score_models(
-    models: Mapping[str, Changes],
-    items: Sequence[Any],
-    load: Callable[[Any], KnownScan],
-    config: Config,
-    progress: Progress,
-) -> list[MethodScore]:
-    refuse_changed(config, {name for changes in models.values() for name in changes})
-    variants = {name: config.replace(**changes) for name, changes in models.items()}
-    return score_variants(items, load, variants, progress=progress)
-
-
-def load_stretches(frame: SimulatedFrame) -> KnownScan:
-    """Simulate a scan whose ground has `STRETCHES`: the rubble's break lines lie across x."""
-    scan = load_simulated(frame)
-    begin, full = np.sort(SCENES[frame.scene](frame.seed).terrain.breaks()[:, 2])
-    ground_x, is_ground = scan.points[:, 0] + frame.x, scan.parts[ALL]
-    scan.parts['smooth'] = is_ground & (ground_x < begin)
-    scan.parts['rubble'] = is_ground & (ground_x > full)
-    return scan
 
 
 def compare_departures(
@@ -182,10 +119,7 @@ def compare_departures(
     config: Config,
     progress: Progress = iter,
 ) -> Report:
-    """Switch one departure after the other, on the same frames in the same run.
-
-    Raises ConfigError if two titles are alike, a switch is not accepted or changes nothing.
-    """
+    """Switch one departure after the other, on the same frames in the same run."""
     variants = {AS_GIVEN: config}
     for one in departures:
         if one.title in variants:
@@ -204,8 +138,7 @@ def compare_departures(
             (Column('switch'), switch),
             (percent('IoU [%]', 'iou'), score.iou),
             (percent('worth [%]', 'worth', '+.2f'), worth),
-            *_worst(score),
-            (centimetres('RMSE [cm]', 'rmse'), score.height().rmse),
+            *_worst_and_rmse(score),
             (Column('time', '.2f', 'time_ratio'), time_ratio),
         ]
 
@@ -215,7 +148,7 @@ def compare_departures(
         switches.append((score, 'off', gain) if one.kept else (score, 'on', -gain))
     rows = [row(given), *(row(*one) for one in sorted(switches, key=lambda one: -one[2]))]
     title = (
-        f'{_frames_title(frames)}; worth: what having it adds to the IoU; RMSE of the height; '
+        f'{_counted(given)}; worth: what having it adds to the IoU; RMSE of the height; '
         'time: over that as given, median of the frames'
     )
     changes = {one.title: one.changes for one in departures}
@@ -223,15 +156,94 @@ def compare_departures(
     return make_report(tables, scores, config, changes=changes)
 
 
-def _worst(score: MethodScore) -> Row:
-    """Cells of the sequence with the lowest IoU."""
+def _worst_and_rmse(score: MethodScore) -> Row:
+    """Cells of the sequence with the lowest IoU, if there are several, and of the height error."""
     iou, name = min((score.of(name).iou, name) for name in score.sequences)
-    return [(percent('worst [%]', 'worst_iou'), iou), (Column('in', '', 'worst_sequence'), name)]
+    worst: Row = [
+        (percent('worst [%]', 'worst_iou'), iou),
+        (Column('in', '', 'worst_sequence'), name),
+    ]
+    return [
+        *(worst if len(score.sequences) > 1 else []),
+        (report.centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
+    ]
 
 
-def _frames_title(frames: Sequence[Frame]) -> str:
-    n = len({frame.sequence for frame in frames})
-    return (
-        f'{len(frames)} labelled frame{"s" * (len(frames) > 1)} of {n} sequence{"s" * (n > 1)}; '
-        'IoU in the GroundGrid convention'
+def _counted(score: MethodScore) -> str:
+    is_exact = 'exact' in score.scans[0].confusions
+    rule = 'by exact labels' if is_exact else 'in the GroundGrid convention'
+    return f'{len(score.scans)} scans of {", ".join(score.sequences)}; IoU {rule}'
+
+
+def coordinate_search(grid: Grid, start: Choice, worth: Callable[[Choice], float]) -> Choice:
+    """Maximise `worth` one parameter after the other; of equal choices the earlier one stays."""
+    best, highest = dict(start), worth(start)
+    better = True
+    while better:
+        better = False
+        for name, values in grid.items():
+            for value in values:
+                trial = {**best, name: value}
+                if (found := worth(trial)) > highest:
+                    best, highest, better = trial, found, True
+    return best
+
+
+def cross_validate(
+    frames: Sequence[Frame], base: Config, grid: Grid, progress: Progress = iter
+) -> Report:
+    """Choose values by pooled IoU, once on all sequences and once without each.
+
+    Each configuration segments every frame once, however many searches need it. `grid` has the
+    values to try beside those of `base`, where each search starts.
+    """
+    sequences = list(dict.fromkeys(frame.sequence for frame in frames))
+    if len(sequences) < 2:
+        raise DataError('cross-validation: needs at least two sequences')
+    # As the configuration holds them: 1 and 1.0 are one value.
+    tried = {name: [base.replace(**{name: v})[name] for v in grid[name]] for name in grid}
+    start: Choice = {name: base[name] for name in grid}
+    known: dict[tuple[ParameterValue, ...], MethodScore] = {}
+
+    def score(choice: Choice) -> MethodScore:
+        key = tuple(choice[name] for name in grid)
+        if key not in known:
+            variant = {str(len(known)): base.replace(**choice)}
+            (known[key],) = score_variants(frames, load_kitti, variant, progress=progress)
+        return known[key]
+
+    def choose(names: Sequence[str]) -> Choice:
+        return coordinate_search(tried, start, lambda choice: score(choice).of(*names).iou)
+
+    choices = {'given': start, 'tuned': choose(sequences)}
+    for left_out in sequences:
+        choices[f'- {left_out}'] = choose([name for name in sequences if name != left_out])
+    scores = [pool(name, [score(choices[name])]) for name in ('given', 'tuned')]
+    own = (score(choices[f'- {name}']).of(name) for name in sequences)
+    scores.append(pool('left out', own))
+    rows: list[Row] = []
+    for parts in zip(*(one.by_sequence() for one in scores), strict=True):
+        rows.append([(Column('sequence'), parts[0][0])])
+        rows[-1] += [(percent(f'IoU {o.name} [%]', f'iou {o.name}'), o.iou) for _, o in parts]
+        rows[-1] += [(Column(f'ECE {o.name}', '.4f'), o.ece) for _, o in parts]
+    title = (
+        'IoU and expected calibration error, GroundGrid convention: as given; with the values '
+        f'best on all {len(sequences)} sequences (tuned); each sequence with the values best on '
+        f'the others (left out). {len(known)} configurations scored.'
     )
+    chosen: list[Row] = [
+        [
+            (Column('parameter'), name),
+            *((Column(way, 's'), _shown(values[name])) for way, values in choices.items()),
+        ]
+        for name in grid
+    ]
+    tables = {
+        'scores': Table.of(rows, title=title, n_sums=1),
+        'choices': Table.of(chosen, title='Values chosen; - 00: without sequence 00'),
+    }
+    return make_report(tables, scores, base, n_configurations=len(known), tried=tried)
+
+
+def _shown(value: ParameterValue) -> str:
+    return f'{value:g}' if isinstance(value, float) else str(value).lower()

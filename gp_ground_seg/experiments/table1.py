@@ -13,12 +13,11 @@ import numpy as np
 
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.environment import changed_parameters
-from gp_ground_seg.evaluation.evaluate import ALL, Progress, load_kitti
+from gp_ground_seg.evaluation.evaluate import Progress, load_kitti
 from gp_ground_seg.evaluation.metrics import height_error
-from gp_ground_seg.evaluation.table import Column, Table
-from gp_ground_seg.experiments.variants import Report, refuse_changed
-from gp_ground_seg.frame import OUTSIDE, BoolArray, FloatArray
+from gp_ground_seg.evaluation.report import Column, Report, Table, changed_parameters
+from gp_ground_seg.experiments.variants import refuse_changed
+from gp_ground_seg.frame import OUTSIDE
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
@@ -39,27 +38,16 @@ class Choice(NamedTuple):
 
     @classmethod
     def parse(cls, word: str) -> Choice:
-        """Read ``08/000005:151,152``; ValueError if it is of another form."""
+        """Read ``08/000005:151,152``; DataError if it is of another form."""
         match = _CHOICE.fullmatch(word)
         if match is None:
-            raise ValueError(f'{word!r}: must be as in 08/000005:151,152')
+            raise DataError(f'--frames {word!r}: must be as in 08/000005:151,152')
         sequence, frame, segments = match.groups()
         return cls(sequence, frame, tuple(map(int, segments.split(','))))
 
 
 DEFAULT_CHOICES = ('10/000000:157,158', '03/000006:147,148')
 """An adjacent pair that climbs a verge and a hill, 3 m over 30 m, and one on uneven ground."""
-
-
-def find_frame(root: str | Path, choice: Choice) -> Frame:
-    """Frame of a choice; DataError if it is not there."""
-    frames = {frame.index: frame for frame in list_frames(root, choice.sequence)}
-    if choice.frame not in frames:
-        raise DataError(
-            f'{root}: no frame {choice.frame} in sequence {choice.sequence}; '
-            f'there are {min(frames)} to {max(frames)}'
-        )
-    return frames[choice.frame]
 
 
 def table1(
@@ -72,14 +60,6 @@ def table1(
     """Measure the table on the chosen segments, at least one choice.
 
     Each method runs on each frame once without counting, then `n_repeats` times, alternately.
-
-    Raises
-    ------
-    ConfigError
-        If ``length_scale.model`` is not the default, nothing is learned, or a segment is out
-        of range.
-    DataError
-        If a frame is missing or unlabelled.
     """
     refuse_changed(config, ['length_scale.model'])
     if config.learning.mode == 'fixed':
@@ -88,7 +68,13 @@ def table1(
     for segment in (segment for choice in choices for segment in choice.segments):
         if not 0 <= segment <= last:
             raise ConfigError(f'segment {segment}: must be in [0, {last}]')
-    frames = [find_frame(root, choice) for choice in choices]
+    frames = []
+    for choice in choices:
+        own = {frame.index: frame for frame in list_frames(root, choice.sequence)}
+        if choice.frame not in own:
+            where = f'{choice.sequence}; there are {min(own)} to {max(own)}'
+            raise DataError(f'{root}: no frame {choice.frame} in sequence {where}')
+        frames.append(own[choice.frame])
     rows: list[dict[str, Any]] = []
     with ExitStack() as stack:
         segmenters = {
@@ -100,28 +86,28 @@ def table1(
         for frame, choice in zip(progress(frames), choices, strict=True):
             found, result = _rows(frame, choice, segmenters, n_repeats)
             rows += found
-    title = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
     names = ['n_PG', 'n_L', *VARIANCES]
-    tables = {'variances': _table(rows, names, title)}
-    title = 'SMSE in sample (at the inliers) and held out (labelled ground); seconds per frame'
-    times = f'times: median of {n_repeats} runs on the whole frame, reading left out'
-    names = [n for n in rows[0] if n not in ('segment', *names) and not n.startswith('inliers')]
-    tables['errors'] = _table(rows, names, title, notes=[times])
+    others = [n for n in rows[0] if n not in ('segment', *names) and not n.startswith('inliers')]
+    tables = {
+        'variances': _table(
+            rows, names, 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar '
+            'without unit]',
+        ),
+        'errors': _table(
+            rows, others, 'SMSE in sample (at the inliers) and held out (labelled ground); '
+            f'seconds per frame: median of {n_repeats} runs on the whole frame, reading left out',
+        ),
+    }  # fmt: skip
     facts = {'config_changes': changed_parameters(config), 'config': config.nested()}
     return Report(tables, rows, result.fit, facts)
 
 
-def _table(
-    rows: Sequence[dict[str, Any]], names: Sequence[str], title: str, notes: Sequence[str] = ()
-) -> Table:
-    columns = [Column('segment'), *(Column(name, _format(name)) for name in names)]
-    return Table(columns, [[row[c.title] for c in columns] for row in rows], title, notes)
-
-
-def _format(name: str) -> str:
-    if name.startswith('n_') or name == 'held out':
-        return 'd'
-    return '.4f' if name.startswith('t ') else '#.4g'
+def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> Table:
+    columns = [Column('segment')]
+    for name in names:
+        number = '.4f' if name.startswith('t ') else '#.4g'
+        columns.append(Column(name, 'd' if isinstance(rows[0][name], int) else number))
+    return Table(columns, [[row[c.title] for c in columns] for row in rows], title)
 
 
 def _rows(
@@ -130,7 +116,6 @@ def _rows(
     """Rows of a frame, by title of the column, and a result of the latent model."""
     scan = load_kitti(frame)
     z = scan.points[:, 2].astype(np.float64)
-    is_ground = scan.parts[ALL]
     seconds: dict[str, list[float]] = {name: [] for name in segmenters}
     results: dict[str, Segmentation] = {}
     for k in range(n_repeats + 1):
@@ -141,17 +126,21 @@ def _rows(
                 seconds[name].append(results[name].timings['total'])
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
     common = results['Z-L']
-    level_z = common.pose.level(scan.points[:, :3])[:, 2].astype(np.float64)
-    held_out = is_ground & (common.grid.bin != OUTSIDE) & ~is_candidate(common, level_z)
+    candidates = common.candidates
+    # A candidate is the point of its segment with the same range and height.
+    place = common.grid.r + 1j * common.pose.level(scan.points[:, :3])[:, 2]
+    modelled = scan.is_ground & (common.grid.bin != OUTSIDE)
     rows = []
     for segment in choice.segments:
-        own = held_out & (common.grid.segment == segment)
+        its = slice(*candidates.offsets[segment : segment + 2])
+        own = modelled & (common.grid.segment == segment)
+        own &= ~np.isin(place, candidates.r[its] + 1j * candidates.z[its])
         variances = np.exp(2.0 * common.theta[segment, : len(VARIANCES)])
         in_sample = {name: _in_sample(result, segment) for name, result in results.items()}
         rows.append(
             {
                 'segment': f'{frame.sequence}/{frame.index}:{segment}',
-                'n_PG': int(np.diff(common.candidates.offsets)[segment]),
+                'n_PG': int(its.stop - its.start),
                 'n_L': int(np.diff(common.pseudo.offsets)[segment]),
                 **dict(zip(VARIANCES, variances.tolist(), strict=True)),
                 **{f'inliers {name}': n for name, (n, _) in in_sample.items()},
@@ -165,17 +154,6 @@ def _rows(
             }
         )
     return rows, common
-
-
-def is_candidate(result: Segmentation, z: FloatArray) -> BoolArray:
-    """Return which points are ground candidates, (N,) bool; `z` (N,) in the level frame [m]."""
-    grid, candidates = result.grid, result.candidates
-    n_bins = len(grid.edges) - 1
-    lowest = np.full((2, grid.n_segments * n_bins), np.nan)
-    lowest[:, candidates.segment * n_bins + candidates.bin] = candidates.r, candidates.z
-    cell = np.maximum(grid.cell, 0)
-    found: BoolArray = grid.inside & (grid.r == lowest[0, cell]) & (z == lowest[1, cell])
-    return found
 
 
 def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:

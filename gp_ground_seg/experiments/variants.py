@@ -1,30 +1,39 @@
-"""The engine of the experiments: named configurations scored over frames, real or simulated."""
+"""The engine of the experiments: configurations scored over frames; simulated scenes."""
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.evaluation.environment import Environment, changed_parameters
-from gp_ground_seg.evaluation.evaluate import ALL, KnownScan, MethodScore, Progress, score_methods
-from gp_ground_seg.evaluation.methods import Method, OurMethod
-from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name
-from gp_ground_seg.evaluation.table import Table, write_json
+from gp_ground_seg.evaluation import evaluate as methods
+from gp_ground_seg.evaluation import report as results
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
+from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
+from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
-from gp_ground_seg.result import FitReport
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 
 Changes = Mapping[str, ParameterValue]
 """Values of parameters, by dotted name."""
+
+PRESET_OF = {
+    'hdl-64e': 'hdl64',
+    'hdl-32e': 'hdl32',
+    'vlp-16': 'vlp16',
+    'os1-128': 'os1_128',
+    'mid-360': 'mid360',
+}
+"""Preset that goes with each simulated sensor."""
+SCENE_PLACES = (0.0, 6.0)
+"""Where the sensor stands in each scene [m]."""
+PEER = methods.TITLES[methods.PATCHWORKPP]
 
 
 class SimulatedFrame(NamedTuple):
@@ -34,6 +43,11 @@ class SimulatedFrame(NamedTuple):
     scene: str
     seed: int
     x: float
+
+    @property
+    def sequence(self) -> str:
+        """Scans of one sensor in one kind of scene belong together."""
+        return f'{self.sensor} {self.scene}'
 
 
 def load_simulated(frame: SimulatedFrame) -> KnownScan:
@@ -45,10 +59,10 @@ def load_simulated(frame: SimulatedFrame) -> KnownScan:
         x=frame.x,
     )
     truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
-    group, index = f'{frame.sensor} {frame.scene}', f'{frame.seed}/{frame.x:g}'
     return KnownScan(
-        group, index, made.points, {'exact': truth}, None, made.ground_z, {ALL: made.is_ground}
-    )
+        frame.sequence, f'{frame.seed}/{frame.x:g}', made.points, {'exact': truth},
+        ground_z=made.ground_z, is_ground=made.is_ground,
+    )  # fmt: skip
 
 
 def simulated_frames(
@@ -70,40 +84,19 @@ def score_variants(
     items: Sequence[Any],
     load: Callable[[Any], KnownScan],
     variants: Mapping[str, Config],
-    peers: Sequence[Method] = (),
+    peers: Sequence[methods.Method] = (),
     *,
-    make: type[OurMethod] = OurMethod,
     progress: Progress = iter,
 ) -> list[MethodScore]:
     """Run every variant once on every scan, alternately, each scan without a past.
 
     `items` are loaded one by one, as by `score_methods`; `peers` are other methods to run on
-    the same scans, whose scores come last; `make` makes the method of a configuration.
+    the same scans, whose scores come last.
     """
     with ExitStack() as stack:
-        ours = [stack.enter_context(closing(make(c, name))) for name, c in variants.items()]
-        return score_methods(items, load, [*ours, *peers], each_alone=True, progress=progress)
-
-
-class Report(NamedTuple):
-    """Tables to show, every number by scan or segment, a fit (of any frame), further facts."""
-
-    tables: dict[str, Table]
-    rows: list[dict[str, Any]]
-    fit: FitReport
-    facts: dict[str, Any]
-
-    def write(self, path: Path, environment: Environment) -> None:
-        """Write every number as JSON."""
-        document = {
-            **self.facts,
-            'n_threads': self.fit.n_threads,
-            'backend': self.fit.backend,
-            'environment': dataclasses.asdict(environment),
-            **{name: table.json() for name, table in self.tables.items()},
-            'rows': self.rows,
-        }
-        write_json(document, path)
+        ours = [stack.enter_context(closing(OurMethod(c, name))) for name, c in variants.items()]
+        every = [*ours, *peers]
+        return methods.score_methods(items, load, every, each_alone=True, progress=progress)
 
 
 def make_report(
@@ -112,8 +105,8 @@ def make_report(
     """Report of scored variants; `config` is what they change, the first is of our method."""
     fit = scores[0].scans[-1].fit
     assert fit is not None
-    facts = {'config_changes': changed_parameters(config), 'config': config.nested(), **facts}
-    return Report(tables, scan_rows(scores), fit, facts)
+    given = {'config_changes': results.changed_parameters(config), 'config': config.nested()}
+    return Report(tables, scan_rows(scores), fit, {**given, **facts})
 
 
 def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
@@ -127,8 +120,8 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
         for key, confusion in scan.confusions.items():
             for name in ('tp', 'fp', 'fn', 'tn', *RATIOS):
                 row[f'{key}_{name}'] = getattr(confusion, name)
-        for part, height in scan.heights.items():
-            row |= {f'{name}_{part}': getattr(height, name) for name in of_height}
+        if scan.height is not None:
+            row |= {f'{name}_all': getattr(scan.height, name) for name in of_height}
         if scan.calibration is not None:
             row['ece'] = scan.calibration.ece
         if scan.classes:
@@ -142,3 +135,74 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
             row |= {'sensor_roll': pose.roll, 'sensor_pitch': pose.pitch}
         rows.append(row)
     return rows
+
+
+def score_scenes(
+    configs: Mapping[str, Config],
+    scenes: Sequence[str],
+    n_seeds: int,
+    with_peer: bool,
+    progress: Progress = iter,
+) -> Report:
+    """Segment `n_seeds` simulated scenes of each name, seen from `SCENE_PLACES`, by each sensor.
+
+    `configs` are our parameters by name of the sensor; the peer, Patchwork++, runs on the same
+    clouds with the true height of the sensor.
+    """
+    ours, theirs = [], []
+    for sensor, config in configs.items():
+        frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
+        peers = [methods.PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
+        own, *other = score_variants(
+            frames, load_simulated, {methods.OURS: config}, peers, progress=progress
+        )
+        ours.append(own)
+        theirs += other
+    pairs = [(methods.OURS, ours), (methods.PATCHWORKPP, theirs)]
+    scores = [methods.pool(name, own) for name, own in pairs if own]
+    report = make_report({'scenes': scene_table(*scores)}, scores, Config())
+    for name, of in (('config_changes', results.changed_parameters), ('config', Config.nested)):
+        report.facts[name] = {sensor: of(config) for sensor, config in configs.items()}
+    return report
+
+
+def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
+    """One row for each sensor and scene; the note says where the peer is ahead in IoU."""
+    rows: list[Row] = []
+    behind = []
+    for group in ours.sequences:
+        own = ours.of(group)
+        height, (sensor, scene) = own.height, group.split()
+        share = ratio(height.n_without_model, height.n_points + height.n_without_model)
+        rows.append(
+            [
+                (Column('sensor'), sensor),
+                (Column('scene'), scene),
+                (percent('IoU', 'iou'), own.iou),
+                (results.centimetres('RMSE', 'rmse'), height.rmse),
+                (results.centimetres('median', 'median_absolute'), height.median_absolute),
+                (percent('no model', 'share_without_model'), share),
+            ]
+        )
+        if peer is not None:
+            its = peer.of(group)
+            median = its.height.median_absolute
+            rows[-1] += [
+                (percent(PEER, 'peer_iou'), its.iou),
+                (percent('difference', 'difference', '+.2f'), own.iou - its.iou),
+                (results.centimetres('its RMSE', 'peer_rmse'), its.height.rmse),
+                (results.centimetres('its median', 'peer_median_absolute'), median),
+            ]
+            if not own.iou > its.iou:
+                behind.append(group)
+    n_scans = len(ours.of(ours.sequences[0]).scans)
+    title = (
+        f'{n_scans} simulated scans per row; IoU against exact labels [%], every point counts; '
+        'height of the surface under true ground [cm]; share of it without a model [%]'
+    )
+    notes = []
+    if peer is not None:
+        title += f'; {PEER} has the true sensor height, its surface is that of its nearest patch'
+        where = f'; behind on {", ".join(behind)}' if behind else ''
+        notes = [f'ahead of {PEER} on {len(rows) - len(behind)} of {len(rows)} rows{where}']
+    return Table.of(rows, title=title, notes=notes)

@@ -14,11 +14,11 @@ from gp_ground_seg.frame import OUTSIDE, FloatArray, Label
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.points import check_points
 from gp_ground_seg.plotting import style
+from gp_ground_seg.plotting.style import new_figure, save
 from gp_ground_seg.result import Segmentation
 
 Labels = npt.NDArray[np.uint8]
 
-FORMATS = ('.png', '.pdf')
 DPI = 130
 # Inches: the figure, and the part of it that the two panels leave to the legend.
 WIDTH, HEIGHT, LEGEND = 12.2, 7.6, 2.6
@@ -56,30 +56,12 @@ def plot_segment(
     title: str = '',
     max_range: float | None = None,
 ) -> None:
-    """Draw a segment from the side as PNG or PDF, replacing the file `path`.
+    """Draw a segment from the side; below it the length-scale and its pseudo-inputs.
 
-    Above: points, ground candidates, the lines through them with their critical
-    points, inliers, and the surface with twice its standard deviation. Below:
-    the length-scale and the pseudo-inputs it follows.
-
-    Parameters
-    ----------
-    result, config : Segmentation, Config
-        The segmentation of `points` and its parameters.
-    points : (N, >=3) float array
-        x forward, y left, z up [m].
-    segment, path : int, str or Path
-        Number of the segment; file to write, .png or .pdf, replaced if it exists.
-    truth : (N,) uint8, optional
-        True `Label` of each point, UNKNOWN where it does not count.
-    max_range : float, optional
-        Range shown [m]; by default a little more than that of the last candidate.
-
-    Raises
-    ------
-    PointCloudError, ConfigError
-        If the shapes do not fit together; if the segment, the range or the file's ending is
-        not accepted.
+    `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
+    labels, UNKNOWN where a point does not count; `max_range` [m] is by default a little more than
+    that of the last candidate. The file `path`, a PDF or else a PNG, is replaced. Raises
+    PointCloudError or ConfigError if shapes do not fit, or segment or range are not accepted.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     style.check_lengths(len(z), result=result.label, truth=truth)
@@ -88,17 +70,23 @@ def plot_segment(
         raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
     if max_range is not None and not (max_range > 0.0 and math.isfinite(max_range)):
         raise ConfigError(f'max_range = {max_range}: must be a positive number of metres')
-    if Path(path).suffix.lower() not in FORMATS:
-        raise ConfigError(f'{path}: must end in {" or ".join(FORMATS)}')
-    figure = style.new_figure(WIDTH, HEIGHT, DPI)
+    figure = new_figure(WIDTH, HEIGHT, DPI)
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    view = SegmentView(result, z, segment, truth)
-    reach = view.reach() if max_range is None else max_range
+    own = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
+    r, z = result.grid.r[own], z[own]
+    view = SegmentView(result, segment)
+    reach = view.reach(r) if max_range is None else max_range
+    low, high = view.heights_shown(reach, z)
+    n_hidden = np.count_nonzero((r > reach) | (z < low) | (z > high))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
     figure.subplots_adjust(0.065, 0.075, 1.0 - LEGEND / WIDTH, 0.93, hspace=0.08)
-    above.set_title(view.title(title), fontsize=12, loc='left', parse_math=False)
-    view.draw_heights(above, reach)
+    name = f'{view.title(title)}; {n_hidden} points outside'
+    above.set_title(name, fontsize=12, loc='left', parse_math=False)
+    view.draw_points(above, r, z, None if truth is None else truth[own])
+    view.draw_ground(above)
+    above.set_xlim(0.0, reach)
+    above.set_ylim(low, high)
     view.draw_length_scale(below, reach, with_pseudo_inputs=config.length_scale.model == 'latent')
     below.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     below.yaxis.set_major_formatter('{x:g}')
@@ -112,22 +100,16 @@ def plot_segment(
             borderaxespad=0.0, labelspacing=0.8, markerscale=1.3,
         )  # fmt: skip
     figure.align_ylabels()
-    style.save(figure, path)
+    save(figure, path)
 
 
 class SegmentView:
-    """The parts of the picture; `z` is the height of each point in the level frame, (N,) [m]."""
+    """The parts of the picture."""
 
-    def __init__(
-        self, result: Segmentation, z: FloatArray, segment: int, truth: Labels | None
-    ) -> None:
+    def __init__(self, result: Segmentation, segment: int) -> None:
         self._result, self._segment = result, segment
-        own = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
-        self._r, self._z = result.grid.r[own], z[own]
-        self._truth = None if truth is None else truth[own]
         self._own = slice(*(int(k) for k in result.candidates.offsets[segment : segment + 2]))
-        self._candidate_r = result.candidates.r[self._own]
-        self._candidate_z = result.candidates.z[self._own]
+        self._r, self._z = result.candidates.r[self._own], result.candidates.z[self._own]
         self._inlier = result.surface.inlier[self._own]
         self._knots = result.surface.knots
         self._mean, self._std = result.surface.mean[segment], result.surface.std[segment]
@@ -140,79 +122,50 @@ class SegmentView:
         own = f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
         return f'{title}, {own}' if title else own
 
-    def reach(self) -> float:
+    def reach(self, point_r: FloatArray) -> float:
         """Range that holds all candidates, or all points where there are none [m]."""
-        if len(self._candidate_r):
-            return float(self._candidate_r[-1]) + BEYOND
-        return float(self._r.max()) + BEYOND if len(self._r) else self._result.grid.edges[-1]
+        r = self._r if len(self._r) else point_r
+        return float(r.max()) + BEYOND if len(r) else float(self._result.grid.edges[-1])
 
-    def draw_heights(self, axes: Any, reach: float) -> None:
-        """Draw points, candidates, lines and ground over range, up to `reach` [m]."""
-        groups = {'points': (POINT_COLOUR, np.ones(len(self._r), dtype=np.bool_))}
-        if self._truth is not None:
+    def draw_points(self, axes: Any, r: FloatArray, z: FloatArray, truth: Labels | None) -> None:
+        """Draw points over range, coloured by their true label if that is known."""
+        groups = {'points': (POINT_COLOUR, np.ones(len(r), dtype=np.bool_))}
+        if truth is not None:
             groups = {
-                f'points, {name}': (colour, self._truth == label)
+                f'points, {name}': (colour, truth == label)
                 for name, (label, colour) in TRUTH_COLOURS.items()
             }
         for name, (colour, chosen) in groups.items():
-            if chosen.any():
-                axes.plot(
-                    self._r[chosen], self._z[chosen], 'o', ms=3.6, mew=0.0, color=colour,
-                    zorder=2, label=f'{name} ({np.count_nonzero(chosen)})',
-                )  # fmt: skip
-        axes.fill_between(
-            self._knots, self._mean - 2.0 * self._std, self._mean + 2.0 * self._std,
-            linewidth=0.0, color=SURFACE_COLOUR, alpha=0.2, zorder=3, label='ground ± 2 std',
-        )  # fmt: skip
+            label = f'{name} ({np.count_nonzero(chosen)})'
+            axes.plot(
+                r[chosen], z[chosen], 'o', ms=3.6, mew=0, color=colour, zorder=2, label=label
+            )
+
+    def draw_ground(self, axes: Any) -> None:
+        """Draw ground, lines and candidates over range."""
+        low, high = self._mean - 2.0 * self._std, self._mean + 2.0 * self._std
+        look = {'linewidth': 0.0, 'color': SURFACE_COLOUR, 'alpha': 0.2, 'zorder': 3}
+        axes.fill_between(self._knots, low, high, label='ground ± 2 std', **look)
         self._draw_lines(axes)
         axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='ground')
+        hollow = {'mfc': 'white', 'mec': CANDIDATE_COLOUR, 'mew': 1.1, 'ms': 5.5, 'zorder': 6}
+        full = {'color': INLIER_COLOUR, 'mew': 0.0, 'ms': 5, 'zorder': 7}
         for name, chosen, look in (
-            ('rejected', ~self._inlier, {'mfc': 'white', 'mec': CANDIDATE_COLOUR, 'mew': 1.1,
-                                         'ms': 5.5, 'zorder': 6}),
-            ('inliers', self._inlier, {'color': INLIER_COLOUR, 'mew': 0.0, 'ms': 5, 'zorder': 7}),
-        ):  # fmt: skip
-            axes.plot(
-                self._candidate_r[chosen], self._candidate_z[chosen], 'o',
-                label=f'candidates, {name} ({np.count_nonzero(chosen)})', **look,
-            )  # fmt: skip
-        axes.set_xlim(0.0, reach)
-        low, high = self._heights_shown(reach)
-        axes.set_ylim(low, high)
+            ('rejected', ~self._inlier, hollow),
+            ('inliers', self._inlier, full),
+        ):
+            label = f'candidates, {name} ({np.count_nonzero(chosen)})'
+            axes.plot(self._r[chosen], self._z[chosen], 'o', label=label, **look)
         axes.set_ylabel('height z, sensor frame [m]')
-        inside = self._r <= reach
-        sides = {'above': inside & (self._z > high), 'below': inside & (self._z < low)}
-        sides['beyond'] = ~inside
-        outside = ', '.join(
-            f'{np.count_nonzero(which)} points {side}'
-            for side, which in sides.items()
-            if which.any()
-        )
-        axes.annotate(
-            f'not shown: {outside}' if outside else '', (1.0, 1.0), (0, 4), 'axes fraction',
-            textcoords='offset points', ha='right', va='bottom', fontsize=8.5,
-            color=CANDIDATE_COLOUR,
-        )  # fmt: skip
 
-    def _heights_shown(self, reach: float) -> tuple[float, float]:
-        """Limits around the ground as far as it rests on inliers, and candidates near it.
-
-        True ground elsewhere is inside the limits as well, but for its outermost percents.
-        """
-        r, z = self._candidate_r, self._candidate_z
-        inlier_r = r[self._inlier & (r <= reach)]
-        if not len(inlier_r):
-            low, high = np.quantile(self._z, (0.0, 0.5)) if len(self._z) else (-2.0, 0.0)
+    def heights_shown(self, reach: float, point_z: FloatArray) -> tuple[float, float]:
+        """Limits around the candidates near the ground, as far as it rests on inliers [m]."""
+        if not (self._inlier & (self._r <= reach)).any():
+            low, high = np.quantile(point_z, (0.0, 0.5)) if len(point_z) else (-2.0, 0.0)
             return float(low) - BELOW, float(high) + ABOVE
-        supported = (self._knots >= inlier_r[0]) & (self._knots <= inlier_r[-1])
-        height = np.abs(z - np.interp(r, self._knots, self._mean))
-        near = z[(height <= NEAR_GROUND) & (r <= reach)]
-        ground = [near, self._mean[supported]]
-        if self._truth is not None:
-            true_ground = self._z[(self._truth == Label.GROUND) & (self._r <= reach)]
-            if len(true_ground):
-                ground.append(np.quantile(true_ground, (0.01, 0.99)))
-        heights = np.concatenate(ground)
-        return float(heights.min()) - BELOW, float(heights.max()) + ABOVE
+        height = np.abs(self._z - np.interp(self._r, self._knots, self._mean))
+        near = self._z[(height <= NEAR_GROUND) & (self._r <= reach)]
+        return float(near.min()) - BELOW, float(near.max()) + ABOVE
 
     def _draw_lines(self, axes: Any) -> None:
         """Draw each line over its extent, and the critical points where the next one begins."""
@@ -244,10 +197,8 @@ class SegmentView:
             n_scalars = list(result.fit.theta).index('length_scale_bar_0')
             columns = n_scalars + result.pseudo.surface_class[first:last]
             l_bar = np.exp(result.theta[self._segment, columns])
-            axes.plot(
-                r_bar, l_bar, 's', ms=5, color=PSEUDO_INPUT_COLOUR, mew=0.0,
-                label=f'pseudo-inputs ({last - first})',
-            )  # fmt: skip
+            look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0}
+            axes.plot(r_bar, l_bar, 's', label=f'pseudo-inputs ({last - first})', **look)
             shown = np.concatenate([shown, l_bar[r_bar <= reach]])
         # At least a decade: ripples of a constant must not look like mountains. Set before the
         # scale, since on a log axis matplotlib warns of limits that a constant makes equal.

@@ -66,12 +66,12 @@ def legend_dots(colours: Mapping[str, str], size: float) -> list[Any]:
     ]
 
 
-def save(figure: Any, path: str | Path, *, force: bool = True) -> None:
-    """Write a figure as PDF where `path` ends so, else as PNG."""
+def save(figure: Any, path: str | Path) -> None:
+    """Write a figure as PDF where `path` ends so, else as PNG, replacing the file."""
     kind = 'pdf' if Path(path).suffix.lower() == '.pdf' else 'png'
     # With its date no PDF would equal another.
     metadata = {'CreationDate': None} if kind == 'pdf' else {}
-    with staged_file(path, force=force) as part:
+    with staged_file(path, force=True) as part:
         figure.savefig(part, format=kind, metadata=metadata)
 
 

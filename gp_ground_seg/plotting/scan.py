@@ -1,0 +1,260 @@
+"""A segmented scan: in perspective with the ground model on it, or from above with its errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.frame import BoolArray, FloatArray, Label
+from gp_ground_seg.ground_model import GroundModel
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.pipeline.points import check_points, finite_points
+from gp_ground_seg.plotting import style
+from gp_ground_seg.plotting.style import (
+    add_axes,
+    length_scale_colours,
+    new_figure,
+    save,
+    write_line,
+)
+from gp_ground_seg.result import Segmentation
+
+Labels = npt.NDArray[np.uint8]
+
+COLOURS = {'ground': '#B9BFC6', 'obstacles': style.VERMILION}
+WIDTH, HEIGHT, TITLE = 12.0, 6.0, 0.4
+"""Size of the picture, and of the line above it [inch]."""
+N_STD = 2.0
+N_PROFILES = 60
+CLOSEST = 1.0
+"""Nothing nearer to the camera than this is drawn [m]."""
+# Places of the camera and of the middle of the picture, sensor frame [m].
+CAMERA, TARGET = (-16.0, -7.0, 10.0), (12.0, 1.0, -3.0)
+ZOOM = 0.75
+"""Focal length over the width of the picture."""
+
+COLOURS_ABOVE = {
+    'ground': '#E3B968',
+    'obstacle': '#1B4F72',
+    'unknown': style.PINK,
+    'not scored': '#E3E6E9',
+    'right': '#BCC2C8',
+    'missed ground': style.BLUE,
+    'false ground': style.VERMILION,
+}
+EXTENT, RING_STEP = 50.0, 10.0
+"""Half the side of the square seen from above, and the step between the rings in it [m]."""
+# Inches: the square of a panel, left, right, below and above it; the line above all panels.
+SQUARE, LEFT, RIGHT, BELOW, ABOVE, LINE = 6.2, 0.8, 0.2, 0.95, 0.4, 0.4
+
+
+def plot_scan_view(
+    points: npt.ArrayLike,
+    segmentation: Segmentation,
+    config: Config,
+    path: str | Path,
+    title: str = '',
+) -> None:
+    """Draw a scan in perspective as a PNG, replacing the file `path`.
+
+    Ground and obstacles of `points`, (N, >=3) [m], and on them profiles of the ground model with
+    two standard deviations, coloured by length-scale: what the node's topics show in RViz.
+    ``length_scale.min`` and ``max`` end the colours; ground less certain than
+    ``label.ground_tolerance`` is not drawn. Raises PointCloudError if another scan was segmented.
+    """
+    xyz = check_points(points)
+    finite = finite_points(xyz)
+    style.check_lengths(len(xyz), label=segmentation.label)
+    figure = new_figure(WIDTH, HEIGHT + (TITLE if title else 0.0))
+    axes = add_axes(figure, 0.0, 0.0, (WIDTH, HEIGHT))
+    write_line(figure, title, 0.5, 0.5 * TITLE, fontsize=14)
+    _draw_points(axes, xyz[finite], segmentation.label[finite])
+    _draw_profiles(axes, GroundModel.of(segmentation), config)
+    _draw_legend(figure, axes, config)
+    axes.set_axis_off()
+    axes.set_aspect('equal')
+    axes.set_xlim(-0.5, 0.5)
+    axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
+    save(figure, path)
+
+
+def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return places in the picture and depths [m] of points, (..., 2) and (...).
+
+    A place is in widths of the picture, right and up of its middle; NaN nearer than `CLOSEST`.
+    """
+    forward = np.subtract(TARGET, CAMERA)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    seen = (points - CAMERA) @ np.stack([right, np.cross(right, forward), forward]).T
+    depth: FloatArray = seen[..., 2]
+    safe = np.where(depth > CLOSEST, depth, np.nan)
+    place: FloatArray = ZOOM * seen[..., :2] / safe[..., None]
+    return place, depth
+
+
+def _draw_points(axes: Any, xyz: FloatArray, label: npt.NDArray[np.uint8]) -> None:
+    """Draw far points first, and the ground below all obstacles."""
+    place, depth = project(xyz)
+    labels_and_layers = ((Label.GROUND, 1), (Label.OBSTACLE, 4))
+    for colour, (value, layer) in zip(COLOURS.values(), labels_and_layers, strict=True):
+        chosen = np.flatnonzero((label == value) & (depth > CLOSEST))
+        chosen = chosen[np.argsort(-depth[chosen])]
+        axes.scatter(
+            *place[chosen].T, s=np.clip(40.0 / depth[chosen], 0.4, 4.0), c=colour,
+            linewidths=0.0, zorder=layer,
+        )  # fmt: skip
+
+
+def _draw_profiles(axes: Any, model: GroundModel, config: Config) -> None:
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    last = len(model.height) - 1
+    rows = np.unique(np.linspace(0, last, min(last + 1, N_PROFILES)).round()).astype(int)
+    middle, lower, upper = (
+        project(model.knot_points(n_std)[rows])[0] for n_std in (0.0, -N_STD, N_STD)
+    )
+    certain = model.std[rows] <= config.label.ground_tolerance
+    shown = certain & np.isfinite(upper + lower + middle).all(axis=-1)
+    piece = shown[:, :-1] & shown[:, 1:]
+    limits = config.length_scale
+    colours = length_scale_colours(model.length_scale[rows], limits.min, limits.max)
+    colours = colours[:, :-1][piece]
+    corners = [lower[:, :-1], lower[:, 1:], upper[:, 1:], upper[:, :-1]]
+    quads = np.stack([corner[piece] for corner in corners], axis=1)
+    ends = np.stack([middle[:, :-1][piece], middle[:, 1:][piece]], axis=1)
+    axes.add_collection(
+        PolyCollection(list(quads), facecolors=colours, alpha=0.35, linewidths=0.0, zorder=2)
+    )
+    axes.add_collection(LineCollection(list(ends), colors=colours, linewidths=1.3, zorder=3))
+
+
+def _draw_legend(figure: Any, axes: Any, config: Config) -> None:
+    from matplotlib.patches import Rectangle
+
+    dots = style.legend_dots(COLOURS, 7)
+    legend = axes.legend(handles=dots, loc='upper left', fontsize=11, framealpha=0.85)
+    legend.set_zorder(5)
+    plate = Rectangle((0.205, -0.5 * HEIGHT / WIDTH + 0.008), 0.285, 0.068)
+    plate.set(facecolor='white', edgecolor='#CCCCCC', alpha=0.85, zorder=5)
+    axes.add_patch(plate)
+    bar = add_axes(figure, 0.72 * WIDTH, 0.40, (0.255 * WIDTH, 0.16))
+    low, high = config.length_scale.min, config.length_scale.max
+    colours = length_scale_colours(np.geomspace(low, high, 200), low, high)
+    bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], colours[None])
+    bar.set_xscale('log')
+    bar.set_yticks([])
+    bar.set_title('length-scale of the ground [m]; ribbons: 2 sigma', fontsize=10)
+    ticks = [tick for tick in (0.1, 0.3, 1, 3, 10, 30, 100, 300) if low <= tick <= high]
+    bar.set_xticks(ticks, labels=[f'{tick:g}' for tick in ticks])
+    bar.minorticks_off()
+
+
+class Layer(NamedTuple):
+    """Points drawn alike: one of `COLOURS_ABOVE`, area of a dot [pt^2], which points, (N,)."""
+
+    name: str
+    size: float
+    chosen: BoolArray
+
+
+def plot_birds_eye(
+    points: npt.ArrayLike,
+    label: Labels,
+    path: str | Path,
+    truth: Labels | None = None,
+    title: str = '',
+) -> None:
+    """Draw points (N, >=3) [m] from above by their `Label`, as a PNG, replacing the file `path`.
+
+    With the true labels, UNKNOWN where a point does not count, a second panel shows the errors.
+    Raises PointCloudError if the shapes do not fit together.
+    """
+    xyz = check_points(points)
+    style.check_lengths(len(xyz), label=label, truth=truth)
+    xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
+    panels = [_label_panel(label)]
+    if truth is not None:
+        panels.append(_error_panel(label, truth))
+    width = LEFT + SQUARE + RIGHT
+    height = BELOW + SQUARE + ABOVE + (LINE if title else 0.0)
+    figure = new_figure(width * len(panels), height)
+    write_line(figure, title, 0.5, 0.6 * LINE, fontsize=15, fontweight='bold')
+    for k, (panel_title, layers) in enumerate(panels):
+        axes = add_axes(figure, k * width + LEFT, BELOW, (SQUARE, SQUARE))
+        axes.set_title(panel_title, fontsize=11)
+        axes.set_xlabel('y, to the left [m]')
+        axes.set_ylabel('x, forward [m]')
+        _draw_panel(axes, xy, layers)
+    save(figure, path)
+
+
+def _label_panel(label: Labels) -> tuple[str, list[Layer]]:
+    """Return title and layers of the given labels."""
+    shown = (Label.GROUND, Label.OBSTACLE, Label.UNKNOWN)
+    layers = [Layer(value.name.lower(), 1.0, label == value) for value in shown]
+    named = [layer for layer in layers if layer.name != 'unknown' or layer.chosen.any()]
+    counts = ', '.join(f'{_thousands(int(one.chosen.sum()))} {one.name}' for one in named)
+    return f'{_thousands(len(label))} points: {counts}', layers
+
+
+def _error_panel(label: Labels, truth: Labels) -> tuple[str, list[Layer]]:
+    """Return title and layers of the errors, lowest first; each point is in one."""
+    given, ground, obstacle = label == Label.GROUND, truth == Label.GROUND, truth == Label.OBSTACLE
+    hit, missed, false = ground & given, ground & ~given, obstacle & given
+    layers = [
+        Layer('not scored', 1.0, ~(ground | obstacle)),
+        Layer('right', 1.0, hit | (obstacle & ~given)),
+        Layer('missed ground', 3.0, missed),
+        Layer('false ground', 3.0, false),
+    ]
+    n_hit, n_missed, n_false = (int(part.sum()) for part in (hit, missed, false))
+    n_union = n_hit + n_missed + n_false
+    iou = f', IoU {100.0 * n_hit / n_union:.2f} %' if n_union else ''
+    return f'{_thousands(n_false)} false ground, {_thousands(n_missed)} missed ground{iou}', layers
+
+
+def _thousands(number: int) -> str:
+    return f'{number:,}'.replace(',', ' ')
+
+
+def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Sequence[Layer]) -> None:
+    """Draw points, rings of equal range and the sensor, forward up and left to the left."""
+    inside = (np.abs(xy) <= EXTENT).all(axis=1)  # False where it is NaN.
+    shown = {}
+    for depth, layer in enumerate(layers):
+        x, y = xy[layer.chosen & inside].T
+        if len(x):
+            shown[layer.name] = colour = COLOURS_ABOVE[layer.name]
+            axes.scatter(y, x, s=layer.size, c=colour, linewidths=0.0, zorder=depth)
+    angle = np.linspace(0.0, 2.0 * np.pi, 361)
+    for radius in np.arange(RING_STEP, EXTENT * math.sqrt(2.0), RING_STEP):
+        axes.plot(
+            radius * np.cos(angle), radius * np.sin(angle), color='#6B7178', linewidth=0.5,
+            linestyle=(0, (4, 4)), zorder=len(layers),
+        )  # fmt: skip
+        if radius < EXTENT:
+            axes.text(
+                *(-radius * math.sqrt(0.5),) * 2, f'{radius:g} m', fontsize=8, color='#3B4046',
+                ha='center', va='center', zorder=len(layers),
+                bbox={'boxstyle': 'round,pad=0.15', 'facecolor': 'white', 'edgecolor': 'none',
+                      'alpha': 0.8},
+            )  # fmt: skip
+    axes.set_aspect('equal')
+    axes.set_xlim(EXTENT, -EXTENT)
+    axes.set_ylim(-EXTENT, EXTENT)
+    (sensor,) = axes.plot(
+        0, 0, marker='^', color='white', markeredgecolor='black', linestyle='none',
+        markersize=8, zorder=len(layers) + 1, label='sensor',
+    )  # fmt: skip
+    axes.legend(
+        handles=[*style.legend_dots(shown, 7), sensor], loc='upper center', frameon=False,
+        bbox_to_anchor=(0.5, -0.08), ncols=len(shown) + 1, fontsize=10.5, handletextpad=0.2,
+        columnspacing=1.5,
+    )  # fmt: skip

@@ -1,0 +1,359 @@
+"""Start and end of ROS processes: arguments that are wrong, signals at any time."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+from conftest import REPOSITORY
+
+pytest.importorskip('rclpy', reason='ROS is not installed')
+
+import ros_helpers as ros
+from rcl_interfaces.srv import GetParameters
+from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
+from sensor_msgs.msg import PointCloud2
+
+from gp_ground_seg.jit import HAVE_NUMBA
+from gp_ground_seg.ros.lifecycle import ros_session
+
+FIXED = (*IN_NAMESPACE, '-p', 'learning.mode:=fixed')
+SOON = 4.0
+"""Half a second of grace, and what a machine that does other things adds to it [s]."""
+
+
+def run_python(*words):
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=60)
+
+
+# What is wrong at the start is one line with a hint and exit code 2, never a traceback.
+
+HEAD = '/**:\n  ros__parameters:\n'
+FILES = {
+    'range': (HEAD + '    label: {ground_tolerance: 9.0}\n', 'must be a number in [0.001, 5] m'),
+    'type': (HEAD + '    label: {ground_tolerance: high}\n', "ground_tolerance = 'high': must be"),
+    'integer': (HEAD + '    label: {ground_tolerance: 1}\n', 'with a decimal point as in 1.0'),
+    'list': (HEAD + '    grid: {n_segments: [1, 2]}\n', 'must be an integer in [4, 2048]'),
+    'nan': (HEAD + '    grid: {r_min: .nan}\n', 'grid.r_min = nan: must be'),
+    'rule': (HEAD + '    grid: {r_min: 50.0, r_max: 20.0}\n', 'must be below grid.r_max = 20'),
+    'choice': (HEAD + '    runtime: {backend: cuda}\n', 'must be one of auto, numba, numpy'),
+    'huge': (HEAD + '    grid: {n_segments: 999999999999999999999}\n', 'must be an integer'),
+    'sim_time': (HEAD + '    use_sim_time: "yes"\n', 'must be true or false'),
+    'null': (HEAD + '    grid:\n', 'No value at line 3'),
+    'mixed': (HEAD + '    grid: {n_bins: [1, 2.5]}\n', 'should be of same type'),
+    'bare': ('label: {ground_tolerance: 0.1}\n', 'before ros__parameters at line 1'),
+    'text': ('just words\n', 'no ros__parameters'),
+    'syntax': (HEAD + '  label: [ {a\n', 'params file'),
+    'tab': ('/**:\n\tros__parameters:\n', 'event near line 1'),
+    'twice': (HEAD + '    grid: {n_bins: 40}\n    grid: {n_bins: 50}\n', 'grid: given twice'),
+    'binary': (b'\xff\xfe\x00\x80', 'utf-8'),
+}
+QOS = 'qos_overrides./points.subscription'
+WORDS = {
+    'no such file': ('--params-file nowhere.yaml', 'nowhere.yaml'),
+    'folder': ('--params-file .', "--params-file .'"),
+    'no file': ('--params-file', 'No file path provided'),
+    'no value': ('-p label.ground_tolerance', "'-p label.ground_tolerance"),
+    'empty value': ('-p label.ground_tolerance:=', "'-p label.ground_tolerance"),
+    'range': ('-p grid.n_segments:=3', 'grid.n_segments = 3: must be an integer in [4, 2048]'),
+    'remap': ('-r points', "'-r points'"),
+    'topic': ('-r points:=/1;2', "'-r points:=/1;2'"),
+    'name': ('-r __node:=1st', '__node:=1st'),
+    'namespace': ('-r __ns:=front', '__ns:=front'),
+    'argument': ('--nonsense', "UnknownROSArgsError: ['--nonsense']"),
+    'log level': ('--log-level loud', 'does not use a valid severity level'),
+    'reliability': (f'-p {QOS}.reliability:=maybe', "= 'maybe': must be one of reliable"),
+    'depth': (f'-p {QOS}.depth:=-3', 'depth = -3: must be an integer in [1, 10000]'),
+    'depth type': (f'-p {QOS}.depth:=many', "depth = 'many': must be"),
+}
+
+
+@pytest.mark.parametrize('name', FILES)
+def test_bad_file(tmp_path, capfd, name):
+    text, hint = FILES[name]
+    path = tmp_path / 'bad.yaml'
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    assert hint in ros.start_error(capfd, '--params-file', str(path))
+
+
+@pytest.mark.parametrize('name', WORDS)
+def test_bad_words(capfd, name):
+    words, hint = WORDS[name]
+    assert hint in ros.start_error(capfd, *words.split())
+
+
+@pytest.mark.parametrize(
+    ('domain', 'hint'), [('999', 'must be an integer in [0, 232]'), ('a', 'not an integral')]
+)
+def test_bad_domain(monkeypatch, capfd, domain, hint):
+    monkeypatch.setenv('ROS_DOMAIN_ID', domain)
+    assert hint in ros.start_error(capfd)
+
+
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        ('config dump --ros-args -p a:=1', '--ros-args: this command takes none'),
+        ('node nonsense', 'nonsense'),
+        ('node --ros-args -- nonsense', 'nonsense'),
+    ],
+)
+def test_words_that_nobody_takes_are_refused(words, complaint):
+    done = run_python('-m', 'gp_ground_seg', *words.split())
+    assert done.returncode == 2
+    assert complaint in done.stderr
+    assert 'Traceback' not in done.stderr
+
+
+def test_missing_ros_is_said_in_one_line():
+    done = run_python('-c', f"import sys; sys.modules['rclpy'] = None; {ros.ENTRY_POINT[1]}")
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "pip install 'gp_ground_seg[ros]'" in line
+
+
+# What is right
+
+
+def test_two_nodes_side_by_side_read_their_parts_of_one_file(tmp_path):
+    """Each has its own parameters and topics; the second is told to be quiet."""
+    path = tmp_path / 'both.yaml'
+    path.write_text(
+        f'/**:\n  ros__parameters:\n    learning: {{mode: fixed}}\n'
+        f'{NAMESPACE}/front:\n  ros__parameters:\n    label: {{ground_tolerance: 0.3}}\n'
+        f'{NAMESPACE}/rear:\n  ros__parameters:\n    label: {{ground_tolerance: 0.4}}\n'
+    )
+    common = (*IN_NAMESPACE, '--params-file', str(path))
+    front = (*common, '-r', '__node:=front', '-r', 'points:=front/points')
+    rear = (*common, '-r', '__node:=rear', '-r', 'ground:=floor', '-p', 'grid.nbins:=5')
+    with (
+        Process(*front, folder=tmp_path) as one,
+        Process(*rear, '--log-level', 'warn', folder=tmp_path, start=MODULE) as other,
+        ros.isolated_context() as context,
+    ):
+        one.wait_until_ready()
+        assert 'label.ground_tolerance: 0.3 m' in one.log
+        assert f'listening to {NAMESPACE}/front/points' in one.log
+        link = ros.Link(context)
+        floor = ros.Collector(link.probe, PointCloud2, 'floor')
+        to_front = link.probe.create_publisher(PointCloud2, 'front/points', ros.RELIABLE)
+        with ros.spinning(context, link.probe):
+            request = GetParameters.Request(names=['label.ground_tolerance', 'learning.mode'])
+            for name, tolerance in (('front', 0.3), ('rear', 0.4)):
+                link.node_name = f'{NAMESPACE}/{name}'
+                values = link.call(GetParameters, 'get_parameters', request).values
+                assert (values[0].double_value, values[1].string_value) == (tolerance, 'fixed')
+            points = ros.street(1000)
+            link.publish_until(ros.to_message(points, frame='r'), lambda: floor.messages, 'floor')
+            link.publisher, heard = to_front, link.ground.messages
+            link.publish_until(ros.to_message(points, frame='f'), lambda: heard, 'ground')
+            assert {message.header.frame_id for message in floor.messages} == {'r'}
+            assert {message.header.frame_id for message in heard} == {'f'}
+        # Quiet but for what is wrong, and that names what was meant.
+        (line,) = other.log.splitlines()
+        assert 'grid.nbins' in line
+        assert 'did you mean grid.n_bins?' in line
+
+
+def test_a_preset_as_the_readme_has_it(tmp_path):
+    """The block that makes a copy of a preset, line for line, but for where the files are."""
+    readme = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
+    blocks = re.findall(r'```sh\n(.*?)```', readme, re.DOTALL)
+    (block,) = [block for block in blocks if 'config dump --preset' in block]
+    *commands, node_command = block.splitlines()
+    script = f'gp-ground-seg() {{ {sys.executable} -m gp_ground_seg "$@"; }}; set -e\n'
+    command = ['bash', '-c', script + '\n'.join(commands)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert 'my.yaml: good; ' in done.stdout
+    program, *words = node_command.split()
+    assert program == 'gp-ground-seg'
+    words[words.index('my.yaml')] = str(tmp_path / 'my.yaml')
+    words += ['-p', 'grid.n_bins:=55']
+    with Process(*words, folder=tmp_path, start=('-m', 'gp_ground_seg')) as node:
+        node.wait_until_ready()
+        assert 'listening to /velodyne_points' in node.log
+        assert 'grid.n_segments: 120  (default 180)' in node.log
+        assert 'grid.n_bins: 55  (default 80)' in node.log
+        assert_good_end(node, signal.SIGINT)
+
+
+# Signals to the node: it ends with code 0, soon, whatever it is doing.
+
+
+def stat_words(pid):
+    with open(f'/proc/{pid}/stat', encoding='ascii') as stat:
+        return stat.read().rsplit(')', 1)[1].split()
+
+
+def cpu_seconds(pid):
+    words = stat_words(pid)
+    return (int(words[11]) + int(words[12])) / os.sysconf('SC_CLK_TCK')
+
+
+def is_running(pid):
+    try:
+        return stat_words(pid)[0] != 'Z'
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def children(pid):
+    found = [int(name) for name in os.listdir('/proc') if name.isdigit()]
+    return [one for one in found if is_running(one) and int(stat_words(one)[1]) == pid]
+
+
+def heeds_sigterm(process):
+    """Whether the process has a handler of its own."""
+    with open(f'/proc/{process.popen.pid}/status', encoding='ascii') as status:
+        caught = next(line for line in status if line.startswith('SigCgt:'))
+    return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
+
+
+def assert_good_end(node, number):
+    code, duration = node.stop(number)
+    assert code == 0, node.log
+    assert duration < SOON
+    assert 'Traceback' not in node.log
+    assert 'ERROR' not in node.log
+
+
+@pytest.mark.parametrize(
+    ('start', 'number'), [(ros.ENTRY_POINT, signal.SIGINT), (MODULE, signal.SIGTERM)]
+)
+def test_while_importing(tmp_path, start, number):
+    with Process(*FIXED, folder=tmp_path, start=start) as node:
+        wait_for(lambda: heeds_sigterm(node), 'handler')
+        assert_good_end(node, number)
+        assert 'listening' not in node.log
+
+
+@pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
+def test_while_compiling(tmp_path, number):
+    """The compiling process ends too, also with a node that is killed."""
+    cache = tmp_path / 'cache'
+    cache.mkdir(mode=0o700)
+    with Process(*FIXED, folder=tmp_path, NUMBA_CACHE_DIR=str(cache)) as node:
+        node.wait_until_ready()
+        wait_for(lambda: len(children(node.popen.pid)) == 1, 'compiler')
+        (compiler,) = children(node.popen.pid)
+        wait_for(lambda: cpu_seconds(compiler) > 2.0, 'work')
+        if number == signal.SIGTERM:
+            assert_good_end(node, number)
+        else:
+            node.stop(number)
+    wait_for(lambda: not is_running(compiler), 'end of the compiler')
+
+
+@pytest.mark.parametrize(
+    ('backend', 'n_segments', 'number'),
+    [('numba', 2048, signal.SIGTERM), ('numpy', 512, signal.SIGINT)],
+)
+def test_within_a_long_segmentation(tmp_path, backend, n_segments, number):
+    """A thread ends what does not end itself: one call into compiled code takes seconds."""
+    if backend == 'numba' and not HAVE_NUMBA:
+        pytest.skip('numba is not installed')
+    # A scan takes 5 s and more.
+    words = {
+        'grid.n_segments': n_segments,
+        'grid.n_bins': n_segments // 2,
+        'learning.max_evaluations': 1000,
+        'learning.segment_step': 1,
+        'runtime.backend': backend,
+    }
+    with ros.linked_process(tmp_path, *ros.given(words)) as (node, link):
+        node.wait_until_settled()
+        before = cpu_seconds(node.popen.pid)
+        link.publisher.publish(ros.to_message(ros.street(300_000)))
+        wait_for(lambda: cpu_seconds(node.popen.pid) > before + 1.0, 'work')
+        assert_good_end(node, number)
+        assert not link.ground.messages
+
+
+@pytest.mark.parametrize(
+    'numbers', [[signal.SIGTERM], [signal.SIGINT, signal.SIGINT, signal.SIGTERM]]
+)
+def test_under_load(tmp_path, numbers):
+    """Signals that follow do not break the end: a terminal and a launch file both send one."""
+    message = ros.to_message(ros.street(20_000))
+    with ros.linked_process(tmp_path, '-p', 'learning.mode:=fixed') as (node, link):
+        link.publish_until(message, lambda: len(link.ground.messages) >= 3, 'cloud')
+        for _ in range(10):
+            link.publisher.publish(message)
+        for number in numbers[:-1]:
+            node.popen.send_signal(number)
+        assert_good_end(node, numbers[-1])
+
+
+UNDISTURBED = """
+import signal
+from gp_ground_seg.ros.lifecycle import stop_on_signals
+before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+with stop_on_signals() as outer:
+    with stop_on_signals() as stop:
+        assert not stop.made
+assert before == (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM))
+assert signal.set_wakeup_fd(-1) == -1
+"""
+
+
+def test_without_a_signal_all_is_as_before():
+    done = run_python('-c', UNDISTURBED)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
+# Signals to the commands that talk to a node
+
+
+@pytest.fixture
+def alone():
+    with ros.isolated():
+        yield
+
+
+def interrupted_by(number, said):
+    with ros_session('one'):
+        said.append('before')
+        os.kill(os.getpid(), number)
+        # Python handles it before this at the latest.
+        said.append('after')
+
+
+def held_back(number, said):
+    with ros_session('one') as session:
+        with session.holding_back():
+            os.kill(os.getpid(), number)
+            said.append('held back')
+        session.check()
+        said.append('after')
+
+
+def misunderstood(number, _said):
+    with ros_session('one') as session:
+        with session.holding_back():
+            os.kill(os.getpid(), number)
+        raise RuntimeError('unable to convert')
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(
+    ('act', 'expected'),
+    [(interrupted_by, ['before']), (held_back, ['held back']), (misunderstood, [])],
+)
+@pytest.mark.usefixtures('alone', 'heeded_hangup')
+def test_a_signal_interrupts_at_once_or_where_it_may(act, expected, number):
+    said = []
+    with pytest.raises(KeyboardInterrupt) as raised:
+        act(number, said)
+    assert said == expected
+    # What the bindings make of an interrupt is its cause.
+    assert isinstance(raised.value.__cause__, RuntimeError) == (act is misunderstood)
+
+
+@pytest.mark.usefixtures('alone')
+def test_without_a_signal_an_error_is_an_error():
+    with pytest.raises(RuntimeError, match='own'), ros_session('one'):
+        raise RuntimeError('own')
