@@ -209,8 +209,8 @@ QOS = 'qos_overrides: {/points: {subscription: {depth: 3}}}'
         'label.ground_tolerance: 0.15\nsensor.height: 2\n',
         f'/**:\n  ros__parameters: {{{GIVEN}}}\n',
         '/**:\n  ros__parameters:\n    label.ground_tolerance: 0.15\n    sensor.height: 2\n',
-        f'ground: {{ros__parameters: {{{GIVEN}}}}}\n',
-        f'/robot/ground:\n  ros__parameters: {{{GIVEN}}}\n',
+        f'ground_segmentation_node: {{ros__parameters: {{{GIVEN}}}}}\n',
+        f'/robot/ground_segmentation_node:\n  ros__parameters: {{{GIVEN}}}\n',
         f'/**:\n  ros__parameters: {{use_sim_time: true, {QOS}, {GIVEN}}}\n',
     ],
 )

@@ -88,10 +88,15 @@ def run_check(arguments: argparse.Namespace) -> int:
         if problems:
             code = EXIT_WRONG
             continue
-        n_given = len(read_parameters(path).values)
-        n_changed = len(export.differences(Config(), Config.from_yaml(path)))
-        given = f'{n_given} of {len(parameter_specs())} parameters given'
-        print(f'{path}: good; {given}, {n_changed} differ from the defaults')
+        file = read_parameters(path)
+        n_changed = len(export.differences(Config(), Config().replace(**file.values)))
+        given = f'{len(file.values)} of {len(parameter_specs())} parameters given'
+        use = ''
+        if not file.node:
+            use = ' for --config; for the node: gp-ground-seg config dump --config FILE > ros.yaml'
+        elif not file.is_ours:
+            use = f' for a node named {file.node} only'
+        print(f'{path}: good{use}; {given}, {n_changed} differ from the defaults')
     return code
 
 

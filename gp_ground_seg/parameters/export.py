@@ -142,7 +142,7 @@ def file_problems(path: str | Path) -> list[str]:
     for name, value in file.values.items():
         try:
             spec = find_spec(name)
-            spec.check_typed(value) if file.is_ros else spec.check(value)
+            spec.check_typed(value) if file.node else spec.check(value)
         except ConfigError as error:
             problems.append(str(error))
     if problems:

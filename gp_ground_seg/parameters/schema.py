@@ -24,6 +24,7 @@ ParameterValue = bool | int | float | str
 AUTO: Literal['auto'] = 'auto'
 """What a number may be instead where its declaration says so: estimated from the scan."""
 ROS_NODE_KEY = '/**'
+NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
 OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters that every ROS node has."""
@@ -185,7 +186,12 @@ class ParameterGroups:
         with the path, if the file cannot be read, a name is unknown, or a value is not accepted.
         """
         try:
-            return (base or cls()).replace(**read_parameters(path).values)
+            file = read_parameters(path)
+            if not file.is_ours:
+                raise ConfigError(
+                    f'parameters of node {file.node}; must be of {ROS_NODE_KEY} or {NODE_NAME}'
+                )
+            return (base or cls()).replace(**file.values)
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
 
@@ -242,7 +248,12 @@ class ParameterFile(NamedTuple):
     """Values of a parameter file by dotted names, unchecked."""
 
     values: dict[str, object]
-    is_ros: bool  # whether it is in the form of ROS, where types are strict
+    node: str  # whose they are, in the form of ROS, where types are strict; '' for bare groups
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether a node of our name, and commands, use it."""
+        return self.node.split('/')[-1] in ('', '*', '**', NODE_NAME)
 
 
 def read_parameters(path: str | Path) -> ParameterFile:
@@ -254,7 +265,10 @@ def read_parameters(path: str | Path) -> ParameterFile:
             if name in values:
                 raise ConfigError(f'{name}: given twice')
             values[name] = value
-        return ParameterFile(values, isinstance(document, Mapping) and _is_ros(document))
+        node = ''
+        if isinstance(document, Mapping) and _is_ros(document):
+            (node,) = map(str, document)
+        return ParameterFile(values, node)
     except OSError as error:
         raise ConfigError(error.strerror or str(error)) from error
     except UnicodeDecodeError as error:
