@@ -25,23 +25,25 @@ class Part(NamedTuple):
     script: str
     n_cases: int
     chunk: int  # cases of one process
-    environment: dict[str, str] = {}
+    environment: tuple[str, ...] = ()  # NAME=value
     timeout: float = 900.0  # of one process [s]
 
 
 PARTS = {
     'clouds': Part('torture_clouds.py', 1000, 100),
     'clouds, debugging allocator': Part(
-        'torture_clouds.py', 100, 50, {'PYTHONMALLOC': 'debug', 'MALLOC_PERTURB_': '165'}
+        'torture_clouds.py', 100, 50, ('PYTHONMALLOC=debug', 'MALLOC_PERTURB_=165')
     ),
     'threads, processes, signals, limits': Part('torture_processes.py', 1, 1),
+    'damaged files': Part('torture_files.py', 600, 200),
+    'hostile clouds over DDS': Part('torture_ros.py', 400, 200),
 }
 
 
 def run_chunk(part, first, stop):
     """Return the lines of the cases that failed; a crash or a hang is one."""
     command = [sys.executable, TEST / part.script, str(first), str(stop)]
-    environment = {**os.environ, **part.environment}
+    environment = {**os.environ, **dict(pair.split('=') for pair in part.environment)}
     environment['PYTHONPATH'] = os.pathsep.join([str(TEST.parent), str(TEST)])
     try:
         done = subprocess.run(

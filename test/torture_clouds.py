@@ -116,7 +116,6 @@ def segment(config, points, backend, n_threads):
     try:
         return segmenter.segment(points)
     except PointCloudError as error:
-        assert '\n' not in str(error), 'an error of more than a line'
         return str(error)
     finally:
         segmenter.close()
@@ -133,6 +132,7 @@ def run_case(number):
     assert points.tobytes() == before, 'the input was written to'
     if isinstance(results[0], str):
         assert results[0] == results[1] == results[2], results
+        assert '\n' not in results[0], 'an error of more than a line'
         return len(results)
     for result in results:
         assert not isinstance(result, str), result
@@ -155,7 +155,7 @@ def main():
         print(f'\r{number}', end='', flush=True)
         try:
             run_case(number)
-        except Exception as error:  # noqa: BLE001 - any error is a finding
+        except Exception as error:
             n_failed += 1
             print(f'\rcase {number}: {type(error).__name__}: {error}', flush=True)
     print()

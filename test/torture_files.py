@@ -19,10 +19,25 @@ from gp_ground_seg.cli import main as cli
 
 SLOWEST = 30.0
 """Time that a command may take [s]."""
-YAML_PIECES = [
-    b'1' * 5000, b'*a', b'&a [*a, *a]', b'1e999', b'.nan', b'-.inf', b'0x7f', b'2011-99-99', b'!!python/name:os',
-    b'~', b'[1, 2]', b'{a: b}', b'true', b'"\\ud800"', b'\t', b'\x00', b'\xff', b'- ', b'? ', b'grid:', b'r_max: 1',
-]  # fmt: skip
+YAML_PIECES = [b'1' * 5000, *rb"""
+*a
+&a [*a, *a]
+1e999
+.nan
+-.inf
+0x7f
+2011-99-99
+!!python/name:os
+~
+[1, 2]
+{a: b}
+true
+"\ud800"
+-
+?
+grid:
+r_max: 1
+""".split(b'\n'), b'\t', b'\x00', b'\xff', b'\n']  # fmt: skip
 
 
 def damage(data, rng, is_text):
@@ -65,38 +80,20 @@ def make_samples(folder):
     write_ros2_bag(folder / 'drive.mcap')
     write_ros2_bag(folder / 'drive.db3')
     write_ros1_bag(folder / 'drive.bag')
-    bag = (
-        [p for p in (folder / 'drive.db3').rglob('*.db3')]
-        if (folder / 'drive.db3').is_dir()
-        else []
-    )
-    (mcap,) = (
-        (folder / 'drive.mcap').rglob('*.mcap')
-        if (folder / 'drive.mcap').is_dir()
-        else [folder / 'drive.mcap']
-    )
+    write_ros2_bag(folder / 'drive')
+    out = ['-o', folder / 'out.mcap']
+    robot = folder / 'robot.yaml'
     samples = {
         'scan': (folder / 'scan.bin', ['segment', folder / 'scan.bin']),
         'scan of a root': (root / 'velodyne' / '000000.bin', ['evaluate', folder / 'root']),
         'labels': (root / 'labels' / '000000.label', ['evaluate', folder / 'root']),
-        'parameters': (folder / 'robot.yaml', ['config', 'check', folder / 'robot.yaml']),
-        'parameters used': (
-            folder / 'robot.yaml',
-            ['segment', folder / 'scan.bin', '--config', folder / 'robot.yaml'],
-        ),
-        'mcap': (mcap, ['segment', folder / 'drive.mcap', '-o', folder / 'out.mcap']),
-        'ros 1 bag': (
-            folder / 'drive.bag',
-            ['segment', folder / 'drive.bag', '-o', folder / 'out.mcap'],
-        ),
+        'parameters': (robot, ['config', 'check', robot]),
+        'parameters used': (robot, ['segment', folder / 'scan.bin', '--config', robot]),
     }
-    if bag:
-        samples['sqlite'] = (bag[0], ['segment', folder / 'drive.db3', '-o', folder / 'out.mcap'])
-        metadata = folder / 'drive.db3' / 'metadata.yaml'
-        samples['metadata'] = (
-            metadata,
-            ['segment', folder / 'drive.db3', '-o', folder / 'out.mcap'],
-        )
+    for name in ('drive.mcap', 'drive.db3', 'drive.bag'):
+        samples[name] = (folder / name, ['segment', folder / name, *out])
+    for path in sorted((folder / 'drive').iterdir()):
+        samples[f'drive/{path.name}'] = (path, ['segment', folder / 'drive', *out])
     return samples
 
 
@@ -117,11 +114,10 @@ def run_case(number, samples, folder):
             code = stop.code
         except BaseException as error:
             return f'{name}: {type(error).__name__}: {" ".join(str(error).split())[:200]}'
-        # `config check` prints a line for each file, other commands an error.
+        # `config check` prints a line for each problem, other commands one error.
         mark = str(path) if words[1] == 'check' else 'error: '
-        lines = [line for line in errors.getvalue().splitlines() if mark in line]
-        n_lines = len(lines) if words[1] != 'check' else min(len(lines), 1)
-        if code not in (0, 2) or (code == 2 and n_lines != 1):
+        n_lines = sum(mark in line for line in errors.getvalue().splitlines())
+        if code not in (0, 2) or (code == 2 and not (n_lines == 1 or words[1] == 'check')):
             return f'{name}: exit code {code}, {errors.getvalue()[-200:]!r}'
         if code == 2 and out.exists():
             return f'{name}: something was written'
