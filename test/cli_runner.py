@@ -1,7 +1,9 @@
 """Runs the commands under test, in this process or in one of their own."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 from gp_ground_seg.cli import main as cli
 
@@ -17,6 +19,25 @@ def start(*words, **options):
         [sys.executable, '-m', 'gp_ground_seg', *(str(word) for word in words)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
     )  # fmt: skip
+
+
+def stat_words(pid):
+    """Words about a process, from its state on; see proc(5)."""
+    return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
+
+
+def is_running(pid):
+    """Whether a process has not ended, waited for by its parent or not."""
+    try:
+        return stat_words(pid)[0] != 'Z'
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def children(pid):
+    """Processes that a process has started and that have not ended."""
+    found = [int(name) for name in os.listdir('/proc') if name.isdigit()]
+    return [one for one in found if is_running(one) and int(stat_words(one)[1]) == pid]
 
 
 def error_line(capsys):

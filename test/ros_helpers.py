@@ -124,8 +124,6 @@ class Collector:
         return self.messages
 
 
-# Clouds
-
 _LAYOUT = {'names': ['intensity', *'xyz'], 'formats': 4 * ['<f4'], 'offsets': [0, 4, 8, 12]}
 POINT = np.dtype({**_LAYOUT, 'itemsize': 64})
 """A point as a driver sends it: x not first, bytes that belong to no field."""
@@ -172,8 +170,6 @@ def rows_of(message):
     data, step = bytes(message.data), message.point_step
     return [data[start : start + step] for start in range(0, len(data), step)]
 
-
-# The node as a process
 
 ENTRY_POINT = ('-c', 'import sys; from gp_ground_seg.cli.node import main; sys.exit(main())')
 """What the installed executable does."""
@@ -245,9 +241,6 @@ def said_by(capfd, *texts):
     return said[0]
 
 
-# Talking to a node
-
-
 def values_of(status):
     """The numbers of a status."""
     return {entry.key: entry.value for entry in status.values}
@@ -265,11 +258,11 @@ class Link:
 
     node_name = f'{NAMESPACE}/{NODE_NAME}'
 
-    def __init__(self, context, sends=RELIABLE, takes=RELIABLE):
+    def __init__(self, context, sends=RELIABLE):
         self.probe = Node('probe', context=context, namespace=NAMESPACE)
         self.publisher = sends and self.probe.create_publisher(PointCloud2, 'points', sends)
-        self.ground = Collector(self.probe, PointCloud2, 'ground', takes)
-        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles', takes)
+        self.ground = Collector(self.probe, PointCloud2, 'ground')
+        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles')
         self.diagnostics = Collector(self.probe, DiagnosticArray, '/diagnostics')
         self._clients = {}
 
@@ -359,10 +352,10 @@ def bench(*words, settled=True):
 
 
 @contextlib.contextmanager
-def linked(sends=RELIABLE, takes=RELIABLE):
+def linked(sends=RELIABLE):
     """A connected `Link` to a node of another process."""
     with isolated_context() as context:
-        link = Link(context, sends, takes)
+        link = Link(context, sends)
         with spinning(context, link.probe):
             link.wait_until_connected()
             yield link

@@ -19,13 +19,8 @@ from gp_ground_seg import Config
 from gp_ground_seg.cli import bench as command
 from gp_ground_seg.cli.bench import RUN_LENGTH, bench_text, load_frames, read_record, runs
 from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.evaluation.benchmark import (
-    BenchFrame,
-    FrameTime,
-    bench_cases,
-    bench_document,
-    run_cases,
-)
+from gp_ground_seg.evaluation import benchmark
+from gp_ground_seg.evaluation.benchmark import FrameTime, bench_cases, bench_document, run_cases
 from gp_ground_seg.evaluation.evaluate import PATCHWORKPP
 from gp_ground_seg.evaluation.report import describe_environment
 
@@ -62,7 +57,7 @@ class Ruler(HeightRule):
 
 def frames_of(*sequences, n_points=300):
     return [
-        BenchFrame(name, str(k), with_intensity(hilly_scan(n_points, seed=k)))
+        benchmark.BenchFrame(name, str(k), with_intensity(hilly_scan(n_points, seed=k)))
         for name, n in sequences
         for k in range(n)
     ]
@@ -160,9 +155,6 @@ def test_docs_show_the_record():
     docs = REPOSITORY / 'docs'
     text = (docs / 'performance.md').read_text(encoding='utf-8')
     assert f'```text\n{bench_text(read_record(docs / "performance.json"))}\n```' in text
-
-
-# The command.
 
 
 @pytest.fixture(scope='module')

@@ -1,6 +1,7 @@
 """The command `play`, by what a subscriber gets of it and by what it says."""
 
 import contextlib
+import functools
 import itertools
 import os
 import re
@@ -12,6 +13,7 @@ import threading
 import numpy as np
 import pytest
 from bag_samples import PERIOD, START, write_ros1_bag, write_ros2_bag
+from cli_runner import error_line, run
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
@@ -22,7 +24,6 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.main import main
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
 from gp_ground_seg.ros import lifecycle, playback
@@ -77,8 +78,7 @@ def drive(folder, n_clouds, **options):
     return folder / 'drive.mcap'
 
 
-def play(*words):
-    return main(['play', *(str(word) for word in words)])
+play = functools.partial(run, 'play')
 
 
 def summary(capsys):
@@ -141,9 +141,9 @@ def test_part_of_a_bag(tmp_path, capsys):
 
     with isolated_context():
         assert play(bag, '--start', 5, '--no-wait', '--quiet') == 2
-    assert capsys.readouterr().err == (
-        f'gp-ground-seg: error: {bag}: no cloud in the time asked for (from 5 s on); '
-        'the last of its 10 clouds is at 0.900 s\n'
+    assert error_line(capsys) == (
+        f'{bag}: no cloud in the time asked for (from 5 s on); '
+        'the last of its 10 clouds is at 0.900 s'
     )
 
 
@@ -184,10 +184,8 @@ def test_nobody_listens(tmp_path, capsys):
     bag = drive(tmp_path, 3)
     with isolated_context():
         assert play(bag, '--wait', 0.2, '--quiet') == 2
-        assert capsys.readouterr().err == (
-            'gp-ground-seg: error: no subscriber of /points within 0.2 s; '
-            '--no-wait plays without one\n'
-        )
+        expected = 'no subscriber of /points within 0.2 s; --no-wait plays without one'
+        assert error_line(capsys) == expected
         assert play(bag, '--no-wait', '--quiet', '--rate', 10) == 0
     numbers = summary(capsys)
     assert (numbers[0], numbers[5]) == (3, 3)
@@ -343,8 +341,8 @@ def test_without_ros(tmp_path, capsys, monkeypatch):
     monkeypatch.delattr('gp_ground_seg.ros.playback')
     monkeypatch.setitem(sys.modules, 'rclpy.duration', None)
     assert play(tmp_path / 'drive.mcap') == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith('gp-ground-seg: error: play needs ROS 2, which cannot be imported')
+    line = error_line(capsys)
+    assert line.startswith('play needs ROS 2, which cannot be imported')
     assert "pip install 'gp_ground_seg[ros]'" in line
 
 
@@ -363,9 +361,7 @@ def test_refused_options(words, tmp_path, capsys):
 
 def test_no_bag(tmp_path, capsys):
     assert play(tmp_path / 'none.mcap') == 2
-    assert capsys.readouterr().err == (
-        f'gp-ground-seg: error: {tmp_path / "none.mcap"}: no such file or folder\n'
-    )
+    assert error_line(capsys) == f'{tmp_path / "none.mcap"}: no such file or folder'
     write_ros2_bag(tmp_path / 'drive.mcap', 1)
     assert play(tmp_path / 'drive.mcap', '--quiet', '--ros-args', '-r', 'nonsense') == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert error_line(capsys)

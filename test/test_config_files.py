@@ -15,15 +15,9 @@ from conftest import REPOSITORY
 from hypothesis import given, settings
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
+from gp_ground_seg.parameters import export
 from gp_ground_seg.parameters.config import parameter_specs
-from gp_ground_seg.parameters.export import (
-    README_BEGIN,
-    README_END,
-    file_problems,
-    generated_files,
-    to_markdown_table,
-    to_yaml,
-)
+from gp_ground_seg.parameters.export import README_BEGIN, README_END, file_problems
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 
@@ -35,7 +29,7 @@ GENERATE = 'run: python -m gp_ground_seg config generate'
 def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
     """ROS parameters are typed: 2 is not a double, and 1e-05 without a point is no number."""
     path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
-    path.write_text(to_yaml(config), encoding='utf-8')
+    path.write_text(export.to_yaml(config), encoding='utf-8')
     assert Config.from_yaml(path) == config
     assert file_problems(path) == []
     document = yaml.safe_load(path.read_text())
@@ -47,7 +41,7 @@ def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
 
 
 def test_every_parameter_is_explained_above_it():
-    lines = to_yaml(Config()).splitlines()
+    lines = export.to_yaml(Config()).splitlines()
     assert max(len(line) for line in lines) <= 99
     assert all(line == line.rstrip() for line in lines)
     specs = iter(parameter_specs())
@@ -69,7 +63,7 @@ def test_every_parameter_is_explained_above_it():
 
 
 def test_generated_files_are_up_to_date():
-    files = generated_files((REPOSITORY / 'README.md').read_text(encoding='utf-8'))
+    files = export.generated_files((REPOSITORY / 'README.md').read_text(encoding='utf-8'))
     assert set(files) == {
         'README.md', 'docs/parameters.md', *(f'config/{name}.yaml' for name in PRESETS)
     }  # fmt: skip
@@ -93,7 +87,7 @@ def test_tables_have_a_row_for_each_parameter(capsys):
         symbol = f'`{spec.symbol}`' if spec.symbol else ''
         assert cells[3:] == [spec.unit, symbol, spec.description]
     # README.md has the basic ones, the page all of them.
-    files = generated_files(f'{README_BEGIN}{README_END}')
+    files = export.generated_files(f'{README_BEGIN}{README_END}')
     assert files['docs/parameters.md'].endswith(table)
     is_basic = [spec.basic for spec in parameter_specs()]
     basic = [row for row, wanted in zip(rows, is_basic, strict=True) if wanted]
@@ -108,7 +102,7 @@ def test_generate_rewrites_what_is_generated_and_nothing_else(tmp_path, capsys):
     assert run('config', 'generate', tmp_path) == 0
     assert capsys.readouterr().out.count('rewritten') == n_files
     text = readme.read_bytes().decode()
-    table = to_markdown_table(basic_only=True)
+    table = export.to_markdown_table(basic_only=True)
     assert text == f'{head}{README_BEGIN}\n\n{table}\n{README_END}{tail}'
     for name, preset in PRESETS.items():
         assert Config.from_yaml(tmp_path / 'config' / f'{name}.yaml') == preset.config

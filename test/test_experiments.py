@@ -9,33 +9,18 @@ from evaluation_samples import write_frame, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg import Config, GroundSegmenter, Label, simulation
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.evaluate import (
-    MethodScore,
-    OurMethod,
-    PatchworkppMethod,
-    ScanScore,
-    labelled_frames,
-    load_kitti,
-    score_methods,
-)
+from gp_ground_seg.evaluation import evaluate as runner
+from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore, labelled_frames
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
 from gp_ground_seg.experiments import ablation, sensor_pose, variants
 from gp_ground_seg.experiments.ablation import MODELS, Departure
 from gp_ground_seg.experiments.sensor_pose import MOUNTS, SIMULATED_MOUNTS, score_poses
 from gp_ground_seg.experiments.variants import PRESET_OF, SimulatedFrame, load_simulated
 from gp_ground_seg.parameters.presets import PRESETS
-from gp_ground_seg.simulation import (
-    HDL_64E,
-    SCENES,
-    SENSORS,
-    VLP_16,
-    Kind,
-    semantic_kitti_labels,
-    simulate_scan,
-)
+from gp_ground_seg.simulation import HDL_64E, SCENES, SENSORS, Kind, simulate_scan
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
 FAR, NEAR = Config(), {'grid.r_max': 15.0}
@@ -44,9 +29,6 @@ FAR, NEAR = Config(), {'grid.r_max': 15.0}
 @pytest.fixture(scope='module')
 def frames(tmp_path_factory):
     return labelled_frames(write_streets(tmp_path_factory.mktemp('kitti'), s00=2, s08=1))
-
-
-# Variants.
 
 
 def test_only_what_the_ray_hit_of_the_terrain_is_ground():
@@ -58,9 +40,6 @@ def test_only_what_the_ray_hit_of_the_terrain_is_ground():
     np.testing.assert_array_equal(~ground, scan.truths['exact'] == Label.OBSTACLE)
 
 
-# Ablation.
-
-
 def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(frames):
     models = {'constant': 'constant', 'Z': 'line_gradient', 'Z-L': 'latent'}
     configs = {name: Config().replace(**changes) for name, changes in MODELS.items()}
@@ -69,7 +48,7 @@ def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(fra
         assert (config.learning.mode == 'fixed') == ('not learned' in title)
         assert (config.learning.scope == 'segment') == ('per segment' in title)
     assert config == Config()  # the last one is the default
-    scores = variants.score_variants(frames[:1], load_kitti, configs)
+    scores = variants.score_variants(frames[:1], runner.load_kitti, configs)
     theta = {score.name: tuple(score.scans[-1].fit.theta.values()) for score in scores}
     assert len(set(theta.values())) == len(MODELS) - 2
     assert len({values for name, values in theta.items() if 'not learned' in name}) == 1
@@ -85,9 +64,6 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     assert latent < 0.9 * min(constant, gradient)
 
 
-# Departures.
-
-
 @pytest.mark.parametrize('departure', ablation.DEPARTURES, ids=lambda one: one.title)
 def test_every_switch_of_the_list_is_accepted_and_turns_something(departure):
     switched = Config().replace(**departure.changes)
@@ -100,7 +76,7 @@ def test_worth_is_what_having_it_adds(frames):
     report = ablation.compare_departures(frames, departures, FAR)
     rows = {row['departure']: row for row in report.tables['departures'].json()}
     given, near = variants.score_variants(
-        frames, load_kitti, {'given': FAR, 'near': FAR.replace(**NEAR)}
+        frames, runner.load_kitti, {'given': FAR, 'near': FAR.replace(**NEAR)}
     )
     gain = given.iou - near.iou
     assert gain > 0.1
@@ -130,8 +106,6 @@ def test_lists_that_cannot_be(departures, message):
         ablation.compare_departures([], departures, Config())
 
 
-# Cross-validation.
-
 GRID = {'a': [0, 1, 2], 'b': [0, 1, 2]}
 
 
@@ -146,16 +120,8 @@ def test_no_single_change_betters_the_choice(heights):
     for name, value in itertools.product(GRID, range(3)):
         assert of({**best, name: value}) <= of(best)
     assert of(best) >= worth[0, 0]
-
-
-def test_a_separable_maximum_is_found():
-    best = ablation.coordinate_search(
-        GRID, {'a': 0, 'b': 0}, lambda c: -abs(c['a'] - 1) - abs(c['b'] - 2)
-    )
-    assert best == {'a': 1, 'b': 2}
-    assert (
-        ablation.coordinate_search(GRID, best, lambda c: 0.0) == best
-    )  # ties keep the given value
+    # Ties keep the given value.
+    assert ablation.coordinate_search(GRID, best, lambda _: 0.0) == best
 
 
 def test_each_sequence_is_scored_with_values_chosen_without_it(monkeypatch):
@@ -192,17 +158,14 @@ def test_scores_of_the_search_are_those_of_evaluate(frames):
     name = 'grid.r_max'
     report = ablation.cross_validate(frames, FAR, {name: [15.0, 90]})
     assert report.facts['n_configurations'] == 2  # 90 is the given value
-    ours = OurMethod(FAR)
-    (score,) = score_methods(frames, load_kitti, [ours])
+    ours = runner.OurMethod(FAR)
+    (score,) = runner.score_methods(frames, runner.load_kitti, [ours])
     ours.close()
     row, *_, pooled = report.tables['scores'].json()
     assert row['iou given'] == score.of('00').iou
     assert (pooled['iou given'], pooled['ECE given']) == (score.iou, score.ece)
     with pytest.raises(DataError, match='at least two sequences'):
         ablation.cross_validate(frames[:2], FAR, {name: [15.0]})
-
-
-# Simulated scenes.
 
 
 def test_every_sensor_has_a_preset_of_its_height():
@@ -218,7 +181,7 @@ def test_scene_scores_follow_their_definitions(monkeypatch):
     (row,) = report.tables['scenes'].json()
     total, its_total = Confusion(), Confusion()
     errors, its_errors = [], []
-    segmenter, method = GroundSegmenter(config), PatchworkppMethod(SENSORS['vlp-16'].height)
+    segmenter, method = GroundSegmenter(config), runner.PatchworkppMethod(SENSORS['vlp-16'].height)
     for seed in (0, 1):
         scan = load_simulated(SimulatedFrame('vlp-16', 'kerb', seed, 6.0))
         ground, z = scan.is_ground, scan.ground_z
@@ -253,9 +216,6 @@ def test_behind_is_said():
     assert note == 'ahead of Patchwork++ on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
 
 
-# Sensor pose.
-
-
 @pytest.fixture(scope='module')
 def streets(tmp_path_factory):
     """Two frames of a simulated street, from KITTI's height."""
@@ -263,7 +223,7 @@ def streets(tmp_path_factory):
     small = dataclasses.replace(HDL_64E, n_columns=500)
     for seed in range(2):
         scan = simulate_scan(SCENES['kerb'](seed), small, np.random.default_rng(seed))
-        write_frame(root, '00', seed, scan.points, semantic_kitti_labels(scan.kind))
+        write_frame(root, '00', seed, scan.points, simulation.semantic_kitti_labels(scan.kind))
     return labelled_frames(root)
 
 
@@ -289,7 +249,7 @@ def test_frames_turned(streets):
 
 
 def test_poses_of_simulated_scans(monkeypatch):
-    small = dataclasses.replace(VLP_16, n_columns=600)
+    small = dataclasses.replace(simulation.VLP_16, n_columns=600)
     monkeypatch.setitem(sensor_pose.SENSORS, 'vlp-16', small)
     frames = variants.simulated_frames(['vlp-16'], ['flat'], 1, (0.0,))
     report = score_poses(frames, sensor_pose.load_mounted, SIMULATED_MOUNTS, FIXED)

@@ -10,16 +10,8 @@ from gp_ground_seg import Config
 from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.frame import Candidates
-from gp_ground_seg.pipeline.ground_plane import (
-    MIN_CELLS,
-    N_RINGS,
-    N_SECTORS,
-    RING_EDGES,
-    fit_plane,
-    lowest_points,
-    segment_directions,
-    solve_plane,
-)
+from gp_ground_seg.pipeline import ground_plane
+from gp_ground_seg.pipeline.ground_plane import MIN_CELLS, N_SECTORS, RING_EDGES, solve_plane
 from gp_ground_seg.pipeline.tilt import rotation
 
 BACKENDS = NumpyBackend(), NumbaBackend(1)
@@ -67,8 +59,8 @@ def slow_lowest(candidates):
 
 
 def assert_lowest(candidates):
-    cells = lowest_points(candidates)
-    cosine, sine = segment_directions(len(candidates.offsets) - 1)
+    cells = ground_plane.lowest_points(candidates)
+    cosine, sine = ground_plane.segment_directions(len(candidates.offsets) - 1)
     expected = [(s, z, r, r * cosine[m], r * sine[m]) for s, z, r, m in slow_lowest(candidates)]
     assert list(zip(cells.sector, cells.z, cells.r, cells.x, cells.y, strict=True)) == expected
 
@@ -83,7 +75,7 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
     if a is not None:
         np.testing.assert_allclose(a, b, atol=1e-9)
         assert 0.0 < a.support <= 1.0
-        assert a.n_support <= a.n_cells <= N_SECTORS * N_RINGS
+        assert a.n_support <= a.n_cells <= N_SECTORS * ground_plane.N_RINGS
 
 
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)
@@ -108,7 +100,7 @@ def test_moments_that_determine_no_plane_or_no_slope():
 def test_a_refinement_that_leaves_the_ground_is_not_used(monkeypatch):
     candidates = BACKENDS[0].build_grid(cluttered_plane(0, 1.5, 0.0, 0.0), Config()).candidates
     monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (99.0, 0.0, 0.0))
-    assert fit_plane(candidates, 0.5).height == pytest.approx(1.5, abs=0.1)
+    assert ground_plane.fit_plane(candidates, 0.5).height == pytest.approx(1.5, abs=0.1)
     # Nor is a plane that no point lies on.
     monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (19.0, 0.0, 0.0))
-    assert fit_plane(candidates, 0.5) is None
+    assert ground_plane.fit_plane(candidates, 0.5) is None

@@ -148,8 +148,6 @@ def test_space_follows_the_configuration(changes, n_free):
     assert theta_names(7)[5:] == ['length_scale_bar_0', 'length_scale_bar_1']
 
 
-# Learning in the segmenter
-
 N_POINTS = fewer(4000, 400)
 
 

@@ -33,9 +33,6 @@ def extract(backend, candidates, changes):
     return found[1], found[3]
 
 
-# Regression
-
-
 def moments(r, z):
     r, z = r - r.mean(), z - z.mean()
     return float(r @ r), float(z @ z), float(r @ z)
@@ -71,9 +68,6 @@ def test_difference_in_direction(slope, new_slope, tolerance):
     difference = abs(math.atan(new_slope) - math.atan(slope))
     if abs(difference - tolerance) > 1e-9:
         assert differs_in_direction(slope, new_slope, tolerance) == (difference > tolerance)
-
-
-# Lines
 
 
 def draw_candidates(seed, n_segments=8, most=30):
@@ -143,9 +137,6 @@ def test_critical_points(backend, name):
     np.testing.assert_array_equal(np.isnan(lines.slope), np.diff(lines.start) == 1)
     for q, extent in enumerate(lines.extent(candidates)):
         assert extent == np.ptp(candidates.r[lines.line == q])
-
-
-# Candidates that continue a line
 
 
 def breaks(backend, r, z):

@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from sklearn.calibration import calibration_curve
-from sklearn.metrics import brier_score_loss
 
 from gp_ground_seg import Label
 from gp_ground_seg.errors import PointCloudError
@@ -154,17 +152,6 @@ def synthetic(n=20_000, seed=0, power=1.0):
     p = rng.beta(0.3, 0.3, n).astype(np.float32)
     ground = rng.random(n) < p.astype(float) ** power
     return p, np.where(ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
-
-
-@pytest.mark.parametrize('power', [1.0, 3.0])
-def test_probabilities_against_scikit_learn(power):
-    p, truth = synthetic(power=power)
-    found = metrics.count_calibration(p, truth)
-    ground = truth == Label.GROUND
-    assert found.brier == pytest.approx(brier_score_loss(ground, p.astype(float)), rel=1e-12)
-    share, mean = calibration_curve(ground, p.astype(float), n_bins=metrics.N_BINS)
-    np.testing.assert_allclose(found.by_bin(found.sum_p), mean, rtol=1e-9)
-    np.testing.assert_allclose(found.by_bin(found.n_ground), share, rtol=1e-9)
 
 
 def test_true_probabilities_have_no_calibration_error_and_wrong_ones_do():

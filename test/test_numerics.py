@@ -3,20 +3,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.compiled.numerics import (
-    LANES,
-    NEGLIGIBLE_EXPONENT,
-    exp_neg,
-    factorise,
-    invert,
-    solve_in_place,
-)
+from gp_ground_seg.compiled import numerics
+from gp_ground_seg.compiled.numerics import exp_neg, factorise, invert, solve_in_place
 
 
 @given(st.floats(0.0, 1e300), st.floats(-10.0, 0.0))
 def test_exp_neg_is_the_exponential(x, negative):
     assert abs(exp_neg(x) - np.exp(-x)) <= 1e-14
-    assert (exp_neg(x) == 0.0) == (x > NEGLIGIBLE_EXPONENT)
+    assert (exp_neg(x) == 0.0) == (x > numerics.NEGLIGIBLE_EXPONENT)
     np.testing.assert_allclose(exp_neg(negative), np.exp(-negative), rtol=1e-11)
 
 
@@ -28,7 +22,7 @@ def positive_definite(n, seed):
 @given(st.integers(0, 10_000), st.integers(1, 13))
 def test_small_systems(seed, n):
     a = positive_definite(n, seed)
-    rng, room = np.random.default_rng(seed), (n + LANES - 1) & -LANES
+    rng, room = np.random.default_rng(seed), (n + numerics.LANES - 1) & -numerics.LANES
     # Arbitrary values left of the diagonal and behind column n.
     matrix = np.where(np.tri(n, room, -1), rng.normal(size=(n, room)), 7.0)
     matrix[:, :n][np.triu_indices(n)] = a[np.triu_indices(n)]

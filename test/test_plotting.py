@@ -33,8 +33,6 @@ def close_to(pixels, colour, tolerance=0.005):
     return np.abs(pixels[..., :3] - np.array(to_rgb(colour))).max(axis=-1) < tolerance
 
 
-# --- from above ---------------------------------------------------------------------------
-
 SQUARE, LEFT, RIGHT, TOP = inches(scan.SQUARE, scan.LEFT, scan.RIGHT, scan.ABOVE)
 PANEL = LEFT + SQUARE + RIGHT
 
@@ -97,7 +95,7 @@ def test_counts_are_in_the_titles():
     ]
     errors, layers = scan._error_panel(label, truth)
     assert errors == '1 false ground, 2 missed ground, IoU 25.00 %'
-    np.testing.assert_array_equal(sum(layer.chosen.astype(int) for layer in layers), 1)
+    np.testing.assert_array_equal(sum(one.astype(int) for one in layers.values()), 1)
     assert scan._error_panel(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
 
 
@@ -148,9 +146,6 @@ def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeyp
     with pytest.raises(MissingDependencyError, match='matplotlib'):
         plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), tmp_path / 'b.png')
     assert not (tmp_path / 'b.png').exists()
-
-
-# --- in perspective -----------------------------------------------------------------------
 
 
 def test_camera_projects_as_a_camera_does():
@@ -216,9 +211,6 @@ def test_command_draws_a_scan_from_above(tmp_path):
     assert missed[1] > 500
 
 
-# --- charts -------------------------------------------------------------------------------
-
-
 def test_bars_are_as_long_as_the_stages(tmp_path):
     cases = {f'case {k}': {'first': 10.0 * k, 'second': 30.0} for k in range(1, 5)}
     path = tmp_path / 'bars.png'
@@ -257,26 +249,10 @@ def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
         charts.plot_reliability({'all': found}, tmp_path / 'b.png', '')
 
 
-# --- colours of length-scales -------------------------------------------------------------
-
-# Brettel-style full loss of one cone, as linear maps in linear RGB (Machado et al. 2009).
-DEFICIENCIES = {
-    'none': np.eye(3),
-    'protanopia': [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
-                   [-0.003882, -0.048116, 1.051998]],
-    'deuteranopia': [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
-                     [-0.011820, 0.042940, 0.968881]],
-    'tritanopia': [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
-                   [0.004733, 0.691367, 0.303900]],
-}  # fmt: skip
-
-
-@pytest.mark.parametrize('name', DEFICIENCIES)
-def test_lightness_of_the_colours_rises_for_every_eye(name):
+def test_lightness_of_the_colours_rises():
     colours = style.length_scale_colours(np.geomspace(1.0, 50.0, 30), 1.0, 50.0)
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(linear @ np.transpose(DEFICIENCIES[name]), 0.0, 1.0)
-    lightness = 116.0 * np.cbrt(seen @ [0.2126, 0.7152, 0.0722]) - 16.0
+    lightness = 116.0 * np.cbrt(linear @ [0.2126, 0.7152, 0.0722]) - 16.0
     assert np.diff(lightness).min() > 1.0
     assert np.ptp(lightness) > 60.0
 

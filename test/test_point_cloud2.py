@@ -12,19 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
-from gp_ground_seg.data.point_cloud2 import (
-    append_columns,
-    cloud_from_columns,
-    decode_cloud,
-    encode_cloud,
-    read_columns,
-    read_xyz,
-    select_points,
-    select_rows,
-    stamp_of,
-    with_header,
-)
+from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_columns, read_xyz
 from gp_ground_seg.errors import PointCloudError
 
 FLOAT32, FLOAT64 = 7, 8
@@ -102,10 +92,13 @@ def test_coordinates_and_selections_agree_with_struct(case, random):
         xyz = xyz.astype(np.float64)
     np.testing.assert_array_equal(xyz, np.reshape(expected, (-1, 3)))
     mask = np.array([random.random() < 0.5 for _ in points], dtype=bool)
-    selected = select_rows(layout, mask)
+    selected = point_cloud2.select_rows(layout, mask)
     assert selected.tobytes() == b''.join(itertools.compress(points, mask))
     # Whatever is not kept is in the complement: nothing is lost or doubled.
-    assert len(selected) + len(select_rows(layout, ~mask)) == len(points) * layout.point_step
+    assert (
+        len(selected) + len(point_cloud2.select_rows(layout, ~mask))
+        == len(points) * layout.point_step
+    )
 
 
 @given(layouts(), st.data())
@@ -118,7 +111,7 @@ def test_points_stay_and_columns_follow(case, data):
         f'c{k}': np.frombuffer(values, TYPES[datatype], count=len(points))
         for k, datatype in enumerate(datatypes)
     }
-    placed, step, wide = append_columns(layout, columns)
+    placed, step, wide = point_cloud2.append_columns(layout, columns)
     assert [name for name, _, _ in placed] == list(columns)
     assert step % 4 == 0
     assert len(wide) == len(points) * step
@@ -176,10 +169,12 @@ def test_precision_is_kept_in_a_copy():
 def test_what_is_not_needed_is_not_checked():
     empty = Layout(0, 0, [], False, 0, 0, b'')
     assert read_xyz(empty).shape == (0, 3)
-    assert len(select_rows(empty, np.zeros(0, dtype=bool))) == 0
+    assert len(point_cloud2.select_rows(empty, np.zeros(0, dtype=bool))) == 0
     layout = kitti_layout(row_step=0)
     np.testing.assert_array_equal(read_xyz(layout), read_xyz(kitti_layout()))
-    assert select_rows(layout, np.ones(5, dtype=bool)).tobytes() == kitti_layout().data
+    assert (
+        point_cloud2.select_rows(layout, np.ones(5, dtype=bool)).tobytes() == kitti_layout().data
+    )
 
 
 def in_z(**changes):
@@ -221,13 +216,13 @@ def test_a_column_that_is_no_single_number_is_refused(changes, n_points):
 def test_select_and_append_refuse_what_they_cannot_read():
     keep, short = np.ones(5, dtype=bool), kitti_layout(data=bytes(70))
     with pytest.raises(PointCloudError, match=r'data of 70 bytes: must be at least 80'):
-        select_rows(short, keep)
+        point_cloud2.select_rows(short, keep)
     with pytest.raises(PointCloudError, match=r'data of 70 bytes: must be at least 80'):
-        append_columns(short, {'a': keep.astype(np.uint8)})
+        point_cloud2.append_columns(short, {'a': keep.astype(np.uint8)})
     with pytest.raises(PointCloudError, match=r'mask of shape \(4,\).*bool of shape \(5,\)'):
-        select_rows(kitti_layout(), keep[:4])
+        point_cloud2.select_rows(kitti_layout(), keep[:4])
     with pytest.raises(PointCloudError, match=r'type uint8'):
-        select_rows(kitti_layout(), keep.astype(np.uint8))
+        point_cloud2.select_rows(kitti_layout(), keep.astype(np.uint8))
 
 
 def assert_same_cloud(cloud, expected):
@@ -238,14 +233,14 @@ def assert_same_cloud(cloud, expected):
 def test_selection_and_another_header_keep_all_else():
     cloud = samples.cloud(2)
     mask = np.isfinite(read_xyz(cloud)).all(axis=1)
-    kept = decode_cloud(encode_cloud(select_points(cloud, mask)))
+    kept = decode_cloud(encode_cloud(point_cloud2.select_points(cloud, mask)))
     data = cloud.data.reshape(-1, cloud.point_step)[mask].ravel()
     shape = {'width': mask.sum(), 'row_step': len(data)}
     assert_same_cloud(kept, dataclasses.replace(cloud, **shape, data=data, is_dense=True))
-    assert not select_points(cloud, ~mask).is_dense
+    assert not point_cloud2.select_points(cloud, ~mask).is_dense
     for frame, expected in ((None, 'velo_link'), ('map', 'map')):
-        moved = decode_cloud(encode_cloud(with_header(cloud, (7, 8), frame)))
-        assert (stamp_of(moved), moved.header.frame_id) == ((7, 8), expected)
+        moved = decode_cloud(encode_cloud(point_cloud2.with_header(cloud, (7, 8), frame)))
+        assert (point_cloud2.stamp_of(moved), moved.header.frame_id) == ((7, 8), expected)
         assert_same_cloud(dataclasses.replace(moved, header=cloud.header), cloud)
 
 
@@ -253,14 +248,14 @@ def test_cloud_from_columns_is_packed_and_typed():
     points = samples.scan(1)
     label = np.arange(len(points), dtype=np.uint32)
     columns = {'x': points[:, 0], 'y': points[:, 1], 'z': points[:, 2], 'label': label}
-    cloud = decode_cloud(encode_cloud(cloud_from_columns((5, 6), 'lidar', columns)))
+    cloud = decode_cloud(encode_cloud(point_cloud2.cloud_from_columns((5, 6), 'lidar', columns)))
     assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == [
         ('x', 0, 7, 1), ('y', 4, 7, 1), ('z', 8, 7, 1), ('label', 12, 6, 1),
     ]  # fmt: skip
-    assert (stamp_of(cloud), cloud.header.frame_id) == ((5, 6), 'lidar')
+    assert (point_cloud2.stamp_of(cloud), cloud.header.frame_id) == ((5, 6), 'lidar')
     np.testing.assert_array_equal(read_xyz(cloud), points[:, :3])
     np.testing.assert_array_equal(read_columns(cloud, ['label'])['label'][0], label)
-    assert cloud_from_columns((0, 0), '', {}).width == 0
+    assert point_cloud2.cloud_from_columns((0, 0), '', {}).width == 0
 
 
 @settings(max_examples=150)

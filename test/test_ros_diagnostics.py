@@ -16,17 +16,8 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 
 import ros_helpers  # noqa: F401  imports type support without its warnings
 
-from gp_ground_seg.ros.diagnostics import (
-    CLOUD_WINDOW,
-    MIN_RATE_SPAN,
-    Diagnostics,
-    InputFacts,
-    InputTask,
-    ModelTask,
-    OutputTask,
-    ProcessingTask,
-    frame_quality,
-)
+from gp_ground_seg.ros import diagnostics
+from gp_ground_seg.ros.diagnostics import InputFacts, InputTask, ModelTask, ProcessingTask
 from gp_ground_seg.ros.input import JUMP_TOLERANCE, SequenceGaps, StampWatch
 from gp_ground_seg.ros.status import RATE_WINDOW, Hysteresis, Level, Rate, Status
 
@@ -51,9 +42,6 @@ def process(statistics, latencies):
     return statistics
 
 
-# Gaps and jumps
-
-
 @given(st.lists(st.booleans(), min_size=1))
 def test_gaps_count_what_is_missing_between_arrivals(is_received):
     gaps = SequenceGaps()
@@ -75,9 +63,6 @@ def test_a_stamp_far_behind_the_newest_is_a_jump(stamps):
         newest = stamp if is_jump or newest is None else max(newest, stamp)
     watch.reset()
     assert watch.note(-100.0) == 0.0
-
-
-# Rates and levels
 
 
 @given(st.lists(st.tuples(times, st.integers(1, 4)), min_size=1))
@@ -117,22 +102,19 @@ def test_a_level_is_the_worst_of_the_latest_time(steps, recover_after):
 
 def test_every_task_is_reported_and_holds_its_own_level():
     nothing = SimpleNamespace(create_publisher=lambda *_: None, create_timer=lambda *_, **__: None)
-    diagnostics = Diagnostics(nothing, lambda: (FACTS, {'/ground': 1}), LIMITS)
-    diagnostics.input = InputTask(0.0)
-    arrive(diagnostics.input, 0.5)
-    diagnostics.input.refused('no field named z')
-    first = diagnostics.report(1.0)
+    reporter = diagnostics.Diagnostics(nothing, lambda: (FACTS, {'/ground': 1}), LIMITS)
+    reporter.input = InputTask(0.0)
+    arrive(reporter.input, 0.5)
+    reporter.input.refused('no field named z')
+    first = reporter.report(1.0)
     assert [s.task for s in first] == ['input', 'processing', 'model', 'output']
     assert [s.level for s in first] == [Level.ERROR, Level.OK, Level.OK, Level.OK]
-    arrive(diagnostics.input, 1.5)
-    second = diagnostics.report(2.0)[0]
+    arrive(reporter.input, 1.5)
+    second = reporter.report(2.0)[0]
     assert second.level == Level.ERROR
     assert second.message == 'receiving; 1.0 s ago: every cloud refused: no field named z'
-    arrive(diagnostics.input, 4.5)
-    assert diagnostics.report(5.0)[0].level == Level.OK
-
-
-# Input
+    arrive(reporter.input, 4.5)
+    assert reporter.report(5.0)[0].level == Level.OK
 
 
 def test_input_waits_then_is_stale_and_recovers():
@@ -198,9 +180,6 @@ def test_refusals_are_an_error_above_their_limit(are_refused, max_ratio):
     assert report.values['Refused since startup'] == str(sum(are_refused))
 
 
-# Processing
-
-
 def test_processing_percentiles_in_milliseconds_and_a_slow_median():
     assert ProcessingTask().report(0.0, LIMITS).message == 'no cloud processed yet'
     statistics = process(ProcessingTask(), [0.001 * k for k in range(101)])
@@ -208,7 +187,7 @@ def test_processing_percentiles_in_milliseconds_and_a_slow_median():
     # The window holds the newest 100 of them: 1 ms to 100 ms.
     expected = {
         'Clouds since startup': '101',
-        'Clouds in window': str(CLOUD_WINDOW),
+        'Clouds in window': str(diagnostics.CLOUD_WINDOW),
         'Latency p50 (ms)': '50.50',
         'Latency p95 (ms)': '95.05',
         'Latency p99 (ms)': '99.01',
@@ -244,7 +223,7 @@ def test_load_is_work_over_the_time_between_clouds_sent(period, duration, n_lost
     now = 0.0
     while now <= 3.0:
         # A burst is no rate.
-        assert now >= MIN_RATE_SPAN or statistics.load(now) is None
+        assert now >= diagnostics.MIN_RATE_SPAN or statistics.load(now) is None
         statistics.arrived(now, n_lost)
         process(statistics, [duration])
         now += period
@@ -254,9 +233,6 @@ def test_load_is_work_over_the_time_between_clouds_sent(period, duration, n_lost
     if not 0.899 < load < 0.901:
         assert report.level == (Level.WARN if load > 0.9 else Level.OK)
     assert float(report.values['Load (%)']) == pytest.approx(100.0 * load, abs=0.051)
-
-
-# Model
 
 
 def status_of(points, limits=LIMITS, **changes):
@@ -314,18 +290,15 @@ def test_a_scan_without_ground_is_a_warning(points):
 def test_quality_is_a_share(n_segments, n_occupied, n_inliers, n_more, certainty, status):
     counts = {'n_inliers': n_inliers, 'n_candidates': n_inliers + n_more}
     fit = dataclasses.replace(NO_FIT, n_segments=n_segments, status=status, **counts)
-    quality = frame_quality(fit, n_occupied, certainty)
-    assert 0.0 <= quality <= frame_quality(fit, n_occupied, np.nan) <= 1.0
-    assert frame_quality(fit, n_occupied, 0.5 * certainty) <= quality
+    quality = diagnostics.frame_quality(fit, n_occupied, certainty)
+    assert 0.0 <= quality <= diagnostics.frame_quality(fit, n_occupied, np.nan) <= 1.0
+    assert diagnostics.frame_quality(fit, n_occupied, 0.5 * certainty) <= quality
     if status == 'failed' or not n_segments or not n_inliers:
         assert quality == 0.0
 
 
-# Output
-
-
 def test_output_lists_every_topic():
-    statistics = OutputTask()
+    statistics = diagnostics.OutputTask()
     assert statistics.report(0.0, {'/ground': 0}).message == 'nobody subscribes'
     for k in range(5):
         statistics.published(0.2 * k, ['/ground'])

@@ -12,6 +12,7 @@ from conftest import REPOSITORY
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
 import ros_helpers as ros
+from cli_runner import children, is_running, stat_words
 from rcl_interfaces.srv import GetParameters
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 from sensor_msgs.msg import PointCloud2
@@ -114,9 +115,6 @@ def test_missing_ros_is_said_in_one_line():
     assert "pip install 'gp_ground_seg[ros]'" in line
 
 
-# What is right
-
-
 def test_two_nodes_side_by_side_read_their_parts_of_one_file(tmp_path):
     """Each has its own parameters and topics; the second is told to be quiet."""
     path = tmp_path / 'both.yaml'
@@ -183,26 +181,9 @@ def test_a_preset_as_the_readme_has_it(tmp_path):
 # Signals to the node: it ends with code 0, soon, whatever it is doing.
 
 
-def stat_words(pid):
-    with open(f'/proc/{pid}/stat', encoding='ascii') as stat:
-        return stat.read().rsplit(')', 1)[1].split()
-
-
 def cpu_seconds(pid):
     words = stat_words(pid)
     return (int(words[11]) + int(words[12])) / os.sysconf('SC_CLK_TCK')
-
-
-def is_running(pid):
-    try:
-        return stat_words(pid)[0] != 'Z'
-    except (FileNotFoundError, ProcessLookupError):
-        return False
-
-
-def children(pid):
-    found = [int(name) for name in os.listdir('/proc') if name.isdigit()]
-    return [one for one in found if is_running(one) and int(stat_words(one)[1]) == pid]
 
 
 def heeds_sigterm(process):
@@ -303,9 +284,6 @@ assert signal.set_wakeup_fd(-1) == -1
 def test_without_a_signal_all_is_as_before():
     done = run_python('-c', UNDISTURBED)
     assert (done.returncode, done.stderr) == (0, '')
-
-
-# Signals to the commands that talk to a node
 
 
 @pytest.fixture

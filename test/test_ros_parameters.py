@@ -243,15 +243,14 @@ def test_changes_during_playback_lose_no_frame(b):
     tolerances = np.linspace(0.05, 0.5, 97)
     for k, tolerance in enumerate(tolerances):
         b.publisher.publish(message)
+        assert b.set('grid.n_segments', 90 if k % 2 else 180).successful
+        assert b.set('runtime.n_threads', 1 + k % 2).successful
         is_bad = k % 10 == 9
         result = b.set('label.ground_tolerance', 9.0 if is_bad else float(tolerance))
         assert result.successful != is_bad
     b.ground.wait(before + 100)
     b.obstacles.wait(before + 100)
     assert b.node.config.label.ground_tolerance == tolerances[-1]
-
-
-# At the start
 
 
 @pytest.mark.parametrize('name', PRESETS)

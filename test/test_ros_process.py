@@ -1,12 +1,7 @@
-"""The node, drivers and players, each a process: what comes back, what the diagnostics say."""
+"""The node and players, each a process: what comes back, what the diagnostics say."""
 
 import itertools
-import os
 import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +10,8 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 pytest.importorskip('rosbags', reason='rosbags is not installed')
 
 import ros_helpers as ros
-from bag_samples import START, write_ros2_bag
+from bag_samples import write_ros2_bag
 from cli_runner import run
-from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.serialization import serialize_message as bytes_of
 from ros_helpers import NAMESPACE, street, to_message
@@ -41,40 +35,6 @@ CONFIG = Config().replace(**PATIENT)
 def play(bag, *words, topic='/points'):
     to_node = ('--quiet', '--ros-args', '-r', f'{topic}:={NAMESPACE}/points')
     return ros.Process(str(bag), *words, *to_node, folder=bag.parent, start=ros.PLAY)
-
-
-@pytest.fixture
-def drive(tmp_path):
-    """A bag of 30 clouds of 2011."""
-    assert START < 1_320_000_000 * 10**9
-    write_ros2_bag(tmp_path / 'drive.mcap', 30)
-    return tmp_path / 'drive.mcap'
-
-
-# Nodes of their own
-
-
-def test_a_bag_of_2011_shows_ok(drive, tmp_path):
-    with ros.linked_process(tmp_path, *ros.given(PATIENT), sends=None) as (node, link):
-        with play(drive, '--rate', '1') as player:
-            status = link.wait_for_status(
-                'input', lambda values, _: int(values['Events since startup']) >= 20
-            )
-            assert player.popen.wait(60.0) == 0, player.log
-        link.ground.wait(30)
-        link.obstacles.wait(30)
-        values = ros.values_of(link.wait_for_status('processing', lambda *_: True))
-        assert (values['Clouds since startup'], values['Dropped since startup']) == ('30', '0')
-        stamps = [message.header.stamp for message in link.ground.messages]
-        statuses = [s for array in link.diagnostics.messages for s in array.status]
-    tasks = ('input', 'processing', 'model', 'output')
-    expected = {(f'{link.node_name[1:]}: {task}', DiagnosticStatus.OK) for task in tasks}
-    assert {(s.name, s.level) for s in statuses} == expected
-    assert float(ros.values_of(status)['Age of last stamp (s)']) > 4e8
-    times = [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps]
-    assert len(times) == len(link.obstacles.messages) == 30
-    assert all(later - earlier == 10**8 for earlier, later in itertools.pairwise(times))
-    assert 'WARN' not in node.log
 
 
 def test_a_bag_in_a_loop_with_a_clock_resets_what_was_learned(tmp_path):
@@ -151,9 +111,6 @@ def test_a_bad_cloud_among_good_ones(tmp_path):
         assert node.stop(signal.SIGINT)[0] == 0
 
 
-# One node for all that follows
-
-
 @pytest.fixture(scope='module')
 def node(tmp_path_factory):
     folder = tmp_path_factory.mktemp('node')
@@ -161,25 +118,7 @@ def node(tmp_path_factory):
         process.wait_until_settled()
         yield process
         assert process.stop(signal.SIGINT)[0] == 0
-        assert 'Traceback' not in process.log
-
-
-@pytest.mark.usefixtures('node')
-def test_clouds_of_two_megabytes_at_10_hz_all_come_back():
-    message = to_message(street(30_000, n_invalid=100), frame='velo_link')
-    assert len(message.data) == 1_920_000
-    with ros.linked() as link:
-        next_time = time.monotonic()
-        for k in range(20):
-            message.header.stamp.sec = k
-            link.publisher.publish(message)
-            next_time += 0.1
-            time.sleep(max(0.0, next_time - time.monotonic()))
-            # Slower only where the machine is too busy for 10 Hz: more than the queue of
-            # the node can hold would rightly be dropped.
-            link.ground.wait(k - 3)
-        for parts in (link.ground.wait(20), link.obstacles.wait(20)):
-            assert [part.header.stamp.sec for part in parts] == list(range(20))
+        assert 'Traceback' not in process.log and 'WARN' not in process.log
 
 
 def simulated_bag(folder):
@@ -205,7 +144,10 @@ def kitti_bag(folder, kitti):
 @pytest.mark.usefixtures('node')
 @pytest.mark.parametrize('source', ['simulated', 'kitti'])
 def test_frames_to_bag_to_player_to_node_and_back(source, tmp_path, request):
-    """Order, header, layout and every byte: the clouds are the selection by the labels."""
+    """Order, header, layout and every byte: the clouds are the selection by the labels.
+
+    Nothing is wrong with stamps of 2011 either, as in the bag from KITTI.
+    """
     if source == 'kitti':
         bag, topic = kitti_bag(tmp_path, request.getfixturevalue('kitti'))
     else:
@@ -215,6 +157,10 @@ def test_frames_to_bag_to_player_to_node_and_back(source, tmp_path, request):
     with ros.linked(sends=None) as link, play(bag, topic=topic) as player:
         back = link.ground.wait(6), link.obstacles.wait(6)
         assert player.popen.wait(60.0) == 0, player.log
+        status = link.wait_for_status('processing', lambda *_: True)
+        levels = {s.level for array in link.diagnostics.messages for s in array.status}
+    assert levels == {DiagnosticStatus.OK}
+    assert ros.values_of(status)['Dropped since startup'] == '0'
     segmenter = GroundSegmenter(CONFIG)
     for cloud, *parts in zip(sent, *back, strict=True):
         label, finite = segmenter.segment(read_xyz(cloud)).label, np.isfinite(read_xyz(cloud))
@@ -226,88 +172,3 @@ def test_frames_to_bag_to_player_to_node_and_back(source, tmp_path, request):
             for name in ('header', 'fields', 'point_step', 'height', 'width'):
                 assert getattr(found, name) == getattr(wanted, name)
     segmenter.close()
-
-
-@pytest.mark.usefixtures('node')
-def test_a_storm_of_parameters_loses_no_cloud(drive):
-    good = itertools.cycle(
-        [
-            ('label.ground_tolerance', 0.3),
-            ('grid.n_segments', 90),
-            ('runtime.n_threads', 1),
-            ('label.ground_tolerance', 0.2),
-            ('grid.n_segments', 180),
-            ('runtime.n_threads', 2),
-        ]
-    )
-    bad = itertools.cycle(
-        [
-            ('label.ground_tolerance', 99.0),
-            ('grid.n_segments', 'many'),
-            ('grid.r_max', 1.5),
-            ('no.such_parameter', 1),
-        ]
-    )
-    with ros.linked(sends=None) as link, play(drive, '--rate', '0.6') as player:
-        link.ground.wait(3)
-        n_before = len(link.ground.messages)
-        n_during = []
-        for k in range(100):
-            name, value = next(bad if k % 5 == 4 else good)
-            result = link.set(name, value)
-            assert result.successful == (k % 5 != 4), result.reason
-            assert result.successful or name in result.reason
-            n_during.append(len(link.ground.messages))
-        # They came while clouds did; on a busy machine the last ones come later.
-        assert n_before < n_during[-1]
-        assert n_during[20] < 30
-        assert player.popen.wait(60.0) == 0, player.log
-        assert len(link.ground.wait(30)) == len(link.obstacles.wait(30)) == 30
-        assert all(result.successful for result in link.load(CONFIG.flat()))
-
-
-# Best-effort publishers last: the node is best-effort itself while it knows of one.
-
-# Sends best-effort clouds of 1.9 MB until it is ended; its domain is that of the environment.
-DRIVER = f"""
-import sys, time
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-import rclpy
-from ros_helpers import BEST_EFFORT, PointCloud2, street, to_message
-rclpy.init()
-node = rclpy.create_node('driver', namespace=sys.argv[1])
-publisher = node.create_publisher(PointCloud2, 'points', BEST_EFFORT)
-message = to_message(street(30_000))
-while True:
-    publisher.publish(message)
-    time.sleep(0.1)
-"""
-
-
-@pytest.mark.usefixtures('node')
-def test_best_effort_driver_with_the_large_segment_profile(tmp_path):
-    profile = str(REPOSITORY / 'config' / 'fastdds_large_clouds.xml')
-    environment = {**os.environ, **ros.ISOLATION, 'FASTRTPS_DEFAULT_PROFILES_FILE': profile}
-    with (tmp_path / 'driver.log').open('wb') as log, ros.linked(sends=None) as link:
-        command = [sys.executable, '-c', DRIVER, ros.NAMESPACE]
-        driver = subprocess.Popen(command, env=environment, stderr=log)
-        try:
-            link.ground.wait(5)
-            assert driver.poll() is None
-        finally:
-            driver.kill()
-            driver.wait()
-    # Fast DDS only warns about a profile that it cannot read, and goes on without.
-    assert 'XML' not in (tmp_path / 'driver.log').read_text()
-
-
-@pytest.mark.usefixtures('node')
-@pytest.mark.parametrize('takes', ['RELIABLE', 'BEST_EFFORT'])
-@pytest.mark.parametrize('sends', ['RELIABLE', 'BEST_EFFORT'])
-def test_every_quality_of_service_is_served(sends, takes):
-    with ros.linked(getattr(ros, sends), getattr(ros, takes)) as link:
-        link.publish_until(
-            to_message(street(500)),
-            lambda: link.ground.messages and link.obstacles.messages,
-            'clouds',
-        )

@@ -41,9 +41,6 @@ def segmenter_of(backend=None, **changes):
     return GroundSegmenter(CONFIG.replace(**changes), backend=backend)
 
 
-# One scan
-
-
 def test_ground_and_boxes_are_told_apart(backend):
     scan = hilly_scan(4000)
     result = GroundSegmenter(CONFIG, backend=backend).segment(scan)
@@ -209,9 +206,6 @@ def test_times_come_from_the_clock_given_and_the_fit_report_counts(scan):
     assert 0 < fit.n_lines <= fit.n_pseudo_inputs
 
 
-# One scan after the other
-
-
 def test_a_result_is_not_changed_by_the_next_scan(backend, scan):
     segmenter = GroundSegmenter(CONFIG, backend=backend)
     result = segmenter.segment(scan)
@@ -275,9 +269,6 @@ def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
     assert (segmenter.backend_name, is_closed) == ('numpy', [])
     segmenter.configure(CONFIG.replace(**{'runtime.n_threads': 1}))
     assert (segmenter.backend_name, is_closed) == (own, [True])
-
-
-# Several callers
 
 
 def test_callers_take_turns_while_the_segmenter_is_closed_and_configured():

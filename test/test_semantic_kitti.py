@@ -7,13 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gp_ground_seg.data.semantic_kitti import (
-    FRAME_PERIOD,
-    list_frames,
-    list_sequences,
-    read_labels,
-    read_points,
-)
+from gp_ground_seg.data import semantic_kitti
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_labels, read_points
 from gp_ground_seg.errors import DataError
 
 FLOATS = st.floats(width=32, allow_nan=True, allow_infinity=True)
@@ -85,7 +80,10 @@ def test_frames_in_order_with_and_without_labels(tmp_path):
 def test_times_belong_to_the_numbers_of_the_files(tmp_path):
     for index in (1, 3):
         write_frame(tmp_path, '00', index, street()[0])
-    assert [frame.time for frame in list_frames(tmp_path, '00')] == [0.0, FRAME_PERIOD]
+    assert [frame.time for frame in list_frames(tmp_path, '00')] == [
+        0.0,
+        semantic_kitti.FRAME_PERIOD,
+    ]
     times = tmp_path / 'sequences/00/times.txt'
     times.write_text('0.000000e+00\n1.036e-01\n2.1e-01\n3.2e-01\n')
     assert [frame.time for frame in list_frames(tmp_path, '00')] == [0.1036, 0.32]

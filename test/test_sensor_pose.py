@@ -52,9 +52,6 @@ def scan_of(scene, sensor, height, seed=0, roll=0.0, pitch=0.0):
     return simulate_scan(made, mounted, np.random.default_rng(seed))
 
 
-# Angles
-
-
 @given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5))
 def test_angles_and_rotation_are_inverse_of_each_other(roll, pitch):
     matrix = rotation(roll, pitch)
@@ -74,9 +71,6 @@ def test_rotated_points_keep_their_precision_and_stay_finite(dtype):
     assert turned.dtype == dtype
     np.testing.assert_allclose(turned[0], rotation(0.3, -0.2) @ xyz[0], rtol=1e-6)
     assert list(np.isfinite(turned).all(axis=1)) == [True, True, False]
-
-
-# Estimation
 
 
 @settings(max_examples=fewer(40, 5))
@@ -156,9 +150,6 @@ def test_too_few_points_to_determine_anything(points, backend):
     assert len(turned.label) == len(points)
 
 
-# What is given
-
-
 def test_what_is_given_is_used_and_contradicted():
     points = scan_of('flat', HDL_64E, 1.73).points
     assert pose_of(points).contradictions == ()
@@ -197,9 +188,6 @@ def test_a_slight_tilt_is_left_alone_and_a_clear_one_is_levelled():
         assert pose_of(tilted(points, 0.0, clear)).pitch == pytest.approx(clear, abs=0.004)
 
 
-# What the segmentation makes of it
-
-
 @pytest.mark.parametrize(('roll', 'pitch'), [(0.09, 0.0), (0.0, -0.09), (-0.1, 0.15)])
 def test_labels_of_a_tilted_scan_are_those_of_the_level_one(roll, pitch):
     points = scan_of('kerb', HDL_64E, 1.73).points[:, :3].astype(np.float64)
@@ -232,8 +220,6 @@ def test_a_sensor_hung_upside_down_works_when_its_roll_is_given():
         known = np.isfinite(result.ground_z)
         np.testing.assert_allclose(result.ground_z[known], -level.ground_z[known], atol=0.02)
 
-
-# What is refused
 
 UPS = {
     '-z': (math.pi, 0.0),
@@ -294,9 +280,6 @@ def test_steep_ground_is_not_refused(gradient):
     scene = Scene('steep', landforms.slope(gradient, 0.7))
     pose = pose_of(scan_of(scene, OS1_128, 1.2).points)
     assert math.acos(pose.rotation[2, 2]) == pytest.approx(math.atan(gradient), abs=0.02)
-
-
-# Real frames
 
 
 def test_real_frames(kitti):

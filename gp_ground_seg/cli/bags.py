@@ -25,8 +25,6 @@ TOPIC = '/kitti/velo/pointcloud'
 FRAME_ID = 'velo_link'
 EPOCH = 1_316_995_200
 """Seconds of 2011-09-26 00:00 UTC, the day of KITTI's first drives; times.txt starts at 0."""
-_LAST_SECOND = 2**31 - 1
-EXIT_UNDELIVERED = 1
 SILENT_WAIT = 1.0
 """Time without a subscriber after which a note says so [s]."""
 
@@ -74,15 +72,15 @@ exit code: 0, 1 if clouds were not delivered (always 0 with --no-wait), 2 for an
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
     parser = options.new_parser(subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES)
-    storage = 'storage (default: by the name of OUT, else mcap)'
+    storage, scans = {'choices': ('mcap', 'sqlite3')}, {'metavar': 'N', 'type': int}
     options.add(
         parser,
         ('root', 'folder with sequences/ in it', {'metavar': 'ROOT'}),
         ('output', 'folder, .mcap or .db3 file to write', {'metavar': 'OUT'}),
         ('--sequence', 'sequence, as in 00', {'metavar': 'S', 'required': True}),
-        ('--format', storage, {'choices': ('mcap', 'sqlite3')}),
-        ('--start', 'scans to skip (default: 0)', {'metavar': 'N', 'type': int, 'default': 0}),
-        ('--count', 'scans to write (default: all)', {'metavar': 'N', 'type': int}),
+        ('--format', 'storage (default: by the name of OUT, else mcap)', storage),
+        ('--start', 'scans to skip (default: 0)', {**scans, 'default': 0}),
+        ('--count', 'scans to write (default: all)', scans),
         options.FORCE,
         options.QUIET,
     )
@@ -117,14 +115,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 def scan_cloud(
-    points: npt.NDArray[np.float32], stamp: int, frame_id: str, **further: npt.NDArray[Any]
+    points: npt.NDArray[np.float32], stamp_ns: int, frame_id: str, **further: npt.NDArray[Any]
 ) -> CloudMessage:
-    """Return points (N, 4), x y z [m] intensity, and other fields (N,) as a cloud.
-
-    `stamp` is the time of the header [ns].
-    """
+    """Return points (N, 4), x y z [m] intensity, and `further` fields (N,) as a cloud."""
     columns = {name: points[:, k] for k, name in enumerate(('x', 'y', 'z', 'intensity'))}
-    return cloud_from_columns(divmod(stamp, 10**9), frame_id, {**columns, **further})
+    return cloud_from_columns(divmod(stamp_ns, 10**9), frame_id, {**columns, **further})
 
 
 def run_convert(arguments: argparse.Namespace) -> int:
@@ -169,10 +164,11 @@ def _choose(frames: Sequence[Frame], arguments: argparse.Namespace) -> Sequence[
 
 def _nanoseconds(frame: Frame) -> int:
     """Return the stamp of a frame [ns]."""
-    if not 0 <= frame.time <= _LAST_SECOND - EPOCH:
+    last = 2**31 - 1 - EPOCH
+    if not 0 <= frame.time <= last:
         raise DataError(
             f'times.txt of sequence {frame.sequence}: time {frame.time:g} s of frame '
-            f'{frame.index}: must be in [0, {_LAST_SECOND - EPOCH}] s'
+            f'{frame.index}: must be in [0, {last}] s'
         )
     return EPOCH * 10**9 + round(frame.time * 1e9)
 
@@ -182,9 +178,8 @@ def run_play(arguments: argparse.Namespace) -> int:
     with needing_ros('play'):
         from gp_ground_seg.ros.playback import Player, PlayOptions
 
-    how = PlayOptions(
-        arguments.rate, arguments.start, arguments.duration, arguments.loop, arguments.clock
-    )
+    names = ('rate', 'start', 'duration', 'loop', 'clock')
+    how = PlayOptions(*(getattr(arguments, name) for name in names))
     with BagReader(arguments.bag) as bag:
         topics = _choose_topics(bag, arguments)
         others = [f'{name} ({kind})' for name, kind in bag.topics.items() if name not in topics]
@@ -204,10 +199,9 @@ def run_play(arguments: argparse.Namespace) -> int:
                 # After an interrupt, too: with --loop it is the only end.
                 if summary := player.summary():
                     print(summary, flush=True)
-                    lossy = [] if arguments.quiet else player.best_effort_topics()
-                    for topic in lossy:
+                    for topic in [] if arguments.quiet else player.best_effort_topics():
                         options.note(f'{topic} has a best-effort subscriber, losses unknown')
-    return EXIT_UNDELIVERED if player.n_undelivered and not arguments.no_wait else 0
+    return 1 if player.n_undelivered and not arguments.no_wait else 0
 
 
 def _choose_topics(bag: BagReader, arguments: argparse.Namespace) -> list[str]:

@@ -34,7 +34,6 @@ Let nothing else run meanwhile.
 
 DATA is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
 """
-
 EXAMPLES = """\
   gp-ground-seg bench KITTI_ROOT
   gp-ground-seg bench drive.mcap --frames 20 --threads 1
@@ -49,14 +48,13 @@ RUN_LENGTH = 10
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'bench', DESCRIPTION, EXAMPLES)
-    number: dict[str, Any] = {'metavar': 'N', 'type': options.positive}
     file = {'metavar': 'FILE'}
     options.add(
         parser,
         ('data', 'scans or a bag', {'metavar': 'DATA', 'nargs': '?'}),
         ('--frames', 'frames, in runs of ten spread over the data (default: %(default)s)',
-         {**number, 'default': 60}),
-        ('--passes', 'go over the frames so often', {**number, 'default': 1}),
+         {**options.NUMBER, 'default': 60}),
+        ('--passes', 'go over the frames so often', {**options.NUMBER, 'default': 1}),
         ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
         ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
@@ -74,10 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.data is None) == (arguments.record is None):
         raise DataError('bench: name either DATA to measure on or --from FILE')
     with staged_options(arguments, 'json', 'plot') as parts:
-        if arguments.record is not None:
-            document = read_record(arguments.record)
-        else:
-            document = _measure(arguments)
+        given = arguments.record
+        document = _measure(arguments) if given is None else read_record(given)
         if 'json' in parts:
             report.write_json(document, parts['json'])
         if 'plot' in parts:
@@ -150,10 +146,8 @@ def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[B
         raise DataError(f'--topic: is for bags, which {source} is not')
     else:
         if any(source.glob('sequences/*/velodyne')):
-            names = list_sequences(source)
-            paths = {
-                name: [one.points_path for one in list_frames(source, name)] for name in names
-            }
+            frames_of = {name: list_frames(source, name) for name in list_sequences(source)}
+            paths = {name: [one.points_path for one in own] for name, own in frames_of.items()}
         else:
             paths = {source.stem: find_scans(source)}
         frames = [
@@ -204,23 +198,21 @@ def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
 def bench_text(document: dict[str, Any]) -> str:
     """Lay out a `gp_ground_seg.evaluation.benchmark.bench_document` for the terminal."""
     cases = document['cases']
-    footer = (
-        report.parameters_line(document['config_changes']),
-        report.machine_line(document['environment']),
-    )
+    parameters = report.parameters_line(document['config_changes'])
+    machine = report.machine_line(document['environment'])
     stages = [Column(name, '.2f') for name in cases[0]['stages_ms']]
     by_stage = Table(
         [Column('stage, median [ms]'), *stages],
         [[case['name'], *case['stages_ms'].values()] for case in cases],
     )
-    parts = [_case_table(document).text(), by_stage.text(), '\n'.join(map(report.fold, footer))]
-    return '\n\n'.join(parts)
+    footer = f'{report.fold(parameters)}\n{report.fold(machine)}'
+    return '\n\n'.join([_case_table(document).text(), by_stage.text(), footer])
 
 
 def _case_table(document: dict[str, Any]) -> Table:
     cases, peer = document['cases'], document['baseline_ms']
     n_points = document['n_points']
-    median, largest = (f'{round(n_points[key]):_d}'.replace('_', ' ') for key in ('median', 'max'))
+    median, largest = (Column('', '_d').show(round(n_points[key])) for key in ('median', 'max'))
     rows: list[list[Cell]] = [[c['name'], c['ms']['median'], c['ms']['p99']] for c in cases]
     columns = [Column('time per frame, reading left out')]
     columns += [Column('median [ms]', '.2f'), Column('p99 [ms]', '.2f')]

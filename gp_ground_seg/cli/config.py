@@ -14,9 +14,6 @@ from gp_ground_seg.parameters.config import Config, parameter_specs
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.parameters.schema import read_parameters
 
-EXIT_DIFFERENT = 1
-EXIT_WRONG = 2
-
 EXAMPLES = """\
   gp-ground-seg config dump > my.yaml            every parameter, explained, with its default
   gp-ground-seg config dump --config my.yaml --set label.ground_tolerance=0.15
@@ -44,19 +41,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = options.new_parser(subparsers, 'config', description, EXAMPLES)
     commands = parser.add_subparsers(metavar='WHAT', required=True)
     added = {}
-    for name, run, purpose, text in (
-        ('dump', run_dump, 'print the effective parameters as a ROS parameter file', ''),
-        ('check', run_check, 'say everything that is wrong with a parameter file', CHECK),
-        ('diff', run_diff, 'compare two parameter files or presets', DIFF),
-        ('presets', run_presets, 'list the presets and what they are for', ''),
-        ('table', run_table, 'print every parameter as a Markdown table', ''),
-        (
-            'generate',
-            run_generate,
-            'rewrite config/*.yaml and the tables of README.md and docs/',
-            '',
-        ),
+    for run, purpose, text in (
+        (run_dump, 'print the effective parameters as a ROS parameter file', ''),
+        (run_check, 'say everything that is wrong with a parameter file', CHECK),
+        (run_diff, 'compare two parameter files or presets', DIFF),
+        (run_presets, 'list the presets and what they are for', ''),
+        (run_table, 'print every parameter as a Markdown table', ''),
+        (run_generate, 'rewrite config/*.yaml and the tables of README.md and docs/', ''),
     ):
+        name = run.__name__.removeprefix('run_')
         added[name] = commands.add_parser(name, help=purpose, description=text or purpose)
         added[name].set_defaults(run=run)
     options.add_config(added['dump'])
@@ -82,11 +75,9 @@ def run_check(arguments: argparse.Namespace) -> int:
     """Print the problems of each file, or how much it gives and changes."""
     code = 0
     for path in arguments.files:
-        problems = export.file_problems(path)
-        for problem in problems:
-            print(f'{path}: {problem}', file=sys.stderr)
-        if problems:
-            code = EXIT_WRONG
+        if problems := export.file_problems(path):
+            code = 2
+            print(*(f'{path}: {problem}' for problem in problems), sep='\n', file=sys.stderr)
             continue
         file = read_parameters(path)
         n_changed = len(export.differences(Config(), Config().replace(**file.values)))
@@ -110,7 +101,7 @@ def run_diff(arguments: argparse.Namespace) -> int:
     for spec, before, after in different:
         unit = f' {spec.unit}' if spec.unit else ''
         print(f'{spec.name}: {export.yaml_scalar(before)} -> {export.yaml_scalar(after)}{unit}')
-    return EXIT_DIFFERENT if different else 0
+    return 1 if different else 0
 
 
 def run_presets(_arguments: argparse.Namespace) -> int:

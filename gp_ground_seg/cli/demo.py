@@ -14,13 +14,15 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
+from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
-from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, stamp_of
+from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, read_xyz
 from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
 from gp_ground_seg.evaluation.evaluate import labelled_frames
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
+from gp_ground_seg.evaluation.report import Column
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.scan import plot_birds_eye
 from gp_ground_seg.ros.lifecycle import needing_ros
@@ -50,7 +52,6 @@ MAX_LOAD, COMFORTABLE_LOAD = 0.9, 0.6
 """Share of the time that the node may need: above the first the rate is lowered."""
 N_TRIALS, TRIAL_TIMEOUT = 5, 60.0
 """Scans sent one by one to see that, and the longest time one may take [s]."""
-EXIT_FAILED = 1
 
 DESCRIPTION = """\
 See it work, with no data at hand: simulate a short drive along a street, write it
@@ -82,7 +83,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--kitti', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'}),
         ('--sequence', 'sequence of it, as in 00 (default: the first)', {'metavar': 'S'}),
         ('--frames', 'scans to play, at most (default: %(default)s)',
-         {'metavar': 'N', 'type': options.positive, 'default': 30}),
+         {**options.NUMBER, 'default': 30}),
         ('--rate', rate, {'metavar': 'HZ', 'type': options.above_zero}),
         ('--output', 'folder for what is written (default: %(default)s)',
          {'metavar': 'DIR', 'default': 'demo_output'}),
@@ -127,20 +128,17 @@ def kitti_drive(root: str | Path, sequence: str, n_frames: int) -> Drive:
 def numbered_cloud(
     points: npt.NDArray[np.float32], semantic: npt.NDArray[np.integer], stamp: int
 ) -> CloudMessage:
-    """Return a cloud whose points carry their class (``label``) and their number (``index``).
-
-    The node keeps every field: they come back with each point.
-    """
+    """Return a cloud whose points carry their class (``label``) and their number (``index``)."""
     index = np.arange(len(points), dtype=np.uint32)
     label = semantic.astype(np.uint32)
     return scan_cloud(points, stamp, FRAME_ID, label=label, index=index)
 
 
 def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> tuple[bool, Labels]:
-    """Compare a `numbered_cloud` with the clouds on `GROUND` and `OBSTACLES` that came back.
+    """Compare a `numbered_cloud` with the clouds that came back.
 
-    Returns whether each finite point came back once, in one of the two clouds, with every byte,
-    and nothing else did; and the `Label` (N,) by the cloud a point came back in.
+    Returns whether each finite point came back once, with every byte, and nothing else did; and
+    the `Label` (N,) by the cloud a point came back in.
     """
     points, clouds = _records(sent), (results[GROUND], results[OBSTACLES])
     label = np.full(len(points), Label.UNKNOWN, dtype=np.uint8)
@@ -154,7 +152,7 @@ def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> tuple[bo
         label[part['index'][part['index'] < len(points)]] = value
     back = np.concatenate([ground, obstacles])
     back = back[np.argsort(back['index'], kind='stable')]
-    finite = np.isfinite(_xyz(points)).all(axis=1)
+    finite = np.isfinite(read_xyz(sent)).all(axis=1)
     return back.tobytes() == points[finite].tobytes(), label
 
 
@@ -164,32 +162,24 @@ def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
     return np.frombuffer(cloud.data, [(n, '<f4' if k < 4 else '<u4') for k, n in enumerate(names)])
 
 
-def _xyz(points: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    return np.stack([points['x'], points['y'], points['z']], axis=1)
-
-
 class Tally:
-    """Sums over the scans of the given `stamps` that came back.
-
-    `picture` is the middle scan or the nearest before it: its number, places (N, 3), labels and
-    true labels of its points.
-    """
+    """Sums over the scans of the given `stamps` that came back."""
 
     def __init__(self, stamps: Sequence[tuple[int, int]]) -> None:
         self._numbers = {stamp: k for k, stamp in enumerate(stamps)}
         self.n_points = self.n_faulty = 0
         self.confusion = Confusion()
-        self.picture: tuple[int, npt.NDArray[np.float32], Labels, Labels] | None = None
+        # Middle scan or nearest before it: number, places (N, 3), labels and true labels.
+        self.picture: tuple[int, npt.NDArray[np.floating], Labels, Labels] | None = None
 
     def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
         """Check a scan that came back, and add it; other clouds are trials."""
-        number = self._numbers.get(stamp_of(sent))
+        number = self._numbers.get(point_cloud2.stamp_of(sent))
         if number is None:
             return
         is_exact, label = check_scan(sent, results)
-        points = _records(sent)
-        xyz = _xyz(points)
-        truth = GROUNDGRID.truth(points['label'], xyz[:, 2])
+        xyz = read_xyz(sent)
+        truth = GROUNDGRID.truth(_records(sent)['label'], xyz[:, 2])
         self.n_points += int(np.isfinite(xyz).all(axis=1).sum())
         self.n_faulty += not is_exact
         self.confusion += count_confusion(label, truth)
@@ -211,7 +201,7 @@ def result_text(
     )
     lines = [
         f'scans    {result["n_sent"]} sent, {result["n_back"]} back, {result["n_lost"]} lost',
-        f'points   {_thousands(tally.n_points)} of these scans: {partition}',
+        f'points   {Column("", "_d").show(tally.n_points)} of these scans: {partition}',
         f'labels   ground IoU {iou}, precision {precision}, recall {recall} (against {truth})',
         f'latency  median {1e3 * result["p50"]:.1f} ms, 99 % within {1e3 * result["p99"]:.1f} ms, '
         'from sending a scan to having both clouds',
@@ -230,7 +220,6 @@ def result_text(
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
     if importlib.util.find_spec('matplotlib') is None:
-        # Said now, not after everything else is done.
         raise MissingDependencyError('the demo draws with matplotlib: pip install matplotlib')
     sequence = arguments.sequence
     if arguments.kitti is not None:
@@ -261,7 +250,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(f'\n{text}\n')
     print(f'picture  {folder / PICTURE}  one of the scans from above, and the errors in it')
     print(f'bag      {folder / BAG}  what was played; `gp-ground-seg play` plays it again')
-    return 0 if is_good else EXIT_FAILED
+    return 0 if is_good else 1
 
 
 def _write(drive: Drive, path: Path, session: Session) -> list[tuple[int, int]]:
@@ -305,7 +294,3 @@ def sustainable_rate(cloud: CloudMessage, probe: Probe) -> float:
     rate = float(f'{COMFORTABLE_LOAD / seconds:.1g}')
     print(f'      a scan takes {1e3 * seconds:.0f} ms here and now: playing {rate:g} per second')
     return rate
-
-
-def _thousands(number: int) -> str:
-    return f'{number:_}'.replace('_', ' ')

@@ -23,10 +23,10 @@ from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.charts import plot_reliability
 
-DESCRIPTION = (
-    'Segment labelled frames and score the labels in both conventions of the field: precision, '
-    'recall, F1, accuracy, IoU, time per frame.'
-)
+DESCRIPTION = """\
+Segment labelled frames and score the labels in both conventions of the field: precision,
+recall, F1, accuracy, IoU, time per frame.
+"""
 EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08 --json scores.json
@@ -41,11 +41,7 @@ KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI).
 ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
 OF_FRAMES = (
     ('--sequences', 'sequences, as in 00,08 (default: all there are)', {'metavar': 'LIST'}),
-    (
-        '--frame-step',
-        'every Nth frame of a sequence only',
-        {'metavar': 'N', 'type': options.positive},
-    ),
+    ('--frame-step', 'every Nth frame of a sequence only', options.NUMBER),
 )
 COUNTS_AS = {Label.GROUND: 'ground', Label.OBSTACLE: 'obstacle', Label.UNKNOWN: 'left out'}
 RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
@@ -54,19 +50,14 @@ RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
-    reliability = 'draw share of ground over p_ground (PNG)'
-    worst = {'metavar': 'N', 'type': options.positive}
+    peers = {'choices': (methods.PATCHWORKPP,)}
     options.add(
         parser,
         ROOT,
         *OF_FRAMES,
-        ('--worst', 'list the N frames with the lowest IoU', worst),
-        ('--reliability', reliability, {'metavar': 'FILE'}),
-        (
-            '--peer',
-            'run this one on the same frames, alternately',
-            {'choices': (methods.PATCHWORKPP,)},
-        ),
+        ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
+        ('--reliability', 'draw share of ground over p_ground (PNG)', {'metavar': 'FILE'}),
+        ('--peer', 'run this one on the same frames, alternately', peers),
         options.TO_JSON,
         options.FORCE,
     )
@@ -94,9 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
         if 'json' in parts:
             report.write(parts['json'], environment)
         if 'reliability' in parts:
-            sequences = _calibrations(scores[0])
             title = f'Reliability, {len(frames)} frames'
-            plot_reliability(sequences, parts['reliability'], title)
+            plot_reliability(_calibrations(scores[0]), parts['reliability'], title)
     print('\n\n'.join([_headline(scores), *(table.text() for table in report.tables.values())]))
     print(f'\n{tables.fold(tables.parameters_line(report.facts["config_changes"]))}')
     print(tables.fold(tables.machine_line(environment, report.fit)))
@@ -139,13 +129,12 @@ def _with_peers(iou: float, peers: Sequence[metrics.Confusion]) -> list[Cell]:
 
 
 def _convention_table(scores: Sequence[MethodScore], convention: metrics.Convention) -> Table:
-    rows = []
+    rows: list[list[Cell]] = []
     for parts in zip(*(score.by_sequence() for score in scores), strict=True):
         found, *its = (own.pooled(convention.key) for _, own in parts)
         sequence, ours = parts[0]
-        row: list[Cell] = [sequence, len(ours.scans)]
-        row += [getattr(found, name) for name in metrics.RATIOS]
-        rows.append([*row, *_with_peers(found.iou, its)])
+        ratios = [getattr(found, name) for name in metrics.RATIOS]
+        rows.append([sequence, len(ours.scans), *ratios, *_with_peers(found.iou, its)])
     columns = [Column('sequence'), Column('frames', 'd')]
     columns += [percent(RATIO_TITLES.get(name, name), name) for name in metrics.RATIOS]
     title = f'{convention.title} convention: {convention.rule}  [%]'
@@ -217,10 +206,9 @@ def _worst_table(score: MethodScore, n_worst: int) -> Table:
     rows: list[list[Cell]] = []
     known = [scan for scan in score.scans if not math.isnan(scan.confusion.iou)]
     for scan in sorted(known, key=lambda scan: scan.confusion.iou)[:n_worst]:
-        found, (main, *_) = scan.confusion, metrics.class_errors(scan.classes)
-        share = metrics.ratio(main.errors, found.errors)
-        cells: list[Cell] = [found.iou, found.fp, found.fn, metrics.class_name(main.number), share]
-        rows.append([scan.sequence, scan.index, *cells])
+        found, main = scan.confusion, metrics.class_errors(scan.classes)[0]
+        name, share = metrics.class_name(main.number), metrics.ratio(main.errors, found.errors)
+        rows.append([scan.sequence, scan.index, found.iou, found.fp, found.fn, name, share])
     columns = [Column('sequence'), Column('frame'), percent('IoU', 'iou')]
     columns += [Column('false', '_d'), Column('missed', '_d'), Column('most errors on')]
     title = 'Frames with the lowest IoU (GroundGrid convention)  [%]'
@@ -242,17 +230,13 @@ def _time_table(scores: Sequence[MethodScore]) -> Table:
 def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
     """Share of ground and mean probability in each bin of probability, by sequence and pooled."""
     rows = []
+    low, high = (metrics.BIN_EDGES[k : k + metrics.N_BINS].tolist() for k in (0, 1))
+    keys = ('from', 'to', 'points', 'mean_p', 'share_ground')
     for sequence, found in _calibrations(score).items():
         bins = (found.n_points, found.by_bin(found.sum_p), found.by_bin(found.n_ground))
-        values = zip(metrics.BIN_EDGES[:-1], metrics.BIN_EDGES[1:], *bins, strict=True)
-        keys = ('from', 'to', 'points', 'mean_p', 'share_ground')
-        for row in values:
-            named = zip(keys, (value.item() for value in row), strict=True)
-            rows.append({'sequence': sequence, **dict(named)})
+        for row in zip(low, high, *(values.tolist() for values in bins), strict=True):
+            rows.append({'sequence': sequence, **dict(zip(keys, row, strict=True))})
     return rows
-
-
-# What `experiment` and `bench` share with this command.
 
 
 def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:

@@ -24,7 +24,7 @@ DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 
 OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
-SEEDS = ('--seeds', 'simulated scenes of each kind', {'metavar': 'N', 'type': options.positive})
+SEEDS = ('--seeds', 'simulated scenes of each kind', options.NUMBER)
 SCENE_LIST = (
     '--scenes', f'simulated scenes, some of {",".join(SCENES)} (default: all)',
     {'metavar': 'LIST', 'type': options.some_of(SCENES)},
@@ -45,7 +45,7 @@ SEGMENTS = (
 )  # fmt: skip
 REPEATS = (
     '--repeats', 'timed runs of each method (default: %(default)s)',
-    {'metavar': 'N', 'type': options.positive, 'default': 9},
+    {**options.NUMBER, 'default': 9},
 )  # fmt: skip
 
 
@@ -146,8 +146,8 @@ def _scenes(arguments: argparse.Namespace) -> Report:
         preset = arguments.preset or variants.PRESET_OF[sensor]
         configs[sensor] = options.read_config(argparse.Namespace(**{**given, 'preset': preset}))
     scenes, seeds = arguments.scenes or list(SCENES), arguments.seeds or 3
-    with_peer = not arguments.no_peer
-    return variants.score_scenes(configs, scenes, seeds, with_peer, options.progress('scenes'))
+    bar = options.progress('scenes')
+    return variants.score_scenes(configs, scenes, seeds, not arguments.no_peer, bar)
 
 
 def _cross_validation(arguments: argparse.Namespace) -> Report:

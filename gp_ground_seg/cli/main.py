@@ -15,12 +15,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from gp_ground_seg import __version__
 from gp_ground_seg.errors import GroundSegError
 
-EXIT_OK = 0
-EXIT_ERROR = 2
-EXIT_INTERRUPTED = 130
-
 ROS_ARGS = '--ros-args'
-
 
 # Module in `gp_ground_seg.cli` and purpose of each command. The `add_parser(subparsers)` of a
 # module declares its commands: their options, and the default `run`, a function of the parsed
@@ -139,11 +134,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     except GroundSegError as error:
         print(f'gp-ground-seg: error: {error}', file=sys.stderr)
-        return EXIT_ERROR
+        return 2
     except KeyboardInterrupt:
         print('gp-ground-seg: interrupted', file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return 130
     except BrokenPipeError:
         # The reader of our output went away (as in `| head`); nothing is wrong here.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_OK
+        return 0

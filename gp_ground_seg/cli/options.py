@@ -58,6 +58,9 @@ def positive(word: str, least: int = 1) -> int:
     return int(word)
 
 
+NUMBER: dict[str, Any] = {'metavar': 'N', 'type': positive}
+
+
 def above_zero(text: str, or_zero: bool = False) -> float:
     """Read a number above 0."""
     try:
@@ -78,9 +81,8 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
         words = [word for word in text.split(',') if word]
         unknown = [word for word in words if word not in names]
         if unknown or not words or len(set(words)) < len(words):
-            raise argparse.ArgumentTypeError(
-                f'{text!r}: must be some of {",".join(names)}, each once'
-            )
+            wanted = ','.join(names)
+            raise argparse.ArgumentTypeError(f'{text!r}: must be some of {wanted}, each once')
         return words
 
     return parse

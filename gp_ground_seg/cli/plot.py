@@ -6,7 +6,7 @@ import argparse
 import math
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from gp_ground_seg.cli import options
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.metrics import GROUNDGRID, Labels
+from gp_ground_seg.evaluation.metrics import GROUNDGRID
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.plotting.scan import plot_birds_eye, plot_scan_view
 from gp_ground_seg.plotting.segment import plot_segment, segment_at
@@ -26,7 +26,6 @@ SCAN = """\
 Draw a scan as RViz would show the node's topics: ground, obstacles, and the ground
 model as profiles with twice its standard deviation, coloured by length-scale.
 """
-
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
   gp-ground-seg plot scan --simulate road_then_rubble -o scan.png
@@ -36,7 +35,6 @@ SCAN_EXAMPLES = """\
 ABOVE = """\
 Draw a scan from above: ground and obstacles; with --labels the errors beside it.
 """
-
 ABOVE_EXAMPLES = """\
   gp-ground-seg plot above velodyne/000000.bin --labels labels/000000.label -o errors.png
 """
@@ -46,7 +44,6 @@ The paper's Figure 1 for any scan and segment: points, ground candidates, the li
 through them with their critical points, the inliers, and the estimated ground with
 twice its standard deviation; below it the length-scale and its pseudo-inputs.
 """
-
 SEGMENT_EXAMPLES = """\
   gp-ground-seg plot segment 000000.bin --segment 157 -o segment.png
   gp-ground-seg plot segment 000000.bin --azimuth 0 -o ahead.pdf
@@ -62,7 +59,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     description = 'Draw a segmented scan: in perspective, from above, or one segment of it.'
     examples = SCAN_EXAMPLES + ABOVE_EXAMPLES + SEGMENT_EXAMPLES
     parser = options.new_parser(subparsers, 'plot', description, examples)
-    pictures = parser.add_subparsers(metavar='PICTURE', required=True)
+    pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
     number: dict[str, Any] = {'metavar': 'N', 'type': int}
     scan = ('input', 'KITTI scan (.bin)', {'metavar': 'INPUT'})
     labels = ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'})
@@ -79,14 +76,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--sensor', sensor, {'choices': SENSORS, 'default': 'hdl-64e'}),
         ('--seed', 'of the simulated scene (default: %(default)s)', {**number, 'default': 0}),
     )
-    above = options.new_parser(
-        pictures, 'above', ABOVE, ABOVE_EXAMPLES, 'a scan and its errors from above'
-    )
+    purpose = 'a scan and its errors from above'
+    above = options.new_parser(pictures, 'above', ABOVE, ABOVE_EXAMPLES, purpose)
     options.add(above, scan, labels)
 
-    segment = options.new_parser(
-        pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side'
-    )
+    purpose = 'a segment from the side'
+    segment = options.new_parser(pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, purpose)
     metres, degrees = {'metavar': 'R', 'type': float}, {'metavar': 'DEG', 'type': float}
     shown = ('--max-range', 'range shown [m] (default: all candidates)', metres)
     options.add(segment, scan, labels, shown)
@@ -95,27 +90,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--segment', 'number of the segment', number),
         ('--azimuth', 'the one that looks there, 90 = left', degrees),
     )
-    for picture, draw, endings in (
-        (view, _draw_view, ('.png',)),
-        (above, _draw_above, ('.png',)),
-        (segment, _draw_segment, ('.png', '.pdf')),
-    ):
-        output = {'metavar': 'OUT', 'required': True}
-        options.add(
-            picture, ('-o --output', f'{" or ".join(endings)} file', output), options.FORCE
-        )
+    for picture in (view, above, segment):
+        endings = ('.png', '.pdf') if picture is segment else ('.png',)
+        output = (f'{" or ".join(endings)} file', {'metavar': 'OUT', 'required': True})
+        options.add(picture, ('-o --output', *output), options.FORCE)
         options.add_config(picture)
-        picture.set_defaults(run=run, draw=draw, endings=endings)
-
-
-class Segmented(NamedTuple):
-    """A scan, its name, its true labels if known, parameters and result."""
-
-    points: npt.NDArray[np.float32]
-    title: str
-    truth: Labels | None
-    config: Config
-    result: Segmentation
+        picture.set_defaults(run=run, endings=endings)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -132,7 +112,15 @@ def run(arguments: argparse.Namespace) -> int:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
     with closing(GroundSegmenter(config)) as segmenter:
         result = segmenter.segment(points)
-    said = arguments.draw(arguments, Segmented(points, title, truth, config, result))
+    said = f'{len(points)} points'
+    if arguments.picture == 'scan':
+        plot_scan_view(points, result, config, path, title)
+    elif arguments.picture == 'above':
+        plot_birds_eye(points, result.label, path, truth, title)
+    else:
+        segment, reach = _segment_number(arguments, config), arguments.max_range
+        plot_segment(result, config, points, segment, path, truth, title, reach)
+        said = _segment_counts(result, segment)
     print(f'{said}, written to {path}')
     return 0
 
@@ -153,26 +141,15 @@ def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.float32], s
     return points, f'simulated {arguments.sensor}: {arguments.simulate}'
 
 
-def _draw_view(arguments: argparse.Namespace, scan: Segmented) -> str:
-    plot_scan_view(scan.points, scan.result, scan.config, arguments.output, scan.title)
-    return f'{len(scan.points)} points'
+def _segment_number(arguments: argparse.Namespace, config: Config) -> int:
+    if arguments.azimuth is None:
+        return int(arguments.segment)
+    if not math.isfinite(arguments.azimuth):
+        raise DataError(f'--azimuth {arguments.azimuth}: must be a number of degrees')
+    return segment_at(math.radians(arguments.azimuth), config.grid.n_segments)
 
 
-def _draw_above(arguments: argparse.Namespace, scan: Segmented) -> str:
-    plot_birds_eye(scan.points, scan.result.label, arguments.output, scan.truth, scan.title)
-    return f'{len(scan.points)} points'
-
-
-def _draw_segment(arguments: argparse.Namespace, scan: Segmented) -> str:
-    segment, result = arguments.segment, scan.result
-    if arguments.azimuth is not None:
-        if not math.isfinite(arguments.azimuth):
-            raise DataError(f'--azimuth {arguments.azimuth}: must be a number of degrees')
-        segment = segment_at(math.radians(arguments.azimuth), scan.config.grid.n_segments)
-    plot_segment(
-        result, scan.config, scan.points, segment, arguments.output, scan.truth, scan.title,
-        arguments.max_range,
-    )  # fmt: skip
+def _segment_counts(result: Segmentation, segment: int) -> str:
     own, pseudo = (
         slice(*offsets[segment : segment + 2])
         for offsets in (result.candidates.offsets, result.pseudo.offsets)

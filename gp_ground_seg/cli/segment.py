@@ -47,7 +47,6 @@ Messages of ROS 1 are converted to ROS 2.
 Nothing is overwritten without --force. Output is written under a hidden name
 (.NAME.partial-...) and takes its name when it is complete.
 """
-
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
@@ -63,7 +62,6 @@ with velodyne/ in it. Each scan is judged by itself. Support is the share of the
 low points on the plane that was found, residual their distance to it. With enough
 scans of level ground the medians are values to set: docs/pose.md.
 """
-
 POSE_EXAMPLES = """\
   gp-ground-seg pose 000000.bin
   gp-ground-seg pose KITTI_ROOT/sequences/00
@@ -71,34 +69,27 @@ POSE_EXAMPLES = """\
 """
 
 GROUND_TOPIC, OBSTACLES_TOPIC = '/ground', '/obstacles'
-"""Topics of the clouds in the output, unless others are given."""
-
-FOR_SCANS = ('raw',)
 FOR_BAGS = ('topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
 # Unlabelled, road and other-object.
 SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
-_SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data')
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
-    output = (
-        'for scans a folder, or a .label file for a single scan; for bags a folder, or a '
-        '.mcap or .db3 file (default: INPUT with _ground added, beside it)'
-    )
     options.add(
         parser,
         ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
-        ('-o --output', output, {'metavar': 'OUT'}),
+        ('-o --output', 'for scans a folder, or a .label file for a single scan; for bags a '
+         'folder, or a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
+         {'metavar': 'OUT'}),
         options.FORCE,
         options.QUIET,
-    )
+    )  # fmt: skip
     options.add_config(parser)
     raw = 'write 0 unknown, 1 ground, 2 obstacle as labels'
     options.add(parser.add_argument_group('for scans'), ('--raw', raw, options.FLAG))
-    storage = 'storage of the output (default: by its name, else as the input; mcap for ROS 1)'
     topic, several = {'metavar': 'T'}, {'metavar': 'T', 'action': 'append', 'default': []}
     options.add(
         parser.add_argument_group('for bags'),
@@ -106,8 +97,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--ground-topic', f'topic of the ground (default: {GROUND_TOPIC})', topic),
         ('--obstacles-topic', f'topic of the obstacles (default: {OBSTACLES_TOPIC})', topic),
         ('--drop', 'leave this topic out of the output (may be repeated)', several),
-        ('--format', storage, {'choices': SUFFIX_OF_STORAGE}),
-    )
+        ('--format', 'storage of the output (default: by its name, else as the input; mcap for '
+         'ROS 1)', {'choices': SUFFIX_OF_STORAGE}),
+    )  # fmt: skip
     parser.set_defaults(run=run)
 
     parser = options.new_parser(subparsers, 'pose', POSE_DESCRIPTION, POSE_EXAMPLES)
@@ -120,43 +112,35 @@ def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
     config = options.read_config(arguments)
     source = Path(arguments.input)
-    holds_bag = is_bag(source) or _holds_bag_files(source)
+    holds_bag = is_bag(source)
+    if source.is_dir() and not any(source.glob('*.bin')):
+        # A folder of bag files and no scans: `BagReader` says what is missing there.
+        holds_bag |= any(child.suffix in BAG_SUFFIXES for child in source.iterdir())
     scans = [] if holds_bag else find_scans(source)
-    kind, foreign = ('scans', FOR_SCANS) if holds_bag else ('bags', FOR_BAGS)
+    kind, foreign = ('scans', ['raw']) if holds_bag else ('bags', FOR_BAGS)
     for name in foreign:
         if getattr(arguments, name):
             option = name.replace('_', '-')
             raise DataError(f'--{option}: is for {kind}, which {source} is not')
     target = Path(arguments.output) if arguments.output else _default_output(source)
+    n_points = n_ground = 0
+    seconds = []
     with closing(GroundSegmenter(config)) as segmenter:
         if holds_bag:
-            frames = _segment_bag(target, arguments, segmenter)
+            results = _segment_bag(target, arguments, segmenter)
         else:
-            frames = _segment_scans(scans, target, arguments, segmenter)
-    n_points = sum(frame[0] for frame in frames)
-    n_ground = sum(frame[1] for frame in frames)
+            results = _segment_scans(scans, target, arguments, segmenter)
+        for result in results:
+            n_points += len(result.label)
+            n_ground += int((result.label == Label.GROUND).sum())
+            seconds.append(result.timings['total'])
     share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
-    time = statistics.median(frame[2] for frame in frames)
     print(
-        f'{options.count(len(frames), "frame")}, {options.count(n_points, "point")}, {share}, '
-        f'{1e3 * time:.1f} ms per frame (median, segmentation only), written to {target}'
+        f'{options.count(len(seconds), "frame")}, {options.count(n_points, "point")}, {share}, '
+        f'{1e3 * statistics.median(seconds):.1f} ms per frame (median, segmentation only), '
+        f'written to {target}'
     )
     return 0
-
-
-_Counts = tuple[int, int, float]
-"""Points, those of them that are ground, and seconds of one frame."""
-
-
-def _count(result: Segmentation) -> _Counts:
-    return len(result.label), int((result.label == Label.GROUND).sum()), result.timings['total']
-
-
-def _holds_bag_files(source: Path) -> bool:
-    """Whether a folder holds bag files and no scans: `BagReader` says what is missing there."""
-    if not source.is_dir() or any(source.glob('*.bin')):
-        return False
-    return any(child.suffix in BAG_SUFFIXES for child in source.iterdir())
 
 
 def _default_output(source: Path) -> Path:
@@ -179,7 +163,7 @@ def find_scans(source: Path) -> list[Path]:
                 'folders of .bin files and rosbag2 folders'
             )
         return [source]
-    for name in _SCAN_FOLDERS:
+    for name in ('.', 'velodyne', 'velodyne_points/data'):
         if scans := sorted((source / name).glob('*.bin')):
             return scans
     sequences = sorted(path.parent for path in source.glob('sequences/*/velodyne'))
@@ -192,9 +176,8 @@ def find_scans(source: Path) -> list[Path]:
 
 def _segment_scans(
     scans: Sequence[Path], target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
-) -> list[_Counts]:
-    """Write one label file per scan."""
-    frames = []
+) -> Iterator[Segmentation]:
+    """Write one label file per scan; yield what each holds."""
     codes = sorted(Label) if arguments.raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
     code = np.array(codes, dtype='<u4')
     if not arguments.quiet:
@@ -209,9 +192,8 @@ def _segment_scans(
             except PointCloudError as error:
                 raise PointCloudError(f'{scan}: {error}') from error
             label_path.write_bytes(code[result.label].tobytes())
-            frames.append(_count(result))
+            yield result
             bar.update()
-    return frames
 
 
 @contextmanager
@@ -232,9 +214,9 @@ def _label_files(
 
 def _segment_bag(
     target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
-) -> list[_Counts]:
-    """Copy a bag, and write the ground and the obstacles of each cloud after it."""
-    frames: list[_Counts] = []
+) -> Iterator[Segmentation]:
+    """Copy a bag, the ground and the obstacles of each cloud after it; yield the results."""
+    n_done = 0
     source = Path(arguments.input)
     here = source.resolve()
     if target.resolve() in (here, *here.parents):
@@ -273,15 +255,15 @@ def _segment_bag(
                     result = segmenter.segment(read_xyz(cloud))
                 except PointCloudError as error:
                     raise DataError(
-                        f'{source}: message {len(frames)} of topic {topic}, '
+                        f'{source}: message {n_done} of topic {topic}, '
                         f'recorded at {time} ns: {error}'
                     ) from error
                 for part, label in outputs.items():
                     chosen = select_points(cloud, result.label == label)
                     output.write(part, time, encode_cloud(chosen))
-                frames.append(_count(result))
+                yield result
+                n_done += 1
                 bar.update()
-    return frames
 
 
 def _check_output_topics(source: Path, topics: tuple[str, str], copied: list[str]) -> None:
@@ -350,6 +332,6 @@ def _pose_summary(poses: list[SensorPose]) -> str:
         return 'no scan shows enough ground to tell the height: set sensor.height'
     words = f'median of {len(heights)}: sensor.height={statistics.median(heights):.2f}'
     if tilts:
-        roll, pitch = (statistics.median(angles) for angles in zip(*tilts, strict=True))
+        roll, pitch = map(statistics.median, zip(*tilts, strict=True))
         words += f' sensor.roll={roll:.3f} sensor.pitch={pitch:.3f} [m, rad]'
     return words

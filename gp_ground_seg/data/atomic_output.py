@@ -12,8 +12,7 @@ from pathlib import Path
 from gp_ground_seg.data.bag_files import is_bag_folder
 from gp_ground_seg.errors import DataError
 
-PARTIAL_MARK = '.partial-'
-"""Part of the hidden names under which unfinished output is kept."""
+PARTIAL_MARK = '.partial-'  # part of the hidden names under which unfinished output is kept
 
 
 def leftovers(target: str | Path) -> list[Path]:

@@ -14,8 +14,7 @@ from typing import Any
 from gp_ground_seg.errors import DataError, GroundSegError
 
 POINT_CLOUD2 = 'sensor_msgs/msg/PointCloud2'
-UNKNOWN_TYPE_HASH = 'RIHS01_' + 64 * '0'
-"""For a type without definition; what rosbag2 stores for it is no valid hash."""
+UNKNOWN_TYPE_HASH = 'RIHS01_' + 64 * '0'  # what rosbag2 itself stores is no valid hash
 METADATA_FILE = 'metadata.yaml'
 SUFFIX_OF_STORAGE = {'mcap': '.mcap', 'sqlite3': '.db3'}
 STORAGE_OF_SUFFIX = {suffix: storage for storage, suffix in SUFFIX_OF_STORAGE.items()}

@@ -9,9 +9,9 @@ import dataclasses
 import functools
 import importlib
 import os
-from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -55,20 +55,22 @@ def jazzy_types() -> Any:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def jazzy_topic(name: str, msgtype: str, qos: tuple[Any, ...] = ()) -> BagTopic:
+def jazzy_topic(name: str, msgtype: str) -> BagTopic:
     """Topic of a type that is part of ROS 2 Jazzy."""
-    types = jazzy_types()
-    definition, _ = types.generate_msgdef(msgtype, ros_version=2)
-    return BagTopic(name, msgtype, definition, types.hash_rihs01(msgtype), qos=qos)
+    return _topic_of(jazzy_types(), name, msgtype, ())
 
 
 def cloud_topic(name: str) -> BagTopic:
     """PointCloud2 topic offered reliably; with best effort, large clouds get lost when played."""
-    return jazzy_topic(name, POINT_CLOUD2, (_reliable_qos('VOLATILE'),))
+    return _topic_of(jazzy_types(), name, POINT_CLOUD2, (_reliable_qos('VOLATILE'),))
+
+
+def _topic_of(types: Any, name: str, msgtype: str, qos: tuple[Any, ...]) -> BagTopic:
+    definition, _ = types.generate_msgdef(msgtype, ros_version=2)
+    return BagTopic(name, msgtype, definition, types.hash_rihs01(msgtype), qos=qos)
 
 
 def _reliable_qos(durability: str) -> Any:
-    require_rosbags()
     from rosbags import interfaces as ros
 
     forever = ros.QosTime(9223372036, 854775807)  # RMW_DURATION_INFINITE
@@ -82,14 +84,13 @@ def _parse_definition(text: str, msgtype: str) -> Any:
     """Types of one definition (.msg or .idl text) in a store of their own, to read only."""
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-    types: dict[str, Any] = {}
+    store = get_typestore(Stores.EMPTY)
     separator = 80 * '=' + '\n'
     if text.startswith(f'{separator}IDL: '):
-        for part in text.split(separator)[1:]:
-            types.update(get_types_from_idl(part.partition('\n')[2]))
+        parts = (part.partition('\n')[2] for part in text.split(separator)[1:])
+        types = {name: kind for part in parts for name, kind in get_types_from_idl(part).items()}
     else:
-        types.update(get_types_from_msg(text, msgtype))
-    store = get_typestore(Stores.EMPTY)
+        types = get_types_from_msg(text, msgtype)
     store.register(types)
     return store
 
@@ -110,11 +111,7 @@ def _ros2_topic(connection: Any) -> BagTopic:
 
 
 def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
-    """Topic of a ROS 1 connection, and a function that converts its messages to CDR.
-
-    Where ROS 2 Jazzy has the type in the same layout, or not at all, only a header's ``seq``
-    goes. Else the message is migrated: fields of one name keep their value, new ones are zero.
-    """
+    """Topic of a ROS 1 connection, and a function that converts its messages to CDR."""
     from rosbags.convert.converter import is_same_wireformat, migrate_bytes
     from rosbags.typesys import Stores, get_typestore
 
@@ -126,19 +123,18 @@ def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
         target = get_typestore(Stores.EMPTY)
         target.register({**source.fielddefs, _HEADER: header})
     convert: Callable[[bytes], Any] = functools.partial(target.ros1_to_cdr, typename=new)
+    # In the same layout only a header's ``seq`` goes; else fields of one name keep their value.
     migrated = not is_same_wireformat(source, target, old, new)
     if migrated:
         convert = functools.partial(
             migrate_bytes, source, target, old, new, {}, src_is2=False, dst_is2=True
         )
-    definition, _ = target.generate_msgdef(new, ros_version=2)
-    type_hash = target.hash_rihs01(new)
     qos = (_reliable_qos('TRANSIENT_LOCAL'),) if connection.ext.latching else ()
-    topic = BagTopic(connection.topic, new, definition, type_hash, qos=qos, migrated=migrated)
-    return topic, convert
+    topic = _topic_of(target, connection.topic, new, qos)
+    return dataclasses.replace(topic, migrated=migrated), convert
 
 
-class BagReader:
+class BagReader(AbstractContextManager['BagReader']):
     """A bag as ROS 2 topics with CDR messages, to be used in a ``with`` statement.
 
     `path` is a ROS 1 ``.bag``, whose messages are converted, a rosbag2 folder, ``.mcap`` or
@@ -150,8 +146,7 @@ class BagReader:
         from rosbags import rosbag1, rosbag2
 
         self.path = Path(path)
-        self.storage = storage_of(self.path)
-        """``ros1``, ``mcap`` or ``sqlite3``."""
+        self.storage = storage_of(self.path)  # ``ros1``, ``mcap`` or ``sqlite3``
         self._converters: dict[int, Callable[[bytes], Any]] = {}
         with ExitStack() as stack:
             with reading(self.path):
@@ -161,15 +156,10 @@ class BagReader:
                 reader.open()
             stack.callback(reader.close)
             self._reader = reader
-            connections = defaultdict(list)
+            self._topics: dict[str, BagTopic] = {}
             for connection in reader.connections:
-                connections[connection.topic].append(connection)
-            self._topics = {name: self._describe(found) for name, found in connections.items()}
+                self._add(self._describe(connection), connection.msgcount)
             self._open = stack.pop_all()
-
-    def __enter__(self) -> BagReader:
-        """Return the open bag."""
-        return self
 
     def __exit__(self, *error: object) -> None:
         """Close the files; nothing can be read afterwards."""
@@ -183,11 +173,8 @@ class BagReader:
     @property
     def point_cloud_topics(self) -> list[str]:
         """Names of the PointCloud2 topics."""
-        return [
-            name
-            for name, topic in self._topics.items()
-            if topic.msgtype == POINT_CLOUD2 and topic.encoding == 'cdr'
-        ]
+        kind = POINT_CLOUD2, 'cdr'
+        return [name for name, t in self._topics.items() if (t.msgtype, t.encoding) == kind]
 
     @property
     def migrated_topics(self) -> list[str]:
@@ -248,12 +235,10 @@ class BagReader:
         while True:
             # The caller's own errors, raised at the yield, must not pass through here.
             with reading(self.path):
-                entry = next(source, None)
-                if entry is None:
+                if (entry := next(source, None)) is None:
                     break
                 connection, time, raw = entry
-                converter = self._converters.get(connection.id)
-                message = bytes(converter(raw) if converter else raw)
+                message = bytes(self._converters.get(connection.id, bytes)(raw))
             found[connection.topic] += 1
             yield connection.topic, time, message
         for name, topic in wanted.items():
@@ -264,24 +249,23 @@ class BagReader:
                     f'or its {METADATA_FILE} belongs to another one'
                 )
 
-    def _describe(self, connections: Sequence[Any]) -> BagTopic:
-        """Topic of several publishers."""
-        parts = [self._describe_one(connection) for connection in connections]
-        name, msgtypes = parts[0].name, list(dict.fromkeys(part.msgtype for part in parts))
-        if len(msgtypes) > 1:
+    def _add(self, topic: BagTopic, n_messages: int) -> None:
+        """Add a topic, or another of its publishers."""
+        known = self._topics.setdefault(topic.name, topic)
+        if known.msgtype != topic.msgtype:
             raise DataError(
-                f'{self.path}: topic {name} has messages of two types, {msgtypes[0]} and '
-                f'{msgtypes[1]}; one topic must have one type'
+                f'{self.path}: topic {topic.name} has messages of two types, {known.msgtype} and '
+                f'{topic.msgtype}; one topic must have one type'
             )
-        return dataclasses.replace(
-            parts[0],
-            n_messages=sum(connection.msgcount for connection in connections),
-            qos=tuple(dict.fromkeys(qos for part in parts for qos in part.qos)),
-            migrated=any(part.migrated for part in parts),
-            problem=next((part.problem for part in parts if part.problem), ''),
+        self._topics[topic.name] = dataclasses.replace(
+            known,
+            n_messages=known.n_messages + n_messages,
+            qos=tuple(dict.fromkeys((*known.qos, *topic.qos))),
+            migrated=known.migrated or topic.migrated,
+            problem=known.problem or topic.problem,
         )
 
-    def _describe_one(self, connection: Any) -> BagTopic:
+    def _describe(self, connection: Any) -> BagTopic:
         if self.storage != 'ros1':
             return _ros2_topic(connection)
         try:

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from gp_ground_seg.errors import DataError
 
 BYTES_PER_POINT = 16
-FRAME_PERIOD = 0.1
-"""Time between frames [s] where a sequence has no times.txt."""
+FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,7 @@ MODES = {'fixed': 'theta fixed', 'every_frame': 'learning'}
 
 @dataclass(frozen=True)
 class BenchFrame:
-    """A cloud in memory, (N, 4) x, y, z [m] and intensity.
-
-    What is temporal starts anew with each sequence.
-    """
+    """A cloud in memory, (N, 4) x, y, z [m] and intensity."""
 
     sequence: str
     index: str
@@ -76,20 +73,17 @@ def run_cases(
 
     The speed of a machine drifts over seconds; a case and its baseline follow one
     another, so that their ratio does not. Which of the two goes first, and which case
-    is the first, changes from frame to frame. Before the first frame counts, each has
-    run on it: compilation and first allocations are not its speed.
-
-    `frames` are grouped by sequence; `cases` are what to time, by title, such as ``learning, 1
-    thread``; `make_baseline` makes the baseline of each, which sees every frame as often.
+    is the first, changes from frame to frame. Each runs once without counting. `frames` are
+    grouped by sequence; `make_baseline` makes the baseline of each case.
     """
     names = list(cases)
     with ExitStack() as stack:
         pairs: list[tuple[OurMethod, Method | None]] = []
-        for name in names:
-            ours = stack.enter_context(closing(OurMethod(cases[name])))
-            baseline = make_baseline() if make_baseline is not None else None
+        for config in cases.values():
+            ours = stack.enter_context(closing(OurMethod(config)))
+            baseline = make_baseline() if make_baseline else None
             pairs.append((ours, baseline))
-            for method in (ours, ours, baseline):  # does not count
+            for method in (ours, ours, baseline):
                 _time(method, frames[0], clock)
         times: dict[str, list[FrameTime]] = {name: [] for name in names}
         sequence = None
@@ -125,8 +119,7 @@ def bench_document(
 ) -> dict[str, Any]:
     """Everything of a benchmark in JSON's own types; times in ms.
 
-    Ratios are to the baseline on the same frame, measured right before or after: their
-    median, and the 99th percentile of our times over the median of those of the baseline.
+    Ratios are to the baseline on the same frame; p99 is that of our times over its median.
     """
     times = next(iter(cases.values()))
     points = [len(one.frame.points) for one in times]

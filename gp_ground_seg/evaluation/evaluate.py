@@ -37,7 +37,6 @@ OURS = 'gp_ground_seg'
 PATCHWORKPP = 'patchworkpp'
 TITLES = {PATCHWORKPP: 'Patchwork++'}
 """Names of methods in tables, where they differ from those in files."""
-
 ALL = 'all'
 Progress = Callable[[Sequence[Any]], Iterable[Any]]
 """Wraps items to show how far the work is, as tqdm does."""
@@ -94,10 +93,8 @@ class OurMethod:
 
     def result(self) -> MethodResult:
         """Return all there is of the last scan."""
-        last = self.last
-        return MethodResult(
-            last.label, last.ground_z, last.p_ground, self.stages, last.pose, last.fit
-        )
+        own = self.last
+        return MethodResult(own.label, own.ground_z, own.p_ground, self.stages, own.pose, own.fit)
 
     def close(self) -> None:
         """End the worker threads."""
@@ -107,8 +104,7 @@ class OurMethod:
 class PatchworkppMethod:
     """Patchwork++ (Lee, Lim, Myung, IROS 2022) from PyPI, with its published parameters.
 
-    Its thresholds adapt over a sequence. The published sensor height [m], that of KITTI, is its
-    default. Raises MissingDependencyError if pypatchworkpp is not installed.
+    Its thresholds adapt over a sequence. The default sensor height [m] is that of KITTI.
     """
 
     name = PATCHWORKPP
@@ -259,8 +255,8 @@ class MethodScore:
     @property
     def rings(self) -> tuple[Confusion, ...]:
         """Sum of the counts by ring."""
-        by_ring = zip(*(scan.rings for scan in self.scans), strict=True)
-        return tuple(sum(ring, Confusion()) for ring in by_ring)
+        of_scans = [scan.rings for scan in self.scans]
+        return tuple(sum(ring, Confusion()) for ring in zip(*of_scans, strict=True))
 
     @property
     def calibration(self) -> metrics.Calibration | None:
@@ -335,11 +331,9 @@ def score_methods(
 ) -> list[MethodScore]:
     """Run methods alternately on the same scans and score each run, in the order of `methods`.
 
-    Which method goes first changes from scan to scan. Before the first scan counts, each method
-    has run on it once: compilation and first allocations are not its speed. `items`, grouped by
-    sequence, are loaded one by one. Methods, each with a name of its own, are reset before each
-    sequence, or with `each_alone` before each scan. Raises PointCloudError if a method refuses a
-    scan.
+    Which method goes first changes from scan to scan. Each runs once without counting:
+    compilation and first allocations are not its speed. `items`, grouped by sequence, are loaded
+    one by one. Methods are reset before each sequence, or with `each_alone` before each scan.
     """
     scores: dict[str, list[ScanScore]] = {method.name: [] for method in methods}
     sequence = None
@@ -372,19 +366,14 @@ def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
     truth = next(iter(scan.truths.values()))
     height = None
     if scan.ground_z is not None:
-        height = metrics.height_error(
-            scan.ground_z[scan.is_ground], result.ground_z[scan.is_ground]
-        )
+        own = scan.is_ground
+        height = metrics.height_error(scan.ground_z[own], result.ground_z[own])
     return ScanScore(
-        scan.sequence,
-        scan.index,
-        seconds,
-        result.stages,
+        scan.sequence, scan.index, seconds, result.stages,
         {key: metrics.count_confusion(label, one) for key, one in scan.truths.items()},
         height,
         {} if scan.semantic is None else metrics.count_classes(label, scan.semantic),
         metrics.count_rings(label, truth, scan.points),
         None if p_ground is None else metrics.count_calibration(p_ground, truth),
-        result.pose,
-        result.fit,
-    )
+        result.pose, result.fit,
+    )  # fmt: skip

@@ -37,7 +37,6 @@ it must not move with ``sensor.height``, which is a parameter of the method."""
 LOW_VEGETATION_Z = -0.75 * SENSOR_HEIGHT
 """Height [m, sensor frame] below which Patchwork's evaluation counts vegetation as ground."""
 
-
 CLASS_NAMES = {
     0: 'unlabelled', 1: 'outlier', 10: 'car', 11: 'bicycle', 13: 'bus', 15: 'motorcycle',
     16: 'on rails', 18: 'truck', 20: 'other vehicle', 30: 'person', 31: 'bicyclist',
@@ -60,23 +59,16 @@ def class_name(number: int) -> str:
 
 @dataclass(frozen=True)
 class Convention:
-    """A way to read semantic classes as ground and not ground.
+    """A way to read semantic classes as ground and not ground."""
 
-    Its name in files, in tables, and what it does; the classes whose points do not count; and
-    the height [m, sensor frame] below which vegetation is ground.
-    """
-
-    key: str
-    title: str
+    key: str  # in files
+    title: str  # in tables
     rule: str
-    left_out: tuple[int, ...]
-    low_vegetation_z: float = -math.inf
+    left_out: tuple[int, ...]  # classes whose points do not count
+    low_vegetation_z: float = -math.inf  # below it vegetation is ground [m, sensor frame]
 
     def truth(self, semantic: npt.NDArray[np.integer], z: npt.NDArray[np.floating]) -> Labels:
-        """Return the true `Label` of each point, UNKNOWN where it does not count, (N,) uint8.
-
-        `semantic` (N,) are classes, `z` (N,) heights in the sensor frame [m].
-        """
+        """Return the true `Label` (N,) by class and height (N,); UNKNOWN does not count."""
         ground = np.isin(semantic, GROUND_CLASSES)
         ground |= (semantic == VEGETATION) & (z < self.low_vegetation_z)
         truth = np.where(ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
@@ -232,19 +224,13 @@ def class_errors(classes: Mapping[int, ClassCount]) -> list[ClassErrors]:
 class Calibration:
     """Probabilities of ground against the truth, as sums; ratios over nothing are NaN.
 
-    Attributes
-    ----------
-    n_points, n_ground, sum_p : (N_BINS,) array
-        Points with a probability, those of them that are ground, and the sum of their
-        probabilities, by bin of it; a bin holds its lower edge, the last one 1 as well.
-    sum_squared_error : float
-        Sum of (probability - truth)^2, truth 1 for ground and 0 for obstacles.
+    Sums by bin of probability, (N_BINS,); a bin holds its lower edge, the last one 1 as well.
     """
 
     n_points: npt.NDArray[np.int64]
     n_ground: npt.NDArray[np.int64]
     sum_p: FloatArray
-    sum_squared_error: float
+    sum_squared_error: float  # of probability minus truth, 1 for ground, over all bins
 
     def __add__(self, other: Calibration) -> Calibration:
         """Add the sums of both."""
@@ -278,8 +264,7 @@ class Calibration:
 def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Calibration:
     """Compare probabilities of ground, (N,), with true labels, (N,).
 
-    Points whose probability is NaN or whose truth is UNKNOWN do not count. Raises
-    PointCloudError if the lengths differ or a probability is outside [0, 1].
+    Points whose probability is NaN or whose truth is UNKNOWN do not count.
     """
     if p_ground.shape != truth.shape:
         raise PointCloudError(
@@ -303,17 +288,15 @@ def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Cali
 class HeightError:
     """Errors of the surface under points whose ground height is known; over no points NaN.
 
-    Points with a surface, which count, and without one, which do not; sums of estimate minus
-    truth [m], of its squares, and of the squared deviations of the truth from its mean in the
-    frame [m^2]; median distance of the two [m], pooled the median over the frames.
+    Points without a surface do not count. The error is estimate minus truth.
     """
 
     n_points: int
     n_without_model: int
-    sum_error: float
-    sum_squared_error: float
-    sum_squared_deviation: float
-    median_absolute: float
+    sum_error: float  # [m]
+    sum_squared_error: float  # [m^2]
+    sum_squared_deviation: float  # of the truth from its mean in the frame [m^2]
+    median_absolute: float  # [m]; pooled the median over the frames
 
     @property
     def rmse(self) -> float:

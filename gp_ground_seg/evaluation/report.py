@@ -91,11 +91,9 @@ class Table:
         """Return aligned text, columns two spaces apart."""
         lines = self._shown()
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        text = []
-        for line in lines:
-            cells = zip(self.columns, line, widths, strict=True)
-            aligned = (c.rjust(w) if column.format else c.ljust(w) for column, c, w in cells)
-            text.append('  '.join(aligned).rstrip())
+        marks = ['>' if column.format else '<' for column in self.columns]
+        form = '  '.join(f'{{:{mark}{w}}}' for mark, w in zip(marks, widths, strict=True))
+        text = [form.format(*line).rstrip() for line in lines]
         rule = '-' * (sum(widths) + 2 * (len(widths) - 1))
         if self.n_sums:
             text.insert(len(text) - self.n_sums, rule)

@@ -39,14 +39,11 @@ PLACES = (0.0, 6.0, 12.0)
 
 
 class Departure(NamedTuple):
-    """A departure from the paper, or another choice; `kept` if the defaults have it.
-
-    `changes` are the parameters that switch it off; where it is not kept, on.
-    """
+    """A departure from the paper, or another choice."""
 
     title: str
-    changes: Changes
-    kept: bool = True
+    changes: Changes  # switch it off; where it is not kept, on
+    kept: bool = True  # if the defaults have it
 
 
 _PLAIN_BAND: Changes = {
@@ -80,8 +77,6 @@ DEPARTURES: tuple[Departure, ...] = (
     Departure('vertical faces from 0.3 m on', {'faces.min_height': 0.3}, kept=False),
 )
 """What `departures` measures. A new row here is all that a further one takes."""
-
-AS_GIVEN = 'as given'
 
 Choice = dict[str, ParameterValue]
 """A value for each parameter that is searched, by dotted name."""
@@ -120,7 +115,7 @@ def compare_departures(
     progress: Progress = iter,
 ) -> Report:
     """Switch one departure after the other, on the same frames in the same run."""
-    variants = {AS_GIVEN: config}
+    variants = {'as given': config}
     for one in departures:
         if one.title in variants:
             raise ConfigError(f'departure {one.title!r}: there is one of that title already')
@@ -151,22 +146,19 @@ def compare_departures(
         f'{_counted(given)}; worth: what having it adds to the IoU; RMSE of the height; '
         'time: over that as given, median of the frames'
     )
-    changes = {one.title: one.changes for one in departures}
     tables = {'departures': Table.of(rows, title=title)}
+    changes = {one.title: one.changes for one in departures}
     return make_report(tables, scores, config, changes=changes)
 
 
 def _worst_and_rmse(score: MethodScore) -> Row:
     """Cells of the sequence with the lowest IoU, if there are several, and of the height error."""
     iou, name = min((score.of(name).iou, name) for name in score.sequences)
-    worst: Row = [
-        (percent('worst [%]', 'worst_iou'), iou),
-        (Column('in', '', 'worst_sequence'), name),
-    ]
-    return [
-        *(worst if len(score.sequences) > 1 else []),
-        (report.centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
-    ]
+    rmse: Row = [(report.centimetres('RMSE [cm]', 'rmse'), score.height.rmse)]
+    if len(score.sequences) == 1:
+        return rmse
+    where = (Column('in', '', 'worst_sequence'), name)
+    return [(percent('worst [%]', 'worst_iou'), iou), where, *rmse]
 
 
 def _counted(score: MethodScore) -> str:
@@ -231,16 +223,11 @@ def cross_validate(
         f'best on all {len(sequences)} sequences (tuned); each sequence with the values best on '
         f'the others (left out). {len(known)} configurations scored.'
     )
-    chosen: list[Row] = [
-        [
-            (Column('parameter'), name),
-            *((Column(way, 's'), _shown(values[name])) for way, values in choices.items()),
-        ]
-        for name in grid
-    ]
+    columns = [Column('parameter'), *(Column(way, 's') for way in choices)]
+    chosen = [[name, *(_shown(own[name]) for own in choices.values())] for name in grid]
     tables = {
         'scores': Table.of(rows, title=title, n_sums=1),
-        'choices': Table.of(chosen, title='Values chosen; - 00: without sequence 00'),
+        'choices': Table(columns, chosen, 'Values chosen; - 00: without sequence 00'),
     }
     return make_report(tables, scores, base, n_configurations=len(known), tried=tried)
 

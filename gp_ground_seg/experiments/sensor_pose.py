@@ -12,22 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gp_ground_seg.data.semantic_kitti import Frame
-from gp_ground_seg.evaluation.evaluate import (
-    ALL,
-    KnownScan,
-    MethodScore,
-    Progress,
-    load_kitti,
-    pool,
-)
+from gp_ground_seg.evaluation import evaluate as methods
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, pool
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, SENSOR_HEIGHT
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
-from gp_ground_seg.experiments.variants import (
-    SimulatedFrame,
-    make_report,
-    refuse_changed,
-    score_variants,
-)
+from gp_ground_seg.experiments import variants as engine
+from gp_ground_seg.experiments.variants import SimulatedFrame
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import AUTO
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
@@ -49,17 +39,13 @@ SIMULATED_MOUNTS: tuple[Mount, ...] = tuple(
 
 
 class Trial(NamedTuple):
-    """Scans of a group, all under one mount, with the pose given and estimated.
-
-    `told` has height and angles as they are, `level` the height with the sensor taken to be
-    level, in `auto` all three are estimated.
-    """
+    """Scans of a group, all under one mount, with the pose given and estimated."""
 
     group: str
     mount: Mount
-    told: MethodScore
-    level: MethodScore
-    auto: MethodScore
+    told: MethodScore  # height and angles as they are
+    level: MethodScore  # the height, the sensor taken to be level
+    auto: MethodScore  # all three estimated
 
     @property
     def change(self) -> float:
@@ -76,7 +62,7 @@ def score_poses(
 ) -> Report:
     """Run scans under each mount; ConfigError if `config` sets the pose itself."""
     names = ('sensor.height', 'sensor.roll', 'sensor.pitch')
-    refuse_changed(config, names)
+    engine.refuse_changed(config, names)
     trials, scores = [], []
     for mount in mounts:
         height, turn = mount
@@ -89,19 +75,20 @@ def score_poses(
             way: config.replace(**dict(zip(names, pose, strict=True)))
             for way, pose in poses.items()
         }
-        found = score_variants(items, partial(load, mount), variants, progress=progress)
+        found = engine.score_variants(items, partial(load, mount), variants, progress=progress)
         for group in found[0].sequences:
             trials.append(Trial(group, mount, *(score.of(group) for score in found)))
         scores += [pool(f'{one.name} {height:g} m {turn_text(turn)}', [one]) for one in found]
-    level = [trial for trial in trials if trial.mount[1] == NO_TURN]
-    turned = [trial for trial in trials if trial.mount[1] != NO_TURN]
-    tables = {'heights': height_table(level), 'turns': turn_table(turned)}
-    return make_report(tables, scores, config)
+    tables = {
+        'heights': height_table([trial for trial in trials if trial.mount[1] == NO_TURN]),
+        'turns': turn_table([trial for trial in trials if trial.mount[1] != NO_TURN]),
+    }
+    return engine.make_report(tables, scores, config)
 
 
 def load_turned(mount: Mount, frame: Frame) -> KnownScan:
     """Read a labelled frame as a turned sensor would see it; its height is what it is."""
-    scan = load_kitti(frame)
+    scan = methods.load_kitti(frame)
     roll, pitch = map(math.radians, mount[1])
     points = scan.points[:, :3].astype(np.float64) @ SensorPose(0.0, roll, pitch).rotation
     return dataclasses.replace(scan, points=points, semantic=None, ground_z=None)
@@ -123,7 +110,7 @@ def _parts(trials: Sequence[Trial], key: Callable[[Trial], str]) -> dict[str, li
     parts: dict[str, list[Trial]] = {}
     for trial in trials:
         parts.setdefault(key(trial), []).append(trial)
-    return {**parts, ALL: list(trials)}
+    return {**parts, methods.ALL: list(trials)}
 
 
 def _pooled(trials: Sequence[Trial]) -> tuple[MethodScore, ...]:
@@ -175,14 +162,12 @@ def _lean(pose: SensorPose) -> float:
 
 def turn_table(trials: Sequence[Trial]) -> Table:
     """Return the scores of turned scans, by turn where there are several, else by group."""
-    turns = {trial.mount[1]: None for trial in trials}
-    parts = _parts(trials, lambda trial: turn_text(trial.mount[1]))
-    first, what = 'turned by', ''
+    turns = {trial.mount[1] for trial in trials}
+    first, what, key = 'turned by', '', lambda trial: turn_text(trial.mount[1])
     if len(turns) == 1:
-        first, what = 'scans of', f' by {turn_text(*turns)}'
-        parts = _parts(trials, lambda trial: trial.group)
+        first, what, key = 'scans of', f' by {turn_text(*turns)}', lambda trial: trial.group
     rows: list[Row] = []
-    for name, own in parts.items():
+    for name, own in _parts(trials, key).items():
         told, level, found = _pooled(own)
         rows.append(
             [

@@ -77,27 +77,24 @@ def table1(
         frames.append(own[choice.frame])
     rows: list[dict[str, Any]] = []
     with ExitStack() as stack:
-        segmenters = {
-            name: stack.enter_context(
-                closing(GroundSegmenter(config.replace(**{'length_scale.model': model})))
-            )
-            for name, model in MODELS.items()
-        }
+        segmenters = {}
+        for name, model in MODELS.items():
+            segmenter = GroundSegmenter(config.replace(**{'length_scale.model': model}))
+            segmenters[name] = stack.enter_context(closing(segmenter))
         for frame, choice in zip(progress(frames), choices, strict=True):
             found, result = _rows(frame, choice, segmenters, n_repeats)
             rows += found
     names = ['n_PG', 'n_L', *VARIANCES]
     others = [n for n in rows[0] if n not in ('segment', *names) and not n.startswith('inliers')]
+    variances = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
+    errors = (
+        'SMSE in sample (at the inliers) and held out (labelled ground); seconds per frame: '
+        f'median of {n_repeats} runs on the whole frame, reading left out'
+    )
     tables = {
-        'variances': _table(
-            rows, names, 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar '
-            'without unit]',
-        ),
-        'errors': _table(
-            rows, others, 'SMSE in sample (at the inliers) and held out (labelled ground); '
-            f'seconds per frame: median of {n_repeats} runs on the whole frame, reading left out',
-        ),
-    }  # fmt: skip
+        'variances': _table(rows, names, variances),
+        'errors': _table(rows, others, errors),
+    }
     facts = {'config_changes': changed_parameters(config), 'config': config.nested()}
     return Report(tables, rows, result.fit, facts)
 

@@ -24,12 +24,9 @@ Changes = Mapping[str, ParameterValue]
 """Values of parameters, by dotted name."""
 
 PRESET_OF = {
-    'hdl-64e': 'hdl64',
-    'hdl-32e': 'hdl32',
-    'vlp-16': 'vlp16',
-    'os1-128': 'os1_128',
+    'hdl-64e': 'hdl64', 'hdl-32e': 'hdl32', 'vlp-16': 'vlp16', 'os1-128': 'os1_128',
     'mid-360': 'mid360',
-}
+}  # fmt: skip
 """Preset that goes with each simulated sensor."""
 SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
@@ -52,12 +49,8 @@ class SimulatedFrame(NamedTuple):
 
 def load_simulated(frame: SimulatedFrame) -> KnownScan:
     """Simulate a scan: what the ray hit of the terrain is ground, all else is an obstacle."""
-    made = simulate_scan(
-        SCENES[frame.scene](frame.seed),
-        SENSORS[frame.sensor],
-        np.random.default_rng(frame.seed),
-        x=frame.x,
-    )
+    scene, rng = SCENES[frame.scene](frame.seed), np.random.default_rng(frame.seed)
+    made = simulate_scan(scene, SENSORS[frame.sensor], rng, x=frame.x)
     truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     return KnownScan(
         frame.sequence, f'{frame.seed}/{frame.x:g}', made.points, {'exact': truth},
@@ -88,11 +81,7 @@ def score_variants(
     *,
     progress: Progress = iter,
 ) -> list[MethodScore]:
-    """Run every variant once on every scan, alternately, each scan without a past.
-
-    `items` are loaded one by one, as by `score_methods`; `peers` are other methods to run on
-    the same scans, whose scores come last.
-    """
+    """Run variants, then `peers`, once on every scan, alternately, each scan without a past."""
     with ExitStack() as stack:
         ours = [stack.enter_context(closing(OurMethod(c, name))) for name, c in variants.items()]
         every = [*ours, *peers]
@@ -100,12 +89,12 @@ def score_variants(
 
 
 def make_report(
-    tables: dict[str, Table], scores: Sequence[MethodScore], config: Config, **facts: Any
+    tables: dict[str, Table], scores: Sequence[MethodScore], base: Config, **facts: Any
 ) -> Report:
-    """Report of scored variants; `config` is what they change, the first is of our method."""
+    """Report of scored variants; `base` is what they change, the first is of our method."""
     fit = scores[0].scans[-1].fit
     assert fit is not None
-    given = {'config_changes': results.changed_parameters(config), 'config': config.nested()}
+    given = {'config_changes': results.changed_parameters(base), 'config': base.nested()}
     return Report(tables, scan_rows(scores), fit, {**given, **facts})
 
 
@@ -113,13 +102,13 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
     """Every number of each scan of each method; heights in metres, angles in radians."""
     rows = []
     scans = [(score.name, scan) for score in scores for scan in score.scans]
+    of_labels = ('tp', 'fp', 'fn', 'tn', *RATIOS)
     of_height = ('n_points', 'n_without_model', 'rmse', 'median_absolute', 'bias', 'smse')
     for method, scan in scans:
         row: dict[str, Any] = {'method': method, 'sequence': scan.sequence}
         row |= {'index': scan.index, 'seconds': scan.seconds}
         for key, confusion in scan.confusions.items():
-            for name in ('tp', 'fp', 'fn', 'tn', *RATIOS):
-                row[f'{key}_{name}'] = getattr(confusion, name)
+            row |= {f'{key}_{name}': getattr(confusion, name) for name in of_labels}
         if scan.height is not None:
             row |= {f'{name}_all': getattr(scan.height, name) for name in of_height}
         if scan.calibration is not None:
@@ -144,10 +133,9 @@ def score_scenes(
     with_peer: bool,
     progress: Progress = iter,
 ) -> Report:
-    """Segment `n_seeds` simulated scenes of each name, seen from `SCENE_PLACES`, by each sensor.
+    """Segment `n_seeds` simulated scenes of each name by each sensor of `configs`.
 
-    `configs` are our parameters by name of the sensor; the peer, Patchwork++, runs on the same
-    clouds with the true height of the sensor.
+    Patchwork++ runs on the same clouds with the true height of the sensor.
     """
     ours, theirs = [], []
     for sensor, config in configs.items():
@@ -160,10 +148,11 @@ def score_scenes(
         theirs += other
     pairs = [(methods.OURS, ours), (methods.PATCHWORKPP, theirs)]
     scores = [methods.pool(name, own) for name, own in pairs if own]
-    report = make_report({'scenes': scene_table(*scores)}, scores, Config())
-    for name, of in (('config_changes', results.changed_parameters), ('config', Config.nested)):
-        report.facts[name] = {sensor: of(config) for sensor, config in configs.items()}
-    return report
+    return make_report(
+        {'scenes': scene_table(*scores)}, scores, Config(),
+        config_changes={name: results.changed_parameters(own) for name, own in configs.items()},
+        config={name: own.nested() for name, own in configs.items()},
+    )  # fmt: skip
 
 
 def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:

@@ -36,8 +36,8 @@ def plot_stage_bars(
 ) -> None:
     """Draw one bar per case, in stages, as a PNG, replacing the file `path`.
 
-    `cases` are the times of each stage by its name [ms], by name of the case; at least one, all
-    with the same stages. `baseline` is another method, and its time for a whole frame [ms].
+    `cases` are the times of each stage [ms], by name of the case; at least one, all with the same
+    stages. `baseline` is another method, and its time for a whole frame [ms].
     """
     stages = list(next(iter(cases.values())))
     height = AROUND + BAR * len(cases)
@@ -65,9 +65,7 @@ def plot_stage_bars(
 def plot_reliability(sequences: Mapping[str, Any], path: str | Path, title: str) -> None:
     """Draw the share of ground over probability, and points per bin below, as a PNG.
 
-    `sequences` are an `evaluation.metrics.Calibration` each, the last one that of all frames;
-    the others are drawn thin. The file `path` is replaced. Raises `PointCloudError` if there is
-    no point to draw.
+    `sequences` are an `evaluation.metrics.Calibration` each, the last one that of all frames.
     """
     *parts, pooled = sequences.values()
     if not pooled.n_total:

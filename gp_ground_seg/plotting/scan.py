@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,13 +14,7 @@ from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.points import check_points, finite_points
 from gp_ground_seg.plotting import style
-from gp_ground_seg.plotting.style import (
-    add_axes,
-    length_scale_colours,
-    new_figure,
-    save,
-    write_line,
-)
+from gp_ground_seg.plotting.style import add_axes, new_figure, save, write_line
 from gp_ground_seg.result import Segmentation
 
 Labels = npt.NDArray[np.uint8]
@@ -64,12 +57,11 @@ def plot_scan_view(
 
     Ground and obstacles of `points`, (N, >=3) [m], and on them profiles of the ground model with
     two standard deviations, coloured by length-scale: what the node's topics show in RViz.
-    ``length_scale.min`` and ``max`` end the colours; ground less certain than
-    ``label.ground_tolerance`` is not drawn. Raises PointCloudError if another scan was segmented.
+    Ground less certain than ``label.ground_tolerance`` is not drawn.
     """
     xyz = check_points(points)
-    finite = finite_points(xyz)
     style.check_lengths(len(xyz), label=segmentation.label)
+    finite = finite_points(xyz)
     figure = new_figure(WIDTH, HEIGHT + (TITLE if title else 0.0))
     axes = add_axes(figure, 0.0, 0.0, (WIDTH, HEIGHT))
     write_line(figure, title, 0.5, 0.5 * TITLE, fontsize=14)
@@ -124,7 +116,7 @@ def _draw_profiles(axes: Any, model: GroundModel, config: Config) -> None:
     shown = certain & np.isfinite(upper + lower + middle).all(axis=-1)
     piece = shown[:, :-1] & shown[:, 1:]
     limits = config.length_scale
-    colours = length_scale_colours(model.length_scale[rows], limits.min, limits.max)
+    colours = style.length_scale_colours(model.length_scale[rows], limits.min, limits.max)
     colours = colours[:, :-1][piece]
     corners = [lower[:, :-1], lower[:, 1:], upper[:, 1:], upper[:, :-1]]
     quads = np.stack([corner[piece] for corner in corners], axis=1)
@@ -146,7 +138,7 @@ def _draw_legend(figure: Any, axes: Any, config: Config) -> None:
     axes.add_patch(plate)
     bar = add_axes(figure, 0.72 * WIDTH, 0.40, (0.255 * WIDTH, 0.16))
     low, high = config.length_scale.min, config.length_scale.max
-    colours = length_scale_colours(np.geomspace(low, high, 200), low, high)
+    colours = style.length_scale_colours(np.geomspace(low, high, 200), low, high)
     bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], colours[None])
     bar.set_xscale('log')
     bar.set_yticks([])
@@ -156,12 +148,8 @@ def _draw_legend(figure: Any, axes: Any, config: Config) -> None:
     bar.minorticks_off()
 
 
-class Layer(NamedTuple):
-    """Points drawn alike: one of `COLOURS_ABOVE`, area of a dot [pt^2], which points, (N,)."""
-
-    name: str
-    size: float
-    chosen: BoolArray
+Layers = dict[str, BoolArray]
+"""Which points, (N,), are drawn in each of `COLOURS_ABOVE`, lowest first."""
 
 
 def plot_birds_eye(
@@ -174,7 +162,6 @@ def plot_birds_eye(
     """Draw points (N, >=3) [m] from above by their `Label`, as a PNG, replacing the file `path`.
 
     With the true labels, UNKNOWN where a point does not count, a second panel shows the errors.
-    Raises PointCloudError if the shapes do not fit together.
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=label, truth=truth)
@@ -195,25 +182,25 @@ def plot_birds_eye(
     save(figure, path)
 
 
-def _label_panel(label: Labels) -> tuple[str, list[Layer]]:
+def _label_panel(label: Labels) -> tuple[str, Layers]:
     """Return title and layers of the given labels."""
     shown = (Label.GROUND, Label.OBSTACLE, Label.UNKNOWN)
-    layers = [Layer(value.name.lower(), 1.0, label == value) for value in shown]
-    named = [layer for layer in layers if layer.name != 'unknown' or layer.chosen.any()]
-    counts = ', '.join(f'{_thousands(int(one.chosen.sum()))} {one.name}' for one in named)
-    return f'{_thousands(len(label))} points: {counts}', layers
+    layers = {value.name.lower(): label == value for value in shown}
+    numbers = {name: int(chosen.sum()) for name, chosen in layers.items()}
+    named = [f'{_thousands(n)} {name}' for name, n in numbers.items() if n or name != 'unknown']
+    return f'{_thousands(len(label))} points: {", ".join(named)}', layers
 
 
-def _error_panel(label: Labels, truth: Labels) -> tuple[str, list[Layer]]:
-    """Return title and layers of the errors, lowest first; each point is in one."""
+def _error_panel(label: Labels, truth: Labels) -> tuple[str, Layers]:
+    """Return title and layers of the errors; each point is in one."""
     given, ground, obstacle = label == Label.GROUND, truth == Label.GROUND, truth == Label.OBSTACLE
     hit, missed, false = ground & given, ground & ~given, obstacle & given
-    layers = [
-        Layer('not scored', 1.0, ~(ground | obstacle)),
-        Layer('right', 1.0, hit | (obstacle & ~given)),
-        Layer('missed ground', 3.0, missed),
-        Layer('false ground', 3.0, false),
-    ]
+    layers = {
+        'not scored': ~(ground | obstacle),
+        'right': hit | (obstacle & ~given),
+        'missed ground': missed,
+        'false ground': false,
+    }
     n_hit, n_missed, n_false = (int(part.sum()) for part in (hit, missed, false))
     n_union = n_hit + n_missed + n_false
     iou = f', IoU {100.0 * n_hit / n_union:.2f} %' if n_union else ''
@@ -224,15 +211,16 @@ def _thousands(number: int) -> str:
     return f'{number:,}'.replace(',', ' ')
 
 
-def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Sequence[Layer]) -> None:
+def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None:
     """Draw points, rings of equal range and the sensor, forward up and left to the left."""
     inside = (np.abs(xy) <= EXTENT).all(axis=1)  # False where it is NaN.
     shown = {}
-    for depth, layer in enumerate(layers):
-        x, y = xy[layer.chosen & inside].T
+    for depth, (name, chosen) in enumerate(layers.items()):
+        x, y = xy[chosen & inside].T
         if len(x):
-            shown[layer.name] = colour = COLOURS_ABOVE[layer.name]
-            axes.scatter(y, x, s=layer.size, c=colour, linewidths=0.0, zorder=depth)
+            shown[name] = colour = COLOURS_ABOVE[name]
+            size = 3.0 if name in ('missed ground', 'false ground') else 1.0
+            axes.scatter(y, x, s=size, c=colour, linewidths=0.0, zorder=depth)
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
     for radius in np.arange(RING_STEP, EXTENT * math.sqrt(2.0), RING_STEP):
         axes.plot(

@@ -60,8 +60,7 @@ def plot_segment(
 
     `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
     labels, UNKNOWN where a point does not count; `max_range` [m] is by default a little more than
-    that of the last candidate. The file `path`, a PDF or else a PNG, is replaced. Raises
-    PointCloudError or ConfigError if shapes do not fit, or segment or range are not accepted.
+    that of the last candidate. The file `path`, a PDF or else a PNG, is replaced.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     style.check_lengths(len(z), result=result.label, truth=truth)
@@ -81,7 +80,11 @@ def plot_segment(
     n_hidden = np.count_nonzero((r > reach) | (z < low) | (z > high))
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
     figure.subplots_adjust(0.065, 0.075, 1.0 - LEGEND / WIDTH, 0.93, hspace=0.08)
-    name = f'{view.title(title)}; {n_hidden} points outside'
+    width = 360.0 / n_segments
+    first, last = (width * (segment + k) - 180.0 for k in (0, 1))
+    model = '' if np.isfinite(result.surface.mean[segment]).any() else ': no ground model'
+    name = f'segment {segment}, azimuth {first:g}° to {last:g}°{model}; {n_hidden} points outside'
+    name = f'{title}, {name}' if title else name
     above.set_title(name, fontsize=12, loc='left', parse_math=False)
     view.draw_points(above, r, z, None if truth is None else truth[own])
     view.draw_ground(above)
@@ -114,14 +117,6 @@ class SegmentView:
         self._knots = result.surface.knots
         self._mean, self._std = result.surface.mean[segment], result.surface.std[segment]
 
-    def title(self, title: str) -> str:
-        """Return `title` with the segment and its azimuths."""
-        width = 360.0 / self._result.grid.n_segments
-        first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
-        model = '' if np.isfinite(self._mean).any() else ': no ground model'
-        own = f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
-        return f'{title}, {own}' if title else own
-
     def reach(self, point_r: FloatArray) -> float:
         """Range that holds all candidates, or all points where there are none [m]."""
         r = self._r if len(self._r) else point_r
@@ -136,10 +131,8 @@ class SegmentView:
                 for name, (label, colour) in TRUTH_COLOURS.items()
             }
         for name, (colour, chosen) in groups.items():
-            label = f'{name} ({np.count_nonzero(chosen)})'
-            axes.plot(
-                r[chosen], z[chosen], 'o', ms=3.6, mew=0, color=colour, zorder=2, label=label
-            )
+            look = {'color': colour, 'label': f'{name} ({np.count_nonzero(chosen)})'}
+            axes.plot(r[chosen], z[chosen], 'o', ms=3.6, mew=0, zorder=2, **look)
 
     def draw_ground(self, axes: Any) -> None:
         """Draw ground, lines and candidates over range."""
@@ -150,10 +143,8 @@ class SegmentView:
         axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='ground')
         hollow = {'mfc': 'white', 'mec': CANDIDATE_COLOUR, 'mew': 1.1, 'ms': 5.5, 'zorder': 6}
         full = {'color': INLIER_COLOUR, 'mew': 0.0, 'ms': 5, 'zorder': 7}
-        for name, chosen, look in (
-            ('rejected', ~self._inlier, hollow),
-            ('inliers', self._inlier, full),
-        ):
+        groups = (('rejected', ~self._inlier, hollow), ('inliers', self._inlier, full))
+        for name, chosen, look in groups:
             label = f'candidates, {name} ({np.count_nonzero(chosen)})'
             axes.plot(self._r[chosen], self._z[chosen], 'o', label=label, **look)
         axes.set_ylabel('height z, sensor frame [m]')
@@ -210,10 +201,7 @@ class SegmentView:
 
 
 def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, FloatArray]:
-    """Return range and height of the ends of a line, (2,) each [m]: its outermost points on it.
-
-    `r` and `z` are those of its points, (n,) each [m]; the slope may be infinite.
-    """
+    """Range and height, (2,) each, of the ends of a line through points (n,) [m]."""
     angle = math.atan(slope)
     along = (r - r.mean()) * math.cos(angle) + (z - z.mean()) * math.sin(angle)
     ends = np.array([along.min(), along.max()])

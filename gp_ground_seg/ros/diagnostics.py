@@ -1,7 +1,4 @@
-"""What the node reports on /diagnostics: four tasks, each held at its worst level for a while.
-
-Times ``now`` are those of a steady clock [s].
-"""
+"""Four tasks on /diagnostics, held at their worst level; ``now`` is on a steady clock [s]."""
 
 from __future__ import annotations
 
@@ -13,20 +10,17 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from gp_ground_seg.frame import FloatArray, Label
 from gp_ground_seg.parameters.config import DiagnosticsConfig
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import FitReport, Segmentation
+from gp_ground_seg.ros.input import STEADY_CLOCK
 from gp_ground_seg.ros.status import Hysteresis, Level, Rate, Status
 
-CLOUD_WINDOW = 100
-"""Clouds over which percentiles are taken."""
-MIN_RATE_SPAN = 1.0
-"""Shortest time from which the load is computed [s]: a burst is no rate."""
+CLOUD_WINDOW = 100  # clouds over which percentiles are taken
+MIN_RATE_SPAN = 1.0  # shortest time from which the load is computed [s]: a burst is no rate
 Finding = tuple[Level, str]
 
 
@@ -302,9 +296,7 @@ class Diagnostics:
         self._node, self._state, self._limits = node, state, limits
         self._hysteresis: defaultdict[str, Hysteresis] = defaultdict(Hysteresis)
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        # Not the clock of the node: with use_sim_time it stands before the first /clock.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(limits.period, self._publish, clock=steady)
+        self._timer = node.create_timer(limits.period, self._publish, clock=STEADY_CLOCK)
 
     def configure(self, limits: DiagnosticsConfig) -> None:
         """Use `limits` from now on; with another period, the next report comes after it."""

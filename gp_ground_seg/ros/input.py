@@ -12,35 +12,31 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from builtin_interfaces.msg import Time as TimeMessage
 from geometry_msgs.msg import Quaternion
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
 
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
 from gp_ground_seg.pipeline.tilt import angles_of
 
-INPUT_DEPTH = 5
-"""Clouds that may wait to be processed: half a second of a LiDAR at 10 Hz."""
-OUTPUT_DEPTH = 20
-"""Clouds kept for repair: Fast DDS may send a lost fragment again after 0.7 s only."""
+INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
+OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
-REVIEW_PERIOD = 1.0
-"""Time between two looks at the publishers [s]."""
-JUMP_TOLERANCE = 0.5
-"""Stamps may be that much out of order [s]: several sensors on one topic are no jump."""
-LOG_PERIOD = 5.0
-"""Shortest time between two messages of the same kind [s]."""
+JUMP_TOLERANCE = 0.5  # stamps of several sensors on one topic may be that much out of order [s]
+STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)  # the clock of a node may stand or jump
+THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
+"""Options of messages that may come with every cloud."""
 
 _CHOICES = {
     'reliability': ('reliable', 'best_effort', 'best_available', 'system_default'),
@@ -72,26 +68,19 @@ def check_overrides(given: Mapping[str, object]) -> None:
 
 def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
     """Return the default of a cloud topic: reliable, volatile, the newest `depth` clouds."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return QoSProfile(depth=depth)
 
 
 def in_words(profile: QoSProfile) -> str:
     """Return `profile` as in ``reliable, keep_last 5, volatile``."""
-    policies = profile.reliability, profile.history, profile.durability
-    reliability, history, durability = (policy.name.lower() for policy in policies)
-    return f'{reliability}, {history} {profile.depth}, {durability}'
+    reliability, history, durability = profile.reliability, profile.history, profile.durability
+    return f'{reliability.name}, {history.name} {profile.depth}, {durability.name}'.lower()
 
 
 class SequenceGaps:
-    """Counts messages of one publisher that did not arrive.
+    """Counts messages of one publisher, numbered 1, 2, 3 ... by it, that did not arrive.
 
-    The middleware numbers a publisher's messages 1, 2, 3 ...: a hole is a message that was
-    lost on the way, or overwritten in a full queue while the node was busy.
+    They were lost on the way, or overwritten in a full queue while the node was busy.
     """
 
     _last: int | None = None
@@ -138,14 +127,18 @@ class CloudSubscription:
             cloud_profile(INPUT_DEPTH), QoSOverridingOptions.with_default_policies()
         )
         # The event can come before the publisher is listed, and there is no event for the end
-        # of the last best-effort publisher.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(REVIEW_PERIOD, self._review_soon.trigger, clock=steady)
+        # of the last best-effort publisher: they are looked at every second too.
+        node.create_timer(1.0, self._review_soon.trigger, clock=STEADY_CLOCK)
 
     @property
     def qos(self) -> QoSProfile:
         """Quality of service in use."""
         return self._subscription.qos_profile
+
+    @property
+    def qos_words(self) -> str:
+        """`qos` as in ``reliable, keep_last 5, volatile``."""
+        return in_words(self.qos)
 
     @property
     def n_publishers(self) -> int:
@@ -164,8 +157,8 @@ class CloudSubscription:
 
     def _receive(self, message: PointCloud2, info: dict[str, Any]) -> None:
         # Both are stamps of the system clock; 0 where the middleware gives none.
-        received = info.get('received_timestamp') or 0
-        wait = max(0.0, 1e-9 * (time.time_ns() - received)) if received > 0 else 0.0
+        now = time.time_ns()
+        wait = max(0.0, 1e-9 * (now - (info.get('received_timestamp') or now)))
         if not self._offered:
             self._look_at_publishers()
         n_lost = self._gaps.note(info.get('publication_sequence_number'))
@@ -177,7 +170,7 @@ class CloudSubscription:
         if self._is_pinned:
             self._node.get_logger().error(
                 f'a publisher of {self.topic} does not offer what qos_overrides asks for '
-                f'({in_words(self.qos)}): nothing will arrive from it'
+                f'({self.qos_words}): nothing will arrive from it'
             )
         self._review_soon.trigger()
 
@@ -187,9 +180,8 @@ class CloudSubscription:
             bytes(entry.endpoint_gid): entry.qos_profile.reliability
             for entry in self._node.get_publishers_info_by_topic(self.topic)
         }
-        has_changed = offered.keys() != self._offered.keys()
-        self._offered = offered
-        if has_changed:
+        before, self._offered = self._offered, offered
+        if has_changed := offered.keys() != before.keys():
             self._gaps.reset()
         return has_changed
 
@@ -198,10 +190,11 @@ class CloudSubscription:
         if not self._offered or self._is_pinned:
             return
         best_effort, reliable = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+        wanted = best_effort if best_effort in self._offered.values() else reliable
         profile = copy(self.qos)
-        profile.reliability = best_effort if best_effort in self._offered.values() else reliable
-        if profile.reliability == self.qos.reliability:
+        if profile.reliability == wanted:
             return
+        profile.reliability = wanted
         self._node.get_logger().info(
             f'subscribing {in_words(profile)} to {self.topic}, as its publishers offer'
         )
@@ -234,7 +227,6 @@ class TimeJumps:
         self._node = node
         self._on_jump = on_jump
         self._stamps = StampWatch()
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         threshold = JumpThreshold(
             min_forward=None, min_backward=Duration(seconds=-JUMP_TOLERANCE), on_clock_change=False
         )
@@ -245,8 +237,7 @@ class TimeJumps:
 
     def note(self, stamp: float) -> None:
         """Take the `stamp` of a cloud [s]."""
-        jump = self._stamps.note(stamp)
-        if jump:
+        if jump := self._stamps.note(stamp):
             self._jumped(jump)
 
     def _clock_jumped(self, jump: TimeJump) -> None:
@@ -258,8 +249,7 @@ class TimeJumps:
         self._on_jump()
         self._node.get_logger().info(
             f'time jumped back by {seconds:.1f} s: what earlier clouds taught is forgotten',
-            throttle_duration_sec=LOG_PERIOD,
-            throttle_time_source_type=self._steady,
+            **THROTTLED,
         )
 
 
@@ -297,16 +287,14 @@ class TfTilt:
         self._buffer = self._tf2_ros.Buffer()
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
-    def tilt(self, frame: str, stamp: TimeMessage, base: str) -> tuple[float, float]:
-        """Return roll and pitch [rad] of `frame` in `base`; PointCloudError if TF has them not.
-
-        The transform is that of the time `stamp`, or the newest if there is none for it: a
-        sensor is fixed to its vehicle, and waiting for TF would delay every cloud.
-        """
+    def tilt(self, header: Header, base: str) -> tuple[float, float]:
+        """Return roll and pitch [rad] of a cloud in `base`; PointCloudError if TF has them not."""
+        frame = header.frame_id
         try:
             try:
-                found = self._buffer.lookup_transform(base, frame, Time.from_msg(stamp))
+                found = self._buffer.lookup_transform(base, frame, Time.from_msg(header.stamp))
             except self._tf2_ros.ExtrapolationException:
+                # The newest: a sensor is fixed to its vehicle, and waiting would delay the cloud.
                 found = self._buffer.lookup_transform(base, frame, Time())
         except self._tf2_ros.TransformException as error:
             way = f'from its frame {frame!r} to frame.base = {base!r}'

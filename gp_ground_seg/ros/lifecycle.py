@@ -1,7 +1,6 @@
 """Start and end of a ROS process: arguments, transport, signals.
 
-ROS is imported by the functions that need it: that takes half a second, in which the signals of
-the process can be handled already.
+Functions import ROS themselves, which takes half a second: signals are handled meanwhile.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ import argparse
 import contextlib
 import itertools
 import os
+import shutil
 import signal
 import threading
 import time
@@ -101,16 +101,14 @@ _PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 _TRANSPORT_VARIABLES = (
     _PROFILE_VARIABLE, 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS',
 )  # fmt: skip
-MIN_SHARED_MEMORY = 128 << 20
-"""Free shared memory below which the profile is not used: four segments [bytes]."""
+MIN_SHARED_MEMORY = 128 << 20  # four segments of the profile [bytes]
 
 
 @contextmanager
 def large_cloud_transport() -> Iterator[None]:
-    """Name the Fast DDS profile for large clouds, if the user has chosen none.
+    """Name the Fast DDS profile for large clouds to ROS, first used in the block, and children.
 
-    For processes started, and ROS used for the first time, within the block. Without it, clouds
-    above 0.5 MB are sent in pieces, which get lost.
+    Unless the user has chosen one. Without it, clouds above 0.5 MB lose pieces on the way.
     """
     profile = _find_profile()
     is_chosen = any(os.environ.get(name) for name in _TRANSPORT_VARIABLES)
@@ -134,14 +132,12 @@ def _find_profile() -> Path | None:
 
 def _free_shared_memory() -> int:
     try:
-        status = os.statvfs('/dev/shm')
+        return shutil.disk_usage('/dev/shm').free
     except OSError:
         return 0
-    return status.f_bavail * status.f_frsize
 
 
-GRACE = 0.5
-"""Time from the signal to the end of the process, if the work does not end before [s]."""
+GRACE = 0.5  # time from the signal to the end of the process, if the work does not end before [s]
 _STOPS = (signal.SIGINT, signal.SIGTERM)
 _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -158,12 +154,9 @@ class StopRequest:
 
 @contextmanager
 def _watchdog() -> Iterator[None]:
-    """End the process with code 0 if the block does not end within `GRACE` of a signal.
-
-    Python calls its handlers between two steps of the main thread, and the next step may be
-    seconds away, behind a long computation. The number of a signal is written to a pipe at
-    once, where a thread waits for it.
-    """
+    """End the process with code 0 if the block does not end within `GRACE` of a signal."""
+    # Python calls its handlers between two steps of the main thread, and the next may be seconds
+    # away. The number of a signal is written to a pipe at once, where a thread waits for it.
     done = threading.Event()
     read_end, write_end = os.pipe()
     os.set_blocking(write_end, False)
@@ -194,20 +187,15 @@ def _watchdog() -> Iterator[None]:
 def stop_on_signals() -> Iterator[StopRequest]:
     """Have SIGINT and SIGTERM within the block noted in the `StopRequest` that it yields.
 
-    If the block does not end soon after, the process does, with code 0. After the first
-    signal both stay ignored: a terminal and ``ros2 launch`` both send one, and the second
-    must not break the clean-up. In other threads than the main one nothing is changed.
+    After the first signal both stay ignored: a terminal and ``ros2 launch`` both send one, and
+    the second must not break the clean-up. In other threads than the main one nothing is changed.
     """
     request = StopRequest()
-    if not _is_main_thread():
+    if threading.current_thread() is not threading.main_thread():
         yield request
         return
     with _watchdog(), _handling(_STOPS, request.note, lambda: not request.made):
         yield request
-
-
-def _is_main_thread() -> bool:
-    return threading.current_thread() is threading.main_thread()
 
 
 @contextmanager
@@ -269,11 +257,8 @@ class Session:
         self.node.destroy_node()
 
     def check(self, cause: Exception | None = None) -> None:
-        """Raise KeyboardInterrupt once interrupted, `cause` being what the interrupt came out as.
-
-        Python swallows an exception that a signal raises within a destructor or a callback:
-        long loops call this now and then.
-        """
+        """Raise KeyboardInterrupt once interrupted; `cause` is what the interrupt came out as."""
+        # Python swallows what a signal raises within a destructor: long loops call this.
         if self._is_interrupted:
             raise KeyboardInterrupt from cause
 
@@ -296,20 +281,18 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
             node = rclpy.create_node(
                 name, context=context, start_parameter_services=False, enable_rosout=False
             )
-        with contextlib.closing(Session(node)) as session, _signals_to(session):
-            yield session
+        is_main = threading.current_thread() is threading.main_thread()
+        # What is ignored on purpose, as by nohup, stays so.
+        heeded = [n for n in _INTERRUPTS if is_main and signal.getsignal(n) != signal.SIG_IGN]
+        with (
+            contextlib.closing(Session(node)) as session,
+            _handling(heeded, session.interrupt),
+        ):
+            try:
+                yield session
+            except Exception as error:
+                # An interrupt within rclpy's bindings may come out of them as another exception.
+                session.check(error)
+                raise
     finally:
         rclpy.try_shutdown(context=context)
-
-
-@contextmanager
-def _signals_to(session: Session) -> Iterator[None]:
-    # What is ignored on purpose, as by nohup, stays so.
-    heeded = [number for number in _INTERRUPTS if signal.getsignal(number) != signal.SIG_IGN]
-    with _handling(heeded if _is_main_thread() else (), session.interrupt):
-        try:
-            yield
-        except Exception as error:
-            # An interrupt within rclpy's bindings may come out of them as another exception.
-            session.check(error)
-            raise

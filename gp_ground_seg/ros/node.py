@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import rclpy
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2
 
@@ -22,36 +20,21 @@ from gp_ground_seg.parameters.schema import NODE_NAME
 from gp_ground_seg.pipeline.points import single_precision
 from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
-from gp_ground_seg.ros.input import (
-    LOG_PERIOD,
-    CloudSubscription,
-    TfTilt,
-    TimeJumps,
-    in_words,
-    require_tf2,
-)
+from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, TfTilt, TimeJumps, require_tf2
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader, LibraryLog
 from gp_ground_seg.segmenter import GroundSegmenter
-
-LONGEST_WAIT = 0.1
-"""Time after which a signal is seen at the latest [s]."""
 
 
 class GroundSegmentationNode(ConfiguredNode):
     """Subscribes to ``points``, publishes ``ground``, ``obstacles`` and /diagnostics.
 
     Each output keeps the header and every field of the input, bit for bit; a finite point
-    is in exactly one of the two clouds, another one in neither. Parameters are those of
-    `gp_ground_seg.parameters.config`; a change takes effect with the next cloud.
-
-    The first clouds are segmented with numpy. The compiled backend, if the parameters ask
-    for it, is made meanwhile, and takes over between two clouds.
-
-    Latency is the time between the arrival of a cloud in this process and the publication of
-    the results, its wait in the queue included. Options are those of `rclpy.node.Node`. Raises
-    a ConfigError if a given parameter is not accepted.
+    is in exactly one of the two clouds, another one in neither. The first clouds are segmented
+    with numpy; the compiled backend, if wanted, is made meanwhile. A changed parameter takes
+    effect with the next cloud. Options are those of `rclpy.node.Node`. Raises a ConfigError if
+    a given parameter is not accepted.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -60,8 +43,6 @@ class GroundSegmentationNode(ConfiguredNode):
         self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
         self._is_compiled = False
         self._tf: TfTilt | None = None
-        # For throttled messages; the default system clock may jump.
-        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         # A guard condition runs in the executor, between two callbacks.
         self._loaded = self.create_guard_condition(self._change_backend)
         self._loader = BackendLoader(self._loaded.trigger)
@@ -82,7 +63,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._diagnostics = Diagnostics(self, self._state, self.config.diagnostics)
         self.warn_of_unused_parameters()
         self._load_backend(self.config)
-        logger.info(f'listening to {self._input.topic} ({in_words(self._input.qos)})')
+        logger.info(f'listening to {self._input.topic} ({self._input.qos_words})')
 
     def check_config(self, config: Config) -> None:
         """Raise a GroundSegError if the backend or TF is asked for and not installed."""
@@ -126,12 +107,6 @@ class GroundSegmentationNode(ConfiguredNode):
             self._tf.close()
             self._tf = None
 
-    def _tilt(self, cloud: PointCloud2) -> tuple[float, float] | None:
-        """Return roll and pitch of the frame of `cloud` by TF; None if they are parameters."""
-        if self._tf is None:
-            return None
-        return self._tf.tilt(cloud.header.frame_id, cloud.header.stamp, self.config.frame.base)
-
     def destroy_node(self) -> None:
         """Free what the node holds, the worker threads too."""
         self._loader.stop()
@@ -152,7 +127,9 @@ class GroundSegmentationNode(ConfiguredNode):
         try:
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
-            segmentation = self._segmenter.segment(points, self._tilt(cloud))
+            base = self.config.frame.base
+            tilt = None if self._tf is None else self._tf.tilt(cloud.header, base)
+            segmentation = self._segmenter.segment(points, tilt)
             segmented = time.monotonic()
             topics = self._outputs.publish(cloud, segmentation, self.config)
         except PointCloudError as error:
@@ -179,15 +156,14 @@ class GroundSegmentationNode(ConfiguredNode):
         self._diagnostics.input.refused(reason)
         self.get_logger().error(
             f'cloud on {self._input.topic} in frame {cloud.header.frame_id!r} refused: {reason}',
-            throttle_duration_sec=LOG_PERIOD,
-            throttle_time_source_type=self._steady_clock,
+            **THROTTLED,
         )
 
     def _state(self) -> tuple[InputFacts, dict[str, int]]:
         clock = self.get_clock()
-        topic, qos, n_publishers = self._input.topic, self._input.qos, self._input.n_publishers
-        now, is_simulated = 1e-9 * clock.now().nanoseconds, clock.ros_time_is_active
-        facts = InputFacts(topic, in_words(qos), n_publishers, now, is_simulated)
+        source, now = self._input, 1e-9 * clock.now().nanoseconds
+        is_simulated = clock.ros_time_is_active
+        facts = InputFacts(source.topic, source.qos_words, source.n_publishers, now, is_simulated)
         return facts, self._outputs.n_subscribers()
 
 
@@ -205,7 +181,7 @@ def main(args: Sequence[str] | None = None) -> int:
             executor.add_node(node)
             while rclpy.ok() and not stop.made:
                 # Python handles a signal after the wait, not within it.
-                executor.spin_once(timeout_sec=LONGEST_WAIT)
+                executor.spin_once(timeout_sec=0.1)
         except GroundSegError as error:
             sys.stderr.write(f'{NODE_NAME}: error: {error}\n')
             return 2

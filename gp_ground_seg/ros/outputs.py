@@ -25,11 +25,8 @@ LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'p_ground')
 
 # rclpy takes some microseconds for each vertex: the markers are thinned to what can be told
 # apart by eye, so that a viewer costs the node less than the segmentation itself.
-MAX_PROFILES = 60
-MAX_KNOTS = 24
-N_STD = 2.0
-"""Half width of the band in standard deviations."""
-LINE_WIDTH = 0.04  # [m]
+MAX_PROFILES, MAX_KNOTS = 60, 24
+N_STD = 2.0  # half width of the band in standard deviations
 BAND_COLOUR = (0.75, 0.75, 0.75, 0.35)
 
 
@@ -67,12 +64,11 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
             with np.errstate(over='ignore'):
                 columns[name] = columns[name].astype(np.float32, copy=False)
     placed, step, data = append_columns(cloud, columns)
-    added = [
-        PointField(name=name, offset=offset, datatype=datatype, count=1)
-        for name, offset, datatype in placed
-    ]
     message = copy(cloud)
-    message.fields = [*cloud.fields, *added]
+    message.fields = [
+        *cloud.fields,
+        *(PointField(name=n, offset=start, datatype=kind, count=1) for n, start, kind in placed),
+    ]
     message.point_step, message.row_step = step, cloud.width * step
     message.data = message_data(data)
     known = read_xyz(cloud), *columns.values()
@@ -98,7 +94,7 @@ def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> A
 
     ends = np.stack([left, left + 1], axis=-1).ravel()
     profiles = _marker(cloud, 'profiles', Marker.LINE_LIST, points.reshape(-1, 3), ends)
-    profiles.scale.x = LINE_WIDTH
+    profiles.scale.x = 0.04  # [m]
     limits = config.length_scale.min, config.length_scale.max
     rgb = length_scale_colours(model.length_scale[grid], *limits)
     profiles.colors = _colours(rgb.reshape(-1, 3)[ends])
@@ -181,14 +177,11 @@ class OutputPublishers:
                 '(sudo apt install ros-jazzy-visualization-msgs)'
             )
         self._renamed: dict[str, str] = {}
-        overrides = QoSOverridingOptions.with_default_policies()
-        self._publishers = []
-        for output in outputs:
-            kind, topic = output.message_type, output.topic
-            publisher = node.create_publisher(
-                kind, topic, cloud_profile(), qos_overriding_options=overrides
-            )
-            self._publishers.append((output, publisher))
+        options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
+        self._publishers = [
+            (o, node.create_publisher(o.message_type, o.topic, cloud_profile(), **options))
+            for o in outputs
+        ]
 
     def n_subscribers(self) -> dict[str, int]:
         """Return the number of subscribers of each topic."""
@@ -196,19 +189,16 @@ class OutputPublishers:
 
     def publish(self, cloud: PointCloud2, segmentation: Segmentation, config: Config) -> list[str]:
         """Publish all outputs of a cloud, or none if one cannot be built; return their topics."""
-        wanted = [
-            (output, publisher)
+        messages = [
+            (output, publisher, output.build(cloud, segmentation, config))
             for output, publisher in self._publishers
             if not output.is_optional or publisher.get_subscription_count() > 0
         ]
-        messages = [
-            (publisher, output.build(cloud, segmentation, config)) for output, publisher in wanted
-        ]
-        if any(output is LABELLED for output, _ in wanted):
-            self._warn_of_renamed(cloud)
-        for publisher, message in messages:
+        for output, publisher, message in messages:
+            if output is LABELLED:
+                self._warn_of_renamed(cloud)
             publisher.publish(message)
-        return [publisher.topic_name for publisher, _ in messages]
+        return [publisher.topic_name for _, publisher, _ in messages]
 
     def _warn_of_renamed(self, cloud: PointCloud2) -> None:
         names = labelled_names(field.name for field in cloud.fields)

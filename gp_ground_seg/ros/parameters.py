@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -63,7 +63,12 @@ def describe(config: Config) -> str:
 
 
 class _ParameterService(ParameterService):  # type: ignore[misc]
-    """rclpy's services; ``set_parameters`` works in any order, while its method has this name."""
+    """rclpy's services; ``set_parameters`` works in any order, while its method has this name.
+
+    ``ros2 param load`` sends a whole file at once; set one by one, as rclpy does, a value that
+    contradicts one still to come would be refused. Here all are tried together; if that fails,
+    one by one, and the refused ones again after every round that set any.
+    """
 
     def __init__(self, node: Node) -> None:
         self._set_atomically = node.set_parameters_atomically
@@ -71,32 +76,16 @@ class _ParameterService(ParameterService):  # type: ignore[misc]
 
     def _set_parameters_callback(self, request: Any, response: Any) -> Any:
         parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
-        response.results = set_in_any_order(parameters, self._set_atomically)
+        results = [self._set_atomically(parameters)] * len(parameters)
+        n_left = len(parameters) + 1
+        while (n_refused := sum(not result.successful for result in results)) < n_left:
+            n_left = n_refused
+            results = [
+                result if result.successful else self._set_atomically([parameter])
+                for parameter, result in zip(parameters, results, strict=True)
+            ]
+        response.results = results
         return response
-
-
-def set_in_any_order(
-    parameters: Sequence[Parameter],
-    set_atomically: Callable[[list[Parameter]], Result],
-) -> list[Result]:
-    """Set as many parameters as can be set; return the result of each.
-
-    ``ros2 param load`` sends a whole file at once; set one by one, as rclpy does, a value that
-    contradicts one still to come would be refused. Here all are tried together; if that fails,
-    one by one, and the refused ones again after every round that set any.
-    """
-    together = set_atomically(list(parameters))
-    if together.successful:
-        return [together] * len(parameters)
-    results: dict[int, Result] = {}
-    pending = list(range(len(parameters)))
-    while pending:
-        results.update({k: set_atomically([parameters[k]]) for k in pending})
-        refused = [k for k in pending if not results[k].successful]
-        if len(refused) == len(pending):
-            break
-        pending = refused
-    return [results[k] for k in range(len(parameters))]
 
 
 class ConfiguredNode(Node):  # type: ignore[misc]
@@ -153,12 +142,10 @@ class ConfiguredNode(Node):  # type: ignore[misc]
     def warn_of_unused_parameters(self) -> None:
         """Log the given names that are not declared; call it after all topics are made."""
         for name in sorted(self._given_names):
-            if self.has_parameter(name):
-                continue
-            reason = _unknown(name)
-            if name.startswith(QOS_OVERRIDES):
-                reason = 'no such topic or policy here'
-            self.get_logger().warning(f'parameter {name} is not used: {reason}')
+            if not self.has_parameter(name):
+                is_qos = name.startswith(QOS_OVERRIDES)
+                reason = 'no such topic or policy here' if is_qos else _unknown(name)
+                self.get_logger().warning(f'parameter {name} is not used: {reason}')
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> Result:
         """Set all or none; checked before rclpy does, whose reasons do not contain the name."""
@@ -187,9 +174,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
                 self.apply_config(config)
                 self._config = config
         except Exception as error:
-            self.get_logger().error(
-                f'parameters could not be applied: {type(error).__name__}: {error}'
-            )
+            reason = f'{type(error).__name__}: {error}'
+            self.get_logger().error(f'parameters could not be applied: {reason}')
 
 
 def _unknown(name: str) -> str:

@@ -1,17 +1,15 @@
-"""Plays the clouds of a bag at the times they were recorded.
-
-Written here because ``ros2 bag play`` does not come with the wheels of ROS.
-"""
+"""Plays the clouds of a bag as recorded; ``ros2 bag play`` does not come with ROS by pip."""
 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import ReliabilityPolicy
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
@@ -20,29 +18,20 @@ from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.ros.input import cloud_profile
 
-DEPTH = 100
-"""Clouds kept until they are acknowledged: small ones are so a few at a time, and lost pieces of
-large ones can take 3 s with stock Fast DDS."""
-LATE = 0.02
-"""A cloud that is sent more than this after its time is late [s]."""
-SLICE = 0.02
-"""Longest wait in one piece [s]: /clock and acknowledgements are served in between."""
-DELIVERY_TIMEOUT = 5.0
-"""How long the last clouds may take to be acknowledged [s]; Fast DDS asks every 3 s."""
-LONE_PERIOD = 0.1
-"""Pause before a bag of a single cloud is played again [s]."""
+DEPTH = 100  # clouds kept until acknowledged: with stock Fast DDS that can take 3 s
+LATE = 0.02  # a cloud that is sent more than this after its time is late [s]
+SLICE = 0.02  # longest wait in one piece [s]: /clock and acknowledgements are served in between
+DELIVERY_TIMEOUT = 5.0  # of the last clouds [s]; Fast DDS asks for lost ones every 3 s
 
 
 class TrackedPublisher:
-    """Publisher of serialised clouds that counts those that were not delivered.
+    """Publisher of serialised clouds that counts those not acknowledged by a reliable subscriber.
 
-    A cloud is delivered when every reliable subscriber has acknowledged it. What a slow
-    subscriber then pushes out of its own queue, or a best-effort one receives, is not known.
     The middleware tells only whether *all* clouds sent so far are acknowledged. Others count
     as undelivered once newer ones take their place or their subscribers are gone.
     """
 
-    n_sent = n_pending = _n_missed = 0
+    n_sent = n_pending = n_missed = 0
     has_best_effort_subscriber = False
 
     def __init__(self, node: Node, topic: str) -> None:
@@ -55,17 +44,14 @@ class TrackedPublisher:
         """Subscribers that can receive."""
         return int(self._publisher.get_subscription_count())
 
-    @property
-    def n_undelivered(self) -> int:
-        """Clouds without a subscriber, or not acknowledged by every reliable one."""
-        return self._n_missed + self.n_pending
-
     def publish(self, raw: bytes) -> None:
         """Send one cloud of CDR bytes."""
+        if self.n_sent == 0:
+            self.look_at_subscribers()
         self.update()
         if self.n_subscribers == 0 or self.n_pending == DEPTH:
             # Not received by any; or it takes the place of the oldest in a full queue.
-            self._n_missed += 1
+            self.n_missed += 1
         else:
             self.n_pending += 1
         self._publisher.publish(raw)
@@ -73,13 +59,11 @@ class TrackedPublisher:
 
     def update(self) -> None:
         """Take note of what has been acknowledged since the last time."""
-        if self.n_pending == 0:
-            return
         # First: without subscribers everything is "acknowledged".
         if self.n_subscribers == 0:
-            self._n_missed += self.n_pending
+            self.n_missed += self.n_pending
             self.n_pending = 0
-        elif self._publisher.wait_for_all_acked(Duration(seconds=0)):
+        elif self.n_pending and self._publisher.wait_for_all_acked(Duration(seconds=0)):
             self.n_pending = 0
 
     def look_at_subscribers(self) -> None:
@@ -119,9 +103,8 @@ class Player:
         self._options = options
         self._pause = pause
         self._publishers = {topic: TrackedPublisher(node, topic) for topic in topics}
-        # Reliable serves both kinds of subscribers.
-        profile = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
-        self._clock = node.create_publisher(Clock, '/clock', profile) if options.clock else None
+        # Reliable, which serves both kinds of subscribers.
+        self._clock = node.create_publisher(Clock, '/clock', 1) if options.clock else None
 
     def topics_without_subscriber(self) -> list[str]:
         """Return the topics, as remapped, that have no subscriber."""
@@ -146,8 +129,8 @@ class Player:
 
     @property
     def n_undelivered(self) -> int:
-        """Clouds not delivered up to now, see `TrackedPublisher`."""
-        return sum(p.n_undelivered for p in self._publishers.values())
+        """Clouds without a subscriber, or not acknowledged by every reliable one."""
+        return sum(p.n_missed + p.n_pending for p in self._publishers.values())
 
     def best_effort_topics(self) -> list[str]:
         """Return the topics with subscribers that may have lost clouds unnoticed."""
@@ -172,12 +155,11 @@ class Player:
 
     def _play_once(self, start: float, on_cloud: Callable[[], object]) -> float:
         """Play from the monotonic time `start` on; return when the next round has to start."""
-        rate = self._options.rate
-        first = last = None
-        n_clouds = dict.fromkeys(self._publishers, 0)
+        rate, first, last = self._options.rate, 0, 0
+        n_clouds: Counter[str] = Counter()
         # The next cloud is read right after one was sent: there is time for it then.
         for topic, recorded, raw in self._clouds():
-            if first is None or last is None:
+            if not n_clouds:
                 first = last = recorded
                 start = max(start, time.monotonic())
             # The parts of a split bag may overlap.
@@ -187,11 +169,17 @@ class Player:
             on_cloud()
             self._send(topic, raw, due)
             n_clouds[topic] += 1
-        if first is None or last is None:
-            raise DataError(f'{self._bag.path}: {self._nothing_to_play()}')
-        n_periods = max(n_clouds.values()) - 1
-        span = 1e-9 * (last - first)
-        return start + (span + (span / n_periods if n_periods else LONE_PERIOD)) / rate
+        if not n_clouds:
+            times = [recorded for _, recorded, _ in self._bag.messages(self._publishers)]
+            span = 1e-9 * (max(times) - min(times)) if times else 0.0
+            raise DataError(
+                f'{self._bag.path}: no cloud in the time asked for (from '
+                f'{self._options.start:g} s on); the last of its {len(times)} clouds is at '
+                f'{span:.3f} s'
+            )
+        n_periods, span = max(n_clouds.values()) - 1, 1e-9 * (last - first)
+        # A bag of a single cloud begins again after 0.1 s.
+        return start + (span + (span / n_periods if n_periods else 0.1)) / rate
 
     def _clouds(self) -> Iterator[tuple[str, int, bytes]]:
         start, duration = self._options.start, self._options.duration
@@ -203,14 +191,6 @@ class Player:
                 return
             if offset >= start:
                 yield topic, recorded, raw
-
-    def _nothing_to_play(self) -> str:
-        times = [recorded for _, recorded, _ in self._bag.messages(self._publishers)]
-        span = 1e-9 * (max(times) - min(times)) if times else 0.0
-        return (
-            f'no cloud in the time asked for (from {self._options.start:g} s on); '
-            f'the last of its {len(times)} clouds is at {span:.3f} s'
-        )
 
     def _wait_until(self, due: float, recorded: int) -> None:
         """Wait until a monotonic time [s]; at it, the time of the bag is `recorded` [ns]."""
@@ -228,13 +208,9 @@ class Player:
             self._clock.publish(Clock(clock=Time(nanoseconds=nanoseconds).to_msg()))
 
     def _send(self, topic: str, raw: bytes, due: float) -> None:
-        publisher = self._publishers[topic]
-        if publisher.n_sent == 0:
-            publisher.look_at_subscribers()
-        now = time.monotonic()
+        publisher, now = self._publishers[topic], time.monotonic()
         publisher.publish(raw)
-        if self._first_sent is None:
-            self._first_sent = now
+        self._first_sent = now if self._first_sent is None else self._first_sent
         self._last_sent = now
         self._n_late += now - due > LATE
         self._worst_delay = max(self._worst_delay, now - due)

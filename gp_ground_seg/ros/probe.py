@@ -26,22 +26,15 @@ from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.ros.lifecycle import Session, large_cloud_transport, ros_session
 
-INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'
-"""Topics of the node, without any remapping."""
-START_TIMEOUT = 300.0
-"""Time the node has to start, and to compile on a slow machine [s]."""
-SILENCE = 2.0
-"""Time without a cloud after which what is still missing is lost [s]."""
-PERIOD_NS = 100_000_000
-"""Between the stamps of `restamped` clouds, at any rate [ns]."""
+INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'  # topics of the node
+START_TIMEOUT = 300.0  # time the node has to start, and to compile on a slow machine [s]
+SILENCE = 2.0  # time without a cloud after which what is still missing is lost [s]
 STEADY_FACTOR, STEADY_MARGIN = 1.5, 0.02
-"""By how much the latency of the last quarter may exceed that of the second one, in which the
-queue of the node has filled [1, s]."""
+"""How far latency may grow from the second quarter, which fills the queue, to the last [1, s]."""
 
 _PROBE_FRAME = 'gp_ground_seg_probe'
 _PROBE_PERIOD = 0.2
 _COUNTERS = ('Clouds since startup', 'Dropped since startup')
-_STOP_TIMEOUT = 5.0
 _HIGHEST_DOMAIN = 101  # ports above meet those that Linux hands out
 _NETWORK = (
     'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -51,9 +44,9 @@ _NETWORK = (
 @contextlib.contextmanager
 def private_network() -> Iterator[None]:
     """Keep this process and its children to this machine, on a ROS domain of their own."""
-    kept = {name: os.environ.pop(name, None) for name in _NETWORK}
+    kept = {name: os.environ.pop(name) for name in _NETWORK if name in os.environ}
     domain = 1 + os.getpid() % _HIGHEST_DOMAIN
-    if str(domain) == kept['ROS_DOMAIN_ID']:
+    if str(domain) == kept.get('ROS_DOMAIN_ID'):
         domain = 1 + domain % _HIGHEST_DOMAIN
     os.environ['ROS_DOMAIN_ID'] = str(domain)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -62,7 +55,7 @@ def private_network() -> Iterator[None]:
     finally:
         for name in _NETWORK:
             os.environ.pop(name, None)
-        os.environ.update({name: value for name, value in kept.items() if value is not None})
+        os.environ.update(kept)
 
 
 class NodeProcess:
@@ -93,7 +86,7 @@ class NodeProcess:
         self._process.terminate()
         try:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(_STOP_TIMEOUT)
+                self._process.wait(5.0)
         finally:
             # Also when interrupted while waiting; does nothing to a process that has ended.
             self._process.kill()
@@ -142,8 +135,8 @@ def memory(pid: int) -> tuple[int, int]:
     try:
         status = path.read_text(encoding='ascii', errors='replace')
     except OSError as error:
-        hint = 'memory is measured on Linux only'
-        raise GroundSegError(f'{path}: {error.strerror}; {hint}') from None
+        reason = f'{error.strerror}; memory is measured on Linux only'
+        raise GroundSegError(f'{path}: {reason}') from None
     values = dict(line.partition(':')[::2] for line in status.splitlines())
     now, peak = (1024 * int(values[key].split()[0]) for key in ('VmRSS', 'VmHWM'))
     return now, peak
@@ -162,15 +155,13 @@ class Trip:
         return np.nan if self.back is None else 1e-9 * (self.back - self.sent)
 
 
-Results = dict[str, CloudMessage]
-"""What came back of a cloud, by topic."""
+Results = dict[str, CloudMessage]  # what came back of a cloud, by topic
 
 
 def restamped(clouds: Iterable[CloudMessage], start: int) -> Iterator[CloudMessage]:
-    """Yield `clouds` over and over, with stamps from the second `start` on."""
+    """Yield `clouds` over and over, stamped every 0.1 s from the second `start` on."""
     for k, cloud in enumerate(itertools.cycle(clouds)):
-        seconds, nanoseconds = divmod(k * PERIOD_NS, 10**9)
-        yield point_cloud2.with_header(cloud, (start + seconds, nanoseconds))
+        yield point_cloud2.with_header(cloud, (start + k // 10, k % 10 * 10**8))
 
 
 class Probe:
@@ -200,10 +191,10 @@ class Probe:
             )
         session.node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnosed, 10)
 
-    def connect(self, node: NodeProcess, timeout: float = START_TIMEOUT) -> None:
+    def connect(self, node: NodeProcess) -> None:
         """Send empty clouds until both topics have answered and the node is settled."""
         empty = point_cloud2.cloud_from_columns((0, 0), _PROBE_FRAME, {})
-        end, next_time, trip = time.monotonic() + timeout, 0.0, Trip(0)
+        end, next_time, trip = time.monotonic() + START_TIMEOUT, 0.0, Trip(0)
         for cloud in restamped([empty], 1):
             while time.monotonic() < next_time:
                 self._session.spin(0.02)
@@ -212,11 +203,11 @@ class Probe:
                 break
             if time.monotonic() > end:
                 raise GroundSegError(
-                    f'no answer on {GROUND} and {OBSTACLES} within {timeout:g} s; '
+                    f'no answer on {GROUND} and {OBSTACLES} within {START_TIMEOUT:g} s; '
                     f'the last words of the node:\n{node.log_tail()}'
                 )
             self._waiting.clear()
-            trip = self._send(cloud)
+            trip = self._send(cloud, encode_cloud(cloud))
             next_time = time.monotonic() + _PROBE_PERIOD
         self._waiting.clear()
 
@@ -245,22 +236,21 @@ class Probe:
         """Send each cloud when the one before is back, or lost; return their trips."""
         trips = []
         for cloud in clouds:
-            trips.append(self._send(cloud))
+            trips.append(self._send(cloud, encode_cloud(cloud)))
             self._wait(silence)
             on_trip(trips[-1])
         return trips
 
-    def counters(self, timeout: float = 5.0) -> tuple[int, int]:
+    def counters(self) -> tuple[int, int]:
         """Return the clouds that the node has processed and dropped, by its next report."""
         self._counts.clear()
-        end = time.monotonic() + timeout
+        end = time.monotonic() + 5.0
         while not self._counts and time.monotonic() < end:
             self._session.spin(0.05)
         processed, dropped = (self._counts.get(name, -1) for name in _COUNTERS)
         return processed, dropped
 
-    def _send(self, cloud: CloudMessage, raw: bytes | None = None) -> Trip:
-        raw = raw or encode_cloud(cloud)
+    def _send(self, cloud: CloudMessage, raw: bytes) -> Trip:
         trip = Trip(time.time_ns())
         self._waiting[stamp_of(cloud)] = trip, cloud, {}
         self._publisher.publish(raw)
@@ -331,8 +321,7 @@ def _percentile(latency: FloatArray, q: float) -> float:
 def memory_result(resident: Sequence[int], peak: int) -> dict[str, float]:
     """Return memory near the start and at the end of ten values or more [bytes]; its growth."""
     n_clouds, share = len(resident), len(resident) // 10
-    start, end = (
-        float(np.median(part)) for part in (resident[share : 2 * share], resident[-share:])
-    )
+    start = float(np.median(resident[share : 2 * share]))
+    end = float(np.median(resident[-share:]))
     growth = end / start - 1.0
     return {'n_clouds': n_clouds, 'start': start, 'end': end, 'peak': peak, 'growth': growth}

@@ -6,8 +6,7 @@ from collections import deque
 from enum import IntEnum
 from typing import NamedTuple
 
-RATE_WINDOW = 10.0
-"""Time over which rates are taken [s]."""
+RATE_WINDOW = 10.0  # time over which rates are taken [s]
 Level = IntEnum('Level', 'OK WARN ERROR STALE', start=0)
 """Severity, with the values of ``diagnostic_msgs/DiagnosticStatus``."""
 

@@ -36,9 +36,7 @@ warm_up()
 class BackendLoader:
     """Makes the compiled backend in a thread, while frames are segmented without it.
 
-    Code that is not kept on disk is compiled by a child process, whose memory is free
-    again after it: the compiler leaves twice as much behind as the node needs. `on_done` is
-    called in the thread when the backend is there or cannot be made; not after `stop`.
+    `on_done` is called there when the backend is made or cannot be made; not after `stop`.
     """
 
     error = ''
@@ -99,7 +97,7 @@ class BackendLoader:
                 self._on_done()
 
     def _compile(self) -> None:
-        """Compile in a child process; raise a RuntimeError if that fails."""
+        """Compile in a child process, whose memory is free after it: twice what the node needs."""
         environment = dict(os.environ)
         if cache := environment.get('NUMBA_CACHE_DIR'):
             environment['NUMBA_CACHE_DIR'] = os.path.abspath(cache)

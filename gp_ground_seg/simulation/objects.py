@@ -5,39 +5,26 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.frame import FloatArray
+from gp_ground_seg.frame import FloatArray, IntArray
 from gp_ground_seg.simulation.terrain import Terrain
 
 KindArray: TypeAlias = npt.NDArray[np.uint8]
-IntArray: TypeAlias = npt.NDArray[np.intp]
 Interval: TypeAlias = tuple[FloatArray, FloatArray]
 Size: TypeAlias = tuple[float, float, float]  # length, width, height [m]
 
-BURIED_DEPTH = 3.0
-"""How far standing solids reach below the ground at their centre, so that none hovers [m]."""
+BURIED_DEPTH = 3.0  # of standing solids below the ground at their centre: none hovers [m]
 WALL_PANEL, WALL_THICKNESS = 4.0, 0.3
 """Longest panel of a wall, each on its own piece of ground, and its thickness [m]."""
-SMALLEST_RATE = 1e-12
-"""Stands in for a zero component of a unit vector; keeps 0 / 0 out of the slab tests."""
-
-
-class Kind(IntEnum):
-    """What a ray hit."""
-
-    TERRAIN = 0
-    BOX = 1
-    WALL = 2
-    POLE = 3
-    OVERHANG = 4
-    REFLECTION = 5
-    VEGETATION = 6
+SMALLEST_RATE = 1e-12  # for a zero component of a unit vector; keeps 0 / 0 out of the slab tests
+Kind = IntEnum('Kind', 'TERRAIN BOX WALL POLE OVERHANG REFLECTION VEGETATION', start=0)
+"""What a ray hit."""
 
 
 # In order of the codes: class in SemanticKITTI, and share of the light that comes back.
@@ -74,8 +61,8 @@ class Solid(ABC):
     radius: float  # of the vertical cylinder around it
 
     @abstractmethod
-    def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
-        """Ranges between which rays are inside its outline, seen from above."""
+    def _outline(self, xy: FloatArray, rate: FloatArray) -> list[Interval]:
+        """Ranges, all of which a ray in its outline is in, seen from above."""
 
     def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
         """Range [m] at which each ray (R, 3) enters the solid, infinite if it does not, (R,)."""
@@ -87,9 +74,9 @@ class Solid(ABC):
         near = np.flatnonzero(ahead & (aside <= self.radius * np.hypot(dx, dy)))
         offset, direction = offset[near], direction[near]
 
-        enter, leave = self._horizontal_interval(offset, direction)
         between = _slab(self.bottom, self.top, offset[:, 2], direction[:, 2])
-        enter, leave = np.maximum(enter, between[0]), np.minimum(leave, between[1])
+        intervals = np.array([between, *self._outline(offset[:, :2], direction[:, :2])])
+        enter, leave = intervals[:, 0].max(axis=0), intervals[:, 1].min(axis=0)
         result[near] = np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
         return result
 
@@ -102,22 +89,17 @@ class Box(Solid):
     width: float
     yaw: float
 
-    def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
+    def _outline(self, xy: FloatArray, rate: FloatArray) -> list[Interval]:
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        enter, leave = np.full(len(offset), -np.inf), np.full(len(offset), np.inf)
-        for axis, size in (((cos, sin), self.length), ((-sin, cos), self.width)):
-            position, rate = (rays[:, :2] @ np.array(axis) for rays in (offset, direction))
-            between = _slab(-0.5 * size, 0.5 * size, position, rate)
-            enter, leave = np.maximum(enter, between[0]), np.minimum(leave, between[1])
-        return enter, leave
+        sides = (np.array([cos, sin]), self.length), (np.array([-sin, cos]), self.width)
+        return [_slab(-0.5 * size, 0.5 * size, xy @ axis, rate @ axis) for axis, size in sides]
 
 
 @dataclass(frozen=True)
 class Cylinder(Solid):
     """Upright cylinder."""
 
-    def _horizontal_interval(self, offset: FloatArray, direction: FloatArray) -> Interval:
-        xy, rate = offset[:, :2], direction[:, :2]
+    def _outline(self, xy: FloatArray, rate: FloatArray) -> list[Interval]:
         a = np.maximum(np.sum(rate * rate, axis=1), SMALLEST_RATE**2)
         half_b = np.sum(xy * rate, axis=1)
         c = np.sum(xy * xy, axis=1) - self.radius**2
@@ -125,7 +107,7 @@ class Cylinder(Solid):
         root = np.sqrt(np.maximum(discriminant, 0.0))
         miss = discriminant < 0.0
         enter = np.where(miss, np.inf, (-half_b - root) / a)
-        return enter, np.where(miss, -np.inf, (-half_b + root) / a)
+        return [(enter, np.where(miss, -np.inf, (-half_b + root) / a))]
 
 
 def _slab(low: float, high: float, position: FloatArray, rate: FloatArray) -> Interval:
@@ -170,19 +152,13 @@ def _find_towards(solid: Solid, origin: FloatArray, azimuth: FloatArray) -> IntA
     return np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
 
 
-def _box(
-    kind: Kind, x: float, y: float, heights: tuple[float, float], size: Size, yaw: float
-) -> Box:
-    length, width, _ = size
-    return Box(kind, x, y, *heights, 0.5 * math.hypot(length, width), length, width, yaw)
-
-
 def standing_box(
     terrain: Terrain, x: float, y: float, size: Size, yaw: float = 0.0, kind: Kind = Kind.BOX
 ) -> Box:
     """Box that stands on the terrain."""
-    ground = float(terrain.height(x, y))
-    return _box(kind, x, y, (ground - BURIED_DEPTH, ground + size[2]), size, yaw)
+    length, width, height = size
+    ground, radius = float(terrain.height(x, y)), 0.5 * math.hypot(length, width)
+    return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, radius, length, width, yaw)
 
 
 def floating_box(
@@ -190,7 +166,8 @@ def floating_box(
 ) -> Box:
     """Box that floats `clearance` [m] over the terrain."""
     bottom = float(terrain.height(x, y)) + clearance
-    return _box(kind, x, y, (bottom, bottom + size[2]), size, 0.0)
+    box = standing_box(terrain, x, y, size, kind=kind)
+    return replace(box, bottom=bottom, top=bottom + size[2])
 
 
 def pole(
@@ -203,17 +180,15 @@ def pole(
 
 def car(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Box, ...]:
     """Car: a body and a cabin."""
-    body = standing_box(terrain, x, y, (4.3, 1.8, 0.9), yaw)
-    cabin = standing_box(terrain, x, y, (2.3, 1.6, 1.5), yaw)
-    return body, cabin
+    body, cabin = (4.3, 1.8, 0.9), (2.3, 1.6, 1.5)
+    return tuple(standing_box(terrain, x, y, size, yaw) for size in (body, cabin))
 
 
 def truck(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Box, ...]:
     """Truck: a load and a lower cab in front of it."""
     cab_x, cab_y = x + 4.2 * math.cos(yaw), y + 4.2 * math.sin(yaw)
     load = standing_box(terrain, x, y, (6.4, 2.5, 3.6), yaw)
-    cab = standing_box(terrain, cab_x, cab_y, (1.8, 2.3, 2.6), yaw)
-    return load, cab
+    return load, standing_box(terrain, cab_x, cab_y, (1.8, 2.3, 2.6), yaw)
 
 
 def wall(

@@ -15,13 +15,9 @@ from gp_ground_seg.simulation.objects import Kind, KindArray, nearest_solid, ref
 from gp_ground_seg.simulation.scenes import Scene
 from gp_ground_seg.simulation.terrain import Terrain, first_hit
 
-FRAME_PERIOD = 0.1
-"""Time of one turn of the sensor [s]."""
-REFLECTION_MIN_DEPTH = 0.1
-"""A mirrored point less deep below the ground than this is the road itself [m]."""
-INTENSITY_STD = 0.05
-PLUMB_LINE = 200.0
-"""How far above a point the search for the ground below it starts, for a tilted sensor [m]."""
+FRAME_PERIOD = 0.1  # time of one turn of the sensor [s]
+REFLECTION_MIN_DEPTH = 0.1  # a mirrored point less deep below the ground is the road itself [m]
+PLUMB_LINE = 200.0  # of a tilted sensor: the search for the ground starts that far above [m]
 
 # Multiples of these fill the unit square evenly: the powers of the plastic number, the
 # two-dimensional counterpart of the golden ratio.
@@ -59,8 +55,7 @@ class SensorModel:
 
     def rotation(self) -> FloatArray:
         """Matrix (3, 3) from the sensor frame to that of the level vehicle."""
-        matrix: FloatArray = Rotation.from_euler('YX', [self.pitch, self.roll]).as_matrix()
-        return matrix
+        return np.asarray(Rotation.from_euler('YX', [self.pitch, self.roll]).as_matrix())
 
 
 @dataclass(frozen=True)
@@ -78,8 +73,7 @@ class ScatterModel(SensorModel):
         # Evenly over the sphere, not over the angle.
         up = high + (low - high) * spread[:, 1]
         flat = np.sqrt(1.0 - up**2)
-        rays: FloatArray = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up])
-        return rays
+        return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up])
 
 
 def _beams(*blocks: tuple[float, float, int]) -> tuple[float, ...]:
@@ -104,7 +98,6 @@ MID_360 = ScatterModel(
     'mid-360', (math.radians(52.0), math.radians(-7.0)), 1, 0.1, 40.0, range_std=0.02, height=0.5
 )
 SENSORS = {sensor.name: sensor for sensor in (HDL_64E, HDL_32E, VLP_16, OS1_128, MID_360)}
-"""The preset sensors by name."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +154,7 @@ def simulate_scan(
     kind = kind[kept]
     points = np.empty((len(kept), 4), dtype=np.float32)
     points[:, :3] = beams[kept] * measured[kept, None]
-    points[:, 3] = np.clip(reflectance(kind) + INTENSITY_STD * intensity_noise[kept], 0.0, 1.0)
+    points[:, 3] = np.clip(reflectance(kind) + 0.05 * intensity_noise[kept], 0.0, 1.0)
     ground_z = _ground_below(scene.terrain, points, position, rotation)
     is_ground = kind == Kind.TERRAIN
     return SimulatedScan(points, is_ground, ground_z, kind, time, position, rotation)
@@ -205,12 +198,10 @@ def _ground_below(
     world = local @ rotation.T + position
     up = rotation[:, 2]
     if up[2] == 1.0:
-        below: FloatArray = terrain.height(world[:, 0], world[:, 1]) - position[2]
-        return below
+        return np.asarray(terrain.height(world[:, 0], world[:, 1]) - position[2])
     down = np.broadcast_to(-up, world.shape)
     fall = first_hit(terrain, world + PLUMB_LINE * up, down, 2.0 * PLUMB_LINE)
-    ground_z: FloatArray = local[:, 2] + PLUMB_LINE - fall
-    return ground_z
+    return np.asarray(local[:, 2] + PLUMB_LINE - fall)
 
 
 def simulate_drive(

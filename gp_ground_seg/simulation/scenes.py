@@ -10,23 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gp_ground_seg.simulation.objects import (
-    Solid,
-    car,
-    floating_box,
-    pole,
-    standing_box,
-    tree,
-    truck,
-    wall,
-)
+from gp_ground_seg.simulation import objects
+from gp_ground_seg.simulation.objects import Solid
 from gp_ground_seg.simulation.terrain import Profile, Terrain, Waves
 
 N_WAVES = 8
 N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
 """Scattered solids, and their distance from the drive [m], which leaves its lane free."""
-URBAN_X = (-80.0, 160.0)
-"""Where the street of the urban scene begins and ends [m]."""
+URBAN_X = (-80.0, 160.0)  # where the street of the urban scene begins and ends [m]
 
 
 def rough(
@@ -107,12 +98,8 @@ def crest(
     """Climb from u = `start` [m], rounded top, descent as steep; horizontal lengths [m]."""
     top, z, level = start + climb, gradient * climb, (0.0, 0.0, 0.0)
     edges = np.array([start, top, top + rounding, top + rounding + climb])
-    up, rounded, down = (
-        (0.0, gradient, 0.0),
-        (z, gradient, -gradient / rounding),
-        (z, -gradient, 0.0),
-    )
-    coefficients = np.array([level, up, rounded, down, level])
+    up, down = (0.0, gradient, 0.0), (z, -gradient, 0.0)
+    coefficients = np.array([level, up, (z, gradient, -gradient / rounding), down, level])
     return Profile(heading, edges, np.array([start, *edges]), coefficients)
 
 
@@ -153,16 +140,18 @@ def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
         yaw = rng.uniform(0.0, 2.0 * math.pi)
         match k % 6:
             case 0 | 1:
-                solids += car(terrain, x, y, yaw)
+                solids += objects.car(terrain, x, y, yaw)
             case 2:
-                solids.append(standing_box(terrain, x, y, (0.8, 0.6, rng.uniform(0.3, 1.0)), yaw))
+                solids.append(
+                    objects.standing_box(terrain, x, y, (0.8, 0.6, rng.uniform(0.3, 1.0)), yaw)
+                )
             case 3:
-                solids.append(pole(terrain, x, y))
+                solids.append(objects.pole(terrain, x, y))
             case 4:
-                solids += tree(terrain, x, y)
+                solids += objects.tree(terrain, x, y)
             case _:
                 along = rng.uniform(4.0, 12.0)
-                solids += wall(terrain, (x, y), (x + along, y), rng.uniform(1.0, 2.5))
+                solids += objects.wall(terrain, (x, y), (x + along, y), rng.uniform(1.0, 2.5))
     return tuple(solids)
 
 
@@ -204,22 +193,22 @@ def _urban(seed: int) -> Scene:
         while x < URBAN_X[1]:
             house = rng.uniform(12.0, 25.0)
             ends = (x, side * front), (x + house, side * front)
-            solids += wall(terrain, *ends, rng.uniform(4.0, 9.0))
+            solids += objects.wall(terrain, *ends, rng.uniform(4.0, 9.0))
             x += house + rng.uniform(2.0, 8.0)
         for x in np.arange(URBAN_X[0], URBAN_X[1], 9.0) + rng.uniform(0.0, 2.0):
             if rng.random() < 0.6:
-                solids += car(terrain, x, side * (road - 1.1), rng.normal(0.0, 0.02))
+                solids += objects.car(terrain, x, side * (road - 1.1), rng.normal(0.0, 0.02))
                 wet.append(WetPatch(x + rng.uniform(-3.0, 3.0), side * 2.5, rng.uniform(0.8, 1.8)))
         for x in np.arange(URBAN_X[0], URBAN_X[1], 22.0) + rng.uniform(0.0, 10.0):
-            solids.append(pole(terrain, x, side * 7.0))
-            solids += tree(terrain, x + 8.0, side * 8.0)
-    solids += truck(terrain, rng.uniform(25.0, 35.0), 2.6, math.pi)
+            solids.append(objects.pole(terrain, x, side * 7.0))
+            solids += objects.tree(terrain, x + 8.0, side * 8.0)
+    solids += objects.truck(terrain, rng.uniform(25.0, 35.0), 2.6, math.pi)
     # Low enough for the flat upper beams of an HDL-64E to meet it.
     deck = (5.0, 2.0 * front, 0.8)
-    solids.append(floating_box(terrain, rng.uniform(40.0, 50.0), 0.0, deck, 2.8))
+    solids.append(objects.floating_box(terrain, rng.uniform(40.0, 50.0), 0.0, deck, 2.8))
     for x in np.arange(URBAN_X[0], URBAN_X[1], 30.0) + rng.uniform(0.0, 20.0):
-        solids.append(floating_box(terrain, x, front - 1.0, (6.0, 2.0, 0.2), 2.1))
-    solids.append(standing_box(terrain, rng.uniform(10.0, 20.0), -8.0, (0.5, 0.5, 0.4)))
+        solids.append(objects.floating_box(terrain, x, front - 1.0, (6.0, 2.0, 0.2), 2.1))
+    solids.append(objects.standing_box(terrain, rng.uniform(10.0, 20.0), -8.0, (0.5, 0.5, 0.4)))
     return Scene('urban', terrain, tuple(solids), tuple(wet))
 
 

@@ -20,9 +20,7 @@ import numpy.typing as npt
 from gp_ground_seg.frame import FloatArray
 
 OptionalArray: TypeAlias = FloatArray | None
-
-TOLERANCE = 1e-9
-"""Height above the terrain at which a ray has met it; length of a piece of no width [m]."""
+TOLERANCE = 1e-9  # height at which a ray has met the terrain; length of an empty piece [m]
 
 
 class Along(NamedTuple):
@@ -81,12 +79,8 @@ class Profile(Terrain):
         """See `Terrain.along`."""
         axis = self._axis
         u, du = at @ axis, direction @ axis
-        if len(self.edges):
-            k = self.piece_index(at if piece is None else piece)
-            anchor, (c0, c1, c2) = self.anchor[k], self.coefficients[k].T
-        else:
-            anchor, (c0, c1, c2) = self.anchor[0], self.coefficients[0]
-        v = u - anchor
+        k = self.piece_index(at if piece is None else piece)
+        v, (c0, c1, c2) = u - self.anchor[k], self.coefficients[k].T
         return Along(c0 + v * (c1 + v * c2), du * (c1 + 2.0 * c2 * v), 2.0 * c2 * du**2)
 
     def piece_index(self, at: FloatArray) -> npt.NDArray[np.intp]:
@@ -144,8 +138,7 @@ class Waves(Terrain):
         edges, anchor = self.envelope.edges, self.envelope.anchor
         near = c0 + c1 * (np.concatenate([anchor[:1], edges]) - anchor)
         far = c0 + c1 * (np.concatenate([edges, anchor[-1:]]) - anchor)
-        factors: FloatArray = np.maximum(near, far)
-        return factors
+        return np.asarray(np.maximum(near, far))
 
     def breaks(self) -> FloatArray:
         """Edges of the envelope, (B, 3)."""
@@ -161,22 +154,10 @@ def first_hit(
     terrain: Terrain, origin: FloatArray, direction: FloatArray, max_range: float
 ) -> FloatArray:
     """Range [m] at which each ray (R, 3) first meets the terrain, infinite beyond `max_range`."""
-    entry = np.zeros(len(origin))
-    ceiling = terrain.ceiling()
+    start, ceiling = np.zeros(len(origin)), terrain.ceiling()
     if ceiling is not terrain:
         # Free space above all waves is crossed in a few steps.
-        entry = _march(ceiling, origin, direction, entry, max_range)
-    return _march(terrain, origin, direction, entry, max_range)
-
-
-def _march(
-    terrain: Terrain,
-    origin: FloatArray,
-    direction: FloatArray,
-    start: FloatArray,
-    max_range: float,
-) -> FloatArray:
-    """As `first_hit`, from the ranges `start` on (infinite = no hit)."""
+        start = first_hit(ceiling, origin, direction, max_range)
     hit = np.full(len(origin), np.inf)
     ray = np.flatnonzero(start <= max_range)
     ends = _piece_ends(terrain, origin[ray], direction[ray], max_range)
@@ -223,7 +204,5 @@ def _piece_ends(
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         crossing = distance / rate
     ahead = (crossing > 0.0) & (crossing < max_range)
-    ends = np.pad(
-        np.where(ahead, crossing, max_range), ((0, 0), (0, 1)), constant_values=max_range
-    )
-    return np.sort(ends, axis=1)
+    last = np.full((len(rate), 1), max_range)
+    return np.sort(np.hstack([np.where(ahead, crossing, max_range), last]), axis=1)
