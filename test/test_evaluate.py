@@ -1,8 +1,8 @@
 """Methods over labelled frames: order and scores; the command `evaluate`: tables and files."""
 
 import itertools
-import logging
 import json
+import logging
 import math
 
 import numpy as np
