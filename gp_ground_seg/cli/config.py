@@ -24,9 +24,9 @@ EXAMPLES = """\
 """
 
 CHECK = """\
-Check names, types, ranges and the rules between parameters. A file in the form of
-ROS (/**: ros__parameters:) is held to the types of ROS: 2.0, not 2, for a float.
-Exit code 2 if anything is wrong.
+Check names, types, ranges and the rules between parameters, and say who reads the
+file: commands read bare groups too, the node only the form of ROS (/**:
+ros__parameters:). Exit code 2 if anything is wrong.
 """
 
 DIFF = """\

@@ -82,13 +82,6 @@ class ParameterSpec:
                     return int(value)
         raise ConfigError(f'{self.name} = {value!r}: must be {self.accepted}')
 
-    def check_typed(self, value: object) -> ParameterValue:
-        """Return `value` as `check`, but refuse an integer for a number, as ROS does."""
-        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
-            expected = f'{self.accepted}, with a decimal point as in {value}.0'
-            raise ConfigError(f'{self.name} = {value}: must be {expected}')
-        return self.check(value)
-
 
 def declare(
     default: ParameterValue,
@@ -248,7 +241,7 @@ class ParameterFile(NamedTuple):
     """Values of a parameter file by dotted names, unchecked."""
 
     values: dict[str, object]
-    node: str  # whose they are, in the form of ROS, where types are strict; '' for bare groups
+    node: str  # whose they are, in the form of ROS; '' for bare groups
 
     @property
     def is_ours(self) -> bool:
