@@ -6,11 +6,12 @@ KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test bench bench-docs node-bench colcon lint format generate clean
+.PHONY: help demo test torture bench bench-docs node-bench colcon lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
 	@echo 'make test      the whole test suite (KITTI=PATH adds labelled frames)'
+	@echo 'make torture   adversarial clouds, files and uses (TORTURE_SCALE=100 for a night)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.json and its picture'
 	@echo 'make node-bench  latency, losses and memory of the node over DDS'
@@ -39,6 +40,9 @@ demo: $(VENV)/.ros
 
 test: $(VENV)/.dev
 	$(WITH_KITTI) $(BIN)/python -m pytest
+
+torture: $(VENV)/.dev
+	$(BIN)/python test/torture.py
 
 bench: $(VENV)/.dev
 	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy

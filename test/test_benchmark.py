@@ -10,7 +10,7 @@ import pytest
 from bag_samples import scan, write_ros1_bag, write_ros2_bag
 from cli_runner import error_line, run
 from conftest import REPOSITORY, hilly_scan
-from evaluation_samples import HeightRule
+from evaluation_samples import HeightRule, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
@@ -226,6 +226,12 @@ def test_frames_come_from_whatever_holds_scans(name, write, expected, tmp_path):
         assert frame.points.dtype == np.float32
         np.testing.assert_array_equal(frame.points[:, :3], scan(k)[:, :3])
     assert len({frame.sequence for frame in frames}) == (2 if name == 'root' else 1)
+
+
+@pytest.mark.parametrize('n_wanted', [1, 2, 7, 10])
+def test_frames_wanted_are_shared_out_over_sequences(n_wanted, tmp_path):
+    write_streets(tmp_path, s00=3, s01=3, s02=3, s03=3)
+    assert len(load_frames(tmp_path, n_wanted)) == n_wanted
 
 
 def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):

@@ -20,8 +20,8 @@ from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 
 SUMMARY = re.compile(
-    r'(\d+) frames?, (\d+) points?, (\d+\.\d)% ground, \d+\.\d ms per frame \(median, '
-    r'segmentation only\), written to (.*)\n'
+    r'(\d+) frames?, (\d+) points?, (\d+\.\d)% ground, \d+\.\d ms (?:per frame \(median|for the '
+    r'first frame \(with loading code), segmentation only\), written to (.*)\n'
 )
 
 

@@ -146,6 +146,21 @@ def test_unknown_names_come_with_the_nearest(name, hint):
 
 
 @pytest.mark.parametrize(
+    ('changes', 'words'),
+    [
+        ({'grid.r_max': 500.0, 'faces.cell_size': 0.05}, ['faces.cell_size', '32.0 GB', '2 GB']),
+        ({'runtime.n_threads': 64, 'faces.cell_size': 0.1}, ['runtime.n_threads = 64', '2 GB']),
+        ({'grid.r_min': np.nextafter(50.0, 0.0), 'grid.r_max': 50.0}, ['first bin', '0.0001 m']),
+        ({'grid.n_bins': 1024, 'grid.bin_growth': 4.0}, ['grid.bin_growth = 4', '8e-11 m']),
+    ],
+)
+def test_what_cannot_run_is_refused(changes, words):
+    with pytest.raises(ConfigError) as refusal:
+        Config().replace(**changes)
+    assert all(word in str(refusal.value) for word in words)
+
+
+@pytest.mark.parametrize(
     ('lower', 'upper', 'low', 'high'),
     [
         ('grid.r_min', 'grid.r_max', 20.0, 30.0),
@@ -194,8 +209,8 @@ QOS = 'qos_overrides: {/points: {subscription: {depth: 3}}}'
         'label.ground_tolerance: 0.15\nsensor.height: 2\n',
         f'/**:\n  ros__parameters: {{{GIVEN}}}\n',
         '/**:\n  ros__parameters:\n    label.ground_tolerance: 0.15\n    sensor.height: 2\n',
-        f'ground: {{ros__parameters: {{{GIVEN}}}}}\n',
-        f'/robot/ground:\n  ros__parameters: {{{GIVEN}}}\n',
+        f'ground_segmentation_node: {{ros__parameters: {{{GIVEN}}}}}\n',
+        f'/robot/ground_segmentation_node:\n  ros__parameters: {{{GIVEN}}}\n',
         f'/**:\n  ros__parameters: {{use_sim_time: true, {QOS}, {GIVEN}}}\n',
     ],
 )
@@ -222,8 +237,10 @@ def test_numbers_are_read_as_ros_reads_them(from_text, number):
         ('label: {ground_tolerance: 99.0}', 'must be a number in [0.001, 5] m'),
         ('label: {ground_tolerance: .nan}', 'must be a number in'),
         ('label: {ground_tolerance: [0.1]}', 'must be a number in'),
-        ('runtime: {n_threads: 2.0}', 'must be an integer in [0, 256]'),
-        ('runtime: {n_threads: yes}', 'must be an integer in [0, 256]'),
+        ('runtime: {n_threads: 2.0}', 'must be an integer in [0, 64]'),
+        ('runtime: {n_threads: yes}', 'must be an integer in [0, 64]'),
+        ('grid: {n_bins: ' + '1' * 100_000 + '}', 'not valid YAML'),
+        ('grid: &a {n_bins: 9}\nlabel: *a', 'line 2: aliases (*name) are not accepted'),
         ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
         ('label:\n  # ground_tolerance: 0.1\n', "'label' is a group of parameters"),
         ('label: {ground_tolerance: {deep: 1.0}}', 'unknown parameter'),
@@ -235,7 +252,7 @@ def test_numbers_are_read_as_ros_reads_them(from_text, number):
         ('just words', 'must be a mapping'),
         ('a: [', 'not valid YAML'),
         ('label: {ground_tolerance: 2011-99-99}', 'not valid YAML'),
-        ('label: &a {ground_tolerance: *a}', 'not valid YAML'),
+        ('label: &a {ground_tolerance: *a}', 'line 1: aliases'),
         ('/**: {label: {ground_tolerance: 0.1}}', 'ros__parameters'),
         ('/**:\n  ros__parameters: 3\n', 'ros__parameters'),
         ('/a: {ros__parameters: {}}\n/b: {ros__parameters: {}}\n', 'parameters of 2 nodes'),

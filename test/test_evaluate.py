@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import logging
 import math
 
 import numpy as np
@@ -49,6 +50,18 @@ def test_frames_without_labels_are_named(tmp_path):
     with pytest.raises(DataError, match='frames of sequence 11 have no labels, as 000005'):
         labelled_frames(tmp_path)
     assert len(labelled_frames(tmp_path, ['00'])) == 1
+
+
+def test_sequences_without_labels_are_left_out_unless_named(tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    write_frame(tmp_path, '11', 0, street()[0])
+    with pytest.raises(DataError, match='no sequence has labels, of 11'):
+        labelled_frames(tmp_path)
+    write_streets(tmp_path, s00=2)
+    assert [frame.sequence for frame in labelled_frames(tmp_path)] == ['00', '00']
+    assert caplog.messages == ['sequences without labels left out: 11']
+    with pytest.raises(DataError, match='frames of sequence 11 have no labels'):
+        labelled_frames(tmp_path, ['11'])
 
 
 @pytest.mark.parametrize('each_alone', [False, True])

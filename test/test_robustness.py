@@ -1,12 +1,15 @@
 """Inputs and uses that once gave a wrong result, a crash or a hang."""
 
+import argparse
+import signal
 import subprocess
 import sys
 
 import numpy as np
 import pytest
 
-from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg.cli import main as cli
 
 
 def ring_scan(n=4000, seed=0, height=1.73):
@@ -75,3 +78,47 @@ finally:
 
 def test_an_array_that_changes_meanwhile_does_not_crash():
     subprocess.run([sys.executable, '-c', CHANGING], check=True, timeout=180)
+
+
+def lose_interrupt(_arguments):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        return 0
+
+
+def garble_interrupt(_arguments):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise SystemError('returned a result with an exception set') from None
+
+
+@pytest.mark.parametrize('run', [lose_interrupt, garble_interrupt])
+def test_an_interrupt_is_130_whatever_compiled_code_makes_of_it(run, monkeypatch, capsys):
+    arguments, before = argparse.Namespace(run=run), signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(cli, '_parse', lambda _words: arguments)
+    assert cli.main([]) == 130
+    assert capsys.readouterr().err == 'gp-ground-seg: interrupted\n'
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(
+    ('text', 'words', 'is_taken'),
+    [
+        ('label: {ground_tolerance: 0.2}', 'good for --config; for the node: ', True),
+        ('/**: {ros__parameters: {runtime: {n_threads: 1}}}', 'good; 1 of ', True),
+        ('ground_segmentation_node: {ros__parameters: {}}', 'good; 0 of ', True),
+        ('/other: {ros__parameters: {}}', 'good for a node named /other only; 0 of', False),
+    ],
+)
+def test_config_check_says_who_reads_a_file(text, words, is_taken, tmp_path, capsys):
+    path = tmp_path / 'robot.yaml'
+    path.write_text(text)
+    assert cli.main(['config', 'check', str(path)]) == 0
+    assert f'{path}: {words}' in capsys.readouterr().out
+    if is_taken:
+        Config.from_yaml(path)
+    else:
+        with pytest.raises(ConfigError, match='parameters of node /other; must be of'):
+            Config.from_yaml(path)

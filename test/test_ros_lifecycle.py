@@ -35,7 +35,6 @@ HEAD = '/**:\n  ros__parameters:\n'
 FILES = {
     'range': (HEAD + '    label: {ground_tolerance: 9.0}\n', 'must be a number in [0.001, 5] m'),
     'type': (HEAD + '    label: {ground_tolerance: high}\n', "ground_tolerance = 'high': must be"),
-    'integer': (HEAD + '    label: {ground_tolerance: 1}\n', 'with a decimal point as in 1.0'),
     'list': (HEAD + '    grid: {n_segments: [1, 2]}\n', 'must be an integer in [4, 2048]'),
     'nan': (HEAD + '    grid: {r_min: .nan}\n', 'grid.r_min = nan: must be'),
     'rule': (HEAD + '    grid: {r_min: 50.0, r_max: 20.0}\n', 'must be below grid.r_max = 20'),

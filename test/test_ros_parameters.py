@@ -110,7 +110,7 @@ HEIGHT = 'must be auto or a number in [0.05, 20] m'
     [
         ('sensor.height', 30.0, f'sensor.height = 30.0: {HEIGHT}'),
         ('sensor.height', float('nan'), f'sensor.height = nan: {HEIGHT}'),
-        ('sensor.height', 2, f'sensor.height = 2: {HEIGHT}, with a decimal '),
+        ('sensor.height', 30, f'sensor.height = 30: {HEIGHT}'),
         ('sensor.height', '2', f"sensor.height = '2': {HEIGHT}"),
         ('sensor.height', [1.0], 'sensor.height = '),
         ('grid.n_segments', 3, 'grid.n_segments = 3: must be an integer in [4, 2048]'),
@@ -129,13 +129,26 @@ def test_a_bad_value_is_refused_with_a_reason_and_changes_nothing(b, name, value
 
 @pytest.mark.parametrize('name', ['sensor.height', 'sensor.roll', 'sensor.pitch'])
 def test_a_number_or_auto_is_taken_and_nothing_else(b, name):
-    for value in (0.5, 'auto', 0.7, 0.6, 'auto'):
+    for value in (0.5, 'auto', 0.7, 1, 'auto'):
         assert b.set(name, value).successful
         assert values_of(b)[name] == value == b.node.config[name]
+        value = float(value) if value == 1 else value
         (found,) = described(b, [name])
         assert found.type == TYPES[type(value)]
         assert found.floating_point_range[0].to_value == find_spec(name).maximum
-    for value in ('Auto', 'automatic', '', '0.5', 1, True, 99.0, -99.0, float('inf'), [0.5], None):
+    for value in (
+        'Auto',
+        'automatic',
+        '',
+        '0.5',
+        True,
+        99,
+        99.0,
+        -99.0,
+        float('inf'),
+        [0.5],
+        None,
+    ):
         result = b.set(name, value)
         assert not result.successful
         assert f'{name} = ' in result.reason
@@ -265,10 +278,15 @@ def test_unknown_names_are_reported_and_not_declared(capfd):
         'lable.ground_tolerance': 0.3,
         'qos_overrides./nowhere.subscription.depth': 3,
         'sensor.height': 2.5,
+        'grid.r_max': 50,
+        'label.ground_tolerance': 1,
     }
     with ros.started_node(*ros.given(words)) as node:
-        assert node.config == Config().replace(**{'sensor.height': 2.5})
-        assert node.get_parameter('sensor.height').value == 2.5
+        changes = {'sensor.height': 2.5, 'grid.r_max': 50.0, 'label.ground_tolerance': 1.0}
+        assert node.config == Config().replace(**changes)
+        for name, value in changes.items():
+            assert node.get_parameter(name).type_ == Parameter.Type.DOUBLE
+            assert node.get_parameter(name).value == value
         assert not node.has_parameter('lable.ground_tolerance')
         log = ros.said_by(capfd, 'did you mean label.ground_tolerance?', '/nowhere')
     assert log.count('is not used') == 2

@@ -150,11 +150,14 @@ def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[B
             paths = {name: [one.points_path for one in own] for name, own in frames_of.items()}
         else:
             paths = {source.stem: find_scans(source)}
-        frames = [
-            BenchFrame(run_name, own[k].stem, read_points(own[k]))
-            for name, own in paths.items()
-            for run_name, k in runs(name, len(own), max(n_frames // len(paths), 1))
-        ]
+        frames = []
+        for j, (name, own) in enumerate(paths.items()):
+            # Shares of whole frames that add up to those wanted.
+            share = n_frames * (j + 1) // len(paths) - n_frames * j // len(paths)
+            frames += [
+                BenchFrame(run_name, own[k].stem, read_points(own[k]))
+                for run_name, k in runs(name, len(own), share)
+            ]
     if not any(len(frame.points) for frame in frames):
         raise DataError(f'{source}: no point in any of {len(frames)} frames')
     return frames
@@ -183,8 +186,8 @@ def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
 
     Each run has a name of its own: what is temporal must not reach over the hole before it.
     """
-    if n_available <= n_wanted:
-        return [(name, k) for k in range(n_available)]
+    if n_available <= n_wanted or not n_wanted:
+        return [(name, k) for k in range(min(n_available, n_wanted))]
     length = min(RUN_LENGTH, n_wanted)
     n_places, n_runs = n_available // length, n_wanted // length
     starts = [length * ((2 * k + 1) * n_places // (2 * n_runs)) for k in range(n_runs)]

@@ -24,9 +24,9 @@ EXAMPLES = """\
 """
 
 CHECK = """\
-Check names, types, ranges and the rules between parameters. A file in the form of
-ROS (/**: ros__parameters:) is held to the types of ROS: 2.0, not 2, for a float.
-Exit code 2 if anything is wrong.
+Check names, types, ranges and the rules between parameters, and say who reads the
+file: commands read bare groups too, the node only the form of ROS (/**:
+ros__parameters:). Exit code 2 if anything is wrong.
 """
 
 DIFF = """\
@@ -79,10 +79,15 @@ def run_check(arguments: argparse.Namespace) -> int:
             code = 2
             print(*(f'{path}: {problem}' for problem in problems), sep='\n', file=sys.stderr)
             continue
-        n_given = len(read_parameters(path).values)
-        n_changed = len(export.differences(Config(), Config.from_yaml(path)))
-        given = f'{n_given} of {len(parameter_specs())} parameters given'
-        print(f'{path}: good; {given}, {n_changed} differ from the defaults')
+        file = read_parameters(path)
+        n_changed = len(export.differences(Config(), Config().replace(**file.values)))
+        given = f'{len(file.values)} of {len(parameter_specs())} parameters given'
+        use = ''
+        if not file.node:
+            use = ' for --config; for the node: gp-ground-seg config dump --config FILE > ros.yaml'
+        elif not file.is_ours:
+            use = f' for a node named {file.node} only'
+        print(f'{path}: good{use}; {given}, {n_changed} differ from the defaults')
     return code
 
 

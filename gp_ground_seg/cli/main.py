@@ -6,9 +6,11 @@ import argparse
 import importlib
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from gp_ground_seg import __version__
 from gp_ground_seg.errors import GroundSegError
@@ -85,6 +87,38 @@ def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
     return library_notes(logging.WARNING if quiet else logging.INFO)
 
 
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Raise KeyboardInterrupt at the end if Ctrl-C came meanwhile and something else became of it.
+
+    Where it comes while numba compiles or loads code, it is lost, or arrives as another error.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    is_interrupted = False
+
+    def note(_number: int, _frame: object) -> None:
+        nonlocal is_interrupted
+        is_interrupted = True
+        # What it is lost in is written to stderr otherwise.
+        sys.unraisablehook = lambda _what: None
+        raise KeyboardInterrupt
+
+    before, hook = signal.signal(signal.SIGINT, note), sys.unraisablehook
+    try:
+        yield
+    except Exception as error:
+        if is_interrupted:
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+        sys.unraisablehook = hook
+    if is_interrupted:
+        raise KeyboardInterrupt
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command of `argv`, by default of the process, and return its exit code.
 
@@ -92,10 +126,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        arguments = _parse(words)
-        with _notes(arguments):
-            code: int = arguments.run(arguments)
-        sys.stdout.flush()
+        with _interruptible():
+            arguments = _parse(words)
+            with _notes(arguments):
+                code: int = arguments.run(arguments)
+            sys.stdout.flush()
         return code
     except GroundSegError as error:
         print(f'gp-ground-seg: error: {error}', file=sys.stderr)

@@ -135,10 +135,11 @@ def run(arguments: argparse.Namespace) -> int:
             n_ground += int((result.label == Label.GROUND).sum())
             seconds.append(result.timings['total'])
     share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
+    pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms'
+    pace += ' per frame (median' if len(seconds) > 1 else ' for the first frame (with loading code'
     print(
         f'{options.count(len(seconds), "frame")}, {options.count(n_points, "point")}, {share}, '
-        f'{1e3 * statistics.median(seconds):.1f} ms per frame (median, segmentation only), '
-        f'written to {target}'
+        f'{pace}, segmentation only), written to {target}'
     )
     return 0
 

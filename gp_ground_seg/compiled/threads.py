@@ -9,12 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 from gp_ground_seg.jit import JIT_ENABLED, jit
+from gp_ground_seg.parameters.config import DEFAULT_MAX_THREADS
 
 MIN_POINTS_TO_SPLIT = 4096
 """Points below which sharing out costs more than it saves."""
-DEFAULT_MAX_THREADS = 4
-"""Most threads where their number is not given: each has tables to fill and a wake-up, which
-costs more than a small part of the work saves."""
 
 
 class Part(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import math
 import os
 import statistics
@@ -33,6 +34,7 @@ from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import FitReport
 from gp_ground_seg.segmenter import GroundSegmenter
 
+_LOGGER = logging.getLogger('gp_ground_seg')
 OURS = 'gp_ground_seg'
 PATCHWORKPP = 'patchworkpp'
 TITLES = {PATCHWORKPP: 'Patchwork++'}
@@ -288,9 +290,10 @@ def pool(name: str, scores: Iterable[MethodScore]) -> MethodScore:
 
 
 def labelled_frames(root: str | Path, sequences: Sequence[str] | None = None) -> list[Frame]:
-    """Frames of the named sequences, or of all, in order.
+    """Frames of the named sequences, or of all that have labels, in order.
 
-    Raises DataError if a sequence is not there, or a frame has no labels.
+    Sequences of SemanticKITTI's test set have none; a note says which are left out. Raises
+    DataError if a sequence is not there, a named one or a single frame has no labels, or all.
     """
     known = list_sequences(root)
     chosen = list(dict.fromkeys(known if sequences is None else sequences))
@@ -298,13 +301,20 @@ def labelled_frames(root: str | Path, sequences: Sequence[str] | None = None) ->
     if unknown or not chosen:
         problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
         raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
-    frames = []
+    frames, left_out = [], []
     for name in chosen:
         own = list_frames(root, name)
         bare = [frame.index for frame in own if frame.labels_path is None]
+        if sequences is None and len(bare) == len(own):
+            left_out.append(name)
+            continue
         if bare:
             raise DataError(f'{root}: frames of sequence {name} have no labels, as {bare[0]}')
         frames += own
+    if not frames:
+        raise DataError(f'{root}: no sequence has labels, of {", ".join(known)}')
+    if left_out:
+        _LOGGER.info('sequences without labels left out: %s', ', '.join(left_out))
     return frames
 
 

@@ -7,6 +7,7 @@ README.md and docs/parameters.md are derived from the dataclasses below. Why not
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -240,7 +241,7 @@ class LearningConfig:
 class RuntimeConfig:
     """How the work is done; nothing here changes a label."""
 
-    n_threads: int = basic(0, (0, 256), 'threads of the compiled code; 0 = all cores, at most 4')
+    n_threads: int = basic(0, (0, 64), 'threads of the compiled code; 0 = all cores, at most 4')
     backend: str = advanced('auto', ('auto', 'numba', 'numpy'),
         'auto = compiled code where numba is installed, numpy otherwise; or either by name')
 
@@ -278,6 +279,13 @@ _ASCENDING = (
     ('label.obstacle_min_height', 'label.obstacle_max_height'),
 )
 """Pairs of which the first must be below the second."""
+NARROWEST_BIN = 1e-4
+"""Least width of a bin [m]: above the resolution of ranges in single precision."""
+DEFAULT_MAX_THREADS = 4
+"""Most threads where their number is not given: each has tables to fill and a wake-up, which
+costs more than a small part of the work saves."""
+BYTES_PER_TILE, BYTES_PER_CELL, MAX_TABLES = 20, 48, 2e9
+"""Size of the tables of each thread, of double precision, and the most that all may take."""
 
 
 @dataclass(frozen=True)
@@ -311,6 +319,33 @@ class Config(ParameterGroups):
                 f'surface.n_neighbours = {self.surface.n_neighbours}: must be below half of '
                 f'grid.n_segments = {self.grid.n_segments}'
             )
+        _check_bins(self.grid)
+        _check_memory(self)
+
+
+def _check_bins(grid: GridConfig) -> None:
+    # Bins widen with range: the first one is the narrowest.
+    width = (grid.r_max - grid.r_min) / float(grid.n_bins) ** grid.bin_growth
+    if width < NARROWEST_BIN:
+        raise ConfigError(
+            f'grid.n_bins = {grid.n_bins}, grid.bin_growth = {grid.bin_growth:g} between '
+            f'grid.r_min = {grid.r_min:g} and grid.r_max = {grid.r_max:g}: the first bin would be '
+            f'{width:.2g} m wide; must be at least {NARROWEST_BIN:g} m'
+        )
+
+
+def _check_memory(config: Config) -> None:
+    grid, n_threads = config.grid, config.runtime.n_threads or DEFAULT_MAX_THREADS
+    n_tiles = math.ceil(2.0 * grid.r_max / config.faces.cell_size) ** 2
+    n_cells = grid.n_segments * grid.n_bins
+    size = n_threads * (BYTES_PER_TILE * n_tiles + BYTES_PER_CELL * n_cells)
+    if size > MAX_TABLES:
+        raise ConfigError(
+            f'grid.r_max = {grid.r_max:g}, faces.cell_size = {config.faces.cell_size:g}, '
+            f'runtime.n_threads = {n_threads}: tables of {n_tiles} tiles and {n_cells} cells '
+            f'for each thread would take {size / 1e9:.1f} GB; must be at most '
+            f'{MAX_TABLES / 1e9:g} GB'
+        )
 
 
 def parameter_specs() -> tuple[ParameterSpec, ...]:

@@ -131,8 +131,7 @@ def generated_files(readme: str) -> dict[str, str]:
 def file_problems(path: str | Path) -> list[str]:
     """Everything wrong with a parameter file, one line each; none if it can be used.
 
-    A file in the form of ROS is held to the strict types of ROS parameters. Rules between
-    parameters are checked where each value by itself is accepted.
+    Rules between parameters are checked where each value by itself is accepted.
     """
     try:
         file = read_parameters(path)
@@ -141,8 +140,7 @@ def file_problems(path: str | Path) -> list[str]:
     problems = []
     for name, value in file.values.items():
         try:
-            spec = find_spec(name)
-            spec.check_typed(value) if file.is_ros else spec.check(value)
+            find_spec(name).check(value)
         except ConfigError as error:
             problems.append(str(error))
     if problems:

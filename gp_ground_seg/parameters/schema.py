@@ -24,6 +24,7 @@ ParameterValue = bool | int | float | str
 AUTO: Literal['auto'] = 'auto'
 """What a number may be instead where its declaration says so: estimated from the scan."""
 ROS_NODE_KEY = '/**'
+NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
 OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters that every ROS node has."""
@@ -80,13 +81,6 @@ class ParameterSpec:
                 if isinstance(value, numbers.Integral):
                     return int(value)
         raise ConfigError(f'{self.name} = {value!r}: must be {self.accepted}')
-
-    def check_typed(self, value: object) -> ParameterValue:
-        """Return `value` as `check`, but refuse an integer for a number, as ROS does."""
-        if self.type is float and isinstance(value, int) and not isinstance(value, bool):
-            expected = f'{self.accepted}, with a decimal point as in {value}.0'
-            raise ConfigError(f'{self.name} = {value}: must be {expected}')
-        return self.check(value)
 
 
 def declare(
@@ -185,7 +179,12 @@ class ParameterGroups:
         with the path, if the file cannot be read, a name is unknown, or a value is not accepted.
         """
         try:
-            return (base or cls()).replace(**read_parameters(path).values)
+            file = read_parameters(path)
+            if not file.is_ours:
+                raise ConfigError(
+                    f'parameters of node {file.node}; must be of {ROS_NODE_KEY} or {NODE_NAME}'
+                )
+            return (base or cls()).replace(**file.values)
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error
 
@@ -206,13 +205,21 @@ def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterVa
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, without two of its surprises (see `load_yaml`)."""
+    """PyYAML's safe loader, without three of its surprises (see `load_yaml`)."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()  # type: ignore[no-untyped-call]
+            line = event.start_mark.line + 1
+            raise ConfigError(f'line {line}: aliases (*name) are not accepted')
+        return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse a key that is there twice; the last would win silently."""
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
         for key in keys:
-            if key != '<<' and keys.count(key) > 1:
+            if keys.count(key) > 1:
                 raise ConfigError(f'{key}: given twice, from line {node.start_mark.line + 1} on')
         return super().construct_mapping(node, deep)
 
@@ -225,7 +232,7 @@ _Loader.add_implicit_resolver(
 
 
 def load_yaml(text: str) -> object:
-    """Read YAML, with 1e-3 a number as in ROS; a key given twice raises ConfigError."""
+    """Read YAML, with 1e-3 a number as in ROS; an alias or a key given twice: ConfigError."""
     document: object = yaml.load(text, Loader=_Loader)
     return document
 
@@ -234,7 +241,12 @@ class ParameterFile(NamedTuple):
     """Values of a parameter file by dotted names, unchecked."""
 
     values: dict[str, object]
-    is_ros: bool  # whether it is in the form of ROS, where types are strict
+    node: str  # whose they are, in the form of ROS; '' for bare groups
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether a node of our name, and commands, use it."""
+        return self.node.split('/')[-1] in ('', '*', '**', NODE_NAME)
 
 
 def read_parameters(path: str | Path) -> ParameterFile:
@@ -246,7 +258,10 @@ def read_parameters(path: str | Path) -> ParameterFile:
             if name in values:
                 raise ConfigError(f'{name}: given twice')
             values[name] = value
-        return ParameterFile(values, isinstance(document, Mapping) and _is_ros(document))
+        node = ''
+        if isinstance(document, Mapping) and _is_ros(document):
+            (node,) = map(str, document)
+        return ParameterFile(values, node)
     except OSError as error:
         raise ConfigError(error.strerror or str(error)) from error
     except UnicodeDecodeError as error:

@@ -16,6 +16,7 @@ from gp_ground_seg.backend import NumpyBackend, choose_backend
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.errors import GroundSegError, PointCloudError
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.schema import NODE_NAME
 from gp_ground_seg.pipeline.points import single_precision
 from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
@@ -24,8 +25,6 @@ from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader, LibraryLog
 from gp_ground_seg.segmenter import GroundSegmenter
-
-NODE_NAME = 'ground_segmentation_node'
 
 
 class GroundSegmentationNode(ConfiguredNode):

@@ -44,7 +44,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
     """Return `config` with those of the `parameters` that it declares, if they are accepted."""
     values = {
-        parameter.name: find_spec(parameter.name).check_typed(parameter.value)
+        parameter.name: find_spec(parameter.name).check(parameter.value)
         for parameter in parameters
         if parameter.name in _OWN_NAMES
     }
@@ -118,8 +118,10 @@ class ConfiguredNode(Node):  # type: ignore[misc]
             self.undeclare_parameter(parameter_name)
         with start_errors():
             for spec in parameter_specs():
-                self.declare_parameter(spec.name, spec.default, descriptor(spec))
+                value = self._config[spec.name]
+                self.declare_parameter(spec.name, value, descriptor(spec), ignore_override=True)
         self._given_names = frozenset(given)
+        self.add_pre_set_parameters_callback(lambda parameters: list(map(_typed, parameters)))
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
         self._parameter_service = _ParameterService(self)
@@ -176,6 +178,14 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         except Exception as error:
             reason = f'{type(error).__name__}: {error}'
             self.get_logger().error(f'parameters could not be applied: {reason}')
+
+
+def _typed(parameter: Parameter) -> Parameter:
+    """Make an integer that is given for a number one, as YAML and ``ros2 param set`` read 2."""
+    is_number = parameter.name in _OWN_NAMES and find_spec(parameter.name).type is float
+    if is_number and parameter.type_ == Parameter.Type.INTEGER:
+        return Parameter(parameter.name, value=float(parameter.value))
+    return parameter
 
 
 def _unknown(name: str) -> str:

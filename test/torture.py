@@ -1,0 +1,130 @@
+"""The torture campaign: `make torture`, `TORTURE_SCALE=100 make torture` for a night.
+
+Each part is a script that runs a range of numbered cases and prints a line for each that fails; a
+case follows from its number. Finished ranges are written to the state file, so that a campaign
+that was stopped goes on where it was. The record (docs/reliability.md shows the last one) is
+printed at the end.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+TEST = Path(__file__).parent
+
+
+class Part(NamedTuple):
+    """A script, and how many cases make the short campaign of a few minutes."""
+
+    script: str
+    n_cases: int
+    chunk: int  # cases of one process
+    environment: tuple[str, ...] = ()  # NAME=value
+    timeout: float = 900.0  # of one process [s]
+
+
+PARTS = {
+    'clouds': Part('torture_clouds.py', 1000, 100),
+    'clouds, debugging allocator': Part(
+        'torture_clouds.py', 100, 50, ('PYTHONMALLOC=debug', 'MALLOC_PERTURB_=165')
+    ),
+    'threads, processes, signals, limits': Part('torture_processes.py', 1, 1),
+    'damaged files': Part('torture_files.py', 600, 200),
+    'hostile clouds over DDS': Part('torture_ros.py', 400, 200),
+}
+
+
+def run_chunk(part, first, stop):
+    """Return the lines of the cases that failed; a crash or a hang is one."""
+    command = [sys.executable, TEST / part.script, str(first), str(stop)]
+    environment = {**os.environ, **dict(pair.split('=') for pair in part.environment)}
+    environment['PYTHONPATH'] = os.pathsep.join([str(TEST.parent), str(TEST)])
+    try:
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            errors='replace',
+            env=environment,
+            timeout=part.timeout,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        last = (error.stdout or b'')[-200:].decode(errors='replace').split('\r')[-1]
+        return [f'no end within {part.timeout:.0f} s, at case {last}']
+    lines = [line.split('\r')[-1] for line in done.stdout.split('\n')]
+    failed = [line for line in lines if ': ' in line]
+    if done.returncode not in (0, 1) or (done.returncode == 1 and not failed):
+        failed.append(f'status {done.returncode} at case {lines[-1]}: {done.stderr[-300:]}')
+    return failed
+
+
+def main():
+    """Run what the state file does not hold yet."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument('--scale', type=float, default=float(os.environ.get('TORTURE_SCALE', '1')))
+    parser.add_argument('--state', type=Path, default=Path('build/torture.jsonl'))
+    parser.add_argument('--part', choices=PARTS, action='append')
+    options = parser.parse_args()
+    options.state.parent.mkdir(parents=True, exist_ok=True)
+    commit = subprocess.run(
+        ['git', 'rev-parse', '--short', 'HEAD'],
+        cwd=TEST,
+        capture_output=True,
+        text=True,
+        check=False,
+    ).stdout.strip()
+    done = {}
+    if options.state.exists():
+        for line in options.state.read_text().splitlines():
+            entry = json.loads(line)
+            if entry['commit'] == commit:
+                done[entry['part'], entry['first'], entry['stop']] = entry
+
+    def run(name, first, stop):
+        started = time.monotonic()
+        failed = run_chunk(PARTS[name], first, stop)
+        seconds = time.monotonic() - started
+        entry = {
+            'commit': commit,
+            'part': name,
+            'first': first,
+            'stop': stop,
+            'failed': failed,
+            'seconds': round(seconds, 1),
+        }
+        with options.state.open('a') as file:
+            file.write(json.dumps(entry) + '\n')
+        for line in failed:
+            print(f'{name}: {line}', flush=True)
+        done[name, first, stop] = entry
+
+    wanted = []
+    for name in options.part or PARTS:
+        part = PARTS[name]
+        n_cases = max(1, round(part.n_cases * options.scale))
+        for first in range(0, n_cases, part.chunk):
+            wanted.append((name, first, min(first + part.chunk, n_cases)))
+    with ThreadPoolExecutor(max(1, len(os.sched_getaffinity(0)))) as pool:
+        list(pool.map(lambda chunk: run(*chunk), [c for c in wanted if c not in done]))
+    n_failed = 0
+    print(f'\ncommit {commit}, {time.strftime("%Y-%m-%d")}, scale {options.scale:g}')
+    for name in options.part or PARTS:
+        own = [done[chunk] for chunk in wanted if chunk[0] == name]
+        failures = sum(len(entry['failed']) for entry in own)
+        n_failed += failures
+        cases, seconds = sum(e['stop'] - e['first'] for e in own), sum(e['seconds'] for e in own)
+        print(f'{name:40} {cases:8} cases {seconds:8.0f} s {failures:4} failures')
+    sys.exit(1 if n_failed else 0)
+
+
+if __name__ == '__main__':
+    main()

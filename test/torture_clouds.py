@@ -1,0 +1,166 @@
+"""Adversarial clouds under random configurations, against what must always hold.
+
+Every case follows from its number alone. `python test/torture_clouds.py FIRST STOP` runs cases and
+prints one line for each that fails; its last line is the number of the case it works on, so that
+a crash shows which one it was.
+"""
+
+import sys
+import warnings
+
+import numpy as np
+
+from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg.parameters.config import parameter_specs
+
+MAX_DIFFERENT = 0.02
+"""Share of the points that rounding may decide differently in the two backends: one candidate
+that joins or not changes the labels of its cells."""
+SPECIAL = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-40, -1e-40, 1e-7, 1e7, 3e38, -3e38, 1e300]
+
+
+def random_cloud(rng):
+    """Cloud of a random kind, size, type and layout."""
+    n = int(
+        rng.choice([0, 1, 2, 3, 7, 60, 500, 3000, 9000], p=[0.03] * 4 + [0.08] * 2 + [0.24] * 3)
+    )
+    azimuth, r = rng.uniform(-np.pi, np.pi, n), rng.gamma(2.0, rng.choice([0.5, 5.0, 40.0]), n)
+    z = rng.normal(rng.choice([-1.73, 0.0, -0.2, 5.0]), rng.choice([0.0, 0.02, 1.0, 50.0]), n)
+    if rng.random() < 0.5:  # rings of beams, walls where they end
+        depression = rng.choice(np.linspace(0.02, 0.5, 16), n)
+        height = rng.uniform(0.2, 3.0)
+        r = np.minimum(height / np.tan(depression), rng.choice([5.0, 30.0, 100.0]))
+        z = -r * np.tan(depression) + rng.normal(0.0, 0.02, n)
+    xyz = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z])
+    kind = rng.integers(8)
+    if kind == 0 and n:  # many points in one place
+        xyz[: n // 2] = xyz[0]
+    elif kind == 1:  # values on the edges of cells and tiles
+        xyz = np.round(xyz * 2.0) / 2.0
+    elif kind == 2:  # in one line, plane or axis
+        xyz[:, rng.integers(3)] = rng.choice([0.0, 1.0, -1.73])
+    elif kind == 3:
+        xyz *= 10.0 ** rng.uniform(-20, 20)
+    elif kind == 4:  # tilted
+        xyz = xyz @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    if rng.random() < 0.5 and n:
+        where = rng.random(xyz.shape) < rng.choice([0.001, 0.05, 0.9])
+        xyz[where] = rng.choice(SPECIAL, where.sum())
+    dtype = rng.choice(['float32', 'float64', 'float16', '>f4'])
+    with np.errstate(over='ignore', invalid='ignore'):
+        xyz = xyz.astype(dtype)
+    layout = rng.integers(4)
+    if layout == 0:
+        xyz = np.asfortranarray(xyz)
+    elif layout == 1:
+        xyz = np.column_stack([xyz, xyz])[:, :4]
+    elif layout == 2:
+        xyz = np.repeat(xyz, 2, axis=0)[::2]
+    elif layout == 3:
+        xyz = xyz[::-1]
+    return xyz
+
+
+def random_config(rng):
+    """Some parameters anywhere in their declared ranges; those that contradict are drawn again."""
+    specs = [s for s in parameter_specs() if s.name.split('.')[0] not in ('runtime', 'frame')]
+    while True:
+        changes = {}
+        for index in rng.choice(len(specs), rng.choice([0, 1, 3, 10, 40]), replace=False):
+            spec = specs[index]
+            if spec.type is bool:
+                changes[spec.name] = bool(rng.integers(2))
+            elif spec.type is str:
+                changes[spec.name] = str(rng.choice(spec.choices))
+            elif rng.random() < 0.3:
+                changes[spec.name] = rng.choice([spec.minimum, spec.maximum])
+            elif spec.minimum > 0.0:
+                low, high = np.log([spec.minimum, spec.maximum])
+                changes[spec.name] = min(float(np.exp(rng.uniform(low, high))), spec.maximum)
+            else:
+                changes[spec.name] = rng.uniform(spec.minimum, spec.maximum)
+            if spec.type is int:
+                changes[spec.name] = int(changes[spec.name])
+        # What a grid may cost is a test of its own; here it would take the night.
+        changes['grid.n_segments'] = min(changes.get('grid.n_segments', 180), 720)
+        changes['grid.n_bins'] = min(changes.get('grid.n_bins', 160), 400)
+        changes['faces.cell_size'] = max(changes.get('faces.cell_size', 0.5), 0.25)
+        changes['learning.max_evaluations'] = min(changes.get('learning.max_evaluations', 4), 8)
+        changes.pop('learning.max_time', None)  # a clock decides
+        try:
+            return Config().replace(**changes)
+        except ConfigError:
+            continue
+
+
+def check(points, result):
+    """Raise AssertionError unless what must always hold does."""
+    n, finite = len(points), np.isfinite(points[:, :3]).all(axis=1)
+    label, height = result.label, result.height
+    assert label.shape == height.shape == result.p_ground.shape == (n,), 'length'
+    assert np.isin(label, [Label.UNKNOWN, Label.GROUND, Label.OBSTACLE]).all(), 'classes'
+    assert ((label == Label.UNKNOWN) == ~finite).all(), 'UNKNOWN is what is not finite'
+    ground = label == Label.GROUND
+    assert np.isfinite(height[ground]).all(), 'NaN height on ground'
+    assert np.isfinite(result.ground_std[ground]).all(), 'NaN std on ground'
+    assert (result.margin[ground] >= 0.0).all(), 'negative margin on ground'
+    assert (result.p_ground[ground] >= 0.5).all(), 'p_ground of ground below one half'
+    assert (np.isnan(result.p_ground) == ~finite).all(), 'p_ground'
+    assert np.isfinite(result.roughness).all(), 'roughness'
+
+
+def segment(config, points, backend, n_threads):
+    """Return the result, or the error as one line."""
+    changes = {'runtime.backend': backend, 'runtime.n_threads': n_threads}
+    segmenter = GroundSegmenter(config.replace(**changes))
+    try:
+        return segmenter.segment(points)
+    except PointCloudError as error:
+        return str(error)
+    finally:
+        segmenter.close()
+
+
+def run_case(number):
+    """Run one case; return how many segmentations it took."""
+    rng = np.random.default_rng([2112, number])
+    points, config = random_cloud(rng), random_config(rng)
+    before = points.tobytes()
+    n_threads = int(rng.integers(2, 9))
+    results = [segment(config, points, 'numba', n) for n in (1, n_threads)]
+    results.append(segment(config, points, 'numpy', 1))
+    assert points.tobytes() == before, 'the input was written to'
+    if isinstance(results[0], str):
+        assert results[0] == results[1] == results[2], results
+        assert '\n' not in results[0], 'an error of more than a line'
+        return len(results)
+    for result in results:
+        assert not isinstance(result, str), result
+        check(points, result)
+    one, many, plain = results
+    assert np.array_equal(one.label, many.label), 'labels depend on the threads'
+    assert np.array_equal(one.height, many.height, equal_nan=True), 'heights depend on the threads'
+    n_different = np.count_nonzero(one.label != plain.label)
+    assert n_different <= max(2, MAX_DIFFERENT * len(points)), (
+        f'numba and numpy differ in {n_different} of {len(points)} labels'
+    )
+    return len(results)
+
+
+def main():
+    """Run the cases of the command line."""
+    warnings.simplefilter('error')
+    n_failed = 0
+    for number in range(*map(int, sys.argv[1:3])):
+        print(f'\r{number}', end='', flush=True)
+        try:
+            run_case(number)
+        except Exception as error:
+            n_failed += 1
+            print(f'\rcase {number}: {type(error).__name__}: {error}', flush=True)
+    print()
+    sys.exit(1 if n_failed else 0)
+
+
+if __name__ == '__main__':
+    main()
