@@ -45,6 +45,11 @@ def test_what_is_a_face(backend, name):
     assert (faces_of(backend, CORNER + xyz)[0] == is_face).all()
 
 
+def test_without_scatter_the_normal_counts_as_vertical(backend):
+    line = CORNER + POST * [0.0, 0.0, 1.0]
+    assert faces_of(backend, line, max_normal_z=1.0)[0].all()
+
+
 def wall(low=0.0, high=1.5, turn=0.3):
     """Rings of returns on a vertical plane, evenly spread over its height."""
     along, z = (

@@ -1,4 +1,8 @@
-"""Sections of the configuration as named tuples of their numbers, which compiled code reads."""
+"""Sections of the configuration as named tuples of their numbers, which compiled code reads.
+
+Kernels are annotated with the dataclasses of the same names, whose fields they have: all numbers,
+and no words.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ _Section = TypeVar('_Section')
 
 def _tuple_type(section: type[Any]) -> type[Any]:
     # numba keeps code under the type of its arguments, which it finds again by this module's name.
-    names = [field.name for field in fields(section) if field.type in ('int', 'float')]
+    names = [field.name for field in fields(section) if field.type in ('bool', 'int', 'float')]
     return namedtuple(section.__name__, names, module=__name__)
 
 

@@ -167,7 +167,8 @@ def _is_vertical(low: FloatArray, high: FloatArray, max_normal_z: float) -> bool
     yz = low[9] + high[9] - y * z / n
     vertical = max(xx * yy - xy * xy, 0.0)
     trace = vertical + max(yy * zz - yz * yz, 0.0) + max(xx * zz - xz * xz, 0.0)
-    return trace > 0.0 and math.sqrt(vertical / trace) <= max_normal_z
+    normal_z = math.sqrt(vertical / trace) if trace > 0.0 else 1.0
+    return normal_z <= max_normal_z
 
 
 @jit()
