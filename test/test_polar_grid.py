@@ -101,7 +101,7 @@ def test_cells_tiles_and_candidates_are_the_reference(backend, seed, n, dtype):
 
 
 def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
-    config = config_of(n_bins=1024, bin_growth=4.0, n_segments=fewer(2048, 200))
+    config = config_of(n_bins=1024, bin_growth=1.97, n_segments=fewer(2048, 200))
     geometry = grid_geometry(config.grid, 0.5, np.dtype(np.float64))
     assert len(geometry.ranges.bins) < 40_000
     assert geometry.ranges.is_coarse

@@ -41,6 +41,8 @@ def test_a_bag_in_a_loop_with_a_clock_resets_what_was_learned(tmp_path):
     bag = tmp_path / 'drive.mcap'
     write_ros2_bag(bag, 15)
     changes = {**PATIENT, 'use_sim_time': True, 'learning.mode': 'first_frame'}
+    # A cloud that a busy machine drops is no fault here.
+    changes['diagnostics.max_drop_ratio'] = 1.0
     with ros.linked_process(tmp_path, *ros.given(changes), sends=None) as (node, link):
         with play(bag, '--loop', '--rate', '2', '--clock') as player:
             link.wait_for_status('input', lambda v, _: int(v['Time jumps since startup']) >= 2)
@@ -52,7 +54,8 @@ def test_a_bag_in_a_loop_with_a_clock_resets_what_was_learned(tmp_path):
         ]
     ages = []
     for report in reports:
-        assert {status.level for status in report.values()} == {DiagnosticStatus.OK}
+        said = {name: (s.level, s.message) for name, s in report.items()}
+        assert {level for level, _ in said.values()} == {DiagnosticStatus.OK}, said
         values = ros.values_of(report['input'])
         ages.append(values['Age of last stamp (s)'])
         n_rounds = 1 + int(values['Time jumps since startup'])
