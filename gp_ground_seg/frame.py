@@ -111,6 +111,24 @@ class Candidates(NamedTuple):
         result *= stop > first
         return result
 
+    @classmethod
+    def room(cls, n: int, n_segments: int) -> Candidates:
+        """Arrays for at most `n` candidates, with arbitrary content."""
+        return cls(
+            r=np.empty(n),
+            z=np.empty(n),
+            bin=np.empty(n, np.int64),
+            density=np.empty(n),
+            offsets=np.empty(n_segments + 1, np.int64),
+            tile=np.empty(n, np.int32),
+        )
+
+    def first(self, n: int) -> Candidates:
+        """First `n`, to which `offsets` refer already."""
+        return Candidates(
+            self.r[:n], self.z[:n], self.bin[:n], self.density[:n], self.offsets, self.tile[:n]
+        )
+
     def where(self, kept: BoolArray) -> Candidates:
         """Those of the (C,) bool mask `kept`."""
         before = np.concatenate([[0], np.cumsum(kept)])

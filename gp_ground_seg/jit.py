@@ -56,7 +56,9 @@ def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
         Let sums be taken in any order, so that they use vector instructions. The compiler
         fixes the order, not the number of threads; NaN and infinity keep their meaning.
     entry : bool
-        Whether it is called from Python: its code, with all that it calls, is kept on disk.
+        Whether it is called from Python: its code, with all that it calls, is kept on disk. It
+        returns numbers, or nothing: numba runs Python to return arrays and named tuples, where
+        Ctrl-C ends in a SystemError or a crash.
     """
 
     def decorate(function: _Function) -> _Function:

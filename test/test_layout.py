@@ -133,7 +133,24 @@ def find_long_signatures(trees):
                     yield f'{path}: {node.name} has {n_parameters} parameters'
 
 
-CHECKS = (find_layer_violations, find_foreign_violations, find_cycles, find_long_signatures)
+def find_returned_arrays(trees):
+    """Compiled functions called from Python that return more than numbers: see `jit`."""
+    for path, tree in trees.items():
+        for node in ast.walk(tree):
+            called = getattr(node, 'decorator_list', [])
+            if any('entry=True' in ast.unparse(decorator) for decorator in called):
+                names = {n.id for n in ast.walk(node.returns) if isinstance(n, ast.Name)}
+                if names - {'bool', 'int', 'float', 'tuple', 'NumbersOfPlane'}:
+                    yield f'{path}: {node.name} returns {ast.unparse(node.returns)}'
+
+
+CHECKS = (
+    find_layer_violations,
+    find_foreign_violations,
+    find_cycles,
+    find_long_signatures,
+    find_returned_arrays,
+)
 
 
 @pytest.fixture(scope='module')
@@ -171,6 +188,7 @@ def test_files_are_of_a_size_worth_opening(trees):
         (find_cycles, 'frame.py', 'from gp_ground_seg.gp.b import f'),
         (find_long_signatures, 'gp/a.py', 'def f(a, b, c, d, e, /, f, g, *, h, i): ...'),
         (find_long_signatures, 'compiled/a.py', f'def f({", ".join("abcdefghijklm")}): ...'),
+        (find_returned_arrays, 'gp/a.py', '@jit(entry=True)\ndef f() -> tuple[int, Lines]: ...'),
     ],
 )
 def test_a_violation_is_found_and_only_that(find, path, source):
@@ -178,7 +196,8 @@ def test_a_violation_is_found_and_only_that(find, path, source):
         'frame.py': 'import numpy as np',
         'gp/b.py': 'from gp_ground_seg.frame import Label\ndef f(a, b, c, d, e, f, g, h): ...',
         'gp/c.py': 'def f(self, a, b, c, d, e, f, g, h): import gp_ground_seg.gp.c',
-        'compiled/b.py': 'import numba\nfrom gp_ground_seg.gp import b\n',
+        'compiled/b.py': 'import numba\nfrom gp_ground_seg.gp import b\n'
+        '@jit(entry=True)\ndef f() -> tuple[int, float]: ...',
         'plotting/b.py': 'def f():\n    from matplotlib.figure import Figure',
         'ros/b.py': 'import rclpy',
     }

@@ -307,7 +307,7 @@ with sharing(3) as backend:
     codes = []
     for k in range(int(sys.argv[2])):
         # Sometimes in the middle of a hand-over to the workers.
-        lock = backend._workers._pool._shutdown_lock if k % 4 == 1 else threading.Lock()
+        lock = backend.workers._pool._shutdown_lock if k % 4 == 1 else threading.Lock()
         lock.acquire()
         child = os.fork()
         if child == 0:

@@ -3,6 +3,7 @@
 import os
 import threading
 import time
+from concurrent.futures import Future
 from unittest.mock import patch
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gp_ground_seg import Config
 from gp_ground_seg.compiled import threads
+from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.compiled.threads import Part, Workers, run_of
 
 
@@ -58,6 +61,38 @@ def test_an_error_is_raised_after_all_parts_have_ended(workers, failing):
     with pytest.raises(ValueError, match='that part'):
         workers.run(work, 3)
     assert sorted(ended) == sorted({0, 1, 2} - {failing})
+
+
+def test_an_interrupted_wait_leaves_the_next_frame_other_buffers():
+    may_end = threading.Event()
+
+    def work(part):
+        if part.number == 0:
+            raise KeyboardInterrupt
+        may_end.wait(30)
+
+    with patch.object(threads, 'JIT_ENABLED', True):
+        backend = NumbaBackend(2)
+    points = np.random.default_rng(0).uniform(-30.0, 30.0, (5000, 3)).astype(np.float32)
+    before = backend.build_grid(points, Config())
+    assert np.shares_memory(before.xyz, backend.build_grid(points, Config()).xyz)
+    assert backend.workers.is_idle
+    busy = backend.workers
+    with (
+        patch.object(Future, 'exception', side_effect=KeyboardInterrupt),
+        pytest.raises(KeyboardInterrupt),
+    ):
+        busy.run(work, 2)
+    try:
+        assert not busy.is_idle
+        after = backend.build_grid(points, Config())
+        assert backend.workers is not busy
+        assert not np.shares_memory(before.xyz, after.xyz)
+        np.testing.assert_array_equal(before.xyz, after.xyz)
+    finally:
+        may_end.set()
+        busy.close()
+        backend.close()
 
 
 @pytest.mark.parametrize('n_started', [0, 1])

@@ -99,7 +99,7 @@ while True: segmenter.segment(scan)
     'interrupted': Scenario("""
 segmenter = make()
 expected = segmenter.segment(scan).label
-for _ in range(5):
+for _ in range(30):
     timer = threading.Timer(random.uniform(0.0, 0.05), os.kill, (os.getpid(), signal.SIGINT))
     try:
         timer.start()

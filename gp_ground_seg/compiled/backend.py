@@ -46,13 +46,18 @@ from gp_ground_seg.pipeline.points import copy_points, points_in
 class NumbaBackend:
     """See `gp_ground_seg.backend.Backend`.
 
-    A process forked off this one has no threads, and perhaps half-filled buffers: there both
-    are made anew.
+    A process forked off this one has no threads, and perhaps half-filled buffers; after Ctrl-C a
+    thread may still write to the buffers. The next frame then begins with new ones.
 
     Parameters
     ----------
     n_threads : int
         Number of threads; 0 = all cores, at most 4.
+
+    Attributes
+    ----------
+    workers : Workers
+        The threads.
     """
 
     name = 'numba'
@@ -63,20 +68,20 @@ class NumbaBackend:
 
     def _renew(self) -> None:
         self._pid = os.getpid()
-        self._workers, self._buffers = Workers(self._wanted_threads), Buffers()
+        self.workers, self._buffers = Workers(self._wanted_threads), Buffers()
 
     @property
     def n_threads(self) -> int:
         """Number of threads, the caller's included."""
-        return self._workers.n_threads
+        return self.workers.n_threads
 
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:
         """Sort points into cells and tiles; lowest point of each cell."""
-        if self._pid != os.getpid():
+        if self._pid != os.getpid() or not self.workers.is_idle:
             self._renew()
         n_points, dtype, take = len(xyz), xyz.dtype, self._buffers.take
         geometry = polar_grid.grid_geometry(config.grid, config.faces.cell_size, dtype)
-        n_parts = self._workers.n_parts(n_points)
+        n_parts = self.workers.n_parts(n_points)
         n_segments, n_cells = config.grid.n_segments, config.grid.n_segments * config.grid.n_bins
         n_tiles = geometry.n_sides**2
         columns = take('columns', (3, n_points), dtype)
@@ -86,7 +91,7 @@ class NumbaBackend:
             take('extremes', (n_parts, n_cells + 1, 3), dtype),
             take('numbers', (n_parts, n_cells + 1, 2), np.int32),
         )
-        tiles = self._buffers.tile_table(self._workers.n_threads, n_tiles, dtype)
+        tiles = self._buffers.tile_table(self.workers.n_threads, n_tiles, dtype)
         places = polar_grid.Places(cell, r, tile)
 
         def copy_and_sort(part: Part) -> None:
@@ -94,27 +99,17 @@ class NumbaBackend:
             copy_points(xyz[own], columns[:, own])
             polar_grid.sort_points(part, columns, geometry, places, cells, tiles)
 
-        self._workers.run(copy_and_sort, n_parts)
-        room = Candidates(
-            r=np.empty(n_cells),
-            z=np.empty(n_cells),
-            bin=np.empty(n_cells, np.int64),
-            density=np.empty(n_cells),
-            offsets=np.empty(n_segments + 1, np.int64),
-            tile=np.empty(n_cells, np.int32),
-        )
+        self.workers.run(copy_and_sort, n_parts)
+        room = Candidates.room(n_cells, n_segments)
         n = polar_grid.merge_parts(
             n_parts, cells, tiles, geometry.edges, config.lines.min_density_extent, room
-        )
-        candidates = Candidates(
-            room.r[:n], room.z[:n], room.bin[:n], room.density[:n], room.offsets, room.tile[:n]
         )
         occupied = tiles.occupied[0, 1 : 1 + tiles.occupied[0, 0]]
         return Scan(
             points_in(columns),
             PolarGrid(cell, r, geometry.edges, n_segments),
             Tiles(tile, tiles.extremes[0, :-1], occupied),
-            candidates,
+            room.first(n),
         )
 
     def fit_plane(self, candidates: Candidates, max_slope: float) -> GroundPlane | None:
@@ -124,12 +119,12 @@ class NumbaBackend:
     def find_faces(self, scan: Scan, config: Config) -> Faces:
         """Tiles that hold a vertical face."""
         take, thresholds = self._buffers.take, numbers_of(config.faces)
-        n_tiles, n_parts = len(scan.tiles.extremes), self._workers.n_parts(len(scan.xyz))
+        n_tiles, n_parts = len(scan.tiles.extremes), self.workers.n_parts(len(scan.xyz))
         tile_to_row, row_to_tile = take('tile_rows', (2, n_tiles), np.int32)
         n_tall = faces_.select_tall(scan.tiles, thresholds, tile_to_row, row_to_tile)
         sums = take('face_sums', (n_parts, 2 * n_tall, faces_.N_COLUMNS), np.float64)
         room = faces_.FaceSums(tile_to_row, row_to_tile, sums)
-        self._workers.run(
+        self.workers.run(
             faces_.sum_returns,
             n_parts,
             scan.xyz.T,
@@ -147,12 +142,7 @@ class NumbaBackend:
         self, candidates: Candidates, faces: Faces, config: Config
     ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
         """Candidates that show ground, lines, pseudo-inputs, candidates that continue a line."""
-        tolerances, growth = numbers_of(config.lines), numbers_of(config.growth)
-        latent, limits = numbers_of(config.latent), numbers_of(config.length_scale)
-        kept = lines.keep_visible(candidates, faces.has_occluded_base)
-        found = lines.extract_lines(kept, tolerances)
-        pseudo = lines.select_pseudo_inputs(kept, found, latent, limits)
-        return kept, found, pseudo, lines.candidates_on_lines(kept, found, tolerances, growth)
+        return lines.find_lines(candidates, faces, config)
 
     def log_likelihood(
         self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
@@ -160,9 +150,9 @@ class NumbaBackend:
         """Log marginal likelihood of the frame and its gradient."""
         n_segments = len(inliers.offsets) - 1
         values, gradients = np.empty(n_segments), np.empty((n_segments, len(theta)))
-        self._workers.run(
+        self.workers.run(
             likelihood.log_likelihood,
-            self._workers.n_threads,
+            self.workers.n_threads,
             theta,
             inliers,
             slope_std,
@@ -201,10 +191,17 @@ class NumbaBackend:
                 latent_.latent_log_length_scales(part, frame, theta, u, knot_u)
             ground.grow_surfaces(part, frame, theta, observation, growth, segment_step, own)
 
-        self._workers.run(grow_surfaces, self.n_threads)
+        self.workers.run(grow_surfaces, self.n_threads)
         mean, std = np.empty((2, *shape))
-        spread = observation.slope_std, n_neighbours
-        ground.fuse_neighbours(own, frame.knots, *spread, frame.prior_mean, mean, std)
+        ground.fuse_neighbours(
+            own,
+            frame.knots,
+            observation.slope_std,
+            n_neighbours,
+            frame.prior_mean,
+            mean,
+            std,
+        )
         return GroundSurface(frame.knots, mean, std, own.inlier), knot_u
 
     def label_points(
@@ -213,7 +210,7 @@ class NumbaBackend:
         """Height, label and margin of each point; roughness of each cell."""
         take, tolerances = self._buffers.take, numbers_of(config.label)
         n_points, n_bins = len(scan.xyz), scan.grid.n_bins
-        n_cells, n_parts = scan.grid.n_segments * n_bins, self._workers.n_parts(n_points)
+        n_cells, n_parts = scan.grid.n_segments * n_bins, self.workers.n_parts(n_points)
         room = labels.LabelRoom(
             take('pieces', (n_cells + 1, 2), np.float64),
             take('square_sums', (n_parts, n_cells + 1, 2), np.int64),
@@ -227,11 +224,11 @@ class NumbaBackend:
             np.empty((scan.grid.n_segments, n_bins)),
         )
         labels.fit_pieces(surface, room)
-        self._workers.run(
+        self.workers.run(
             labels.survey, n_parts, scan, faces.is_face, tolerances, result.height, room
         )
         labels.set_bands(n_parts, tolerances, room, result.roughness)
-        self._workers.run(
+        self.workers.run(
             labels.label_part,
             n_parts,
             scan,
@@ -249,4 +246,4 @@ class NumbaBackend:
         if self._pid != os.getpid():
             # The pool is that of the parent process, and its lock perhaps held for ever.
             self._renew()
-        self._workers.close()
+        self.workers.close()

@@ -47,7 +47,9 @@ _PER_METRE = 4.0 / float(RING_EDGES[1] - RING_EDGES[0])
 _STARTS = RING_EDGES[0] + (np.arange(int(RING_EDGES[-1] * _PER_METRE) + 1) - 0.02) / _PER_METRE
 _RING_TABLE = np.clip(np.searchsorted(RING_EDGES, _STARTS, side='right') - 1, 0, N_RINGS - 1)
 
-Values = tuple[float, float, float, float, float, float, float, float, float, float, int, int]
+NumbersOfPlane = tuple[
+    float, float, float, float, float, float, float, float, float, float, int, int
+]
 
 
 _solve_plane = jit()(ground_plane.solve_plane)
@@ -204,7 +206,7 @@ def _refine(
 @jit(entry=True)
 def _describe(
     cells: FloatArray, sectors: IntArray, n: int, plane: tuple[float, float, float]
-) -> Values:
+) -> NumbersOfPlane:
     """Evidence for a plane: fields of the `GroundPlane`; cells come sector by sector."""
     height, slope_x, slope_y = plane
     ranges, drops, near = np.empty(n), np.empty(n), np.empty(n)

@@ -6,16 +6,19 @@ import math
 
 import numpy as np
 
+from gp_ground_seg.compiled.sections import numbers_of
 from gp_ground_seg.frame import (
     N_CLASSES,
     BoolArray,
     Candidates,
+    Faces,
     FloatArray,
     Lines,
     PseudoInputs,
 )
 from gp_ground_seg.jit import jit
 from gp_ground_seg.parameters.config import (
+    Config,
     GrowthConfig,
     LatentConfig,
     LengthScaleConfig,
@@ -27,31 +30,49 @@ from gp_ground_seg.pipeline.lines import MIN_BREAK_CANDIDATES
 _deming_slope = jit()(plain.deming_slope)
 
 
+def find_lines(
+    candidates: Candidates, faces: Faces, config: Config
+) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
+    """Do what `gp_ground_seg.pipeline.lines.find_lines` does."""
+    tolerances = numbers_of(config.lines)
+    room = Candidates.room(len(candidates.r), len(candidates.offsets) - 1)
+    n = _keep_visible(candidates, faces.has_occluded_base, room)
+    kept = room.first(n)
+    lines = Lines(np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64))
+    n_lines = _extract_lines(kept, tolerances, lines)
+    lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
+    pseudo = PseudoInputs(
+        np.empty(n), np.empty(n, np.int64), np.empty_like(kept.offsets), np.empty(N_CLASSES)
+    )
+    latent, limits = numbers_of(config.latent), numbers_of(config.length_scale)
+    p = _select_pseudo_inputs(kept, lines, latent, limits, pseudo)
+    pseudo = pseudo._replace(r_bar=pseudo.r_bar[:p], surface_class=pseudo.surface_class[:p])
+    continues_line = np.empty(n, np.bool_)
+    _mark_candidates_on_lines(kept, lines, tolerances, numbers_of(config.growth), continues_line)
+    return kept, lines, pseudo, continues_line
+
+
 @jit(entry=True)
-def keep_visible(candidates: Candidates, has_occluded_base: BoolArray) -> Candidates:
-    """Leave out candidates in tiles where the base of a face is occluded."""
-    size = len(candidates.r)
-    r, z, density = np.empty(size), np.empty(size), np.empty(size)
-    own_bin, tile = np.empty(size, np.int64), np.empty(size, np.int32)
-    offsets = np.zeros(len(candidates.offsets), np.int64)
+def _keep_visible(candidates: Candidates, has_occluded_base: BoolArray, kept: Candidates) -> int:
+    """Leave out candidates in tiles where the base of a face is occluded; return their number."""
     n = 0
-    for m in range(len(offsets) - 1):
+    kept.offsets[0] = 0
+    for m in range(len(candidates.offsets) - 1):
         for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if not has_occluded_base[candidates.tile[c]]:
-                r[n], z[n], density[n] = candidates.r[c], candidates.z[c], candidates.density[c]
-                own_bin[n], tile[n] = candidates.bin[c], candidates.tile[c]
+                kept.r[n], kept.z[n] = candidates.r[c], candidates.z[c]
+                kept.density[n] = candidates.density[c]
+                kept.bin[n], kept.tile[n] = candidates.bin[c], candidates.tile[c]
                 n += 1
-        offsets[m + 1] = n
-    return Candidates(r[:n], z[:n], own_bin[:n], density[:n], offsets, tile[:n])
+        kept.offsets[m + 1] = n
+    return n
 
 
 @jit(entry=True)
-def extract_lines(candidates: Candidates, config: LinesConfig) -> Lines:
-    """Do what the twin does."""
+def _extract_lines(candidates: Candidates, config: LinesConfig, lines: Lines) -> int:
+    """Cut the candidates into lines; return their number."""
     r, z, density, offsets = candidates.r, candidates.z, candidates.density, candidates.offsets
-    line = np.empty(len(r), np.int64)
-    start = np.empty(len(r) + 1, np.int64)
-    slopes = np.empty(len(r))
+    line, slopes, start = lines.line, lines.slope, lines.start
     tangent = math.tan(config.slope_tolerance)
     square_distance = config.max_line_distance * config.max_line_distance
     current = 0
@@ -107,7 +128,7 @@ def extract_lines(candidates: Candidates, config: LinesConfig) -> Lines:
             current += 1
             i = j
     start[current] = len(r)
-    return Lines(line, slopes[:current], start[: current + 1])
+    return current
 
 
 @jit()
@@ -122,14 +143,17 @@ def _differs_in_direction(
 
 
 @jit(entry=True)
-def select_pseudo_inputs(
-    candidates: Candidates, lines: Lines, latent: LatentConfig, limits: LengthScaleConfig
-) -> PseudoInputs:
-    """Do what the twin does."""
+def _select_pseudo_inputs(
+    candidates: Candidates,
+    lines: Lines,
+    latent: LatentConfig,
+    limits: LengthScaleConfig,
+    pseudo: PseudoInputs,
+) -> int:
+    """Select pseudo-inputs; return their number, at most that of the candidates."""
     r, start, slope = candidates.r, lines.start, lines.slope
     n_lines = len(slope)
-    r_bar, surface_class = np.empty(len(r)), np.empty(len(r), dtype=np.int64)
-    offsets = np.empty(len(candidates.offsets), dtype=np.int64)
+    r_bar, surface_class, offsets = pseudo.r_bar, pseudo.surface_class, pseudo.offsets
     count, total = np.zeros(N_CLASSES, dtype=np.int64), np.zeros(N_CLASSES)
     log_shortest = math.log(limits.min)
     m = 0
@@ -165,20 +189,22 @@ def select_pseudo_inputs(
     for k in range(m, len(offsets)):
         offsets[k] = p
     empty = total.sum() / n_lines if n_lines > 0 else log_shortest
-    first_guess = np.empty(N_CLASSES)
     for k in range(N_CLASSES):
-        first_guess[k] = total[k] / count[k] if count[k] > 0 else empty
-    return PseudoInputs(r_bar[:p], surface_class[:p], offsets, first_guess)
+        pseudo.first_guess[k] = total[k] / count[k] if count[k] > 0 else empty
+    return p
 
 
 @jit(entry=True)
-def candidates_on_lines(
-    candidates: Candidates, lines: Lines, config: LinesConfig, growth: GrowthConfig
-) -> BoolArray:
-    """Do what the twin does."""
+def _mark_candidates_on_lines(
+    candidates: Candidates,
+    lines: Lines,
+    config: LinesConfig,
+    growth: GrowthConfig,
+    continues_line: BoolArray,
+) -> None:
+    """Mark the candidates that join the inliers if the one before them has joined."""
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     start, slope = lines.start, lines.slope
-    continues_line = np.empty(len(r), dtype=np.bool_)
     m = 0
     for q in range(len(slope)):
         first, stop = start[q], start[q + 1]
@@ -202,7 +228,6 @@ def candidates_on_lines(
         continues_line[first] = at_break
         for c in range(first + 1, stop):
             continues_line[c] = at_break or (is_flat and stop - first >= growth.min_line_size)
-    return continues_line
 
 
 @jit()

@@ -17,11 +17,11 @@ _Section = TypeVar('_Section')
 
 
 def _tuple_type(section: type[Any]) -> type[Any]:
-    # numba keeps code under the type of its arguments, which it finds again by this module's name.
     names = [field.name for field in fields(section) if field.type in ('bool', 'int', 'float')]
     return namedtuple(section.__name__, names, module=__name__)
 
 
+# numba pickles the type with the code it keeps, by module and name: each is an attribute here.
 LinesConfig = _tuple_type(config.LinesConfig)
 LengthScaleConfig = _tuple_type(config.LengthScaleConfig)
 ObservationConfig = _tuple_type(config.ObservationConfig)
@@ -30,10 +30,20 @@ GrowthConfig = _tuple_type(config.GrowthConfig)
 FacesConfig = _tuple_type(config.FacesConfig)
 LabelConfig = _tuple_type(config.LabelConfig)
 
+_TUPLE_TYPES = {
+    config.LinesConfig: LinesConfig,
+    config.LengthScaleConfig: LengthScaleConfig,
+    config.ObservationConfig: ObservationConfig,
+    config.LatentConfig: LatentConfig,
+    config.GrowthConfig: GrowthConfig,
+    config.FacesConfig: FacesConfig,
+    config.LabelConfig: LabelConfig,
+}
+
 
 @lru_cache(maxsize=64)
 def numbers_of(section: _Section) -> _Section:
     """Return the numbers of a section under the same names."""
-    tuple_type = globals()[type(section).__name__]
+    tuple_type = _TUPLE_TYPES[type(section)]
     values = [getattr(section, name) for name in tuple_type._fields]
     return cast(_Section, tuple_type(*values))

@@ -43,11 +43,18 @@ class Workers:
     n_threads : int
         Number of threads, the caller's included; 0 = all cores of this process, at most
         `DEFAULT_MAX_THREADS`.
+
+    Attributes
+    ----------
+    is_idle : bool
+        Whether the last `run` saw all its parts end. After an exception, such as that of Ctrl-C
+        while it waited, a thread may still work on the arrays that it was given.
     """
 
     def __init__(self, n_threads: int) -> None:
         wanted = n_threads or min(len(os.sched_getaffinity(0)), DEFAULT_MAX_THREADS)
         self.n_threads = wanted if JIT_ENABLED else 1
+        self.is_idle = True
         self._pool: ThreadPoolExecutor | None = None
 
     def n_parts(self, n_points: int) -> int:
@@ -60,7 +67,7 @@ class Workers:
         Raises
         ------
         Exception
-            The first error of a part, after all parts have ended.
+            The first error of a part, after all parts have ended (but see `is_idle`).
         """
         if n_parts > 1 and self._pool is None:
             self._start()
@@ -69,12 +76,14 @@ class Workers:
             for part in (own, *others):
                 function(part, *arguments)
             return
+        self.is_idle = False
         futures = [self._pool.submit(function, part, *arguments) for part in others]
         try:
             function(own, *arguments)
         finally:
             # The parts work on arrays that belong to the caller afterwards.
             errors = [future.exception() for future in futures]
+        self.is_idle = True
         for error in errors:
             if error is not None:
                 raise error
@@ -87,12 +96,12 @@ class Workers:
             for _ in range(self.n_threads - 1):
                 pool.submit(all_started.wait)
         except RuntimeError:  # the system has no thread left
-            all_started.set()
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)
             self.n_threads = 1
         else:
-            all_started.set()
             self._pool = pool
+        finally:
+            all_started.set()
 
     def close(self) -> None:
         """End the threads; they start again if they are needed again."""
