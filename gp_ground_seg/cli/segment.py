@@ -88,8 +88,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         options.QUIET,
     )  # fmt: skip
     options.add_config(parser)
-    raw = 'write 0 unknown, 1 ground, 2 obstacle as labels'
-    options.add(parser.add_argument_group('for scans'), ('--raw', raw, options.FLAG))
+    raw = ('--raw', 'write 0 unknown, 1 ground, 2 obstacle as labels', options.FLAG)
+    options.add(parser.add_argument_group('for scans'), *options.SCAN_LAYOUT, raw)
     topic, several = {'metavar': 'T'}, {'metavar': 'T', 'action': 'append', 'default': []}
     options.add(
         parser.add_argument_group('for bags'),
@@ -103,7 +103,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
     parser = options.new_parser(subparsers, 'pose', POSE_DESCRIPTION, POSE_EXAMPLES)
-    options.add(parser, ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}))
+    options.add(
+        parser,
+        ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}),
+        *options.SCAN_LAYOUT,
+        options.FORCE,
+    )
     options.add_config(parser)
     parser.set_defaults(run=run_pose)
 
@@ -122,6 +127,8 @@ def run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, name):
             option = name.replace('_', '-')
             raise DataError(f'--{option}: is for {kind}, which {source} is not')
+    if holds_bag:
+        options.refuse_scan_layout(arguments, source)
     target = Path(arguments.output) if arguments.output else _default_output(source)
     n_points = n_ground = 0
     seconds = []
@@ -180,7 +187,7 @@ def _segment_scans(
 ) -> Iterator[Segmentation]:
     """Write one label file per scan; yield what each holds."""
     codes = sorted(Label) if arguments.raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
-    code = np.array(codes, dtype='<u4')
+    code, layout = np.array(codes, dtype='<u4'), options.scan_layout(arguments)
     if not arguments.quiet:
         options.note_leftovers(target)
     with (
@@ -189,7 +196,7 @@ def _segment_scans(
     ):
         for scan, label_path in zip(scans, label_paths, strict=True):
             try:
-                result = segmenter.segment(read_points(scan))
+                result = segmenter.segment(read_points(scan, layout))
             except PointCloudError as error:
                 raise PointCloudError(f'{scan}: {error}') from error
             label_path.write_bytes(code[result.label].tobytes())
@@ -293,10 +300,11 @@ POSE_COLUMNS = (
 def run_pose(arguments: argparse.Namespace) -> int:
     """Print a line for each scan, and the medians."""
     poses, rows, notes = [], [], []
+    layout = options.scan_layout(arguments)
     with closing(GroundSegmenter(options.read_config(arguments))) as segmenter:
         for scan in find_scans(Path(arguments.input)):
             try:
-                pose = segmenter.estimate_pose(read_points(scan))
+                pose = segmenter.estimate_pose(read_points(scan, layout))
             except PointCloudError as error:
                 notes.append(f'{scan.name}: refused: {error}')
                 continue
