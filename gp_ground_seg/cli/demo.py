@@ -234,10 +234,11 @@ def run(arguments: argparse.Namespace) -> int:
         options.refuse_scan_layout(arguments, 'a simulated one')
         drive = simulated_drive(arguments.frames)
     folder = Path(arguments.output)
+    options.note_leftovers(folder)
     with (
         staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
         needing_ros('the demo'),
-        probed_node(part / LOG, 'demo') as (node, session),
+        probed_node(part / LOG, 'demo', unfinished=part.parent) as (node, session),
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)

@@ -193,8 +193,9 @@ def _measure(
     with (
         tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
         needing_ros('node-bench'),
-        probing.probed_node(Path(folder, 'log'), 'node_bench', words) as (node, session),
+        probing.probed_node(Path(folder, 'log'), 'node_bench', words, Path(folder)) as probed,
     ):
+        node, session = probed
         probe = probing.Probe(session, lambda *_: None)
         if not quiet:
             options.note('waiting for the node; it compiles when it runs the first time')
