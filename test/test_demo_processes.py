@@ -28,7 +28,7 @@ def test_a_kill_ends_the_node_and_removes_the_folder(tmp_path, monkeypatch, comm
     with start(command, '--frames', 500, cwd=tmp_path) as process:
         wait_until(lambda: children(process.pid))
         nodes = children(process.pid)
-        wait_until(lambda: [*tmp_path.rglob('*log')])
+        wait_until(lambda: [*tmp_path.rglob('*log')])  # in the folder that is to go
         process.send_signal(signal.SIGKILL)
         process.communicate(timeout=PATIENCE)
     assert process.returncode == -signal.SIGKILL
@@ -71,6 +71,9 @@ def test_an_interrupt_counts_where_it_is_ignored_at_the_start(tmp_path):
         # It says what it leaves out when it has opened the bag.
         assert process.stderr.readline().startswith('gp-ground-seg: note: not played: /note')
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=20.0)
+        try:
+            _, said = process.communicate(timeout=20.0)
+        finally:
+            process.kill()
     assert process.returncode == 130
     assert said.splitlines()[-1] == 'gp-ground-seg: interrupted'

@@ -113,6 +113,24 @@ def test_wrong_data_are_named(scans, change):
         assert problem in said and advice in f'{said} '
 
 
+def test_a_file_of_another_size_is_told_from_one_that_is_cut():
+    points = simulated('vlp-16')
+    for data, layout, said in (
+        (points.tobytes()[:-7], KITTI, ''),  # truncated, as the reader says
+        (b'0123456789', KITTI, ''),
+        (
+            with_columns(points, 5)[:-1].tobytes(), KITTI,
+            'looks like 5 columns of float32, which --columns 5 reads',
+        ),
+        (
+            points[:-1].astype('<f8').tobytes(), ScanLayout(5, 'float64'),
+            'looks like 4 columns of float64, which --columns 4 reads',
+        ),
+    ):  # fmt: skip
+        found = find_doubt(data, layout)
+        assert found.endswith(said) if said else not found
+
+
 def test_the_library_reads_what_it_is_told_and_keeps_points(tmp_path):
     points, path = simulated('vlp-16'), tmp_path / 'a.bin'
     for n_columns, dtype in ((3, '<f4'), (4, '<f4'), (5, '<f4'), (4, '<f8'), (7, '<f8')):

@@ -29,7 +29,7 @@ DESCRIPTION = """\
 Split scans into ground and obstacles.
 
 INPUT is one of:
-  scan.bin             a KITTI scan (float32 x, y, z, intensity)
+  scan.bin             a scan as KITTI's: float32 x, y, z, intensity; --columns, --dtype: another
   folder               of .bin files, or a sequence with velodyne/ in it
   drive.bag            a ROS 1 bag
   drive.mcap, .db3     a single-file rosbag2
@@ -44,12 +44,16 @@ point cloud its ground and its obstacles: every field of every point bit for bit
 the same header, the same recorded time. Unknown points are in neither.
 Messages of ROS 1 are converted to ROS 2.
 
+Scans whose numbers can be none, as of another layout or in millimetres, are refused
+with what they look like; with --force they are taken.
+
 Nothing is overwritten without --force. Output is written under a hidden name
 (.NAME.partial-...) and takes its name when it is complete.
 """
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
+  gp-ground-seg segment nuscenes/samples/LIDAR_TOP -o labels --columns 5
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
 """
@@ -57,7 +61,7 @@ EXAMPLES = """\
 POSE_DESCRIPTION = """\
 Estimate from scans how high the sensor is and how it is tilted.
 
-INPUT is a .bin scan (float32 x, y, z, intensity), a folder of them, or a sequence
+INPUT is a .bin scan (float32 x, y, z, intensity; else --columns, --dtype), a folder of them, or a sequence
 with velodyne/ in it. Each scan is judged by itself. Support is the share of the
 low points on the plane that was found, residual their distance to it. With enough
 scans of level ground the medians are values to set: docs/pose.md.

@@ -84,15 +84,16 @@ def find_doubt(data: bytes, layout: ScanLayout) -> str:
             return ''
         other = _likely_layout(data, layout)
         guess = _guess(points) if other is None else _advice(other, layout)
-    begin = ', '.join(f'{x:.4g}' for x in points[:3, 0])
-    problem = problem or 'it does not end with a whole point'
-    return f'read as {layout}, {problem} (x begins {begin}){guess}'
+    if problem:
+        begin = ', '.join(f'{x:.4g}' for x in points[:3, 0])
+        problem = f'read as {layout}, {problem} (x begins {begin})'
+    return '; '.join(part for part in (problem, guess) if part)
 
 
 def _advice(other: ScanLayout, layout: ScanLayout) -> str:
     names = [n for n in ('columns', 'dtype') if getattr(other, n) != getattr(layout, n)]
     words = ' '.join(f'--{name} {getattr(other, name)}' for name in names)
-    return f'; looks like {other}, which {words} reads'
+    return f'looks like {other}, which {words} reads'
 
 
 def _objection(points: _Numbers) -> str:
@@ -177,7 +178,7 @@ def _guess(points: _Numbers) -> str:
     size = np.abs(xyz[np.isfinite(xyz) & (xyz != 0.0)].astype(np.float64))
     middle = float(np.median(size)) if len(size) else 0.0
     if 0.0 < middle < np.finfo(np.float32).tiny:
-        return '; looks like whole numbers, as of a .label file'
+        return 'looks like whole numbers, as of a .label file'
     if MAX_RANGE < middle < 1000.0 * MAX_RANGE:
-        return '; looks like millimetres, a scan is in metres'
+        return 'looks like millimetres, a scan is in metres'
     return ''
