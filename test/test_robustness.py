@@ -4,12 +4,17 @@ import argparse
 import signal
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
+from conftest import fewer
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.cli import main as cli
+from gp_ground_seg.compiled.backend import NumbaBackend
+from gp_ground_seg.parameters.config import size_of_tables
 
 
 def ring_scan(n=4000, seed=0, height=1.73):
@@ -78,6 +83,30 @@ finally:
 
 def test_an_array_that_changes_meanwhile_does_not_crash():
     subprocess.run([sys.executable, '-c', CHANGING], check=True, timeout=180)
+
+
+@pytest.mark.parametrize(
+    'values',
+    [
+        {'grid.r_max': 400, 'faces.cell_size': 0.16},
+        {'grid.n_segments': 2048, 'grid.n_bins': 1024, 'grid.bin_growth': 1},
+    ],
+)
+@pytest.mark.parametrize('make', [NumpyBackend, lambda: NumbaBackend(1), lambda: NumbaBackend(2)])
+def test_memory_is_what_was_computed(values, make):
+    backend = make()
+    config = Config().replace(**{**values, 'runtime.n_threads': backend.n_threads})
+    points = np.tile(ring_scan(4096), (fewer(2, 1), 1))
+    tracemalloc.start()
+    try:
+        segmenter = GroundSegmenter(config, backend=backend)
+        for _ in range(2):
+            segmenter.segment(points)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+        backend.close()
+    assert 0.4 * size_of_tables(config) < peak < 1.05 * size_of_tables(config)
 
 
 def lose_interrupt(_arguments):
