@@ -12,7 +12,7 @@ from cli_runner import children, is_running, start
 from ros_helpers import PATIENCE
 
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud
-from gp_ground_seg.ros.probe import NodeProcess, Probe, probed_node, restamped
+from gp_ground_seg.ros.probe import NodeProcess, Probe, probe_session, restamped
 
 
 def wait_until(condition):
@@ -39,7 +39,8 @@ def test_a_kill_ends_the_node_and_removes_the_folder(tmp_path, monkeypatch, comm
 def test_a_node_that_an_earlier_run_left_does_not_answer(tmp_path):
     """One on the same ROS domain and the topics that a node has by default."""
     with (
-        probed_node(tmp_path / 'log', 'probe') as (node, session),
+        probe_session('probe') as (session, words),
+        NodeProcess(tmp_path / 'log', words) as node,
         NodeProcess(tmp_path / 'stranger') as stranger,
     ):
         probe = Probe(session, lambda *_: None)

@@ -31,8 +31,9 @@ from gp_ground_seg.ros.probe import (
     GROUND,
     INPUT,
     OBSTACLES,
+    NodeProcess,
     Probe,
-    probed_node,
+    probe_session,
     rate_result,
     restamped,
 )
@@ -236,9 +237,11 @@ def run(arguments: argparse.Namespace) -> int:
     folder = Path(arguments.output)
     options.note_leftovers(folder)
     with (
-        staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
         needing_ros('the demo'),
-        probed_node(part / LOG, 'demo', unfinished=part.parent) as (node, session),
+        probe_session('demo') as (session, words),
+        # Right before the process that removes the folder if this one is killed.
+        staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
+        NodeProcess(part / LOG, words, session.holding_back, part.parent) as node,
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)

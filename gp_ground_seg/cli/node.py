@@ -191,11 +191,13 @@ def _measure(
     n, n_memory = arguments.frames, arguments.memory_frames
     stamped = probing.restamped(different, 1_700_000_000)
     with (
-        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
         needing_ros('node-bench'),
-        probing.probed_node(Path(folder, 'log'), 'node_bench', words, Path(folder)) as probed,
+        probing.probe_session('node_bench') as (session, own),
+        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
+        probing.NodeProcess(
+            Path(folder, 'log'), [*own, *words], session.holding_back, Path(folder)
+        ) as node,
     ):
-        node, session = probed
         probe = probing.Probe(session, lambda *_: None)
         if not quiet:
             options.note('waiting for the node; it compiles when it runs the first time')

@@ -61,10 +61,10 @@ EXAMPLES = """\
 POSE_DESCRIPTION = """\
 Estimate from scans how high the sensor is and how it is tilted.
 
-INPUT is a .bin scan (float32 x, y, z, intensity; else --columns, --dtype), a folder of them, or a sequence
-with velodyne/ in it. Each scan is judged by itself. Support is the share of the
-low points on the plane that was found, residual their distance to it. With enough
-scans of level ground the medians are values to set: docs/pose.md.
+INPUT is a .bin scan (float32 x, y, z, intensity; else --columns, --dtype), a folder of
+them, or a sequence with velodyne/ in it. Each scan is judged by itself. Support is the
+share of the low points on the plane that was found, residual their distance to it.
+With enough scans of level ground the medians are values to set: docs/pose.md.
 """
 POSE_EXAMPLES = """\
   gp-ground-seg pose 000000.bin

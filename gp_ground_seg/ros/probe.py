@@ -147,12 +147,11 @@ def _run_node(unfinished: str, *words: str) -> int:
 
 
 @contextlib.contextmanager
-def probed_node(
-    log: Path, name: str, ros_args: Sequence[str] = (), unfinished: Path | None = None
-) -> Iterator[tuple[NodeProcess, Session]]:
-    """Yield a node on a network of its own, and a session named `name` to talk to it.
+def probe_session(name: str) -> Iterator[tuple[Session, list[str]]]:
+    """Yield a session named `name` to talk to a `NodeProcess`, and the ROS arguments of that.
 
-    Their topics have random names: another run may have taken the same ROS domain.
+    Both are on a network of their own. Their topics have random names: another run may have
+    taken the same ROS domain.
     """
     token = secrets.token_hex(8)
     topics = (INPUT, GROUND, OBSTACLES, _DIAGNOSTICS)
@@ -161,9 +160,8 @@ def probed_node(
         private_network(),
         large_cloud_transport(),
         ros_session(name, ['--ros-args', *own]) as session,
-        NodeProcess(log, [*own, *ros_args], session.holding_back, unfinished) as node,
     ):
-        yield node, session
+        yield session, own
 
 
 def memory(pid: int) -> tuple[int, int]:
