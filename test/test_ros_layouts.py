@@ -153,6 +153,8 @@ def test_a_cloud_that_cannot_hold_what_it_claims_is_refused_and_the_next_one_pro
     before = len(b.ground.messages)
     b.publisher.publish(message)
     # The cloud after it is processed, and is the only one.
-    for parts in b.segment(PointCloud2(height=1)):
-        assert parts.width == 0
+    good = PointCloud2(height=1)
+    good.header.frame_id = 'good'
+    for part in b.segment(good):
+        assert (part.width, part.header.frame_id) == (0, 'good')
     assert len(b.ground.messages) == len(b.obstacles.messages) == before + 1
