@@ -19,7 +19,7 @@ MAX_RANGE = find_spec('grid.r_max').maximum or 0.0  # what lies beyond is never 
 
 _Numbers = npt.NDArray[np.floating]
 _MIN_POINTS = 100  # fewer are not judged
-_N_JUDGED = 20_000  # points, and numbers, looked at in a larger file
+_N_JUDGED = 20_000  # numbers looked at in a larger file
 _LEAST, _LARGEST = 1e-6, 1e6  # of a coordinate that can be measured [m]
 _MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
 _COLUMNS = range(MIN_COLUMNS, 9)  # numbers of columns that are tried
@@ -100,17 +100,18 @@ def _objection(points: _Numbers) -> str:
     """Return what is wrong with x, y, z, or ''."""
     if not len(points):
         return ''
-    xyz = points[:, :3]
-    is_finite = np.isfinite(xyz).all(axis=1)
-    if not is_finite.any():
+    # Some drivers put rays without a return at the origin.
+    xyz = points[:: 1 + points.size // _N_JUDGED, :3].astype(np.float64)
+    if np.count_nonzero(np.isfinite(xyz) & (xyz != 0.0)) < 3 * _MIN_POINTS:
+        xyz = points[:, :3].astype(np.float64)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    if not len(xyz):
         return f'none of {len(points)} points is finite'
     if len(points) < _MIN_POINTS:
         return ''
-    # Some drivers put rays without a return at the origin.
-    xyz = xyz[is_finite & xyz.any(axis=1)]
-    if not len(xyz):
+    size = np.abs(xyz[(xyz != 0.0).any(axis=1)])
+    if not len(size):
         return 'all points are at the origin'
-    size = np.abs(xyz[:: 1 + len(xyz) // _N_JUDGED].astype(np.float64))
     share = float(np.mean((size < _LEAST) | (size > _LARGEST)))
     if share > _MAX_UNMEASURABLE:
         return f'{share:.0%} of the coordinates are below 1e-6 m or above 1e6 m'
