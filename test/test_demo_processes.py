@@ -60,6 +60,20 @@ def test_a_node_that_an_earlier_run_left_does_not_answer(tmp_path):
         assert probe.counters()[0] >= len(trips)
 
 
+def test_nothing_is_imported_from_the_current_folder(tmp_path, monkeypatch):
+    for name in ('numpy', 'yaml', 'rclpy', 'gp_ground_seg'):
+        (tmp_path / f'{name}.py').write_text(
+            f'open("ran", "w").close(); raise SystemExit({name!r})'
+        )
+    monkeypatch.chdir(tmp_path)
+    with (
+        probe_session('probe') as (_, words),
+        NodeProcess(tmp_path / 'log', words),
+    ):
+        wait_until(lambda: 'listening to' in (tmp_path / 'log').read_text())
+    assert not (tmp_path / 'ran').exists()
+
+
 def test_an_interrupt_counts_where_it_is_ignored_at_the_start(tmp_path):
     """As in the background of a script, of a shell without job control."""
     write_ros2_bag(tmp_path / 'drive.mcap')

@@ -11,6 +11,7 @@ import itertools
 import os
 import shutil
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -95,6 +96,12 @@ def needing_ros(command: str) -> Iterator[None]:
             f'{command} needs ROS 2, which cannot be imported ({error}): source the setup '
             "file of a ROS 2 installation, or pip install 'gp_ground_seg[ros]'"
         ) from error
+
+
+def own_code(code: str) -> str:
+    """Code for ``python -c`` that imports nothing from the current folder, which may be any."""
+    path = [entry for entry in sys.path if os.path.isabs(entry)]
+    return f'import sys\nsys.path[:] = {path!r}\n{code}'
 
 
 _PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'

@@ -31,6 +31,7 @@ from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.ros.lifecycle import (
     Session,
     large_cloud_transport,
+    own_code,
     ros_session,
     stop_on_signals,
 )
@@ -41,6 +42,10 @@ SILENCE = 2.0  # time without a cloud after which what is still missing is lost 
 STEADY_FACTOR, STEADY_MARGIN = 1.5, 0.02
 """How far latency may grow from the second quarter, which fills the queue, to the last [1, s]."""
 
+_RUN = """\
+from gp_ground_seg.ros.probe import run_node
+sys.exit(run_node(*sys.argv[1:]))
+"""
 _DIAGNOSTICS = '/diagnostics'
 _PROBE_FRAME = 'gp_ground_seg_probe'
 _PROBE_PERIOD = 0.2
@@ -84,7 +89,7 @@ class NodeProcess:
         self._log = log
         self._uninterrupted = uninterrupted
         words = [str(unfinished or ''), '--ros-args', *ros_args]
-        self._command = [sys.executable, '-m', 'gp_ground_seg.ros.probe', *words]
+        self._command = [sys.executable, '-c', own_code(_RUN), *words]
 
     def __enter__(self) -> NodeProcess:
         """Start it."""
@@ -129,7 +134,7 @@ class NodeProcess:
             raise GroundSegError(f'the node {ended}; its last words:\n{self.log_tail()}')
 
 
-def _run_node(unfinished: str, *words: str) -> int:
+def run_node(unfinished: str, *words: str) -> int:
     """Run the node of a `NodeProcess`: in that process."""
 
     def end_with_parent() -> None:
@@ -360,7 +365,3 @@ def memory_result(resident: Sequence[int], peak: int) -> dict[str, float]:
     end = float(np.median(resident[-share:]))
     growth = end / start - 1.0
     return {'n_clouds': n_clouds, 'start': start, 'end': end, 'peak': peak, 'growth': growth}
-
-
-if __name__ == '__main__':
-    sys.exit(_run_node(*sys.argv[1:]))

@@ -15,6 +15,7 @@ from typing import Any
 from gp_ground_seg.backend import Backend
 from gp_ground_seg.jit import code_folder, is_code_kept
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.ros.lifecycle import own_code
 from gp_ground_seg.segmenter import warm_up
 
 FOLLOWS = 'segmenting with numpy until the compiled code is there; to compile takes a minute'
@@ -23,8 +24,6 @@ STAYS = 'segmenting with numpy from now on'
 _LIBRARY = logging.getLogger('gp_ground_seg')
 
 _COMPILE = """\
-import sys
-sys.path[:] = {path!r}
 import os, threading
 # Standard input ends when the process that has started this one does.
 threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
@@ -101,13 +100,11 @@ class BackendLoader:
         environment = dict(os.environ)
         if cache := environment.get('NUMBA_CACHE_DIR'):
             environment['NUMBA_CACHE_DIR'] = os.path.abspath(cache)
-        # Nothing is imported from the current folder, which may be any.
-        path = [entry for entry in sys.path if os.path.isabs(entry)]
         with self._lock:
             if self._is_stopped:
                 return
             self._compiler = subprocess.Popen(
-                [sys.executable, '-c', _COMPILE.format(path=path)], cwd='/', env=environment,
+                [sys.executable, '-c', own_code(_COMPILE)], cwd='/', env=environment,
                 stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
             )  # fmt: skip
         with self._compiler:
