@@ -20,9 +20,10 @@ from gp_ground_seg.parameters.schema import NODE_NAME
 from gp_ground_seg.pipeline.points import single_precision
 from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
-from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, TfTilt, TimeJumps, require_tf2
+from gp_ground_seg.ros.input import THROTTLED, TfTilt, TimeJumps, require_tf2
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
+from gp_ground_seg.ros.subscription import CloudSubscription
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader, LibraryLog
 from gp_ground_seg.segmenter import GroundSegmenter
 
@@ -163,7 +164,9 @@ class GroundSegmentationNode(ConfiguredNode):
         clock = self.get_clock()
         source, now = self._input, 1e-9 * clock.now().nanoseconds
         is_simulated = clock.ros_time_is_active
-        facts = InputFacts(source.topic, source.qos_words, source.n_publishers, now, is_simulated)
+        facts = InputFacts(
+            source.topic, source.qos_words, source.n_publishers, now, is_simulated, source.fault
+        )
         return facts, self._outputs.n_subscribers()
 
 
