@@ -27,6 +27,7 @@ OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 JUMP_TOLERANCE = 0.5  # stamps of several sensors on one topic may be that much out of order [s]
+TF_JUMP = 1.0  # jump back up to which the transforms are those of the same time [s]
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)  # the clock of a node may stand or jump
 THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
 """Options of messages that may come with every cloud."""
@@ -88,9 +89,9 @@ class StampWatch:
 
 
 class TimeJumps:
-    """Calls `on_jump` when the stamps of clouds, or the clock of `node`, jump back."""
+    """Calls `on_jump`, with the seconds, when stamps of clouds or the clock of `node` jump back."""
 
-    def __init__(self, node: Node, on_jump: Callable[[], None]) -> None:
+    def __init__(self, node: Node, on_jump: Callable[[float], None]) -> None:
         self._node = node
         self._on_jump = on_jump
         self._stamps = StampWatch()
@@ -113,7 +114,7 @@ class TimeJumps:
         self._jumped(-1e-9 * jump.delta.nanoseconds)
 
     def _jumped(self, seconds: float) -> None:
-        self._on_jump()
+        self._on_jump(seconds)
         self._node.get_logger().info(
             f'time jumped back by {seconds:.1f} s: what earlier clouds taught is forgotten',
             **THROTTLED,
@@ -150,8 +151,9 @@ class TfTilt:
     def __init__(self, node: Node) -> None:
         self._tf2_ros = require_tf2()
         # Without the node: given one, the buffer clears itself at jumps of the node's clock,
-        # and in some releases raises an error there that ends the executor. See `reset`.
+        # and in some releases raises an error there that ends the executor. See `time_jumped`.
         self._buffer = self._tf2_ros.Buffer()
+        self._known: dict[tuple[str, str], tuple[float, float]] = {}  # newest tilt found
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
     def tilt(self, header: Header, base: str) -> tuple[float, float]:
@@ -164,13 +166,18 @@ class TfTilt:
                 # The newest: a sensor is fixed to its vehicle, and waiting would delay the cloud.
                 found = self._buffer.lookup_transform(base, frame, Time())
         except self._tf2_ros.TransformException as error:
+            # After a jump in time /tf may be silent for a while.
+            if (base, frame) in self._known:
+                return self._known[base, frame]
             way = f'from its frame {frame!r} to frame.base = {base!r}'
             raise PointCloudError(f'no transform {way}: {error}') from error
-        return tilt_of(found.transform.rotation)
+        self._known[base, frame] = tilt_of(found.transform.rotation)
+        return self._known[base, frame]
 
-    def reset(self) -> None:
-        """Forget all transforms, as after a jump in time."""
-        self._buffer.clear()
+    def time_jumped(self, seconds: float) -> None:
+        """Forget what moved if time jumped far back; the newest tilt serves until TF sends anew."""
+        if seconds > TF_JUMP:
+            self._buffer.clear()
 
     def close(self) -> None:
         """Stop listening."""

@@ -145,10 +145,10 @@ class GroundSegmentationNode(ConfiguredNode):
             health.model.segmented(segmentation)
             health.output.published(end, topics)
 
-    def _on_time_jump(self) -> None:
+    def _on_time_jump(self, seconds: float) -> None:
         self._segmenter.reset()
         if self._tf is not None:
-            self._tf.reset()
+            self._tf.time_jumped(seconds)
         self._diagnostics.input.time_jumped()
 
     def _refuse(self, cloud: PointCloud2, reason: str) -> None:

@@ -96,6 +96,7 @@ class CloudSubscription:
         # The executor still uses a subscription within its own event; a guard condition runs
         # after all that became ready with it.
         self._review_soon = node.create_guard_condition(self._review)
+        self._take_soon = node.create_guard_condition(self._take_waiting)
         overrides = QoSOverridingOptions.with_default_policies()
         self._subscription = self._create(self._receive, cloud_profile(INPUT_DEPTH), overrides)
         self._best_effort: Subscription | None = None
@@ -162,7 +163,8 @@ class CloudSubscription:
 
     def _receive_best_effort(self, message: PointCloud2, info: dict[str, Any]) -> None:
         self._waiting.append((time.monotonic(), message, info))
-        self._take_waiting()
+        # After all that is ready by then: a copy of the reliable subscription comes first.
+        self._take_soon.trigger()
 
     def _take_waiting(self) -> None:
         """Take the best-effort clouds that overtake no reliable one."""
