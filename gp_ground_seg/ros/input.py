@@ -89,7 +89,7 @@ class StampWatch:
 
 
 class TimeJumps:
-    """Calls `on_jump`, with the seconds, when stamps of clouds or the clock of `node` jump back."""
+    """Calls `on_jump` with how far [s] stamps of clouds, or the clock of `node`, jump back."""
 
     def __init__(self, node: Node, on_jump: Callable[[float], None]) -> None:
         self._node = node
@@ -175,7 +175,7 @@ class TfTilt:
         return self._known[base, frame]
 
     def time_jumped(self, seconds: float) -> None:
-        """Forget what moved if time jumped far back; the newest tilt serves until TF sends anew."""
+        """Forget what moved after a long jump back; the newest tilt serves until TF sends anew."""
         if seconds > TF_JUMP:
             self._buffer.clear()
 

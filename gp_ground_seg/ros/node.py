@@ -126,6 +126,7 @@ class GroundSegmentationNode(ConfiguredNode):
         health.input.arrived(start, stamp, cloud.header.frame_id, fields)
         health.processing.arrived(start, n_lost)
         try:
+            self._check_size(cloud)
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
             base = self.config.frame.base
@@ -144,6 +145,13 @@ class GroundSegmentationNode(ConfiguredNode):
             health.processing.processed(end - start, stages, segmentation.fit)
             health.model.segmented(segmentation)
             health.output.published(end, topics)
+
+    def _check_size(self, cloud: PointCloud2) -> None:
+        size, limit = len(cloud.data) / 1e6, self.config.input.max_cloud_size
+        if size > limit:
+            raise PointCloudError(
+                f'cloud of {size:.1f} MB: must be at most input.max_cloud_size = {limit:g} MB'
+            )
 
     def _on_time_jump(self, seconds: float) -> None:
         self._segmenter.reset()
