@@ -121,6 +121,24 @@ def test_large_clouds_that_come_best_effort_are_a_warning(tmp_path):
         assert '[WARN]' in line and f'{NAMESPACE}/points' in line
 
 
+def test_a_cloud_above_the_limit_is_refused_and_the_next_answered(tmp_path):
+    words = ros.given({**CHANGES, 'input.max_cloud_size': 1})
+    small = to_message(street(500))
+    with ros.linked_process(tmp_path, *words) as (node, link):
+        link.segment(small)
+        link.publisher.publish(LARGE)
+        status = link.wait_for_status('input', lambda v, _: v['Refused since startup'] == '1')
+        assert status.level == DiagnosticStatus.ERROR
+        said = 'cloud of 1.9 MB: must be at most input.max_cloud_size = 1 MB'
+        assert ros.values_of(status)['Last error'] == said
+        assert said in node.log
+        link.segment(small)
+        assert len(link.ground.messages) == 2
+        assert link.set('input.max_cloud_size', 2).successful
+        parts = link.segment(LARGE)
+        assert sum(part.width for part in parts) == LARGE.width
+
+
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 5)), max_size=50), st.booleans())
 def test_gaps_of_two_publishers_add_up(steps, are_near):
     gaps, last = SequenceGaps(), [1000, 1000 if are_near else 1]

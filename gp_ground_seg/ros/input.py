@@ -27,7 +27,7 @@ OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 JUMP_TOLERANCE = 0.5  # stamps of several sensors on one topic may be that much out of order [s]
-TF_JUMP = 1.0  # jump back up to which the transforms are those of the same time [s]
+TF_JUMP = 1.0  # jump back up to which transforms are kept: a late stamp, no other run [s]
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)  # the clock of a node may stand or jump
 THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
 """Options of messages that may come with every cloud."""
