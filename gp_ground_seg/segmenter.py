@@ -144,11 +144,6 @@ class GroundSegmenter:
         """Backend of the next scan."""
         return self._backend
 
-    @property
-    def backend_name(self) -> str:
-        """Name of the backend: ``numba`` or ``numpy``."""
-        return self._backend.name
-
     def configure(self, config: Config) -> None:
         """Use `config` from the next scan on; what was learned under another is forgotten."""
         with self._exclusive():

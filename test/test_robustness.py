@@ -1,15 +1,24 @@
 """Inputs and uses that once gave a wrong result, a crash or a hang."""
 
 import argparse
+import os
 import signal
 import subprocess
 import sys
+import tracemalloc
 
 import numpy as np
 import pytest
+from bag_samples import write_ros2_bag
+from conftest import fewer
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.cli import main as cli
+from gp_ground_seg.compiled.backend import NumbaBackend
+from gp_ground_seg.data.atomic_output import staged_bag_folder
+from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.parameters.config import size_of_tables
 
 
 def ring_scan(n=4000, seed=0, height=1.73):
@@ -80,6 +89,30 @@ def test_an_array_that_changes_meanwhile_does_not_crash():
     subprocess.run([sys.executable, '-c', CHANGING], check=True, timeout=180)
 
 
+@pytest.mark.parametrize(
+    'values',
+    [
+        {'grid.r_max': 400, 'faces.cell_size': 0.16},
+        {'grid.n_segments': 2048, 'grid.n_bins': 1024, 'grid.bin_growth': 1},
+    ],
+)
+@pytest.mark.parametrize('make', [NumpyBackend, lambda: NumbaBackend(1), lambda: NumbaBackend(2)])
+def test_memory_is_what_was_computed(values, make):
+    backend = make()
+    config = Config().replace(**{**values, 'runtime.n_threads': backend.n_threads})
+    points = np.tile(ring_scan(4096), (fewer(2, 1), 1))
+    tracemalloc.start()
+    try:
+        segmenter = GroundSegmenter(config, backend=backend)
+        for _ in range(2):
+            segmenter.segment(points)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+        backend.close()
+    assert 0.4 * size_of_tables(config) < peak < 1.05 * size_of_tables(config)
+
+
 def lose_interrupt(_arguments):
     try:
         signal.raise_signal(signal.SIGINT)
@@ -122,3 +155,28 @@ def test_config_check_says_who_reads_a_file(text, words, is_taken, tmp_path, cap
     else:
         with pytest.raises(ConfigError, match='parameters of node /other; must be of'):
             Config.from_yaml(path)
+
+
+@pytest.mark.parametrize('interrupted', [0, 1])
+@pytest.mark.parametrize('when', ['before', 'after'])
+def test_an_interrupted_replacement_leaves_a_whole_bag(interrupted, when, tmp_path, monkeypatch):
+    old = write_ros2_bag(tmp_path / 'drive', n_clouds=1)
+    rename, calls = os.rename, []
+
+    def interrupt(source, target):
+        calls.extend({source, target} & {tmp_path / 'drive'})  # not those of the writer
+        if len(calls) - 1 != interrupted:
+            return rename(source, target)
+        if when == 'after':
+            rename(source, target)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, 'rename', interrupt)
+    with (
+        pytest.raises(KeyboardInterrupt),
+        staged_bag_folder(tmp_path / 'drive', force=True) as part,
+    ):
+        new = write_ros2_bag(part, n_clouds=2)
+    with BagReader(tmp_path / 'drive') as bag:
+        assert list(bag.messages()) == (new if (interrupted, when) == (1, 'after') else old)
+    assert [path.name for path in tmp_path.iterdir()] == ['drive']

@@ -112,7 +112,7 @@ def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, capfd):
     with ros.bench(settled=False) as b:
         assert 'OSError: no space left' in ros.said_by(capfd, STAYS)
         b.segment(to_message(street(1000)))
-        assert b.node._segmenter.backend_name == 'numpy'
+        assert b.node._segmenter.backend.name == 'numpy'
 
 
 def test_loader_that_is_closed_calls_nobody_and_frees_its_backend(held_back):

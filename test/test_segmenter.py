@@ -197,7 +197,7 @@ def test_times_come_from_the_clock_given_and_the_fit_report_counts(scan):
     stages = ['grid', 'pose', 'faces', 'lines', 'learning', 'surface', 'label']
     assert result.timings == dict.fromkeys(stages, 1.0)
     assert total == len(stages)
-    assert (fit.mode, fit.backend) == ('every_frame', SEGMENTER.backend_name)
+    assert (fit.mode, fit.backend) == ('every_frame', SEGMENTER.backend.name)
     assert 1 <= fit.n_evaluations <= CONFIG.learning.max_evaluations
     assert fit.theta['sigma_n'] > 0 and np.isfinite(fit.objective)
     assert fit.status in ('converged', 'budget')
@@ -239,7 +239,7 @@ def test_threads_and_history_do_not_change_a_bit(scan, mode):
 def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
     with pytest.raises(ConfigError, match=r'surface\.n_neighbours = 2'):
         CONFIG.replace(**{'grid.n_segments': 4})
-    segmenter, own = GroundSegmenter(CONFIG), SEGMENTER.backend_name
+    segmenter, own = GroundSegmenter(CONFIG), SEGMENTER.backend.name
     segmenter.configure(CONFIG.replace(**{'grid.n_segments': 90, 'runtime.n_threads': 1}))
     after = segmenter.segment(scan)
     assert len(after.surface.mean) == segmenter.config.grid.n_segments == 90
@@ -255,7 +255,7 @@ def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
         segmenter.configure(CONFIG.replace(**changes))
         result = segmenter.segment(scan)
         name = 'numpy' if changes.get('runtime.backend') == 'numpy' else own
-        assert result.fit.backend == segmenter.backend_name == name
+        assert result.fit.backend == segmenter.backend.name == name
         np.testing.assert_array_equal(result.label, expected.label)
     same(result, expected)
 
@@ -266,9 +266,9 @@ def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
     # A backend that was handed over stays until the parameters of the runtime change.
     segmenter.use_backend(Closing())
     segmenter.configure(CONFIG.replace(**{'label.ground_tolerance': 0.2}))
-    assert (segmenter.backend_name, is_closed) == ('numpy', [])
+    assert (segmenter.backend.name, is_closed) == ('numpy', [])
     segmenter.configure(CONFIG.replace(**{'runtime.n_threads': 1}))
-    assert (segmenter.backend_name, is_closed) == (own, [True])
+    assert (segmenter.backend.name, is_closed) == (own, [True])
 
 
 def test_callers_take_turns_while_the_segmenter_is_closed_and_configured():

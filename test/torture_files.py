@@ -7,13 +7,13 @@ A command answers a damaged file with a result, or with one line, exit code 2 an
 import contextlib
 import io
 import shutil
-import sys
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 from bag_samples import scan, write_ros1_bag, write_ros2_bag
+from torture_cases import run_cases
 
 from gp_ground_seg.cli import main as cli
 
@@ -134,20 +134,7 @@ def run_case(number, samples, folder):
                 leftover.unlink()
 
 
-def main():
-    """Run the cases of the command line."""
-    n_failed = 0
-    with tempfile.TemporaryDirectory() as folder:
-        samples = make_samples(Path(folder))
-        for number in range(*map(int, sys.argv[1:3])):
-            print(f'\r{number}', end='', flush=True)
-            wrong = run_case(number, samples, Path(folder))
-            if wrong:
-                n_failed += 1
-                print(f'\rcase {number}: {wrong}', flush=True)
-    print()
-    sys.exit(1 if n_failed else 0)
-
-
 if __name__ == '__main__':
-    main()
+    with tempfile.TemporaryDirectory() as name:
+        files = make_samples(Path(name))
+        run_cases(lambda number: run_case(number, files, Path(name)))

@@ -1,16 +1,19 @@
 """Use from several threads and processes, under limits and signals.
 
 Each scenario is a program of its own, run again and again with another seed: it must end in time
-with the status expected, and print nothing on stderr but what is expected.
-`python test/torture_processes.py FIRST STOP` runs the seeds of a range.
+with the status expected, and print nothing on stderr but what is expected:
+`python test/torture_processes.py FIRST STOP`.
 """
 
 import os
 import re
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import NamedTuple
+
+from torture_cases import run_cases
 
 PRELUDE = """
 import asyncio, os, random, resource, signal, sys, threading, time, warnings
@@ -148,11 +151,11 @@ if __name__ == '__main__':
 }
 
 
-def run_scenario(name, seed, folder):
-    """Return what is wrong with one run, or None."""
-    scenario = SCENARIOS[name]
-    program = folder / f'scenario_{seed}.py'
-    program.write_text(f'seed = {seed}\n{PRELUDE}\n{scenario.code}')
+def run_case(number, folder):
+    """Return what is wrong with a run of one scenario, or None; the number is its seed as well."""
+    name = list(SCENARIOS)[number % len(SCENARIOS)]
+    scenario, program = SCENARIOS[name], folder / f'scenario_{number}.py'
+    program.write_text(f'seed = {number}\n{PRELUDE}\n{scenario.code}')
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join([p for p in sys.path if p])}
     try:
         done = subprocess.run(
@@ -164,30 +167,16 @@ def run_scenario(name, seed, folder):
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return 'did not end within 180 s'
+        return f'{name}: did not end within 180 s'
     finally:
         program.unlink()
     if done.returncode not in scenario.statuses:
-        return f'status {done.returncode}: {done.stderr.strip()[-300:]}'
+        return f'{name}: status {done.returncode}: {done.stderr.strip()[-300:]}'
     if not re.fullmatch(scenario.stderr, done.stderr, re.DOTALL):
-        return f'stderr: {done.stderr.strip()[-300:]}'
+        return f'{name}: stderr: {done.stderr.strip()[-300:]}'
     return None
 
 
-def main():
-    """Run the seeds of the command line."""
-    import tempfile
-
-    n_failed = 0
-    with tempfile.TemporaryDirectory() as folder:
-        for seed in range(*map(int, sys.argv[1:3])):
-            for name in SCENARIOS:
-                wrong = run_scenario(name, seed, Path(folder))
-                if wrong:
-                    n_failed += 1
-                    print(f'{name}, seed {seed}: {wrong}', flush=True)
-    sys.exit(1 if n_failed else 0)
-
-
 if __name__ == '__main__':
-    main()
+    with tempfile.TemporaryDirectory() as folder_name:
+        run_cases(lambda number: run_case(number, Path(folder_name)))

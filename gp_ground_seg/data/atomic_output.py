@@ -47,13 +47,12 @@ def staged_bag_folder(target: str | Path, *, force: bool) -> AbstractContextMana
     def place(product: Path, path: Path) -> None:
         # A folder cannot be replaced in one step: the old one is renamed, and back if need be.
         aside = product.with_name('replaced')
-        existed = path.exists()
-        if existed:
-            os.rename(path, aside)
         try:
+            if path.exists():
+                os.rename(path, aside)
             os.rename(product, path)
-        except OSError:
-            if existed:
+        except BaseException:  # also that of Ctrl-C
+            if aside.exists() and not path.exists():
                 os.rename(aside, path)
             raise
 

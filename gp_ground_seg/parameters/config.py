@@ -292,8 +292,8 @@ NARROWEST_BIN = 1e-4
 DEFAULT_MAX_THREADS = 4
 """Most threads where their number is not given: each has tables to fill and a wake-up, which
 costs more than a small part of the work saves."""
-BYTES_PER_TILE, BYTES_PER_CELL, MAX_TABLES = 20, 48, 2e9
-"""Size of the tables of each thread, of double precision, and the most that all may take."""
+MAX_TABLES = 2e9
+"""Most memory that the tables of tiles and cells may take [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -343,16 +343,22 @@ def _check_bins(grid: GridConfig) -> None:
         )
 
 
+def size_of_tables(config: Config) -> int:
+    """Memory that tables of tiles and cells take, of points of double precision [bytes]."""
+    n_threads = config.runtime.n_threads or DEFAULT_MAX_THREADS
+    n_tiles = math.ceil(2.0 * config.grid.r_max / config.faces.cell_size) ** 2
+    n_cells = config.grid.n_segments * config.grid.n_bins
+    # Once, and for each thread; held against both backends by test_robustness.py.
+    return (16 + 20 * n_threads) * n_tiles + (160 + 48 * n_threads) * n_cells
+
+
 def _check_memory(config: Config) -> None:
-    grid, n_threads = config.grid, config.runtime.n_threads or DEFAULT_MAX_THREADS
-    n_tiles = math.ceil(2.0 * grid.r_max / config.faces.cell_size) ** 2
-    n_cells = grid.n_segments * grid.n_bins
-    size = n_threads * (BYTES_PER_TILE * n_tiles + BYTES_PER_CELL * n_cells)
+    size = size_of_tables(config)
     if size > MAX_TABLES:
         raise ConfigError(
-            f'grid.r_max = {grid.r_max:g}, faces.cell_size = {config.faces.cell_size:g}, '
-            f'runtime.n_threads = {n_threads}: tables of {n_tiles} tiles and {n_cells} cells '
-            f'for each thread would take {size / 1e9:.1f} GB; must be at most '
+            f'grid.r_max = {config.grid.r_max:g}, faces.cell_size = {config.faces.cell_size:g}, '
+            f'runtime.n_threads = {config.runtime.n_threads or DEFAULT_MAX_THREADS}: tables of '
+            f'tiles and cells would take {size / 1e9:.1f} GB; must be at most '
             f'{MAX_TABLES / 1e9:g} GB'
         )
 
