@@ -151,3 +151,12 @@ def test_gaps_of_two_publishers_add_up(steps, are_near):
         counted += gaps.note(last[which], 2)
         lost += n_lost
     assert counted == lost
+
+
+def test_a_message_that_comes_late_was_not_lost():
+    gaps = SequenceGaps()
+    for number in (10, 5000):
+        assert gaps.note(number, 2) == 0
+    # 5001 to 5003 are missing, and two of them come late.
+    counts = [gaps.note(number, 2) for number in (5004, 11, 5002, 12, 5001, 5005, 14)]
+    assert counts == [3, 0, -1, 0, -1, 0, 1]

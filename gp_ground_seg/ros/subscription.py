@@ -20,7 +20,8 @@ from gp_ground_seg.ros.input import STEADY_CLOCK, cloud_profile, in_words
 
 INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
 LARGE_CLOUD = 500_000  # size up to which stock Fast DDS loses no best-effort cloud [bytes]
-OVERTAKING_TIME = 0.5  # longest wait of a best-effort cloud for reliable ones [s]
+OVERTAKING_TIME = 1.0  # longest wait of a best-effort cloud for reliable ones [s]
+NEAR = 1000  # holes in the numbers of several publishers up to which they are taken for losses
 MAX_IN_FLIGHT = 1000  # clouds that are remembered to know a second copy
 
 
@@ -35,6 +36,7 @@ class SequenceGaps:
 
     def __init__(self) -> None:
         self._last: list[int] = []
+        self._n_lost = 0
 
     @property
     def n_heard(self) -> int:
@@ -44,22 +46,29 @@ class SequenceGaps:
     def reset(self) -> None:
         """Forget the last numbers: other publishers have their own."""
         self._last.clear()
+        self._n_lost = 0
 
     def note(self, number: int | None, n_publishers: int = 1) -> int:
-        """Return how many messages are missing before the one with this `number`."""
+        """Return how many messages are missing before the one with this `number`.
+
+        -1 if it comes late, and was counted as missing.
+        """
         if number is None:
             self.reset()
             return 0
-        last = max((last for last in self._last if last < number), default=None)
-        are_all_heard = self.n_heard >= max(1, n_publishers)
-        if last is None and are_all_heard:
-            last, n_lost = min(self._last), 0  # one of them counts anew
-        elif last is None or (last < number - 1 and not are_all_heard):
+        below = max((last for last in self._last if last < number), default=None)
+        if self.n_heard < max(1, n_publishers) and below != number - 1:
             self._last.append(number)
             return 0
-        else:
-            n_lost = number - last - 1
+        is_next = below is not None and (self.n_heard == 1 or number - below < NEAR)
+        if not is_next and self._n_lost and any(0 <= last - number < NEAR for last in self._last):
+            self._n_lost -= 1
+            return -1
+        # Where none is near, one of them counts anew.
+        last = below if below is not None else min(self._last)
         self._last[self._last.index(last)] = number
+        n_lost = number - last - 1 if is_next else 0
+        self._n_lost += n_lost
         return n_lost
 
 
@@ -71,7 +80,8 @@ class CloudSubscription:
     too, and has their clouds at times before a lost one is sent again: beside a reliable publisher
     its clouds wait for a newer one of the reliable subscription, `OVERTAKING_TIME` at most.
     Reliability given in ``qos_overrides``, by `is_given`, is kept for any publisher. `callback`
-    takes each cloud once, its wait in this process [s] and the clouds lost before it.
+    takes each cloud once, its wait in this process [s] and the clouds lost before it, -1 for one
+    that was counted as lost.
     """
 
     def __init__(
@@ -183,6 +193,8 @@ class CloudSubscription:
         header = message.header
         key = (sent, number, header.stamp.sec, header.stamp.nanosec, header.frame_id)
         if self._best_effort and key in self._had:
+            if source is self._subscription:
+                self._large_size = 0  # it only was faster
             return
         self._had.append(key)
         if not self._offered:
@@ -203,9 +215,8 @@ class CloudSubscription:
 
     def _check_size(self, size: int) -> None:
         if size > LARGE_CLOUD:
-            is_new, self._large_size = not self._large_size, size
-            if is_new:
-                self._node.get_logger().warning(f'on {self.topic}, {self.fault}')
+            self._large_size = size
+            self._node.get_logger().warning(f'on {self.topic}, {self.fault}', once=True)
 
     def _on_incompatible(self, _event: object) -> None:
         if self._is_pinned:
