@@ -258,11 +258,11 @@ class Link:
 
     node_name = f'{NAMESPACE}/{NODE_NAME}'
 
-    def __init__(self, context, sends=RELIABLE):
+    def __init__(self, context, sends=RELIABLE, takes=RELIABLE):
         self.probe = Node('probe', context=context, namespace=NAMESPACE)
         self.publisher = sends and self.probe.create_publisher(PointCloud2, 'points', sends)
-        self.ground = Collector(self.probe, PointCloud2, 'ground')
-        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles')
+        self.ground = Collector(self.probe, PointCloud2, 'ground', takes)
+        self.obstacles = Collector(self.probe, PointCloud2, 'obstacles', takes)
         self.diagnostics = Collector(self.probe, DiagnosticArray, '/diagnostics')
         self._clients = {}
 
@@ -352,10 +352,10 @@ def bench(*words, settled=True):
 
 
 @contextlib.contextmanager
-def linked(sends=RELIABLE):
+def linked(sends=RELIABLE, takes=RELIABLE):
     """A connected `Link` to a node of another process."""
     with isolated_context() as context:
-        link = Link(context, sends)
+        link = Link(context, sends, takes)
         with spinning(context, link.probe):
             link.wait_until_connected()
             yield link

@@ -6,6 +6,7 @@ The ament linters come with ROS only. What they run, flake8 and pydocstyle, is i
 
 import importlib
 import importlib.util
+import re
 import subprocess
 import sys
 
@@ -37,6 +38,17 @@ def test_flake8_with_the_settings_of_ament():
     need(*FLAKE8)
     done = run('-m', 'flake8', f'--config={CONFIG}', *SOURCES)
     assert (done.returncode, done.stdout, done.stderr) == (0, '', '')
+
+
+def test_flake8_would_find_something(tmp_path):
+    need(*FLAKE8)
+    bad = tmp_path / 'bad.py'
+    bad.write_text(
+        'import os\nx = "a" ; y = list([i for i in x])\ndef list(): """no"""\n' + 'z' * 120
+    )
+    done = run('-m', 'flake8', f'--config={CONFIG}', str(bad))
+    codes = set(re.findall(r'[A-Z]\d{3}', done.stdout))
+    assert {'F401', 'Q000', 'E501', 'C411', 'A001', 'D400'} <= codes
 
 
 def test_pydocstyle_with_the_settings_of_ament():

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from gp_ground_seg.data.atomic_output import leftovers
+from gp_ground_seg.data.atomic_output import leftovers, staged_files
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, jazzy_topic
 from gp_ground_seg.data.point_cloud2 import encode_cloud
@@ -292,6 +292,21 @@ def test_a_full_disk_is_reported(tmp_path, monkeypatch, error):
     with pytest.raises(DataError, match=r'a\.mcap: cannot be written: (No space|disk full)'):
         samples.write_note(tmp_path / 'a.mcap', 1, 'text')
     assert listing(tmp_path) == []
+
+
+def test_files_into_an_existing_folder_leave_the_others(tmp_path):
+    (tmp_path / 'mine').write_text('kept')
+    with staged_files(tmp_path, ['a', 'b'], force=False) as folder:
+        (folder / 'a').write_text('1')
+        assert [path.name for path in tmp_path.iterdir()] == ['mine']
+        (folder / 'b').write_text('2')
+    assert listing(tmp_path) == ['a', 'b', 'mine']
+    refused = pytest.raises(DataError, match=r'/b: exists already \(1 of 2 files to write do\)')
+    with refused, staged_files(tmp_path, ['b', 'c'], force=False):
+        pass
+    with staged_files(tmp_path, ['b'], force=True) as folder:
+        (folder / 'b').write_text('3')
+    assert [(tmp_path / name).read_text() for name in ('b', 'mine')] == ['3', 'kept']
 
 
 def test_force_never_replaces_what_is_no_bag(tmp_path):

@@ -13,6 +13,7 @@ from cli_runner import error_line, run
 from config_samples import configs
 from conftest import REPOSITORY
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
 from gp_ground_seg.parameters import export
@@ -38,6 +39,15 @@ def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
         group, name = spec.name.split('.')
         value = document['/**']['ros__parameters'][group][name]
         assert type(value) is spec.type or (spec.auto and value == 'auto')
+
+
+@settings(max_examples=40)
+@given(configs(), st.booleans(), st.booleans())
+def test_any_yaml_writer_will_do(tmp_path_factory, config, flow, ros):
+    path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
+    tree = {'/**': {'ros__parameters': config.nested()}} if ros else config.nested()
+    path.write_text(yaml.safe_dump(tree, default_flow_style=flow))
+    assert Config.from_yaml(path) == config
 
 
 def test_every_parameter_is_explained_above_it():

@@ -4,6 +4,7 @@ import itertools
 import json
 import logging
 import math
+import sys
 
 import numpy as np
 import pypatchworkpp
@@ -13,7 +14,7 @@ from evaluation_samples import HeightRule, street, write_frame, write_streets
 from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation import metrics
 from gp_ground_seg.evaluation.evaluate import OurMethod, PatchworkppMethod, labelled_frames
@@ -34,6 +35,21 @@ def test_times():
     assert (score.seconds(), score.seconds(max)) == (0.020, 0.090)
     assert score.median_stages == {'grid': 0.006, 'label': 0.002}
     assert math.isnan(runner.MethodScore('x', ()).seconds())
+
+
+def test_pooling_sums_counts_and_does_not_average_ratios():
+    large, small = Confusion(tp=90, fp=10), Confusion(fn=1)
+    score = runner.MethodScore('x', tuple(
+        runner.ScanScore(name, '0', 0.0, {}, {'groundgrid': one}, classes={40: ClassCount(4, 3)})
+        for name, one in (('08', large), ('00', small))
+    ))  # fmt: skip
+    assert score.iou == score.pooled('groundgrid').iou == 90 / 101
+    assert score.of('00').confusion == small
+    assert score.classes == {40: ClassCount(8, 6)}
+    assert [name for name, _ in score.by_sequence()] == [*score.sequences, 'all']
+    assert score.sequences == ['08', '00']
+    parts = [score.of('00'), score.of('08')]
+    assert runner.pool('y', parts).confusion == score.confusion
 
 
 def test_labelled_frames_of_all_and_of_some(tmp_path):
@@ -158,6 +174,12 @@ def test_ours_is_the_library(tmp_path):
         assert 0.0 < sum(scored.stages.values()) <= scored.seconds
         assert scored.pose.height == result.pose.height
     assert score.scans[0].fit.n_threads == 1
+
+
+def test_a_missing_peer_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pypatchworkpp', None)
+    with pytest.raises(MissingDependencyError, match='pip install pypatchworkpp'):
+        PatchworkppMethod()
 
 
 def run_peer(scene, sensor='vlp-16', **options):

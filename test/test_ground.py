@@ -167,3 +167,23 @@ def test_a_line_is_followed_from_inliers_on(backend):
     inlier, knots, mean, _ = grow_line(backend, z, continues=range(5, 14))
     assert inlier == list(range(14))
     assert mean[np.searchsorted(knots, 14.0)] > 1.0
+
+
+def test_a_segment_without_a_model_gets_its_neighbours(backend):
+    config = config_of(n_neighbours=1)
+    xyz = hilly_scan(fewer(4000, 1000))
+    frame = frame_of(xyz[xyz[:, 1] > 0.0], config)
+    theta = given_theta(frame, config)
+    fused, alone = (
+        backend.estimate_surface(frame, theta, config.replace(**{'surface.n_neighbours': n}))[0]
+        for n in (1, 0)
+    )
+    has_model, had_model = (np.isfinite(s.mean[:, 5]) for s in (fused, alone))
+    beside = np.roll(had_model, 1) | np.roll(had_model, -1)
+    np.testing.assert_array_equal(has_model, had_model | beside)
+    (m, *_) = np.flatnonzero(has_model & ~had_model)
+    source = m - 1 if had_model[m - 1] else (m + 1) % len(had_model)
+    assert fused.mean[m, 5] == pytest.approx(alone.mean[source, 5])
+    arc = frame.knots[5] * 2.0 * np.pi / len(had_model)
+    slope_std = config.observation.slope_std
+    assert fused.std[m, 5] == pytest.approx(np.hypot(alone.std[source, 5], slope_std * arc))

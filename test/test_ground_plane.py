@@ -78,6 +78,20 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
         assert a.n_support <= a.n_cells <= N_SECTORS * ground_plane.N_RINGS
 
 
+@settings(max_examples=fewer(20, 3))
+@given(st.integers(0, 2**32 - 1), st.floats(0.3, 4.0), st.floats(-0.1, 0.1))
+def test_a_cluttered_plane_is_found(seed, height, slope):
+    points = cluttered_plane(seed, height, 0.0, slope)
+    candidates = BACKENDS[0].build_grid(points, Config()).candidates
+    assert_lowest(candidates)
+    plane, same = (backend.fit_plane(candidates, 0.5) for backend in BACKENDS)
+    np.testing.assert_allclose(plane, same, atol=1e-9)
+    assert plane.height == pytest.approx(height, abs=0.04)
+    np.testing.assert_allclose(plane.up, rotation(0.0, slope)[2], atol=0.01)
+    assert plane.residual < 0.1
+    assert 0.5 < plane.support <= 1.0
+
+
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)
 def test_no_plane(backend):
     few = random_candidates(0, 1, 40, 1.0)

@@ -85,6 +85,17 @@ def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():
     assert found[4] == 0.0
 
 
+@pytest.mark.parametrize(('rough', 'expected'), [(0.0, 'OOO'), (0.08, 'GOO'), (0.4, 'GGO')])
+def test_the_band_follows_the_roughness_up_to_the_height_of_an_obstacle(backend, rough, expected):
+    # Beside the points, as many below the surface as make that roughness.
+    ranges = np.concatenate([[3.0, 5.0, 7.0], np.tile([3.0, 5.0, 7.0], 3000)])
+    heights = np.concatenate([[0.3, 0.45, 0.51], np.full(9000, -rough)])
+    gain = CONFIG.label.roughness_gain
+    found, _ = label(backend, ranges, heights, roughness_gain=gain)
+    assert [Label(value).name[0] for value in found.label[:3]] == list(expected)
+    assert list(label(backend, ranges, heights)[0].label[:3]) == [O, O, O]
+
+
 @settings(max_examples=fewer(60, 10))
 @given(st.integers(0, 10_000), st.sampled_from([np.float32, np.float64]))
 def test_labels_are_the_reference(backend, seed, dtype):

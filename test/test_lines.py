@@ -12,8 +12,9 @@ from scipy.optimize import minimize
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.frame import Candidates, Faces
+from gp_ground_seg.parameters.config import LatentConfig
 from gp_ground_seg.parameters.presets import find_preset
-from gp_ground_seg.pipeline.lines import deming_slope, differs_in_direction
+from gp_ground_seg.pipeline.lines import classify_lines, deming_slope, differs_in_direction
 from gp_ground_seg.simulation import SCENES, VLP_16, simulate_scan
 
 N_TILES = 50
@@ -114,6 +115,27 @@ def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_rat
     assert len(found[0].r) == (~faces.has_occluded_base[candidates.tile]).sum()
 
 
+def test_the_candidates_drawn_hold_every_case():
+    """Slope breaks, and lines that do and do not continue, in the test above."""
+    at_break = continued = alone = 0
+    config = Config().replace(**{'lines.max_gap': 6.0, 'growth.min_bend_extent': 3.0})
+    for seed in range(40):
+        _, lines, _, continues = Reference().extract_lines(draw_candidates(seed), NO_FACES, config)
+        at_break += continues[lines.start[:-1]].sum()
+        continued += (continues[1:] & (lines.line[1:] == lines.line[:-1])).sum()
+        alone += (~continues).sum()
+    assert min(at_break, continued, alone) > 20
+
+
+def test_classes_by_slope_and_extent():
+    latent = LatentConfig(
+        sloped_gradient=0.1, steep_gradient=0.4, medium_extent=1.5, long_extent=5.0
+    )
+    slopes = np.array([0.0, -0.05, 0.05, 0.1, -0.3, 0.3, 0.4, -2.0, np.inf, np.nan])
+    extents = np.array([1.0, 1.5, 5.0, 1.0, 2.0, 9.0, 0.5, 3.0, 6.0, 0.0])
+    assert list(classify_lines(slopes, extents, latent)) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 6]
+
+
 KINK = np.arange(3.0, 23.0)
 CRITICAL = {
     'gap': (candidates_of([3, 4, 6, 50, 55], np.zeros(5)), [0, 0, 1, 2, 2]),
@@ -139,14 +161,30 @@ def test_critical_points(backend, name):
         assert extent == np.ptp(candidates.r[lines.line == q])
 
 
-def breaks(backend, r, z):
+def test_long_and_flat_lines_are_continued(backend):
+    # A road, a ramp of 0.3, a wall of three candidates.
+    r = np.concatenate([np.arange(2.0, 8.0), np.arange(8.0, 14.0), [14.0, 14.2, 14.4]])
+    z = np.concatenate([np.zeros(6), 0.3 * np.arange(1.0, 7.0), [2.5, 3.5, 4.5]])
+    both = [*range(1, 6), *range(7, 12)]
+    for max_slope, min_size, expected in (
+        (1.0, 4, both), (0.2, 4, both[:5]), (10.0, 3, [*both, 13, 14]), (1.0, 7, []),
+    ):  # fmt: skip
+        bounds = {'growth.max_line_slope': max_slope, 'growth.min_line_size': min_size}
+        bounds['growth.min_bend_extent'] = 99.0
+        lines, continues = extract(backend, candidates_of(r, z), bounds)
+        assert list(lines.start) == [0, 6, 12, 15]
+        assert list(np.flatnonzero(continues)) == expected
+
+
+def breaks(backend, r, z, offsets=None, **bounds):
     """First candidates of the lines, and whether each line starts at a slope break."""
     gaps = {'lines.max_gap': 6.0, 'lines.max_gap_growth': 0.6, 'growth.min_bend_extent': 8.0}
-    lines, continues = extract(backend, candidates_of(r, z), gaps)
+    bounds = gaps | {f'growth.{name}': value for name, value in bounds.items()}
+    lines, continues = extract(backend, candidates_of(r, z, offsets=offsets), bounds)
     return list(lines.start), list(continues[lines.start[:-1]])
 
 
-def slope_at_16_m(rise, step):
+def slope_at_16_m(rise, step=0.0):
     """A level road, then a slope."""
     r = np.array([3.0, 4.0, 5.0, 6.6, 9.2, 15.0, 19.5, 26.0, 40.0])
     return r, np.where(r > 16.0, step + rise * (r - 16.0), 0.0)
@@ -158,6 +196,16 @@ def slope_at_16_m(rise, step):
 )
 def test_a_slope_starts_at_a_break_and_a_step_does_not(backend, rise, step, at_break):
     assert breaks(backend, *slope_at_16_m(rise, step)) == ([0, 6, 9], [False, at_break])
+
+
+def test_lines_that_are_short_or_steep_or_of_two_candidates_start_at_no_break(backend):
+    r, z = slope_at_16_m(0.12)
+    assert breaks(backend, r, z, min_bend_extent=21.0)[1] == [False, False]
+    assert breaks(backend, r, z, max_line_slope=0.1)[1] == [False, False]
+    few = breaks(backend, r[:-1], z[:-1], min_bend_extent=1.0)
+    assert few == ([0, 6, 8], [False, False])
+    # The line before must lie in the same segment.
+    assert breaks(backend, r, z, offsets=[0, 6, 9])[1] == [False, False]
 
 
 def test_a_ramp_seen_by_few_rings_is_ground():

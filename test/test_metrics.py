@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from sklearn.calibration import calibration_curve
+from sklearn.metrics import brier_score_loss
 
 from gp_ground_seg import Label
 from gp_ground_seg.errors import PointCloudError
@@ -158,6 +160,16 @@ def test_true_probabilities_have_no_calibration_error_and_wrong_ones_do():
     assert metrics.count_calibration(*synthetic()).ece < 0.01
     # E[p - p^3] of Beta(a, a): 1/2 - a (a+1) (a+2) / (2a (2a+1) (2a+2)).
     assert metrics.count_calibration(*synthetic(power=3.0)).ece == pytest.approx(0.1406, abs=0.01)
+
+
+@pytest.mark.parametrize('power', [1.0, 3.0])
+def test_probabilities_against_scikit_learn(power):
+    p, truth = synthetic(power=power)
+    found, ground = metrics.count_calibration(p, truth), truth == Label.GROUND
+    assert found.brier == pytest.approx(brier_score_loss(ground, p.astype(float)), rel=1e-12)
+    share, mean = calibration_curve(ground, p.astype(float), n_bins=metrics.N_BINS)
+    np.testing.assert_allclose(found.by_bin(found.sum_p), mean, rtol=1e-9)
+    np.testing.assert_allclose(found.by_bin(found.n_ground), share, rtol=1e-9)
 
 
 def test_the_last_bin_holds_certainty():

@@ -188,6 +188,16 @@ def test_errors_are_said(scan, tmp_path, monkeypatch, capsys, words, message):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_existing_file_is_kept_without_force(scan, draw, tmp_path, capsys):
+    picture = tmp_path / 'a.png'
+    picture.write_text('mine')
+    assert run('plot', 'segment', scan, '--segment', SEGMENT, '-o', picture) == 2
+    assert '--force' in error_line(capsys)
+    assert picture.read_text() == 'mine'
+    draw('--force')
+    assert list(tmp_path.iterdir()) == [picture]
+
+
 @pytest.mark.parametrize('words', [[], ['--segment', '1', '--azimuth', '1']])
 def test_one_way_to_name_the_segment(scan, words):
     with pytest.raises(SystemExit, match='2'):

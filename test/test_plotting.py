@@ -249,10 +249,23 @@ def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
         charts.plot_reliability({'all': found}, tmp_path / 'b.png', '')
 
 
-def test_lightness_of_the_colours_rises():
+DEFICIENCIES = {
+    'none': np.eye(3),
+    'protanopia': [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+                   [-0.003882, -0.048116, 1.051998]],
+    'deuteranopia': [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+                     [-0.011820, 0.042940, 0.968881]],
+    'tritanopia': [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
+                   [0.004733, 0.691367, 0.303900]],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', DEFICIENCIES)
+def test_lightness_of_the_colours_rises_for_every_eye(name):
     colours = style.length_scale_colours(np.geomspace(1.0, 50.0, 30), 1.0, 50.0)
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
-    lightness = 116.0 * np.cbrt(linear @ [0.2126, 0.7152, 0.0722]) - 16.0
+    seen = np.clip(linear @ np.transpose(DEFICIENCIES[name]), 0.0, 1.0)
+    lightness = 116.0 * np.cbrt(seen @ [0.2126, 0.7152, 0.0722]) - 16.0
     assert np.diff(lightness).min() > 1.0
     assert np.ptp(lightness) > 60.0
 

@@ -159,6 +159,14 @@ def test_input_reports_what_it_saw():
     assert jumped.items() <= statistics.report(2.3, FACTS, LIMITS).values.items()
 
 
+@given(st.floats(-1e10, 1e10), st.floats(0.0, 1e10), st.booleans())
+def test_a_stamp_of_any_age_is_no_fault(stamp, ros_time, is_simulated):
+    statistics = InputTask(0.0)
+    arrive(statistics, 0.1, stamp)
+    facts = InputFacts('/points', '', 1, ros_time, is_simulated)
+    assert statistics.report(0.2, facts, LIMITS).level == Level.OK
+
+
 @given(st.lists(st.booleans(), min_size=1, max_size=20), st.floats(0.0, 1.0))
 def test_refusals_are_an_error_above_their_limit(are_refused, max_ratio):
     statistics = InputTask(0.0)

@@ -5,7 +5,7 @@ from array import array
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
@@ -127,3 +127,34 @@ def test_every_layout_comes_through(tested, case):
         np.testing.assert_array_equal(values, getattr(expected, name).astype(code))
         is_dense &= np.isfinite(values).all()
     assert whole.is_dense == is_dense
+
+
+@settings(max_examples=60)
+@given(clouds(), st.sampled_from(('short', 'no z', 'two x', 'step', 'integer', 'outside')))
+def test_a_cloud_that_cannot_hold_what_it_claims_is_refused_and_the_next_one_processed(
+    tested, case, fault
+):
+    (b, _, _), (message, _, _) = tested, case
+    assume(message.height * message.width > 0)
+    by_name = {field.name: field for field in message.fields}
+    if fault == 'short':
+        row = message.width * message.point_step
+        message.data = message.data[: (message.height - 1) * message.row_step + row - 1]
+    elif fault == 'no z':
+        message.fields.remove(by_name['z'])
+    elif fault == 'two x':
+        message.fields.append(by_name['x'])
+    elif fault == 'step':
+        message.point_step = 0
+    elif fault == 'integer':
+        by_name['y'].datatype = PointField.INT32
+    else:
+        by_name['x'].offset = message.point_step - 3
+    before = len(b.ground.messages)
+    b.publisher.publish(message)
+    # The cloud after it is processed, and is the only one.
+    good = PointCloud2(height=1)
+    good.header.frame_id = 'good'
+    for part in b.segment(good):
+        assert (part.width, part.header.frame_id) == (0, 'good')
+    assert len(b.ground.messages) == len(b.obstacles.messages) == before + 1

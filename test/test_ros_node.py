@@ -157,6 +157,22 @@ def test_simulated_time_that_jumps_back_resets_what_was_learned():
         assert wait_for_input('Events since startup', '3')['Time jumps since startup'] == '1'
 
 
+def test_drops_are_counted_exactly():
+    message = to_message(street(20_000))
+    depth = f'qos_overrides.{NAMESPACE}/points.subscription.depth:=1'
+    with ros.bench(*OFTEN, '-p', depth) as b:
+        b.segment(message)
+        for _ in range(29):
+            b.publisher.publish(message)
+
+        def all_accounted_for(values, _status):
+            return int(values['Clouds since startup']) + int(values['Dropped since startup']) == 30
+
+        values = ros.values_of(b.wait_for_status('processing', all_accounted_for))
+        assert int(values['Dropped since startup']) > 0
+        assert int(values['Clouds since startup']) == len(b.ground.wait(2))
+
+
 def test_nothing_is_loaded_for_numpy():
     with ros.bench('-p', 'runtime.backend:=numpy') as b:
         b.segment(to_message(street(1000)))

@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import qos_profile_parameters
 from ros_helpers import bench, street, to_message
 
-from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
 from gp_ground_seg.parameters.config import find_spec, parameter_specs
 from gp_ground_seg.parameters.export import file_problems
 from gp_ground_seg.parameters.presets import PRESETS
@@ -227,6 +227,7 @@ def test_diagnostics_period_and_parameters_of_ros_itself_change_live(b):
     wrong = [Parameter('diagnostics.period', value=0.0)]
     (result,) = b.in_executor(b.node.set_parameters, wrong)
     assert not result.successful
+    assert b.node.config == Config()
     assert b.set('diagnostics.period', 60.0).successful
     assert b.set('diagnostics.period', 0.1).successful
     b.diagnostics.wait(len(b.diagnostics.messages) + 3)
@@ -310,6 +311,14 @@ def test_node_starts_with_every_shipped_file(name):
     path = REPOSITORY / 'config' / f'{name}.yaml'
     with ros.started_node('--params-file', str(path), '-r', '__ns:=/any') as node:
         assert node.config == PRESETS[name].config
+
+
+def test_the_constructor_raises_what_is_not_accepted():
+    with (
+        pytest.raises(ConfigError, match=r'sensor\.height = 99'),
+        ros.started_node('-p', 'sensor.height:=99.0'),
+    ):
+        pass
 
 
 def test_unknown_names_are_reported_and_not_declared(capfd):

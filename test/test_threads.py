@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config
 from gp_ground_seg.compiled import threads
 from gp_ground_seg.compiled.backend import NumbaBackend
-from gp_ground_seg.compiled.threads import Part, Workers, run_of
+from gp_ground_seg.compiled.threads import MIN_POINTS_TO_SPLIT, Part, Workers, run_of
+from gp_ground_seg.frame import GroundSurface
 
 
 @pytest.fixture
@@ -126,3 +127,18 @@ def test_number_of_threads():
         assert Workers(7).n_parts(threads.MIN_POINTS_TO_SPLIT - 1) == 1
     with patch.object(threads, 'JIT_ENABLED', False):
         assert Workers(7).n_threads == 1
+
+
+def test_points_of_small_clouds_are_not_split_and_threads_end_and_start_again():
+    with patch.object(threads, 'JIT_ENABLED', True):
+        backend = NumbaBackend(3)
+    points = np.random.default_rng(0).uniform(-30.0, 30.0, (MIN_POINTS_TO_SPLIT, 3))
+    config, before = Config(), threading.active_count()
+    for n_points, n_started in ((len(points) - 1, 0), (len(points), 2), (len(points), 2)):
+        scan = backend.build_grid(points[:n_points], config)
+        flat = np.zeros((config.grid.n_segments, len(scan.grid.edges)))
+        surface = GroundSurface(scan.grid.edges, flat, flat, np.ones(0, dtype=bool))
+        backend.label_points(scan, backend.find_faces(scan, config), surface, config)
+        assert threading.active_count() == before + n_started
+        backend.close()
+        assert threading.active_count() == before
