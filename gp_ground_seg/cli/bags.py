@@ -81,6 +81,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--format', 'storage (default: by the name of OUT, else mcap)', storage),
         ('--start', 'scans to skip (default: 0)', {**scans, 'default': 0}),
         ('--count', 'scans to write (default: all)', scans),
+        *options.SCAN_LAYOUT,
         options.FORCE,
         options.QUIET,
     )
@@ -124,7 +125,8 @@ def scan_cloud(
 
 def run_convert(arguments: argparse.Namespace) -> int:
     """Write the bag."""
-    frames = _choose(list_frames(arguments.root, arguments.sequence), arguments)
+    layout = options.scan_layout(arguments)
+    frames = _choose(list_frames(arguments.root, arguments.sequence, layout), arguments)
     stamps = [_nanoseconds(frame) for frame in frames]
     target = Path(arguments.output)
     if not arguments.quiet:
@@ -136,7 +138,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
     ):
         bag.add_topic(cloud_topic(TOPIC))
         for frame, stamp in zip(frames, stamps, strict=True):
-            points = read_points(frame.points_path)
+            points = read_points(frame.points_path, frame.layout)
             labels = {}
             if frame.labels_path is not None:
                 labels['label'] = read_labels(frame.labels_path, len(points)).astype(np.uint32)

@@ -15,6 +15,7 @@ from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.bag_files import is_bag
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
+from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation import report
@@ -60,6 +61,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
         ('--plot', 'draw the stages as a PNG', file),
         ('--numpy', 'time learning without compiled code as well', options.FLAG),
+        *options.SCAN_LAYOUT,
         options.TO_JSON,
         options.FORCE,
     )  # fmt: skip
@@ -71,8 +73,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure or read a record; write the files, print the tables."""
     if (arguments.data is None) == (arguments.record is None):
         raise DataError('bench: name either DATA to measure on or --from FILE')
+    given = arguments.record
+    if given is not None:
+        options.refuse_scan_layout(arguments, given)
     with staged_options(arguments, 'json', 'plot') as parts:
-        given = arguments.record
         document = _measure(arguments) if given is None else read_record(given)
         if 'json' in parts:
             report.write_json(document, parts['json'])
@@ -115,7 +119,7 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         options.note('no ratios without the baseline: pip install pypatchworkpp')
         baseline = None
     measured = run_cases(
-        load_frames(Path(arguments.data), arguments.frames, arguments.topic),
+        frames_from_options(arguments, arguments.frames),
         bench_cases(config, threads, with_numpy=arguments.numpy),
         PatchworkppMethod if baseline else None,
         arguments.passes,
@@ -136,7 +140,17 @@ def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
     return threads
 
 
-def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[BenchFrame]:
+def frames_from_options(arguments: argparse.Namespace, n_frames: int) -> list[BenchFrame]:
+    """Read about `n_frames` frames of the options."""
+    source = Path(arguments.data)
+    if is_bag(source):
+        options.refuse_scan_layout(arguments, source)
+    return load_frames(source, n_frames, arguments.topic, options.scan_layout(arguments))
+
+
+def load_frames(
+    source: Path, n_frames: int, topic: str | None = None, layout: ScanLayout = KITTI
+) -> list[BenchFrame]:
     """Read about `n_frames` frames of DATA; DataError if there is no point in any."""
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
@@ -155,7 +169,7 @@ def load_frames(source: Path, n_frames: int, topic: str | None = None) -> list[B
             # Shares of whole frames that add up to those wanted.
             share = n_frames * (j + 1) // len(paths) - n_frames * j // len(paths)
             frames += [
-                BenchFrame(run_name, own[k].stem, read_points(own[k]))
+                BenchFrame(run_name, own[k].stem, read_points(own[k], layout))
                 for run_name, k in runs(name, len(own), share)
             ]
     if not any(len(frame.points) for frame in frames):

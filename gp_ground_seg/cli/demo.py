@@ -18,6 +18,7 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, read_xyz
+from gp_ground_seg.data.scan_layout import ScanLayout
 from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
 from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
 from gp_ground_seg.evaluation.evaluate import labelled_frames
@@ -30,8 +31,9 @@ from gp_ground_seg.ros.probe import (
     GROUND,
     INPUT,
     OBSTACLES,
+    NodeProcess,
     Probe,
-    probed_node,
+    probe_session,
     rate_result,
     restamped,
 )
@@ -84,6 +86,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--sequence', 'sequence of it, as in 00 (default: the first)', {'metavar': 'S'}),
         ('--frames', 'scans to play, at most (default: %(default)s)',
          {**options.NUMBER, 'default': 30}),
+        *options.SCAN_LAYOUT,
         ('--rate', rate, {'metavar': 'HZ', 'type': options.above_zero}),
         ('--output', 'folder for what is written (default: %(default)s)',
          {'metavar': 'DIR', 'default': 'demo_output'}),
@@ -112,13 +115,13 @@ def simulated_drive(n_frames: int) -> Drive:
     return Drive('Simulated street', 'the truth, which the simulator knows', n_frames, labelled)
 
 
-def kitti_drive(root: str | Path, sequence: str, n_frames: int) -> Drive:
+def kitti_drive(root: str | Path, sequence: str, n_frames: int, layout: ScanLayout) -> Drive:
     """Return the first labelled scans of a KITTI sequence; raise a DataError if it has none."""
-    frames = labelled_frames(root, [sequence])[:n_frames]
+    frames = labelled_frames(root, [sequence], layout)[:n_frames]
 
     def scans() -> Iterator[Scan]:
         for frame in frames:
-            points = read_points(frame.points_path)
+            points = read_points(frame.points_path, frame.layout)
             assert frame.labels_path is not None, 'labelled_frames gives only labelled ones'
             yield points, read_labels(frame.labels_path, len(points)), frame.time
 
@@ -224,16 +227,21 @@ def run(arguments: argparse.Namespace) -> int:
     sequence = arguments.sequence
     if arguments.kitti is not None:
         sequence = sequence or list_sequences(arguments.kitti)[0]
-        drive = kitti_drive(arguments.kitti, sequence, arguments.frames)
+        layout = options.scan_layout(arguments)
+        drive = kitti_drive(arguments.kitti, sequence, arguments.frames, layout)
     elif sequence is not None:
         raise DataError(f'--sequence {sequence}: goes with --kitti ROOT')
     else:
+        options.refuse_scan_layout(arguments, 'a simulated one')
         drive = simulated_drive(arguments.frames)
     folder = Path(arguments.output)
+    options.note_leftovers(folder)
     with (
-        staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
         needing_ros('the demo'),
-        probed_node(part / LOG, 'demo') as (node, session),
+        probe_session('demo') as (session, words),
+        # Right before the process that removes the folder if this one is killed.
+        staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
+        NodeProcess(part / LOG, words, session.holding_back, part.parent) as node,
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)

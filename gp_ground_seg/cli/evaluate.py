@@ -42,6 +42,7 @@ ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
 OF_FRAMES = (
     ('--sequences', 'sequences, as in 00,08 (default: all there are)', {'metavar': 'LIST'}),
     ('--frame-step', 'every Nth frame of a sequence only', options.NUMBER),
+    *options.SCAN_LAYOUT,
 )
 COUNTS_AS = {Label.GROUND: 'ground', Label.OBSTACLE: 'obstacle', Label.UNKNOWN: 'left out'}
 RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
@@ -243,7 +244,7 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
     """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
-    frames = methods.labelled_frames(arguments.root, chosen)
+    frames = methods.labelled_frames(arguments.root, chosen, options.scan_layout(arguments))
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]
 

@@ -191,7 +191,8 @@ def _sensor_pose(arguments: argparse.Namespace) -> Report:
 def _table1(arguments: argparse.Namespace) -> Report:
     config, bar = options.read_config(arguments), options.progress('table1')
     choices = [Choice.parse(word) for word in arguments.frames]
-    return table1(arguments.root, choices, config, arguments.repeats, bar)
+    layout = options.scan_layout(arguments)
+    return table1(arguments.root, choices, config, arguments.repeats, layout, bar)
 
 
 EXPERIMENTS = {
@@ -244,7 +245,7 @@ sensors at four heights.
         """\
 Measure the paper's Table I on segments of labelled frames.
 """,
-        (ROOT, SEGMENTS, REPEATS),
+        (ROOT, SEGMENTS, REPEATS, *options.SCAN_LAYOUT),
         _table1,
     ),
 }

@@ -89,9 +89,10 @@ def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Raise KeyboardInterrupt at the end if Ctrl-C came meanwhile and something else became of it.
+    """Turn Ctrl-C into KeyboardInterrupt also where numba swallows it or raises another error.
 
-    Where it comes while numba compiles or loads code, it is lost, or arrives as another error.
+    numba does either when SIGINT comes while it compiles or loads code. SIGINT counts also where
+    it is ignored at the start, as in the background of a script: `kill -INT` ends a command there.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -134,6 +135,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     except GroundSegError as error:
         print(f'gp-ground-seg: error: {error}', file=sys.stderr)
+        return 2
+    except MemoryError:
+        print('gp-ground-seg: error: not enough memory for this input', file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print('gp-ground-seg: interrupted', file=sys.stderr)

@@ -85,6 +85,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {**number, 'default': 600}),
         ('--memory-frames', 'clouds sent one by one; 0 = leave memory out (default: %(default)s)',
          {'metavar': 'N', 'type': int, 'default': 2000}),
+        *options.SCAN_LAYOUT,
         options.TO_JSON,
         options.FORCE,
         options.QUIET,
@@ -167,15 +168,15 @@ def run_bench(arguments: argparse.Namespace) -> int:
 def _load_clouds(arguments: argparse.Namespace) -> list[CloudMessage]:
     """Return the clouds to send, x, y, z and intensity as float32."""
     from gp_ground_seg.cli.bags import scan_cloud
-    from gp_ground_seg.cli.bench import load_frames
+    from gp_ground_seg.cli.bench import frames_from_options
     from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
 
     if arguments.data is not None:
-        frames = load_frames(Path(arguments.data), arguments.clouds, arguments.topic)
-        points = [frame.points for frame in frames]
+        points = [frame.points for frame in frames_from_options(arguments, arguments.clouds)]
     elif arguments.topic is not None:
         raise DataError(f'--topic {arguments.topic}: goes with a bag')
     else:
+        options.refuse_scan_layout(arguments, 'a simulated one')
         points = [scan for scan, _, _ in simulated_drive(min(arguments.clouds, N_SIMULATED)).scans]
     return [scan_cloud(scan, 0, FRAME_ID) for scan in points]
 
@@ -190,9 +191,12 @@ def _measure(
     n, n_memory = arguments.frames, arguments.memory_frames
     stamped = probing.restamped(different, 1_700_000_000)
     with (
-        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
         needing_ros('node-bench'),
-        probing.probed_node(Path(folder, 'log'), 'node_bench', words) as (node, session),
+        probing.probe_session('node_bench') as (session, own),
+        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
+        probing.NodeProcess(
+            Path(folder, 'log'), [*own, *words], session.holding_back, Path(folder)
+        ) as node,
     ):
         probe = probing.Probe(session, lambda *_: None)
         if not quiet:

@@ -16,14 +16,15 @@ import yaml
 from tqdm import tqdm
 
 from gp_ground_seg.data.atomic_output import leftovers
-from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
+from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.parameters.schema import load_yaml
 
 DEFAULT_PRESET = 'default'
 FLAG = {'action': 'store_true'}
-FORCE = ('--force', 'replace output that exists', FLAG)
+FORCE = ('--force', 'replace output that exists; take scans that look wrong', FLAG)
 QUIET = ('--quiet', 'no progress bar, no notes', FLAG)
 TO_JSON = ('--json', 'write every number to this file as well', {'metavar': 'FILE'})
 
@@ -59,6 +60,28 @@ def positive(word: str, least: int = 1) -> int:
 
 
 NUMBER: dict[str, Any] = {'metavar': 'N', 'type': positive}
+
+
+SCAN_LAYOUT: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ('--columns', f'numbers per point of a .bin scan, x y z first (default: {KITTI.columns})',
+     {'metavar': 'N', 'type': partial(positive, least=MIN_COLUMNS)}),
+    ('--dtype', f'type of these numbers (default: {KITTI.dtype})', {'choices': DTYPES}),
+)  # fmt: skip
+"""Options of every command that reads ``.bin`` scans; it takes `FORCE` as well."""
+
+
+def scan_layout(arguments: argparse.Namespace) -> ScanLayout:
+    """Return the layout of ``.bin`` scans; what can be no scan is refused, without ``--force``."""
+    doubts = 'warn' if arguments.force else 'raise'
+    columns, dtype = arguments.columns or KITTI.columns, arguments.dtype or KITTI.dtype
+    return ScanLayout(columns, dtype, doubts)
+
+
+def refuse_scan_layout(arguments: argparse.Namespace, source: object) -> None:
+    """Raise a DataError if a layout is given, but `source` is no ``.bin`` scan."""
+    for name in ('columns', 'dtype'):
+        if getattr(arguments, name) is not None:
+            raise DataError(f'--{name}: is for .bin scans, which {source} is not')
 
 
 def above_zero(text: str, or_zero: bool = False) -> float:

@@ -93,7 +93,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for picture in (view, above, segment):
         endings = ('.png', '.pdf') if picture is segment else ('.png',)
         output = (f'{" or ".join(endings)} file', {'metavar': 'OUT', 'required': True})
-        options.add(picture, ('-o --output', *output), options.FORCE)
+        options.add(picture, ('-o --output', *output), *options.SCAN_LAYOUT, options.FORCE)
         options.add_config(picture)
         picture.set_defaults(run=run, endings=endings)
 
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise DataError(f'{path}: must end in {" or ".join(arguments.endings)}')
     if path.exists() and not arguments.force:
         raise DataError(f'{path}: exists already; --force replaces it')
-    points, title = _simulate(arguments) if arguments.input is None else _read(arguments.input)
+    points, title = _simulate(arguments) if arguments.input is None else _read(arguments)
     truth = None
     if getattr(arguments, 'labels', None) is not None:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
@@ -125,15 +125,16 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _read(path: str) -> tuple[npt.NDArray[np.float32], str]:
+def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.float32], str]:
     """Points of a file, and its name as in ``00/000005``."""
-    scan = Path(path)
+    scan = Path(arguments.input)
     folder = scan.resolve().parent
     title = f'{folder.parent.name}/{scan.stem}' if folder.name == 'velodyne' else scan.name
-    return read_points(scan), title
+    return read_points(scan, options.scan_layout(arguments)), title
 
 
 def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.float32], str]:
+    options.refuse_scan_layout(arguments, 'a simulated one')
     if arguments.seed < 0:
         raise DataError(f'--seed {arguments.seed}: must not be negative')
     scene, rng = SCENES[arguments.simulate], np.random.default_rng(arguments.seed)

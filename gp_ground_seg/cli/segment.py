@@ -29,7 +29,7 @@ DESCRIPTION = """\
 Split scans into ground and obstacles.
 
 INPUT is one of:
-  scan.bin             a KITTI scan (float32 x, y, z, intensity)
+  scan.bin             a scan as KITTI's: float32 x, y, z, intensity; --columns, --dtype: another
   folder               of .bin files, or a sequence with velodyne/ in it
   drive.bag            a ROS 1 bag
   drive.mcap, .db3     a single-file rosbag2
@@ -44,12 +44,16 @@ point cloud its ground and its obstacles: every field of every point bit for bit
 the same header, the same recorded time. Unknown points are in neither.
 Messages of ROS 1 are converted to ROS 2.
 
+Scans whose numbers can be none, as of another layout or in millimetres, are refused
+with what they look like; with --force they are taken.
+
 Nothing is overwritten without --force. Output is written under a hidden name
 (.NAME.partial-...) and takes its name when it is complete.
 """
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
+  gp-ground-seg segment nuscenes/samples/LIDAR_TOP -o labels --columns 5
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
 """
@@ -57,10 +61,10 @@ EXAMPLES = """\
 POSE_DESCRIPTION = """\
 Estimate from scans how high the sensor is and how it is tilted.
 
-INPUT is a .bin scan (float32 x, y, z, intensity), a folder of them, or a sequence
-with velodyne/ in it. Each scan is judged by itself. Support is the share of the
-low points on the plane that was found, residual their distance to it. With enough
-scans of level ground the medians are values to set: docs/pose.md.
+INPUT is a .bin scan (float32 x, y, z, intensity; else --columns, --dtype), a folder of
+them, or a sequence with velodyne/ in it. Each scan is judged by itself. Support is the
+share of the low points on the plane that was found, residual their distance to it.
+With enough scans of level ground the medians are values to set: docs/pose.md.
 """
 POSE_EXAMPLES = """\
   gp-ground-seg pose 000000.bin
@@ -88,8 +92,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         options.QUIET,
     )  # fmt: skip
     options.add_config(parser)
-    raw = 'write 0 unknown, 1 ground, 2 obstacle as labels'
-    options.add(parser.add_argument_group('for scans'), ('--raw', raw, options.FLAG))
+    raw = ('--raw', 'write 0 unknown, 1 ground, 2 obstacle as labels', options.FLAG)
+    options.add(parser.add_argument_group('for scans'), *options.SCAN_LAYOUT, raw)
     topic, several = {'metavar': 'T'}, {'metavar': 'T', 'action': 'append', 'default': []}
     options.add(
         parser.add_argument_group('for bags'),
@@ -103,7 +107,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
     parser = options.new_parser(subparsers, 'pose', POSE_DESCRIPTION, POSE_EXAMPLES)
-    options.add(parser, ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}))
+    options.add(
+        parser,
+        ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}),
+        *options.SCAN_LAYOUT,
+        options.FORCE,
+    )
     options.add_config(parser)
     parser.set_defaults(run=run_pose)
 
@@ -122,6 +131,8 @@ def run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, name):
             option = name.replace('_', '-')
             raise DataError(f'--{option}: is for {kind}, which {source} is not')
+    if holds_bag:
+        options.refuse_scan_layout(arguments, source)
     target = Path(arguments.output) if arguments.output else _default_output(source)
     n_points = n_ground = 0
     seconds = []
@@ -180,7 +191,7 @@ def _segment_scans(
 ) -> Iterator[Segmentation]:
     """Write one label file per scan; yield what each holds."""
     codes = sorted(Label) if arguments.raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
-    code = np.array(codes, dtype='<u4')
+    code, layout = np.array(codes, dtype='<u4'), options.scan_layout(arguments)
     if not arguments.quiet:
         options.note_leftovers(target)
     with (
@@ -189,7 +200,7 @@ def _segment_scans(
     ):
         for scan, label_path in zip(scans, label_paths, strict=True):
             try:
-                result = segmenter.segment(read_points(scan))
+                result = segmenter.segment(read_points(scan, layout))
             except PointCloudError as error:
                 raise PointCloudError(f'{scan}: {error}') from error
             label_path.write_bytes(code[result.label].tobytes())
@@ -293,10 +304,11 @@ POSE_COLUMNS = (
 def run_pose(arguments: argparse.Namespace) -> int:
     """Print a line for each scan, and the medians."""
     poses, rows, notes = [], [], []
+    layout = options.scan_layout(arguments)
     with closing(GroundSegmenter(options.read_config(arguments))) as segmenter:
         for scan in find_scans(Path(arguments.input)):
             try:
-                pose = segmenter.estimate_pose(read_points(scan))
+                pose = segmenter.estimate_pose(read_points(scan, layout))
             except PointCloudError as error:
                 notes.append(f'{scan.name}: refused: {error}')
                 continue

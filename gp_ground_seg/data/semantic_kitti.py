@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, find_doubt
 from gp_ground_seg.errors import DataError
 
-BYTES_PER_POINT = 16
+_LOGGER = logging.getLogger('gp_ground_seg')
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
+MAX_SCAN_BYTES = 1 << 30  # of a .bin file: 67 million points, a hundred times a dense scan
+_MAX_TIMES_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,7 @@ class Frame:
     points_path: Path  # the ``.bin`` file
     labels_path: Path | None  # the ``.label`` file, if there is one
     time: float  # since the start of the sequence [s]
+    layout: ScanLayout = KITTI  # of the ``.bin`` file
 
 
 def list_sequences(root: str | Path) -> list[str]:
@@ -35,7 +41,7 @@ def list_sequences(root: str | Path) -> list[str]:
     return names
 
 
-def list_frames(root: str | Path, sequence: str) -> list[Frame]:
+def list_frames(root: str | Path, sequence: str, layout: ScanLayout = KITTI) -> list[Frame]:
     """Frames of one sequence, in order; DataError if there are none, or times.txt does not fit."""
     folder = Path(root) / 'sequences' / sequence
     if not (folder / 'velodyne').is_dir():
@@ -47,7 +53,8 @@ def list_frames(root: str | Path, sequence: str) -> list[Frame]:
     frames = []
     for path, time in zip(paths, _read_times(folder / 'times.txt', paths), strict=True):
         labels = folder / 'labels' / f'{path.stem}.label'
-        frames.append(Frame(sequence, path.stem, path, labels if labels.exists() else None, time))
+        own = labels if labels.exists() else None
+        frames.append(Frame(sequence, path.stem, path, own, time, layout))
     return frames
 
 
@@ -56,7 +63,7 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
     if not path.exists():
         return [FRAME_PERIOD * k for k in range(len(frames))]
     try:
-        lines = [float(word) for word in _read_bytes(path).split()]
+        lines = [float(word) for word in _read_bytes(path, _MAX_TIMES_BYTES).split()]
     except ValueError as error:
         raise DataError(f'{path}: {error}') from error
     times: list[float] = []
@@ -72,26 +79,43 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
     return times
 
 
-def read_points(path: str | Path) -> npt.NDArray[np.float32]:
-    """Points of a KITTI ``.bin`` file, x, y, z [m], intensity, (N, 4); DataError if it is none."""
-    data = _read_bytes(path)
-    if len(data) % BYTES_PER_POINT:
-        problem = f'is not a whole number of points ({BYTES_PER_POINT} bytes each); truncated?'
-        raise DataError(f'{path}: {len(data)} bytes {problem}')
-    return np.frombuffer(data, dtype='<f4').astype(np.float32).reshape(-1, 4)
+def read_points(path: str | Path, layout: ScanLayout = KITTI) -> npt.NDArray[np.float32]:
+    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4).
+
+    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
+    points, or, where the layout asks for that, its numbers can be no scan.
+    """
+    data = _read_bytes(path, MAX_SCAN_BYTES)
+    doubt = '' if layout.doubts == 'ignore' else find_doubt(data, layout)
+    if len(data) % layout.bytes_per_point:
+        problem = f'is not a whole number of points ({layout.bytes_per_point} bytes each)'
+        raise DataError(f'{path}: {len(data)} bytes {problem}; {doubt or "truncated?"}')
+    if doubt and layout.doubts == 'raise':
+        raise DataError(f'{path}: {doubt}; --force takes it as it is')
+    if doubt:
+        _LOGGER.warning('%s: %s', path, doubt)
+    return layout.points(data)
 
 
 def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
     """Semantic classes of a ``.label`` file, (n_points,); DataError if it has another number."""
-    data = _read_bytes(path)
+    expected = f'expected {4 * n_points} for {n_points} points'
+    data = _read_bytes(path, 4 * n_points, expected)
     if len(data) != 4 * n_points:
-        expected = f'expected {4 * n_points} for {n_points} points'
         raise DataError(f'{path}: {len(data)} bytes, {expected}')
     return (np.frombuffer(data, dtype='<u4') & 0xFFFF).astype(np.uint16)
 
 
-def _read_bytes(path: str | Path) -> bytes:
+def _read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:
+    """Read a file; DataError if it cannot be read or has more than `most` bytes."""
     try:
-        return Path(path).read_bytes()
+        with open(path, 'rb') as file:
+            size = os.fstat(file.fileno()).st_size
+            # A pipe or a device has the size 0, and may have no end.
+            data = b'' if size > most else file.read(size or most + 1)
     except OSError as error:
         raise DataError(f'{path}: {error.strerror or error}') from error
+    if max(size, len(data)) > most:
+        expected = expected or f'accepted are at most {most}'
+        raise DataError(f'{path}: {max(size, len(data))} bytes, {expected}')
+    return data

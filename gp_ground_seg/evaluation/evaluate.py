@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import (
     Frame,
     list_frames,
@@ -289,7 +290,9 @@ def pool(name: str, scores: Iterable[MethodScore]) -> MethodScore:
     return MethodScore(name, tuple(scan for one in scores for scan in one.scans))
 
 
-def labelled_frames(root: str | Path, sequences: Sequence[str] | None = None) -> list[Frame]:
+def labelled_frames(
+    root: str | Path, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
+) -> list[Frame]:
     """Frames of the named sequences, or of all that have labels, in order.
 
     Sequences of SemanticKITTI's test set have none; a note says which are left out. Raises
@@ -303,7 +306,7 @@ def labelled_frames(root: str | Path, sequences: Sequence[str] | None = None) ->
         raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
     frames, left_out = [], []
     for name in chosen:
-        own = list_frames(root, name)
+        own = list_frames(root, name, layout)
         bare = [frame.index for frame in own if frame.labels_path is None]
         if sequences is None and len(bare) == len(own):
             left_out.append(name)
@@ -322,7 +325,7 @@ def load_kitti(frame: Frame) -> KnownScan:
     """Read a labelled frame; the ground whose height counts is what is labelled ground."""
     if frame.labels_path is None:
         raise DataError(f'{frame.points_path}: has no labels')
-    points = read_points(frame.points_path)
+    points = read_points(frame.points_path, frame.layout)
     semantic = read_labels(frame.labels_path, len(points))
     z = points[:, 2].astype(np.float64)
     truths = {one.key: one.truth(semantic, points[:, 2]) for one in CONVENTIONS}

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.evaluate import Progress, load_kitti
@@ -55,6 +56,7 @@ def table1(
     choices: Sequence[Choice],
     config: Config,
     n_repeats: int,
+    layout: ScanLayout = KITTI,
     progress: Progress = iter,
 ) -> Report:
     """Measure the table on the chosen segments, at least one choice.
@@ -70,7 +72,7 @@ def table1(
             raise ConfigError(f'segment {segment}: must be in [0, {last}]')
     frames = []
     for choice in choices:
-        own = {frame.index: frame for frame in list_frames(root, choice.sequence)}
+        own = {frame.index: frame for frame in list_frames(root, choice.sequence, layout)}
         if choice.frame not in own:
             where = f'{choice.sequence}; there are {min(own)} to {max(own)}'
             raise DataError(f'{root}: no frame {choice.frame} in sequence {where}')

@@ -26,6 +26,7 @@ AUTO: Literal['auto'] = 'auto'
 ROS_NODE_KEY = '/**'
 NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
+MAX_FILE_BYTES = 1 << 18  # those of config/ have 10 000
 OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters that every ROS node has."""
 
@@ -231,6 +232,15 @@ _Loader.add_implicit_resolver(
 )
 
 
+def read_yaml(path: str | Path) -> object:
+    """Read a YAML file as `load_yaml`; ConfigError also if it is too large to be of parameters."""
+    with open(path, 'rb') as file:
+        data = file.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
+        raise ConfigError(f'too large for a parameter file, accepted are {MAX_FILE_BYTES} bytes')
+    return load_yaml(data.decode('utf-8'))
+
+
 def load_yaml(text: str) -> object:
     """Read YAML, with 1e-3 a number as in ROS; an alias or a key given twice: ConfigError."""
     document: object = yaml.load(text, Loader=_Loader)
@@ -252,7 +262,7 @@ class ParameterFile(NamedTuple):
 def read_parameters(path: str | Path) -> ParameterFile:
     """Read a parameter file; ConfigError if it cannot be read or parsed, or gives a name twice."""
     try:
-        document = load_yaml(Path(path).read_text(encoding='utf-8'))
+        document = read_yaml(path)
         values: dict[str, object] = {}
         for name, value in _flatten(_unwrap_ros(document)):
             if name in values:

@@ -22,7 +22,7 @@ from typing import Any
 import yaml
 
 from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyError
-from gp_ground_seg.parameters.schema import load_yaml
+from gp_ground_seg.parameters.schema import read_yaml
 
 HIGHEST_DOMAIN = 232
 
@@ -76,7 +76,7 @@ def _check_surroundings(words: Sequence[str]) -> None:
     for path in (path for flag, path in itertools.pairwise(words) if flag == '--params-file'):
         with contextlib.suppress(OSError, yaml.YAMLError, RecursionError):
             try:
-                document = load_yaml(Path(path).read_text(encoding='utf-8'))
+                document = read_yaml(path)
             except (UnicodeDecodeError, ConfigError) as error:
                 raise ConfigError(f'{path}: {error}') from error
             if not isinstance(document, dict | None):

@@ -9,8 +9,12 @@ import contextlib
 import dataclasses
 import itertools
 import os
+import secrets
+import shutil
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -24,7 +28,12 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.point_cloud2 import CloudMessage, encode_cloud, stamp_of
 from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.frame import FloatArray
-from gp_ground_seg.ros.lifecycle import Session, large_cloud_transport, ros_session
+from gp_ground_seg.ros.lifecycle import (
+    Session,
+    large_cloud_transport,
+    ros_session,
+    stop_on_signals,
+)
 
 INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'  # topics of the node
 START_TIMEOUT = 300.0  # time the node has to start, and to compile on a slow machine [s]
@@ -32,6 +41,7 @@ SILENCE = 2.0  # time without a cloud after which what is still missing is lost 
 STEADY_FACTOR, STEADY_MARGIN = 1.5, 0.02
 """How far latency may grow from the second quarter, which fills the queue, to the last [1, s]."""
 
+_DIAGNOSTICS = '/diagnostics'
 _PROBE_FRAME = 'gp_ground_seg_probe'
 _PROBE_PERIOD = 0.2
 _COUNTERS = ('Clouds since startup', 'Dropped since startup')
@@ -59,24 +69,29 @@ def private_network() -> Iterator[None]:
 
 
 class NodeProcess:
-    """A node in a second process, for a ``with`` statement; its output goes to the file `log`."""
+    """A node in a second process, for a ``with`` statement; its output goes to the file `log`.
+
+    It ends when this process does, however that ends, and then removes the folder `unfinished`.
+    """
 
     def __init__(
         self,
         log: Path,
         ros_args: Sequence[str] = (),
         uninterrupted: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
+        unfinished: Path | None = None,
     ) -> None:
         self._log = log
         self._uninterrupted = uninterrupted
-        self._command = [sys.executable, '-m', 'gp_ground_seg', 'node', '--ros-args', *ros_args]
+        words = [str(unfinished or ''), '--ros-args', *ros_args]
+        self._command = [sys.executable, '-m', 'gp_ground_seg.ros.probe', *words]
 
     def __enter__(self) -> NodeProcess:
         """Start it."""
         # An interrupt between the start and the assignment would leave it running.
         with self._log.open('wb') as log, self._uninterrupted():
             self._process = subprocess.Popen(
-                self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+                self._command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT
             )
         self.pid = self._process.pid
         return self
@@ -90,7 +105,7 @@ class NodeProcess:
         finally:
             # Also when interrupted while waiting; does nothing to a process that has ended.
             self._process.kill()
-            self._process.wait()
+            self._process.communicate()
 
     def _said(self) -> str:
         return self._log.read_text(encoding='utf-8', errors='replace')
@@ -114,19 +129,39 @@ class NodeProcess:
             raise GroundSegError(f'the node {ended}; its last words:\n{self.log_tail()}')
 
 
+def _run_node(unfinished: str, *words: str) -> int:
+    """Run the node of a `NodeProcess`: in that process."""
+
+    def end_with_parent() -> None:
+        # Nothing is ever written: this returns when the other end is closed, by a kill too.
+        os.read(0, 1)
+        if unfinished:
+            shutil.rmtree(unfinished, ignore_errors=True)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    with stop_on_signals() as stop:
+        from gp_ground_seg.ros.node import main
+
+        return 0 if stop.made else main(words)
+
+
 @contextlib.contextmanager
-def probed_node(
-    log: Path, name: str, ros_args: Sequence[str] = ()
-) -> Iterator[tuple[NodeProcess, Session]]:
-    """Yield a node on a network of its own, and a session named `name` to talk to it."""
-    words = ('-r', f'points:={INPUT}', *ros_args)
+def probe_session(name: str) -> Iterator[tuple[Session, list[str]]]:
+    """Yield a session named `name` to talk to a `NodeProcess`, and the ROS arguments of that.
+
+    Both are on a network of their own. Their topics have random names: another run may have
+    taken the same ROS domain.
+    """
+    token = secrets.token_hex(8)
+    topics = (INPUT, GROUND, OBSTACLES, _DIAGNOSTICS)
+    own = [word for topic in topics for word in ('-r', f'{topic}:=/probe_{token}{topic}')]
     with (
         private_network(),
         large_cloud_transport(),
-        ros_session(name) as session,
-        NodeProcess(log, words, session.holding_back) as node,
+        ros_session(name, ['--ros-args', *own]) as session,
     ):
-        yield node, session
+        yield session, own
 
 
 def memory(pid: int) -> tuple[int, int]:
@@ -189,7 +224,7 @@ class Probe:
             session.node.create_subscription(
                 PointCloud2, topic, partial(self._receive, topic), cloud_profile(50), raw=True
             )
-        session.node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnosed, 10)
+        session.node.create_subscription(DiagnosticArray, _DIAGNOSTICS, self._diagnosed, 10)
 
     def connect(self, node: NodeProcess) -> None:
         """Send empty clouds until both topics have answered and the node is settled."""
@@ -325,3 +360,7 @@ def memory_result(resident: Sequence[int], peak: int) -> dict[str, float]:
     end = float(np.median(resident[-share:]))
     growth = end / start - 1.0
     return {'n_clouds': n_clouds, 'start': start, 'end': end, 'peak': peak, 'growth': growth}
+
+
+if __name__ == '__main__':
+    sys.exit(_run_node(*sys.argv[1:]))

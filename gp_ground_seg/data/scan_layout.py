@@ -1,0 +1,185 @@
+"""How the points of a ``.bin`` scan are stored, and whether its numbers can be points so read.
+
+The files carry no description. Read in the wrong layout most of them still give numbers, and
+numbers still give labels: a command checks them first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.parameters.config import find_spec
+
+DTYPES = ('float32', 'float64')
+MIN_COLUMNS = 3
+MAX_RANGE = find_spec('grid.r_max').maximum or 0.0  # what lies beyond is never segmented [m]
+
+_Numbers = npt.NDArray[np.floating]
+_MIN_POINTS = 100  # fewer are not judged
+_N_JUDGED = 20_000  # numbers looked at in a larger file
+_LEAST, _LARGEST = 1e-6, 1e6  # of a coordinate that can be measured [m]
+_MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
+_COLUMNS = range(MIN_COLUMNS, 9)  # numbers of columns that are tried
+_BLOCK = 840  # numbers: a whole number of points for each of these
+# Spread within columns, over that in the layout given, from which on another number of columns
+# fits better; that of a multiple is less by itself where lasers that look elsewhere alternate.
+_BETTER, _BETTER_MULTIPLE, _SAME = 0.95, 0.65, 1.03
+_BAGS = (b'#ROSBAG', b'\x89MCAP', b'SQLite format 3')
+
+
+@dataclass(frozen=True)
+class ScanLayout:
+    """Layout of a ``.bin`` scan: x, y, z [m] first in each point, then intensity if there is more.
+
+    Attributes
+    ----------
+    columns : numbers per point, at least 3
+    dtype : ``'float32'`` or ``'float64'``, little-endian
+    doubts : what to do where the numbers cannot be points so read: ``'ignore'``, ``'warn'`` or
+        ``'raise'``
+    """
+
+    columns: int = 4
+    dtype: str = 'float32'
+    doubts: str = 'ignore'
+
+    @property
+    def bytes_per_point(self) -> int:
+        """Bytes of one point."""
+        return self.columns * np.dtype(self.dtype).itemsize
+
+    def __str__(self) -> str:
+        """Columns and type in words."""
+        return f'{self.columns} columns of {self.dtype}'
+
+    def points(self, data: bytes) -> npt.NDArray[np.float32]:
+        """Return x, y, z, intensity of a file, (N, 4); without a fourth column it is zero."""
+        columns = self.view(data)[:, :4]
+        points = np.zeros((len(columns), 4), dtype=np.float32)
+        with np.errstate(over='ignore', invalid='ignore'):
+            points[:, : columns.shape[1]] = columns
+        return points
+
+    def view(self, data: bytes) -> _Numbers:
+        """Return the whole points of a file, (N, columns)."""
+        n_points = len(data) // self.bytes_per_point
+        numbers = np.frombuffer(data, f'<{np.dtype(self.dtype).str[1:]}', n_points * self.columns)
+        return numbers.reshape(n_points, self.columns)
+
+
+KITTI = ScanLayout()
+
+
+def find_doubt(data: bytes, layout: ScanLayout) -> str:
+    """Return why a file can be no scan in `layout`, and what it looks like; '' if it can."""
+    if data.startswith(_BAGS):
+        return 'begins as a bag does; `segment` and `bench` read bags'
+    points = layout.view(data)
+    with np.errstate(all='ignore'):
+        problem = _objection(points) or _column_objection(points)
+        if not problem and len(data) % layout.bytes_per_point == 0:
+            return ''
+        other = _likely_layout(data, layout)
+        guess = _guess(points) if other is None else _advice(other, layout)
+    if problem:
+        begin = ', '.join(f'{x:.4g}' for x in points[:3, 0])
+        problem = f'read as {layout}, {problem} (x begins {begin})'
+    return '; '.join(part for part in (problem, guess) if part)
+
+
+def _advice(other: ScanLayout, layout: ScanLayout) -> str:
+    names = [n for n in ('columns', 'dtype') if getattr(other, n) != getattr(layout, n)]
+    words = ' '.join(f'--{name} {getattr(other, name)}' for name in names)
+    return f'looks like {other}, which {words} reads'
+
+
+def _objection(points: _Numbers) -> str:
+    """Return what is wrong with x, y, z, or ''."""
+    if not len(points):
+        return ''
+    # Some drivers put rays without a return at the origin.
+    xyz = points[:: 1 + points.size // _N_JUDGED, :3].astype(np.float64)
+    if np.count_nonzero(np.isfinite(xyz) & (xyz != 0.0)) < 3 * _MIN_POINTS:
+        xyz = points[:, :3].astype(np.float64)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    if not len(xyz):
+        return f'none of {len(points)} points is finite'
+    if len(points) < _MIN_POINTS:
+        return ''
+    size = np.abs(xyz[(xyz != 0.0).any(axis=1)])
+    if not len(size):
+        return 'all points are at the origin'
+    share = float(np.mean((size < _LEAST) | (size > _LARGEST)))
+    if share > _MAX_UNMEASURABLE:
+        return f'{share:.0%} of the coordinates are below 1e-6 m or above 1e6 m'
+    middle = float(np.median(np.linalg.norm(size, axis=1)))
+    if middle > MAX_RANGE:
+        return f'half of the points are farther than {middle:.0f} m'
+    return ''
+
+
+def _spreads(numbers: _Numbers) -> dict[int, float]:
+    """Return the mean difference of two numbers of a column, for each number of columns tried.
+
+    It is least for the right one, whatever the order of the points, and larger where different
+    quantities are mixed in a column: E|a - b| >= (E|a - a'| + E|b - b'|) / 2 (Szekely, Rizzo:
+    Energy statistics, J. Stat. Plan. Inference 143, 2013).
+    """
+    n_blocks = len(numbers) // _BLOCK
+    if n_blocks < 2:
+        return {}
+    chosen = np.linspace(0, n_blocks - 1, min(n_blocks, _N_JUDGED // _BLOCK)).astype(int)
+    part = numbers[: n_blocks * _BLOCK].reshape(n_blocks, _BLOCK)[chosen]
+    # So that no single quantity decides, as a time in nanoseconds.
+    values = np.arcsinh(np.nan_to_num(part).clip(-1e9, 1e9))
+    spreads = {}
+    for n_columns in _COLUMNS:
+        ordered = np.sort(values.reshape(-1, n_columns), axis=0)
+        n = len(ordered)
+        rank = 2.0 * np.arange(n) + 1.0 - n
+        spreads[n_columns] = max(0.0, 2.0 * float(np.mean(rank @ ordered)) / n**2)
+    return spreads
+
+
+def _column_objection(points: _Numbers) -> str:
+    """Return whether another number of columns fits better, or ''."""
+    own, spreads = points.shape[1], _spreads(points.reshape(-1))
+    if own not in spreads:
+        return ''
+    worth = {n: _BETTER if n % own else _BETTER_MULTIPLE for n in spreads if own % n}
+    better = {n: spreads[n] for n in worth if spreads[n] < worth[n] * spreads[own]}
+    return f'its numbers repeat every {_fewest(better)}, not every {own}' if better else ''
+
+
+def _fewest(spreads: dict[int, float]) -> int:
+    """Return the least number of columns among those that fit as well as any."""
+    least = min(spreads.values())
+    return min(n for n in spreads if spreads[n] <= _SAME * least)
+
+
+def _likely_layout(data: bytes, layout: ScanLayout) -> ScanLayout | None:
+    """Return the layout that makes points of all bytes, None if there is none."""
+    for dtype in sorted(DTYPES, key=lambda name: name != layout.dtype):
+        numbers = ScanLayout(1, dtype).view(data).reshape(-1)
+        spreads = _spreads(numbers)
+        other = ScanLayout(_fewest(spreads) if spreads else layout.columns, dtype)
+        is_whole = len(data) % other.bytes_per_point == 0
+        is_other = str(other) != str(layout)
+        if is_other and is_whole and not _objection(other.view(data)):
+            return other
+    return None
+
+
+def _guess(points: _Numbers) -> str:
+    """Return what points that have no likely layout look like, or ''."""
+    xyz = points[:, :3]
+    size = np.abs(xyz[np.isfinite(xyz) & (xyz != 0.0)].astype(np.float64))
+    middle = float(np.median(size)) if len(size) else 0.0
+    if 0.0 < middle < np.finfo(np.float32).tiny:
+        return 'looks like whole numbers, as of a .label file'
+    if MAX_RANGE < middle < 1000.0 * MAX_RANGE:
+        return 'looks like millimetres, a scan is in metres'
+    return ''
