@@ -197,6 +197,7 @@ def in_z(**changes):
         ({'data': b''}, r'data of 0 bytes: must be at least 80'),
         ({'height': 5, 'width': 1, 'row_step': 15}, r'row_step 15: must be at least 16 \(width 1'),
         ({'height': 2, 'row_step': 2**32 - 1}, r'data of 80 bytes: must be at least'),
+        ({'row_step': 81}, r'row_step 81: must be at most the 80 bytes of data'),
     ],
 )
 def test_malformed_layout_says_what_and_where(changes, message):

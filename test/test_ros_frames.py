@@ -133,6 +133,7 @@ class StandInBuffer:
 
     def clear(self):
         type(self).cleared += 1
+        self.known.clear()
 
 
 class StandInListener:
@@ -164,10 +165,17 @@ def test_tilt_by_tf_is_as_good_as_given(monkeypatch):
         # Newer than what TF knows: the newest is taken.
         late = to_message(points, stamp=(1000, 0), frame='tilted_lidar')
         check_levelled(points, late, b.segment(late))
-        # And back: a bag that starts again forgets what moved.
-        cleared = StandInBuffer.cleared
-        b.segment(message)
-        assert StandInBuffer.cleared > cleared
+        # And back: by a little all is kept; to the start of a bag what moved is forgotten, but no
+        # cloud is refused until TF sends anew.
+        for stamp, n_cleared in (((999, 400_000_000), 0), ((3, 4), 1)):
+            cleared = StandInBuffer.cleared
+            early = to_message(points, stamp=stamp, frame='tilted_lidar')
+            check_levelled(points, early, b.segment(early))
+            assert StandInBuffer.cleared - cleared == n_cleared
+        # The next transform counts.
+        StandInBuffer.known['base_link', 'tilted_lidar'] = quaternion(np.eye(3))
+        label = SEGMENTER.segment(xyz_of(points), (0.0, 0.0)).label
+        assert b.segment(message)[0].width == (label == Label.GROUND).sum()
         assert b.set('frame.level', 'sensor').successful
         assert StandInListener.alive == 0
         assert b.set('frame.level', 'tf').successful

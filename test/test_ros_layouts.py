@@ -47,10 +47,10 @@ def clouds(draw):
         offset += int(code[1]) * max(count, int(is_axis)) + draw(st.integers(0, 5))
     step = offset
     shape = height, width = draw(st.integers(0, 5)), draw(st.integers(0, 40))
-    # A single row needs no row_step; drivers leave it at 0 or write anything.
+    # A single row needs no row_step; drivers leave it at 0.
     least = 0 if height == 1 else width * step
     row_step = draw(st.sampled_from((least, width * step, width * step + 13)))
-    size = height * row_step if height != 1 else width * step
+    size = height * max(row_step, width * step)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     raw = rng.integers(0, 256, size + draw(st.sampled_from((0, 7))), dtype=np.uint8)
 

@@ -268,6 +268,35 @@ def test_under_load(tmp_path, numbers):
         assert_good_end(node, numbers[-1])
 
 
+IGNORING = [
+    '/bin/sh',
+    '-c',
+    'trap \'\' INT; exec "$@"',
+    'sh',
+    sys.executable,
+    '-m',
+    'gp_ground_seg',
+]
+"""As a shell without job control starts what ends with ``&``."""
+
+
+def test_sigint_that_was_ignored_at_the_start_ends_the_player_and_the_node(tmp_path):
+    pytest.importorskip('rosbags', reason='rosbags is not installed')
+    from bag_samples import write_ros2_bag
+
+    bag = tmp_path / 'drive.mcap'
+    write_ros2_bag(bag, 3)
+    to_node = ('--ros-args', '-r', f'/points:={NAMESPACE}/points')
+    player = [*IGNORING, 'play', str(bag), '--loop', *to_node]
+    node = [*IGNORING, 'node', *FIXED, '-p', 'runtime.backend:=numpy']
+    with Process(folder=tmp_path, command=node) as node, ros.linked(sends=None) as link:
+        with Process(folder=tmp_path, command=player) as player:
+            link.ground.wait(4)
+            assert player.stop(signal.SIGINT)[0] == 130
+            assert player.log.splitlines()[-1] == 'gp-ground-seg: interrupted'
+        assert_good_end(node, signal.SIGINT)
+
+
 UNDISTURBED = """
 import signal
 from gp_ground_seg.ros.lifecycle import stop_on_signals

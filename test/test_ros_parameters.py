@@ -14,6 +14,7 @@ import ros_helpers as ros
 from rcl_interfaces import srv
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import qos_profile_parameters
 from ros_helpers import bench, street, to_message
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
@@ -170,6 +171,44 @@ def test_several_at_once_are_all_taken_or_none(b):
     assert set_all(r_min=40.0, r_max=49.0).successful
     assert set_all(r_max=30.0, r_min=1.0).successful
     assert values_of(b) == {**Config().flat(), 'grid.r_min': 1.0, 'grid.r_max': 30.0}
+
+
+@pytest.mark.parametrize('how', ['set_parameters', 'set_parameters_atomically'])
+def test_an_integer_is_taken_for_any_number(b, how):
+    """As ``ros2 param set`` and rqt_reconfigure send what is typed without a point."""
+    kind = srv.SetParameters if how == 'set_parameters' else srv.SetParametersAtomically
+    whole = {spec.name: int(spec.default) for spec in SPECS if str(spec.default).endswith('.0')}
+    assert len(whole) > 20
+    for name, value in {**whole, 'label.ground_tolerance': 1, 'sensor.height': 2}.items():
+        request = kind.Request(parameters=ros.parameter_messages({name: value}))
+        response = b.call(kind, how, request)
+        result = response.results[0] if how == 'set_parameters' else response.result
+        assert result.successful, result.reason
+        (found,) = values_of(b, [name]).values()
+        assert (type(found), found) == (float, value)
+        assert b.node.config[name] == value
+
+
+def test_an_integer_in_a_file_is_taken_for_a_number(tmp_path):
+    path = tmp_path / 'parameters.yaml'
+    path.write_text(
+        '/**:\n  ros__parameters:\n    {label: {ground_tolerance: 1}, sensor.height: 2}\n'
+    )
+    with ros.started_node('--params-file', str(path)) as node:
+        changes = {'label.ground_tolerance': 1.0, 'sensor.height': 2.0}
+        assert node.config == Config().replace(**changes)
+        assert all(node.get_parameter(n).type_ == Parameter.Type.DOUBLE for n in changes)
+
+
+def test_hundreds_of_calls_at_once_are_all_answered(b):
+    """By a client that keeps the answers: with rclpy's default it keeps ten."""
+    name = f'{b.node_name}/get_parameters'
+    client = b.probe.create_client(srv.GetParameters, name, qos_profile=qos_profile_parameters)
+    ros.wait_for(client.service_is_ready, name)
+    request = srv.GetParameters.Request(names=['grid.r_max'])
+    futures = b.in_executor(lambda: [client.call_async(request) for _ in range(900)])
+    ros.wait_for(lambda: all(future.done() for future in futures), 'answers')
+    assert {future.result().values[0].double_value for future in futures} == {90.0}
 
 
 def test_a_fault_in_the_check_is_answered_and_the_node_lives(b, monkeypatch):

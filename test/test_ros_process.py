@@ -156,7 +156,10 @@ def node(tmp_path_factory):
         process.wait_until_settled()
         yield process
         assert process.stop(signal.SIGINT)[0] == 0
-        assert 'Traceback' not in process.log and 'WARN' not in process.log
+        assert 'Traceback' not in process.log
+        # Large clouds of a best-effort driver are warned of.
+        warnings = [line for line in process.log.splitlines() if 'WARN' in line]
+        assert all('come best-effort' in line for line in warnings)
 
 
 def simulated_bag(folder):

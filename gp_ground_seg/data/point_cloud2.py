@@ -46,9 +46,10 @@ Cloud = TypeVar('Cloud', bound=CloudMessage)
 def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
     """Coordinates of every point, row by row, a copy in native byte order, (height * width, 3).
 
-    float64 if any of the three is FLOAT64. Only x, y and z are checked. As in PCL, a cloud of one
-    row never uses ``row_step``, and bytes after the last point are ignored. A cloud without points
-    needs no fields. Raises PointCloudError if the layout cannot hold what it claims.
+    float64 if any of the three is FLOAT64. Only x, y and z are checked. A cloud of one row never
+    uses ``row_step``, which must not exceed its data; bytes after the last point are ignored. A
+    cloud without points needs no fields. Raises PointCloudError if the layout cannot hold what it
+    claims.
     """
     if cloud.height * cloud.width == 0:
         return np.empty((0, 3), dtype=np.float32)
@@ -174,6 +175,8 @@ def _view(cloud: CloudMessage, code: str, offset: int = 0) -> npt.NDArray[Any]:
     elif len(raw) < needed:
         layout = f'height {height}, width {width}, point_step {point_step}, row_step {row_step}'
         problem = f'data of {len(raw)} bytes: must be at least {needed} ({layout})'
+    elif row_step > len(raw):
+        problem = f'row_step {row_step}: must be at most the {len(raw)} bytes of data'
     if problem:
         raise PointCloudError(f'point cloud: {problem}')
     view: npt.NDArray[Any] = np.ndarray((height, width), code, raw, offset, (row_step, point_step))

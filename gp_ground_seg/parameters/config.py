@@ -48,6 +48,14 @@ class FrameConfig:
 
 
 @dataclass(frozen=True)
+class InputConfig:
+    """Clouds that are taken; the node only."""
+
+    max_cloud_size: float = advanced(64.0, (0.001, 4294.0),
+        'size of the data of a cloud above which it is refused', 'MB')
+
+
+@dataclass(frozen=True)
 class GridConfig:
     """Radial grid map."""
 
@@ -294,6 +302,7 @@ class Config(ParameterGroups):
 
     sensor: SensorConfig = SensorConfig()
     frame: FrameConfig = FrameConfig()
+    input: InputConfig = InputConfig()
     grid: GridConfig = GridConfig()
     lines: LinesConfig = LinesConfig()
     length_scale: LengthScaleConfig = LengthScaleConfig()

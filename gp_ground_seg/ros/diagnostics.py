@@ -32,6 +32,7 @@ class InputFacts(NamedTuple):
     n_publishers: int
     ros_time: float  # by the clock of the node [s]
     is_simulated: bool = False  # that clock
+    fault: str = ''  # of the way clouds are received
 
 
 class InputTask:
@@ -102,7 +103,7 @@ class InputTask:
             return Level.OK, f'waiting for the first cloud on {facts.topic}'
         # A stamp may be of any age: a recording is played at any time.
         if n_refused == 0:
-            return Level.OK, 'receiving'
+            return (Level.WARN, facts.fault) if facts.fault else (Level.OK, 'receiving')
         share = 'every cloud' if n_refused == n_received else f'{n_refused} of {n_received} clouds'
         is_error = n_refused > min(limits.max_refused_ratio * n_received, n_received - 1)
         return Level.ERROR if is_error else Level.WARN, f'{share} refused: {self._last_error}'
@@ -120,7 +121,7 @@ class ProcessingTask:
         self._backend, self._n_threads = '', 0
 
     def arrived(self, now: float, n_lost: int) -> None:
-        """Count a cloud that arrived, and `n_lost` sent just before it that did not."""
+        """Count a cloud that arrived, and `n_lost` before it that did not; -1 if it is late."""
         self._sent.count(now, 1 + n_lost)
         self._n_sent_recent += 1 + n_lost
         self._n_dropped += n_lost

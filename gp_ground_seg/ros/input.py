@@ -1,13 +1,11 @@
-"""The input: clouds, losses, QoS that follows the publishers, time jumps, tilt by TF."""
+"""The input: profiles of clouds, time jumps, tilt by TF."""
 
 from __future__ import annotations
 
 import functools
 import importlib
-import time
 from array import array
 from collections.abc import Callable, Mapping
-from copy import copy
 from typing import Any
 
 import numpy as np
@@ -16,24 +14,20 @@ from geometry_msgs.msg import Quaternion
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.subscription import Subscription
+from rclpy.qos import QoSProfile
 from rclpy.time import Time
-from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
 from gp_ground_seg.pipeline.tilt import angles_of
 
-INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
 OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 JUMP_TOLERANCE = 0.5  # stamps of several sensors on one topic may be that much out of order [s]
+TF_JUMP = 1.0  # jump back up to which transforms are kept: a late stamp, no other run [s]
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)  # the clock of a node may stand or jump
 THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
 """Options of messages that may come with every cloud."""
@@ -77,132 +71,6 @@ def in_words(profile: QoSProfile) -> str:
     return f'{reliability.name}, {history.name} {profile.depth}, {durability.name}'.lower()
 
 
-class SequenceGaps:
-    """Counts messages of one publisher, numbered 1, 2, 3 ... by it, that did not arrive.
-
-    They were lost on the way, or overwritten in a full queue while the node was busy.
-    """
-
-    _last: int | None = None
-
-    def reset(self) -> None:
-        """Forget the last number: another publisher has its own count."""
-        self._last = None
-
-    def note(self, number: int | None) -> int:
-        """Return how many messages are missing before the one with this `number`."""
-        last, self._last = self._last, number
-        if last is None or number is None or number <= last:
-            return 0
-        return number - last - 1
-
-
-class CloudSubscription:
-    """Subscription that is best-effort if a publisher is, and reliable otherwise.
-
-    A best-effort reader loses most of a replayed KITTI bag with stock Fast DDS; a reliable one
-    gets nothing from a best-effort LiDAR driver. Reliability given in ``qos_overrides``, by
-    `is_given`, is kept for any publisher. `callback` takes each cloud, its wait in this process
-    [s] and the clouds lost before it: 0 with several publishers, whose numbers tell nothing.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        topic: str,
-        is_given: Callable[[str], bool],
-        callback: Callable[[PointCloud2, float, int], None],
-    ) -> None:
-        self._node = node
-        self._unresolved_topic = topic
-        self._callback = callback
-        self._gaps = SequenceGaps()
-        self._offered: dict[bytes, ReliabilityPolicy] = {}
-        self.topic: str = node.resolve_topic_name(topic)
-        self._is_pinned = is_given(f'qos_overrides.{self.topic}.subscription.reliability')
-        # The executor still uses a subscription within its own event; a guard condition runs
-        # after all that became ready with it.
-        self._review_soon = node.create_guard_condition(self._review)
-        self._subscription = self._create(
-            cloud_profile(INPUT_DEPTH), QoSOverridingOptions.with_default_policies()
-        )
-        # The event can come before the publisher is listed, and there is no event for the end
-        # of the last best-effort publisher: they are looked at every second too.
-        node.create_timer(1.0, self._review_soon.trigger, clock=STEADY_CLOCK)
-
-    @property
-    def qos(self) -> QoSProfile:
-        """Quality of service in use."""
-        return self._subscription.qos_profile
-
-    @property
-    def qos_words(self) -> str:
-        """`qos` as in ``reliable, keep_last 5, volatile``."""
-        return in_words(self.qos)
-
-    @property
-    def n_publishers(self) -> int:
-        """Publishers, as of the last look."""
-        return len(self._offered)
-
-    def _create(self, profile: QoSProfile, overrides: QoSOverridingOptions | None) -> Subscription:
-        return self._node.create_subscription(
-            PointCloud2,
-            self._unresolved_topic,
-            self._receive,
-            profile,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible),
-            qos_overriding_options=overrides,
-        )
-
-    def _receive(self, message: PointCloud2, info: dict[str, Any]) -> None:
-        # Both are stamps of the system clock; 0 where the middleware gives none.
-        now = time.time_ns()
-        wait = max(0.0, 1e-9 * (now - (info.get('received_timestamp') or now)))
-        if not self._offered:
-            self._look_at_publishers()
-        n_lost = self._gaps.note(info.get('publication_sequence_number'))
-        if n_lost and (self._look_at_publishers() or self.n_publishers != 1):
-            n_lost = 0
-        self._callback(message, wait, n_lost)
-
-    def _on_incompatible(self, _event: object) -> None:
-        if self._is_pinned:
-            self._node.get_logger().error(
-                f'a publisher of {self.topic} does not offer what qos_overrides asks for '
-                f'({self.qos_words}): nothing will arrive from it'
-            )
-        self._review_soon.trigger()
-
-    def _look_at_publishers(self) -> bool:
-        """Return whether the publishers have changed since the last look."""
-        offered = {
-            bytes(entry.endpoint_gid): entry.qos_profile.reliability
-            for entry in self._node.get_publishers_info_by_topic(self.topic)
-        }
-        before, self._offered = self._offered, offered
-        if has_changed := offered.keys() != before.keys():
-            self._gaps.reset()
-        return has_changed
-
-    def _review(self) -> None:
-        self._look_at_publishers()
-        if not self._offered or self._is_pinned:
-            return
-        best_effort, reliable = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
-        wanted = best_effort if best_effort in self._offered.values() else reliable
-        profile = copy(self.qos)
-        if profile.reliability == wanted:
-            return
-        profile.reliability = wanted
-        self._node.get_logger().info(
-            f'subscribing {in_words(profile)} to {self.topic}, as its publishers offer'
-        )
-        self._node.destroy_subscription(self._subscription)
-        self._gaps.reset()
-        self._subscription = self._create(profile, None)
-
-
 class StampWatch:
     """Detects from the stamps of clouds that time has jumped back."""
 
@@ -221,9 +89,9 @@ class StampWatch:
 
 
 class TimeJumps:
-    """Calls `on_jump` when the stamps of clouds, or the clock of `node`, jump back."""
+    """Calls `on_jump` with how far [s] stamps of clouds, or the clock of `node`, jump back."""
 
-    def __init__(self, node: Node, on_jump: Callable[[], None]) -> None:
+    def __init__(self, node: Node, on_jump: Callable[[float], None]) -> None:
         self._node = node
         self._on_jump = on_jump
         self._stamps = StampWatch()
@@ -246,7 +114,7 @@ class TimeJumps:
         self._jumped(-1e-9 * jump.delta.nanoseconds)
 
     def _jumped(self, seconds: float) -> None:
-        self._on_jump()
+        self._on_jump(seconds)
         self._node.get_logger().info(
             f'time jumped back by {seconds:.1f} s: what earlier clouds taught is forgotten',
             **THROTTLED,
@@ -283,8 +151,9 @@ class TfTilt:
     def __init__(self, node: Node) -> None:
         self._tf2_ros = require_tf2()
         # Without the node: given one, the buffer clears itself at jumps of the node's clock,
-        # and in some releases raises an error there that ends the executor. See `reset`.
+        # and in some releases raises an error there that ends the executor. See `time_jumped`.
         self._buffer = self._tf2_ros.Buffer()
+        self._known: dict[tuple[str, str], tuple[float, float]] = {}  # newest tilt found
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
     def tilt(self, header: Header, base: str) -> tuple[float, float]:
@@ -297,13 +166,18 @@ class TfTilt:
                 # The newest: a sensor is fixed to its vehicle, and waiting would delay the cloud.
                 found = self._buffer.lookup_transform(base, frame, Time())
         except self._tf2_ros.TransformException as error:
+            # After a jump in time /tf may be silent for a while.
+            if (base, frame) in self._known:
+                return self._known[base, frame]
             way = f'from its frame {frame!r} to frame.base = {base!r}'
             raise PointCloudError(f'no transform {way}: {error}') from error
-        return tilt_of(found.transform.rotation)
+        self._known[base, frame] = tilt_of(found.transform.rotation)
+        return self._known[base, frame]
 
-    def reset(self) -> None:
-        """Forget all transforms, as after a jump in time."""
-        self._buffer.clear()
+    def time_jumped(self, seconds: float) -> None:
+        """Forget what moved after a long jump back; the newest tilt serves until TF sends anew."""
+        if seconds > TF_JUMP:
+            self._buffer.clear()
 
     def close(self) -> None:
         """Stop listening."""

@@ -20,9 +20,10 @@ from gp_ground_seg.parameters.schema import NODE_NAME
 from gp_ground_seg.pipeline.points import single_precision
 from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
-from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, TfTilt, TimeJumps, require_tf2
+from gp_ground_seg.ros.input import THROTTLED, TfTilt, TimeJumps, require_tf2
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
+from gp_ground_seg.ros.subscription import CloudSubscription
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader, LibraryLog
 from gp_ground_seg.segmenter import GroundSegmenter
 
@@ -125,6 +126,7 @@ class GroundSegmentationNode(ConfiguredNode):
         health.input.arrived(start, stamp, cloud.header.frame_id, fields)
         health.processing.arrived(start, n_lost)
         try:
+            self._check_size(cloud)
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
             base = self.config.frame.base
@@ -144,10 +146,17 @@ class GroundSegmentationNode(ConfiguredNode):
             health.model.segmented(segmentation)
             health.output.published(end, topics)
 
-    def _on_time_jump(self) -> None:
+    def _check_size(self, cloud: PointCloud2) -> None:
+        size, limit = len(cloud.data) / 1e6, self.config.input.max_cloud_size
+        if size > limit:
+            raise PointCloudError(
+                f'cloud of {size:.1f} MB: must be at most input.max_cloud_size = {limit:g} MB'
+            )
+
+    def _on_time_jump(self, seconds: float) -> None:
         self._segmenter.reset()
         if self._tf is not None:
-            self._tf.reset()
+            self._tf.time_jumped(seconds)
         self._diagnostics.input.time_jumped()
 
     def _refuse(self, cloud: PointCloud2, reason: str) -> None:
@@ -163,7 +172,9 @@ class GroundSegmentationNode(ConfiguredNode):
         clock = self.get_clock()
         source, now = self._input, 1e-9 * clock.now().nanoseconds
         is_simulated = clock.ros_time_is_active
-        facts = InputFacts(source.topic, source.qos_words, source.n_publishers, now, is_simulated)
+        facts = InputFacts(
+            source.topic, source.qos_words, source.n_publishers, now, is_simulated, source.fault
+        )
         return facts, self._outputs.n_subscribers()
 
 
