@@ -7,9 +7,11 @@ from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.msg import SetParametersResult as Result
+from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_service import ParameterService
+from rclpy.qos import qos_profile_parameters
 
 from gp_ground_seg.errors import ConfigError, GroundSegError
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
@@ -62,32 +64,6 @@ def describe(config: Config) -> str:
     return '\n'.join(lines)
 
 
-class _ParameterService(ParameterService):  # type: ignore[misc]
-    """rclpy's services; ``set_parameters`` works in any order, while its method has this name.
-
-    ``ros2 param load`` sends a whole file at once; set one by one, as rclpy does, a value that
-    contradicts one still to come would be refused. Here all are tried together; if that fails,
-    one by one, and the refused ones again after every round that set any.
-    """
-
-    def __init__(self, node: Node) -> None:
-        self._set_atomically = node.set_parameters_atomically
-        super().__init__(node)
-
-    def _set_parameters_callback(self, request: Any, response: Any) -> Any:
-        parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
-        results = [self._set_atomically(parameters)] * len(parameters)
-        n_left = len(parameters) + 1
-        while (n_refused := sum(not result.successful for result in results)) < n_left:
-            n_left = n_refused
-            results = [
-                result if result.successful else self._set_atomically([parameter])
-                for parameter, result in zip(parameters, results, strict=True)
-            ]
-        response.results = results
-        return response
-
-
 class ConfiguredNode(Node):  # type: ignore[misc]
     """A node, with the options of `rclpy.node.Node`, whose ROS parameters are a `Config`.
 
@@ -124,7 +100,16 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         self.add_pre_set_parameters_callback(lambda parameters: list(map(_typed, parameters)))
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
-        self._parameter_service = _ParameterService(self)
+        self._parameter_service = ParameterService(self)
+        for service in list(self.services):
+            if service.srv_type is SetParameters:
+                self.destroy_service(service)
+        self.create_service(
+            SetParameters,
+            '~/set_parameters',
+            self._on_set_request,
+            qos_profile=qos_profile_parameters,
+        )
 
     @property
     def config(self) -> Config:
@@ -156,6 +141,25 @@ class ConfiguredNode(Node):  # type: ignore[misc]
                 return Result(successful=False, reason=_unknown(parameter.name))
         result = self._on_set(parameter_list)
         return super().set_parameters_atomically(parameter_list) if result.successful else result
+
+    def _on_set_request(self, request: Any, response: Any) -> Any:
+        """Set what ``ros2 param load`` sends at once, a whole file, in any order.
+
+        Set one by one, as rclpy does, a value that contradicts one still to come would be
+        refused. Here all are tried together; if that fails, one by one, and the refused ones
+        again after every round that set any.
+        """
+        parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
+        results = [self.set_parameters_atomically(parameters)] * len(parameters)
+        n_left = len(parameters) + 1
+        while (n_refused := sum(not result.successful for result in results)) < n_left:
+            n_left = n_refused
+            results = [
+                result if result.successful else self.set_parameters_atomically([parameter])
+                for parameter, result in zip(parameters, results, strict=True)
+            ]
+        response.results = results
+        return response
 
     def _on_set(self, parameters: list[Parameter]) -> Result:
         # An exception out of here would end the executor and leave the caller waiting.
