@@ -34,7 +34,7 @@ PARTS = {
     'clouds, debugging allocator': Part(
         'torture_clouds.py', 100, 50, ('PYTHONMALLOC=debug', 'MALLOC_PERTURB_=165')
     ),
-    'threads, processes, signals, limits': Part('torture_processes.py', 22, 11),
+    'threads, processes, signals, limits': Part('torture_processes.py', 110, 11),
     'damaged compiled code': Part('torture_cache.py', 40, 20),
     'commands killed, interrupted, disk full': Part('torture_writes.py', 40, 20),
     'damaged files': Part('torture_files.py', 600, 200),
