@@ -1,11 +1,16 @@
 """Runs the commands under test, in this process or in one of their own."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 from gp_ground_seg.cli import main as cli
+
+INTERRUPTED = (130, -signal.SIGINT)
+"""Exit codes, 130 to a shell both: Python ends by the signal itself where that came while it ran
+code made from a string, as `namedtuple` and `dataclass` do, although we caught it."""
 
 
 def run(*words):
