@@ -9,8 +9,8 @@ from pathlib import Path
 from gp_ground_seg.cli import main as cli
 
 INTERRUPTED = (130, -signal.SIGINT)
-"""Exit codes, 130 to a shell both: Python ends by the signal itself where that came while it ran
-code made from a string, as `namedtuple` and `dataclass` do, although we caught it."""
+"""Exit codes, 130 to a shell both: `python -m` ends by the signal itself where that came while
+code made from a string ran, as of `namedtuple` and `dataclass`, although it was caught."""
 
 
 def run(*words):
