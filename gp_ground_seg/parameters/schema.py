@@ -26,7 +26,7 @@ AUTO: Literal['auto'] = 'auto'
 ROS_NODE_KEY = '/**'
 NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
-MAX_FILE_BYTES = 1 << 18  # those of config/ have 10 000
+MAX_FILE_BYTES = 1 << 18  # twenty times the largest of config/
 OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters that every ROS node has."""
 

@@ -153,7 +153,6 @@ class TfTilt:
         # Without the node: given one, the buffer clears itself at jumps of the node's clock,
         # and in some releases raises an error there that ends the executor. See `time_jumped`.
         self._buffer = self._tf2_ros.Buffer()
-        self._known: dict[tuple[str, str], tuple[float, float]] = {}  # newest tilt found
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
     def tilt(self, header: Header, base: str) -> tuple[float, float]:
@@ -166,16 +165,12 @@ class TfTilt:
                 # The newest: a sensor is fixed to its vehicle, and waiting would delay the cloud.
                 found = self._buffer.lookup_transform(base, frame, Time())
         except self._tf2_ros.TransformException as error:
-            # After a jump in time /tf may be silent for a while.
-            if (base, frame) in self._known:
-                return self._known[base, frame]
             way = f'from its frame {frame!r} to frame.base = {base!r}'
             raise PointCloudError(f'no transform {way}: {error}') from error
-        self._known[base, frame] = tilt_of(found.transform.rotation)
-        return self._known[base, frame]
+        return tilt_of(found.transform.rotation)
 
     def time_jumped(self, seconds: float) -> None:
-        """Forget what moved after a long jump back; the newest tilt serves until TF sends anew."""
+        """Forget all transforms after a long jump back."""
         if seconds > TF_JUMP:
             self._buffer.clear()
 
