@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.frame import (
@@ -66,34 +66,34 @@ def lowest_of_cells(scan, config):
 
 def find_faces(scan, config):
     """Tall tiles whose returns have a level normal; of those, faces down to the lowest return."""
-    faces, limit = config.faces, config.label.obstacle_max_height
+    faces, label = config.faces, config.label
+    limit = label.obstacle_max_height
     result = Faces(*np.zeros((2, len(scan.tiles.extremes)), dtype=bool))
     for t in np.unique(scan.tiles.tile[scan.tiles.tile >= 0]):
         own = scan.xyz[scan.tiles.tile == t].astype(np.float64)
         above = own[:, 2] - own[:, 2].min()
         own, above = own[above <= limit], above[above <= limit]
-        if len(own) < 4 or above.max() <= faces.min_height:
+        if len(own) < 4 or above.max() <= label.obstacle_min_height:
             continue
         value, vector = np.linalg.eigh(np.cov(own.T))
         # Each eigenvector is a normal with the product of the other two eigenvalues.
         weight = np.array([value[1] * value[2], value[0] * value[2], value[0] * value[1]])
         weight = np.maximum(weight, 0.0)
         square = (weight * vector[2] ** 2).sum() / weight.sum() if weight.sum() > 0.0 else 1.0
-        result.is_face[t] = math.sqrt(square) <= faces.max_normal_z
-        result.has_occluded_base[t] = result.is_face[t] and _is_occluded(own, above, faces)
+        result.is_face[t] = math.sqrt(square) < faces.max_normal_z
+        result.has_occluded_base[t] = result.is_face[t] and _is_occluded(own, above, config)
     return result
 
 
-def _is_occluded(own, above, faces):
-    low, high = own[above <= faces.tolerance, :2], own[above > faces.tolerance, :2]
+def _is_occluded(own, above, config):
+    faces, foot_height = config.faces, 0.2 * config.label.obstacle_min_height
+    low, high = own[above <= foot_height, :2], own[above > foot_height, :2]
     if len(high) < 2 or faces.max_foot_distance <= 0.0:
         return False
     # The direction in which the returns above scatter least, across the face.
     across = np.linalg.eigh(np.cov(high.T))[1][:, 0]
     distance = (low - high.mean(axis=0)) @ across
-    densities = len(low) / faces.tolerance, len(high) / (above.max() - faces.tolerance)
-    is_sparse = densities[0] <= faces.max_foot_density * densities[1]
-    return is_sparse and np.mean(distance**2) <= faces.max_foot_distance**2
+    return len(low) == 0 or np.mean(distance**2) <= faces.max_foot_distance**2
 
 
 # Lines and pseudo-inputs (sections III-C, III-D, Algorithm 1)
@@ -348,6 +348,7 @@ def label_points(scan, faces, surface, config):
     grid, label, n_points = scan.grid, config.label, len(scan.xyz)
     height, margin = np.full((2, n_points), np.nan)
     roughness = np.zeros((grid.n_segments, grid.n_bins))
+    band, depth = np.full(roughness.shape, label.ground_tolerance), label.ground_tolerance
     result = np.full(n_points, Label.OBSTACLE, np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
     is_face, is_occluded = (mask[scan.tiles.tile] & grid.inside for mask in faces)
@@ -363,16 +364,20 @@ def label_points(scan, faces, surface, config):
         aside = np.isin(grid.segment, [(m + k) % grid.n_segments for k in (-1, 0, 1)])
         about = height[near & aside & (abs(grid.bin - n) <= 1)]
         roughness[m, n] = math.sqrt(np.mean(about**2)) if len(about) else 0.0
+        if label.rule == 'predictive':
+            depth = label.obstacle_max_height
+            n_obstacles = np.sum(shows & aside & grid.inside & (abs(grid.bin - n) <= 1))
+            span = label.obstacle_max_height - label.obstacle_min_height
+            spread = math.hypot(roughness[m, n], config.observation.sigma_n)
+            # Where max(n, 1) N(h; 0, spread) falls to the density of obstacles.
+            peak = norm.pdf(0.0, 0.0, spread) * max(len(about), 1)
+            log_ratio = math.log(peak * span / (n_obstacles + 1))
+            likely = spread * math.sqrt(2.0 * log_ratio) if log_ratio > 0.0 else 0.0
+            band[m, n] = min(max(likely, label.ground_tolerance), label.obstacle_min_height)
     for i, m, n in places:
-        rough = roughness[m, n]
-        band = label.ground_tolerance + label.roughness_gain * rough
-        if shows[grid.cell == grid.cell[i]].any():
-            strict = label.obstacle_tolerance + label.obstacle_roughness_gain * rough
-            band = min(band, strict)
-        band = min(band, label.obstacle_min_height)
-        margin[i] = min(band - height[i], height[i] + label.below_tolerance)
+        margin[i] = min(band[m, n] - height[i], height[i] + depth)
         if is_face[i]:
-            limit = config.faces.tolerance * (-1.0 if is_occluded[i] else 1.0)
+            limit = label.ground_tolerance * (-1.0 if is_occluded[i] else 1.0)
             lowest = float(scan.tiles.lowest_z[scan.tiles.tile[i]])
             margin[i] = min(margin[i], limit - max(height[i], float(scan.xyz[i, 2]) - lowest))
         if margin[i] >= 0.0:

@@ -173,9 +173,9 @@ def test_the_paper_preset_has_none_of_our_departures():
     paper = PRESETS['paper'].config
     for name, value in switches:
         assert str(paper[name]) in (value, f'{value}.0'), f'{name} of the preset paper'
-    label, growth = paper.label, paper.growth
-    assert label.ground_tolerance == label.obstacle_tolerance == label.below_tolerance
-    assert paper.faces.min_height > label.obstacle_max_height
+    growth = paper.growth
+    assert paper.label.rule == 'tolerance'
+    assert paper.faces.max_normal_z == 0.0
     assert growth.max_standardised_depth == growth.max_standardised_residual
 
 

@@ -6,9 +6,10 @@ from conftest import fewer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg import Config, Label
+from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.frame import Faces, GroundSurface, Scan
 from gp_ground_seg.pipeline.labels import ground_probability
+from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 
 CONFIG = Config().replace(
     **{
@@ -30,13 +31,13 @@ def surface_of(heights=(0.0,) * 5):
     return GroundSurface(KNOTS, mean, np.full((4, 5), 0.1), np.ones(0, dtype=bool))
 
 
-def label(backend, ranges, z, surface=None, faces=None, angle=0.1, **changes):
-    """Labels and cells of points in one direction, without roughness in the bands.
+def label(backend, ranges, z, surface=None, faces=None, angle=0.1, sigma_n=0.05, **changes):
+    """Labels and cells of points in one direction.
 
     `faces` names points whose tile is a face, and whether its base is occluded.
     """
-    changes = {'roughness_gain': 0.0, 'obstacle_roughness_gain': 0.0, **changes}
-    config = CONFIG.replace(**{f'label.{name}': value for name, value in changes.items()})
+    named = {f'label.{name}': value for name, value in changes.items()}
+    config = CONFIG.replace(**{'observation.sigma_n': sigma_n, **named})
     r, z = np.broadcast_arrays(np.asarray(ranges, dtype=float), np.asarray(z, dtype=float))
     scan = backend.build_grid(np.column_stack([r * np.cos(angle), r * np.sin(angle), z]), config)
     marks = Faces(*np.zeros((2, len(scan.tiles.extremes)), dtype=bool))
@@ -50,20 +51,58 @@ def label(backend, ranges, z, surface=None, faces=None, angle=0.1, **changes):
     return found, scan.grid
 
 
-def test_labels_by_height(backend):
-    heights = [0.0, 0.09, 0.11, -0.99, -1.01, np.nan]
-    found, _ = label(backend, 3.0, heights)
-    assert list(found.label) == [G, G, O, G, O, U]
-    np.testing.assert_allclose(found.margin[:5], [0.1, 0.01, -0.01, 0.01, -0.01], atol=1e-12)
+@pytest.mark.parametrize(
+    ('rule', 'expected'), [('tolerance', [G, G, O, G, O, U]), ('predictive', [G, G, O, G, G, U])]
+)
+def test_labels_by_height(backend, rule, expected):
+    # On a surface as smooth as this the returns about a cell say less than the tolerance.
+    heights = [0.0, 0.09, 0.11, -0.09, -0.11, np.nan, *[0.0] * 2000]
+    found, _ = label(backend, 3.0, heights, rule=rule, sigma_n=0.001)
+    assert list(found.label[:6]) == expected
+    np.testing.assert_allclose(found.margin[:3], [0.1, 0.01, -0.01], atol=1e-12)
+    below = {'tolerance': 0.1 - 0.11, 'predictive': 0.1 + 0.11}[rule]
+    np.testing.assert_allclose(found.margin[4], below, atol=1e-12)
     assert np.isnan(found.margin[5])
 
 
-@pytest.mark.parametrize(('other', 'expected'), [(1.0, O), (0.3, G), (2.5, G), (np.nan, G)])
+def ground_about(n, std=0.1):
+    """Returns of rough ground in all four segments, and their heights."""
+    rng = np.random.default_rng(7)
+    return np.full(n, 3.0), rng.normal(0.0, std, n)
+
+
+@pytest.mark.parametrize(('other', 'expected'), [(0.8, O), (0.3, G), (1.5, G), (np.nan, G)])
 def test_the_base_of_an_obstacle_is_judged_more_strictly(backend, other, expected):
-    found, _ = label(backend, [3.0, 3.5, 3.2, 3.9], [0.08, other, 0.04, -0.15])
-    assert list(found.label[[0, 2, 3]]) == [expected, G, G]
-    # Obstacles in the next bin, or outside, do not count.
-    assert label(backend, [3.0, 5.0, 1e3], [0.08, 1.0, 1.0])[0].label[0] == G
+    ranges, heights = ground_about(30)
+    z = np.concatenate([[0.15, 0.04, -0.15], np.full(100, other), heights])
+    found, _ = label(backend, np.concatenate([np.full(103, 3.0), ranges]), z)
+    assert list(found.label[:3]) == [expected, G, G]
+
+
+def test_the_band_is_where_ground_and_obstacle_are_equally_likely(backend):
+    ranges, heights = ground_about(2000)
+    ranges, z = np.append(ranges, np.full(20, 3.2)), np.append(heights, np.full(20, 0.7))
+    found, grid = label(backend, ranges, z)
+    near = heights[abs(heights) < 0.5]
+    spread = np.hypot(np.sqrt(np.mean(near**2)), CONFIG.observation.sigma_n)
+    band = found.margin + found.height
+    band = band[heights.argmax()]
+    ground = len(near) * scipy.stats.norm.pdf(band, 0.0, spread)
+    np.testing.assert_allclose(ground, (20 + 1) / (1.0 - 0.5), rtol=1e-6)
+    assert 0.1 < band < 0.5
+
+
+def test_more_tolerance_is_more_ground(backend):
+    """The parameter moves points from obstacle to ground, and none the other way."""
+    made = simulate_scan(SCENES['urban'](0), SENSORS['vlp-16'], np.random.default_rng(0))
+    before, shares = np.zeros(len(made.points), bool), []
+    for tolerance in (0.05, 0.1, 0.2, 0.3):
+        config = Config().replace(**{'label.ground_tolerance': tolerance})
+        is_ground = GroundSegmenter(config, backend=backend).segment(made.points).label == G
+        assert not (before & ~is_ground).any()
+        before = is_ground
+        shares.append(is_ground.mean())
+    assert min(np.diff(shares)) > 0.0005
 
 
 def test_of_a_face_only_the_base_is_ground_and_nothing_where_it_is_occluded(backend):
@@ -90,10 +129,9 @@ def test_the_band_follows_the_roughness_up_to_the_height_of_an_obstacle(backend,
     # Beside the points, as many below the surface as make that roughness.
     ranges = np.concatenate([[3.0, 5.0, 7.0], np.tile([3.0, 5.0, 7.0], 3000)])
     heights = np.concatenate([[0.3, 0.45, 0.51], np.full(9000, -rough)])
-    gain = CONFIG.label.roughness_gain
-    found, _ = label(backend, ranges, heights, roughness_gain=gain)
+    found, _ = label(backend, ranges, heights)
     assert [Label(value).name[0] for value in found.label[:3]] == list(expected)
-    assert list(label(backend, ranges, heights)[0].label[:3]) == [O, O, O]
+    assert list(label(backend, ranges, heights, rule='tolerance')[0].label[:3]) == [O, O, O]
 
 
 @settings(max_examples=fewer(60, 10))
@@ -103,7 +141,7 @@ def test_labels_are_the_reference(backend, seed, dtype):
     xyz = rng.uniform(-12, 12, (300, 3)).astype(dtype)
     xyz[:, 2] *= 0.1
     # Posts, so that there are faces.
-    xyz[100:200, :2] = np.repeat(xyz[100:120, :2], 5, axis=0) + rng.normal(0, 0.02, (100, 2))
+    xyz[100:200, :2] = np.repeat(xyz[100:105, :2], 20, axis=0) + rng.normal(0, 0.02, (100, 2))
     xyz[::20] = np.nan
     mean, std = rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5))
     mean[seed % 4] = std[seed % 4] = np.nan
@@ -117,7 +155,9 @@ def test_labels_are_the_reference(backend, seed, dtype):
     wide = CONFIG.replace(**{'label.ground_tolerance': rng.uniform(0.1, 1.0)})
     is_wide = backend.label_points(scan, faces, surface, wide).label == Label.GROUND
     assert is_wide[found.label == Label.GROUND].all()
-    expected = reference.label_points(scan, faces, surface, CONFIG)
+    config = CONFIG.replace(**{'label.rule': ('predictive', 'tolerance')[seed % 2]})
+    found = backend.label_points(scan, faces, surface, config)
+    expected = reference.label_points(scan, faces, surface, config)
     np.testing.assert_array_equal(found.label, expected.label)
     for name in ('height', 'margin', 'roughness'):
         ours, theirs = getattr(found, name), getattr(expected, name)

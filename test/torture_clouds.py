@@ -86,7 +86,8 @@ def random_config(rng):
         changes['learning.max_evaluations'] = min(changes.get('learning.max_evaluations', 4), 8)
         changes.pop('learning.max_time', None)  # a clock decides
         try:
-            return Config().replace(**changes)
+            # Tables grow with the threads, of which up to eight are tried.
+            return Config().replace(**changes, **{'runtime.n_threads': 8})
         except ConfigError:
             continue
 

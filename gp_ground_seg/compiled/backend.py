@@ -118,10 +118,11 @@ class NumbaBackend:
 
     def find_faces(self, scan: Scan, config: Config) -> Faces:
         """Tiles that hold a vertical face."""
-        take, thresholds = self._buffers.take, numbers_of(config.faces)
+        take = self._buffers.take
+        thresholds, heights = numbers_of(config.faces), numbers_of(config.label)
         n_tiles, n_parts = len(scan.tiles.extremes), self.workers.n_parts(len(scan.xyz))
         tile_to_row, row_to_tile = take('tile_rows', (2, n_tiles), np.int32)
-        n_tall = faces_.select_tall(scan.tiles, thresholds, tile_to_row, row_to_tile)
+        n_tall = faces_.select_tall(scan.tiles, heights, tile_to_row, row_to_tile)
         sums = take('face_sums', (n_parts, 2 * n_tall, faces_.N_COLUMNS), np.float64)
         room = faces_.FaceSums(tile_to_row, row_to_tile, sums)
         self.workers.run(
@@ -129,13 +130,13 @@ class NumbaBackend:
             n_parts,
             scan.xyz.T,
             scan.tiles,
-            thresholds,
-            config.label.obstacle_max_height,
+            thresholds.cell_size,
+            heights,
             n_tall,
             room,
         )
         result = Faces(*take('faces', (2, n_tiles), np.bool_))
-        faces_.decide_faces(n_parts, n_tall, thresholds, room, result)
+        faces_.decide_faces(n_parts, n_tall, thresholds, heights, room, result)
         return result
 
     def extract_lines(
@@ -208,14 +209,16 @@ class NumbaBackend:
         self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
     ) -> Labelled:
         """Height, label and margin of each point; roughness of each cell."""
-        take, tolerances = self._buffers.take, numbers_of(config.label)
+        take, label = self._buffers.take, numbers_of(config.label)
+        is_predictive = config.label.rule == 'predictive'
+        max_depth = label.obstacle_max_height if is_predictive else label.ground_tolerance
         n_points, n_bins = len(scan.xyz), scan.grid.n_bins
         n_cells, n_parts = scan.grid.n_segments * n_bins, self.workers.n_parts(n_points)
         room = labels.LabelRoom(
             take('pieces', (n_cells + 1, 2), np.float64),
             take('square_sums', (n_parts, n_cells + 1, 2), np.int64),
             take('band', (n_cells + 1,), np.float64),
-            square_units(n_points, config.label.obstacle_min_height),
+            square_units(n_points, label.obstacle_min_height),
         )
         result = Labelled(
             np.empty(n_points, dtype=np.uint8),
@@ -224,17 +227,17 @@ class NumbaBackend:
             np.empty((scan.grid.n_segments, n_bins)),
         )
         labels.fit_pieces(surface, room)
-        self.workers.run(
-            labels.survey, n_parts, scan, faces.is_face, tolerances, result.height, room
+        self.workers.run(labels.survey, n_parts, scan, faces.is_face, label, result.height, room)
+        labels.set_bands(
+            n_parts, label, is_predictive, config.observation.sigma_n, room, result.roughness
         )
-        labels.set_bands(n_parts, tolerances, room, result.roughness)
         self.workers.run(
             labels.label_part,
             n_parts,
             scan,
             faces,
-            tolerances,
-            config.faces.tolerance,
+            label.ground_tolerance,
+            max_depth,
             room.band,
             result,
         )

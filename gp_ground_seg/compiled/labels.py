@@ -29,7 +29,8 @@ from gp_ground_seg.parameters.config import LabelConfig
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
 OBSTACLE_FLAG = 2**32
-"""Added to the number of points for each that shows an obstacle: more than there are points."""
+"""Added to the number of returns near the surface for each that shows an obstacle: more than there
+are points."""
 
 
 class LabelRoom(NamedTuple):
@@ -100,34 +101,43 @@ def survey(
 
 
 @jit(entry=True)
-def set_bands(n_parts: int, config: LabelConfig, room: LabelRoom, roughness: FloatArray) -> None:
-    """Roughness and band of each cell from the sums of all parts."""
+def set_bands(
+    n_parts: int,
+    config: LabelConfig,
+    is_predictive: bool,
+    sigma_n: float,
+    room: LabelRoom,
+    roughness: FloatArray,
+) -> None:
+    """Roughness and band of each cell from the sums of all parts, see `ground_band` of the twin."""
     n_segments, n_bins = roughness.shape
     # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
     number = np.empty(n_bins + 2, np.int64)
     squares = np.empty(n_bins + 2, np.int64)
-    n_obstacles = np.empty(n_bins, np.int64)
+    obstacle_depth = config.obstacle_max_height - config.obstacle_min_height
     for m in range(n_segments):
         for n in range(n_bins + 2):
             number[n] = squares[n] = 0
-        for n in range(n_bins):
-            n_obstacles[n] = 0
         for index in range(n_parts):
             for k in range(-1, 2):
                 first = (m + k + n_segments) % n_segments * n_bins
                 for n in range(n_bins):
-                    number[n + 1] += room.sums[index, first + n, 0] & (OBSTACLE_FLAG - 1)
+                    number[n + 1] += room.sums[index, first + n, 0]
                     squares[n + 1] += room.sums[index, first + n, 1]
-            for n in range(n_bins):
-                n_obstacles[n] += room.sums[index, m * n_bins + n, 0] >> 32
         for n in range(n_bins):
-            count = max(number[n] + number[n + 1] + number[n + 2], 1)
+            flagged = number[n] + number[n + 1] + number[n + 2]
+            n_near = np.float64(max(flagged & (OBSTACLE_FLAG - 1), 1))
             total = squares[n] + squares[n + 1] + squares[n + 2]
-            rough = math.sqrt(np.float64(total) / (room.units * np.float64(count)))
-            free = config.ground_tolerance + config.roughness_gain * rough
-            beside = config.obstacle_tolerance + config.obstacle_roughness_gain * rough
-            own = min(free, beside) if n_obstacles[n] > 0 else free
-            room.band[m * n_bins + n] = min(own, config.obstacle_min_height)
+            rough = math.sqrt(np.float64(total) / (room.units * n_near))
+            band = config.ground_tolerance
+            if is_predictive:
+                variance = rough**2 + sigma_n**2
+                obstacles_per_metre = np.float64((flagged >> 32) + 1) / obstacle_depth
+                ground_per_metre = n_near / math.sqrt(2.0 * math.pi * variance)
+                log_ratio = math.log(ground_per_metre / obstacles_per_metre)
+                likely = math.sqrt(2.0 * variance * max(log_ratio, 0.0))
+                band = min(max(likely, band), config.obstacle_min_height)
+            room.band[m * n_bins + n] = band
             roughness[m, n] = rough
     room.band[n_segments * n_bins] = math.nan
 
@@ -137,26 +147,25 @@ def label_part(
     part: Part,
     scan: Scan,
     faces: Faces,
-    config: LabelConfig,
-    face_tolerance: float,
+    tolerance: float,
+    max_depth: float,
     band: FloatArray,
     result: Labelled,
 ) -> None:
-    """Label the points of a part from their heights in `result`."""
+    """Label the points of a part from their heights in `result`.
+
+    Ground reaches `max_depth` below the surface, and on faces `tolerance` above their base.
+    """
     points = points_of(part, len(result.height))
     z, tile, cell = scan.xyz.T[2, points], scan.tiles.tile[points], scan.grid.cell[points]
     height, label, margins = result.height[points], result.label[points], result.margin[points]
     for i in range(len(cell)):
         n, h = cell[i], height[i]
-        margin = min(
-            band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + config.below_tolerance
-        )
+        margin = min(band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + max_depth)
         t = np.uintp(tile[i] if n >= 0 else 0)
         if faces.is_face[t]:
             over_base = max(h, np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0]))
-            limit = face_tolerance
-            if faces.has_occluded_base[t]:
-                limit = -limit
+            limit = -tolerance if faces.has_occluded_base[t] else tolerance
             margin = min(margin, limit - over_base)
         margins[i] = margin
         own = _UNKNOWN if n == NOT_FINITE else _OBSTACLE

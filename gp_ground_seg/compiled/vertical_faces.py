@@ -15,8 +15,8 @@ import numpy as np
 from gp_ground_seg.compiled.threads import Part, points_of
 from gp_ground_seg.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Tiles
 from gp_ground_seg.jit import jit
-from gp_ground_seg.parameters.config import FacesConfig
-from gp_ground_seg.pipeline.vertical_faces import MIN_RETURNS, UNITS_PER_METRE
+from gp_ground_seg.parameters.config import FacesConfig, LabelConfig
+from gp_ground_seg.pipeline.vertical_faces import FOOT_SHARE, MIN_RETURNS, UNITS_PER_METRE
 
 # Each tall tile has two rows of sums, for the lowest returns and for those above: number, x, y, z,
 # their squares, x y, x z, y z; the greatest height. The first row also holds `_TO_UNITS` less
@@ -49,13 +49,14 @@ class FaceSums(NamedTuple):
 
 @jit(entry=True)
 def select_tall(
-    tiles: Tiles, config: FacesConfig, tile_to_row: CellArray, row_to_tile: CellArray
+    tiles: Tiles, label: LabelConfig, tile_to_row: CellArray, row_to_tile: CellArray
 ) -> int:
     """Give each tall tile its rows (see `FaceSums`); return the number of tall tiles."""
     extremes, n_tall = tiles.extremes, 0
     for tile in tiles.occupied:
         t = np.uintp(tile)
-        if np.float64(extremes[t, 1]) - np.float64(extremes[t, 0]) > config.min_height:
+        height = np.float64(extremes[t, 1]) - np.float64(extremes[t, 0])
+        if height > label.obstacle_min_height:
             tile_to_row[t] = 2 * n_tall
             row_to_tile[n_tall] = tile
             n_tall += 1
@@ -69,14 +70,15 @@ def sum_returns(
     part: Part,
     columns: PointArray,
     tiles: Tiles,
-    config: FacesConfig,
-    max_height: float,
+    tile_size: float,
+    label: LabelConfig,
     n_tall: int,
     room: FaceSums,
 ) -> None:
     """Sum over the returns of a part of the points, (3, N), in tall tiles."""
     sums = room.sums[part.number]
-    _clear_sums(tiles.extremes, config.cell_size, n_tall, room.row_to_tile, sums)
+    _clear_sums(tiles.extremes, tile_size, n_tall, room.row_to_tile, sums)
+    foot_height, max_height = FOOT_SHARE * label.obstacle_min_height, label.obstacle_max_height
     # Slices, because indices from 0 on need no check for negative ones.
     own = points_of(part, len(tiles.tile))
     x, y, z, tile = columns[0, own], columns[1, own], columns[2, own], tiles.tile[own]
@@ -94,7 +96,7 @@ def sum_returns(
         dy = (np.float64(y[i]) + low[_TO_UNITS_Y]) - _TO_UNITS
         dz = (above + _TO_UNITS) - _TO_UNITS
         # No branch: whether a return is one of the lowest is unpredictable.
-        s = sums[np.uintp(k + np.int32(above > config.tolerance))]
+        s = sums[np.uintp(k + np.int32(above > foot_height))]
         s[0] += 1.0
         s[1] += dx
         s[2] += dy
@@ -127,7 +129,12 @@ def _clear_sums(
 
 @jit(entry=True)
 def decide_faces(
-    n_parts: int, n_tall: int, config: FacesConfig, room: FaceSums, faces: Faces
+    n_parts: int,
+    n_tall: int,
+    config: FacesConfig,
+    label: LabelConfig,
+    room: FaceSums,
+    faces: Faces,
 ) -> None:
     """Decide from the sums of all parts which tiles hold a face, into `faces`."""
     for t in range(len(faces.is_face)):
@@ -137,10 +144,10 @@ def decide_faces(
         _add_parts(n_parts, 2 * k, room.sums, low)
         _add_parts(n_parts, 2 * k + 1, room.sums, high)
         top = max(low[_TOP], high[_TOP])
-        if top > config.min_height and _is_vertical(low, high, config.max_normal_z):
+        if top > label.obstacle_min_height and _is_vertical(low, high, config.max_normal_z):
             t = room.row_to_tile[k]
             faces.is_face[t] = True
-            faces.has_occluded_base[t] = _is_base_occluded(low, high, top, config)
+            faces.has_occluded_base[t] = _is_base_occluded(low, high, config.max_foot_distance)
 
 
 @jit()
@@ -168,17 +175,14 @@ def _is_vertical(low: FloatArray, high: FloatArray, max_normal_z: float) -> bool
     vertical = max(xx * yy - xy * xy, 0.0)
     trace = vertical + max(yy * zz - yz * yz, 0.0) + max(xx * zz - xz * xz, 0.0)
     normal_z = math.sqrt(vertical / trace) if trace > 0.0 else 1.0
-    return normal_z <= max_normal_z
+    return normal_z < max_normal_z
 
 
 @jit()
-def _is_base_occluded(low: FloatArray, high: FloatArray, top: float, config: FacesConfig) -> bool:
+def _is_base_occluded(low: FloatArray, high: FloatArray, max_foot_distance: float) -> bool:
     """Whether the lowest returns are the face's own, see `is_base_occluded` of the twin."""
     n_low, n_high = low[0], high[0]
-    if config.max_foot_distance <= 0.0 or n_high < 2.0:
-        return False
-    usual = n_high * config.tolerance
-    if n_low * (top - config.tolerance) > config.max_foot_density * usual:
+    if max_foot_distance <= 0.0 or n_high < 2.0:
         return False
     mean_x, mean_y = high[1] / n_high, high[2] / n_high
     xx = high[4] - n_high * mean_x * mean_x
@@ -192,5 +196,5 @@ def _is_base_occluded(low: FloatArray, high: FloatArray, top: float, config: Fac
     if size > 0.0:
         aligned = ((low_xx - low_yy) * (xx - yy) + 4.0 * low_xy * xy) / size
     square: float = 0.5 * (low_xx + low_yy - aligned)
-    in_plane: bool = square <= n_low * config.max_foot_distance * config.max_foot_distance
+    in_plane: bool = square <= n_low * max_foot_distance * max_foot_distance
     return in_plane

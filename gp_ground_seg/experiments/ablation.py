@@ -46,11 +46,7 @@ class Departure(NamedTuple):
     kept: bool = True  # if the defaults have it
 
 
-_PLAIN_BAND: Changes = {
-    'label.roughness_gain': 0.0,
-    'label.obstacle_roughness_gain': 0.0,
-    'label.ground_tolerance': 0.2,
-}
+_PLAIN_BAND: Changes = {'label.rule': 'tolerance', 'label.ground_tolerance': 0.2}
 
 DEPARTURES: tuple[Departure, ...] = (
     Departure('latent length-scales (constant instead)', {'length_scale.model': 'constant'}),
@@ -59,11 +55,9 @@ DEPARTURES: tuple[Departure, ...] = (
     Departure('sloping mean', {'observation.slope_std': 0.0}),
     Departure('neighbouring segments fused', {'surface.n_neighbours': 0}),
     Departure('asymmetric gate of the growth', {'growth.max_standardised_depth': 2.0}),
-    Departure('vertical faces', {'faces.min_height': 100.0}),
+    Departure('vertical faces', {'faces.max_normal_z': 0.0}),
     Departure('vertical faces with occluded base', {'faces.max_foot_distance': 0.0}),
-    Departure('band that follows the roughness', _PLAIN_BAND),
-    Departure('narrower band beside an obstacle', {'label.obstacle_tolerance': 0.2}),
-    Departure('band open downwards', {'label.below_tolerance': 0.2}),
+    Departure('labels by the predictive distribution', _PLAIN_BAND),
     Departure('bins that widen, 80 of them', {'grid.n_bins': 120, 'grid.bin_growth': 1.0}),
     Departure('lines end at 0.1 rad', {'lines.slope_tolerance': 0.02}),
     Departure('length-scales of classes learned', {'learning.fixed': 'length_scales'}),
@@ -74,7 +68,7 @@ DEPARTURES: tuple[Departure, ...] = (
     Departure('240 segments', {'grid.n_segments': 240}, kept=False),
     Departure('twice the neighbours fused', {'surface.n_neighbours': 4}, kept=False),
     Departure('a wider gate (3)', {'growth.max_standardised_residual': 3.0}, kept=False),
-    Departure('vertical faces from 0.3 m on', {'faces.min_height': 0.3}, kept=False),
+    Departure('obstacles from 0.3 m on', {'label.obstacle_min_height': 0.3}, kept=False),
 )
 """What `departures` measures. A new row here is all that a further one takes."""
 

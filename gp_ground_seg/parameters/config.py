@@ -177,41 +177,30 @@ class FacesConfig:
 
     cell_size: float = advanced(0.5, (0.05, 10.0),
         'side of the square tiles whose returns are judged together', 'm')
-    min_height: float = advanced(0.5, (0.05, 100.0),
-        'height of the returns of a tile above its lowest from which it may be a face', 'm')
     max_normal_z: float = advanced(0.45, (0.0, 1.0),
-        'vertical part of the unit normal up to which the returns of a tile are a vertical face')
-    tolerance: float = advanced(0.1, (0.001, 100.0),
-        'largest height of a ground point above the base of a face', 'm')
+        'vertical part of the unit normal below which the returns of a tile are a vertical face; '
+        '0 = no tile has one')
     max_foot_distance: float = advanced(0.06, (0.0, 10.0),
         'distance (root mean square) of the lowest returns of a face from its plane up to which '
         'its base is occluded, with no ground seen before it; 0 = never', 'm')
-    max_foot_density: float = advanced(3.0, (0.0, 1000.0),
-        'density over height of those returns, in multiples of that above them, up to which they '
-        'belong to the face: ground would pile up at one height')
 
 
 @dataclass(frozen=True)
 class LabelConfig:
     """Labels from the distance to the surface."""
 
+    rule: str = advanced('predictive', ('predictive', 'tolerance'),
+        'predictive = a return is ground where its height is more likely of ground than of an '
+        'obstacle, by the returns about it; tolerance = ground_tolerance alone, above and below')
     ground_tolerance: float = basic(0.1, (0.001, 5.0),
-        'largest height of a ground point above a smooth surface', 'm', 'zeta_g')
-    roughness_gain: float = advanced(3.0, (0.0, 20.0),
-        'growth of that height in multiples of the local roughness')
-    below_tolerance: float = basic(1.0, (0.001, 50.0),
-        'largest depth of a ground point below the surface; obstacles lie only above', 'm')
-    obstacle_tolerance: float = advanced(0.05, (0.001, 5.0),
-        'largest height of a ground point above a smooth surface beside an obstacle (in its bin)',
-        'm')
-    obstacle_roughness_gain: float = advanced(1.0, (0.0, 20.0),
-        'growth of that height in multiples of the local roughness')
+        'height above the surface up to which a return is ground in any case; more = more ground',
+        'm', 'zeta_g')
     obstacle_min_height: float = advanced(0.5, (0.01, 10.0),
         'height above the surface from which a return is an obstacle however rough the ground',
         'm')
-    obstacle_max_height: float = advanced(2.0, (0.02, 50.0),
-        'height above the surface up to which a return shows an obstacle; higher ones overhang',
-        'm')
+    obstacle_max_height: float = advanced(1.0, (0.02, 50.0),
+        'height above the surface up to which a return shows an obstacle, as higher ones overhang; '
+        'and depth below it up to which a return is ground', 'm')
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,9 +29,8 @@ FINEST_UNITS = 2.0**40
 def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Config) -> Labelled:
     """Label points by their height over the surface (paper, Algorithm 2, line 14).
 
-    The paper's one tolerance is a band here that follows the local roughness, is
-    narrower in a cell with an obstacle, and is wide below the surface: obstacles
-    stand on the ground, not below it. Of a vertical face only
+    A point within the paper's tolerance is ground; above it, the returns about the cell decide
+    (see `ground_band`); and below the surface there is no obstacle. Of a vertical face only
     returns near its lowest one are ground; none are where its base is occluded.
 
     Parameters
@@ -49,54 +49,75 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     height = z - surface.at(grid)[0]
     tile, inside = np.maximum(tiles.tile, 0), grid.inside
     in_face = faces.is_face[tile] & inside
-    roughness = local_roughness(height, grid, in_face, label.obstacle_min_height)
-    band = ground_band(roughness, bin_has_obstacle(height, grid, label), label).ravel()
-    margin = np.minimum(band[np.maximum(grid.cell, 0)] - height, height + label.below_tolerance)
+    near = local_heights(height, grid, in_face, label)
+    tolerance = label.ground_tolerance
+    if label.rule == 'predictive':
+        band = ground_band(near, config)[np.maximum(grid.cell, 0)]
+        margin = np.minimum(band - height, height + label.obstacle_max_height)
+    else:
+        margin = tolerance - np.abs(height)
     over_base = np.maximum(height, z - np.where(in_face, tiles.lowest_z[tile], 0.0))
     # With a limit below zero no return of the tile is ground; the margin stays a distance.
-    tolerance = config.faces.tolerance
     limit = np.where(faces.has_occluded_base[tile], -tolerance, tolerance)
     margin = np.where(in_face, np.minimum(margin, limit - over_base), margin)
     margin[~inside] = np.nan
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
+    roughness = near.roughness.reshape(grid.n_segments, grid.n_bins)
     return Labelled(result, height, margin, roughness)
 
 
-def ground_band(roughness: FloatArray, has_obstacle: BoolArray, label: LabelConfig) -> FloatArray:
-    """Largest height of ground over the surface in each cell, (M, n_bins) [m].
+class LocalHeights(NamedTuple):
+    """Heights over the surface of the returns in each cell and the eight around it.
+
+    Attributes
+    ----------
+    n_near : (M * n_bins,) float64
+        Returns within ``label.obstacle_min_height`` of the surface, but for those of faces.
+    roughness : (M * n_bins,) float64
+        Their root mean square height [m]; 0 where there are none.
+    n_obstacles : (M * n_bins,) float64
+        Returns from that height to ``label.obstacle_max_height``.
+    """
+
+    n_near: FloatArray
+    roughness: FloatArray
+    n_obstacles: FloatArray
+
+
+def ground_band(near: LocalHeights, config: Config) -> FloatArray:
+    """Largest height of ground over the surface in each cell, (M * n_bins,) [m].
+
+    The height of a ground return is normally distributed about the surface, with the local
+    roughness and the noise; returns of obstacles are spread evenly over height, as densely as
+    those that are too high for ground. Up to the band a return is more likely ground. One more
+    obstacle return is counted than there is: that none was seen does not exclude any.
 
     Parameters
     ----------
-    roughness : (M, n_bins) float64
-        See `local_roughness` [m].
-    has_obstacle : (M, n_bins) bool
-        See `bin_has_obstacle`.
-    label : LabelConfig
-        Tolerances.
+    near : LocalHeights
+        Heights about each cell.
+    config : Config
+        Heights of obstacles, noise, and the least and largest band.
     """
-    free = label.ground_tolerance + label.roughness_gain * roughness
-    beside = label.obstacle_tolerance + label.obstacle_roughness_gain * roughness
-    result = np.where(has_obstacle, np.minimum(free, beside), free)
-    return np.minimum(result, label.obstacle_min_height)
+    label = config.label
+    variance = near.roughness**2 + config.observation.sigma_n**2
+    obstacles_per_metre = (near.n_obstacles + 1.0) / (
+        label.obstacle_max_height - label.obstacle_min_height
+    )
+    ground_per_metre = np.maximum(near.n_near, 1.0) / np.sqrt(2.0 * np.pi * variance)
+    log_ratio = np.log(ground_per_metre / obstacles_per_metre)
+    likely = np.sqrt(2.0 * variance * np.maximum(log_ratio, 0.0))
+    result: FloatArray = np.minimum(
+        np.maximum(likely, label.ground_tolerance), label.obstacle_min_height
+    )
+    return result
 
 
-def bin_has_obstacle(height: FloatArray, grid: PolarGrid, label: LabelConfig) -> BoolArray:
-    """Whether an obstacle stands in each cell, (M, n_bins) bool.
-
-    The base of a wall lies within any tolerance that ground needs; the returns above it
-    show the wall. Returns above ``label.obstacle_max_height`` may overhang.
-    """
-    result = np.zeros(grid.n_segments * grid.n_bins, dtype=np.bool_)
-    shows = (height >= label.obstacle_min_height) & (height <= label.obstacle_max_height)
-    result[grid.cell[shows & grid.inside]] = True
-    return result.reshape(grid.n_segments, grid.n_bins)
-
-
-def local_roughness(
-    height: FloatArray, grid: PolarGrid, in_face: BoolArray, max_height: float
-) -> FloatArray:
-    """Root mean square height over the surface in each cell and the eight around it.
+def local_heights(
+    height: FloatArray, grid: PolarGrid, in_face: BoolArray, label: LabelConfig
+) -> LocalHeights:
+    """Count the returns about each cell.
 
     Parameters
     ----------
@@ -106,26 +127,21 @@ def local_roughness(
         Cells of the points.
     in_face : (N,) bool
         Points of vertical faces, which are no roughness of the ground.
-    max_height : float
-        Largest distance from the surface that counts [m].
-
-    Returns
-    -------
-    (M, n_bins) float64
-        Roughness [m]; 0 where there are no points.
+    label : LabelConfig
+        Heights of obstacles.
     """
-    counts = (height < max_height) & (height >= -max_height) & grid.inside & ~in_face
-    cell = grid.cell[counts]
-    size = grid.n_segments * grid.n_bins
-    number = np.bincount(cell, minlength=size)
-    units = square_units(len(height), max_height)
-    whole = np.floor(height[counts] ** 2 * units + 0.5)
-    squares = np.bincount(cell, weights=whole, minlength=size)
-    near_number = sum_neighbourhood(number.reshape(grid.n_segments, -1))
-    mean = sum_neighbourhood(squares.reshape(grid.n_segments, -1))
-    mean /= units * np.maximum(near_number, 1.0)
-    result: FloatArray = np.sqrt(mean)
-    return result
+    low, high = label.obstacle_min_height, label.obstacle_max_height
+    units = square_units(len(height), low)
+
+    def total(counts: BoolArray, weights: FloatArray | None = None) -> FloatArray:
+        table = np.bincount(grid.cell[counts], weights, grid.n_segments * grid.n_bins)
+        return sum_neighbourhood(table.reshape(grid.n_segments, grid.n_bins)).ravel()
+
+    is_near = (height < low) & (height >= -low) & grid.inside & ~in_face
+    n_near = total(is_near)
+    squares = total(is_near, np.floor(height[is_near] ** 2 * units + 0.5))
+    roughness = np.sqrt(squares / (units * np.maximum(n_near, 1.0)))
+    return LocalHeights(n_near, roughness, total((height >= low) & (height <= high) & grid.inside))
 
 
 def square_units(n_points: int, max_height: float) -> float:

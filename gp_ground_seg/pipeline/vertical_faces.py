@@ -13,10 +13,12 @@ import math
 import numpy as np
 
 from gp_ground_seg.frame import OUTSIDE, BoolArray, Faces, FloatArray, IntArray, Scan
-from gp_ground_seg.parameters.config import Config, FacesConfig
+from gp_ground_seg.parameters.config import Config
 
 MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
+FOOT_SHARE = 0.2
+"""Part of the least height of a face whose returns are its foot, the lowest ones."""
 UNITS_PER_METRE = 2.0**16
 """Coordinates are rounded to units of 15 um: squares and products within a tile, and sums of two
 hundred thousand of them, are then exact, so that their order does not matter."""
@@ -25,11 +27,11 @@ hundred thousand of them, are then exact, so that their order does not matter.""
 def find_faces(scan: Scan, config: Config) -> Faces:
     """Find the tiles that hold a vertical face.
 
-    A tile is examined if a return lies more than ``faces.min_height`` above the lowest. The
-    scatter of its returns determines their orientation, see `normal_z`; those higher than
+    A tile is examined if a return lies more than ``label.obstacle_min_height`` above the lowest.
+    The scatter of its returns determines their orientation, see `normal_z`; those higher than
     ``label.obstacle_max_height`` above the lowest may overhang, and are left out.
     """
-    tiles, faces = scan.tiles, config.faces
+    tiles, faces, label = scan.tiles, config.faces, config.label
     inside = tiles.tile != OUTSIDE
     own, points = tiles.tile[inside], scan.xyz[inside].astype(np.float64)
     n_tiles = len(tiles.extremes)
@@ -41,9 +43,9 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     above = points[:, 2] - tiles.lowest_z[own]
     points[:, 2] = above
     points = np.rint(points * UNITS_PER_METRE) / UNITS_PER_METRE
-    low = above <= config.label.obstacle_max_height
+    low = above <= label.obstacle_max_height
     is_tall = np.zeros(n_tiles, dtype=np.bool_)
-    is_tall[own[low & (above > faces.min_height)]] = True
+    is_tall[own[low & (above > label.obstacle_min_height)]] = True
 
     used = low & is_tall[own]
     tall, row = np.unique(own[used], return_inverse=True)
@@ -59,10 +61,11 @@ def find_faces(scan: Scan, config: Config) -> Faces:
             product = centred[:, i] * centred[:, j]
             scatter[:, i, j] = np.bincount(row, product, minlength=len(tall))
     is_face = np.zeros(n_tiles, dtype=np.bool_)
-    is_vertical = normal_z(scatter) <= faces.max_normal_z
+    is_vertical = normal_z(scatter) < faces.max_normal_z
     is_face[tall] = is_vertical & (count >= MIN_RETURNS)
     has_occluded_base = np.zeros(n_tiles, dtype=np.bool_)
-    occluded = is_base_occluded(row, centred, above[used], len(tall), faces)
+    is_foot = above[used] <= FOOT_SHARE * label.obstacle_min_height
+    occluded = is_base_occluded(row, centred, is_foot, len(tall), faces.max_foot_distance)
     has_occluded_base[tall] = occluded & is_face[tall]
     return Faces(is_face, has_occluded_base)
 
@@ -97,12 +100,11 @@ def normal_z(scatter: FloatArray) -> FloatArray:
 
 
 def is_base_occluded(
-    row: IntArray, xyz: FloatArray, above: FloatArray, n_rows: int, faces: FacesConfig
+    row: IntArray, xyz: FloatArray, is_foot: BoolArray, n_rows: int, max_foot_distance: float
 ) -> BoolArray:
     """Whether the lowest returns of each face are its own, not ground before it.
 
-    Ground would lie off the plane of the returns above, and all at one height; returns in
-    the plane that are no denser than those above belong to the face.
+    Ground would lie off the plane of the returns above.
 
     Parameters
     ----------
@@ -110,37 +112,32 @@ def is_base_occluded(
         Face of each return.
     xyz : (P, 3) float64
         Returns, relative to any point of their tile [m].
-    above : (P,) float64
-        Height above the lowest return of the tile [m].
+    is_foot : (P,) bool
+        Returns at the foot of their face.
     n_rows : int
         Number of faces T.
-    faces : FacesConfig
-        Thresholds.
+    max_foot_distance : float
+        See ``faces.max_foot_distance`` [m].
 
     Returns
     -------
     (T,) bool
-        False where fewer than two returns are higher than the tolerance.
+        False where fewer than two returns are above the foot.
     """
 
     def total(values: FloatArray, chosen: BoolArray) -> FloatArray:
         return np.bincount(row[chosen], values[chosen], minlength=n_rows).astype(np.float64)
 
-    low = above <= faces.tolerance
-    n_low, n_high = (np.bincount(row[part], minlength=n_rows) for part in (low, ~low))
-    number = np.maximum(n_high, 1)
-    x = xyz[:, 0] - (total(xyz[:, 0], ~low) / number)[row]
-    y = xyz[:, 1] - (total(xyz[:, 1], ~low) / number)[row]
-    along, across = total(x * x - y * y, ~low), 2.0 * total(x * y, ~low)
-    low_along, low_across = total(x * x - y * y, low), 2.0 * total(x * y, low)
+    n_foot, n_above = (np.bincount(row[part], minlength=n_rows) for part in (is_foot, ~is_foot))
+    number = np.maximum(n_above, 1)
+    x = xyz[:, 0] - (total(xyz[:, 0], ~is_foot) / number)[row]
+    y = xyz[:, 1] - (total(xyz[:, 1], ~is_foot) / number)[row]
+    along, across = total(x * x - y * y, ~is_foot), 2.0 * total(x * y, ~is_foot)
+    foot_along, foot_across = total(x * x - y * y, is_foot), 2.0 * total(x * y, is_foot)
     # Mean square along the direction in which the returns above scatter least.
     size = np.hypot(along, across)
-    aligned = (low_along * along + low_across * across) / np.where(size > 0.0, size, 1.0)
-    square = 0.5 * (total(x * x + y * y, low) - aligned)
-    top = np.zeros(n_rows)
-    np.maximum.at(top, row, above)
-    is_in_plane = square <= n_low * faces.max_foot_distance**2
-    usual = n_high * faces.tolerance
-    is_sparse = n_low * (top - faces.tolerance) <= faces.max_foot_density * usual
-    result: BoolArray = is_in_plane & is_sparse & (n_high >= 2)
-    return result & (faces.max_foot_distance > 0.0)
+    aligned = (foot_along * along + foot_across * across) / np.where(size > 0.0, size, 1.0)
+    square = 0.5 * (total(x * x + y * y, is_foot) - aligned)
+    is_in_plane = square <= n_foot * max_foot_distance**2
+    result: BoolArray = is_in_plane & (n_above >= 2) & (max_foot_distance > 0.0)
+    return result
