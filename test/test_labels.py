@@ -82,7 +82,7 @@ def test_the_base_of_an_obstacle_is_judged_more_strictly(backend, other, expecte
 def test_the_band_is_where_ground_and_obstacle_are_equally_likely(backend):
     ranges, heights = ground_about(2000)
     ranges, z = np.append(ranges, np.full(20, 3.2)), np.append(heights, np.full(20, 0.7))
-    found, grid = label(backend, ranges, z)
+    found, _ = label(backend, ranges, z)
     near = heights[abs(heights) < 0.5]
     spread = np.hypot(np.sqrt(np.mean(near**2)), CONFIG.observation.sigma_n)
     band = found.margin + found.height
@@ -142,6 +142,7 @@ def test_labels_are_the_reference(backend, seed, dtype):
     xyz[:, 2] *= 0.1
     # Posts, so that there are faces.
     xyz[100:200, :2] = np.repeat(xyz[100:105, :2], 20, axis=0) + rng.normal(0, 0.02, (100, 2))
+    xyz[100:200, 2] = rng.uniform(-0.1, 0.8, 100)
     xyz[::20] = np.nan
     mean, std = rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5))
     mean[seed % 4] = std[seed % 4] = np.nan

@@ -109,7 +109,7 @@ def set_bands(
     room: LabelRoom,
     roughness: FloatArray,
 ) -> None:
-    """Roughness and band of each cell from the sums of all parts, see `ground_band` of the twin."""
+    """Roughness and band of each cell from all parts, see `ground_band` of the twin."""
     n_segments, n_bins = roughness.shape
     # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
     number = np.empty(n_bins + 2, np.int64)

@@ -199,7 +199,7 @@ class LabelConfig:
         'height above the surface from which a return is an obstacle however rough the ground',
         'm')
     obstacle_max_height: float = advanced(1.0, (0.02, 50.0),
-        'height above the surface up to which a return shows an obstacle, as higher ones overhang; '
+        'height above the surface up to which a return shows an obstacle, higher ones overhang; '
         'and depth below it up to which a return is ground', 'm')
 
 
