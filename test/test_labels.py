@@ -141,7 +141,8 @@ def test_labels_are_the_reference(backend, seed, dtype):
     xyz = rng.uniform(-12, 12, (300, 3)).astype(dtype)
     xyz[:, 2] *= 0.1
     # Posts, so that there are faces.
-    xyz[100:200, :2] = np.repeat(xyz[100:105, :2], 20, axis=0) + rng.normal(0, 0.02, (100, 2))
+    places = np.repeat(rng.uniform(-6, 6, (5, 2)), 20, axis=0)
+    xyz[100:200, :2] = places + rng.normal(0, 0.02, (100, 2))
     xyz[100:200, 2] = rng.uniform(-0.1, 0.8, 100)
     xyz[::20] = np.nan
     mean, std = rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5))
