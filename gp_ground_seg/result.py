@@ -257,8 +257,6 @@ class Segmentation:
         """
         rough = self.roughness.ravel()[np.maximum(self.grid.cell, 0)]
         noise = float(np.exp(self.theta[:, 1].mean()))
-        result = ground_probability(
-            self.margin, self._at_points(self.surface.std), rough, noise
-        )
+        result = ground_probability(self.margin, self._at_points(self.surface.std), rough, noise)
         result[self.label == Label.UNKNOWN] = np.nan
         return result

@@ -100,7 +100,7 @@ def test_markers_draw_profiles_and_band(b):
     assert 200 < len(lines) == len(corners) < 60 * 23 + 1
     assert len(profiles.colors) == len(profiles.points)
     assert {color.a for color in profiles.colors} == {1.0}
-    found = GroundSegmenter(CONFIG).segment(xyz_of(points)).surface
+    found = GroundSegmenter(CONFIG).segment(xyz_of(points)).corrected
     at_ends = np.hypot(lines[..., 0], lines[..., 1])
     knot = np.searchsorted(found.knots, at_ends - 1e-6)
     np.testing.assert_allclose(at_ends, found.knots[knot])

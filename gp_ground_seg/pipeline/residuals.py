@@ -1,15 +1,15 @@
-"""What the returns called ground say of the surface: its bias, and how far ground departs from it.
+"""What the returns called ground say of the surface: its bias, and its uncertainty.
 
-The process is fitted to the lowest point of each bin, so it lies below the mean of the returns, and
-its standard deviation is that of a process whose hyper-parameters are given. The returns themselves
-tell both. About each knot they lie in up to six cells: the two of its segment and theirs of the
-segments beside it. With ``n_i`` returns of mean residual ``e_i`` in cell i, n in all, the residuals
-have the mean ``e = sum n_i e_i / n``, and by the law of total variance their variance is
+The process is fitted to the lowest point of each bin, so it lies below the mean of the returns,
+and its standard deviation follows from its hyper-parameters. The returns tell both. About each
+knot they lie in up to six cells: the two of its segment that meet there, and theirs of the
+segments beside it. With ``n_i`` returns of mean residual ``e_i`` in cell i, n in all, the mean of
+the residuals is ``e = sum n_i e_i / n``, and by the law of total variance their variance is::
 
     sum n_i (e_i - e)^2 / n  +  sum n_i Var_i / n,
 
-between the cells and within them. The first is how far the ground departs from the corrected
-surface from cell to cell; the second is range noise, and roughness finer than a cell.
+that between the cells and that within them. The first is how far the ground departs from the
+corrected surface from cell to cell; the second is range noise, and roughness finer than a cell.
 """
 
 from __future__ import annotations
@@ -44,10 +44,14 @@ def correct_surface(
 ) -> CorrectedSurface:
     """Correct a surface by the residuals of the returns called ground.
 
-    One cell does not show how ground varies from cell to cell: there the standard deviations are
-    those of the process. Knots without returns take the correction of the nearest knot that has
-    some; their variance is the larger of its and the process's own, plus
-    ``(slope_std distance)^2``, what the prior of the slope gives away from evidence.
+    One cell does not show how ground varies from cell to cell: where the window has no other, the
+    standard deviations are those of the process.
+
+    A knot is seen if one of the two cells that touch it has returns. The height at any other is
+    estimated twice: by the process, and by the nearest knot that is seen, whose variance grows by
+    ``(slope_std distance)^2``, the prior of the slope. The two are weighted by their inverse
+    variances. The result is as uncertain as evidence so far away, or as the process where that is
+    more, plus the variance between the two.
 
     Parameters
     ----------
@@ -63,7 +67,7 @@ def correct_surface(
         Prior standard deviation of the ground's slope.
     """
     has_model = np.isfinite(surface.mean)
-    n_cells, n_returns, total, squares, squared_means = _sums_about_knots(labelled, grid)
+    is_touched, (n_cells, n_returns, total, squares, squared_means) = _sums(labelled, grid)
     number = np.maximum(n_returns, 1.0)
     correction = total / number
     variance = np.maximum(squared_means / number - correction**2, 0.0)
@@ -72,21 +76,27 @@ def correct_surface(
     own, tells = surface.std**2, n_cells >= 2.0
     variance = np.where(tells & has_model, variance, own)
     noise = np.where(tells, noise, noise_std**2)
-    seen, unseen = (n_returns > 0.0) & has_model, (n_returns == 0.0) & has_model
+    seen, unseen = is_touched & has_model, ~is_touched & has_model
     if seen.any() and unseen.any():
         distance, nearest = _nearest(surface.knots, seen, unseen)
+        own, apart = own[unseen], (slope_std * distance) ** 2
         for table in (correction, variance, noise):
             table[unseen] = table[seen][nearest]
-        variance[unseen] = np.maximum(variance[unseen], own[unseen]) + (slope_std * distance) ** 2
+        near_mean = surface.mean[seen][nearest]
+        difference = near_mean - surface.mean[unseen]
+        weight = own / np.maximum(own + variance[unseen] + apart, np.finfo(float).tiny)
+        correction[unseen] += weight * difference
+        variance[unseen] = np.maximum(variance[unseen], own) + apart
+        variance[unseen] += weight * (1.0 - weight) * difference**2
     mean, std = surface.mean + correction, np.sqrt(variance)
     return CorrectedSurface(surface.knots, correction, mean, std, np.sqrt(variance + noise))
 
 
-def _sums_about_knots(labelled: Labelled, grid: PolarGrid) -> tuple[FloatArray, ...]:
-    """Sums over the cells about each knot, (M, K) each.
+def _sums(labelled: Labelled, grid: PolarGrid) -> tuple[BoolArray, tuple[FloatArray, ...]]:
+    """Which knots are touched by a cell with returns called ground, and sums about them, (M, K).
 
-    Cells with returns called ground, their number, the sum of their residuals [m] and of the
-    squares [m^2], and the sum over cells of number times squared mean [m^2].
+    The sums are over six cells: cells with such returns, their number, the sum of their residuals
+    [m], of the squares [m^2], and over the cells of number times squared mean [m^2].
     """
     is_ground = (labelled.label == Label.GROUND) & grid.inside
     cell, residual = grid.cell[is_ground], np.rint(labelled.height[is_ground] * UNITS)
@@ -97,15 +107,16 @@ def _sums_about_knots(labelled: Labelled, grid: PolarGrid) -> tuple[FloatArray, 
 
     number, total = by_cell(None), by_cell(residual) / UNITS
     squares = by_cell(residual**2) / UNITS**2
-    tables = number > 0.0, number, total, squares, total**2 / np.maximum(number, 1.0)
-    return tuple(_sum_about_knots(table) for table in tables)
+    occupied = (number > 0.0).astype(np.float64)
+    tables = occupied, number, total, squares, total**2 / np.maximum(number, 1.0)
+    rings = (np.roll(table, 1, 0) + table + np.roll(table, -1, 0) for table in tables)
+    return _of_both_bins(occupied) > 0.0, tuple(map(_of_both_bins, rings))
 
 
-def _sum_about_knots(table: FloatArray | BoolArray) -> FloatArray:
-    """Sum over the cells that touch each knot and those beside them, (M, n_bins + 1)."""
-    cells = table.astype(np.float64)
-    ring = np.pad(np.roll(cells, 1, 0) + cells + np.roll(cells, -1, 0), ((0, 0), (1, 1)))
-    result: FloatArray = ring[:, :-1] + ring[:, 1:]
+def _of_both_bins(table: FloatArray) -> FloatArray:
+    """Sum of the two bins that meet at each knot, (M, n_bins + 1)."""
+    padded = np.pad(table, ((0, 0), (1, 1)))
+    result: FloatArray = padded[:, :-1] + padded[:, 1:]
     return result
 
 
