@@ -68,15 +68,14 @@ def correct_surface(
     """
     has_model = np.isfinite(surface.mean)
     is_touched, (n_cells, n_returns, total, squares, squared_means) = _sums(labelled, grid)
-    number = np.maximum(n_returns, 1.0)
-    correction = total / number
-    variance = np.maximum(squared_means / number - correction**2, 0.0)
-    noise = np.maximum(squares - squared_means, 0.0) / number
-
-    own, tells = surface.std**2, n_cells >= 2.0
-    variance = np.where(tells & has_model, variance, own)
-    noise = np.where(tells, noise, noise_std**2)
     seen, unseen = is_touched & has_model, ~is_touched & has_model
+    number = np.maximum(n_returns, 1.0)
+    correction = np.where(seen, total / number, np.where(has_model, 0.0, np.nan))
+
+    own, tells = surface.std**2, seen & (n_cells >= 2.0)
+    between = np.maximum(squared_means / number - correction**2, 0.0)
+    variance = np.where(tells, between, own)
+    noise = np.where(tells, np.maximum(squares - squared_means, 0.0) / number, noise_std**2)
     if seen.any() and unseen.any():
         distance, nearest = _nearest(surface.knots, seen, unseen)
         own, apart = own[unseen], (slope_std * distance) ** 2
