@@ -132,6 +132,11 @@ def compare_coverage(
     progress: Progress = iter,
 ) -> Report:
     """Segment each scan, with the configuration of its group and without a past."""
+    changes = {name: results.changed_parameters(config) for name, config in configs.items()}
+    nested = {name: config.nested() for name, config in configs.items()}
+    facts: dict[str, dict[str, Any]] = {'config_changes': changes, 'config': nested}
+    if kind is LABELLED:  # of one sensor
+        facts = {key: next(iter(value.values())) for key, value in facts.items()}
     rings: list[RingCoverage] = []
     for name, own in items.items():
         with closing(GroundSegmenter(configs[name])) as segmenter:
@@ -144,11 +149,7 @@ def compare_coverage(
         {name: _table(rings, name, kind) for name in kind.keys},
         [_row_of(one) for one in rings],
         found.fit,
-        {
-            'std': kind.std,
-            'config_changes': {k: results.changed_parameters(c) for k, c in configs.items()},
-            'config': {name: own.nested() for name, own in configs.items()},
-        },
+        {'std': kind.std, **facts},
     )
 
 
