@@ -225,17 +225,21 @@ class GroundSurface(NamedTuple):
         Linear between the knots; nearer than the first knot it is the first
         knot's. NaN beyond the last knot and in segments without a model.
         """
-        cell = np.maximum(grid.cell, 0)
-        outside = ~grid.inside
-        away = np.maximum(grid.r, self.knots[0])
-        values = []
-        for table in (self.mean, self.std):
-            level, slope = linear_pieces(self.knots, table)
-            with np.errstate(invalid='ignore'):  # points outside may be infinitely far
-                value = level[cell] + slope[cell] * away
-            value[outside] = np.nan
-            values.append(value)
-        return values[0], values[1]
+        mean, std = (at_points(self.knots, table, grid) for table in (self.mean, self.std))
+        return mean, std
+
+
+def at_points(knots: FloatArray, table: FloatArray, grid: PolarGrid) -> FloatArray:
+    """Value under each point, (N,) float64, as `GroundSurface.at` gives it.
+
+    `knots` (K,) are ranges [m], `table` (M, K) the values there.
+    """
+    level, slope = linear_pieces(knots, table)
+    cell = np.maximum(grid.cell, 0)
+    with np.errstate(invalid='ignore'):  # points outside may be infinitely far
+        value: FloatArray = level[cell] + slope[cell] * np.maximum(grid.r, knots[0])
+    value[~grid.inside] = np.nan
+    return value
 
 
 def linear_pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -31,7 +31,8 @@ class GroundModel:
         Height of the ground over the sensor at the knots of each segment [m], so mostly
         negative; NaN where there is no model. Segments go counter-clockwise from -x.
     std : (M, K) float64
-        Its standard deviation [m]; NaN where there is no model.
+        Its standard deviation [m], as that of ``Segmentation.ground_std``; NaN where there is
+        no model.
     length_scale : (M, K) float64
         Over how far the ground is smooth there [m]; NaN in segments without a ground
         candidate of their own.
@@ -48,8 +49,8 @@ class GroundModel:
 
     @classmethod
     def of(cls, segmentation: Segmentation) -> GroundModel:
-        """Take the model out of a segmented scan."""
-        surface, pose = segmentation.surface, segmentation.pose
+        """Take the corrected surface out of a segmented scan."""
+        surface, pose = segmentation.corrected, segmentation.pose
         with np.errstate(over='ignore'):
             length_scale = np.exp(segmentation.log_length_scale)
         return cls(surface.knots, surface.mean, surface.std, length_scale, pose.roll, pose.pitch)

@@ -17,9 +17,11 @@ from gp_ground_seg.frame import (
     Lines,
     PolarGrid,
     PseudoInputs,
+    at_points,
 )
 from gp_ground_seg.gp.learning import Learned, theta_names
 from gp_ground_seg.pipeline.labels import ground_probability
+from gp_ground_seg.pipeline.residuals import CorrectedSurface, correct_surface
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 
 
@@ -125,14 +127,15 @@ class Segmentation:
     Attributes
     ----------
     labelled : Labelled
-        Labels, heights and what they follow from; `label`, `height`, `margin` and
-        `roughness` are taken from it.
+        Labels and what they follow from, heights over `surface` among it; `label`, `margin`
+        and `roughness` are taken from it.
     timings : dict of str to float
         Seconds per stage, and ``total``.
     fitting : Fitting
         How it was fitted; `fit` sums it up.
     grid, candidates, lines, pseudo, surface
-        Intermediate results, for plots and diagnostics; in the level frame.
+        Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
+        process's own, which the labels follow from; `corrected` is what users are given.
     theta : (M, 5 + K) float64
         Logarithms of the hyper-parameters of each segment, named by `theta_names`.
     log_length_scale : (M, knots) float64
@@ -141,8 +144,11 @@ class Segmentation:
     pose : SensorPose
         Height and tilt of the sensor that were used, and what the scan says of them;
         ``pose.level(xyz)`` gives points in the level frame.
-    tilted_ground_z : (N,) float64 or None
-        `ground_z` where `pose` has a tilt.
+    tilted_z : (N,) float64 or None
+        Height of `surface` under each point along the sensor's z axis where `pose` has a
+        tilt, sensor frame [m].
+    slope_std : float
+        ``observation.slope_std`` of the frame.
     """
 
     labelled: Labelled
@@ -156,7 +162,8 @@ class Segmentation:
     theta: FloatArray
     log_length_scale: FloatArray
     pose: SensorPose
-    tilted_ground_z: FloatArray | None
+    tilted_z: FloatArray | None
+    slope_std: float
 
     @property
     def label(self) -> npt.NDArray[np.uint8]:
@@ -166,15 +173,6 @@ class Segmentation:
         for ground, and they are OBSTACLE. Points that are not finite are UNKNOWN.
         """
         return self.labelled.label
-
-    @property
-    def height(self) -> FloatArray:
-        """Height of each point over the surface, (N,) float64 [m]; negative below it.
-
-        NaN where there is no model. Vertical in the level frame, like `ground_std`:
-        where `pose` has no tilt, that is the sensor's own.
-        """
-        return self.labelled.height
 
     @property
     def margin(self) -> FloatArray:
@@ -197,25 +195,58 @@ class Segmentation:
         return FitReport.of(self)
 
     @cached_property
+    def corrected(self) -> CorrectedSurface:
+        """The surface without the bias of lowest points, as uncertain as its residuals say.
+
+        See `gp_ground_seg.pipeline.residuals.correct_surface`.
+        """
+        noise_std = np.exp(self.theta[:, 1:2])
+        return correct_surface(self.surface, self.labelled, self.grid, noise_std, self.slope_std)
+
+    @cached_property
+    def height(self) -> FloatArray:
+        """Height of each point over the ground, (N,) float64 [m]; negative below it.
+
+        NaN where there is no model. Vertical in the level frame, like `ground_std`; where
+        `pose` has no tilt, that is the sensor's own, and the height is ``z - ground_z``. The
+        labels follow from ``labelled.height``, which is that over the uncorrected `surface`.
+        """
+        return self.labelled.height - self._correction
+
+    @cached_property
     def ground_z(self) -> FloatArray:
-        """Surface height under each point along the sensor's z axis, (N,) float64 [m].
+        """Height of the ground under each point along the sensor's z axis, (N,) float64 [m].
 
         In the sensor frame; NaN where there is no model. Without tilt ``z - height``;
         with it ``z - height / cos(tilt)``, exact where the ground is level (see
         `gp_ground_seg.pipeline.sensor_pose.SensorPose.ground_z`).
         """
-        if self.tilted_ground_z is not None:
-            return self.tilted_ground_z
-        return self._surface_at_points[0]
+        if self.tilted_z is not None:
+            return self.pose.ground_z(self.tilted_z, -self._correction)
+        return self._at_points(self.corrected.mean)
 
     @cached_property
     def ground_std(self) -> FloatArray:
-        """Standard deviation of the surface's height, (N,) float64 [m]; NaN without a model."""
-        return self._surface_at_points[1]
+        """Standard deviation of the height of the ground, (N,) float64 [m]; NaN without a model.
+
+        It grows with the distance to the nearest return called ground.
+        """
+        return self._at_points(self.corrected.std)
 
     @cached_property
-    def _surface_at_points(self) -> tuple[FloatArray, FloatArray]:
-        return self.surface.at(self.grid)
+    def return_std(self) -> FloatArray:
+        """Standard deviation of the height of a ground return, (N,) float64 [m].
+
+        About `ground_z`: surface, roughness and range noise together. NaN without a model.
+        """
+        return self._at_points(self.corrected.return_std)
+
+    @cached_property
+    def _correction(self) -> FloatArray:
+        return self._at_points(self.corrected.correction)
+
+    def _at_points(self, table: FloatArray) -> FloatArray:
+        return at_points(self.surface.knots, table, self.grid)
 
     @cached_property
     def p_ground(self) -> npt.NDArray[np.float32]:
@@ -226,6 +257,6 @@ class Segmentation:
         """
         rough = self.roughness.ravel()[np.maximum(self.grid.cell, 0)]
         noise = float(np.exp(self.theta[:, 1].mean()))
-        result = ground_probability(self.margin, self.ground_std, rough, noise)
+        result = ground_probability(self.margin, self._at_points(self.surface.std), rough, noise)
         result[self.label == Label.UNKNOWN] = np.nan
         return result

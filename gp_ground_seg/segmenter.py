@@ -107,7 +107,7 @@ class GroundSegmenter:
             # 6. Labels: height of each point over the surface, against a band that follows
             # the roughness.
             labelled = backend.label_points(scan, faces, surface, config)
-            ground_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
+            tilted_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
             timer.mark('label')
 
             return Segmentation(
@@ -122,7 +122,8 @@ class GroundSegmenter:
                 theta,
                 log_length_scale,
                 pose,
-                ground_z,
+                tilted_z,
+                config.observation.slope_std,
             )
 
     def estimate_pose(self, points: npt.ArrayLike) -> SensorPose:

@@ -385,6 +385,60 @@ def label_points(scan, faces, surface, config):
     return Labelled(result, height, margin, roughness)
 
 
+# The surface corrected by the returns called ground
+
+
+def correct_surface(surface, labelled, grid, noise_std, slope_std, takes_first=True):
+    """Correction, standard deviation of the ground and of its returns, at each knot."""
+    n_segments, n_knots = surface.mean.shape
+    ground = np.flatnonzero(labelled.label == Label.GROUND)
+    cells = {}
+    for i in ground:
+        cells.setdefault((grid.segment[i], grid.bin[i]), []).append(labelled.height[i])
+    result = np.full((3, n_segments, n_knots), np.nan)
+    seen = []
+    for m, k in np.ndindex(n_segments, n_knots):
+        if np.isnan(surface.mean[m, k]) or not {(m, k - 1), (m, k)} & set(cells):
+            continue
+        beside = [(m + j) % n_segments for j in (-1, 0, 1)]
+        own = [cells[s, n] for n in (k - 1, k) for s in beside if (s, n) in cells]
+        heights = np.concatenate(own)
+        means = np.concatenate([np.full(len(one), np.mean(one)) for one in own])
+        between, whole = np.var(means), np.var(heights)
+        if len(own) == 1:
+            between, whole = surface.std[m, k] ** 2, surface.std[m, k] ** 2 + noise_std[m, 0] ** 2
+        result[:, m, k] = heights.mean(), between, whole
+        seen.append((m, k))
+    for m, k in np.ndindex(n_segments, n_knots):
+        if np.isnan(surface.mean[m, k]) or (m, k) in seen:
+            continue
+        own = surface.std[m, k] ** 2
+        if not seen:
+            result[:, m, k] = 0.0, own, own + noise_std[m, 0] ** 2
+            continue
+        # Of several that are equally far the first or the last one.
+        far = [round(_between_knots(surface.knots, (m, k), at, n_segments), 9) for at in seen]
+        apart = min(far)
+        equal = [at for at, its in zip(seen, far, strict=True) if its == apart]
+        s, j = equal[0 if takes_first else -1]
+        mean, between, whole = result[:, s, j]
+        near = between + (slope_std * apart) ** 2
+        heights = np.array([surface.mean[m, k] + mean, surface.mean[s, j] + mean])
+        share = np.array([near, own]) / (near + own)
+        fused = share @ heights
+        spread = share @ (heights - fused) ** 2
+        variance = max(between, own) + (slope_std * apart) ** 2 + spread
+        result[:, m, k] = fused - surface.mean[m, k], variance, variance + whole - between
+    return result[0], np.sqrt(result[1]), np.sqrt(result[2])
+
+
+def _between_knots(knots, one, other, n_segments):
+    """Horizontal distance of two knots, each a segment and a range."""
+    angle = 2.0 * math.pi * (one[0] - other[0]) / n_segments
+    a, b = knots[one[1]], knots[other[1]]
+    return math.sqrt((a - b) ** 2 + 2.0 * a * b * (1.0 - math.cos(angle)))
+
+
 class Reference(NumpyBackend):
     """Plain loops; cells and the plane of the ground are those of the numpy backend."""
 

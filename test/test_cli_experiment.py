@@ -45,6 +45,10 @@ CASES = {
          'near: grid.r_max=15', *SMALL],
         'departures', 3 * 4,
     ),
+    'coverage': (['ROOT', *SMALL], 'sequence', 4 * 6),
+    'coverage --simulated': (
+        ['--sensors', 'vlp-16,mid-360', '--scenes', 'kerb', '--seeds', '1'], 'sensor', 2 * 6,
+    ),
     'scenes': (
         ['--sensors', 'vlp-16,os1-128', '--scenes', 'flat,slope', '--seeds', '1'],
         'scenes', 2 * 4,
@@ -154,6 +158,8 @@ def test_a_departure_in_words():
             'searched twice',
         ),
         (['sensor-pose', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
+        (['coverage', 'ROOT', '--sensors', 'vlp-16'], '--sensors: is for --simulated only'),
+        (['coverage'], 'coverage: give either ROOT or --simulated'),
         (['sensor-pose', 'ROOT', '--set', 'sensor.height=1.0'], 'sensor.height = 1.0: the exp'),
         (['sensor-pose', 'ROOT', '--set', 'sensor.roll=1.0'], 'sensor.roll = 1.0: the exp'),
         (['scenes', '--preset', 'vlp-16'], 'vlp16'),

@@ -295,6 +295,15 @@ def test_classes_rings_and_probabilities(evaluated):
     rings = {row['range']: row for row in document['rings']}
     assert rings['> 50 m']['iou'] is rings['> 50 m']['patchworkpp_iou'] is None
     assert sum(row['share_of_errors'] for row in rings.values()) == pytest.approx(1.0)
+    own = [row for row in document['rows'] if row['method'] == 'gp_ground_seg']
+    for row in document['heights']:
+        parts = [one for one in own if row['sequence'] in (one['sequence'], 'all')]
+        n = [one['n_points_all'] for one in parts]
+        assert row['points'] == sum(n)
+        squares = np.dot(n, [one['rmse_all'] ** 2 for one in parts])
+        assert row['rmse'] == pytest.approx(math.sqrt(squares / sum(n)))
+        assert row['patchworkpp_rmse'] > 0.0
+        assert abs(row['bias']) < 0.005
     pooled = document['probabilities'][-1]
     bins = [row for row in document['reliability'] if row['sequence'] == 'all']
     assert sum(row['points'] for row in bins) == pooled['points']

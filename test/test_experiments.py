@@ -5,6 +5,7 @@ import itertools
 
 import numpy as np
 import pytest
+import scipy.stats
 from evaluation_samples import write_frame, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,7 +16,7 @@ from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore, labelled_frames
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
-from gp_ground_seg.experiments import ablation, sensor_pose, variants
+from gp_ground_seg.experiments import ablation, coverage, sensor_pose, variants
 from gp_ground_seg.experiments.ablation import MODELS, Departure
 from gp_ground_seg.experiments.sensor_pose import MOUNTS, SIMULATED_MOUNTS, score_poses
 from gp_ground_seg.experiments.variants import PRESET_OF, SimulatedFrame, load_simulated
@@ -104,6 +105,48 @@ def test_worth_is_what_having_it_adds(frames):
 def test_lists_that_cannot_be(departures, message):
     with pytest.raises(ConfigError, match=message):
         ablation.compare_departures([], departures, Config())
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.5, 2.0), st.floats(-0.1, 0.1))
+def test_coverage_of_normal_errors_is_what_the_normal_distribution_says(seed, factor, bias):
+    rng = np.random.default_rng(seed)
+    std = rng.uniform(0.02, 0.2, 5000)
+    error = rng.normal(bias, std)
+    error[::10], std[1::10] = np.nan, np.nan
+    said, known = factor * std, np.isfinite(error) & np.isfinite(std)
+    parts = [coverage.count_coverage(*pair) for pair in ((error[:99], said[:99]),
+             (error[99:], said[99:]))]  # fmt: skip
+    found = sum(parts, coverage.Coverage())
+    e, s = error[known], said[known]
+    assert found.n_points == known.sum()
+    assert found.within_1 == np.mean(np.abs(e) <= s)
+    assert found.within_2 == np.mean(np.abs(e) <= 2.0 * s)
+    assert found.bias == pytest.approx(np.mean(e))
+    assert found.rmse == pytest.approx(np.sqrt(np.mean(e**2)))
+    assert found.nlpd == pytest.approx(-np.mean(scipy.stats.norm.logpdf(e, 0.0, s)))
+    assert np.isnan(coverage.Coverage().within_1) and np.isnan(coverage.Coverage().nlpd)
+
+
+def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):
+    report = coverage.compare_coverage(
+        {'KITTI': frames}, runner.load_kitti, {'KITTI': FIXED}, coverage.LABELLED
+    )
+    errors, ratios, p = [], [], []
+    for frame in frames:
+        scan = runner.load_kitti(frame)
+        found = GroundSegmenter(FIXED).segment(scan.points)
+        own = scan.is_ground & np.isfinite(found.height)
+        errors.append(-found.height[own])
+        ratios.append(np.abs(found.height[own]) / found.return_std[own])
+        p.append(runner.metrics.count_calibration(found.p_ground, scan.truths['groundgrid']))
+    row = report.tables['sequence'].json()[-1]
+    assert row['sequence'] == 'all'
+    assert row['points'] == sum(map(len, errors))
+    assert row['within_1'] == pytest.approx(np.mean(np.concatenate(ratios) <= 1.0), abs=1e-3)
+    assert row['bias'] == pytest.approx(np.mean(np.concatenate(errors)), abs=1e-6)
+    assert row['ece'] == pytest.approx(sum(p[1:], p[0]).ece)
+    assert [one['range'] for one in report.tables['range'].json()][:2] == ['0-10 m', '10-20 m']
+    assert sum(one['n_points'] for one in report.rows) == row['points']
 
 
 GRID = {'a': [0, 1, 2], 'b': [0, 1, 2]}

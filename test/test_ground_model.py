@@ -63,7 +63,7 @@ def test_height_under_every_point_is_that_of_the_segmentation(segmented):
         height, std = one.at(points[:, 0], points[:, 1])
         np.testing.assert_allclose(height, found.ground_z, rtol=0, atol=tolerance)
         np.testing.assert_allclose(std, found.ground_std, rtol=0, atol=tolerance)
-    np.testing.assert_array_equal(np.float32(found.surface.mean), np.float32(model.height))
+    np.testing.assert_array_equal(np.float32(found.corrected.mean), np.float32(model.height))
     np.testing.assert_array_equal(np.isnan(model.length_scale), np.isnan(found.log_length_scale))
 
 

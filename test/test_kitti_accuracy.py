@@ -67,3 +67,28 @@ def test_backends_agree_on_a_real_frame(kitti, sequence):
     slow = GroundSegmenter(Config().replace(**{'runtime.backend': 'numpy'})).segment(points)
     assert (fast.label != slow.label).sum() <= 2
     np.testing.assert_allclose(fast.ground_z, slow.ground_z, atol=1e-6)
+
+
+def test_ground_lies_where_it_is_said_to(kitti):
+    """Heights of labelled ground returns about `ground_z`, as uncertain as `return_std` says."""
+    segmenter = GroundSegmenter()
+    ratios, errors, before = {}, [], []
+    for sequence in list_sequences(kitti):
+        for frame in list_frames(kitti, sequence):
+            points = read_points(frame.points_path)
+            found = segmenter.segment(points)
+            own = np.isin(read_labels(frame.labels_path, len(points)), GROUND_CLASSES)
+            own &= np.isfinite(found.height)
+            errors.append(found.height[own])
+            before.append(found.labelled.height[own])
+            ratios.setdefault(sequence, []).append(np.abs(errors[-1]) / found.return_std[own])
+    by_sequence = {name: np.concatenate(one) for name, one in ratios.items()}
+    pooled = np.concatenate([*by_sequence.values()])
+    assert 0.62 <= np.mean(pooled <= 1.0) <= 0.76
+    assert 0.92 <= np.mean(pooled <= 2.0) <= 0.985
+    for name, one in by_sequence.items():
+        assert np.mean(one <= 1.0) >= 0.50, name
+        assert np.mean(one <= 2.0) >= 0.85, name
+    error, uncorrected = np.concatenate(errors), np.concatenate(before)
+    assert abs(np.mean(error)) < 0.005
+    assert np.sqrt(np.mean(error**2)) < 0.85 * np.sqrt(np.mean(uncorrected**2))

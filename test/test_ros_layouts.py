@@ -115,7 +115,7 @@ def test_every_layout_comes_through(tested, case):
     names = list(labelled_names(field.name for field in message.fields).values())
     added = whole.fields[len(message.fields) :]
     assert [field.name for field in added] == names
-    assert [CODES[field.datatype - 1] for field in added] == ['u1', 'f4', 'f4', 'f4', 'f4']
+    assert [CODES[field.datatype - 1] for field in added] == ['u1', *['f4'] * 5]
     raw = np.frombuffer(whole.data, np.uint8).reshape(len(rows), whole.point_step)
     assert [row[: message.point_step].tobytes() for row in raw] == rows
     is_dense = np.isfinite(xyz).all()

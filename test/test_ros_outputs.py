@@ -12,7 +12,7 @@ from ros_helpers import said_by, street, to_message, wait_for, xyz_of
 from sensor_msgs.msg import PointCloud2, PointField
 from visualization_msgs.msg import Marker, MarkerArray
 
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.data.point_cloud2 import read_columns
 from gp_ground_seg.parameters.schema import NODE_NAME
 from gp_ground_seg.ros import outputs
@@ -69,6 +69,22 @@ def test_names_are_free_however_often_a_cloud_comes_round():
         taken += names.values()
 
 
+def test_labelled_points_tell_their_ground_and_how_sure_it_is(b):
+    points = street(6000)
+    found = received(b, '~/labeled', to_message(points))
+    expected = GroundSegmenter(CONFIG).segment(xyz_of(points))
+    names = ['label', 'height', 'ground_z', 'ground_std', 'return_std']
+    label, height, ground_z, ground_std, return_std = (
+        column[0] for column in read_columns(found, names).values()
+    )
+    np.testing.assert_array_equal(return_std, np.float32(expected.return_std))
+    ground = label == Label.GROUND
+    assert ground.sum() > 1000
+    np.testing.assert_allclose(height, points['z'] - ground_z, atol=1e-5)
+    assert (return_std >= ground_std)[ground].all()
+    assert 0.5 < np.mean(np.abs(height[ground]) <= return_std[ground]) < 0.9
+
+
 def test_ground_model_gives_the_height_anywhere(b):
     points = street(6000)
     message = to_message(points, stamp=(17, 23), frame='velo_link')
@@ -100,7 +116,7 @@ def test_markers_draw_profiles_and_band(b):
     assert 200 < len(lines) == len(corners) < 60 * 23 + 1
     assert len(profiles.colors) == len(profiles.points)
     assert {color.a for color in profiles.colors} == {1.0}
-    found = GroundSegmenter(CONFIG).segment(xyz_of(points)).surface
+    found = GroundSegmenter(CONFIG).segment(xyz_of(points)).corrected
     at_ends = np.hypot(lines[..., 0], lines[..., 1])
     knot = np.searchsorted(found.knots, at_ends - 1e-6)
     np.testing.assert_allclose(at_ends, found.knots[knot])

@@ -23,7 +23,7 @@ from gp_ground_seg.jit import HAVE_NUMBA, JIT_ENABLED
 SIZE = {} if JIT_ENABLED else {'grid.n_segments': 36, 'grid.n_bins': 60, 'grid.bin_growth': 1.5}
 CONFIG = Config().replace(**SIZE)
 SEGMENTER = GroundSegmenter(CONFIG)
-VALUES = 'label', 'height', 'margin', 'ground_z', 'ground_std', 'p_ground'
+VALUES = 'label', 'height', 'margin', 'ground_z', 'ground_std', 'return_std', 'p_ground'
 N_POINTS = fewer(4000, 800)
 
 

@@ -213,7 +213,7 @@ def test_a_sensor_hung_upside_down_works_when_its_roll_is_given():
         SEGMENTER.segment(hung)
     level = SEGMENTER.segment(points)
     assert level.pose.is_level
-    np.testing.assert_array_equal(level.height, points[:, 2] - level.ground_z)
+    np.testing.assert_allclose(level.height, points[:, 2] - level.ground_z, atol=1e-12)
     for angles in ({'roll': 3.1416}, {'roll': 3.1416, 'pitch': 0.0}):
         result = segmenter(**angles).segment(hung)
         assert (result.label != level.label).mean() < 1e-3

@@ -101,7 +101,8 @@ def check(points, result):
     assert ((label == Label.UNKNOWN) == ~finite).all(), 'UNKNOWN is what is not finite'
     ground = label == Label.GROUND
     assert np.isfinite(height[ground]).all(), 'NaN height on ground'
-    assert np.isfinite(result.ground_std[ground]).all(), 'NaN std on ground'
+    for std in (result.ground_std, result.return_std):
+        assert np.isfinite(std[ground]).all(), 'NaN std on ground'
     assert (result.margin[ground] >= 0.0).all(), 'negative margin on ground'
     assert (result.p_ground[ground] >= 0.5).all(), 'p_ground of ground below one half'
     assert (np.isnan(result.p_ground) == ~finite).all(), 'p_ground'

@@ -112,6 +112,7 @@ def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str
         'rings': _ring_table(scores),
         'classes': _class_table(scores[0]),
         'probabilities': _calibration_table(scores[0]),
+        'heights': _height_table(scores),
         **({'worst': _worst_table(scores[0], n_worst)} if n_worst else {}),
         'times': _time_table(scores),
     }
@@ -200,6 +201,25 @@ def _calibration_table(score: MethodScore) -> Table:
         f'{metrics.N_BINS} bins, Brier score'
     )
     return Table([*columns, Column('Brier', '.4f', 'brier')], rows, title, n_sums=1)
+
+
+def _height_table(scores: Sequence[MethodScore]) -> Table:
+    """Errors of the surface under points labelled ground, by sequence and pooled."""
+    rows: list[list[Cell]] = []
+    for parts in zip(*(score.by_sequence() for score in scores), strict=True):
+        found, *its = (own.height for _, own in parts)
+        without = metrics.ratio(found.n_without_model, found.n_points + found.n_without_model)
+        ours = [found.n_points, without, found.bias, found.rmse, found.median_absolute]
+        rows.append([parts[0][0], *ours, *(one.rmse for one in its)])
+    columns = [Column('sequence'), Column('points', '_d')]
+    columns += [percent('no model', 'share_without_model'), tables.centimetres('bias')]
+    columns += [tables.centimetres('RMSE', 'rmse')]
+    columns += [tables.centimetres('median', 'median_absolute')]
+    columns += [tables.centimetres(f'{one.title} RMSE', f'{one.name}_rmse') for one in scores[1:]]
+    title = (
+        'Height of the ground under returns labelled ground, those without a model left out  [cm]'
+    )
+    return Table(columns, rows, title, n_sums=1)
 
 
 def _worst_table(score: MethodScore, n_worst: int) -> Table:

@@ -12,9 +12,10 @@ from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, sta
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.evaluate import load_kitti
 from gp_ground_seg.evaluation.report import Report, describe_environment, fold, machine_line
-from gp_ground_seg.experiments import ablation, sensor_pose, variants
+from gp_ground_seg.experiments import ablation, coverage, sensor_pose, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
+from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
 from gp_ground_seg.simulation import SCENES, SENSORS
 
@@ -32,6 +33,9 @@ SCENE_LIST = (
 SENSOR_LIST = (
     '--sensors', f'some of {",".join(SENSORS)} (default: {",".join(DEFAULT_SENSORS)})',
     {'metavar': 'LIST', 'type': options.some_of(SENSORS)},
+)  # fmt: skip
+EVERY_SENSOR = (
+    SENSOR_LIST[0], f'some of {",".join(SENSORS)} (default: all)', SENSOR_LIST[2],
 )  # fmt: skip
 NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
 SWITCH = (
@@ -76,7 +80,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         options.add(own, *experiment.options, markdown, options.TO_JSON, options.FORCE)
         options.add_config(own)
         own.set_defaults(run=run)
-        if name == 'scenes':
+        if name in ('scenes', 'coverage'):  # there each sensor has the preset of its own
             own.set_defaults(preset=None)
 
 
@@ -108,7 +112,7 @@ def _check_source(arguments: argparse.Namespace) -> None:
     """Refuse options that contradict one another."""
     if arguments.simulated == (arguments.root is not None):
         raise DataError(f'{arguments.experiment}: give either ROOT or --simulated')
-    for option in OF_FRAMES if arguments.simulated else (SEEDS, SCENE_LIST):
+    for option in OF_FRAMES if arguments.simulated else (SEEDS, SCENE_LIST, EVERY_SENSOR):
         if getattr(arguments, _name(option), None) is not None:
             kind = 'labelled frames' if arguments.simulated else '--simulated'
             raise DataError(f'{option[0]}: is for {kind} only')
@@ -139,15 +143,32 @@ def parse_departure(text: str) -> ablation.Departure:
     return ablation.Departure(title.strip(), dict(map(options.parse_setting, settings)))
 
 
-def _scenes(arguments: argparse.Namespace) -> Report:
-    given = vars(arguments)
-    configs = {}
-    for sensor in arguments.sensors or DEFAULT_SENSORS:
-        preset = arguments.preset or variants.PRESET_OF[sensor]
+def _configs_of(arguments: argparse.Namespace, sensors: Sequence[str]) -> dict[str, Config]:
+    """Parameters of each sensor: those of its preset, or of the one that is named for all."""
+    given, configs = vars(arguments), {}
+    for sensor in sensors:
+        preset = arguments.preset or variants.PRESET_OF.get(sensor, options.DEFAULT_PRESET)
         configs[sensor] = options.read_config(argparse.Namespace(**{**given, 'preset': preset}))
+    return configs
+
+
+def _scenes(arguments: argparse.Namespace) -> Report:
+    configs = _configs_of(arguments, arguments.sensors or DEFAULT_SENSORS)
     scenes, seeds = arguments.scenes or list(SCENES), arguments.seeds or 3
     bar = options.progress('scenes')
     return variants.score_scenes(configs, scenes, seeds, not arguments.no_peer, bar)
+
+
+def _coverage(arguments: argparse.Namespace) -> Report:
+    bar = options.progress('coverage')
+    if not arguments.simulated:
+        configs = _configs_of(arguments, ['KITTI'])
+        frames = {'KITTI': frames_from_options(arguments)}
+        return coverage.compare_coverage(frames, load_kitti, configs, coverage.LABELLED, bar)
+    sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or list(SCENES)
+    seeds, configs = arguments.seeds or 2, _configs_of(arguments, sensors)
+    scans = {one: simulated_frames([one], scenes, seeds, (0.0,)) for one in sensors}
+    return coverage.compare_coverage(scans, load_simulated, configs, coverage.SIMULATED, bar)
 
 
 def _cross_validation(arguments: argparse.Namespace) -> Report:
@@ -213,6 +234,15 @@ gp_ground_seg/experiments/ablation.py; --switch measures another without touchin
 """,
         (ROOT, *OF_FRAMES, SWITCH),
         _departures,
+    ),
+    'coverage': Experiment(
+        """\
+Compare errors of the ground's height with their standard deviations: how many lie within one
+and two, by sequence and range. On labelled frames that of the returns (return_std), with
+--simulated that of the ground (ground_std) by exact heights, each sensor with its preset.
+""",
+        (OPTIONAL_ROOT, SIMULATED, *OF_FRAMES, EVERY_SENSOR, SCENE_LIST, SEEDS),
+        _coverage,
     ),
     'scenes': Experiment(
         """\

@@ -206,7 +206,7 @@ class ModelTask:
             return Status('model', Level.OK, 'no cloud segmented yet', {})
         fit, label = scan.fit, scan.label
         n_occupied = int(np.count_nonzero(np.diff(scan.candidates.offsets)))
-        has_model = np.isfinite(scan.ground_z)
+        has_model = np.isfinite(scan.labelled.height)
         certainty = _mean(np.abs(2.0 * scan.p_ground[has_model] - 1.0))
         quality = frame_quality(fit, n_occupied, certainty)
         without_model = _mean(~has_model & (label != Label.UNKNOWN))

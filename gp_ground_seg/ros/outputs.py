@@ -20,7 +20,7 @@ from gp_ground_seg.result import Segmentation
 from gp_ground_seg.ros.ground_model import ground_model_cloud
 from gp_ground_seg.ros.input import cloud_profile, message_data, select_points
 
-LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'p_ground')
+LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
 
 # rclpy takes some microseconds for each vertex: the markers are thinned to what can be told

@@ -1,0 +1,208 @@
+"""Whether the ground lies where it is said to: errors against their standard deviations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.evaluation import evaluate as methods
+from gp_ground_seg.evaluation import report as results
+from gp_ground_seg.evaluation.evaluate import KnownScan, Progress
+from gp_ground_seg.evaluation.metrics import (
+    RING_EDGES,
+    RING_TITLES,
+    Calibration,
+    count_calibration,
+    ratio,
+)
+from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
+from gp_ground_seg.frame import FloatArray
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.result import Segmentation
+from gp_ground_seg.segmenter import GroundSegmenter
+
+FINEST_STD = 1e-3
+"""Least standard deviation in the predictive density [m]: no sensor resolves a millimetre, and the
+density of a handful of returns that happen to agree would outweigh all others."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Errors of the ground's height against their standard deviations, as sums.
+
+    Ratios over nothing are NaN. The error is estimate minus truth.
+    """
+
+    n_points: int = 0
+    n_within_1: int = 0  # of points whose error is at most one standard deviation
+    n_within_2: int = 0
+    sum_error: float = 0.0  # [m]
+    sum_squared_error: float = 0.0  # [m^2]
+    sum_nlpd: float = 0.0  # negative logs of the predictive density, [nat] of a density per metre
+
+    def __add__(self, other: Coverage) -> Coverage:
+        """Add the sums of both."""
+        names = (field.name for field in fields(self))
+        return Coverage(*(getattr(self, name) + getattr(other, name) for name in names))
+
+    @property
+    def within_1(self) -> float:
+        """Share within one standard deviation; 0.683 of a normal distribution."""
+        return ratio(self.n_within_1, self.n_points)
+
+    @property
+    def within_2(self) -> float:
+        """Share within two standard deviations; 0.954 of a normal distribution."""
+        return ratio(self.n_within_2, self.n_points)
+
+    @property
+    def bias(self) -> float:
+        """Mean error [m]."""
+        return ratio(self.sum_error, self.n_points)
+
+    @property
+    def rmse(self) -> float:
+        """Root mean squared error [m]."""
+        return math.sqrt(ratio(self.sum_squared_error, self.n_points))
+
+    @property
+    def nlpd(self) -> float:
+        """Mean negative log predictive density (Rasmussen and Williams, 2006, section 2.5)."""
+        return ratio(self.sum_nlpd, self.n_points)
+
+
+def count_coverage(error: FloatArray, std: FloatArray) -> Coverage:
+    """Compare errors with their standard deviations, (n,) each [m]; NaN does not count."""
+    known = np.isfinite(error) & np.isfinite(std)
+    e, s = np.abs(error[known]), std[known]
+    fine = np.maximum(s, FINEST_STD)
+    nlpd = 0.5 * np.log(2.0 * np.pi * fine**2) + 0.5 * (e / fine) ** 2
+    return Coverage(
+        len(e), int((e <= s).sum()), int((e <= 2.0 * s).sum()), float(error[known].sum()),
+        float(e @ e), float(nlpd.sum()),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RingCoverage:
+    """A scan, or a sum of scans, in one ring of horizontal range."""
+
+    sequence: str
+    index: str
+    ring: str  # of `RING_TITLES`
+    coverage: Coverage
+    calibration: Calibration  # of p_ground
+
+
+class Kind(NamedTuple):
+    """What errors of the ground's height are held against, and the tables of it."""
+
+    std: str  # attribute of `Segmentation`
+    against: str
+    keys: dict[str, Callable[[RingCoverage], str]]  # what the rows of each table are
+
+
+_BY_RANGE: dict[str, Callable[[RingCoverage], str]] = {'range': lambda one: one.ring}
+LABELLED = Kind(
+    'return_std',
+    'labelled ground returns',
+    {'sequence': lambda one: one.sequence, **_BY_RANGE},
+)
+SIMULATED = Kind(
+    'ground_std',
+    'exact heights under ground returns',
+    {
+        'sensor': lambda one: one.sequence.split()[0],
+        'scene': lambda one: one.sequence.split()[1],
+        **_BY_RANGE,
+    },
+)
+
+
+def compare_coverage(
+    items: Mapping[str, Sequence[Any]],
+    load: Callable[[Any], KnownScan],
+    configs: Mapping[str, Config],
+    kind: Kind,
+    progress: Progress = iter,
+) -> Report:
+    """Segment each scan, with the configuration of its group and without a past."""
+    changes = {name: results.changed_parameters(config) for name, config in configs.items()}
+    nested = {name: config.nested() for name, config in configs.items()}
+    facts: dict[str, dict[str, Any]] = {'config_changes': changes, 'config': nested}
+    if kind is LABELLED:  # of one sensor
+        facts = {key: next(iter(value.values())) for key, value in facts.items()}
+    rings: list[RingCoverage] = []
+    for name, own in items.items():
+        with closing(GroundSegmenter(configs[name])) as segmenter:
+            for item in progress(own):
+                segmenter.reset()
+                scan = load(item)
+                found = segmenter.segment(scan.points)
+                rings += ring_coverages(scan, found, kind.std)
+    return Report(
+        {name: _table(rings, name, kind) for name in kind.keys},
+        [_row_of(one) for one in rings],
+        found.fit,
+        {'std': kind.std, **facts},
+    )
+
+
+def ring_coverages(scan: KnownScan, found: Segmentation, std: str) -> list[RingCoverage]:
+    """Compare a segmented scan with the truth in each ring; `std` as in `Kind`."""
+    assert scan.ground_z is not None and scan.is_ground is not None
+    truth = next(iter(scan.truths.values()))
+    error, spread = found.ground_z - scan.ground_z, getattr(found, std)
+    x, y = scan.points[:, :2].astype(np.float64).T
+    ring = np.digitize(np.hypot(x, y), RING_EDGES[1:-1])
+    result = []
+    for k, title in enumerate(RING_TITLES):
+        own = ring == k
+        ground = own & scan.is_ground
+        height = count_coverage(error[ground], spread[ground])
+        probabilities = count_calibration(found.p_ground[own], truth[own])
+        result.append(RingCoverage(scan.sequence, scan.index, title, height, probabilities))
+    return result
+
+
+def _table(rings: Sequence[RingCoverage], name: str, kind: Kind) -> Table:
+    """Table of `Kind.keys`, and the sum of all."""
+    groups: dict[str, list[RingCoverage]] = {}
+    for one in rings:
+        groups.setdefault(kind.keys[name](one), []).append(one)
+    rows: list[Row] = []
+    for group, own in {**groups, methods.ALL: list(rings)}.items():
+        pooled = sum((one.coverage for one in own), Coverage())
+        probabilities = [one.calibration for one in own]
+        ece = sum(probabilities[1:], probabilities[0]).ece
+        rows.append(
+            [
+                (Column(name), group),
+                (Column('points', '_d'), pooled.n_points),
+                (percent('1 std', 'within_1', '.1f'), pooled.within_1),
+                (percent('2 std', 'within_2', '.1f'), pooled.within_2),
+                (Column('NLPD', '.2f', 'nlpd'), pooled.nlpd),
+                (results.centimetres('bias'), pooled.bias),
+                (results.centimetres('RMSE', 'rmse'), pooled.rmse),
+                (Column('ECE', '.4f', 'ece'), ece),
+            ]
+        )
+    title = (
+        f'ground_z and {kind.std} against {kind.against}, by {name}: points within 1 and 2 '
+        'standard deviations [%] (68.3 and 95.4 of a normal distribution), mean negative log '
+        'predictive density, bias and RMSE [cm]; expected calibration error of p_ground'
+    )
+    return Table.of(rows, title=title, n_sums=1)
+
+
+def _row_of(one: RingCoverage) -> dict[str, Any]:
+    """Every number of a scan in a ring; lengths in metres."""
+    names = ('n_points', 'within_1', 'within_2', 'nlpd', 'bias', 'rmse')
+    row: dict[str, Any] = {'sequence': one.sequence, 'index': one.index, 'ring': one.ring}
+    row |= {name: getattr(one.coverage, name) for name in names}
+    return row | {'ece': one.calibration.ece, 'n_probabilities': one.calibration.n_total}

@@ -1,0 +1,168 @@
+"""The surface corrected by the returns called ground: its height and its standard deviations."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+import reference
+from conftest import hilly_scan
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.experiments.variants import PRESET_OF
+from gp_ground_seg.frame import GroundSurface, Labelled, PolarGrid
+from gp_ground_seg.parameters.presets import PRESETS
+from gp_ground_seg.pipeline.residuals import correct_surface
+from gp_ground_seg.simulation import SCENES, SENSORS, VLP_16, objects, simulate_scan
+from gp_ground_seg.simulation.scenes import Scene, ramp
+
+N_SEGMENTS = 7
+KNOTS = np.array([1.0, 2.0, 3.5, 5.0, 7.0, 10.0])
+
+
+def correct(cells, residuals, surface, noise=0.02, slope_std=0.05, find=correct_surface):
+    """Correct a surface of `N_SEGMENTS` by ground returns in some cells."""
+    cells, residuals = np.asarray(cells, np.int32), np.asarray(residuals, float)
+    label = np.full(len(cells), Label.GROUND, np.uint8)
+    grid = PolarGrid(cells, np.ones(len(cells)), KNOTS, N_SEGMENTS)
+    labelled = Labelled(label, residuals, residuals, np.zeros((N_SEGMENTS, len(KNOTS) - 1)))
+    return find(surface, labelled, grid, np.full((N_SEGMENTS, 1), noise), slope_std)
+
+
+def flat(std=0.03, z=-1.7):
+    shape = N_SEGMENTS, len(KNOTS)
+    return GroundSurface(KNOTS, np.full(shape, z), np.full(shape, std), np.ones(0, bool))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 60))
+def test_the_correction_is_the_reference(seed, n_returns):
+    rng = np.random.default_rng(seed)
+    cells = rng.integers(0, N_SEGMENTS * (len(KNOTS) - 1), n_returns)
+    residuals = np.round(rng.normal(0.01, 0.05, n_returns) * 2**20) / 2**20
+    shape = N_SEGMENTS, len(KNOTS)
+    mean, std = rng.normal(-1.7, 0.2, shape), rng.uniform(0.001, 0.1, shape)
+    # A segment has no model, and others none from some range on.
+    for m, end in enumerate(rng.integers(0, len(KNOTS) + 4, N_SEGMENTS)):
+        mean[m, end:] = std[m, end:] = np.nan
+    surface = GroundSurface(KNOTS, mean, std, np.ones(0, bool))
+    found = correct(cells, residuals, surface)
+    values = np.array([found.correction, found.std, found.return_std])
+    finds = [partial(reference.correct_surface, takes_first=first) for first in (True, False)]
+    one, other = (np.array(correct(cells, residuals, surface, find=find)) for find in finds)
+    np.testing.assert_array_equal(np.isnan(one).any(axis=0), np.isnan(mean))
+    # The nearest of two knots that are equally far may be either.
+    is_one = np.isclose(values, one, rtol=0, atol=1e-7, equal_nan=True).all(axis=0)
+    np.testing.assert_allclose(np.where(is_one, one, other), values, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found.mean, mean + found.correction, atol=1e-12)
+    assert (found.return_std >= found.std)[np.isfinite(mean)].all()
+
+
+def test_returns_of_one_place_divide_into_ground_and_noise():
+    """Two cells whose means lie 4 cm apart, each with returns 1 cm to both sides."""
+    found = correct([0, 0, 1, 1], [0.01, 0.03, 0.05, 0.07], flat())
+    assert found.mean[0, 1] == pytest.approx(-1.7 + 0.04, abs=1e-6)
+    assert found.std[0, 1] == pytest.approx(0.02, abs=1e-6)
+    assert found.return_std[0, 1] == pytest.approx(np.hypot(0.02, 0.01), abs=1e-6)
+    # One cell alone does not show how ground varies: there the process has its word.
+    assert found.mean[0, 0] == pytest.approx(-1.7 + 0.02, abs=1e-6)
+    assert found.std[0, 0] == pytest.approx(0.03, abs=1e-6)
+    assert found.return_std[0, 0] == pytest.approx(np.hypot(0.03, 0.02), abs=1e-6)
+
+
+@pytest.mark.parametrize('slope_std', [0.0, 0.05, 0.2])
+def test_away_from_evidence_the_ground_is_uncertain_by_the_distance(slope_std):
+    found = correct([0, 0, 1, 1], [0.0, 0.02, 0.0, 0.02], flat(), slope_std=slope_std)
+    distance = KNOTS[3:] - KNOTS[2]
+    expected = np.sqrt(0.03**2 + (slope_std * distance) ** 2)
+    np.testing.assert_allclose(found.std[0, 3:], expected, rtol=1e-6)
+    np.testing.assert_allclose(found.correction, 0.01, atol=1e-6)
+    # The same to both sides.
+    np.testing.assert_allclose(found.std[1:], found.std[:0:-1], rtol=1e-6)
+
+
+def test_two_estimates_of_unseen_ground_that_differ_make_it_uncertain():
+    """The process sees a car's roof, 0.5 m up, beside ground that is seen."""
+    surface = flat(std=0.05)
+    surface.mean[0, 3:] += 0.5
+    plain = correct([0, 0, 1, 1], [0.0, 0.0, 0.0, 0.0], flat(std=0.05))
+    found = correct([0, 0, 1, 1], [0.0, 0.0, 0.0, 0.0], surface)
+    assert (found.mean[0, 3:] > -1.7 + 0.05).all()
+    assert (found.mean[0, 3:] < -1.7 + 0.49).all()
+    assert (found.std[0, 3:] > plain.std[0, 3:] + [0.1, 0.03, 0.005]).all()
+    inside = np.abs(found.mean[0, 3:] + 1.7) / found.std[0, 3:]
+    assert (inside < 2.5).all()
+
+
+def test_without_a_ground_return_the_surface_is_that_of_the_process():
+    surface = flat()
+    found = correct([], [], surface)
+    np.testing.assert_array_equal(found.mean, surface.mean)
+    np.testing.assert_allclose(found.std, surface.std)
+    np.testing.assert_allclose(found.return_std, np.hypot(0.03, 0.02))
+
+
+def test_nothing_is_computed_before_it_is_asked_for(monkeypatch):
+    def asked(*_):
+        raise AssertionError('asked for')
+
+    monkeypatch.setattr('gp_ground_seg.result.correct_surface', asked)
+    result = GroundSegmenter().segment(hilly_scan())
+    assert np.isfinite(result.p_ground).all()
+    assert result.fit.n_inliers > 0
+    with pytest.raises(AssertionError, match='asked for'):
+        _ = result.height
+
+
+@pytest.mark.parametrize('tilt', [None, (0.05, -0.1)])
+def test_height_and_ground_z_are_of_one_surface(tilt):
+    points = hilly_scan()
+    with_tilt = GroundSegmenter().segment(points, tilt)
+    cosine = 1.0 if tilt is None else np.cos(tilt[0]) * np.cos(tilt[1])
+    known = np.isfinite(with_tilt.height)
+    assert known.sum() > 3000
+    over = (points[:, 2] - with_tilt.ground_z) * cosine
+    np.testing.assert_allclose(with_tilt.height[known], over[known], atol=1e-9)
+    ground = with_tilt.label == Label.GROUND
+    for value in (with_tilt.height, with_tilt.ground_std, with_tilt.return_std):
+        assert np.isfinite(value[ground]).all()
+    # The labels follow from heights over the surface of the process.
+    own, corrected = with_tilt.labelled.height[ground], with_tilt.height[ground]
+    assert np.sqrt(np.mean(corrected**2)) < 0.95 * np.sqrt(np.mean(own**2))
+    assert abs(np.mean(corrected)) < 0.003
+
+
+@pytest.mark.parametrize('sensor', SENSORS)
+def test_errors_against_exact_heights_are_as_large_as_said(sensor):
+    """Every scene once; docs/accuracy.md has the table of two seeds."""
+    segmenter = GroundSegmenter(PRESETS[PRESET_OF[sensor]].config)
+    ratios, errors = [], []
+    for scene in SCENES.values():
+        made = simulate_scan(scene(0), SENSORS[sensor], np.random.default_rng(0))
+        found = segmenter.segment(made.points[:, :3])
+        own = made.is_ground & np.isfinite(found.ground_z)
+        errors.append((found.ground_z - made.ground_z)[own])
+        ratios.append(np.abs(errors[-1]) / found.ground_std[own])
+    ratio = np.concatenate(ratios)
+    assert 0.60 <= np.mean(ratio <= 1.0) <= 0.80
+    assert 0.90 <= np.mean(ratio <= 2.0) <= 0.99
+    assert abs(np.median(np.concatenate(errors))) < 0.001
+
+
+def test_ground_that_a_car_hides_is_uncertain():
+    """A street climbs behind a parked car; the process takes its height from afar."""
+    terrain = ramp(8.0, 0.15)
+    scene = Scene('climb', terrain, objects.car(terrain, 14.0, 0.0))
+    made = simulate_scan(scene, VLP_16, np.random.default_rng(0))
+    found = GroundSegmenter(Config()).segment(made.points[:, :3])
+    x, y = made.points[:, :2].T
+    above = made.points[:, 2] - made.ground_z
+    roof = ~made.is_ground & (np.hypot(x - 14.0, y) < 4.0) & (above > 1.2)
+    assert roof.sum() > 20
+    wrong = np.abs(found.surface.at(found.grid)[0] - made.ground_z)[roof]
+    sure = found.surface.at(found.grid)[1][roof]
+    assert np.median(wrong / sure) > 5.0  # as if it had been seen
+    error = np.abs(found.ground_z - made.ground_z)[roof]
+    assert np.median(error) < np.median(wrong)
+    assert np.median(error / found.ground_std[roof]) < 2.0
+    assert np.median(found.ground_std[roof]) > 0.1
