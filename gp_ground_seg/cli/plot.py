@@ -116,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.picture == 'scan':
         plot_scan_view(points, result, config, path, title)
     elif arguments.picture == 'above':
-        plot_birds_eye(points, result.label, path, truth, title)
+        said = plot_birds_eye(points, result.label, path, truth, title)
     else:
         segment, reach = _segment_number(arguments, config), arguments.max_range
         plot_segment(result, config, points, segment, path, truth, title, reach)

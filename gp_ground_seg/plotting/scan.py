@@ -158,10 +158,11 @@ def plot_birds_eye(
     path: str | Path,
     truth: Labels | None = None,
     title: str = '',
-) -> None:
+) -> str:
     """Draw points (N, >=3) [m] from above by their `Label`, as a PNG, replacing the file `path`.
 
     With the true labels, UNKNOWN where a point does not count, a second panel shows the errors.
+    Returns the title of the last panel: the numbers of points in it.
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=label, truth=truth)
@@ -180,6 +181,7 @@ def plot_birds_eye(
         axes.set_ylabel('x, forward [m]')
         _draw_panel(axes, xy, layers)
     save(figure, path)
+    return panels[-1][0]
 
 
 def _label_panel(label: Labels) -> tuple[str, Layers]:
