@@ -8,12 +8,12 @@ else there is to say; what stands between the two is written here:
     -->
     <!-- end of figure -->
 
-sample: ...            further words for a run of a few seconds; its rows are kept in a comment, and
+sample: WORDS          further words for a run of seconds; its rows are kept in a comment, and
                        test/test_pages.py computes them again
 keep: TITLE; TITLE     only the tables whose titles begin so
 picture: FILE -> PATH  the file that the command makes, and its place in the repository
 
-Pages and pictures are written when all commands have run, so that each runs on the commit it names.
+Pages and pictures are written when all commands have run: each runs on the commit it names.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,14 +111,14 @@ def body_of(figure: Figure, output: str, sample: str | None, commit: str) -> str
     shown = f'`gp-ground-seg {figure.command}`'
     if 'picture' in figure.options:
         # The image, with the words it had, and the line that names the file.
-        made, _, place = figure.options['picture'].partition(' -> ')
+        made = figure.options['picture'].partition(' -> ')[0]
         (image,) = re.findall(r'^!\[.*\)$', figure.body, re.MULTILINE)
         (said,) = [line for line in output.splitlines() if made in line]
         return f'{image}\n\n{shown}\n({caption(said, made)}; commit {commit})\n'
     if 'keep' in figure.options:
         titles = tuple(figure.options['keep'].split('; '))
         parts = output.split('\n\n')
-        kept = [f'{a}\n\n{b}' for a, b in zip(parts, parts[1:]) if a.startswith(titles)]
+        kept = [f'{a}\n\n{b}' for a, b in pairwise(parts) if a.startswith(titles)]
         output = '\n\n'.join([*kept, parts[-1]])
     if '| ---' not in output:
         output = f'```text\n{output}\n```'
