@@ -66,10 +66,6 @@ class Figure(NamedTuple):
         """Whether the command reads labelled frames."""
         return ROOT in self.command
 
-    def text(self, body: str) -> str:
-        """Return the figure with another body, as it stands on the page."""
-        return f'<!-- figure: {self.head}\n-->\n{body}<!-- end of figure {digest(body)} -->'
-
 
 def find_figures(page: str, text: str) -> list[Figure]:
     """Figures of a page."""
@@ -81,6 +77,14 @@ def find_figures(page: str, text: str) -> list[Figure]:
             Figure(page, command.strip(), options, match['head'], match['body'], match['digest'])
         )
     return figures
+
+
+def replaced(page: str, figure: Figure, body: str) -> str:
+    """Text of a page with another body of a figure."""
+    begin = f'<!-- figure: {figure.head}\n-->\n'
+    before, _, after = page.partition(f'{begin}{figure.body}<!-- end of figure')
+    end = f'<!-- end of figure {digest(body)} -->'
+    return before + begin + body + end + after.partition('-->')[2]
 
 
 def digest(body: str) -> str:
@@ -159,12 +163,13 @@ def main() -> int:
                 outputs[command] = run(command, kitti, folder)
             except subprocess.CalledProcessError as error:
                 print(f'FAILED with exit code {error.returncode}; its figures stay as they are')
+            except KeyboardInterrupt:
+                print('interrupted: what is done is written')
+                break
         done = [f for f in figures if f.command in outputs and f.sample in outputs]
         for figure in done:
             body = body_of(figure, outputs[figure.command], outputs[figure.sample], commit)
-            old = f'<!-- figure: {figure.head}\n-->\n{figure.body}<!-- end of figure'
-            before, _, after = texts[figure.page].partition(old)
-            texts[figure.page] = before + figure.text(body) + after.partition('-->')[2]
+            texts[figure.page] = replaced(texts[figure.page], figure, body)
             if 'picture' in figure.options:
                 made, _, place = figure.options['picture'].partition(' -> ')
                 shutil.copyfile(folder / made, REPOSITORY / place)

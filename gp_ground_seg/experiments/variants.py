@@ -186,8 +186,8 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
             its = peer.of(group)
             median = its.height.median_absolute
             rows[-1] += [
-                (percent(PEER, 'peer_iou'), its.iou),
-                (percent('difference', 'difference', '+.2f'), own.iou - its.iou),
+                (percent('its IoU', 'peer_iou'), its.iou),
+                (percent('ahead', 'difference', '+.2f'), own.iou - its.iou),
                 (results.centimetres('its RMSE', 'peer_rmse'), its.height.rmse),
                 (results.centimetres('its median', 'peer_median_absolute'), median),
             ]
@@ -204,7 +204,9 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
     )
     notes = []
     if peer is not None:
-        title += f'; {PEER} has the true sensor height, its surface is that of its nearest patch'
+        title += (
+            f'; its: of {PEER}, which has the true sensor height, and as surface its nearest patch'
+        )
         title += f'; {interval_note("scenes of each row")}'
         n_ahead = len(rows) - len(behind) - len(ties)
         where = f'; ties on {", ".join(ties)}' if ties else ''

@@ -142,7 +142,7 @@ def _draw_legend(figure: Any, axes: Any, config: Config) -> None:
     bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], colours[None])
     bar.set_xscale('log')
     bar.set_yticks([])
-    bar.set_title('length-scale of the ground [m]; ribbons: 2 sigma', fontsize=10)
+    bar.set_title('length-scale of the ground [m]; ribbons: 2 sigma', fontsize=9.5)
     ticks = [tick for tick in (0.1, 0.3, 1, 3, 10, 30, 100, 300) if low <= tick <= high]
     bar.set_xticks(ticks, labels=[f'{tick:g}' for tick in ticks])
     bar.minorticks_off()
