@@ -144,6 +144,8 @@ def main() -> int:
     )
     arguments = parser.parse_args()
     kitti = str(Path(arguments.kitti).resolve())
+    if not (Path(kitti) / 'sequences').is_dir():
+        parser.error(f'{arguments.kitti}: holds no sequences/; say make figures KITTI=PATH')
     texts = {page: (REPOSITORY / page).read_text(encoding='utf-8') for page in PAGES}
     figures = [figure for page, text in texts.items() for figure in find_figures(page, text)]
     if arguments.part:

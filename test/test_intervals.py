@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore
-from gp_ground_seg.evaluation.intervals import difference_interval, interval_text
-from gp_ground_seg.evaluation.metrics import Confusion
+from gp_ground_seg.evaluation.intervals import difference_interval, interval_text, mse_sums
+from gp_ground_seg.evaluation.metrics import Confusion, height_error
 
 
 def clusters(*hits, of=100):
@@ -73,3 +73,14 @@ def test_it_is_the_same_each_time_and_follows_the_generator_given():
     assert difference_interval(ours, theirs) == before
     found = [difference_interval(ours, theirs, rng=np.random.default_rng(k)) for k in (1, 2)]
     assert found[0] != found[1] and found[0] == pytest.approx(found[1], abs=0.01)
+
+
+def test_heights_are_compared_by_their_rmse():
+    def score(name, *errors):
+        found = height_error(np.zeros(len(errors)), np.array(errors))
+        return MethodScore('x', (ScanScore(name, '0', 0.0, height=found),))
+
+    ours, theirs = [score('0', 0.3, 0.3), score('1', 0.1)], [score('0', 0.0, 0.0), score('1', 0.1)]
+    # Twice the first: 0.3 - 0; twice the second: no difference.
+    assert difference_interval(ours, theirs, mse_sums) == pytest.approx((0.0, 0.3))
+    assert interval_text(ours, theirs, mse_sums) == '+0.00 to +30.00 tie'

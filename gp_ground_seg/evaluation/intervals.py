@@ -41,6 +41,11 @@ def iou_sums(score: MethodScore) -> tuple[float, float]:
     return score.confusion.tp, score.confusion.tp + score.confusion.errors
 
 
+def mse_sums(score: MethodScore) -> tuple[float, float]:
+    """Mean squared error of the height."""
+    return score.height.sum_squared_error, score.height.n_points
+
+
 def difference_interval(
     ones: Sequence[MethodScore],
     others: Sequence[MethodScore],
@@ -50,7 +55,8 @@ def difference_interval(
     """Interval of the pooled ratio of one method minus that of another.
 
     Both are given by cluster, on the same scans; None with fewer than two clusters, or where a
-    ratio is over nothing. `rng` draws; by default in the same way each time.
+    ratio is over nothing. For `mse_sums` it is the difference of the roots, the RMSE. `rng`
+    draws; by default in the same way each time.
     """
     n = len(ones)
     if n < 2:
@@ -61,7 +67,7 @@ def difference_interval(
     def ratios(scores: Sequence[MethodScore]) -> FloatArray:
         above, below = (times_drawn @ np.array([sums(s) for s in scores], dtype=np.float64)).T
         result: FloatArray = np.divide(above, below, where=below > 0, out=np.full(N_DRAWS, np.nan))
-        return result
+        return np.sqrt(result) if sums is mse_sums else result
 
     difference = ratios(ones) - ratios(others)
     if np.isnan(difference).any():
@@ -73,7 +79,7 @@ def difference_interval(
 def interval_text(
     ones: Sequence[MethodScore], others: Sequence[MethodScore], sums: Sums = iou_sums
 ) -> str | None:
-    """`difference_interval` in percent, as in ``-0.10 to +0.25 tie``; None without one."""
+    """`difference_interval` in percent or cm, as in ``-0.10 to +0.25 tie``; None without one."""
     found = difference_interval(ones, others, sums)
     if found is None:
         return None

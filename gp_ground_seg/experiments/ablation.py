@@ -11,10 +11,16 @@ from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import report
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, load_kitti, pool
-from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
+from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text, mse_sums
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.experiments.interpolation import interpolation_method
-from gp_ground_seg.experiments.variants import Changes, make_report, refuse_changed, score_variants
+from gp_ground_seg.experiments.variants import (
+    Changes,
+    make_report,
+    refuse_changed,
+    scene_parts,
+    score_variants,
+)
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
 
@@ -96,18 +102,23 @@ def compare_models(
     with closing(interpolation_method(config)) as plain:
         scores = score_variants(items, load, variants, [plain], progress=progress)
     last = scores[len(MODELS) - 1]
+    # Simulated scans are of one sequence, and of many scenes.
+    parts = MethodScore.parts if len(last.sequences) > 1 else scene_parts
     rows: list[Row] = [
         [
             (Column('method'), one.name),
             (percent('IoU [%]', 'iou'), one.iou),
-            (INTERVAL, None if one is last else interval_text(one.parts(), last.parts())),
             *_worst_and_rmse(one),
+            (INTERVAL, None if one is last else interval_text(parts(one), parts(last), mse_sums)),
             (report.centimetres('median [cm]', 'median_absolute'), one.height.median_absolute),
         ]
         for one in scores
     ]
-    note = interval_note(f'{len(last.sequences)} sequences')
-    title = f'{_counted(last)} minus that of {last.name}: {note}; heights under true ground'
+    clusters = 'sequences' if len(last.sequences) > 1 else 'scenes'
+    title = (
+        f'{_counted(last)}; RMSE and median of the height under true ground, RMSE minus that of '
+        f'{last.name}: {interval_note(f"{len(parts(last))} {clusters}")}'
+    )
     return make_report({'models': Table.of(rows, title=title)}, scores, config, changes=MODELS)
 
 
