@@ -60,7 +60,7 @@ def score_steps(frames: Sequence[Frame], with_peer: bool, progress: Progress = i
         )
     n_sequences = len(scores[0].sequences)
     title = (
-        f'{len(frames)} scans of {n_sequences} sequences; difference to the row above, below '
+        f'{len(frames)} scans of {n_sequences} sequences, each by itself; difference to the row above, below '
         'the steps to the last of them; '
         f'{interval_note(f"{n_sequences} sequences")}; RMSE of the height under labelled ground'
     )
