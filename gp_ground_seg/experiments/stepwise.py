@@ -60,8 +60,8 @@ def score_steps(frames: Sequence[Frame], with_peer: bool, progress: Progress = i
         )
     n_sequences = len(scores[0].sequences)
     title = (
-        f'{len(frames)} scans of {n_sequences} sequences, each by itself; difference to the row above, below '
-        'the steps to the last of them; '
+        f'{len(frames)} scans of {n_sequences} sequences, each by itself; difference to the row '
+        'above, below the steps to the last of them; '
         f'{interval_note(f"{n_sequences} sequences")}; RMSE of the height under labelled ground'
     )
     return make_report({'steps': Table.of(rows, title=title)}, scores, Config())
