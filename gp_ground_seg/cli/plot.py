@@ -112,9 +112,8 @@ def run(arguments: argparse.Namespace) -> int:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
     with closing(GroundSegmenter(config)) as segmenter:
         result = segmenter.segment(points)
-    said = f'{len(points)} points'
     if arguments.picture == 'scan':
-        plot_scan_view(points, result, config, path, title)
+        said = plot_scan_view(points, result, config, path, title)
     elif arguments.picture == 'above':
         said = plot_birds_eye(points, result.label, path, truth, title)
     else:

@@ -52,8 +52,8 @@ def plot_scan_view(
     config: Config,
     path: str | Path,
     title: str = '',
-) -> None:
-    """Draw a scan in perspective as a PNG, replacing the file `path`.
+) -> str:
+    """Draw a scan in perspective as a PNG, replacing the file `path`; return numbers of points.
 
     Ground and obstacles of `points`, (N, >=3) [m], and on them profiles of the ground model with
     two standard deviations, coloured by length-scale: what the node's topics show in RViz.
@@ -73,6 +73,7 @@ def plot_scan_view(
     axes.set_xlim(-0.5, 0.5)
     axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
     save(figure, path)
+    return _label_panel(segmentation.label)[0]
 
 
 def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
