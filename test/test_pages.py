@@ -11,6 +11,7 @@ from conftest import REPOSITORY, find_kitti
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.cli import demo
 from gp_ground_seg.evaluation.metrics import GROUNDGRID
+from gp_ground_seg.jit import JIT_ENABLED
 from gp_ground_seg.plotting.scan import plot_birds_eye
 
 SPEC = importlib.util.spec_from_file_location('figures', REPOSITORY / 'docs' / 'figures.py')
@@ -26,6 +27,7 @@ ANEW = 'make figures KITTI=PATH'
 NUMBER = re.compile(r'[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?')
 TIMES = ('time', 't Z', 'ms')
 """Beginnings of the titles of columns that depend on the machine."""
+compiled = pytest.mark.skipif(not JIT_ENABLED, reason='takes minutes without compiled code')
 
 
 def once(chosen):
@@ -89,6 +91,7 @@ def test_every_table_with_numbers_of_ours_and_every_picture_is_a_figure():
         assert '--: |' not in rest, f'{page}: a table of numbers without its command'
 
 
+@compiled
 @pytest.mark.parametrize('figure', SAMPLED, ids=lambda figure: figure.command)
 def test_samples_of_tables_come_out_again(figure, capfd):
     root = root_for(figure)
@@ -99,6 +102,7 @@ def test_samples_of_tables_come_out_again(figure, capfd):
     assert not wrong, f'{figure.page}, {figure.command}: {"; ".join(wrong[:5])}. {ANEW}'
 
 
+@compiled
 @pytest.mark.parametrize('figure', PLOTTED, ids=lambda figure: figure.options['picture'])
 def test_numbers_of_pictures_come_out_again(figure, tmp_path, capsys, monkeypatch):
     root = root_for(figure)
@@ -109,6 +113,7 @@ def test_numbers_of_pictures_come_out_again(figure, tmp_path, capsys, monkeypatc
     assert f'({said}; commit ' in figure.body, f'{figure.page}: now {said}. {ANEW}'
 
 
+@compiled
 def test_the_picture_of_the_demo_is_that_of_the_demo(tmp_path):
     """The same scan without the node: the labels that came back are those of the library."""
     (figure,) = (figure for figure in FIGURES if figure.command == 'demo')
