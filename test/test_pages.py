@@ -61,15 +61,16 @@ def last_digit(word):
 def differences(shown, found):
     """Cells of two lists of Markdown rows that differ, times left out."""
     assert len(shown) == len(found)
-    titles, before = [], None
-    for a, b in zip(shown, found, strict=True):
-        cells, others = ([cell.strip() for cell in row.split('|')[1:-1]] for row in (a, b))
-        if set(''.join(others)) <= set('-: '):
-            titles = before
-        for title, cell, other in zip(titles or cells, cells, others, strict=True):
-            if not (titles and title.startswith(TIMES)) and not same(cell, other):
+    rows = [[cell.strip() for cell in row.split('|')[1:-1]] for row in shown]
+    anew = [[cell.strip() for cell in row.split('|')[1:-1]] for row in found]
+    rules = [set(''.join(row)) <= set('-:') for row in rows]
+    for k, (cells, others) in enumerate(zip(rows, anew, strict=True)):
+        if k + 1 < len(rows) and rules[k + 1]:
+            titles = cells
+        assert len(cells) == len(others)
+        for title, cell, other in zip(titles, cells, others, strict=True):
+            if (cells is titles or not title.startswith(TIMES)) and not same(cell, other):
                 yield f'{title} of {cells[0]}: {cell} is {other}'
-        before = others
 
 
 def test_every_figure_is_as_it_was_written():
