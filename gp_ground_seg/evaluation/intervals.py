@@ -37,12 +37,12 @@ class Interval(NamedTuple):
 
 
 def iou_sums(score: MethodScore) -> tuple[float, float]:
-    """IoU in the convention that counts."""
+    """Return the IoU in the convention that counts, as a ratio."""
     return score.confusion.tp, score.confusion.tp + score.confusion.errors
 
 
 def mse_sums(score: MethodScore) -> tuple[float, float]:
-    """Mean squared error of the height."""
+    """Return the mean squared error of the height, as a ratio."""
     return score.height.sum_squared_error, score.height.n_points
 
 
