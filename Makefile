@@ -6,7 +6,7 @@ KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test torture bench bench-docs node-bench colcon lint format generate clean
+.PHONY: help demo test torture bench bench-docs figures node-bench colcon lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
@@ -14,6 +14,7 @@ help:
 	@echo 'make torture   adversarial clouds, files and uses (TORTURE_SCALE=100 for a night)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.json and its picture'
+	@echo 'make figures   every table and picture of README and docs anew (needs KITTI=PATH; ONLY=word for some)'
 	@echo 'make node-bench  latency, losses and memory of the node over DDS'
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make lint      ruff and mypy'
@@ -50,6 +51,9 @@ bench: $(VENV)/.dev
 bench-docs: $(VENV)/.dev
 	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy --force \
 		--json docs/performance.json --plot docs/images/performance.png
+
+figures: $(VENV)/.dev
+	$(BIN)/python docs/figures.py $(KITTI) $(ONLY)
 
 node-bench: $(VENV)/.ros
 	$(BIN)/gp-ground-seg node-bench $(KITTI)

@@ -104,8 +104,8 @@ class GroundSegmenter:
             surface, log_length_scale = backend.estimate_surface(frame, theta, config)
             timer.mark('surface')
 
-            # 6. Labels: height of each point over the surface, against a band that follows
-            # the roughness.
+            # 6. Labels: a point is ground where its height over the surface is more likely of
+            #    ground than of an obstacle.
             labelled = backend.label_points(scan, faces, surface, config)
             tilted_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
             timer.mark('label')

@@ -40,6 +40,8 @@ def few_places(monkeypatch):
 CASES = {
     'ablation': (['ROOT', '--frame-step', '2', *SMALL], 'models', 7 * 3),
     'ablation --simulated': (['--seeds', '1', *SMALL], 'models', 7),
+    'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
+    'wrong-values': (['ROOT', '--frame-step', '3', *SMALL], 'values', 18 * 2),
     'departures': (
         ['ROOT', '--switch', 'small: grid.n_bins=79', '--switch',
          'near: grid.r_max=15', *SMALL],
@@ -148,6 +150,9 @@ def test_a_departure_in_words():
         (['ablation', '--simulated', '--frame-step', '2'], '--frame-step: is for labelled frames'),
         (['ablation', 'ROOT', '--sequences', '07'], 'no sequence 07; sequences here: 00, 08'),
         (['ablation', 'ROOT', '--set', 'learning.mode=fixed'], 'leave it out'),
+        (['wrong-values', 'ROOT', '--set', 'observation.sigma_n=0.1'], 'leave it out'),
+        (['steps', 'ROOT', '--set', 'grid.n_bins=40'], 'give no parameters'),
+        (['steps', 'ROOT', '--preset', 'paper'], 'give no parameters'),
         (['ablation', '--simulated', '--set', 'length_scale.model=latent2'], 'length_scale.model'),
         (['departures', 'ROOT', '--switch', 'a: '], 'must be TITLE'),
         (['cross-validation', 'ROOT', '--set', 'grid.r_max=50,0.001'], 'grid.r_max'),

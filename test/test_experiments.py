@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -16,7 +17,14 @@ from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore, labelled_frames
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
-from gp_ground_seg.experiments import ablation, coverage, sensor_pose, variants
+from gp_ground_seg.experiments import (
+    ablation,
+    coverage,
+    interpolation,
+    sensor_pose,
+    stepwise,
+    variants,
+)
 from gp_ground_seg.experiments.ablation import MODELS, Departure
 from gp_ground_seg.experiments.sensor_pose import MOUNTS, SIMULATED_MOUNTS, score_poses
 from gp_ground_seg.experiments.variants import PRESET_OF, SimulatedFrame, load_simulated
@@ -61,8 +69,42 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     monkeypatch.setattr(ablation, 'MODELS', {name: MODELS[name] for name in names})
     frames = variants.simulated_frames(['hdl-64e'], [ablation.SCENE], 2, ablation.PLACES)
     report = ablation.compare_models(frames, load_simulated, Config())
-    constant, gradient, latent = (row['rmse'] for row in report.tables['models'].json())
+    constant, gradient, latent, _ = (row['rmse'] for row in report.tables['models'].json())
     assert latent < 0.9 * min(constant, gradient)
+
+
+def test_steps_go_from_the_paper_to_the_defaults():
+    steps = list(stepwise.paper_steps().values())
+    assert (steps[0], steps[-1]) == (PRESETS['paper'].config, Config())
+    for before, after in itertools.pairwise(steps):
+        assert before != after
+
+
+def test_interpolation_joins_lowest_points_that_are_not_too_steep():
+    r, z = np.array([5.0, 6.0, 10.0, 20.0]), np.array([-1.7, -1.0, -1.2, -3.0])
+    # 0.7 m within 1 m is an obstacle, 0.5 m within 5 m a slope, and so is 1.8 m down in 10 m not.
+    assert interpolation.ground_points(r, z, -1.73) == ([0.0, 5.0, 10.0], [-1.73, -1.7, -1.2])
+
+
+def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
+    scan = runner.load_kitti(frames[0])
+    with closing(interpolation.interpolation_method(Config())) as plain:
+        plain.run(scan.points)
+        result = plain.last
+    candidates, surface, segment = result.candidates, result.surface, 60
+    lines = []
+    for k in (segment - 1, segment, segment + 1):
+        own = candidates.segment == k
+        found = interpolation.ground_points(candidates.r[own], candidates.z[own], -1.73)
+        lines.append(np.interp(surface.knots, *found))
+    known = np.isfinite(surface.mean[segment])
+    assert known.sum() > 5
+    # The height of the sensor is estimated; it only moves what lies before the first point.
+    far = known & (surface.knots > 8.0)
+    expected = np.median(lines, axis=0)[far]
+    np.testing.assert_allclose(surface.mean[segment][far], expected, atol=1e-9)
+    assert result.fit.mode == 'fixed'
+    assert count_confusion(result.label, scan.truths['groundgrid']).iou > 0.9
 
 
 @pytest.mark.parametrize('departure', ablation.DEPARTURES, ids=lambda one: one.title)

@@ -1,5 +1,6 @@
 """The pictures of scans and scores, by their pixels."""
 
+import re
 import subprocess
 import sys
 
@@ -185,7 +186,8 @@ def test_command_draws_a_scan_and_keeps_what_is_there(tmp_path, capsys):
     path = tmp_path / 'a.png'
     words = ['plot', 'scan', '--simulate', 'flat', '--sensor', 'vlp-16', '--preset', 'vlp16', '-o']
     assert run(*words, path) == 0
-    assert 'points, written to' in capsys.readouterr().out
+    said = r'[\d ]+ points: [\d ]+ ground, [\d ]+ obstacle, written to .*a\.png\n'
+    assert re.fullmatch(said, capsys.readouterr().out)
     before = path.read_bytes()
     for wrong, message in (
         ([path], '--force replaces it'),
@@ -200,13 +202,15 @@ def test_command_draws_a_scan_and_keeps_what_is_there(tmp_path, capsys):
     assert path.read_bytes() != before
 
 
-def test_command_draws_a_scan_from_above(tmp_path):
+def test_command_draws_a_scan_from_above(tmp_path, capsys):
     points = np.column_stack([hilly_scan(8000), np.zeros(8000)]).astype('<f4')
     points.tofile(tmp_path / 'a.bin')
     np.full(8000, 40, '<u4').tofile(tmp_path / 'a.label')
     for words, n_panels in (([], 1), (['--labels', tmp_path / 'a.label', '--force'], 2)):
         assert run('plot', 'above', tmp_path / 'a.bin', '-o', tmp_path / 'a.png', *words) == 0
         assert imread(tmp_path / 'a.png').shape[1] == n_panels * PANEL
+    said = r'0 false ground, [\d ]+ missed ground, IoU [\d.]+ %, written to'
+    assert re.match(said, capsys.readouterr().out.splitlines()[-1])
     missed = where(tmp_path / 'a.png', COLOURS['missed ground'], left=LEFT + PANEL)
     assert missed[1] > 500
 

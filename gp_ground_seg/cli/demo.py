@@ -253,10 +253,10 @@ def run(arguments: argparse.Namespace) -> int:
             raise GroundSegError(f'no scan came back; the node said:\n{node.log_tail()}')
         number, xyz, label, truth = tally.picture
         title = f'{drive.name}, scan {number + 1} of {drive.n_frames}'
-        plot_birds_eye(xyz, label, part / PICTURE, truth, title)
+        counts = plot_birds_eye(xyz, label, part / PICTURE, truth, title)
     text, is_good = result_text(tally, result, probe.n_stray, drive.truth)
     print(f'\n{text}\n')
-    print(f'picture  {folder / PICTURE}  one of the scans from above, and the errors in it')
+    print(f'picture  {folder / PICTURE}  scan {number + 1} from above: {counts}')
     print(f'bag      {folder / BAG}  what was played; `gp-ground-seg play` plays it again')
     return 0 if is_good else 1
 

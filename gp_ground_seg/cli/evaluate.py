@@ -18,6 +18,7 @@ from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import metrics
 from gp_ground_seg.evaluation import report as tables
 from gp_ground_seg.evaluation.evaluate import MethodScore
+from gp_ground_seg.evaluation.intervals import INTERVAL, Sums, interval_note, interval_text
 from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
@@ -59,6 +60,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
         ('--reliability', 'draw share of ground over p_ground (PNG)', {'metavar': 'FILE'}),
         ('--peer', 'run this one on the same frames, alternately', peers),
+        options.MARKDOWN,
         options.TO_JSON,
         options.FORCE,
     )
@@ -88,9 +90,10 @@ def run(arguments: argparse.Namespace) -> int:
         if 'reliability' in parts:
             title = f'Reliability, {len(frames)} frames'
             plot_reliability(_calibrations(scores[0]), parts['reliability'], title)
-    print('\n\n'.join([_headline(scores), *(table.text() for table in report.tables.values())]))
-    print(f'\n{tables.fold(tables.parameters_line(report.facts["config_changes"]))}')
-    print(tables.fold(tables.machine_line(environment, report.fit)))
+    print(f'{_headline(scores)}\n')
+    lines = [tables.parameters_line(report.facts['config_changes'])]
+    lines.append(tables.machine_line(environment, report.fit))
+    print(tables.written(report.tables.values(), lines, markdown=arguments.markdown))
     for name in parts:
         print(f'{files[name]}: {getattr(arguments, name)}')
     return 0
@@ -109,6 +112,7 @@ def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str
     """Tables of an evaluation by name, ours first in `scores`."""
     return {
         **{one.key: _convention_table(scores, one) for one in metrics.CONVENTIONS},
+        **({'differences': _difference_table(*scores)} if len(scores) > 1 else {}),
         'rings': _ring_table(scores),
         'classes': _class_table(scores[0]),
         'probabilities': _calibration_table(scores[0]),
@@ -141,6 +145,31 @@ def _convention_table(scores: Sequence[MethodScore], convention: metrics.Convent
     columns += [percent(RATIO_TITLES.get(name, name), name) for name in metrics.RATIOS]
     title = f'{convention.title} convention: {convention.rule}  [%]'
     return Table([*columns, *_peer_columns(scores[1:])], rows, title, n_sums=1)
+
+
+def _difference_table(ours: MethodScore, peer: MethodScore) -> Table:
+    """Differences of the IoU over all sequences: by convention, and by range."""
+
+    def of_convention(key: str) -> Sums:
+        return lambda score: _iou_sums(score.pooled(key))
+
+    def of_ring(k: int) -> Sums:
+        return lambda score: _iou_sums(score.rings[k])
+
+    cases = {f'all, {one.title} convention': of_convention(one.key) for one in metrics.CONVENTIONS}
+    cases |= {title: of_ring(k) for k, title in enumerate(metrics.RING_TITLES)}
+    rows: list[list[Cell]] = []
+    for title, sums in cases.items():
+        own, its = (metrics.ratio(*sums(score)) for score in (ours, peer))
+        rows.append([title, own - its, interval_text(ours.parts(), peer.parts(), sums)])
+    note = interval_note(options.count(len(ours.sequences), 'sequence'))
+    title = f'IoU minus that of {peer.title}  [%]; {note}'
+    columns = [Column('points'), percent('difference', form='+.2f'), INTERVAL]
+    return Table(columns, rows, title)
+
+
+def _iou_sums(found: metrics.Confusion) -> tuple[float, float]:
+    return found.tp, found.tp + found.errors
 
 
 def _ring_table(scores: Sequence[MethodScore]) -> Table:

@@ -11,8 +11,8 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, staged_options
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.evaluate import load_kitti
-from gp_ground_seg.evaluation.report import Report, describe_environment, fold, machine_line
-from gp_ground_seg.experiments import ablation, coverage, sensor_pose, variants
+from gp_ground_seg.evaluation.report import Report, describe_environment, machine_line, written
+from gp_ground_seg.experiments import ablation, coverage, sensor_pose, stepwise, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
@@ -76,8 +76,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             description=experiment.description,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        markdown = ('--markdown', 'print the tables as Markdown', options.FLAG)
-        options.add(own, *experiment.options, markdown, options.TO_JSON, options.FORCE)
+        options.add(own, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
         options.add_config(own)
         own.set_defaults(run=run)
         if name in ('scenes', 'coverage'):  # there each sensor has the preset of its own
@@ -97,10 +96,8 @@ def run(arguments: argparse.Namespace) -> int:
             options = {name: getattr(arguments, name) for name in map(_name, experiment.options)}
             report.facts.update(experiment=arguments.experiment, options=options)
             report.write(parts['json'], environment)
-    tables = report.tables.values()
-    print('\n\n'.join(t.markdown() if arguments.markdown else t.text() for t in tables))
-    machine = machine_line(environment, report.fit)
-    print(f'\n{machine if arguments.markdown else fold(machine)}')
+    lines = [machine_line(environment, report.fit)]
+    print(written(report.tables.values(), lines, markdown=arguments.markdown))
     return 0
 
 
@@ -141,6 +138,18 @@ def parse_departure(text: str) -> ablation.Departure:
     if not title.strip() or not settings:
         raise ConfigError(f'--switch {text!r}: must be TITLE: NAME=VALUE ...')
     return ablation.Departure(title.strip(), dict(map(options.parse_setting, settings)))
+
+
+def _steps(arguments: argparse.Namespace) -> Report:
+    if options.read_config(arguments) != Config():
+        raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
+    frames, bar = frames_from_options(arguments), options.progress('steps')
+    return stepwise.score_steps(frames, not arguments.no_peer, bar)
+
+
+def _wrong_values(arguments: argparse.Namespace) -> Report:
+    config, bar = options.read_config(arguments), options.progress('wrong-values')
+    return stepwise.score_wrong_values(frames_from_options(arguments), config, bar)
 
 
 def _configs_of(arguments: argparse.Namespace, sensors: Sequence[str]) -> dict[str, Config]:
@@ -220,8 +229,9 @@ EXPERIMENTS = {
     'ablation': Experiment(
         """\
 Compare length-scale models and ways to learn: a constant length-scale, the gradients of the
-lines (Z), and the latent process (Z-L), on labelled frames; with --simulated on a smooth
-road that ends in rubble, by exact labels and heights.
+lines (Z), and the latent process (Z-L), and beside them a surface that is interpolated
+between lowest points, on labelled frames; with --simulated on a smooth road that ends in
+rubble, by exact labels and heights.
 """,
         (OPTIONAL_ROOT, SIMULATED, *OF_FRAMES, SEEDS),
         _ablation,
@@ -243,6 +253,21 @@ and two, by sequence and range. On labelled frames that of the returns (return_s
 """,
         (OPTIONAL_ROOT, SIMULATED, *OF_FRAMES, EVERY_SENSOR, SCENE_LIST, SEEDS),
         _coverage,
+    ),
+    'steps': Experiment(
+        """\
+Go from the paper's method to the defaults, one step after the other, beside Patchwork++ and a
+surface that is interpolated, with our labels.
+""",
+        (ROOT, *OF_FRAMES, NO_PEER),
+        _steps,
+    ),
+    'wrong-values': Experiment(
+        """\
+Give hyper-parameters that are wrong by factors of 3 and 10, with and without learning.
+""",
+        (ROOT, *OF_FRAMES),
+        _wrong_values,
     ),
     'scenes': Experiment(
         """\

@@ -25,6 +25,7 @@ from gp_ground_seg.parameters.schema import load_yaml
 DEFAULT_PRESET = 'default'
 FLAG = {'action': 'store_true'}
 FORCE = ('--force', 'replace output that exists; take scans that look wrong', FLAG)
+MARKDOWN = ('--markdown', 'print the tables as Markdown', FLAG)
 QUIET = ('--quiet', 'no progress bar, no notes', FLAG)
 TO_JSON = ('--json', 'write every number to this file as well', {'metavar': 'FILE'})
 

@@ -112,11 +112,10 @@ def run(arguments: argparse.Namespace) -> int:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
     with closing(GroundSegmenter(config)) as segmenter:
         result = segmenter.segment(points)
-    said = f'{len(points)} points'
     if arguments.picture == 'scan':
-        plot_scan_view(points, result, config, path, title)
+        said = plot_scan_view(points, result, config, path, title)
     elif arguments.picture == 'above':
-        plot_birds_eye(points, result.label, path, truth, title)
+        said = plot_birds_eye(points, result.label, path, truth, title)
     else:
         segment, reach = _segment_number(arguments, config), arguments.max_range
         plot_segment(result, config, points, segment, path, truth, title, reach)

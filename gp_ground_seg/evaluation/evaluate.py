@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from gp_ground_seg.backend import Backend
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import (
     Frame,
@@ -76,9 +77,9 @@ class Method(Protocol):
 class OurMethod:
     """`GroundSegmenter` as a method; `last` is its last result."""
 
-    def __init__(self, config: Config, name: str = OURS) -> None:
+    def __init__(self, config: Config, name: str = OURS, backend: Backend | None = None) -> None:
         self.name = name
-        self._segmenter = GroundSegmenter(config)
+        self._segmenter = GroundSegmenter(config, backend=backend)
 
     def reset(self) -> None:
         """Forget what was learned."""
@@ -222,6 +223,10 @@ class MethodScore:
     def of(self, *sequences: str) -> MethodScore:
         """Return the part of some sequences."""
         return MethodScore(self.name, tuple(s for s in self.scans if s.sequence in sequences))
+
+    def parts(self) -> list[MethodScore]:
+        """Return the part of each sequence."""
+        return [self.of(name) for name in self.sequences]
 
     def by_sequence(self) -> list[tuple[str, MethodScore]]:
         """Return the parts of the sequences by name, and the whole as `ALL`."""

@@ -9,7 +9,7 @@ import os
 import platform
 import subprocess
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -126,6 +126,13 @@ class Table:
 def fold(line: str) -> str:
     """Fold a line for the terminal."""
     return textwrap.fill(line, WIDTH, subsequent_indent='  ', break_on_hyphens=False)
+
+
+def written(tables: Iterable[Table], lines: Sequence[str], *, markdown: bool) -> str:
+    """Tables, and below them lines on the run, for the terminal or as Markdown."""
+    shown = [table.markdown() if markdown else table.text() for table in tables]
+    below = [*lines] if markdown else ['\n'.join(map(fold, lines))]
+    return '\n\n'.join([*shown, *below])
 
 
 def _plain(value: Any) -> Any:

@@ -4,20 +4,28 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from typing import Any, NamedTuple
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import report
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, load_kitti, pool
+from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text, mse_sums
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
-from gp_ground_seg.experiments.variants import Changes, make_report, refuse_changed, score_variants
+from gp_ground_seg.experiments.interpolation import interpolation_method
+from gp_ground_seg.experiments.variants import (
+    Changes,
+    make_report,
+    refuse_changed,
+    scene_parts,
+    score_variants,
+)
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
 
 _FIXED: Changes = {'learning.mode': 'fixed'}
 _WHOLE_FRAME: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'frame'}
-_PER_SEGMENT: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'segment'}
 _CONSTANT: Changes = {'length_scale.model': 'constant'}
 _GRADIENT: Changes = {'length_scale.model': 'line_gradient'}
 _LATENT: Changes = {'length_scale.model': 'latent'}
@@ -28,10 +36,9 @@ MODELS: dict[str, Changes] = {
     'Z, not learned': {**_GRADIENT, **_FIXED},
     'Z, learned': {**_GRADIENT, **_WHOLE_FRAME},
     'Z-L, not learned': {**_LATENT, **_FIXED},
-    'Z-L, learned per segment': {**_LATENT, **_PER_SEGMENT},
     'Z-L, learned over the frame': {**_LATENT, **_WHOLE_FRAME},
 }
-"""Length-scale models and ways to learn; the last one is the paper's."""
+"""Length-scale models, each with theta given and learned; the last one is the paper's."""
 
 SCENE = 'road_then_rubble'
 PLACES = (0.0, 6.0, 12.0)
@@ -83,22 +90,29 @@ def compare_models(
     config: Config,
     progress: Progress = iter,
 ) -> Report:
-    """Score `MODELS` on scans; ConfigError if `config` sets what they set."""
+    """Score `MODELS` and an interpolation; ConfigError if `config` sets what they set."""
     refuse_changed(config, {name for changes in MODELS.values() for name in changes})
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
-    scores = score_variants(items, load, variants, progress=progress)
+    with closing(interpolation_method(config)) as plain:
+        scores = score_variants(items, load, variants, [plain], progress=progress)
+    last = scores[len(MODELS) - 1]
+    # Simulated scans are of one sequence, and of many scenes.
+    parts = MethodScore.parts if len(last.sequences) > 1 else scene_parts
     rows: list[Row] = [
         [
             (Column('method'), one.name),
             (percent('IoU [%]', 'iou'), one.iou),
             *_worst_and_rmse(one),
+            (INTERVAL, None if one is last else interval_text(parts(one), parts(last), mse_sums)),
             (report.centimetres('median [cm]', 'median_absolute'), one.height.median_absolute),
-            (Column('SMSE', '.5f', 'smse'), one.height.smse),
-            (report.milliseconds('ms', 'seconds'), one.seconds()),
         ]
         for one in scores
     ]
-    title = f'{_counted(scores[0])}; heights under true ground'
+    clusters = 'sequences' if len(last.sequences) > 1 else 'scenes'
+    title = (
+        f'{_counted(last)}; RMSE and median of the height under true ground, RMSE minus that of '
+        f'{last.name}: {interval_note(f"{len(parts(last))} {clusters}")}'
+    )
     return make_report({'models': Table.of(rows, title=title)}, scores, config, changes=MODELS)
 
 
@@ -119,7 +133,12 @@ def compare_departures(
     scores = score_variants(frames, load_kitti, variants, progress=progress)
     given, *switched = scores
 
-    def row(score: MethodScore, switch: str | None = None, worth: float | None = None) -> Row:
+    def row(
+        score: MethodScore,
+        switch: str | None = None,
+        worth: float | None = None,
+        interval: str | None = None,
+    ) -> Row:
         pairs = zip(score.scans, given.scans, strict=True)
         time_ratio = statistics.median(one.seconds / other.seconds for one, other in pairs)
         return [
@@ -127,17 +146,21 @@ def compare_departures(
             (Column('switch'), switch),
             (percent('IoU [%]', 'iou'), score.iou),
             (percent('worth [%]', 'worth', '+.2f'), worth),
+            (INTERVAL, interval),
             *_worst_and_rmse(score),
             (Column('time', '.2f', 'time_ratio'), time_ratio),
         ]
 
     switches = []
     for one, score in zip(departures, switched, strict=True):
-        gain = given.iou - score.iou
-        switches.append((score, 'off', gain) if one.kept else (score, 'on', -gain))
+        having, without = (given, score) if one.kept else (score, given)
+        interval = interval_text(having.parts(), without.parts())
+        switch = 'off' if one.kept else 'on'
+        switches.append((score, switch, having.iou - without.iou, interval))
     rows = [row(given), *(row(*one) for one in sorted(switches, key=lambda one: -one[2]))]
     title = (
-        f'{_counted(given)}; worth: what having it adds to the IoU; RMSE of the height; '
+        f'{_counted(given)}; worth: what having it adds to the IoU; '
+        f'{interval_note(f"{len(given.sequences)} sequences")}; RMSE of the height; '
         'time: over that as given, median of the frames'
     )
     tables = {'departures': Table.of(rows, title=title)}

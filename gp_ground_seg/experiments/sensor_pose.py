@@ -14,6 +14,7 @@ import numpy as np
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, pool
+from gp_ground_seg.evaluation.intervals import interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, SENSOR_HEIGHT
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.experiments import variants as engine
@@ -150,7 +151,7 @@ def height_table(trials: Sequence[Trial]) -> Table:
         'largest tilt measured [degrees]; how many were levelled, and how many do not show '
         'their height'
     )
-    return Table.of(rows, title=title)
+    return Table.of(rows, title=title, notes=_note(trials))
 
 
 def _lean(pose: SensorPose) -> float:
@@ -187,7 +188,17 @@ def turn_table(trials: Sequence[Trial]) -> Table:
         'told, taken to be level; and with all estimated (auto). Each with its change against '
         'told, the worst one that of a sequence, turn or height; how many scans were levelled'
     )
-    return Table.of(rows, title=title)
+    return Table.of(rows, title=title, notes=_note(trials))
+
+
+def _note(trials: Sequence[Trial]) -> list[str]:
+    """Say how sure the change by the estimate is, over all scans."""
+    told, _, found = _pooled(trials)
+    interval = interval_text(found.parts(), told.parts())
+    if interval is None:
+        return []
+    clusters = f'{len(told.sequences)} groups of scans'
+    return [f'change by auto over all: {interval} [%] ({interval_note(clusters)})']
 
 
 def turn_text(turn: Turn) -> str:

@@ -13,6 +13,7 @@ from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import report as results
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
+from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
@@ -155,10 +156,18 @@ def score_scenes(
     )  # fmt: skip
 
 
+def scene_parts(score: MethodScore) -> list[MethodScore]:
+    """Return the scans of each scene: of one seed, from all places."""
+    seeds: dict[str, list[methods.ScanScore]] = {}
+    for scan in score.scans:
+        seeds.setdefault(scan.index.split('/')[0], []).append(scan)
+    return [MethodScore(score.name, tuple(scans)) for scans in seeds.values()]
+
+
 def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
     """One row for each sensor and scene; the note says where the peer is ahead in IoU."""
     rows: list[Row] = []
-    behind = []
+    behind, ties = [], []
     for group in ours.sequences:
         own = ours.of(group)
         height, (sensor, scene) = own.height, group.split()
@@ -177,12 +186,16 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
             its = peer.of(group)
             median = its.height.median_absolute
             rows[-1] += [
-                (percent(PEER, 'peer_iou'), its.iou),
-                (percent('difference', 'difference', '+.2f'), own.iou - its.iou),
+                (percent('its IoU', 'peer_iou'), its.iou),
+                (percent('ahead', 'difference', '+.2f'), own.iou - its.iou),
                 (results.centimetres('its RMSE', 'peer_rmse'), its.height.rmse),
                 (results.centimetres('its median', 'peer_median_absolute'), median),
             ]
-            if not own.iou > its.iou:
+            interval = interval_text(scene_parts(own), scene_parts(its))
+            rows[-1].append((INTERVAL, interval))
+            if interval is not None and interval.endswith('tie'):
+                ties.append(group)
+            elif not own.iou > its.iou:
                 behind.append(group)
     n_scans = len(ours.of(ours.sequences[0]).scans)
     title = (
@@ -191,7 +204,12 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
     )
     notes = []
     if peer is not None:
-        title += f'; {PEER} has the true sensor height, its surface is that of its nearest patch'
-        where = f'; behind on {", ".join(behind)}' if behind else ''
-        notes = [f'ahead of {PEER} on {len(rows) - len(behind)} of {len(rows)} rows{where}']
+        title += (
+            f'; its: of {PEER}, which has the true sensor height, and as surface its nearest patch'
+        )
+        title += f'; {interval_note("scenes of each row")}'
+        n_ahead = len(rows) - len(behind) - len(ties)
+        where = f'; ties on {", ".join(ties)}' if ties else ''
+        where += f'; behind on {", ".join(behind)}' if behind else ''
+        notes = [f'ahead of {PEER} on {n_ahead} of {len(rows)} rows{where}']
     return Table.of(rows, title=title, notes=notes)

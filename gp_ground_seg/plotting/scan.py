@@ -52,8 +52,8 @@ def plot_scan_view(
     config: Config,
     path: str | Path,
     title: str = '',
-) -> None:
-    """Draw a scan in perspective as a PNG, replacing the file `path`.
+) -> str:
+    """Draw a scan in perspective as a PNG, replacing the file `path`; return numbers of points.
 
     Ground and obstacles of `points`, (N, >=3) [m], and on them profiles of the ground model with
     two standard deviations, coloured by length-scale: what the node's topics show in RViz.
@@ -73,6 +73,7 @@ def plot_scan_view(
     axes.set_xlim(-0.5, 0.5)
     axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
     save(figure, path)
+    return _label_panel(segmentation.label)[0]
 
 
 def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -142,7 +143,7 @@ def _draw_legend(figure: Any, axes: Any, config: Config) -> None:
     bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], colours[None])
     bar.set_xscale('log')
     bar.set_yticks([])
-    bar.set_title('length-scale of the ground [m]; ribbons: 2 sigma', fontsize=10)
+    bar.set_title('length-scale of the ground [m]; ribbons: 2 sigma', fontsize=9.5)
     ticks = [tick for tick in (0.1, 0.3, 1, 3, 10, 30, 100, 300) if low <= tick <= high]
     bar.set_xticks(ticks, labels=[f'{tick:g}' for tick in ticks])
     bar.minorticks_off()
@@ -158,10 +159,11 @@ def plot_birds_eye(
     path: str | Path,
     truth: Labels | None = None,
     title: str = '',
-) -> None:
+) -> str:
     """Draw points (N, >=3) [m] from above by their `Label`, as a PNG, replacing the file `path`.
 
     With the true labels, UNKNOWN where a point does not count, a second panel shows the errors.
+    Returns the title of the last panel: the numbers of points in it.
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=label, truth=truth)
@@ -180,6 +182,7 @@ def plot_birds_eye(
         axes.set_ylabel('x, forward [m]')
         _draw_panel(axes, xy, layers)
     save(figure, path)
+    return panels[-1][0]
 
 
 def _label_panel(label: Labels) -> tuple[str, Layers]:

@@ -1,0 +1,186 @@
+"""Recompute the tables and pictures of README.md and docs/: `make figures`.
+
+A figure of a page stands between two comments. The first holds the command, and below it what
+else there is to say; what stands between the two is written here:
+
+    <!-- figure: experiment departures KITTI_ROOT
+    sample: --sequences 03 --frame-step 10
+    -->
+    <!-- end of figure -->
+
+sample: WORDS          further words for a run of seconds; its rows are kept in a comment, and
+                       test/test_pages.py computes them again
+keep: TITLE; TITLE     only the tables whose titles begin so
+picture: FILE -> PATH  the file that the command makes, and its place in the repository
+
+Pages and pictures are written when all commands have run: each runs on the commit it names.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from gp_ground_seg.evaluation.report import describe_environment
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PAGES = (
+    'README.md',
+    *(f'docs/{path.name}' for path in sorted((REPOSITORY / 'docs').glob('*.md'))),
+)
+FIGURE = re.compile(
+    r'<!-- figure: (?P<head>.*?)\n-->\n(?P<body>.*?)<!-- end of figure ?(?P<digest>\w*) -->',
+    re.DOTALL,
+)
+SAMPLE = re.compile(r'<!-- sample\n(.*?)-->\n', re.DOTALL)
+ROOT = 'KITTI_ROOT'
+
+
+class Figure(NamedTuple):
+    """A figure as its page has it."""
+
+    page: str
+    command: str
+    options: dict[str, str]
+    head: str  # the first comment, without its marks
+    body: str
+    digest: str
+
+    @property
+    def sample(self) -> str | None:
+        """The command of the sample."""
+        return f'{self.command} {self.options["sample"]}' if 'sample' in self.options else None
+
+    @property
+    def needs_kitti(self) -> bool:
+        """Whether the command reads labelled frames."""
+        return ROOT in self.command
+
+
+def find_figures(page: str, text: str) -> list[Figure]:
+    """Figures of a page."""
+    figures = []
+    for match in FIGURE.finditer(text):
+        command, *lines = match['head'].splitlines()
+        options = dict(line.split(': ', 1) for line in lines)
+        figures.append(
+            Figure(page, command.strip(), options, match['head'], match['body'], match['digest'])
+        )
+    return figures
+
+
+def replaced(page: str, figure: Figure, body: str) -> str:
+    """Text of a page with another body of a figure."""
+    begin = f'<!-- figure: {figure.head}\n-->\n'
+    before, _, after = page.partition(f'{begin}{figure.body}<!-- end of figure')
+    end = f'<!-- end of figure {digest(body)} -->'
+    return before + begin + body + end + after.partition('-->')[2]
+
+
+def digest(body: str) -> str:
+    """Digest that shows whether a body was changed by hand."""
+    return hashlib.sha256(body.encode()).hexdigest()[:8]
+
+
+def words_of(command: str, kitti: str) -> list[str]:
+    """Words of a command as they are run."""
+    words = [word.replace(ROOT, kitti) for word in shlex.split(command)]
+    return [*words, '--markdown'] if words[0] in ('evaluate', 'experiment') else words
+
+
+def run(command: str, kitti: str, folder: Path) -> str:
+    """Run a command in a folder, and return what it prints."""
+    words = [sys.executable, '-m', 'gp_ground_seg', *words_of(command, kitti)]
+    done = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, text=True, check=True)
+    return done.stdout.strip()
+
+
+def rows_of(output: str) -> list[str]:
+    """Rows of the Markdown tables in an output, with those of the titles."""
+    return [line for line in output.splitlines() if line.startswith('| ')]
+
+
+def body_of(figure: Figure, output: str, sample: str | None, commit: str) -> str:
+    """Write what stands between the comments."""
+    shown = f'`gp-ground-seg {figure.command}`'
+    if 'picture' in figure.options:
+        # The image, with the words it had, and the line that names the file.
+        made = figure.options['picture'].partition(' -> ')[0]
+        (image,) = re.findall(r'^!\[.*\)$', figure.body, re.MULTILINE)
+        (said,) = [line for line in output.splitlines() if made in line]
+        return f'{image}\n\n{shown}\n({caption(said, made)}; commit {commit})\n'
+    if 'keep' in figure.options:
+        titles = tuple(figure.options['keep'].split('; '))
+        parts = output.split('\n\n')
+        kept = [f'{a}\n\n{b}' for a, b in pairwise(parts) if a.startswith(titles)]
+        output = '\n\n'.join([*kept, parts[-1]])
+    if '| ---' not in output:
+        output = f'```text\n{output}\n```'
+    rows = f'<!-- sample\n{chr(10).join(rows_of(sample))}\n-->\n' if sample is not None else ''
+    return f'{shown}\n\n{output}\n\n{rows}'
+
+
+def caption(said: str, made: str) -> str:
+    """Numbers that a command says of its picture."""
+    return said.replace(f', written to {made}', '').replace(f'picture  {made}  ', '')
+
+
+def main() -> int:
+    """Run the commands, then write pages and pictures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('kitti', metavar=ROOT, help='labelled frames, SemanticKITTI layout')
+    parser.add_argument(
+        'part', nargs='*', help='only pages and commands with one of these in them'
+    )
+    arguments = parser.parse_args()
+    kitti = str(Path(arguments.kitti).resolve())
+    if not (Path(kitti) / 'sequences').is_dir():
+        parser.error(f'{arguments.kitti}: holds no sequences/; say make figures KITTI=PATH')
+    texts = {page: (REPOSITORY / page).read_text(encoding='utf-8') for page in PAGES}
+    figures = [figure for page, text in texts.items() for figure in find_figures(page, text)]
+    if arguments.part:
+        chosen = arguments.part
+        figures = [f for f in figures if any(p in f'{f.page} {f.command}' for p in chosen)]
+    commands = [c for figure in figures for c in (figure.command, figure.sample) if c is not None]
+    commands = list(dict.fromkeys(commands))
+    commit = (describe_environment()['commit'] or 'unknown')[:12]
+    outputs: dict[str | None, str | None] = {None: None}
+    with tempfile.TemporaryDirectory() as name:
+        folder, started = Path(name), time.monotonic()
+        (folder / 'docs').symlink_to(REPOSITORY / 'docs')
+        for k, command in enumerate(commands, 1):
+            seconds = time.monotonic() - started
+            print(f'[{k}/{len(commands)}, {seconds:.0f} s] gp-ground-seg {command}', flush=True)
+            try:
+                outputs[command] = run(command, kitti, folder)
+            except subprocess.CalledProcessError as error:
+                print(f'FAILED with exit code {error.returncode}; its figures stay as they are')
+            except KeyboardInterrupt:
+                print('interrupted: what is done is written')
+                break
+        done = [f for f in figures if f.command in outputs and f.sample in outputs]
+        for figure in done:
+            body = body_of(figure, outputs[figure.command], outputs[figure.sample], commit)
+            texts[figure.page] = replaced(texts[figure.page], figure, body)
+            if 'picture' in figure.options:
+                made, _, place = figure.options['picture'].partition(' -> ')
+                shutil.copyfile(folder / made, REPOSITORY / place)
+    for page, text in texts.items():
+        (REPOSITORY / page).write_text(text, encoding='utf-8')
+    seconds = time.monotonic() - started
+    print(f'{len(done)} of {len(figures)} figures written in {seconds:.0f} s')
+    return 0 if len(done) == len(figures) else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,186 @@
+"""The pages hold: samples of their tables and the numbers of their pictures, computed again."""
+
+import importlib.util
+import json
+import re
+
+import pytest
+from cli_runner import run
+from conftest import REPOSITORY, find_kitti
+
+from gp_ground_seg import GroundSegmenter
+from gp_ground_seg.cli import demo
+from gp_ground_seg.evaluation.metrics import GROUNDGRID
+from gp_ground_seg.jit import JIT_ENABLED
+from gp_ground_seg.plotting.scan import plot_birds_eye
+
+SPEC = importlib.util.spec_from_file_location('figures', REPOSITORY / 'docs' / 'figures.py')
+figures = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(figures)
+
+FIGURES = [
+    figure
+    for page in figures.PAGES
+    for figure in figures.find_figures(page, (REPOSITORY / page).read_text(encoding='utf-8'))
+]
+ANEW = 'make figures KITTI=PATH'
+NUMBER = re.compile(r'[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?')
+TIMES = ('time', 't Z', 'ms')
+"""Beginnings of the titles of columns that depend on the machine."""
+compiled = pytest.mark.skipif(not JIT_ENABLED, reason='takes minutes without compiled code')
+
+
+def once(chosen):
+    """Figures with different samples or commands."""
+    return list({figure.sample or figure.command: figure for figure in chosen}.values())
+
+
+SAMPLED = once(figure for figure in FIGURES if figure.sample)
+PLOTTED = [figure for figure in FIGURES if figure.command.startswith('plot ')]
+
+
+def root_for(figure):
+    if figure.needs_kitti and find_kitti() is None:
+        pytest.skip('no labelled KITTI frames: set GP_GROUND_SEG_KITTI to their folder')
+    return str(find_kitti())
+
+
+def same(shown, found):
+    """Whether two cells say the same, numbers to within one in the last digit shown."""
+    if NUMBER.sub('#', shown) != NUMBER.sub('#', found):
+        return False
+    pairs = zip(NUMBER.findall(shown), NUMBER.findall(found), strict=True)
+    return all(abs(float(a) - float(b)) <= 1.01 * last_digit(a) for a, b in pairs)
+
+
+def last_digit(word):
+    mantissa, _, exponent = word.partition('e')
+    return 10.0 ** (int(exponent or 0) - len(mantissa.partition('.')[2]))
+
+
+def differences(shown, found):
+    """Cells of two lists of Markdown rows that differ, times left out."""
+    assert len(shown) == len(found)
+    rows = [[cell.strip() for cell in row.split('|')[1:-1]] for row in shown]
+    anew = [[cell.strip() for cell in row.split('|')[1:-1]] for row in found]
+    rules = [set(''.join(row)) <= set('-:') for row in rows]
+    for k, (cells, others) in enumerate(zip(rows, anew, strict=True)):
+        if k + 1 < len(rows) and rules[k + 1]:
+            titles = cells
+        assert len(cells) == len(others)
+        for title, cell, other in zip(titles, cells, others, strict=True):
+            if (cells is titles or not title.startswith(TIMES)) and not same(cell, other):
+                yield f'{title} of {cells[0]}: {cell} is {other}'
+
+
+def test_every_figure_is_as_it_was_written():
+    assert len(FIGURES) >= 15
+    for figure in FIGURES:
+        where = f'{figure.page}: {figure.command}'
+        assert figure.body, f'{where}: not made yet, {ANEW}'
+        assert figure.digest == figures.digest(figure.body), f'{where}: changed by hand, {ANEW}'
+        assert 'commit ' in figure.body, where
+
+
+def test_every_table_with_numbers_of_ours_and_every_picture_is_a_figure():
+    """What stands outside of figures is text, or a table without numbers to compute."""
+    for page in figures.PAGES:
+        text = (REPOSITORY / page).read_text(encoding='utf-8')
+        rest = figures.FIGURE.sub('', text)
+        images = re.findall(r'^!\[.*\]\((.*)\)$', rest, re.MULTILINE)
+        assert set(images) <= {'images/performance.png'}, page  # by `make bench-docs`
+        assert '--: |' not in rest, f'{page}: a table of numbers without its command'
+
+
+@compiled
+@pytest.mark.parametrize('figure', SAMPLED, ids=lambda figure: figure.command)
+def test_samples_of_tables_come_out_again(figure, capfd):
+    root = root_for(figure)
+    (shown,) = figures.SAMPLE.findall(figure.body)
+    assert run(*figures.words_of(figure.sample, root)) == 0
+    found = figures.rows_of(capfd.readouterr().out)
+    wrong = list(differences(shown.splitlines(), found))
+    assert not wrong, f'{figure.page}, {figure.command}: {"; ".join(wrong[:5])}. {ANEW}'
+
+
+@compiled
+@pytest.mark.parametrize('figure', PLOTTED, ids=lambda figure: figure.options['picture'])
+def test_numbers_of_pictures_come_out_again(figure, tmp_path, capsys, monkeypatch):
+    root = root_for(figure)
+    monkeypatch.chdir(tmp_path)
+    assert run(*figures.words_of(figure.command, root)) == 0
+    made = figure.options['picture'].partition(' -> ')[0]
+    said = figures.caption(capsys.readouterr().out.strip(), made)
+    assert f'({said}; commit ' in figure.body, f'{figure.page}: now {said}. {ANEW}'
+
+
+@compiled
+def test_the_picture_of_the_demo_is_that_of_the_demo(tmp_path):
+    """The same scan without the node: the labels that came back are those of the library."""
+    (figure,) = (figure for figure in FIGURES if figure.command == 'demo')
+    number = int(re.search(r'\(scan (\d+) ', figure.body)[1])
+    *_, (points, semantic, _) = (
+        scan for _, scan in zip(range(number), demo.simulated_drive(30).scans, strict=False)
+    )
+    label = GroundSegmenter().segment(points).label
+    counts = plot_birds_eye(
+        points, label, tmp_path / 'a.png', GROUNDGRID.truth(semantic, points[:, 2])
+    )
+    assert f'(scan {number} from above: {counts}; commit ' in figure.body, f'now {counts}. {ANEW}'
+
+
+def test_times_in_the_readme_are_those_of_the_record():
+    """`make bench-docs` measures them."""
+    text = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
+    record = json.loads((REPOSITORY / 'docs' / 'performance.json').read_text(encoding='utf-8'))
+    ratios = {case['name']: case['ratio']['median'] for case in record['cases']}
+    begin = text.index('Median time per frame over that of Patchwork++')
+    said = re.findall(r'\b\d+\.\d+\b', text[begin:].partition('\n\n')[0])
+    names = ('learning, 2 threads', 'learning, 1 thread', 'theta fixed, 2 threads')
+    expected = [ratios[name] for name in (*names, 'theta fixed, 1 thread', 'learning, numpy')]
+    for word, ratio in zip(said, expected, strict=True):
+        assert abs(float(word) - ratio) <= 0.51 * last_digit(word), f'{word}: is {ratio}'
+
+
+PAGE = """\
+# A page
+<!-- figure: experiment scenes --sensors vlp-16 --scenes flat --seeds 1 --no-peer
+sample: --scenes kerb
+-->
+stale
+<!-- end of figure 12345678 -->
+And text.
+"""
+
+
+def test_a_figure_is_replaced_and_nothing_else(tmp_path):
+    (figure,) = figures.find_figures('docs/a.md', PAGE)
+    assert (figure.body, figure.digest, figure.needs_kitti) == ('stale\n', '12345678', False)
+    output, sample = (figures.run(c, '', tmp_path) for c in (figure.command, figure.sample))
+    body = figures.body_of(figure, output, sample, 'abc')
+    text = figures.replaced(PAGE, figure, body)
+    assert text.startswith('# A page\n<!-- figure: ') and text.endswith(' -->\nAnd text.\n')
+    (again,) = figures.find_figures('docs/a.md', text)
+    assert (again.command, again.options) == (figure.command, figure.options)
+    assert again.digest == figures.digest(again.body)
+    assert '| vlp-16 | flat | ' in again.body and 'machine: ' in again.body
+    (kept,) = figures.SAMPLE.findall(again.body)
+    assert kept.splitlines()[2].startswith('| vlp-16 | kerb | ')
+    assert list(differences(kept.splitlines(), figures.rows_of(sample))) == []
+    wrong = re.sub(r'kerb \| \d', 'kerb | 1', kept)
+    assert list(differences(wrong.splitlines(), figures.rows_of(sample)))
+
+
+@pytest.mark.parametrize(
+    ('shown', 'found', 'is_same'),
+    [
+        ('97.50', '97.51', True),
+        ('97.50', '97.52', False),
+        ('+0.10 to +0.30', '+0.10 to +0.30 tie', False),
+        ('1.2e-05', '1.3e-05', True),
+        ('1.2e-05', '1.4e-05', False),
+        ('kerb', 'flat', False),
+    ],
+)
+def test_cells(shown, found, is_same):
+    assert same(shown, found) is is_same
