@@ -146,7 +146,10 @@ def _rows(
                 **{f'in sample {name}': smse for name, (_, smse) in in_sample.items()},
                 'held out': int(own.sum()),
                 **{
-                    f'held out {name}': height_error(z[own], result.ground_z[own]).smse
+                    # Of the process itself, as in the paper; not the corrected surface.
+                    f'held out {name}': height_error(
+                        z[own], z[own] - result.labelled.height[own]
+                    ).smse
                     for name, result in results.items()
                 },
                 **{f't {name} [s]': statistics.median(own) for name, own in seconds.items()},
