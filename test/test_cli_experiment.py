@@ -41,7 +41,7 @@ CASES = {
     'ablation': (['ROOT', '--frame-step', '2', *SMALL], 'models', 7 * 3),
     'ablation --simulated': (['--seeds', '1', *SMALL], 'models', 7),
     'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
-    'wrong-values': (['ROOT', '--frame-step', '3', *SMALL], 'values', 18 * 2),
+    'wrong-values': (['ROOT', '--frame-step', '3', *SMALL], 'values', 26 * 2),
     'departures': (
         ['ROOT', '--switch', 'small: grid.n_bins=79', '--switch',
          'near: grid.r_max=15', *SMALL],

@@ -26,8 +26,12 @@ STEPS = {
 """Steps from the preset ``paper`` to the defaults: beginnings of the names that change."""
 
 FACTORS = (0.1, 1 / 3, 3.0, 10.0)
-GIVEN = ('observation.sigma_f', 'observation.sigma_n')
-"""Hyper-parameters that are given wrong, one at a time, by these factors."""
+GIVEN = {
+    'sigma_f': ('observation.sigma_f',),
+    'sigma_n': ('observation.sigma_n',),
+    'both': ('observation.sigma_f', 'observation.sigma_n'),
+}
+"""Hyper-parameters that are given wrong by these factors."""
 
 
 def paper_steps() -> dict[str, Config]:
@@ -70,11 +74,11 @@ def score_steps(frames: Sequence[Frame], with_peer: bool, progress: Progress = i
 def score_wrong_values(
     frames: Sequence[Frame], config: Config, progress: Progress = iter
 ) -> Report:
-    """Give one hyper-parameter after the other wrong, with and without learning."""
-    refuse_changed(config, [*GIVEN, 'learning.mode'])
+    """Give hyper-parameters wrong, with and without learning."""
+    refuse_changed(config, [*GIVEN['both'], 'learning.mode'])
     wrong = {
-        f'{name.rpartition(".")[2]} times {factor:.2g}': {name: factor * float(config[name])}
-        for name in GIVEN
+        f'{title} times {factor:.2g}': {name: factor * float(config[name]) for name in names}
+        for title, names in GIVEN.items()
         for factor in FACTORS
     }
     variants = {}
