@@ -110,6 +110,15 @@ def rows_of(output: str) -> list[str]:
     return [line for line in output.splitlines() if line.startswith('| ')]
 
 
+def kept(figure: Figure, output: str) -> str:
+    """Return the tables of an output that a figure keeps, and the last line, on the run."""
+    if 'keep' not in figure.options:
+        return output
+    titles, parts = tuple(figure.options['keep'].split('; ')), output.split('\n\n')
+    tables = [f'{a}\n\n{b}' for a, b in pairwise(parts) if a.startswith(titles)]
+    return '\n\n'.join([*tables, parts[-1]])
+
+
 def body_of(figure: Figure, output: str, sample: str | None, commit: str) -> str:
     """Write what stands between the comments."""
     shown = f'`gp-ground-seg {figure.command}`'
@@ -119,15 +128,11 @@ def body_of(figure: Figure, output: str, sample: str | None, commit: str) -> str
         (image,) = re.findall(r'^!\[.*\)$', figure.body, re.MULTILINE)
         (said,) = [line for line in output.splitlines() if made in line]
         return f'{image}\n\n{shown}\n({caption(said, made)}; commit {commit})\n'
-    if 'keep' in figure.options:
-        titles = tuple(figure.options['keep'].split('; '))
-        parts = output.split('\n\n')
-        kept = [f'{a}\n\n{b}' for a, b in pairwise(parts) if a.startswith(titles)]
-        output = '\n\n'.join([*kept, parts[-1]])
+    output = kept(figure, output)
     if '| ---' not in output:
         output = f'```text\n{output}\n```'
-    rows = f'<!-- sample\n{chr(10).join(rows_of(sample))}\n-->\n' if sample is not None else ''
-    return f'{shown}\n\n{output}\n\n{rows}'
+    rows = '' if sample is None else '\n'.join(rows_of(kept(figure, sample)))
+    return f'{shown}\n\n{output}\n\n' + (f'<!-- sample\n{rows}\n-->\n' if rows else '')
 
 
 def caption(said: str, made: str) -> str:

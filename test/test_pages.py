@@ -30,12 +30,7 @@ TIMES = ('time', 't Z', 'ms')
 compiled = pytest.mark.skipif(not JIT_ENABLED, reason='takes minutes without compiled code')
 
 
-def once(chosen):
-    """Figures with different samples or commands."""
-    return list({figure.sample or figure.command: figure for figure in chosen}.values())
-
-
-SAMPLED = once(figure for figure in FIGURES if figure.sample)
+SAMPLED = [figure for figure in FIGURES if figure.sample]
 PLOTTED = [figure for figure in FIGURES if figure.command.startswith('plot ')]
 
 
@@ -93,12 +88,12 @@ def test_every_table_with_numbers_of_ours_and_every_picture_is_a_figure():
 
 
 @compiled
-@pytest.mark.parametrize('figure', SAMPLED, ids=lambda figure: figure.command)
+@pytest.mark.parametrize('figure', SAMPLED, ids=lambda figure: f'{figure.page}: {figure.command}')
 def test_samples_of_tables_come_out_again(figure, capfd):
     root = root_for(figure)
     (shown,) = figures.SAMPLE.findall(figure.body)
     assert run(*figures.words_of(figure.sample, root)) == 0
-    found = figures.rows_of(capfd.readouterr().out)
+    found = figures.rows_of(figures.kept(figure, capfd.readouterr().out.strip()))
     wrong = list(differences(shown.splitlines(), found))
     assert not wrong, f'{figure.page}, {figure.command}: {"; ".join(wrong[:5])}. {ANEW}'
 
@@ -153,10 +148,25 @@ And text.
 """
 
 
-def test_a_figure_is_replaced_and_nothing_else(tmp_path):
+def test_a_command_is_run_in_a_folder_of_its_own(tmp_path):
+    (tmp_path / 'a.yaml').write_text('grid: {n_bins: 41}\n')
+    assert 'a.yaml' in figures.run('config check a.yaml', '', tmp_path)
+    assert figures.words_of('evaluate KITTI_ROOT', '/a b') == ['evaluate', '/a b', '--markdown']
+
+
+def test_only_the_tables_that_a_figure_keeps():
+    (figure,) = figures.find_figures('a.md', PAGE.replace('sample:', 'keep: B; C\nsample:'))
+    parts = ['headline', 'A is', '| a |', 'a note', 'B is', '| b |', 'C', '| c |', 'machine: x']
+    assert figures.kept(figure, '\n\n'.join(parts)) == '\n\n'.join(parts[4:])
+
+
+def test_a_figure_is_replaced_and_nothing_else():
     (figure,) = figures.find_figures('docs/a.md', PAGE)
     assert (figure.body, figure.digest, figure.needs_kitti) == ('stale\n', '12345678', False)
-    output, sample = (figures.run(c, '', tmp_path) for c in (figure.command, figure.sample))
+    output = (
+        '| sensor | scene | IoU |\n| --- | --- | --: |\n| vlp-16 | flat | 98.5 |\n\nmachine: x'
+    )
+    sample = output.replace('flat', 'kerb')
     body = figures.body_of(figure, output, sample, 'abc')
     text = figures.replaced(PAGE, figure, body)
     assert text.startswith('# A page\n<!-- figure: ') and text.endswith(' -->\nAnd text.\n')
