@@ -18,7 +18,7 @@ from gp_ground_seg.frame import (
     PolarGrid,
     PseudoInputs,
 )
-from gp_ground_seg.gp.learning import Learned, theta_names
+from gp_ground_seg.gp.learning import THETA_NAMES, Learned
 from gp_ground_seg.pipeline.labels import ground_probability
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 
@@ -95,7 +95,7 @@ class FitReport:
     def of(cls, frame: Segmentation) -> FitReport:
         """Sum up one frame."""
         learned = frame.fitting.learned
-        names = theta_names(frame.theta.shape[1])
+        names = THETA_NAMES
         values = np.exp(frame.theta.mean(axis=0))
         statuses = {one.status for one in learned}
         at_bound = np.any([one.at_bound for one in learned], axis=0) if learned else []

@@ -50,7 +50,7 @@ def log_likelihood(
         sharpness = 0.5 / sigma_l_bar**2
         if p > 0:
             for i in range(p):
-                l_bar[i] = theta[5 + inliers.surface_class[bar_first + i]]
+                l_bar[i] = inliers.log_extent[bar_first + i]
                 mean += l_bar[i] / p
                 centre = own_r_bar[i]
                 for j in range(p):
@@ -67,7 +67,7 @@ def log_likelihood(
                 for j in range(p):
                     beta[i] += b_inverse[i, j] * (l_bar[j] - mean)
             for i in range(n):
-                value = mean
+                value = mean + theta[5]
                 centre = own_r[i]
                 for j in range(p):
                     d = centre - own_r_bar[j]
@@ -149,16 +149,12 @@ def log_likelihood(
             g_sum += g_u[i]
             for j in range(p):
                 raised[j] += k_star[i, j] * g_u[i]
-        weight_sum = 0.0
         for i in range(p):
             for j in range(p):
                 weight[i] += b_inverse[i, j] * raised[j]
-            weight_sum += weight[i]
             if latent_terms:
                 value -= math.log(b_factor[i, i]) + 0.5 * _LOG_2PI
-        for i in range(p):
-            slot = 5 + inliers.surface_class[bar_first + i]
-            gradients[m, slot] += weight[i] + (g_sum - weight_sum) / p
+        gradients[m, 5] = g_sum
         g_sigma_f_bar = g_sigma_l_bar = g_noise_bar = 0.0
         share = 0.5 if latent_terms else 0.0
         for i in range(n):

@@ -16,19 +16,15 @@ from scipy.optimize import minimize
 
 from gp_ground_seg.frame import BoolArray, FloatArray, Frame, GroundSurface, Inliers
 from gp_ground_seg.gp.latent import given_log_length_scales
-from gp_ground_seg.gp.likelihood import N_SCALARS
 from gp_ground_seg.gp.linalg import single_threaded_blas
 from gp_ground_seg.parameters.config import Config
 
-SCALAR_NAMES = ('sigma_f', 'sigma_n', 'sigma_f_bar', 'sigma_l_bar', 'sigma_n_bar')
+THETA_NAMES = (
+    'sigma_f', 'sigma_n', 'sigma_f_bar', 'sigma_l_bar', 'sigma_n_bar', 'length_scale_factor'
+)  # fmt: skip
 Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 
 _AT_BOUND = 1e-6
-
-
-def theta_names(size: int) -> list[str]:
-    """Names of the entries of a theta of the given size."""
-    return [*SCALAR_NAMES, *(f'length_scale_bar_{k}' for k in range(size - N_SCALARS))]
 
 
 class ThetaSpace(NamedTuple):
@@ -53,7 +49,7 @@ class ThetaSpace(NamedTuple):
     prior_std: float
 
 
-def theta_centre(config: Config, first_guess: FloatArray) -> FloatArray:
+def theta_centre(config: Config) -> FloatArray:
     """Values given by the configuration and the first guess, (5 + K,), in log space.
 
     Parameters
@@ -63,31 +59,29 @@ def theta_centre(config: Config, first_guess: FloatArray) -> FloatArray:
     first_guess : (K,) float64
         First guess of the surface classes' log length-scales [log m].
     """
-    observation, latent, limits = config.observation, config.latent, config.length_scale
+    observation, latent = config.observation, config.latent
     values = (
         observation.sigma_f,
         observation.sigma_n,
         latent.sigma_f_bar,
         latent.sigma_l_bar,
         latent.sigma_n_bar,
+        1.0,
     )
-    guessed = np.clip(first_guess, math.log(limits.min), math.log(limits.max))
-    return np.array([*map(math.log, values), *guessed])
+    return np.log(values)
 
 
-def theta_space(config: Config, first_guess: FloatArray) -> ThetaSpace:
+def theta_space(config: Config) -> ThetaSpace:
     """Space of theta for a frame; parameters are those of `theta_centre`."""
     learning = config.learning
-    centre = theta_centre(config, first_guess)
+    centre = theta_centre(config)
     width = np.log(learning.bound_factor)
     lower, upper = centre - width, centre + width
-    lower[N_SCALARS:] = np.log(config.length_scale.min)
-    upper[N_SCALARS:] = np.log(config.length_scale.max)
     free = np.ones(len(centre), dtype=np.bool_)
     if config.length_scale.model != 'latent' or learning.fixed == 'length_scales':
         free[2:] = False
     elif learning.fixed == 'latent':
-        free[2:N_SCALARS] = False
+        free[2:5] = False
     elif learning.fixed == 'sigma_f_bar':
         free[2] = False
     return ThetaSpace(centre, lower, upper, free, learning.prior_std)
@@ -95,8 +89,7 @@ def theta_space(config: Config, first_guess: FloatArray) -> ThetaSpace:
 
 def given_theta(frame: Frame, config: Config) -> FloatArray:
     """Theta before anything is learned, the same in every segment, (M, 5 + K)."""
-    centre = theta_centre(config, frame.pseudo.first_guess)
-    return np.tile(centre, (len(frame.candidates.offsets) - 1, 1))
+    return np.tile(theta_centre(config), (len(frame.candidates.offsets) - 1, 1))
 
 
 class Learned(NamedTuple):
@@ -174,7 +167,7 @@ def learn_frame(
     surface, _ = model.estimate_surface(frame._replace(knots=no_knots), start, config, step)
     inliers = take_inliers(frame._replace(knots=no_knots), surface.inlier, config)
     is_map = learning.objective == 'map'
-    space = theta_space(config, frame.pseudo.first_guess)
+    space = theta_space(config)
 
     def learn(begin: FloatArray, own: Inliers) -> Learned:
         def objective(theta: FloatArray) -> tuple[float, FloatArray]:
@@ -213,7 +206,7 @@ def take_inliers(frame: Frame, inlier: BoolArray, config: Config) -> Inliers:
         log_length_scale=u,
         bar_offsets=bar_offsets,
         r_bar=pseudo.r_bar,
-        surface_class=pseudo.surface_class,
+        log_extent=pseudo.log_extent,
     )
 
 
@@ -227,7 +220,7 @@ def _one_segment(inliers: Inliers, m: int) -> Inliers:
         inliers.log_length_scale[own],
         np.array([0, bar.stop - bar.start]),
         inliers.r_bar[bar],
-        inliers.surface_class[bar],
+        inliers.log_extent[bar],
     )
 
 
