@@ -199,7 +199,6 @@ class Inliers(NamedTuple):
     offsets: IntArray  # (M + 1,) inliers of segment m are ``offsets[m]:offsets[m + 1]``
     r: FloatArray  # (n,) ranges [m]
     z: FloatArray  # (n,) heights about the prior mean [m]
-    noise: FloatArray  # (n,) variance of the noise of each over sigma_n^2
     # (n,) log length-scales where no latent process gives them [log m]
     log_length_scale: FloatArray
     bar_offsets: IntArray  # (M + 1,) pseudo-inputs of segment m; all zero without a latent process

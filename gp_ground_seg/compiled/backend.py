@@ -150,7 +150,6 @@ class NumbaBackend:
         """Log marginal likelihood of the frame and its gradient."""
         n_segments = len(inliers.offsets) - 1
         values, gradients = np.empty(n_segments), np.empty((n_segments, len(theta)))
-        self.surprise = np.empty(len(inliers.r))
         self.workers.run(
             likelihood.log_likelihood,
             self.workers.n_threads,
@@ -160,7 +159,6 @@ class NumbaBackend:
             latent_terms,
             values,
             gradients,
-            self.surprise,
         )
         value = float(values.sum())
         if not np.isfinite(value):

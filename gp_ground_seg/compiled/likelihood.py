@@ -23,7 +23,6 @@ def log_likelihood(
     latent_terms: bool,
     values: FloatArray,
     gradients: FloatArray,
-    surprise: FloatArray,
 ) -> None:
     """Set ``values[m]`` and ``gradients[m]`` of the segments of a part; -inf where not defined."""
     sigma_f, sigma_n = math.exp(theta[0]), math.exp(theta[1])
@@ -101,7 +100,7 @@ def log_likelihood(
                 row[j] = value
                 factor_row[j] = value + tilt * own_r[j]
                 ratio_row[j] = own_square * inverse_spread
-            factor_row[i] += sigma_n**2 * inliers.noise[first + i]
+            factor_row[i] += sigma_n**2
         if not factorise(factor, n):
             values[m] = -np.inf
             continue
@@ -122,11 +121,7 @@ def log_likelihood(
         g_u = np.zeros(n)
         for i in range(n):
             g_ii = 0.5 * (alpha[i] * alpha[i] - inverse[i, i])
-            own_noise = inliers.noise[first + i]
-            g_trace += g_ii * own_noise
-            # Left out, an inlier is predicted with the variance 1 / inverse[i, i].
-            spread = 1.0 / inverse[i, i] + sigma_n**2 * (1.0 - own_noise)
-            surprise[first + i] = (alpha[i] / inverse[i, i]) ** 2 / spread
+            g_trace += g_ii
             g_sigma_f += 2.0 * g_ii * k[i, i]
             own_alpha, centre, own_square = alpha[i], own_r[i], square[i]
             row, ratio_row, inverse_row = k[i], ratios[i], inverse[i]
