@@ -66,7 +66,7 @@ class Backend(Protocol):
         """See `gp_ground_seg.gp.likelihood.log_likelihood`."""
 
     def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
+        self, frame: Frame, theta: FloatArray, config: Config
     ) -> tuple[GroundSurface, FloatArray]:
         """See `gp_ground_seg.gp.ground.estimate_surface`."""
 

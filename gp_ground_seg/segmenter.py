@@ -200,9 +200,9 @@ class GroundSegmenter:
     def _learn(self, frame: Frame) -> tuple[FloatArray, list[Learned]]:
         """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""
         learning = self._config.learning
-        given = given_theta(frame, self._config)
         if learning.mode == 'fixed':
-            return given, []
+            n_segments = len(frame.candidates.offsets) - 1
+            return np.tile(given_theta(self._config), (n_segments, 1)), []
         period = {'every_frame': 1, 'every_k': learning.period, 'first_frame': None}[learning.mode]
         self._frames_since_learning += 1
         is_kept = period is None or self._frames_since_learning < period
@@ -213,8 +213,8 @@ class GroundSegmenter:
         def out_of_time() -> bool:
             return 0.0 < learning.max_time <= self._clock() - started
 
-        start = self._theta if self._theta is not None and learning.warm_start else given
-        self._theta, learned = learn_frame(frame, start, self._config, self._backend, out_of_time)
+        before = self._theta if learning.warm_start else None
+        self._theta, learned = learn_frame(frame, before, self._config, self._backend, out_of_time)
         self._frames_since_learning = 0
         return self._theta, learned
 

@@ -242,7 +242,7 @@ def log_length_scales(frame, theta, config, m):
     return u, np.interp(knots, r, u)
 
 
-def estimate_surface(frame, theta, config, segment_step=1):
+def estimate_surface(frame, theta, config):
     """Inliers that join until none does, and the surface fused over neighbours."""
     growth, slope_std = config.growth, config.observation.slope_std
     shape = len(theta), len(frame.knots)
@@ -256,15 +256,13 @@ def estimate_surface(frame, theta, config, segment_step=1):
         u, u_star = log_length_scales(frame, theta, config, m)
         knot_u[m, : len(u_star)] = u_star
         sigma_f, sigma_n = np.exp(theta[m, :2])
-        gate = max(sigma_n, config.observation.sigma_n)
         chosen = np.zeros(len(r), dtype=bool)
         joining = (r <= growth.seed_range) & (abs(z) <= growth.seed_height_tolerance)
-        joining &= m % segment_step == 0
         while joining.any():
             chosen |= joining
             data = r[chosen], z[chosen], np.exp(u[chosen])
             height, variance = posterior(*data, r, np.exp(u), sigma_f, sigma_n, slope_std)
-            residual = (z - height) / np.sqrt(variance + gate**2)
+            residual = (z - height) / np.sqrt(variance + sigma_n**2)
             joining = variance <= growth.max_std**2
             joining &= residual <= growth.max_standardised_residual
             joining &= residual >= -growth.max_standardised_depth

@@ -166,7 +166,7 @@ class NumbaBackend:
         return value, gradients.sum(axis=0)
 
     def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
+        self, frame: Frame, theta: FloatArray, config: Config
     ) -> tuple[GroundSurface, FloatArray]:
         """Inliers, the surface, and log length-scales at the knots."""
         take, observation = self._buffers.take, numbers_of(config.observation)
@@ -189,7 +189,7 @@ class NumbaBackend:
         def grow_surfaces(part: Part) -> None:
             if is_latent:
                 latent_.latent_log_length_scales(part, frame, theta, u, knot_u)
-            ground.grow_surfaces(part, frame, theta, observation, growth, segment_step, own)
+            ground.grow_surfaces(part, frame, theta, observation, growth, own)
 
         self.workers.run(grow_surfaces, self.n_threads)
         mean, std = np.empty((2, *shape))

@@ -15,7 +15,7 @@ from gp_ground_seg.parameters.config import Config, GrowthConfig
 
 @single_threaded_blas()
 def estimate_surface(
-    frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
+    frame: Frame, theta: FloatArray, config: Config
 ) -> tuple[GroundSurface, FloatArray]:
     """Inliers that grow from low, near candidates, and the surface that rests on them.
 
@@ -35,8 +35,6 @@ def estimate_surface(
         Hyper-parameters of each segment (see `gp_ground_seg.gp.learning`).
     config : Config
         Model of the length-scale, prior slope, gates, neighbours to fuse.
-    segment_step : int
-        Only every n-th segment has seeds.
 
     Returns
     -------
@@ -52,10 +50,7 @@ def estimate_surface(
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
     seed = (candidates.r <= growth.seed_range) & (np.abs(z) <= growth.seed_height_tolerance)
-    seed &= candidates.segment % segment_step == 0
     sigma_f, sigma_n = np.exp(theta[:, :2]).T
-    # Learned on inliers the noise comes out small, which must not close the gate.
-    gate_noise = np.maximum(sigma_n, config.observation.sigma_n)
     length_scale, knot_l = np.exp(u), np.exp(knot_u)
 
     inlier = np.zeros(len(z), dtype=np.bool_)
@@ -70,7 +65,6 @@ def estimate_surface(
             covariance,
             own_z,
             noise,
-            gate_noise[segments, None] ** 2,
             own.mask,
             seed[own.place] & own.mask,
             frame.continues_line[own.place] & own.mask,
@@ -104,7 +98,6 @@ class _Batch(NamedTuple):
     covariance: FloatArray  # (S, n, n) prior
     z: FloatArray  # (S, n) about the prior mean
     noise: FloatArray  # (S, n) variance
-    gate_noise: FloatArray  # (S, 1) variance that residuals are standardised with
     mask: BoolArray  # (S, n)
     seed: BoolArray  # (S, n)
     continues_line: BoolArray  # (S, n)
@@ -135,7 +128,7 @@ def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
         z = batch.z[active]
         height, covariance = _condition(covariance, height, z, batch.noise[active], joining)
         variance = np.diagonal(covariance, axis1=1, axis2=2)
-        spread = np.sqrt(np.maximum(variance, 0.0) + batch.gate_noise[active])
+        spread = np.sqrt(np.maximum(variance, 0.0) + batch.noise[active])
         residual = (z - height) / spread
         joining = (
             ~chosen[active]

@@ -69,6 +69,7 @@ _PRESETS = (
             'label.obstacle_roughness_gain': (0.0, 'one zeta_g for all (Algorithm 2)'),
             'learning.objective': ('paper', 'section III-E as printed'),
             'learning.scope': ('frame', 'one theta for the whole frame, section III-E'),
+            'learning.fixed': ('none', 'all hyper-parameters are learned, section III-E'),
             'learning.segment_step': (1, 'theta is learned from every segment, section III-E'),
         },
     ),
