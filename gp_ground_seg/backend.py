@@ -67,7 +67,7 @@ class Backend(Protocol):
 
     def estimate_surface(
         self, frame: Frame, theta: FloatArray, config: Config
-    ) -> tuple[GroundSurface, FloatArray]:
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
         """See `gp_ground_seg.gp.ground.estimate_surface`."""
 
     def label_points(

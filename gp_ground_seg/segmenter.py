@@ -101,7 +101,7 @@ class GroundSegmenter:
             #    length-scale): hyper-parameters theta, in log space, then inliers and surface.
             theta, learned = self._learn(frame)
             timer.mark('learning')
-            surface, log_length_scale = backend.estimate_surface(frame, theta, config)
+            surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
             timer.mark('surface')
 
             # 6. Labels: height of each point over the surface, against a band that follows

@@ -247,14 +247,14 @@ def estimate_surface(frame, theta, config):
     growth, slope_std = config.growth, config.observation.slope_std
     shape = len(theta), len(frame.knots)
     mean, std, knot_u = np.full((3, *shape), np.nan)
-    inlier = np.zeros(len(frame.candidates.r), dtype=bool)
+    inlier, u_all = np.zeros(len(frame.candidates.r), dtype=bool), np.zeros(len(frame.candidates.r))
     for m in range(len(theta)):
         own = slice(*frame.candidates.offsets[m : m + 2])
         r, z = frame.candidates.r[own], frame.candidates.z[own] - frame.prior_mean
         if len(r) == 0:
             continue
         u, u_star = log_length_scales(frame, theta, config, m)
-        knot_u[m, : len(u_star)] = u_star
+        knot_u[m, : len(u_star)], u_all[own] = u_star, u
         sigma_f, sigma_n = np.exp(theta[m, :2])
         chosen = np.zeros(len(r), dtype=bool)
         joining = (r <= growth.seed_range) & (abs(z) <= growth.seed_height_tolerance)
@@ -275,7 +275,7 @@ def estimate_surface(frame, theta, config):
             mean[m, wanted], variance = posterior(*data, *at)
             std[m, wanted] = np.sqrt(variance)
     mean, std = fuse(mean, std, frame.knots, config.surface.n_neighbours, slope_std)
-    return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u
+    return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u, u_all
 
 
 def fuse(mean, std, knots, n_neighbours, slope_std):

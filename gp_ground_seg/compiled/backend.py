@@ -167,8 +167,8 @@ class NumbaBackend:
 
     def estimate_surface(
         self, frame: Frame, theta: FloatArray, config: Config
-    ) -> tuple[GroundSurface, FloatArray]:
-        """Inliers, the surface, and log length-scales at the knots."""
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
+        """Inliers, the surface, and log length-scales at the knots and at the candidates."""
         take, observation = self._buffers.take, numbers_of(config.observation)
         growth, n_neighbours = numbers_of(config.growth), config.surface.n_neighbours
         shape, n_candidates = (len(theta), len(frame.knots)), len(frame.candidates.r)
@@ -202,7 +202,7 @@ class NumbaBackend:
             mean,
             std,
         )
-        return GroundSurface(frame.knots, mean, std, own.inlier), knot_u
+        return GroundSurface(frame.knots, mean, std, own.inlier), knot_u, u
 
     def label_points(
         self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled.numerics import exp_neg, factorise, invert
+from gp_ground_seg.compiled.numerics import exp_neg, factorise, invert, invert_triangle
 from gp_ground_seg.compiled.threads import Part
 from gp_ground_seg.frame import FloatArray, Inliers
 from gp_ground_seg.jit import jit
@@ -104,9 +104,36 @@ def log_likelihood(
         if not factorise(factor, n):
             values[m] = -np.inf
             continue
-        inverse = np.empty((n, n))
-        invert(factor, n, np.empty((n, n)), inverse)
+        whitened = np.empty((n, n))
         alpha = np.zeros(n)
+        if p == 0:
+            # Both derivatives follow from traces: K is A without noise and slope.
+            invert_triangle(factor, n, whitened)
+            value = -0.5 * n * _LOG_2PI
+            trace = square_sum = tilt_trace = tilt_sum = fit = 0.0
+            for i in range(n):
+                row = whitened[i]
+                own_sum = own_tilt = 0.0
+                for j in range(i + 1):
+                    own_sum += row[j] * own_z[j]
+                    own_tilt += row[j] * own_r[j]
+                    trace += row[j] * row[j]
+                for j in range(i + 1):
+                    alpha[j] += row[j] * own_sum
+                tilt_trace += own_tilt * own_tilt
+                fit += own_sum * own_sum
+                value -= math.log(factor[i, i])
+            for i in range(n):
+                square_sum += alpha[i] * alpha[i]
+                tilt_sum += alpha[i] * own_r[i]
+            noise, slope = sigma_n**2, slope_std**2
+            gradients[m, 1] = noise * (square_sum - trace)
+            gradients[m, 0] = fit - slope * tilt_sum * tilt_sum - n + slope * tilt_trace
+            gradients[m, 0] -= gradients[m, 1]
+            values[m] = value - 0.5 * fit
+            continue
+        inverse = np.empty((n, n))
+        invert(factor, n, whitened, inverse)
         for i in range(n):
             value = 0.0
             row = inverse[i]
@@ -138,9 +165,6 @@ def log_likelihood(
             g_u[i] += own
         gradients[m, 0] = g_sigma_f
         gradients[m, 1] = 2.0 * sigma_n**2 * g_trace
-        values[m] = value
-        if p == 0:
-            continue
 
         weight = np.zeros(p)
         raised = np.zeros(p)

@@ -16,7 +16,7 @@ from gp_ground_seg.parameters.config import Config, GrowthConfig
 @single_threaded_blas()
 def estimate_surface(
     frame: Frame, theta: FloatArray, config: Config
-) -> tuple[GroundSurface, FloatArray]:
+) -> tuple[GroundSurface, FloatArray, FloatArray]:
     """Inliers that grow from low, near candidates, and the surface that rests on them.
 
     A candidate joins when the predictive standard deviation is at most
@@ -40,8 +40,10 @@ def estimate_surface(
     -------
     surface : GroundSurface
         Inliers; height and standard deviation at the knots, fused with the neighbours'.
-    log_length_scale : (M, K) float64
+    knot_log_length_scale : (M, K) float64
         At the knots [log m].
+    log_length_scale : (C,) float64
+        At the candidates [log m]; may lie in a buffer that the next call reuses.
     """
     candidates, growth, slope_std = frame.candidates, config.growth, config.observation.slope_std
     if config.length_scale.model == 'latent':
@@ -89,7 +91,7 @@ def estimate_surface(
         mean[kept] = np.where(is_wanted, mean[kept], np.nan)
         std[kept] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
     mean, std = fuse_neighbours(mean, std, frame.knots, config.surface.n_neighbours, slope_std)
-    return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u
+    return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u, u
 
 
 class _Batch(NamedTuple):

@@ -15,6 +15,7 @@ import numpy as np
 
 from gp_ground_seg.frame import (
     BoolArray,
+    Candidates,
     FloatArray,
     Frame,
     GroundSurface,
@@ -22,7 +23,6 @@ from gp_ground_seg.frame import (
     IntArray,
     PseudoInputs,
 )
-from gp_ground_seg.gp.latent import given_log_length_scales
 from gp_ground_seg.parameters.config import Config
 
 THETA_NAMES = (
@@ -146,8 +146,8 @@ class Model(Protocol):
 
     def estimate_surface(
         self, frame: Frame, theta: FloatArray, config: Config
-    ) -> tuple[GroundSurface, FloatArray]:
-        """Inliers under `theta`."""
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
+        """Inliers and log length-scales under `theta`."""
 
     def log_likelihood(
         self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
@@ -188,7 +188,8 @@ def learn_frame(
     by_frame, space = learning.scope == 'frame', theta_space(config)
     own = every_segment(frame, learning.segment_step if by_frame else 1)
     n_own = len(own.candidates.offsets) - 1
-    theta = np.tile(first_theta(own, config), (n_own, 1)) if before is None else before[:n_own]
+    theta = np.tile(first_theta(frame, config), (n_own, 1)) if before is None else before[:n_own]
+    has_latent = bool(space.free[2:].any())
     is_map, slope_std = learning.objective == 'map', config.observation.slope_std
 
     def learn(begin: FloatArray, data: Inliers, budget: int) -> Learned:
@@ -210,8 +211,8 @@ def learn_frame(
     for budget in (first, learning.max_evaluations - first):
         if budget == 0 or (learned and out_of_time()):
             continue
-        surface, _ = model.estimate_surface(own, theta, config)
-        inliers = take_inliers(own, surface.inlier, config)
+        surface, _, u = model.estimate_surface(own, theta, config)
+        inliers = take_inliers(own, surface.inlier, u, has_latent)
         parts = [inliers] if by_frame else [_one_segment(inliers, m) for m in range(n_own)]
         earlier = [one.n_evaluations for one in learned] or [0] * len(parts)
         learned = [learn(*one, budget) for one in zip(theta, parts, strict=False)]
@@ -232,37 +233,51 @@ def every_segment(frame: Frame, step: int) -> Frame:
         return no_knots
     candidates, pseudo = frame.candidates, frame.pseudo
 
-    def thin(offsets: IntArray) -> tuple[BoolArray, IntArray]:
-        """Which values are kept, and their offsets."""
-        size = np.diff(offsets)
-        is_kept = np.arange(len(size)) % step == 0
-        return np.repeat(is_kept, size), np.concatenate([[0], np.cumsum(size[is_kept])])
+    def thin(offsets: IntArray) -> tuple[IntArray, IntArray]:
+        """Places of the values that are kept, and their offsets."""
+        first, stop = offsets[:-1:step], offsets[1::step]
+        places = [np.arange(*ends) for ends in zip(first.tolist(), stop.tolist(), strict=False)]
+        return np.concatenate(places), np.concatenate([[0], np.cumsum((stop - first))])
 
     kept, offsets = thin(candidates.offsets)
     kept_bar, bar_offsets = thin(pseudo.offsets)
     return no_knots._replace(
-        candidates=candidates.where(kept)._replace(offsets=offsets),
+        candidates=Candidates(
+            candidates.r[kept],
+            candidates.z[kept],
+            candidates.bin[kept],
+            candidates.density[kept],
+            offsets,
+            candidates.tile[kept],
+        ),
         lines=frame.lines._replace(line=frame.lines.line[kept]),
         pseudo=PseudoInputs(pseudo.r_bar[kept_bar], pseudo.log_extent[kept_bar], bar_offsets),
         continues_line=frame.continues_line[kept],
     )
 
 
-def take_inliers(frame: Frame, inlier: BoolArray, config: Config) -> Inliers:
-    """Candidates of the mask `inlier` (C,), with the pseudo-inputs of their segments."""
+def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: bool) -> Inliers:
+    """Inliers of a frame.
+
+    Parameters
+    ----------
+    frame : Frame
+        Candidates and pseudo-inputs.
+    inlier : (C,) bool
+        Which candidates are inliers.
+    u : (C,) float64
+        Log length-scales at the candidates [log m].
+    has_latent : bool
+        Whether the pseudo-inputs go with them, and give the length-scales instead of `u`.
+    """
     candidates, pseudo = frame.candidates, frame.pseudo
     taken = np.concatenate([[0], np.cumsum(inlier)])
-    if config.length_scale.model == 'latent':
-        u, bar_offsets = np.zeros(int(taken[-1])), pseudo.offsets
-    else:
-        u = given_log_length_scales(frame, config.length_scale)[0][inlier]
-        bar_offsets = np.zeros_like(candidates.offsets)
     return Inliers(
         offsets=taken[candidates.offsets],
         r=candidates.r[inlier],
         z=candidates.z[inlier] - frame.prior_mean,
-        log_length_scale=u,
-        bar_offsets=bar_offsets,
+        log_length_scale=u[inlier],
+        bar_offsets=pseudo.offsets if has_latent else np.zeros_like(candidates.offsets),
         r_bar=pseudo.r_bar,
         log_extent=pseudo.log_extent,
     )
@@ -336,7 +351,8 @@ def maximise(
     x = theta[free]
     value, gradient = evaluate(x)
     n_evaluations, status, reach = 1, 'budget' if math.isfinite(value) else 'failed', 1.0
-    inverse = np.eye(len(x))
+    unit = np.eye(len(x))
+    inverse = unit
     while status == 'budget':
         held = ((x <= lower) & (gradient < 0.0)) | ((x >= upper) & (gradient > 0.0))
         slope = np.where(held, 0.0, gradient)
@@ -347,20 +363,21 @@ def maximise(
             break
         if n_evaluations >= max_evaluations or out_of_time():
             break
-        trial = np.clip(x + step * (reach * min(1.0, _LONGEST_STEP / longest)), lower, upper)
+        trial = x + step * (reach * min(1.0, _LONGEST_STEP / longest))
+        trial = np.minimum(np.maximum(trial, lower), upper)
         trial_value, trial_gradient = evaluate(trial)
         n_evaluations += 1
         if not trial_value > value:
             reach *= _SHRINK
             # The step from here on goes along the slope if it does not get any shorter.
             if reach < _SHRINK**3:
-                inverse, reach = _SHRINK**3 * np.eye(len(x)), 1.0
+                inverse, reach = _SHRINK**3 * unit, 1.0
             continue
         gain, moved, bent = trial_value - value, trial - x, gradient - trial_gradient
         x, value, gradient, reach = trial, trial_value, trial_gradient, 1.0
         if (along := float(moved @ bent)) > 0.0:
-            mixed = np.eye(len(x)) - np.outer(moved, bent) / along
-            inverse = mixed @ inverse @ mixed.T + np.outer(moved, moved) / along
+            mixed = unit - moved[:, None] * bent / along
+            inverse = mixed @ inverse @ mixed.T + moved[:, None] * moved / along
         if gain < _NO_GAIN:
             status = 'converged'
     theta[free] = x
