@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.backend import Backend, make_backend
 from gp_ground_seg.frame import Candidates, FloatArray, Frame, PointArray, Scan
-from gp_ground_seg.gp.learning import Learned, given_theta, learn_frame
+from gp_ground_seg.gp.learning import Learned, given_theta, in_rows, learn_frame
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config, SensorConfig
 from gp_ground_seg.pipeline.points import take_points
@@ -202,7 +202,7 @@ class GroundSegmenter:
         learning = self._config.learning
         if learning.mode == 'fixed':
             n_segments = len(frame.candidates.offsets) - 1
-            return np.tile(given_theta(self._config), (n_segments, 1)), []
+            return in_rows(given_theta(self._config), n_segments), []
         period = {'every_frame': 1, 'every_k': learning.period, 'first_frame': None}[learning.mode]
         self._frames_since_learning += 1
         is_kept = period is None or self._frames_since_learning < period

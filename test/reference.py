@@ -147,25 +147,19 @@ def _is_critical(start, new, r, z, density, lines):
 
 def pseudo_inputs(candidates, lines, config):
     """One pseudo-input in the middle of each of equal shares of a line's candidates."""
-    latent, limits = config.latent, config.length_scale
-    r_bar, classes, places, extents = [], [], [], [[] for _ in range(9)]
-    for q, slope in enumerate(lines.slope):
+    r_bar, guesses, places = [], [], []
+    limits, per = config.length_scale, config.latent.candidates_per_pseudo_input
+    for q in range(len(lines.slope)):
         first, stop = lines.start[q], lines.start[q + 1]
         extent = candidates.r[stop - 1] - candidates.r[first]
-        steepness = math.inf if math.isnan(slope) else abs(slope)
-        length = sum(extent >= one for one in (latent.medium_extent, latent.long_extent))
-        tilt = sum(steepness >= one for one in (latent.sloped_gradient, latent.steep_gradient))
-        extents[3 * tilt + length].append(math.log(min(max(extent, limits.min), limits.max)))
-        number = max(round((stop - first) / latent.candidates_per_pseudo_input), 1)
+        number = max(round((stop - first) / per), 1)
         for k in range(number):
             place = first + int((stop - first) * (k + 0.5) / number)
             r_bar.append(candidates.r[place])
-            classes.append(3 * tilt + length)
+            guesses.append(math.log(min(max(extent, limits.min), limits.max)))
             places.append(place)
-    everything = [value for own in extents for value in own] or [math.log(limits.min)]
     offsets = np.array([sum(p < o for p in places) for o in candidates.offsets], np.int64)
-    means = np.array([np.mean(own or everything) for own in extents])
-    return PseudoInputs(np.array(r_bar), np.array(classes, np.int64), offsets, means)
+    return PseudoInputs(np.array(r_bar, float), np.array(guesses, float), offsets)
 
 
 def continues_line(candidates, lines, config):
@@ -229,7 +223,7 @@ def log_length_scales(frame, theta, config, m):
     r = frame.candidates.r[own]
     knots = frame.knots[: frame.candidates.bin[own][-1] + 2]
     if config.length_scale.model == 'latent':
-        l_bar = theta[m, 5 + frame.pseudo.surface_class[bar]]
+        l_bar = theta[m, 5] + frame.pseudo.log_extent[bar]
         both = np.concatenate([r, knots])
         u = log_length_scale(frame.pseudo.r_bar[bar], l_bar, both, *np.exp(theta[m, 2:5]))
         return u[: len(r)], u[len(r) :]
@@ -323,7 +317,7 @@ def _log_likelihood(theta, inliers, slope_std, latent_terms):
             continue
         try:
             if len(r_bar):
-                l_bar = theta[5 + inliers.surface_class[bar]]
+                l_bar = theta[5] + inliers.log_extent[bar]
                 u = log_length_scale(r_bar, l_bar, r, *latent)
             if len(r_bar) and latent_terms:
                 # Density at its mean: the quadratic term, which the paper leaves out, is zero.

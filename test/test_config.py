@@ -165,8 +165,6 @@ def test_what_cannot_run_is_refused(changes, words):
     [
         ('grid.r_min', 'grid.r_max', 20.0, 30.0),
         ('length_scale.min', 'length_scale.max', 20.0, 60.0),
-        ('latent.sloped_gradient', 'latent.steep_gradient', 0.5, 0.6),
-        ('latent.medium_extent', 'latent.long_extent', 6.0, 7.0),
         ('label.obstacle_min_height', 'label.obstacle_max_height', 3.0, 4.0),
     ],
 )

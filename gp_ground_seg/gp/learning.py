@@ -35,7 +35,7 @@ WIDEST = 5.0
 _AT_BOUND = 1e-6
 _LEVEL = 1e-3
 """Gradient for each datum below which the objective counts as level."""
-_NO_GAIN = 1e-5
+_NO_GAIN = 1e-7
 """Gain for each datum below which a step was the last."""
 _LONGEST_STEP = 1.0
 _SHRINK = 0.3
@@ -104,14 +104,14 @@ def first_theta(frame: Frame, config: Config) -> FloatArray:
     is_ground = np.abs(lines.slope) <= growth.max_line_slope
     is_ground &= np.diff(lines.start) >= growth.min_line_size
     height = candidates.z[is_ground[line] & (r <= growth.seed_range)] - frame.prior_mean
-    height = np.clip(height, -growth.seed_height_tolerance, growth.seed_height_tolerance)
+    height = np.minimum(np.abs(height), growth.seed_height_tolerance)
     inner = np.flatnonzero(line[2:] == line[:-2]) + 1
     share = (r[inner] - r[inner - 1]) / (r[inner + 1] - r[inner - 1])
     z = candidates.z
     missed = z[inner] - (1.0 - share) * z[inner - 1] - share * z[inner + 1]
     missed /= np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
     for i, values in enumerate((height, missed)):
-        mean_square = float(np.mean(values**2)) if len(values) else 0.0
+        mean_square = float(values @ values) / max(len(values), 1)
         if mean_square > 0.0:
             theta[i] = 0.5 * math.log(mean_square)
     return theta
@@ -188,7 +188,7 @@ def learn_frame(
     by_frame, space = learning.scope == 'frame', theta_space(config)
     own = every_segment(frame, learning.segment_step if by_frame else 1)
     n_own = len(own.candidates.offsets) - 1
-    theta = np.tile(first_theta(frame, config), (n_own, 1)) if before is None else before[:n_own]
+    theta = in_rows(first_theta(frame, config), n_own) if before is None else before[:n_own]
     has_latent = bool(space.free[2:].any())
     is_map, slope_std = learning.objective == 'map', config.observation.slope_std
 
@@ -218,12 +218,17 @@ def learn_frame(
         learned = [learn(*one, budget) for one in zip(theta, parts, strict=False)]
         theta = np.array([one.theta for one in learned])
         if by_frame:
-            theta = np.tile(theta, (n_own, 1))
+            theta = in_rows(theta[0], n_own)
         learned = [
             one._replace(n_evaluations=one.n_evaluations + n)
             for one, n in zip(learned, earlier, strict=True)
         ]
-    return np.tile(theta[0], (n_segments, 1)) if by_frame else theta, learned
+    return in_rows(theta[0], n_segments) if by_frame else theta, learned
+
+
+def in_rows(theta: FloatArray, n: int) -> FloatArray:
+    """Return the same theta for each of `n` segments, (n, 6)."""
+    return np.repeat(theta[None], n, axis=0)
 
 
 def every_segment(frame: Frame, step: int) -> Frame:
