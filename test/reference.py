@@ -241,7 +241,10 @@ def estimate_surface(frame, theta, config):
     growth, slope_std = config.growth, config.observation.slope_std
     shape = len(theta), len(frame.knots)
     mean, std, knot_u = np.full((3, *shape), np.nan)
-    inlier, u_all = np.zeros(len(frame.candidates.r), dtype=bool), np.zeros(len(frame.candidates.r))
+    inlier, u_all = (
+        np.zeros(len(frame.candidates.r), dtype=bool),
+        np.zeros(len(frame.candidates.r)),
+    )
     for m in range(len(theta)):
         own = slice(*frame.candidates.offsets[m : m + 2])
         r, z = frame.candidates.r[own], frame.candidates.z[own] - frame.prior_mean

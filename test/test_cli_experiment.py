@@ -45,6 +45,7 @@ CASES = {
          'near: grid.r_max=15', *SMALL],
         'departures', 3 * 4,
     ),
+    'wrong-parameters': (['ROOT', *SMALL], 'wrong_values', 13 * 2 * 4),
     'scenes': (
         ['--sensors', 'vlp-16,os1-128', '--scenes', 'flat,slope', '--seeds', '1'],
         'scenes', 2 * 4,

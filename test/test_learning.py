@@ -8,8 +8,15 @@ from conftest import fewer, hilly_scan
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
-from gp_ground_seg.frame import Inliers
-from gp_ground_seg.gp.learning import ThetaSpace, maximise, theta_space
+from gp_ground_seg.frame import Frame, Inliers
+from gp_ground_seg.gp.learning import (
+    ThetaSpace,
+    every_segment,
+    given_theta,
+    in_rows,
+    maximise,
+    theta_space,
+)
 from gp_ground_seg.jit import JIT_ENABLED
 
 MODEL = NumbaBackend(1) if JIT_ENABLED else NumpyBackend()
@@ -157,6 +164,39 @@ def test_space_follows_the_configuration(changes, n_free):
 
 
 N_POINTS = fewer(4000, 400)
+
+
+@pytest.mark.parametrize('factor', [0.1, 10.0])
+def test_what_is_learned_does_not_hang_on_the_given_values(factor):
+    names = 'observation.sigma_f', 'observation.sigma_n'
+    wrong = Config().replace(**{name: Config()[name] * factor for name in names})
+    scan = hilly_scan(4000)
+    ours, theirs = (
+        GroundSegmenter(config, backend=MODEL).segment(scan).fit.theta
+        for config in (Config(), wrong)
+    )
+    for name in ('sigma_f', 'sigma_n'):
+        assert theirs[name] == pytest.approx(ours[name], rel=0.1)
+
+
+@pytest.mark.parametrize('step', [1, 7])
+def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame(step):
+    config = Config()
+    found = GroundSegmenter(config.replace(**{'learning.mode': 'fixed'})).segment(hilly_scan(900))
+    continues = np.zeros(len(found.candidates.r), dtype=bool)
+    edges = found.surface.knots
+    frame = Frame(found.candidates, found.lines, found.pseudo, continues, edges, -1.73)
+    own = every_segment(frame, step)
+    kept = np.isin(frame.candidates.segment, np.arange(0, config.grid.n_segments, step))
+    theta = in_rows(given_theta(config), config.grid.n_segments)
+    whole, alone = (
+        MODEL.estimate_surface(one, theta[: len(one.candidates.offsets) - 1], config)
+        for one in (frame, own)
+    )
+    np.testing.assert_array_equal(own.candidates.r, frame.candidates.r[kept])
+    np.testing.assert_array_equal(alone[0].inlier, whole[0].inlier[kept])
+    np.testing.assert_allclose(alone[2], whole[2][kept])
+    assert len(own.knots) == 0
 
 
 def segmenter_of(**changes):

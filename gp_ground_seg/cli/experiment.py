@@ -130,6 +130,11 @@ def _departures(arguments: argparse.Namespace) -> Report:
     return ablation.compare_departures(frames, chosen, config, options.progress('departures'))
 
 
+def _wrong_parameters(arguments: argparse.Namespace) -> Report:
+    config, frames = options.read_config(arguments), frames_from_options(arguments)
+    return ablation.compare_wrong_values(frames, config, options.progress('wrong-parameters'))
+
+
 def parse_departure(text: str) -> ablation.Departure:
     """Read ``TITLE: NAME=VALUE NAME=VALUE``; ConfigError if it is not of that form."""
     title, _, switch = text.rpartition(': ')
@@ -213,6 +218,13 @@ gp_ground_seg/experiments/ablation.py; --switch measures another without touchin
 """,
         (ROOT, *OF_FRAMES, SWITCH),
         _departures,
+    ),
+    'wrong-parameters': Experiment(
+        """\
+Give wrong hyper-parameters, by factors of 3 and 10, and compare them with what is learned.
+""",
+        (ROOT, *OF_FRAMES),
+        _wrong_parameters,
     ),
     'scenes': Experiment(
         """\

@@ -1,4 +1,4 @@
-"""What settings are worth: length-scale models, departures from the paper, cross-validation."""
+"""What settings are worth: models, departures, wrong values given, cross-validation."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ DEPARTURES: tuple[Departure, ...] = (
     Departure('band open downwards', {'label.below_tolerance': 0.2}),
     Departure('bins that widen, 80 of them', {'grid.n_bins': 120, 'grid.bin_growth': 1.0}),
     Departure('lines end at 0.1 rad', {'lines.slope_tolerance': 0.02}),
-    Departure('length-scales of classes learned', {'learning.fixed': 'length_scales'}),
+    Departure('length-scales not learned', {'learning.fixed': 'none'}),
     Departure('lines continued outside the gate', {'growth.max_line_slope': 0.0}),
     Departure('lines continued past a slope break', {'growth.min_bend_extent': 1000.0}),
-    Departure('learning from every third segment', {'learning.segment_step': 1}),
+    Departure('learning from every tenth segment', {'learning.segment_step': 1}),
     Departure('one theta for the frame', {'learning.scope': 'segment'}),
     Departure('240 segments', {'grid.n_segments': 240}, kept=False),
     Departure('twice the neighbours fused', {'surface.n_neighbours': 4}, kept=False),
@@ -77,6 +77,14 @@ DEPARTURES: tuple[Departure, ...] = (
     Departure('vertical faces from 0.3 m on', {'faces.min_height': 0.3}, kept=False),
 )
 """What `departures` measures. A new row here is all that a further one takes."""
+
+WRONG_FACTORS = {'10': 10.0, '3': 3.0, '1/3': 1.0 / 3.0, '1/10': 0.1}
+"""By what the values given in `compare_wrong_values` are wrong."""
+WRONG_NAMES = (
+    ('observation.sigma_f', 'observation.sigma_n'),
+    ('observation.sigma_f',),
+    ('observation.sigma_n',),
+)
 
 Choice = dict[str, ParameterValue]
 """A value for each parameter that is searched, by dotted name."""
@@ -149,6 +157,40 @@ def compare_departures(
     tables = {'departures': Table.of(rows, title=title)}
     changes = {one.title: one.changes for one in departures}
     return make_report(tables, scores, config, changes=changes)
+
+
+def compare_wrong_values(
+    frames: Sequence[Frame], config: Config, progress: Progress = iter
+) -> Report:
+    """Score hyper-parameters as given against those learned, where the given ones are wrong.
+
+    ConfigError if `config` says whether they are learned.
+    """
+    refuse_changed(config, _FIXED)
+    given: dict[str, Changes] = {'as given': {}}
+    for names in WRONG_NAMES:
+        title = ', '.join(name.rpartition('.')[2] for name in names)
+        for factor, value in WRONG_FACTORS.items():
+            given[f'{title} x {factor}'] = {name: value * float(config[name]) for name in names}
+    variants = {}
+    for title, changes in given.items():
+        variants[title] = config.replace(**changes, **_FIXED)
+        variants[f'{title}, learned'] = config.replace(**changes)
+    scores = score_variants(frames, load_kitti, variants, progress=progress)
+    rows: list[Row] = [
+        [
+            (Column('hyper-parameters'), fixed.name),
+            (percent('fixed [%]', 'iou_fixed'), fixed.iou),
+            (percent('learned [%]', 'iou_learned'), learned.iou),
+            (percent('gain [%]', 'gain', '+.2f'), learned.iou - fixed.iou),
+            (report.centimetres('RMSE fixed [cm]', 'rmse_fixed'), fixed.height.rmse),
+            (report.centimetres('learned [cm]', 'rmse_learned'), learned.height.rmse),
+        ]
+        for fixed, learned in zip(scores[::2], scores[1::2], strict=True)
+    ]
+    title = f'{_counted(scores[0])}; RMSE of the height'
+    tables = {'wrong_values': Table.of(rows, title=title)}
+    return make_report(tables, scores, config, changes=given)
 
 
 def _worst_and_rmse(score: MethodScore) -> Row:

@@ -242,7 +242,7 @@ def every_segment(frame: Frame, step: int) -> Frame:
         """Places of the values that are kept, and their offsets."""
         first, stop = offsets[:-1:step], offsets[1::step]
         places = [np.arange(*ends) for ends in zip(first.tolist(), stop.tolist(), strict=False)]
-        return np.concatenate(places), np.concatenate([[0], np.cumsum((stop - first))])
+        return np.concatenate(places), np.concatenate([[0], np.cumsum(stop - first)])
 
     kept, offsets = thin(candidates.offsets)
     kept_bar, bar_offsets = thin(pseudo.offsets)

@@ -10,8 +10,6 @@ from gp_ground_seg.frame import (
     BoolArray,
     Candidates,
     Faces,
-    FloatArray,
-    IntArray,
     Lines,
     PseudoInputs,
 )
