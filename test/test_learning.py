@@ -176,7 +176,7 @@ def test_what_is_learned_does_not_hang_on_the_given_values(factor):
         for config in (Config(), wrong)
     )
     for name in ('sigma_f', 'sigma_n'):
-        assert theirs[name] == pytest.approx(ours[name], rel=0.1)
+        assert theirs[name] == pytest.approx(ours[name], rel=0.2)
 
 
 @pytest.mark.parametrize('step', [1, 7])
