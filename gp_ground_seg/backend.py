@@ -66,8 +66,8 @@ class Backend(Protocol):
         """See `gp_ground_seg.gp.likelihood.log_likelihood`."""
 
     def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
-    ) -> tuple[GroundSurface, FloatArray]:
+        self, frame: Frame, theta: FloatArray, config: Config
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
         """See `gp_ground_seg.gp.ground.estimate_surface`."""
 
     def label_points(

@@ -25,8 +25,6 @@ NOT_FINITE = -2
 """Cell of a point that is not finite."""
 NO_TILE = 2**31 - 1
 """Tile of the lowest point of an empty cell."""
-N_CLASSES = 9
-"""Surface classes: flat, sloped, steep times short, medium, long."""
 
 
 class Label(IntEnum):
@@ -176,12 +174,11 @@ class Lines(NamedTuple):
 
 
 class PseudoInputs(NamedTuple):
-    """Pseudo-inputs of the latent process; those of one surface class share a log length-scale."""
+    """Pseudo-inputs of the latent process."""
 
     r_bar: FloatArray  # (P,) ranges [m], increasing in each segment
-    surface_class: IntArray  # (P,) surface class, 0 to `N_CLASSES` - 1
+    log_extent: FloatArray  # (P,) log extent of the line of each, first guess of L-bar [log m]
     offsets: IntArray  # (M + 1,) pseudo-inputs of segment m are ``offsets[m]:offsets[m + 1]``
-    first_guess: FloatArray  # (N_CLASSES,) mean log extent of the lines of each class [log m]
 
 
 class Frame(NamedTuple):
@@ -206,7 +203,7 @@ class Inliers(NamedTuple):
     log_length_scale: FloatArray
     bar_offsets: IntArray  # (M + 1,) pseudo-inputs of segment m; all zero without a latent process
     r_bar: FloatArray  # (P,) ranges of the pseudo-inputs [m]
-    surface_class: IntArray  # (P,) surface class of each pseudo-input
+    log_extent: FloatArray  # (P,) their first guesses of the log length-scale [log m]
 
 
 class GroundSurface(NamedTuple):

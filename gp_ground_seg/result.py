@@ -19,7 +19,7 @@ from gp_ground_seg.frame import (
     PseudoInputs,
     at_points,
 )
-from gp_ground_seg.gp.learning import Learned, theta_names
+from gp_ground_seg.gp.learning import THETA_NAMES, Learned
 from gp_ground_seg.pipeline.labels import ground_probability
 from gp_ground_seg.pipeline.residuals import CorrectedSurface, correct_surface
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
@@ -64,8 +64,8 @@ class FitReport:
         Objective per inlier at the end; NaN when nothing was learned.
     theta : dict of str to float
         Hyper-parameters used: sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m],
-        sigma_n_bar, and length_scale_bar_0 ... [m] of the surface classes. Means of
-        the logarithms where each segment has its own.
+        sigma_n_bar, and the factor on the length-scales that the lines suggest. Means
+        of the logarithms where each segment has its own.
     at_bound : tuple of str
         Those that ended at a bound.
     n_segments : int
@@ -97,7 +97,6 @@ class FitReport:
     def of(cls, frame: Segmentation) -> FitReport:
         """Sum up one frame."""
         learned = frame.fitting.learned
-        names = theta_names(frame.theta.shape[1])
         values = np.exp(frame.theta.mean(axis=0))
         statuses = {one.status for one in learned}
         at_bound = np.any([one.at_bound for one in learned], axis=0) if learned else []
@@ -108,8 +107,8 @@ class FitReport:
             status=next((s for s in ('failed', 'budget', 'converged') if s in statuses), 'kept'),
             n_evaluations=sum(one.n_evaluations for one in learned),
             objective=total / n_inliers if learned and n_inliers else float('nan'),
-            theta={name: float(value) for name, value in zip(names, values, strict=True)},
-            at_bound=tuple(n for n, hit in zip(names, at_bound, strict=False) if hit),
+            theta={name: float(value) for name, value in zip(THETA_NAMES, values, strict=True)},
+            at_bound=tuple(n for n, hit in zip(THETA_NAMES, at_bound, strict=False) if hit),
             n_segments=int(np.isfinite(frame.surface.mean[:, 0]).sum()),
             n_candidates=len(frame.candidates.r),
             n_inliers=n_inliers,
@@ -136,8 +135,8 @@ class Segmentation:
     grid, candidates, lines, pseudo, surface
         Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
         process's own, which the labels follow from; `corrected` is what users are given.
-    theta : (M, 5 + K) float64
-        Logarithms of the hyper-parameters of each segment, named by `theta_names`.
+    theta : (M, 6) float64
+        Logarithms of the hyper-parameters of each segment, named by `THETA_NAMES`.
     log_length_scale : (M, knots) float64
         Log length-scale at the knots of the surface [log m]; NaN in segments
         without candidates.

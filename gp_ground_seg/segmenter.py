@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.backend import Backend, make_backend
 from gp_ground_seg.frame import Candidates, FloatArray, Frame, PointArray, Scan
-from gp_ground_seg.gp.learning import Learned, given_theta, learn_frame
+from gp_ground_seg.gp.learning import Learned, given_theta, in_rows, learn_frame
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config, SensorConfig
 from gp_ground_seg.pipeline.points import take_points
@@ -101,7 +101,7 @@ class GroundSegmenter:
             #    length-scale): hyper-parameters theta, in log space, then inliers and surface.
             theta, learned = self._learn(frame)
             timer.mark('learning')
-            surface, log_length_scale = backend.estimate_surface(frame, theta, config)
+            surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
             timer.mark('surface')
 
             # 6. Labels: a point is ground where its height over the surface is more likely of
@@ -199,11 +199,11 @@ class GroundSegmenter:
         return scan, pose
 
     def _learn(self, frame: Frame) -> tuple[FloatArray, list[Learned]]:
-        """Theta of this frame by ``learning.mode``; (M, 5 + K) and the outcome, if learned."""
+        """Theta of this frame by ``learning.mode``; (M, 6) and the outcome, if learned."""
         learning = self._config.learning
-        given = given_theta(frame, self._config)
         if learning.mode == 'fixed':
-            return given, []
+            n_segments = len(frame.candidates.offsets) - 1
+            return in_rows(given_theta(self._config), n_segments), []
         period = {'every_frame': 1, 'every_k': learning.period, 'first_frame': None}[learning.mode]
         self._frames_since_learning += 1
         is_kept = period is None or self._frames_since_learning < period
@@ -214,8 +214,8 @@ class GroundSegmenter:
         def out_of_time() -> bool:
             return 0.0 < learning.max_time <= self._clock() - started
 
-        start = self._theta if self._theta is not None and learning.warm_start else given
-        self._theta, learned = learn_frame(frame, start, self._config, self._backend, out_of_time)
+        before = self._theta if learning.warm_start else None
+        self._theta, learned = learn_frame(frame, before, self._config, self._backend, out_of_time)
         self._frames_since_learning = 0
         return self._theta, learned
 

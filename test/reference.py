@@ -147,25 +147,19 @@ def _is_critical(start, new, r, z, density, lines):
 
 def pseudo_inputs(candidates, lines, config):
     """One pseudo-input in the middle of each of equal shares of a line's candidates."""
-    latent, limits = config.latent, config.length_scale
-    r_bar, classes, places, extents = [], [], [], [[] for _ in range(9)]
-    for q, slope in enumerate(lines.slope):
+    r_bar, guesses, places = [], [], []
+    limits, per = config.length_scale, config.latent.candidates_per_pseudo_input
+    for q in range(len(lines.slope)):
         first, stop = lines.start[q], lines.start[q + 1]
         extent = candidates.r[stop - 1] - candidates.r[first]
-        steepness = math.inf if math.isnan(slope) else abs(slope)
-        length = sum(extent >= one for one in (latent.medium_extent, latent.long_extent))
-        tilt = sum(steepness >= one for one in (latent.sloped_gradient, latent.steep_gradient))
-        extents[3 * tilt + length].append(math.log(min(max(extent, limits.min), limits.max)))
-        number = max(round((stop - first) / latent.candidates_per_pseudo_input), 1)
+        number = max(round((stop - first) / per), 1)
         for k in range(number):
             place = first + int((stop - first) * (k + 0.5) / number)
             r_bar.append(candidates.r[place])
-            classes.append(3 * tilt + length)
+            guesses.append(math.log(min(max(extent, limits.min), limits.max)))
             places.append(place)
-    everything = [value for own in extents for value in own] or [math.log(limits.min)]
     offsets = np.array([sum(p < o for p in places) for o in candidates.offsets], np.int64)
-    means = np.array([np.mean(own or everything) for own in extents])
-    return PseudoInputs(np.array(r_bar), np.array(classes, np.int64), offsets, means)
+    return PseudoInputs(np.array(r_bar, float), np.array(guesses, float), offsets)
 
 
 def continues_line(candidates, lines, config):
@@ -229,7 +223,7 @@ def log_length_scales(frame, theta, config, m):
     r = frame.candidates.r[own]
     knots = frame.knots[: frame.candidates.bin[own][-1] + 2]
     if config.length_scale.model == 'latent':
-        l_bar = theta[m, 5 + frame.pseudo.surface_class[bar]]
+        l_bar = theta[m, 5] + frame.pseudo.log_extent[bar]
         both = np.concatenate([r, knots])
         u = log_length_scale(frame.pseudo.r_bar[bar], l_bar, both, *np.exp(theta[m, 2:5]))
         return u[: len(r)], u[len(r) :]
@@ -242,29 +236,30 @@ def log_length_scales(frame, theta, config, m):
     return u, np.interp(knots, r, u)
 
 
-def estimate_surface(frame, theta, config, segment_step=1):
+def estimate_surface(frame, theta, config):
     """Inliers that join until none does, and the surface fused over neighbours."""
     growth, slope_std = config.growth, config.observation.slope_std
     shape = len(theta), len(frame.knots)
     mean, std, knot_u = np.full((3, *shape), np.nan)
-    inlier = np.zeros(len(frame.candidates.r), dtype=bool)
+    inlier, u_all = (
+        np.zeros(len(frame.candidates.r), dtype=bool),
+        np.zeros(len(frame.candidates.r)),
+    )
     for m in range(len(theta)):
         own = slice(*frame.candidates.offsets[m : m + 2])
         r, z = frame.candidates.r[own], frame.candidates.z[own] - frame.prior_mean
         if len(r) == 0:
             continue
         u, u_star = log_length_scales(frame, theta, config, m)
-        knot_u[m, : len(u_star)] = u_star
+        knot_u[m, : len(u_star)], u_all[own] = u_star, u
         sigma_f, sigma_n = np.exp(theta[m, :2])
-        gate = max(sigma_n, config.observation.sigma_n)
         chosen = np.zeros(len(r), dtype=bool)
         joining = (r <= growth.seed_range) & (abs(z) <= growth.seed_height_tolerance)
-        joining &= m % segment_step == 0
         while joining.any():
             chosen |= joining
             data = r[chosen], z[chosen], np.exp(u[chosen])
             height, variance = posterior(*data, r, np.exp(u), sigma_f, sigma_n, slope_std)
-            residual = (z - height) / np.sqrt(variance + gate**2)
+            residual = (z - height) / np.sqrt(variance + sigma_n**2)
             joining = variance <= growth.max_std**2
             joining &= residual <= growth.max_standardised_residual
             joining &= residual >= -growth.max_standardised_depth
@@ -277,7 +272,7 @@ def estimate_surface(frame, theta, config, segment_step=1):
             mean[m, wanted], variance = posterior(*data, *at)
             std[m, wanted] = np.sqrt(variance)
     mean, std = fuse(mean, std, frame.knots, config.surface.n_neighbours, slope_std)
-    return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u
+    return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u, u_all
 
 
 def fuse(mean, std, knots, n_neighbours, slope_std):
@@ -325,7 +320,7 @@ def _log_likelihood(theta, inliers, slope_std, latent_terms):
             continue
         try:
             if len(r_bar):
-                l_bar = theta[5 + inliers.surface_class[bar]]
+                l_bar = theta[5] + inliers.log_extent[bar]
                 u = log_length_scale(r_bar, l_bar, r, *latent)
             if len(r_bar) and latent_terms:
                 # Density at its mean: the quadratic term, which the paper leaves out, is zero.

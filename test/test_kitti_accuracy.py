@@ -8,7 +8,7 @@ from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_
 
 GROUND_CLASSES = [40, 44, 48, 49, 60, 72]
 LEFT_OUT = [0, 1, 70]
-FLOOR = {'00': 98.5, '01': 98.9, '03': 94.3, '05': 95.5, '08': 97.1, '10': 97.7}
+FLOOR = {'00': 98.5, '01': 98.9, '03': 94.4, '05': 95.5, '08': 97.1, '10': 97.7}
 
 
 def test_iou_on_labelled_frames(kitti):
@@ -30,7 +30,7 @@ def test_iou_on_labelled_frames(kitti):
         counts[sequence] = total
     iou = {name: 100 * total[0] / total.sum() for name, total in counts.items()}
     pooled = sum(counts.values())
-    assert 100 * pooled[0] / pooled.sum() >= 97.4
+    assert 100 * pooled[0] / pooled.sum() >= 97.5
     for sequence, floor in FLOOR.items():
         if sequence in iou:
             assert iou[sequence] >= floor, sequence

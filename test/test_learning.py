@@ -8,39 +8,43 @@ from conftest import fewer, hilly_scan
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
-from gp_ground_seg.frame import Inliers
-from gp_ground_seg.gp.learning import ThetaSpace, maximise, theta_names, theta_space
+from gp_ground_seg.frame import Frame, Inliers
+from gp_ground_seg.gp.learning import (
+    ThetaSpace,
+    every_segment,
+    given_theta,
+    in_rows,
+    maximise,
+    theta_space,
+)
 from gp_ground_seg.jit import JIT_ENABLED
 
 MODEL = NumbaBackend(1) if JIT_ENABLED else NumpyBackend()
 
 
 def draw_inliers(seed, n_segments=120, n=50, sigma_f=0.3, sigma_n=0.05):
-    """Inliers drawn from the model: smooth road to 25 m, rubble beyond.
-
-    Returns them, and theta with the log length-scales of two classes.
-    """
+    """Inliers drawn from the model: smooth road to 25 m, rubble beyond; and the true theta."""
     rng = np.random.default_rng(seed)
-    truth = np.log([sigma_f, sigma_n, 0.9, 3.0, 0.25, 10.0, 1.5])
+    truth = np.log([sigma_f, sigma_n, 0.9, 3.0, 0.25, 1.0])
     r_bar = np.arange(4.0, 50.0, 3.0)
-    surface_class = (r_bar > 25.0).astype(np.int64)
+    log_extent = np.log(np.where(r_bar > 25.0, 1.5, 10.0))
     r, z = [], []
     for _ in range(n_segments):
         own = np.sort(rng.uniform(3, 50, n))
-        length = np.exp(profile(truth, r_bar, surface_class, own))
+        length = np.exp(profile(truth, r_bar, log_extent, own))
         a = reference.paciorek(own, length, own, length, sigma_f) + sigma_n**2 * np.eye(n)
         r.append(own)
         z.append(np.linalg.cholesky(a) @ rng.standard_normal(n))
     number = np.arange(n_segments + 1)
-    bars = number * len(r_bar), np.tile(r_bar, n_segments), np.tile(surface_class, n_segments)
+    bars = number * len(r_bar), np.tile(r_bar, n_segments), np.tile(log_extent, n_segments)
     inliers = Inliers(
         number * n, np.concatenate(r), np.concatenate(z), np.zeros(n_segments * n), *bars
     )
     return inliers, truth
 
 
-def profile(theta, r_bar, surface_class, r):
-    return reference.log_length_scale(r_bar, theta[5 + surface_class], r, *np.exp(theta[2:5]))
+def profile(theta, r_bar, log_extent, r):
+    return reference.log_length_scale(r_bar, theta[5] + log_extent, r, *np.exp(theta[2:5]))
 
 
 def space_about(centre, free=None, factor=20.0):
@@ -67,13 +71,13 @@ def learn(inliers, space, start, use_priors=True, max_evaluations=200, out_of_ti
 @pytest.mark.parametrize('seed', [0, 1, 2])
 def test_noise_and_length_scales_of_a_drawn_frame_are_recovered(seed):
     inliers, truth = draw_inliers(seed)
-    # Far off: half the amplitude, twice the noise, one length-scale for all.
-    start = truth + np.log([0.5, 2.0, 1.3, 0.7, 1.5, 0.4, 2.7])
+    # Far off: half the amplitude, twice the noise, short length-scales.
+    start = truth + np.log([0.5, 2.0, 1.3, 0.7, 1.5, 0.4])
     theta = learn(inliers, space_about(start), start)[0].theta
     assert np.exp(theta[1]) == pytest.approx(0.05, rel=0.1)
     assert np.exp(theta[0]) == pytest.approx(0.3, rel=0.15)
     first = slice(0, inliers.bar_offsets[1])
-    at = inliers.r_bar[first], inliers.surface_class[first], np.linspace(4, 48, 100)
+    at = inliers.r_bar[first], inliers.log_extent[first], np.linspace(4, 48, 100)
     assert np.corrcoef(profile(theta, *at), profile(truth, *at))[0, 1] >= 0.9
 
 
@@ -86,7 +90,7 @@ def gradient_per_datum(inliers, space, theta):
 def test_the_end_is_level_or_at_a_bound_and_said_to_be(noise_is_possible):
     inliers, truth = draw_inliers(3, n_segments=30)
     # Without the true noise in the box.
-    centre = truth + np.log([1, 1 if noise_is_possible else 3, 1, 1, 1, 1, 1])
+    centre = truth + np.log([1, 1 if noise_is_possible else 3, 1, 1, 1, 1])
     space, start = space_about(centre, factor=1.5), truth + 0.3
     learned, _ = learn(inliers, space, start)
     level = gradient_per_datum(inliers, space, learned.theta) < 1e-3
@@ -101,7 +105,7 @@ def test_the_end_is_level_or_at_a_bound_and_said_to_be(noise_is_possible):
     assert (space.lower - 1e-12 <= learned.theta).all()
     assert (learned.theta <= space.upper + 1e-12).all()
     # Fixed entries stay.
-    free = np.array([True, True, False, False, False, True, True])
+    free = np.array([True, True, False, False, False, True])
     theta = learn(inliers, space_about(start, free), start)[0].theta
     np.testing.assert_array_equal(theta[~free], start[~free])
     assert (theta[free] != start[free]).all()
@@ -142,9 +146,9 @@ def test_no_time_means_one_evaluation_and_nowhere_finite_is_a_failure():
 @pytest.mark.parametrize(
     ('changes', 'n_free'),
     [
-        ({}, [0, 1, 2, 3, 4, 5, 6]),
-        ({'learning.fixed': 'latent'}, [0, 1, 5, 6]),
-        ({'learning.fixed': 'sigma_f_bar'}, [0, 1, 3, 4, 5, 6]),
+        ({}, [0, 1, 2, 3, 4, 5]),
+        ({'learning.fixed': 'latent'}, [0, 1, 5]),
+        ({'learning.fixed': 'sigma_f_bar'}, [0, 1, 3, 4, 5]),
         ({'learning.fixed': 'length_scales'}, [0, 1]),
         ({'length_scale.model': 'line_gradient'}, [0, 1]),
         ({'length_scale.model': 'constant'}, [0, 1]),
@@ -152,15 +156,53 @@ def test_no_time_means_one_evaluation_and_nowhere_finite_is_a_failure():
 )
 def test_space_follows_the_configuration(changes, n_free):
     config = Config().replace(**{'learning.fixed': 'none', 'observation.sigma_n': 0.1, **changes})
-    space = theta_space(config, np.log([1.0, 3.0]))
+    space = theta_space(config)
     assert list(np.flatnonzero(space.free)) == n_free
     assert np.exp(space.centre[1]) == pytest.approx(0.1)
-    assert np.exp(space.upper[1]) == pytest.approx(0.1 * config.learning.bound_factor)
-    np.testing.assert_allclose(np.exp(space.lower[5:]), config.length_scale.min)
-    assert theta_names(7)[5:] == ['length_scale_bar_0', 'length_scale_bar_1']
+    assert np.exp(space.upper[1]) == pytest.approx(0.1 * np.exp(5.0 * config.learning.prior_std))
+    assert space.centre[5] == 0.0
 
 
 N_POINTS = fewer(4000, 400)
+
+
+@pytest.mark.parametrize('factor', [0.1, 10.0])
+def test_what_is_learned_does_not_hang_on_the_given_values(factor):
+    names = 'observation.sigma_f', 'observation.sigma_n'
+    # Few points: every tenth segment has as many as every 30th of a real scan.
+    given = Config().replace(**{'learning.segment_step': 10})
+    wrong = given.replace(**{name: given[name] * factor for name in names})
+    scan = hilly_scan(4000)
+    ours, theirs = (
+        GroundSegmenter(config, backend=MODEL).segment(scan).fit.theta
+        for config in (given, wrong)
+    )
+    for name in ('sigma_f', 'sigma_n'):
+        assert theirs[name] == pytest.approx(ours[name], rel=0.2)
+
+
+@pytest.mark.parametrize('step', [1, 7])
+def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame(step):
+    config = Config()
+    found = GroundSegmenter(config.replace(**{'learning.mode': 'fixed'})).segment(hilly_scan(900))
+    continues = np.zeros(len(found.candidates.r), dtype=bool)
+    edges = found.surface.knots
+    frame = Frame(found.candidates, found.lines, found.pseudo, continues, edges, -1.73)
+    own = every_segment(frame, step)
+    kept = np.isin(frame.candidates.segment, np.arange(0, config.grid.n_segments, step))
+    theta = in_rows(given_theta(config), config.grid.n_segments)
+    # Copied, as the next call reuses the buffer of the length-scales.
+    (whole, whole_u), (alone, alone_u) = (
+        (surface.inlier, u.copy())
+        for one in (frame, own)
+        for surface, _, u in [
+            MODEL.estimate_surface(one, theta[: len(one.candidates.offsets) - 1], config)
+        ]
+    )
+    np.testing.assert_array_equal(own.candidates.r, frame.candidates.r[kept])
+    np.testing.assert_array_equal(alone, whole[kept])
+    np.testing.assert_allclose(alone_u, whole_u[kept])
+    assert len(own.knots) == 0
 
 
 def segmenter_of(**changes):

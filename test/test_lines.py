@@ -12,9 +12,8 @@ from scipy.optimize import minimize
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.frame import Candidates, Faces
-from gp_ground_seg.parameters.config import LatentConfig
 from gp_ground_seg.parameters.presets import find_preset
-from gp_ground_seg.pipeline.lines import classify_lines, deming_slope, differs_in_direction
+from gp_ground_seg.pipeline.lines import deming_slope, differs_in_direction
 from gp_ground_seg.simulation import SCENES, VLP_16, simulate_scan
 
 N_TILES = 50
@@ -125,15 +124,6 @@ def test_the_candidates_drawn_hold_every_case():
         continued += (continues[1:] & (lines.line[1:] == lines.line[:-1])).sum()
         alone += (~continues).sum()
     assert min(at_break, continued, alone) > 20
-
-
-def test_classes_by_slope_and_extent():
-    latent = LatentConfig(
-        sloped_gradient=0.1, steep_gradient=0.4, medium_extent=1.5, long_extent=5.0
-    )
-    slopes = np.array([0.0, -0.05, 0.05, 0.1, -0.3, 0.3, 0.4, -2.0, np.inf, np.nan])
-    extents = np.array([1.0, 1.5, 5.0, 1.0, 2.0, 9.0, 0.5, 3.0, 6.0, 0.0])
-    assert list(classify_lines(slopes, extents, latent)) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 6]
 
 
 KINK = np.arange(3.0, 23.0)

@@ -167,9 +167,9 @@ class NumbaBackend:
         return value, gradients.sum(axis=0)
 
     def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
-    ) -> tuple[GroundSurface, FloatArray]:
-        """Inliers, the surface, and log length-scales at the knots."""
+        self, frame: Frame, theta: FloatArray, config: Config
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
+        """Inliers, the surface, and log length-scales at the knots and at the candidates."""
         take, observation = self._buffers.take, numbers_of(config.observation)
         growth, n_neighbours = numbers_of(config.growth), config.surface.n_neighbours
         shape, n_candidates = (len(theta), len(frame.knots)), len(frame.candidates.r)
@@ -190,7 +190,7 @@ class NumbaBackend:
         def grow_surfaces(part: Part) -> None:
             if is_latent:
                 latent_.latent_log_length_scales(part, frame, theta, u, knot_u)
-            ground.grow_surfaces(part, frame, theta, observation, growth, segment_step, own)
+            ground.grow_surfaces(part, frame, theta, observation, growth, own)
 
         self.workers.run(grow_surfaces, self.n_threads)
         mean, std = np.empty((2, *shape))
@@ -203,7 +203,7 @@ class NumbaBackend:
             mean,
             std,
         )
-        return GroundSurface(frame.knots, mean, std, own.inlier), knot_u
+        return GroundSurface(frame.knots, mean, std, own.inlier), knot_u, u
 
     def label_points(
         self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config

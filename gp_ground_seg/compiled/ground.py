@@ -52,7 +52,6 @@ def grow_surfaces(
     theta: FloatArray,
     observation: ObservationConfig,
     growth: GrowthConfig,
-    segment_step: int,
     own: SegmentSurfaces,
 ) -> None:
     """Inliers and surface of the segments of a part, into `own`."""
@@ -79,7 +78,7 @@ def grow_surfaces(
             inlier[first + i] = False
             observed[i] = candidates.z[first + i] - frame.prior_mean
             is_low = abs(observed[i]) <= growth.seed_height_tolerance
-            if is_low and r[first + i] <= growth.seed_range and m % segment_step == 0:
+            if is_low and r[first + i] <= growth.seed_range:
                 new[n_new] = i
                 n_new += 1
         own.n_knots[m] = 0
@@ -103,8 +102,7 @@ def grow_surfaces(
             square[j] = all_l[j] * all_l[j]
             predicted[j] = 0.0
             variance[j] = sill + slope * all_r[j] * all_r[j]
-        # Learned on inliers the noise comes out small, which must not close the gate.
-        noise, gate = sigma_n**2, max(sigma_n, observation.sigma_n) ** 2
+        noise = sigma_n**2
         n_inliers = done = 0
         # Unsigned, as a signed index could count from the end.
         end = np.uintp(size)
@@ -156,7 +154,7 @@ def grow_surfaces(
                 limit = growth.max_standardised_depth
                 if residual > 0.0:
                     limit = growth.max_standardised_residual
-                spread = max(variance[i], 0.0) + gate
+                spread = max(variance[i], 0.0) + noise
                 if (frame.continues_line[first + i] and inlier[first + i - 1]) or (
                     variance[i] <= growth.max_std**2
                     and residual * residual <= limit * limit * spread

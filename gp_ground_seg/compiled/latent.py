@@ -46,12 +46,12 @@ def latent_log_length_scales(
         noise = math.exp(2.0 * theta[m, 4])
         mean = 0.0
         for i in range(p):
-            mean += theta[m, 5 + pseudo.surface_class[first + i]] / p
+            mean += pseudo.log_extent[first + i] / p
         end = (p + LANES - 1) & -LANES
         for i in range(end):
             centres[i] = pseudo.r_bar[first + i] if i < p else 0.0
         for i in range(p):
-            weight[i] = theta[m, 5 + pseudo.surface_class[first + i]] - mean
+            weight[i] = pseudo.log_extent[first + i] - mean
             row = matrix[i]
             for j in range(i & -LANES, end):
                 d = centres[i] - centres[j]
@@ -71,7 +71,7 @@ def latent_log_length_scales(
         for i in range(n + n_wanted, size):
             wanted[i] = 0.0
         for i in range(size):
-            value[i] = mean
+            value[i] = mean + theta[m, 5]
         for j in range(p):
             scaled = weight[j] * variance
             centre = centres[j]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.compiled.numerics import exp_neg, factorise, invert
+from gp_ground_seg.compiled.numerics import exp_neg, factorise, invert, invert_triangle
 from gp_ground_seg.compiled.threads import Part
 from gp_ground_seg.frame import FloatArray, Inliers
 from gp_ground_seg.jit import jit
@@ -50,7 +50,7 @@ def log_likelihood(
         sharpness = 0.5 / sigma_l_bar**2
         if p > 0:
             for i in range(p):
-                l_bar[i] = theta[5 + inliers.surface_class[bar_first + i]]
+                l_bar[i] = inliers.log_extent[bar_first + i]
                 mean += l_bar[i] / p
                 centre = own_r_bar[i]
                 for j in range(p):
@@ -67,7 +67,7 @@ def log_likelihood(
                 for j in range(p):
                     beta[i] += b_inverse[i, j] * (l_bar[j] - mean)
             for i in range(n):
-                value = mean
+                value = mean + theta[5]
                 centre = own_r[i]
                 for j in range(p):
                     d = centre - own_r_bar[j]
@@ -104,9 +104,36 @@ def log_likelihood(
         if not factorise(factor, n):
             values[m] = -np.inf
             continue
-        inverse = np.empty((n, n))
-        invert(factor, n, np.empty((n, n)), inverse)
+        whitened = np.empty((n, n))
         alpha = np.zeros(n)
+        if p == 0:
+            # Both derivatives follow from traces: K is A without noise and slope.
+            invert_triangle(factor, n, whitened)
+            value = -0.5 * n * _LOG_2PI
+            trace = square_sum = tilt_trace = tilt_sum = fit = 0.0
+            for i in range(n):
+                row = whitened[i]
+                own_sum = own_tilt = 0.0
+                for j in range(i + 1):
+                    own_sum += row[j] * own_z[j]
+                    own_tilt += row[j] * own_r[j]
+                    trace += row[j] * row[j]
+                for j in range(i + 1):
+                    alpha[j] += row[j] * own_sum
+                tilt_trace += own_tilt * own_tilt
+                fit += own_sum * own_sum
+                value -= math.log(factor[i, i])
+            for i in range(n):
+                square_sum += alpha[i] * alpha[i]
+                tilt_sum += alpha[i] * own_r[i]
+            noise, slope = sigma_n**2, slope_std**2
+            gradients[m, 1] = noise * (square_sum - trace)
+            gradients[m, 0] = fit - slope * tilt_sum * tilt_sum - n + slope * tilt_trace
+            gradients[m, 0] -= gradients[m, 1]
+            values[m] = value - 0.5 * fit
+            continue
+        inverse = np.empty((n, n))
+        invert(factor, n, whitened, inverse)
         for i in range(n):
             value = 0.0
             row = inverse[i]
@@ -138,9 +165,6 @@ def log_likelihood(
             g_u[i] += own
         gradients[m, 0] = g_sigma_f
         gradients[m, 1] = 2.0 * sigma_n**2 * g_trace
-        values[m] = value
-        if p == 0:
-            continue
 
         weight = np.zeros(p)
         raised = np.zeros(p)
@@ -149,16 +173,12 @@ def log_likelihood(
             g_sum += g_u[i]
             for j in range(p):
                 raised[j] += k_star[i, j] * g_u[i]
-        weight_sum = 0.0
         for i in range(p):
             for j in range(p):
                 weight[i] += b_inverse[i, j] * raised[j]
-            weight_sum += weight[i]
             if latent_terms:
                 value -= math.log(b_factor[i, i]) + 0.5 * _LOG_2PI
-        for i in range(p):
-            slot = 5 + inliers.surface_class[bar_first + i]
-            gradients[m, slot] += weight[i] + (g_sum - weight_sum) / p
+        gradients[m, 5] = g_sum
         g_sigma_f_bar = g_sigma_l_bar = g_noise_bar = 0.0
         share = 0.5 if latent_terms else 0.0
         for i in range(n):

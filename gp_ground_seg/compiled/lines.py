@@ -8,7 +8,6 @@ import numpy as np
 
 from gp_ground_seg.compiled.sections import numbers_of
 from gp_ground_seg.frame import (
-    N_CLASSES,
     BoolArray,
     Candidates,
     Faces,
@@ -41,12 +40,10 @@ def find_lines(
     lines = Lines(np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64))
     n_lines = _extract_lines(kept, tolerances, lines)
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
-    pseudo = PseudoInputs(
-        np.empty(n), np.empty(n, np.int64), np.empty_like(kept.offsets), np.empty(N_CLASSES)
-    )
+    pseudo = PseudoInputs(np.empty(n), np.empty(n), np.empty_like(kept.offsets))
     latent, limits = numbers_of(config.latent), numbers_of(config.length_scale)
     p = _select_pseudo_inputs(kept, lines, latent, limits, pseudo)
-    pseudo = pseudo._replace(r_bar=pseudo.r_bar[:p], surface_class=pseudo.surface_class[:p])
+    pseudo = pseudo._replace(r_bar=pseudo.r_bar[:p], log_extent=pseudo.log_extent[:p])
     continues_line = np.empty(n, np.bool_)
     _mark_candidates_on_lines(kept, lines, tolerances, numbers_of(config.growth), continues_line)
     return kept, lines, pseudo, continues_line
@@ -151,46 +148,28 @@ def _select_pseudo_inputs(
     pseudo: PseudoInputs,
 ) -> int:
     """Select pseudo-inputs; return their number, at most that of the candidates."""
-    r, start, slope = candidates.r, lines.start, lines.slope
-    n_lines = len(slope)
-    r_bar, surface_class, offsets = pseudo.r_bar, pseudo.surface_class, pseudo.offsets
-    count, total = np.zeros(N_CLASSES, dtype=np.int64), np.zeros(N_CLASSES)
+    r, start = candidates.r, lines.start
+    r_bar, offsets = pseudo.r_bar, pseudo.offsets
     log_shortest = math.log(limits.min)
     m = 0
     p = 0
-    for q in range(n_lines):
+    for q in range(len(start) - 1):
         first = start[q]
         while candidates.offsets[m] <= first:
             offsets[m] = p
             m += 1
         size = start[q + 1] - first
         extent = r[first + size - 1] - r[first]
-        steepness = abs(slope[q])
-        own = 0
-        if extent >= latent.medium_extent:
-            own += 1
-        if extent >= latent.long_extent:
-            own += 1
-        # Negated, so that a line of one point, whose slope is NaN, counts as steep.
-        if not steepness < latent.sloped_gradient:
-            own += 3
-        if not steepness < latent.steep_gradient:
-            own += 3
         log_extent = log_shortest
         if extent > limits.min:
             log_extent = math.log(min(extent, limits.max))
-        count[own] += 1
-        total[own] += log_extent
         number = max(int(np.rint(size / latent.candidates_per_pseudo_input)), 1)
         for rank in range(number):
             r_bar[p] = r[first + (size * (2 * rank + 1)) // (2 * number)]
-            surface_class[p] = own
+            pseudo.log_extent[p] = log_extent
             p += 1
     for k in range(m, len(offsets)):
         offsets[k] = p
-    empty = total.sum() / n_lines if n_lines > 0 else log_shortest
-    for k in range(N_CLASSES):
-        pseudo.first_guess[k] = total[k] / count[k] if count[k] > 0 else empty
     return p
 
 

@@ -97,11 +97,8 @@ def factorise(a: FloatArray, n: int) -> bool:
 
 
 @jit(fastmath=True)
-def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray) -> None:
-    """Inverse of ``U^T U``, both triangles, in `inverse`.
-
-    `whitened` is working space; its lower triangle becomes ``U^-T``.
-    """
+def invert_triangle(factor: FloatArray, n: int, whitened: FloatArray) -> None:
+    """Set the lower triangle of `whitened` to ``U^-T``."""
     for i in range(n):
         row = whitened[i]
         for j in range(i + 1):
@@ -115,6 +112,15 @@ def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray
         for j in range(i):
             row[j] *= scale
         row[i] = scale
+
+
+@jit(fastmath=True)
+def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray) -> None:
+    """Inverse of ``U^T U``, both triangles, in `inverse`.
+
+    `whitened` is working space; its lower triangle becomes ``U^-T``.
+    """
+    invert_triangle(factor, n, whitened)
     for i in range(n):
         for j in range(i + 1):
             inverse[i, j] = 0.0

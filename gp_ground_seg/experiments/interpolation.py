@@ -35,13 +35,13 @@ class InterpolatingBackend:
         return getattr(self._backend, name)
 
     def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
-    ) -> tuple[GroundSurface, FloatArray]:
+        self, frame: Frame, theta: FloatArray, config: Config
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
         """Interpolate `ground_points` of each segment; take the median of three segments.
 
         Standard deviation and end of the surface are those of the other backend.
         """
-        surface, scales = self._backend.estimate_surface(frame, theta, config, segment_step)
+        surface, *scales = self._backend.estimate_surface(frame, theta, config)
         own = np.empty_like(surface.mean)
         for segment, line in enumerate(own):
             part = slice(*frame.candidates.offsets[segment : segment + 2])
@@ -49,7 +49,7 @@ class InterpolatingBackend:
             line[:] = np.interp(frame.knots, *ground_points(r, z, frame.prior_mean))
         mean = np.median([np.roll(own, k, axis=0) for k in (-1, 0, 1)], axis=0)
         mean[np.isnan(surface.mean)] = np.nan
-        return surface._replace(mean=mean), scales
+        return surface._replace(mean=mean), scales[0], scales[1]
 
 
 def ground_points(r: FloatArray, z: FloatArray, start: float) -> tuple[list[float], list[float]]:

@@ -15,8 +15,8 @@ from gp_ground_seg.parameters.config import Config, GrowthConfig
 
 @single_threaded_blas()
 def estimate_surface(
-    frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
-) -> tuple[GroundSurface, FloatArray]:
+    frame: Frame, theta: FloatArray, config: Config
+) -> tuple[GroundSurface, FloatArray, FloatArray]:
     """Inliers that grow from low, near candidates, and the surface that rests on them.
 
     A candidate joins when the predictive standard deviation is at most
@@ -31,19 +31,19 @@ def estimate_surface(
     ----------
     frame : Frame
         Candidates, lines, pseudo-inputs, knots.
-    theta : (M, 5 + K) float64
+    theta : (M, 6) float64
         Hyper-parameters of each segment (see `gp_ground_seg.gp.learning`).
     config : Config
         Model of the length-scale, prior slope, gates, neighbours to fuse.
-    segment_step : int
-        Only every n-th segment has seeds.
 
     Returns
     -------
     surface : GroundSurface
         Inliers; height and standard deviation at the knots, fused with the neighbours'.
-    log_length_scale : (M, K) float64
+    knot_log_length_scale : (M, K) float64
         At the knots [log m].
+    log_length_scale : (C,) float64
+        At the candidates [log m]; may lie in a buffer that the next call reuses.
     """
     candidates, growth, slope_std = frame.candidates, config.growth, config.observation.slope_std
     if config.length_scale.model == 'latent':
@@ -52,10 +52,7 @@ def estimate_surface(
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
     seed = (candidates.r <= growth.seed_range) & (np.abs(z) <= growth.seed_height_tolerance)
-    seed &= candidates.segment % segment_step == 0
     sigma_f, sigma_n = np.exp(theta[:, :2]).T
-    # Learned on inliers the noise comes out small, which must not close the gate.
-    gate_noise = np.maximum(sigma_n, config.observation.sigma_n)
     length_scale, knot_l = np.exp(u), np.exp(knot_u)
 
     inlier = np.zeros(len(z), dtype=np.bool_)
@@ -70,7 +67,6 @@ def estimate_surface(
             covariance,
             own_z,
             noise,
-            gate_noise[segments, None] ** 2,
             own.mask,
             seed[own.place] & own.mask,
             frame.continues_line[own.place] & own.mask,
@@ -95,7 +91,7 @@ def estimate_surface(
         mean[kept] = np.where(is_wanted, mean[kept], np.nan)
         std[kept] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
     mean, std = fuse_neighbours(mean, std, frame.knots, config.surface.n_neighbours, slope_std)
-    return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u
+    return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u, u
 
 
 class _Batch(NamedTuple):
@@ -104,7 +100,6 @@ class _Batch(NamedTuple):
     covariance: FloatArray  # (S, n, n) prior
     z: FloatArray  # (S, n) about the prior mean
     noise: FloatArray  # (S, n) variance
-    gate_noise: FloatArray  # (S, 1) variance that residuals are standardised with
     mask: BoolArray  # (S, n)
     seed: BoolArray  # (S, n)
     continues_line: BoolArray  # (S, n)
@@ -135,7 +130,7 @@ def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
         z = batch.z[active]
         height, covariance = _condition(covariance, height, z, batch.noise[active], joining)
         variance = np.diagonal(covariance, axis1=1, axis2=2)
-        spread = np.sqrt(np.maximum(variance, 0.0) + batch.gate_noise[active])
+        spread = np.sqrt(np.maximum(variance, 0.0) + batch.noise[active])
         residual = (z - height) / spread
         joining = (
             ~chosen[active]

@@ -28,7 +28,7 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
     ----------
     frame : Frame
         Candidates, pseudo-inputs and knots.
-    theta : (M, 5 + K) float64
+    theta : (M, 6) float64
         Hyper-parameters of each segment (see `gp_ground_seg.gp.learning`).
 
     Returns
@@ -47,8 +47,7 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
         bar = Padded.of(segments, pseudo.offsets)
         own_r, r_bar = own.take(candidates.r), bar.take(pseudo.r_bar)
         sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[segments, 2:5]).T
-        classes = bar.take(pseudo.surface_class).astype(np.int64)
-        l_bar = np.where(bar.mask, theta[segments[:, None], 5 + classes], 0.0)
+        l_bar = np.where(bar.mask, bar.take(pseudo.log_extent) + theta[segments, 5:], 0.0)
         mean = l_bar.sum(axis=1, keepdims=True) / bar.mask.sum(axis=1, keepdims=True)
         covariance = squared_exponential(r_bar, r_bar, sigma_f_bar, sigma_l_bar)
         add_noise(covariance, sigma_n_bar[:, None] ** 2, bar.mask)

@@ -1,8 +1,8 @@
 """Stage 5: hyper-parameters by maximum a posteriori over the whole frame (paper, section III-E).
 
-Theta is a vector of logarithms: sigma_f, sigma_n, sigma_f_bar, sigma_l_bar, sigma_n_bar, then the
-length-scale of each surface class. A frame has one row of it per segment; learned over the whole
-frame, the rows are equal.
+Theta is a vector of logarithms: sigma_f, sigma_n, sigma_f_bar, sigma_l_bar, sigma_n_bar, then a
+factor on the length-scales that the lines suggest. A frame has one row of it per segment; learned
+over the whole frame, the rows are equal.
 """
 
 from __future__ import annotations
@@ -12,23 +12,34 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.optimize import minimize
 
-from gp_ground_seg.frame import BoolArray, FloatArray, Frame, GroundSurface, Inliers
-from gp_ground_seg.gp.latent import given_log_length_scales
-from gp_ground_seg.gp.likelihood import N_SCALARS
-from gp_ground_seg.gp.linalg import single_threaded_blas
+from gp_ground_seg.frame import (
+    BoolArray,
+    Candidates,
+    FloatArray,
+    Frame,
+    GroundSurface,
+    Inliers,
+    IntArray,
+    PseudoInputs,
+)
 from gp_ground_seg.parameters.config import Config
 
-SCALAR_NAMES = ('sigma_f', 'sigma_n', 'sigma_f_bar', 'sigma_l_bar', 'sigma_n_bar')
+THETA_NAMES = (
+    'sigma_f', 'sigma_n', 'sigma_f_bar', 'sigma_l_bar', 'sigma_n_bar', 'length_scale_factor'
+)  # fmt: skip
 Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 
+WIDEST = 5.0
+"""Distance from the given value to the bounds, in standard deviations of the prior."""
 _AT_BOUND = 1e-6
-
-
-def theta_names(size: int) -> list[str]:
-    """Names of the entries of a theta of the given size."""
-    return [*SCALAR_NAMES, *(f'length_scale_bar_{k}' for k in range(size - N_SCALARS))]
+_LEVEL = 1e-3
+"""Gradient for each datum below which the objective counts as level."""
+_NO_GAIN = 1e-7
+"""Gain for each datum below which a step was the last."""
+_LONGEST_STEP = 1.0
+_SHRINK = 0.3
+"""Factor on a step that made things worse."""
 
 
 class ThetaSpace(NamedTuple):
@@ -36,11 +47,11 @@ class ThetaSpace(NamedTuple):
 
     Attributes
     ----------
-    centre : (T,) float64
-        Values given by the configuration and the first guess; centres of the priors.
-    lower, upper : (T,) float64
+    centre : (6,) float64
+        Values given by the configuration; centres of the priors.
+    lower, upper : (6,) float64
         Bounds.
-    free : (T,) bool
+    free : (6,) bool
         Entries that are learned.
     prior_std : float
         Standard deviation of the priors.
@@ -53,50 +64,57 @@ class ThetaSpace(NamedTuple):
     prior_std: float
 
 
-def theta_centre(config: Config, first_guess: FloatArray) -> FloatArray:
-    """Values given by the configuration and the first guess, (5 + K,), in log space.
-
-    Parameters
-    ----------
-    config : Config
-        Values, and bounds of the length-scale.
-    first_guess : (K,) float64
-        First guess of the surface classes' log length-scales [log m].
-    """
-    observation, latent, limits = config.observation, config.latent, config.length_scale
+def given_theta(config: Config) -> FloatArray:
+    """Values given by the configuration, (6,), in log space."""
+    observation, latent = config.observation, config.latent
     values = (
         observation.sigma_f,
         observation.sigma_n,
         latent.sigma_f_bar,
         latent.sigma_l_bar,
         latent.sigma_n_bar,
+        1.0,
     )
-    guessed = np.clip(first_guess, math.log(limits.min), math.log(limits.max))
-    return np.array([*map(math.log, values), *guessed])
+    return np.log(values)
 
 
-def theta_space(config: Config, first_guess: FloatArray) -> ThetaSpace:
-    """Space of theta for a frame; parameters are those of `theta_centre`."""
-    learning = config.learning
-    centre = theta_centre(config, first_guess)
-    width = np.log(learning.bound_factor)
-    lower, upper = centre - width, centre + width
-    lower[N_SCALARS:] = np.log(config.length_scale.min)
-    upper[N_SCALARS:] = np.log(config.length_scale.max)
+def theta_space(config: Config) -> ThetaSpace:
+    """Bounds, priors and free entries by the configuration."""
+    learning, centre = config.learning, given_theta(config)
+    width = WIDEST * learning.prior_std
     free = np.ones(len(centre), dtype=np.bool_)
     if config.length_scale.model != 'latent' or learning.fixed == 'length_scales':
         free[2:] = False
     elif learning.fixed == 'latent':
-        free[2:N_SCALARS] = False
+        free[2:5] = False
     elif learning.fixed == 'sigma_f_bar':
         free[2] = False
-    return ThetaSpace(centre, lower, upper, free, learning.prior_std)
+    return ThetaSpace(centre, centre - width, centre + width, free, learning.prior_std)
 
 
-def given_theta(frame: Frame, config: Config) -> FloatArray:
-    """Theta before anything is learned, the same in every segment, (M, 5 + K)."""
-    centre = theta_centre(config, frame.pseudo.first_guess)
-    return np.tile(centre, (len(frame.candidates.offsets) - 1, 1))
+def first_theta(frame: Frame, config: Config) -> FloatArray:
+    """Where learning begins, (6,), in log space: what the lines show, else the given values.
+
+    sigma_f is the root mean square height, over the prior mean, of the near candidates on lines
+    that may be ground, heights cut at ``growth.seed_height_tolerance``. sigma_n follows from the
+    differences between candidates and the line through the two beside them.
+    """
+    candidates, lines, growth = frame.candidates, frame.lines, config.growth
+    theta, r, line = given_theta(config), candidates.r, lines.line
+    is_ground = np.abs(lines.slope) <= growth.max_line_slope
+    is_ground &= np.diff(lines.start) >= growth.min_line_size
+    height = candidates.z[is_ground[line] & (r <= growth.seed_range)] - frame.prior_mean
+    height = np.minimum(np.abs(height), growth.seed_height_tolerance)
+    inner = np.flatnonzero(line[2:] == line[:-2]) + 1
+    share = (r[inner] - r[inner - 1]) / (r[inner + 1] - r[inner - 1])
+    z = candidates.z
+    missed = z[inner] - (1.0 - share) * z[inner - 1] - share * z[inner + 1]
+    missed /= np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
+    for i, values in enumerate((height, missed)):
+        mean_square = float(values @ values) / max(len(values), 1)
+        if mean_square > 0.0:
+            theta[i] = 0.5 * math.log(mean_square)
+    return theta
 
 
 class Learned(NamedTuple):
@@ -104,7 +122,7 @@ class Learned(NamedTuple):
 
     Attributes
     ----------
-    theta : (T,) float64
+    theta : (6,) float64
         Best hyper-parameters evaluated, log space.
     objective : float
         Objective there, with the priors if any.
@@ -112,7 +130,7 @@ class Learned(NamedTuple):
         Evaluations of objective and gradient.
     status : str
         ``converged``, ``budget`` or ``failed`` (no finite objective found).
-    at_bound : (T,) bool
+    at_bound : (6,) bool
         Free entries that ended at a bound.
     """
 
@@ -127,9 +145,9 @@ class Model(Protocol):
     """The part of a backend that learning needs, see `gp_ground_seg.backend.Backend`."""
 
     def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config, segment_step: int = 1
-    ) -> tuple[GroundSurface, FloatArray]:
-        """Inliers under `theta`."""
+        self, frame: Frame, theta: FloatArray, config: Config
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
+        """Inliers and log length-scales under `theta`."""
 
     def log_likelihood(
         self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
@@ -137,22 +155,21 @@ class Model(Protocol):
         """Log marginal likelihood and its gradient."""
 
 
-@single_threaded_blas()
 def learn_frame(
     frame: Frame,
-    start: FloatArray,
+    before: FloatArray | None,
     config: Config,
     model: Model,
     out_of_time: Callable[[], bool],
 ) -> tuple[FloatArray, list[Learned]]:
-    """Learn theta on the inliers that grow under it.
+    """Learn theta on the inliers that grow under it, then again on those under what was learned.
 
     Parameters
     ----------
     frame : Frame
         Candidates and pseudo-inputs.
-    start : (M, 5 + K) float64
-        Where to begin.
+    before : (M, 6) float64, optional
+        Where to begin, if not at `first_theta`.
     config : Config
         Scope, objective, budget, priors.
     model : Model
@@ -162,58 +179,112 @@ def learn_frame(
 
     Returns
     -------
-    theta : (M, 5 + K) float64
+    theta : (M, 6) float64
         Hyper-parameters of each segment.
     learned : list of Learned
         One outcome for the frame, or one for each segment.
     """
-    learning = config.learning
-    by_frame = learning.scope == 'frame'
-    step = learning.segment_step if by_frame else 1
-    no_knots = frame.knots[:0]
-    surface, _ = model.estimate_surface(frame._replace(knots=no_knots), start, config, step)
-    inliers = take_inliers(frame._replace(knots=no_knots), surface.inlier, config)
-    is_map = learning.objective == 'map'
-    space = theta_space(config, frame.pseudo.first_guess)
+    learning, n_segments = config.learning, len(frame.candidates.offsets) - 1
+    by_frame, space = learning.scope == 'frame', theta_space(config)
+    own = every_segment(frame, learning.segment_step if by_frame else 1)
+    n_own = len(own.candidates.offsets) - 1
+    theta = in_rows(first_theta(frame, config), n_own) if before is None else before[:n_own]
+    has_latent = bool(space.free[2:].any())
+    is_map, slope_std = learning.objective == 'map', config.observation.slope_std
 
-    def learn(begin: FloatArray, own: Inliers) -> Learned:
+    def learn(begin: FloatArray, data: Inliers, budget: int) -> Learned:
         def objective(theta: FloatArray) -> tuple[float, FloatArray]:
-            return model.log_likelihood(theta, own, config.observation.slope_std, not is_map)
+            return model.log_likelihood(theta, data, slope_std, not is_map)
 
         return maximise(
             objective,
             space,
             begin,
-            len(own.r),
+            len(data.r),
             use_priors=is_map,
-            max_evaluations=learning.max_evaluations,
+            max_evaluations=budget,
             out_of_time=out_of_time,
         )
 
-    if by_frame:
-        learned = [learn(start[0], inliers)]
-        return np.tile(learned[0].theta, (len(start), 1)), learned
-    learned = [learn(begin, _one_segment(inliers, m)) for m, begin in enumerate(start)]
-    return np.array([one.theta for one in learned]), learned
+    learned: list[Learned] = []
+    first = learning.max_evaluations // 2
+    for budget in (first, learning.max_evaluations - first):
+        if budget == 0 or (learned and out_of_time()):
+            continue
+        surface, _, u = model.estimate_surface(own, theta, config)
+        inliers = take_inliers(own, surface.inlier, u, has_latent)
+        parts = [inliers] if by_frame else [_one_segment(inliers, m) for m in range(n_own)]
+        earlier = [one.n_evaluations for one in learned] or [0] * len(parts)
+        learned = [learn(*one, budget) for one in zip(theta, parts, strict=False)]
+        theta = np.array([one.theta for one in learned])
+        if by_frame:
+            theta = in_rows(theta[0], n_own)
+        learned = [
+            one._replace(n_evaluations=one.n_evaluations + n)
+            for one, n in zip(learned, earlier, strict=True)
+        ]
+    return in_rows(theta[0], n_segments) if by_frame else theta, learned
 
 
-def take_inliers(frame: Frame, inlier: BoolArray, config: Config) -> Inliers:
-    """Candidates of the mask `inlier` (C,), with the pseudo-inputs of their segments."""
+def in_rows(theta: FloatArray, n: int) -> FloatArray:
+    """Return the same theta for each of `n` segments, (n, 6)."""
+    return np.repeat(theta[None], n, axis=0)
+
+
+def every_segment(frame: Frame, step: int) -> Frame:
+    """Every `step`-th segment of a frame, by itself and without knots."""
+    no_knots = frame._replace(knots=frame.knots[:0])
+    if step == 1:
+        return no_knots
+    candidates, pseudo = frame.candidates, frame.pseudo
+
+    def thin(offsets: IntArray) -> tuple[IntArray, IntArray]:
+        """Places of the values that are kept, and their offsets."""
+        first, stop = offsets[:-1:step], offsets[1::step]
+        places = [np.arange(*ends) for ends in zip(first.tolist(), stop.tolist(), strict=False)]
+        return np.concatenate(places), np.concatenate([[0], np.cumsum(stop - first)])
+
+    kept, offsets = thin(candidates.offsets)
+    kept_bar, bar_offsets = thin(pseudo.offsets)
+    return no_knots._replace(
+        candidates=Candidates(
+            candidates.r[kept],
+            candidates.z[kept],
+            candidates.bin[kept],
+            candidates.density[kept],
+            offsets,
+            candidates.tile[kept],
+        ),
+        lines=frame.lines._replace(line=frame.lines.line[kept]),
+        pseudo=PseudoInputs(pseudo.r_bar[kept_bar], pseudo.log_extent[kept_bar], bar_offsets),
+        continues_line=frame.continues_line[kept],
+    )
+
+
+def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: bool) -> Inliers:
+    """Inliers of a frame.
+
+    Parameters
+    ----------
+    frame : Frame
+        Candidates and pseudo-inputs.
+    inlier : (C,) bool
+        Which candidates are inliers.
+    u : (C,) float64
+        Log length-scales at the candidates [log m].
+    has_latent : bool
+        Whether the pseudo-inputs go with them, and give the length-scales instead of `u`.
+    """
     candidates, pseudo = frame.candidates, frame.pseudo
     taken = np.concatenate([[0], np.cumsum(inlier)])
-    if config.length_scale.model == 'latent':
-        u, bar_offsets = np.zeros(int(taken[-1])), pseudo.offsets
-    else:
-        u = given_log_length_scales(frame, config.length_scale)[0][inlier]
-        bar_offsets = np.zeros_like(candidates.offsets)
     return Inliers(
         offsets=taken[candidates.offsets],
         r=candidates.r[inlier],
         z=candidates.z[inlier] - frame.prior_mean,
-        log_length_scale=u,
-        bar_offsets=bar_offsets,
+        log_length_scale=u[inlier],
+        bar_offsets=pseudo.offsets if has_latent else np.zeros_like(candidates.offsets),
         r_bar=pseudo.r_bar,
-        surface_class=pseudo.surface_class,
+        log_extent=pseudo.log_extent,
     )
 
 
@@ -227,12 +298,8 @@ def _one_segment(inliers: Inliers, m: int) -> Inliers:
         inliers.log_length_scale[own],
         np.array([0, bar.stop - bar.start]),
         inliers.r_bar[bar],
-        inliers.surface_class[bar],
+        inliers.log_extent[bar],
     )
-
-
-class _BudgetSpentError(Exception):
-    pass
 
 
 def maximise(
@@ -247,9 +314,10 @@ def maximise(
 ) -> Learned:
     """Maximise objective plus log priors from `start`, within bounds and budget.
 
-    The variables are scaled by the priors' width and the objective by the number
-    of data, so that the first step is of a sensible size (the paper's scaled
-    gradient-based optimisation).
+    Quasi-Newton steps (BFGS). Divided by the number of data, the curvature in the logarithm of
+    a standard deviation is about one: the first step is of a sensible size (the paper's scaled
+    gradient-based optimisation). SciPy's L-BFGS-B takes longer between two evaluations than
+    most evaluations take.
 
     Parameters
     ----------
@@ -268,48 +336,55 @@ def maximise(
     out_of_time : callable
         Called before each evaluation after the first; True ends the learning.
     """
-    free, scale = space.free, space.prior_std
-    begin = np.clip(start, space.lower, space.upper)
-    best_theta, best_value, n_evaluations = begin, -np.inf, 0
+    free, theta = space.free, np.clip(start, space.lower, space.upper)
+    lower, upper = space.lower[free], space.upper[free]
+    if not free.any() or n_data == 0 or max_evaluations == 0:
+        return Learned(theta, -math.inf, 0, 'converged', np.zeros_like(free))
 
-    def negative(x: FloatArray) -> tuple[float, FloatArray]:
-        nonlocal best_theta, best_value, n_evaluations
-        if n_evaluations >= max_evaluations or (n_evaluations > 0 and out_of_time()):
-            raise _BudgetSpentError
-        theta = begin.copy()
-        theta[free] = x * scale
-        value, gradient = objective(theta)
-        n_evaluations += 1
+    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
+        """Objective and gradient in the free entries, for each datum."""
+        trial = theta.copy()
+        trial[free] = x
+        value, slope = objective(trial)
+        slope = slope[free]
         if use_priors:
-            deviation = (theta - space.centre)[free] / scale
+            deviation = (x - space.centre[free]) / space.prior_std
             value -= 0.5 * float(deviation @ deviation)
-            gradient = gradient.copy()
-            gradient[free] -= deviation / scale
-        if value > best_value:
-            best_theta, best_value = theta, value
-        if not np.isfinite(value):
-            # Large and level, so that the line search turns back.
-            return 1e10, np.zeros(len(x))
-        return -value / n_data, -gradient[free] * scale / n_data
+            slope = slope - deviation / space.prior_std
+        return value / n_data, slope / n_data
 
-    status = 'converged'
-    if free.any() and n_data > 0:
-        try:
-            result = minimize(
-                negative,
-                begin[free] / scale,
-                jac=True,
-                method='L-BFGS-B',
-                bounds=list(
-                    zip(space.lower[free] / scale, space.upper[free] / scale, strict=True)
-                ),
-                options={'ftol': 1e-6, 'gtol': 1e-5},
-            )
-            status = 'converged' if result.success else 'budget'
-        except _BudgetSpentError:
-            status = 'budget'
-        if not np.isfinite(best_value):
-            status = 'failed'
-    near_lower = best_theta <= space.lower + _AT_BOUND
-    near_upper = best_theta >= space.upper - _AT_BOUND
-    return Learned(best_theta, best_value, n_evaluations, status, free & (near_lower | near_upper))
+    x = theta[free]
+    value, gradient = evaluate(x)
+    n_evaluations, status, reach = 1, 'budget' if math.isfinite(value) else 'failed', 1.0
+    unit = np.eye(len(x))
+    inverse = unit
+    while status == 'budget':
+        held = ((x <= lower) & (gradient < 0.0)) | ((x >= upper) & (gradient > 0.0))
+        slope = np.where(held, 0.0, gradient)
+        step = np.where(held, 0.0, inverse @ slope)
+        longest = float(np.abs(step).max())
+        if float(np.abs(slope).max()) < _LEVEL:
+            status = 'converged'
+            break
+        if n_evaluations >= max_evaluations or out_of_time():
+            break
+        trial = x + step * (reach * min(1.0, _LONGEST_STEP / longest))
+        trial = np.minimum(np.maximum(trial, lower), upper)
+        trial_value, trial_gradient = evaluate(trial)
+        n_evaluations += 1
+        if not trial_value > value:
+            reach *= _SHRINK
+            # The step from here on goes along the slope if it does not get any shorter.
+            if reach < _SHRINK**3:
+                inverse, reach = _SHRINK**3 * unit, 1.0
+            continue
+        gain, moved, bent = trial_value - value, trial - x, gradient - trial_gradient
+        x, value, gradient, reach = trial, trial_value, trial_gradient, 1.0
+        if (along := float(moved @ bent)) > 0.0:
+            mixed = unit - moved[:, None] * bent / along
+            inverse = mixed @ inverse @ mixed.T + moved[:, None] * moved / along
+        if gain < _NO_GAIN:
+            status = 'converged'
+    theta[free] = x
+    near_bound = (theta <= space.lower + _AT_BOUND) | (theta >= space.upper - _AT_BOUND)
+    return Learned(theta, value * n_data, n_evaluations, status, free & near_bound)

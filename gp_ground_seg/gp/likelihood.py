@@ -11,8 +11,6 @@ from gp_ground_seg.frame import FloatArray, Inliers, IntArray
 from gp_ground_seg.gp.kernels import squared_exponential
 from gp_ground_seg.gp.linalg import Padded, add_noise, batches, single_threaded_blas
 
-N_SCALARS = 5
-"""Entries of theta before the log length-scales of the surface classes."""
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -24,9 +22,9 @@ def log_likelihood(
 
     Parameters
     ----------
-    theta : (5 + K,) float64
+    theta : (6,) float64
         Logarithms of sigma_f, sigma_n [m], sigma_f_bar [log m], sigma_l_bar [m],
-        sigma_n_bar [log m], then the log length-scale of each of K surface classes.
+        sigma_n_bar [log m], and the factor on the length-scales of the lines.
     inliers : Inliers
         Inliers and pseudo-inputs.
     slope_std : float
@@ -41,7 +39,7 @@ def log_likelihood(
     -------
     value : float
         Log marginal likelihood; ``-inf`` where a covariance is not positive definite.
-    gradient : (5 + K,) float64
+    gradient : (6,) float64
         Its gradient in `theta`.
     """
     value, gradient = 0.0, np.zeros(len(theta))
@@ -121,7 +119,6 @@ class _Latent(NamedTuple):
     sigma_l_bar: float
     sigma_n_bar: float
     bar: Padded
-    surface_class: IntArray  # (P,)
     k_bar: FloatArray  # (S, p, p) without noise
     k_star: FloatArray  # (S, n, p)
     distance2: FloatArray  # (S, p, p)
@@ -132,9 +129,9 @@ class _Latent(NamedTuple):
 
     @classmethod
     def of(cls, theta: FloatArray, inliers: Inliers, bar: Padded, r: FloatArray) -> _Latent:
-        sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[2:N_SCALARS])
+        sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[2:5])
         r_bar = bar.take(inliers.r_bar)
-        l_bar = bar.take(theta[N_SCALARS + inliers.surface_class])
+        l_bar = bar.take(inliers.log_extent)
         mean = l_bar.sum(axis=1, keepdims=True) / np.maximum(bar.mask.sum(axis=1), 1)[:, None]
         scales = np.full(len(r), sigma_f_bar), np.full(len(r), sigma_l_bar)
         k_bar = squared_exponential(r_bar, r_bar, *scales)
@@ -145,11 +142,10 @@ class _Latent(NamedTuple):
         factor = np.linalg.cholesky(b).astype(np.float64, copy=False)
         beta: FloatArray = (inverse @ np.where(bar.mask, l_bar - mean, 0.0)[:, :, None])[:, :, 0]
         return cls(
-            u=mean + (k_star @ beta[:, :, None])[:, :, 0],
+            u=mean + theta[5] + (k_star @ beta[:, :, None])[:, :, 0],
             sigma_l_bar=sigma_l_bar,
             sigma_n_bar=sigma_n_bar,
             bar=bar,
-            surface_class=inliers.surface_class,
             k_bar=k_bar,
             k_star=k_star,
             distance2=(r_bar[:, :, None] - r_bar[:, None, :]) ** 2,
@@ -163,11 +159,7 @@ class _Latent(NamedTuple):
         """Propagate the derivatives in u to theta; return the latent terms of the value."""
         bar, beta = self.bar, self.beta
         weight = (self.inverse @ (g_u[:, None, :] @ self.k_star).swapaxes(1, 2))[:, :, 0]
-        count = np.maximum(bar.mask.sum(axis=1), 1)
-        shared = (g_u.sum(axis=1) - weight.sum(axis=1)) / count
-        g_l_bar = (weight + shared[:, None])[bar.mask]
-        classes = self.surface_class[bar.place[bar.mask]]
-        gradient[N_SCALARS:] += np.bincount(classes, g_l_bar, len(gradient) - N_SCALARS)
+        gradient[5] += g_u.sum()
 
         # Adjoints of k_star and of B: every derivative is contracted with them.
         star = g_u[:, :, None] * self.k_star * beta[:, None, :]

@@ -89,7 +89,7 @@ def _controller() -> Any:
 def single_threaded_blas() -> Iterator[None]:
     """Keep OpenBLAS from waking its threads within the block.
 
-    SciPy's L-BFGS-B wakes them for systems of a dozen unknowns. They find nothing
+    NumPy wakes them for systems of a dozen unknowns. They find nothing
     to do, yet spin for milliseconds on the cores that the segments need.
     """
     if ThreadpoolController is None:

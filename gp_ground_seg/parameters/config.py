@@ -131,14 +131,6 @@ class LatentConfig:
         'standard deviation of the noise of the log length-scale', symbol='sigma_n_bar')
     candidates_per_pseudo_input: float = advanced(3.0, (1.0, 100.0),
         'ground candidates of a line for each pseudo-input: more = faster, less precise')
-    sloped_gradient: float = advanced(0.1, (0.001, 10.0),
-        'slope from which a line counts as sloped')
-    steep_gradient: float = advanced(0.4, (0.001, 100.0),
-        'slope from which a line counts as steep')
-    medium_extent: float = advanced(1.5, (0.01, 200.0),
-        'extent from which a line counts as medium', 'm')
-    long_extent: float = advanced(5.0, (0.01, 200.0),
-        'extent from which a line counts as long', 'm')
 
 
 @dataclass(frozen=True)
@@ -214,23 +206,21 @@ class LearningConfig:
     scope: str = advanced('frame', ('frame', 'segment'),
         'frame = one set of hyper-parameters for the whole frame; segment = one for each segment '
         '(slow, for comparison)')
-    segment_step: int = advanced(3, (1, 60),
+    segment_step: int = advanced(30, (1, 60),
         'for the scope frame: one of how many segments is learned from; neighbouring segments see '
         'much the same ground')
     objective: str = advanced('map', ('map', 'paper'),
         'map = likelihood of the heights and priors; paper = as printed, which has no upper bound')
     warm_start: bool = advanced(False, (),
-        'start from the frame before: fewer evaluations, but the labels depend on the past')
-    max_evaluations: int = advanced(4, (1, 1000),
+        'start from the frame before instead of the lines; the labels then depend on the past')
+    max_evaluations: int = advanced(5, (1, 1000),
         'evaluations of the objective per frame; the best so far is used')
     max_time: float = advanced(0.0, (0.0, 60.0),
         'time for the learning of a frame, after which the best so far is used; 0 = no limit; the '
         'labels then depend on the speed of the machine', 's')
     prior_std: float = advanced(1.0, (0.01, 10.0),
         'standard deviation of the log-normal priors about the values given here')
-    bound_factor: float = advanced(20.0, (1.01, 1e6),
-        'largest factor by which a hyper-parameter may leave the value given here')
-    fixed: str = advanced('none', ('none', 'sigma_f_bar', 'latent', 'length_scales'),
+    fixed: str = advanced('length_scales', ('none', 'sigma_f_bar', 'latent', 'length_scales'),
         'hyper-parameters that are not learned')
 
 
@@ -271,8 +261,6 @@ class DiagnosticsConfig:
 _ASCENDING = (
     ('grid.r_min', 'grid.r_max'),
     ('length_scale.min', 'length_scale.max'),
-    ('latent.sloped_gradient', 'latent.steep_gradient'),
-    ('latent.medium_extent', 'latent.long_extent'),
     ('label.obstacle_min_height', 'label.obstacle_max_height'),
 )
 """Pairs of which the first must be below the second."""

@@ -66,6 +66,8 @@ _PRESETS = (
             'label.rule': ('tolerance', 'one zeta_g for all (Algorithm 2)'),
             'learning.objective': ('paper', 'section III-E as printed'),
             'learning.scope': ('frame', 'one theta for the whole frame, section III-E'),
+            'learning.fixed': ('none', 'all hyper-parameters are learned, section III-E'),
+            'learning.max_evaluations': (20, 'for six hyper-parameters, two of them unbounded'),
             'learning.segment_step': (1, 'theta is learned from every segment, section III-E'),
         },
     ),

@@ -7,16 +7,13 @@ import math
 import numpy as np
 
 from gp_ground_seg.frame import (
-    N_CLASSES,
     BoolArray,
     Candidates,
     Faces,
-    FloatArray,
-    IntArray,
     Lines,
     PseudoInputs,
 )
-from gp_ground_seg.parameters.config import Config, LatentConfig, LinesConfig
+from gp_ground_seg.parameters.config import Config, LinesConfig
 
 MIN_BREAK_CANDIDATES = 3
 """Candidates that a line after a slope break needs: through two there is always one."""
@@ -161,30 +158,6 @@ def differs_in_direction(slope: float, new_slope: float, tolerance: float) -> bo
     return abs(math.atan(new_slope) - math.atan(slope)) > tolerance
 
 
-def classify_lines(slope: FloatArray, extent: FloatArray, latent: LatentConfig) -> IntArray:
-    """Surface class of each line, (Q,) int64.
-
-    The paper has every segment share the log length-scales of the frame, yet
-    segments differ in their lines: lines of similar slope and extent are taken for
-    the same kind of surface. A line of one point (slope NaN) counts as steep.
-
-    Parameters
-    ----------
-    slope : (Q,) float64
-        Slope dz/dr of each line.
-    extent : (Q,) float64
-        Horizontal extent of each line [m].
-    latent : LatentConfig
-        Limits between the classes.
-    """
-    steepness = np.where(np.isnan(slope), np.inf, np.abs(slope))
-    result: IntArray = (extent >= latent.medium_extent).astype(np.int64)
-    result += extent >= latent.long_extent
-    result += 3 * (steepness >= latent.sloped_gradient)
-    result += 3 * (steepness >= latent.steep_gradient)
-    return result
-
-
 def select_pseudo_inputs(candidates: Candidates, lines: Lines, config: Config) -> PseudoInputs:
     """Spread pseudo-inputs evenly over the candidates of each line (paper, section III-C).
 
@@ -195,27 +168,21 @@ def select_pseudo_inputs(candidates: Candidates, lines: Lines, config: Config) -
     lines : Lines
         Lines through them; every line gets at least one pseudo-input.
     config : Config
-        Number of pseudo-inputs, limits of the classes, bounds of the length-scale.
+        Number of pseudo-inputs, bounds of the length-scale.
     """
-    latent, limits = config.latent, config.length_scale
-    size = np.diff(lines.start)
-    wanted = np.rint(size / latent.candidates_per_pseudo_input).astype(np.int64)
+    limits, size = config.length_scale, np.diff(lines.start)
+    wanted = np.rint(size / config.latent.candidates_per_pseudo_input).astype(np.int64)
     number = np.maximum(wanted, 1)
     extent = lines.extent(candidates)
-    line_class = classify_lines(lines.slope, extent, latent)
     log_extent = np.log(np.clip(extent, limits.min, limits.max))
-    count = np.bincount(line_class, minlength=N_CLASSES)
-    total = np.bincount(line_class, weights=log_extent, minlength=N_CLASSES)
-    empty = log_extent.mean() if len(log_extent) else np.log(limits.min)
     line = np.repeat(np.arange(len(number)), number)
     rank = np.arange(len(line)) - np.repeat(np.cumsum(number) - number, number)
     # The middle of each of `number` equal shares of the line's candidates.
     position = lines.start[line] + (size[line] * (2 * rank + 1)) // (2 * number[line])
     return PseudoInputs(
         r_bar=candidates.r[position],
-        surface_class=line_class[line],
+        log_extent=log_extent[line],
         offsets=np.searchsorted(position, candidates.offsets),
-        first_guess=np.where(count > 0, total / np.maximum(count, 1), empty),
     )
 
 

@@ -185,9 +185,8 @@ class SegmentView:
         first, last = result.pseudo.offsets[self._segment : self._segment + 2]
         if with_pseudo_inputs and last > first:
             r_bar = result.pseudo.r_bar[first:last]
-            n_scalars = list(result.fit.theta).index('length_scale_bar_0')
-            columns = n_scalars + result.pseudo.surface_class[first:last]
-            l_bar = np.exp(result.theta[self._segment, columns])
+            factor = np.exp(result.theta[self._segment, -1])
+            l_bar = factor * np.exp(result.pseudo.log_extent[first:last])
             look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0}
             axes.plot(r_bar, l_bar, 's', label=f'pseudo-inputs ({last - first})', **look)
             shown = np.concatenate([shown, l_bar[r_bar <= reach]])
