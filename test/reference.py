@@ -79,7 +79,8 @@ def find_faces(scan, config):
         # Each eigenvector is a normal with the product of the other two eigenvalues.
         weight = np.array([value[1] * value[2], value[0] * value[2], value[0] * value[1]])
         weight = np.maximum(weight, 0.0)
-        square = (weight * vector[2] ** 2).sum() / weight.sum() if weight.sum() > 0.0 else 1.0
+        is_wide = weight.sum() > 1e-9 * value.sum() ** 2
+        square = (weight * vector[2] ** 2).sum() / weight.sum() if is_wide else 1.0
         result.is_face[t] = math.sqrt(square) < faces.max_normal_z
         result.has_occluded_base[t] = result.is_face[t] and _is_occluded(own, above, config)
     return result

@@ -262,7 +262,8 @@ def test_columns_follow_their_definitions(measured, frame, method, model):
     """Everything anew from a segmentation of its own, but for the times."""
     points, semantic = frame
     z = points[:, 2].astype(float)
-    result = GroundSegmenter(Config().replace(**{'length_scale.model': model})).segment(points)
+    changes = {'length_scale.model': model, 'learning.fixed': 'none'}
+    result = GroundSegmenter(Config().replace(**changes)).segment(points)
     candidates, surface = result.candidates, result.surface
     for row, segment in zip(measured, SEGMENTS, strict=True):
         own = slice(*candidates.offsets[segment : segment + 2])

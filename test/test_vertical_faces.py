@@ -35,6 +35,7 @@ CLOUDS = {
     'three returns': (POST[:3], False),
     'beyond the grid': (np.add(POST, [50.0, 0.0, 0.0]), False),
     'a vertical line': (POST * [0.0, 0.0, 1.0], False),
+    'a leaning line': (np.outer(np.arange(9), [0.01, 0.02, 0.1]) + 0.1, False),
     'not finite': (POST * np.nan, False),
 }
 

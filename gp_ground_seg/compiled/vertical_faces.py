@@ -16,7 +16,12 @@ from gp_ground_seg.compiled.threads import Part, points_of
 from gp_ground_seg.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Tiles
 from gp_ground_seg.jit import jit
 from gp_ground_seg.parameters.config import FacesConfig, LabelConfig
-from gp_ground_seg.pipeline.vertical_faces import FOOT_SHARE, MIN_RETURNS, UNITS_PER_METRE
+from gp_ground_seg.pipeline.vertical_faces import (
+    FLATNESS,
+    FOOT_SHARE,
+    MIN_RETURNS,
+    UNITS_PER_METRE,
+)
 
 # Each tall tile has two rows of sums, for the lowest returns and for those above: number, x, y, z,
 # their squares, x y, x z, y z; the greatest height. The first row also holds `_TO_UNITS` less
@@ -174,8 +179,9 @@ def _is_vertical(low: FloatArray, high: FloatArray, max_normal_z: float) -> bool
     yz = low[9] + high[9] - y * z / n
     vertical = max(xx * yy - xy * xy, 0.0)
     trace = vertical + max(yy * zz - yz * yz, 0.0) + max(xx * zz - xz * xz, 0.0)
-    normal_z = math.sqrt(vertical / trace) if trace > 0.0 else 1.0
-    return normal_z < max_normal_z
+    if trace <= FLATNESS * (xx + yy + zz) ** 2:
+        return False
+    return math.sqrt(vertical / trace) < max_normal_z
 
 
 @jit()

@@ -17,6 +17,9 @@ from gp_ground_seg.parameters.config import Config
 
 MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
+FLATNESS = 1e-9
+"""Scatter across a line, in parts of that along it, which is none: as wide as coordinates are
+rounded to. What is left of it then is rounding, and says nothing of an orientation."""
 FOOT_SHARE = 0.2
 """Part of the least height of a face whose returns are its foot, the lowest ones."""
 UNITS_PER_METRE = 2.0**16
@@ -87,13 +90,14 @@ def normal_z(scatter: FloatArray) -> FloatArray:
     Returns
     -------
     (T,) float64
-        0 for vertical planes and poles, 1 for level planes; 1 where there is no scatter.
+        0 for vertical planes and poles, 1 for level planes; 1 where there is no scatter, or
+        only along a line.
     """
     xx, yy, zz = scatter[:, 0, 0], scatter[:, 1, 1], scatter[:, 2, 2]
     xy, xz, yz = scatter[:, 0, 1], scatter[:, 0, 2], scatter[:, 1, 2]
     vertical = np.maximum(xx * yy - xy * xy, 0.0)
     trace = vertical + np.maximum(yy * zz - yz * yz, 0.0) + np.maximum(xx * zz - xz * xz, 0.0)
-    known = trace > 0.0
+    known = trace > FLATNESS * (xx + yy + zz) ** 2
     result = np.ones(len(scatter))
     result[known] = np.sqrt(vertical[known] / trace[known])
     return result
