@@ -174,8 +174,7 @@ def test_what_is_learned_does_not_hang_on_the_given_values(factor):
     wrong = given.replace(**{name: given[name] * factor for name in names})
     scan = hilly_scan(4000)
     ours, theirs = (
-        GroundSegmenter(config, backend=MODEL).segment(scan).fit.theta
-        for config in (given, wrong)
+        GroundSegmenter(config, backend=MODEL).segment(scan).fit.theta for config in (given, wrong)
     )
     for name in ('sigma_f', 'sigma_n'):
         assert theirs[name] == pytest.approx(ours[name], rel=0.2)

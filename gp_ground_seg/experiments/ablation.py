@@ -28,7 +28,7 @@ _FIXED: Changes = {'learning.mode': 'fixed'}
 _WHOLE_FRAME: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'frame'}
 _CONSTANT: Changes = {'length_scale.model': 'constant'}
 _GRADIENT: Changes = {'length_scale.model': 'line_gradient'}
-_LATENT: Changes = {'length_scale.model': 'latent'}
+_LATENT: Changes = {'length_scale.model': 'latent', 'learning.fixed': 'none'}
 
 MODELS: dict[str, Changes] = {
     'constant, not learned': {**_CONSTANT, **_FIXED},
@@ -67,7 +67,7 @@ DEPARTURES: tuple[Departure, ...] = (
     Departure('labels by the predictive distribution', _PLAIN_BAND),
     Departure('bins that widen, 80 of them', {'grid.n_bins': 120, 'grid.bin_growth': 1.0}),
     Departure('lines end at 0.1 rad', {'lines.slope_tolerance': 0.02}),
-    Departure('length-scales learned', {'learning.fixed': 'length_scales'}),
+    Departure('length-scales not learned', {'learning.fixed': 'none'}),
     Departure('lines continued outside the gate', {'growth.max_line_slope': 0.0}),
     Departure('lines continued past a slope break', {'growth.min_bend_extent': 1000.0}),
     Departure('learning from every 30th segment', {'learning.segment_step': 1}),

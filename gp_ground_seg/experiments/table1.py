@@ -63,7 +63,7 @@ def table1(
 
     Each method runs on each frame once without counting, then `n_repeats` times, alternately.
     """
-    refuse_changed(config, ['length_scale.model'])
+    refuse_changed(config, ['length_scale.model', 'learning.fixed'])
     if config.learning.mode == 'fixed':
         raise ConfigError('learning.mode = fixed: the table is of what is learned, leave it out')
     last = config.grid.n_segments - 1
@@ -81,7 +81,9 @@ def table1(
     with ExitStack() as stack:
         segmenters = {}
         for name, model in MODELS.items():
-            segmenter = GroundSegmenter(config.replace(**{'length_scale.model': model}))
+            segmenter = GroundSegmenter(
+                config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
+            )
             segmenters[name] = stack.enter_context(closing(segmenter))
         for frame, choice in zip(progress(frames), choices, strict=True):
             found, result = _rows(frame, choice, segmenters, n_repeats)
