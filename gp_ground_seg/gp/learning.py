@@ -96,21 +96,21 @@ def first_theta(frame: Frame, config: Config) -> FloatArray:
     """Where learning begins, (6,), in log space: what the lines show, else the given values.
 
     sigma_f is the root mean square height, over the prior mean, of the near candidates on lines
-    that may be ground, heights cut at ``growth.seed_height_tolerance``. sigma_n follows from the
-    differences between candidates and the line through the two beside them.
+    that may be ground. sigma_n follows from the differences between candidates and the line
+    through the two beside them. Both are cut at ``growth.seed_height_tolerance``.
     """
     candidates, lines, growth = frame.candidates, frame.lines, config.growth
     theta, r, line = given_theta(config), candidates.r, lines.line
     is_ground = np.abs(lines.slope) <= growth.max_line_slope
     is_ground &= np.diff(lines.start) >= growth.min_line_size
     height = candidates.z[is_ground[line] & (r <= growth.seed_range)] - frame.prior_mean
-    height = np.minimum(np.abs(height), growth.seed_height_tolerance)
     inner = np.flatnonzero(line[2:] == line[:-2]) + 1
     share = (r[inner] - r[inner - 1]) / (r[inner + 1] - r[inner - 1])
     z = candidates.z
     missed = z[inner] - (1.0 - share) * z[inner - 1] - share * z[inner + 1]
     missed /= np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
     for i, values in enumerate((height, missed)):
+        values = np.minimum(np.abs(values), growth.seed_height_tolerance)
         mean_square = float(values @ values) / max(len(values), 1)
         if mean_square > 0.0:
             theta[i] = 0.5 * math.log(mean_square)
