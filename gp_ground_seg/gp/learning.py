@@ -32,6 +32,8 @@ Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 
 WIDEST = 5.0
 """Distance from the given value to the bounds, in standard deviations of the prior."""
+FARTHEST_START = math.log(20.0)
+"""Distance of the start of learning from the given values, at most."""
 _AT_BOUND = 1e-6
 _LEVEL = 1e-3
 """Gradient for each datum below which the objective counts as level."""
@@ -97,7 +99,8 @@ def first_theta(frame: Frame, config: Config) -> FloatArray:
 
     sigma_f is the root mean square height, over the prior mean, of the near candidates on lines
     that may be ground. sigma_n follows from the differences between candidates and the line
-    through the two beside them. Both are cut at ``growth.seed_height_tolerance``.
+    through the two beside them. Both are cut at ``growth.seed_height_tolerance``, and kept within
+    `FARTHEST_START` of the given values: lines without any noise would make covariances singular.
     """
     candidates, lines, growth = frame.candidates, frame.lines, config.growth
     theta, r, line = given_theta(config), candidates.r, lines.line
@@ -114,7 +117,8 @@ def first_theta(frame: Frame, config: Config) -> FloatArray:
         mean_square = float(values @ values) / max(len(values), 1)
         if mean_square > 0.0:
             theta[i] = 0.5 * math.log(mean_square)
-    return theta
+    given = given_theta(config)
+    return np.clip(theta, given - FARTHEST_START, given + FARTHEST_START)
 
 
 class Learned(NamedTuple):
