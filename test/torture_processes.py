@@ -16,7 +16,8 @@ from typing import NamedTuple
 from torture_cases import run_cases
 
 PRELUDE = """
-import asyncio, os, random, resource, signal, sys, threading, time, warnings
+import asyncio, faulthandler, os, random, resource, signal, sys, threading, time, warnings
+faulthandler.dump_traceback_later(170)
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 import multiprocessing
 import numpy as np
@@ -166,8 +167,9 @@ def run_case(number, folder):
             text=True,
             check=False,
         )
-    except subprocess.TimeoutExpired:
-        return f'{name}: did not end within 180 s'
+    except subprocess.TimeoutExpired as error:
+        stack = (error.stderr or b'')[-600:].decode(errors='replace').replace('\n', ' | ')
+        return f'{name}: did not end within 180 s: {stack}'
     finally:
         program.unlink()
     if done.returncode not in scenario.statuses:
