@@ -32,8 +32,8 @@ Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 
 WIDEST = 5.0
 """Distance from the given value to the bounds, in standard deviations of the prior."""
-FARTHEST_START = math.log(20.0)
-"""Distance of the start of learning from the given values, at most."""
+FARTHEST_START = 5.0
+"""Distance of the start of learning from the given values, at most: a factor of 148."""
 _AT_BOUND = 1e-6
 _LEVEL = 1e-3
 """Gradient for each datum below which the objective counts as level."""
