@@ -6,7 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.frame import BoolArray, FloatArray, Frame, GroundSurface
+from gp_ground_seg.frame import BoolArray, FloatArray, Frame, GroundSurface, IntArray
+from gp_ground_seg.gp.evidence import (
+    N_ROUNDS,
+    Evidence,
+    at_candidates,
+    evidence_aside,
+    seeds,
+    uses_evidence,
+)
 from gp_ground_seg.gp.kernels import paciorek
 from gp_ground_seg.gp.latent import given_log_length_scales, latent_log_length_scales
 from gp_ground_seg.gp.linalg import Padded, add_noise, batches, single_threaded_blas
@@ -27,6 +35,11 @@ def estimate_surface(
     rejection). The gate is asymmetric because obstacles stand only above the ground. The
     height and variance of the surface are the paper's eqs. 6 and 7.
 
+    Segments first grow by themselves. Those that the segments beside them contradict, or where
+    these let more candidates join, grow again: the prediction is then that of the segment and of
+    those beside it together, and what stands above the latter alone neither starts the set nor
+    joins it by a line (see `gp_ground_seg.gp.evidence`).
+
     Parameters
     ----------
     frame : Frame
@@ -45,53 +58,142 @@ def estimate_surface(
     log_length_scale : (C,) float64
         At the candidates [log m]; may lie in a buffer that the next call reuses.
     """
-    candidates, growth, slope_std = frame.candidates, config.growth, config.observation.slope_std
+    candidates, knots, slope_std = frame.candidates, frame.knots, config.observation.slope_std
     if config.length_scale.model == 'latent':
         u, knot_u = latent_log_length_scales(frame, theta)
     else:
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
-    seed = (candidates.r <= growth.seed_range) & (np.abs(z) <= growth.seed_height_tolerance)
-    sigma_f, sigma_n = np.exp(theta[:, :2]).T
-    length_scale, knot_l = np.exp(u), np.exp(knot_u)
+    own = SegmentSurfaces.empty(len(z), knot_u.shape)
+    model = _Model(frame, theta, z, np.exp(u), np.exp(knot_u), seeds(frame, theta, config))
+    aside = Evidence(*np.zeros((2, len(z))))
+    task = np.full(len(theta), BEGIN)
+    for round_ in range(1 + N_ROUNDS * uses_evidence(frame, config)):
+        if round_ > 0:
+            prior_variance = np.exp(2.0 * theta[:, :1]) + slope_std**2 * knots**2
+            at_knots = evidence_aside(own.mean, own.std, prior_variance, knots, slope_std)
+            aside = at_candidates(at_knots, candidates, knots)
+            task = _tasks(model, own, aside, config.growth)
+        for segments in batches(candidates.offsets):
+            for work in (BEGIN, GO_ON):
+                chosen = segments[task[segments] == work]
+                _grow_segments(chosen, work, model, aside, config, own)
+    mean, std = fuse_neighbours(own.mean, own.std, knots, config.surface.n_neighbours, slope_std)
+    return GroundSurface(knots, mean + frame.prior_mean, std, own.inlier), knot_u, u
 
-    inlier = np.zeros(len(z), dtype=np.bool_)
-    mean, std = np.full((2, *knot_l.shape), np.nan)
-    for segments in batches(candidates.offsets):
-        own = Padded.of(segments, candidates.offsets)
-        r, own_z, own_l = own.take(candidates.r), own.take(z), own.take(length_scale, 1.0)
-        covariance = paciorek(r, own_l, r, own_l, sigma_f[segments])
-        covariance += slope_std**2 * r[:, :, None] * r[:, None, :]
-        noise = np.broadcast_to(sigma_n[segments, None] ** 2, r.shape)
-        batch = _Batch(
-            covariance,
-            own_z,
-            noise,
-            own.mask,
-            seed[own.place] & own.mask,
-            frame.continues_line[own.place] & own.mask,
-        )
-        chosen = _grow(batch, growth)
-        inlier[own.place[own.mask]] = chosen[own.mask]
-        grown = chosen.any(axis=1)
-        if len(frame.knots) == 0 or not grown.any():
-            continue
-        kept = segments[grown]
-        knots = np.broadcast_to(frame.knots, (len(kept), len(frame.knots)))
-        is_wanted = np.isfinite(knot_l[kept])
-        wanted_l = np.where(is_wanted, knot_l[kept], 1.0)
-        cross = paciorek(r[grown], own_l[grown], knots, wanted_l, sigma_f[kept])
-        cross += slope_std**2 * r[grown][:, :, None] * frame.knots
-        mean[kept], variance = _predict(
-            add_noise(covariance[grown], noise[grown], chosen[grown]),
-            cross * chosen[grown][:, :, None],
-            own_z[grown] * chosen[grown],
-        )
-        variance += sigma_f[kept, None] ** 2 + slope_std**2 * frame.knots**2
-        mean[kept] = np.where(is_wanted, mean[kept], np.nan)
-        std[kept] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
-    mean, std = fuse_neighbours(mean, std, frame.knots, config.surface.n_neighbours, slope_std)
-    return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u, u
+
+BEGIN, GO_ON = 1, 2
+"""Tasks of a segment: grow from its seeds, or from the inliers that it has; 0 = neither."""
+
+
+class SegmentSurfaces(NamedTuple):
+    """Each segment's own surface, before neighbours are fused."""
+
+    inlier: BoolArray  # (C,) candidates that the surface rests on
+    # (C,) height about the prior mean [m] at the candidates, and its variance [m^2]
+    height: FloatArray
+    variance: FloatArray
+    # (M, K) the same at the knots, and its standard deviation [m]; NaN where there is none
+    mean: FloatArray
+    std: FloatArray
+
+    @classmethod
+    def empty(cls, n_candidates: int, shape: tuple[int, ...]) -> SegmentSurfaces:
+        """No inlier, no surface."""
+        none = np.zeros(n_candidates, dtype=np.bool_)
+        return cls(none, *np.zeros((2, n_candidates)), *np.full((2, *shape), np.nan))
+
+
+class _Model(NamedTuple):
+    """What the segments grow from."""
+
+    frame: Frame
+    theta: FloatArray  # (M, 6)
+    z: FloatArray  # (C,) about the prior mean [m]
+    length_scale: FloatArray  # (C,) at the candidates [m]
+    knot_length_scale: FloatArray  # (M, K) at the knots [m]
+    seed: BoolArray  # (C,) candidates that start the inlier set
+
+
+def _tasks(
+    model: _Model, own: SegmentSurfaces, aside: Evidence, growth: GrowthConfig
+) -> IntArray:
+    """What each segment has to do, (M,): see `BEGIN`, `GO_ON`."""
+    segment = model.frame.candidates.segment
+    noise = np.exp(2.0 * model.theta[segment, 1])
+    above = aside.contradicts(model.z, noise, growth.max_standardised_residual)
+    fits = _fits(model.z, *aside.combined(own.height, own.variance), noise, growth)
+    task = np.zeros(len(model.theta), dtype=np.int64)
+    task[segment[~own.inlier & fits & (aside.precision > 0.0)]] = GO_ON
+    task[segment[own.inlier & above]] = BEGIN
+    return task
+
+
+def _fits(
+    z: FloatArray, height: FloatArray, variance: FloatArray, noise: FloatArray, growth: GrowthConfig
+) -> BoolArray:
+    """Whether heights are predicted well enough, and near enough, to join."""
+    residual = (z - height) / np.sqrt(np.maximum(variance, 0.0) + noise)
+    result: BoolArray = (
+        (variance <= growth.max_std**2)
+        & (residual <= growth.max_standardised_residual)
+        & (residual >= -growth.max_standardised_depth)
+    )
+    return result
+
+
+def _grow_segments(
+    segments: IntArray,
+    task: int,
+    model: _Model,
+    aside: Evidence,
+    config: Config,
+    own: SegmentSurfaces,
+) -> None:
+    """Inliers and surface of `segments`, into `own`."""
+    if len(segments) == 0:
+        return
+    frame, theta, slope_std = model.frame, model.theta[segments], config.observation.slope_std
+    layout, knots = Padded.of(segments, frame.candidates.offsets), frame.knots
+    sigma_f, sigma_n = np.exp(theta[:, :2]).T
+    r, own_l = layout.take(frame.candidates.r), layout.take(model.length_scale, 1.0)
+    covariance = paciorek(r, own_l, r, own_l, sigma_f)
+    covariance += slope_std**2 * r[:, :, None] * r[:, None, :]
+    noise = np.exp(2.0 * model.theta[frame.candidates.segment, 1])
+    above = aside.contradicts(model.z, noise, config.growth.max_standardised_residual)
+    first = model.seed & ~above if task == BEGIN else own.inlier
+    batch = _Batch(
+        covariance,
+        layout.take(model.z),
+        np.broadcast_to(sigma_n[:, None] ** 2, r.shape),
+        layout.mask,
+        first[layout.place] & layout.mask,
+        (frame.continues_line & ~above)[layout.place] & layout.mask,
+        Evidence(layout.take(aside.height), layout.take(aside.precision)),
+    )
+    grown = _grow(batch, config.growth)
+    place = layout.place[layout.mask]
+    for values, new in zip(own[:3], grown, strict=True):
+        values[place] = new[layout.mask]
+    own.mean[segments] = own.std[segments] = np.nan
+    chosen = grown[0]
+    has_surface = chosen.any(axis=1)
+    if len(knots) == 0 or not has_surface.any():
+        return
+    kept, chosen, sigma_f = segments[has_surface], chosen[has_surface], sigma_f[has_surface]
+    is_wanted = np.isfinite(model.knot_length_scale[kept])
+    wanted_l = np.where(is_wanted, model.knot_length_scale[kept], 1.0)
+    everywhere = np.broadcast_to(knots, (len(kept), len(knots)))
+    cross = paciorek(r[has_surface], own_l[has_surface], everywhere, wanted_l, sigma_f)
+    cross += slope_std**2 * r[has_surface][:, :, None] * knots
+    mean, variance = _predict(
+        add_noise(covariance[has_surface], batch.noise[has_surface], chosen),
+        cross * chosen[:, :, None],
+        batch.z[has_surface] * chosen,
+    )
+    variance += sigma_f[:, None] ** 2 + slope_std**2 * knots**2
+    own.mean[kept] = np.where(is_wanted, mean, np.nan)
+    own.std[kept] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
 
 
 class _Batch(NamedTuple):
@@ -101,8 +203,9 @@ class _Batch(NamedTuple):
     z: FloatArray  # (S, n) about the prior mean
     noise: FloatArray  # (S, n) variance
     mask: BoolArray  # (S, n)
-    seed: BoolArray  # (S, n)
+    first: BoolArray  # (S, n) those that join first
     continues_line: BoolArray  # (S, n)
+    aside: Evidence  # (S, n)
 
 
 def _predict(
@@ -114,38 +217,34 @@ def _predict(
     return mean, -np.einsum('sik,sik->sk', cross, solution[:, :, :-1])
 
 
-def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
-    """Inliers of each segment, (S, n).
+def _grow(batch: _Batch, growth: GrowthConfig) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Inliers of each segment, and height and variance of the candidates, three (S, n).
 
     Candidates that join in a round are conditioned on at once: the covariance of all
     candidates given the inliers shrinks by one product, and nothing is factored twice.
     """
-    chosen = np.zeros_like(batch.seed)
+    chosen, all_heights = np.zeros_like(batch.first), np.zeros(batch.first.shape)
+    all_variances = np.diagonal(batch.covariance, axis1=1, axis2=2).copy()
     # Segments that still grow, and their state.
-    active = np.flatnonzero(batch.seed.any(axis=1))
-    joining = batch.seed[active]
-    covariance, height = batch.covariance[active], np.zeros(joining.shape)
+    active, joining = np.arange(len(chosen)), batch.first
+    covariance, height = batch.covariance, all_heights
     while len(active):
         chosen[active] |= joining
-        z = batch.z[active]
-        height, covariance = _condition(covariance, height, z, batch.noise[active], joining)
+        z, noise = batch.z[active], batch.noise[active]
+        if joining.any():
+            height, covariance = _condition(covariance, height, z, noise, joining)
         variance = np.diagonal(covariance, axis1=1, axis2=2)
-        spread = np.sqrt(np.maximum(variance, 0.0) + batch.noise[active])
-        residual = (z - height) / spread
-        joining = (
-            ~chosen[active]
-            & batch.mask[active]
-            & (variance <= growth.max_std**2)
-            & (residual <= growth.max_standardised_residual)
-            & (residual >= -growth.max_standardised_depth)
-        )
-        following = batch.continues_line[active] & ~chosen[active]
+        all_heights[active], all_variances[active] = height, variance
+        aside = Evidence(*(values[active] for values in batch.aside))
+        following = batch.continues_line[active]
         following[:, 1:] &= chosen[active, :-1]
-        joining |= following
+        following[:, 0] = False
+        joining = _fits(z, *aside.combined(height, variance), noise, growth) | following
+        joining &= ~chosen[active] & batch.mask[active]
         grows = joining.any(axis=1)
         active, joining = active[grows], joining[grows]
         covariance, height = covariance[grows], height[grows]
-    return chosen
+    return chosen, all_heights, all_variances
 
 
 def _condition(

@@ -141,7 +141,7 @@ class GrowthConfig:
         'horizontal range within which low candidates start the inlier set', 'm')
     seed_height_tolerance: float = basic(0.45, (0.01, 5.0),
         'largest height of a seed above or below the expected ground', 'm')
-    max_std: float = advanced(0.4, (0.001, 10.0),
+    max_std: float = advanced(0.2, (0.001, 10.0),
         'predictive standard deviation above which a candidate is not decided yet', 'm')
     max_standardised_residual: float = advanced(2.0, (0.1, 50.0),
         'residual over predictive standard deviation above which a candidate is an outlier')
