@@ -7,6 +7,7 @@ import os
 import numpy as np
 
 from gp_ground_seg.compiled import (
+    evidence,
     ground,
     ground_plane,
     labels,
@@ -35,6 +36,7 @@ from gp_ground_seg.frame import (
     Scan,
     Tiles,
 )
+from gp_ground_seg.gp.evidence import N_ROUNDS, uses_evidence
 from gp_ground_seg.gp.latent import given_log_length_scales
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config
@@ -181,18 +183,35 @@ class NumbaBackend:
         own = ground.SegmentSurfaces(
             u,
             knot_u,
-            inlier=np.empty(n_candidates, np.bool_),
-            mean=take('mean', shape, np.float64),
-            std=take('std', shape, np.float64),
-            n_knots=take('n_knots', shape[:1], np.int64),
+            take('seed', (n_candidates,), np.bool_),
+            np.empty(n_candidates, np.bool_),
+            *take('candidate_surface', (2, n_candidates), np.float64),
+            *take('knot_surface', (2, *shape), np.float64),
+            take('n_knots', shape[:1], np.int64),
         )
+        looks_aside, slope_std = uses_evidence(frame, config), observation.slope_std
+        max_slope = growth.max_standardised_residual * slope_std if looks_aside else -1.0
+        room, aside = take('aside', (2, 2, *shape), np.float64)
+        evidence.find_seeds(frame, theta, growth, max_slope, room[0], own.seed)
 
         def grow_surfaces(part: Part) -> None:
             if is_latent:
                 latent_.latent_log_length_scales(part, frame, theta, u, knot_u)
-            ground.grow_surfaces(part, frame, theta, observation, growth, own)
+            ground.grow_surfaces(part, frame, theta, observation, growth, aside[:, :0], own)
 
         self.workers.run(grow_surfaces, self.n_threads)
+        for _ in range(N_ROUNDS * looks_aside):
+            evidence.find_evidence(own.mean, own.std, theta, frame.knots, slope_std, room, aside)
+            self.workers.run(
+                ground.grow_surfaces,
+                self.n_threads,
+                frame,
+                theta,
+                observation,
+                growth,
+                aside,
+                own,
+            )
         mean, std = np.empty((2, *shape))
         ground.fuse_neighbours(
             own,

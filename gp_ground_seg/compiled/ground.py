@@ -29,17 +29,24 @@ class SegmentSurfaces(NamedTuple):
         At the candidates [log m].
     knot_log_length_scale : (M, K) float64
         At the knots [log m]; NaN from the first knot on that is not wanted.
+    seed : (C,) bool
+        Candidates that start the inlier set.
     inlier : (C,) bool
         Candidates that the surface rests on.
+    height, variance : (C,) float64
+        Height about the prior mean [m] at the candidates that are no inliers, and its variance.
     mean, std : (M, K) float64
-        Height about the prior mean and its standard deviation [m].
+        Height about the prior mean and its standard deviation at the knots [m].
     n_knots : (M,) int64
         Knots up to which there is a surface.
     """
 
     log_length_scale: FloatArray
     knot_log_length_scale: FloatArray
+    seed: BoolArray
     inlier: BoolArray
+    height: FloatArray
+    variance: FloatArray
     mean: FloatArray
     std: FloatArray
     n_knots: IntArray
@@ -52,38 +59,74 @@ def grow_surfaces(
     theta: FloatArray,
     observation: ObservationConfig,
     growth: GrowthConfig,
+    aside: FloatArray,
     own: SegmentSurfaces,
 ) -> None:
-    """Inliers and surface of the segments of a part, into `own`."""
+    """Inliers and surface of the segments of a part, into `own`.
+
+    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) where there is none
+    yet: all segments then begin.
+    """
     candidates, knots = frame.candidates, frame.knots
     offsets, r = candidates.offsets, candidates.r
     inlier, mean, std = own.inlier, own.mean, own.std
+    looks_aside = aside.shape[1] > 0
     most = 0
     for m in range(part.number, len(mean), part.n_parts):
         most = max(most, offsets[m + 1] - offsets[m])
     room = (most + len(knots) + LANES - 1) & -LANES
-    columns, whitened = np.empty((6, room)), np.empty((most, room))
+    columns, whitened = np.empty((8, room)), np.empty((most, room))
     # One by one, so that the compiler knows them to be contiguous.
     all_r, all_l, square = columns[0], columns[1], columns[2]
     predicted, variance, observed = columns[3], columns[4], columns[5]
+    aside_height, aside_precision = columns[6], columns[7]
+    above = np.zeros(most, np.bool_)
     new = np.empty(most, np.int64)
     slope = observation.slope_std**2
     for m in range(part.number, len(mean), part.n_parts):
         first = offsets[m]
         n = offsets[m + 1] - first
-        for j in range(len(knots)):
-            mean[m, j] = std[m, j] = np.nan
+        sigma_n = math.exp(theta[m, 1])
+        sill, noise = math.exp(theta[m, 0]) ** 2, sigma_n**2
+        begins, goes_on = not looks_aside, False
+        for i in range(n):
+            observed[i] = candidates.z[first + i] - frame.prior_mean
+            if not looks_aside:
+                aside_height[i] = aside_precision[i] = 0.0
+                continue
+            j = candidates.bin[first + i]
+            share = (r[first + i] - knots[j]) / (knots[j + 1] - knots[j])
+            share = min(max(share, 0.0), 1.0)
+            height, precision = aside[0, m], aside[1, m]
+            aside_height[i] = height[j] + share * (height[j + 1] - height[j])
+            weight = precision[j] + share * (precision[j + 1] - precision[j])
+            aside_precision[i] = weight
+            above[i] = False
+            if weight > 0.0:
+                spread = math.sqrt(1.0 / weight + noise)
+                residual = observed[i] - aside_height[i]
+                above[i] = residual > growth.max_standardised_residual * spread
+                if inlier[first + i]:
+                    begins |= above[i]
+                else:
+                    goes_on |= fits(
+                        observed[i],
+                        own.height[first + i],
+                        own.variance[first + i],
+                        aside_height[i],
+                        weight,
+                        noise,
+                        growth,
+                    )
+        if not begins and not goes_on:
+            continue
         n_new = 0
         for i in range(n):
+            starts = own.seed[first + i] and not above[i] if begins else inlier[first + i]
             inlier[first + i] = False
-            observed[i] = candidates.z[first + i] - frame.prior_mean
-            is_low = abs(observed[i]) <= growth.seed_height_tolerance
-            if is_low and r[first + i] <= growth.seed_range:
+            if starts:
                 new[n_new] = i
                 n_new += 1
-        own.n_knots[m] = 0
-        if n_new == 0:
-            continue
         n_knots = 0
         while n_knots < len(knots) and not math.isnan(own.knot_log_length_scale[m, n_knots]):
             n_knots += 1
@@ -95,18 +138,15 @@ def grow_surfaces(
             all_r[n + j], all_l[n + j] = knots[j], own.knot_log_length_scale[m, j]
         for j in range(n + n_knots, size):
             all_r[j] = all_l[j] = 0.0
-        sigma_n = math.exp(theta[m, 1])
-        sill = math.exp(theta[m, 0]) ** 2
         for j in range(size):
             all_l[j] = exp_neg(-all_l[j])
             square[j] = all_l[j] * all_l[j]
             predicted[j] = 0.0
             variance[j] = sill + slope * all_r[j] * all_r[j]
-        noise = sigma_n**2
         n_inliers = done = 0
         # Unsigned, as a signed index could count from the end.
         end = np.uintp(size)
-        while n_new > 0:
+        while True:
             for a in range(n_new):
                 i = new[a]
                 inlier[first + i] = True
@@ -150,21 +190,52 @@ def grow_surfaces(
             for i in range(done, n):
                 if inlier[first + i]:
                     continue
-                residual = observed[i] - predicted[i]
-                limit = growth.max_standardised_depth
-                if residual > 0.0:
-                    limit = growth.max_standardised_residual
-                spread = max(variance[i], 0.0) + noise
-                if (frame.continues_line[first + i] and inlier[first + i - 1]) or (
-                    variance[i] <= growth.max_std**2
-                    and residual * residual <= limit * limit * spread
+                follows = i > 0 and inlier[first + i - 1] and frame.continues_line[first + i]
+                if (follows and not above[i]) or fits(
+                    observed[i],
+                    predicted[i],
+                    variance[i],
+                    aside_height[i],
+                    aside_precision[i],
+                    noise,
+                    growth,
                 ):
                     new[n_new] = i
                     n_new += 1
-        for j in range(n_knots):
+            if n_new == 0:
+                break
+        for i in range(done, n):
+            own.height[first + i], own.variance[first + i] = predicted[i], variance[i]
+        for j in range(len(knots)):
+            mean[m, j] = std[m, j] = np.nan
+        own.n_knots[m] = n_knots if n_inliers > 0 else 0
+        for j in range(own.n_knots[m]):
             mean[m, j] = predicted[n + j]
             std[m, j] = math.sqrt(max(variance[n + j], 0.0))
-        own.n_knots[m] = n_knots
+
+
+@jit(fastmath=True)
+def fits(
+    z: float,
+    height: float,
+    variance: float,
+    aside_height: float,
+    aside_precision: float,
+    noise: float,
+    growth: GrowthConfig,
+) -> bool:
+    """Whether a candidate is predicted well enough, and near enough, to join."""
+    if aside_precision > 0.0:
+        variance = max(variance, 0.0)
+        own_share = 1.0 / (1.0 + variance * aside_precision)
+        height = own_share * height + (1.0 - own_share) * aside_height
+        variance *= own_share
+    residual = z - height
+    limit = growth.max_standardised_depth
+    if residual > 0.0:
+        limit = growth.max_standardised_residual
+    spread = max(variance, 0.0) + noise
+    return variance <= growth.max_std**2 and residual * residual <= limit * limit * spread
 
 
 @jit(entry=True, fastmath=True)

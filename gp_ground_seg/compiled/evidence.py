@@ -1,0 +1,122 @@
+"""Compiled twin of `gp_ground_seg.gp.evidence`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gp_ground_seg.frame import BoolArray, FloatArray, Frame
+from gp_ground_seg.gp.evidence import LEAST_PRECISION, LEAST_STD
+from gp_ground_seg.jit import jit
+from gp_ground_seg.parameters.config import GrowthConfig
+
+
+@jit(entry=True, fastmath=True)
+def find_seeds(
+    frame: Frame,
+    theta: FloatArray,
+    growth: GrowthConfig,
+    max_slope: float,
+    table: FloatArray,
+    seed: BoolArray,
+) -> None:
+    """Do what `seeds` of the twin does, into `seed`; `max_slope` < 0: segments do not look aside.
+
+    `table` (M, K) is overwritten.
+    """
+    candidates, knots = frame.candidates, frame.knots
+    n_segments = len(candidates.offsets) - 1
+    n_bins = 0
+    for i in range(len(seed)):
+        z = candidates.z[i] - frame.prior_mean
+        seed[i] = candidates.r[i] <= growth.seed_range and abs(z) <= growth.seed_height_tolerance
+        if seed[i]:
+            n_bins = max(n_bins, candidates.bin[i] + 1)
+    if max_slope < 0.0 or n_bins == 0:
+        return
+    for m in range(n_segments):
+        for j in range(n_bins):
+            table[m, j] = np.inf
+        for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            if seed[i]:
+                table[m, candidates.bin[i]] = candidates.z[i] - frame.prior_mean
+    rise_along(table, n_bins, max_slope, knots)
+    around = max_slope * 2.0 * math.pi / n_segments
+    for m in range(1, 2 * n_segments):
+        own, other = table[m % n_segments], table[(m - 1) % n_segments]
+        for j in range(n_bins):
+            own[j] = min(own[j], other[j] + around * knots[j])
+    for m in range(2 * n_segments - 2, -1, -1):
+        own, other = table[m % n_segments], table[(m + 1) % n_segments]
+        for j in range(n_bins):
+            own[j] = min(own[j], other[j] + around * knots[j])
+    rise_along(table, n_bins, max_slope, knots)
+    limit = growth.max_standardised_residual
+    for m in range(n_segments):
+        noise = limit * math.sqrt(2.0) * math.exp(theta[m, 1])
+        for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            if seed[i]:
+                z = candidates.z[i] - frame.prior_mean
+                seed[i] = z <= table[m, candidates.bin[i]] + noise
+
+
+@jit(fastmath=True)
+def rise_along(table: FloatArray, n_bins: int, max_slope: float, knots: FloatArray) -> None:
+    """Let the ground rise outwards, then inwards."""
+    for m in range(len(table)):
+        own = table[m]
+        for j in range(1, n_bins):
+            own[j] = min(own[j], own[j - 1] + max_slope * (knots[j] - knots[j - 1]))
+        for j in range(n_bins - 2, -1, -1):
+            own[j] = min(own[j], own[j + 1] + max_slope * (knots[j + 1] - knots[j]))
+
+
+@jit(entry=True, fastmath=True)
+def find_evidence(
+    mean: FloatArray,
+    std: FloatArray,
+    theta: FloatArray,
+    knots: FloatArray,
+    slope_std: float,
+    shown: FloatArray,
+    aside: FloatArray,
+) -> None:
+    """Do what `evidence_aside` of the twin does, into `aside` (2, M, K): height and precision.
+
+    `shown` (2, M, K) is overwritten.
+    """
+    n_segments, n_knots = mean.shape
+    height, own_std = shown[0], shown[1]
+    total_height, total = aside[0], aside[1]
+    for m in range(n_segments):
+        sill = math.exp(theta[m, 0]) ** 2
+        for j in range(n_knots):
+            total_height[m, j] = total[m, j] = height[m, j] = 0.0
+            own_std[m, j] = np.inf
+            square = max(std[m, j], LEAST_STD) ** 2
+            precision = 1.0 / square - 1.0 / (sill + slope_std**2 * knots[j] ** 2)
+            if precision > LEAST_PRECISION:
+                height[m, j] = mean[m, j] / (square * precision)
+                own_std[m, j] = 1.0 / math.sqrt(precision)
+    around = slope_std * 2.0 * math.pi / n_segments
+    nearest, nearest_std = np.empty(n_knots), np.empty(n_knots)
+    for step in (1, -1):
+        for j in range(n_knots):
+            nearest[j], nearest_std[j] = 0.0, np.inf
+        for k in range(2 * n_segments):
+            m = k % n_segments if step > 0 else n_segments - 1 - k % n_segments
+            for j in range(n_knots):
+                carried = nearest_std[j] + around * knots[j]
+                # The first time around finds what the second begins with.
+                if k >= n_segments:
+                    weight = 1.0 / carried**2
+                    total[m, j] += weight
+                    total_height[m, j] += weight * nearest[j]
+                if own_std[m, j] <= carried:
+                    nearest[j], carried = height[m, j], own_std[m, j]
+                nearest_std[j] = carried
+    for m in range(n_segments):
+        for j in range(n_knots):
+            if total[m, j] > 0.0:
+                total_height[m, j] /= total[m, j]
