@@ -16,8 +16,8 @@ import numpy as np
 from gp_ground_seg.frame import BoolArray, Candidates, FloatArray, Frame
 from gp_ground_seg.parameters.config import Config
 
-N_ROUNDS = 2
-"""Times that segments grow again by what those beside them show."""
+STEP = 4
+"""One of how many segments shows its ground to those beside it: neighbours see much the same."""
 LEAST_STD = 1e-3
 """Standard deviation of a surface below which it counts as that [m]."""
 LEAST_PRECISION = 1e-3
@@ -51,10 +51,24 @@ class Evidence(NamedTuple):
         return own_share * height + (1.0 - own_share) * self.height, own_share * variance
 
 
-def uses_evidence(frame: Frame, config: Config) -> bool:
-    """Whether segments look aside: not where each is by itself, nor without a prior slope."""
-    has_neighbours = config.surface.n_neighbours > 0 and len(frame.knots) > 0
-    return has_neighbours and config.observation.slope_std > 0.0
+    def combined_surface(
+        self, mean: FloatArray, std: FloatArray, prior_variance: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Height and standard deviation of surfaces together with the evidence [m].
+
+        NaN where there is neither.
+        """
+        has_own = np.isfinite(std)
+        variance = np.where(has_own, np.maximum(std, LEAST_STD) ** 2, prior_variance)
+        height, variance = self.combined(np.where(has_own, mean, 0.0), variance)
+        known = has_own | (self.precision > 0.0)
+        return np.where(known, height, np.nan), np.where(known, np.sqrt(variance), np.nan)
+
+
+def looks_aside_in(frame: Frame, config: Config) -> bool:
+    """Whether segments look aside; without a prior slope, others would be right at any distance."""
+    wanted = config.surface.look_aside and config.observation.slope_std > 0.0
+    return wanted and len(frame.knots) > 0
 
 
 def seeds(frame: Frame, theta: FloatArray, config: Config) -> BoolArray:
@@ -66,7 +80,7 @@ def seeds(frame: Frame, theta: FloatArray, config: Config) -> BoolArray:
     candidates, growth = frame.candidates, config.growth
     z = candidates.z - frame.prior_mean
     seed = (candidates.r <= growth.seed_range) & (np.abs(z) <= growth.seed_height_tolerance)
-    if uses_evidence(frame, config):
+    if looks_aside_in(frame, config):
         limit = growth.max_standardised_residual
         highest = highest_ground(frame, z, seed, limit * config.observation.slope_std)
         noise = limit * math.sqrt(2.0) * np.exp(theta[candidates.segment, 1])

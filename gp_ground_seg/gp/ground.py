@@ -8,12 +8,12 @@ import numpy as np
 
 from gp_ground_seg.frame import BoolArray, FloatArray, Frame, GroundSurface, IntArray
 from gp_ground_seg.gp.evidence import (
-    N_ROUNDS,
+    STEP,
     Evidence,
     at_candidates,
     evidence_aside,
+    looks_aside_in,
     seeds,
-    uses_evidence,
 )
 from gp_ground_seg.gp.kernels import paciorek
 from gp_ground_seg.gp.latent import given_log_length_scales, latent_log_length_scales
@@ -35,10 +35,10 @@ def estimate_surface(
     rejection). The gate is asymmetric because obstacles stand only above the ground. The
     height and variance of the surface are the paper's eqs. 6 and 7.
 
-    Segments first grow by themselves. Those that the segments beside them contradict, or where
-    these let more candidates join, grow again: the prediction is then that of the segment and of
-    those beside it together, and what stands above the latter alone neither starts the set nor
-    joins it by a line (see `gp_ground_seg.gp.evidence`).
+    With ``surface.look_aside`` one of `STEP` segments grows by itself first. Then all grow: the
+    prediction is that of the segment and of those beside it together, and what stands above the
+    latter alone neither starts the set nor joins it by a line (see `gp_ground_seg.gp.evidence`).
+    The surface, too, is that of the segment and of those beside it together.
 
     Parameters
     ----------
@@ -47,12 +47,12 @@ def estimate_surface(
     theta : (M, 6) float64
         Hyper-parameters of each segment (see `gp_ground_seg.gp.learning`).
     config : Config
-        Model of the length-scale, prior slope, gates, neighbours to fuse.
+        Model of the length-scale, prior slope, gates.
 
     Returns
     -------
     surface : GroundSurface
-        Inliers; height and standard deviation at the knots, fused with the neighbours'.
+        Inliers; height and standard deviation at the knots.
     knot_log_length_scale : (M, K) float64
         At the knots [log m].
     log_length_scale : (C,) float64
@@ -66,34 +66,30 @@ def estimate_surface(
     z = candidates.z - frame.prior_mean
     own = SegmentSurfaces.empty(len(z), knot_u.shape)
     model = _Model(frame, theta, z, np.exp(u), np.exp(knot_u), seeds(frame, theta, config))
-    aside = Evidence(*np.zeros((2, len(z))))
-    task = np.full(len(theta), BEGIN)
-    for round_ in range(1 + N_ROUNDS * uses_evidence(frame, config)):
-        if round_ > 0:
-            prior_variance = np.exp(2.0 * theta[:, :1]) + slope_std**2 * knots**2
-            at_knots = evidence_aside(own.mean, own.std, prior_variance, knots, slope_std)
-            aside = at_candidates(at_knots, candidates, knots)
-            task = _tasks(model, own, aside, config.growth)
-        for segments in batches(candidates.offsets):
-            for work in (BEGIN, GO_ON):
-                chosen = segments[task[segments] == work]
-                _grow_segments(chosen, work, model, aside, config, own)
-    mean, std = fuse_neighbours(own.mean, own.std, knots, config.surface.n_neighbours, slope_std)
+    everywhere = np.arange(len(theta))
+    looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
+    prior_variance = np.exp(2.0 * theta[:, :1]) + slope_std**2 * knots**2
+
+    def aside() -> Evidence:
+        return evidence_aside(own.mean, own.std, prior_variance, knots, slope_std)
+
+    if looks_aside:
+        _grow_segments(everywhere[::STEP], model, Evidence(*none), config, own)
+        beside = at_candidates(aside(), candidates, knots)
+    _grow_segments(everywhere, model, beside if looks_aside else Evidence(*none), config, own)
+    mean, std = own.mean, own.std
+    if looks_aside:
+        mean, std = aside().combined_surface(mean, std, prior_variance)
+        mean[np.isnan(knot_u)] = std[np.isnan(knot_u)] = np.nan
     return GroundSurface(knots, mean + frame.prior_mean, std, own.inlier), knot_u, u
-
-
-BEGIN, GO_ON = 1, 2
-"""Tasks of a segment: grow from its seeds, or from the inliers that it has; 0 = neither."""
 
 
 class SegmentSurfaces(NamedTuple):
     """Each segment's own surface, before neighbours are fused."""
 
     inlier: BoolArray  # (C,) candidates that the surface rests on
-    # (C,) height about the prior mean [m] at the candidates, and its variance [m^2]
-    height: FloatArray
-    variance: FloatArray
-    # (M, K) the same at the knots, and its standard deviation [m]; NaN where there is none
+    # (M, K) height about the prior mean and its standard deviation at the knots [m]; NaN where
+    # there is none
     mean: FloatArray
     std: FloatArray
 
@@ -101,7 +97,7 @@ class SegmentSurfaces(NamedTuple):
     def empty(cls, n_candidates: int, shape: tuple[int, ...]) -> SegmentSurfaces:
         """No inlier, no surface."""
         none = np.zeros(n_candidates, dtype=np.bool_)
-        return cls(none, *np.zeros((2, n_candidates)), *np.full((2, *shape), np.nan))
+        return cls(none, *np.full((2, *shape), np.nan))
 
 
 class _Model(NamedTuple):
@@ -113,20 +109,6 @@ class _Model(NamedTuple):
     length_scale: FloatArray  # (C,) at the candidates [m]
     knot_length_scale: FloatArray  # (M, K) at the knots [m]
     seed: BoolArray  # (C,) candidates that start the inlier set
-
-
-def _tasks(
-    model: _Model, own: SegmentSurfaces, aside: Evidence, growth: GrowthConfig
-) -> IntArray:
-    """What each segment has to do, (M,): see `BEGIN`, `GO_ON`."""
-    segment = model.frame.candidates.segment
-    noise = np.exp(2.0 * model.theta[segment, 1])
-    above = aside.contradicts(model.z, noise, growth.max_standardised_residual)
-    fits = _fits(model.z, *aside.combined(own.height, own.variance), noise, growth)
-    task = np.zeros(len(model.theta), dtype=np.int64)
-    task[segment[~own.inlier & fits & (aside.precision > 0.0)]] = GO_ON
-    task[segment[own.inlier & above]] = BEGIN
-    return task
 
 
 def _fits(
@@ -143,16 +125,19 @@ def _fits(
 
 
 def _grow_segments(
-    segments: IntArray,
-    task: int,
-    model: _Model,
-    aside: Evidence,
-    config: Config,
-    own: SegmentSurfaces,
+    segments: IntArray, model: _Model, aside: Evidence, config: Config, own: SegmentSurfaces
 ) -> None:
-    """Inliers and surface of `segments`, into `own`."""
-    if len(segments) == 0:
-        return
+    """Inliers and surface of `segments`, into `own`; `aside` is the evidence at the candidates."""
+    own.mean[segments] = own.std[segments] = np.nan
+    offsets = model.frame.candidates.offsets
+    size = offsets[segments + 1] - offsets[segments]
+    for batch in batches(np.concatenate([[0], np.cumsum(size)])):
+        _grow_batch(segments[batch], model, aside, config, own)
+
+
+def _grow_batch(
+    segments: IntArray, model: _Model, aside: Evidence, config: Config, own: SegmentSurfaces
+) -> None:
     frame, theta, slope_std = model.frame, model.theta[segments], config.observation.slope_std
     layout, knots = Padded.of(segments, frame.candidates.offsets), frame.knots
     sigma_f, sigma_n = np.exp(theta[:, :2]).T
@@ -161,22 +146,17 @@ def _grow_segments(
     covariance += slope_std**2 * r[:, :, None] * r[:, None, :]
     noise = np.exp(2.0 * model.theta[frame.candidates.segment, 1])
     above = aside.contradicts(model.z, noise, config.growth.max_standardised_residual)
-    first = model.seed & ~above if task == BEGIN else own.inlier
     batch = _Batch(
         covariance,
         layout.take(model.z),
         np.broadcast_to(sigma_n[:, None] ** 2, r.shape),
         layout.mask,
-        first[layout.place] & layout.mask,
+        (model.seed & ~above)[layout.place] & layout.mask,
         (frame.continues_line & ~above)[layout.place] & layout.mask,
         Evidence(layout.take(aside.height), layout.take(aside.precision)),
     )
-    grown = _grow(batch, config.growth)
-    place = layout.place[layout.mask]
-    for values, new in zip(own[:3], grown, strict=True):
-        values[place] = new[layout.mask]
-    own.mean[segments] = own.std[segments] = np.nan
-    chosen = grown[0]
+    chosen = _grow(batch, config.growth)
+    own.inlier[layout.place[layout.mask]] = chosen[layout.mask]
     has_surface = chosen.any(axis=1)
     if len(knots) == 0 or not has_surface.any():
         return
@@ -203,7 +183,7 @@ class _Batch(NamedTuple):
     z: FloatArray  # (S, n) about the prior mean
     noise: FloatArray  # (S, n) variance
     mask: BoolArray  # (S, n)
-    first: BoolArray  # (S, n) those that join first
+    seed: BoolArray  # (S, n)
     continues_line: BoolArray  # (S, n)
     aside: Evidence  # (S, n)
 
@@ -217,34 +197,34 @@ def _predict(
     return mean, -np.einsum('sik,sik->sk', cross, solution[:, :, :-1])
 
 
-def _grow(batch: _Batch, growth: GrowthConfig) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Inliers of each segment, and height and variance of the candidates, three (S, n).
+def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
+    """Inliers of each segment, (S, n).
 
     Candidates that join in a round are conditioned on at once: the covariance of all
     candidates given the inliers shrinks by one product, and nothing is factored twice.
     """
-    chosen, all_heights = np.zeros_like(batch.first), np.zeros(batch.first.shape)
-    all_variances = np.diagonal(batch.covariance, axis1=1, axis2=2).copy()
+    chosen = np.zeros_like(batch.seed)
     # Segments that still grow, and their state.
-    active, joining = np.arange(len(chosen)), batch.first
-    covariance, height = batch.covariance, all_heights
+    active, joining = np.arange(len(chosen)), batch.seed
+    covariance, height = batch.covariance, np.zeros(joining.shape)
     while len(active):
         chosen[active] |= joining
         z, noise = batch.z[active], batch.noise[active]
         if joining.any():
             height, covariance = _condition(covariance, height, z, noise, joining)
         variance = np.diagonal(covariance, axis1=1, axis2=2)
-        all_heights[active], all_variances[active] = height, variance
         aside = Evidence(*(values[active] for values in batch.aside))
         following = batch.continues_line[active]
         following[:, 1:] &= chosen[active, :-1]
         following[:, 0] = False
         joining = _fits(z, *aside.combined(height, variance), noise, growth) | following
         joining &= ~chosen[active] & batch.mask[active]
+        # Before anything has joined, only evidence from aside decides.
+        joining &= chosen[active].any(axis=1, keepdims=True) | (aside.precision > 0.0)
         grows = joining.any(axis=1)
         active, joining = active[grows], joining[grows]
         covariance, height = covariance[grows], height[grows]
-    return chosen, all_heights, all_variances
+    return chosen
 
 
 def _condition(
@@ -263,48 +243,3 @@ def _condition(
     columns = np.swapaxes(rows, 1, 2)
     height = height + np.matmul(columns, gain[:, :, -1:])[:, :, 0]
     return height, covariance - np.matmul(columns, gain[:, :, :-1])
-
-
-def fuse_neighbours(
-    mean: FloatArray, std: FloatArray, knots: FloatArray, n_neighbours: int, slope_std: float
-) -> tuple[FloatArray, FloatArray]:
-    """Fuse each segment's surface with those of its neighbours.
-
-    The surface of the segment k steps aside predicts this one with the variance
-    ``std^2 + (slope_std s_k)^2``, where ``s_k`` is the arc between the two at the
-    knot's range: the same prior slope as along the range. The predictions are
-    weighted by their inverse variances. A segment without a model gets one from
-    its neighbours, if they have any.
-
-    Parameters
-    ----------
-    mean, std : (M, K) float64
-        Height and standard deviation at the knots [m]; NaN from the first knot on
-        where there is no model.
-    knots : (K,) float64
-        Ranges of the knots [m].
-    n_neighbours : int
-        Segments on either side.
-    slope_std : float
-        Standard deviation of the ground's slope.
-
-    Returns
-    -------
-    mean, std : (M, K) float64
-        Fused height and standard deviation [m].
-    """
-    if n_neighbours == 0:
-        return mean, std
-    step = 2.0 * np.pi / len(mean)
-    total_weight = np.zeros_like(mean)
-    weighted = np.zeros_like(mean)
-    for k in range(-n_neighbours, n_neighbours + 1):
-        variance = np.roll(std, k, axis=0) ** 2 + (slope_std * abs(k) * step * knots) ** 2
-        known = np.isfinite(variance)
-        # Standard deviations below a tenth of a millimetre count as that.
-        weight = np.where(known, 1.0 / np.maximum(np.where(known, variance, 1.0), 1e-8), 0.0)
-        total_weight += weight
-        weighted += weight * np.where(known, np.roll(mean, k, axis=0), 0.0)
-    known = total_weight > 0.0
-    safe = np.where(known, total_weight, 1.0)
-    return np.where(known, weighted / safe, np.nan), np.where(known, 1.0 / np.sqrt(safe), np.nan)

@@ -141,7 +141,7 @@ class GrowthConfig:
         'horizontal range within which low candidates start the inlier set', 'm')
     seed_height_tolerance: float = basic(0.45, (0.01, 5.0),
         'largest height of a seed above or below the expected ground', 'm')
-    max_std: float = advanced(0.2, (0.001, 10.0),
+    max_std: float = advanced(0.25, (0.001, 10.0),
         'predictive standard deviation above which a candidate is not decided yet', 'm')
     max_standardised_residual: float = advanced(2.0, (0.1, 50.0),
         'residual over predictive standard deviation above which a candidate is an outlier')
@@ -159,8 +159,8 @@ class GrowthConfig:
 class SurfaceConfig:
     """From the segments' surfaces to the surface of the frame."""
 
-    n_neighbours: int = advanced(2, (0, 16),
-        "segments on either side whose surfaces are fused with a segment's own; 0 = none")
+    look_aside: bool = advanced(True, (),
+        'whether the segments beside one decide with it what its ground is; false = each by itself')
 
 
 @dataclass(frozen=True)
@@ -300,11 +300,6 @@ class Config(ParameterGroups):
             low, high = float(self[lower]), float(self[upper])
             if not low < high:
                 raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
-        if 2 * self.surface.n_neighbours >= self.grid.n_segments:
-            raise ConfigError(
-                f'surface.n_neighbours = {self.surface.n_neighbours}: must be below half of '
-                f'grid.n_segments = {self.grid.n_segments}'
-            )
         _check_bins(self.grid)
         _check_memory(self)
 
