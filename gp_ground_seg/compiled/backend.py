@@ -36,7 +36,7 @@ from gp_ground_seg.frame import (
     Scan,
     Tiles,
 )
-from gp_ground_seg.gp.evidence import N_ROUNDS, uses_evidence
+from gp_ground_seg.gp.evidence import STEP, looks_aside_in
 from gp_ground_seg.gp.latent import given_log_length_scales
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config
@@ -173,7 +173,7 @@ class NumbaBackend:
     ) -> tuple[GroundSurface, FloatArray, FloatArray]:
         """Inliers, the surface, and log length-scales at the knots and at the candidates."""
         take, observation = self._buffers.take, numbers_of(config.observation)
-        growth, n_neighbours = numbers_of(config.growth), config.surface.n_neighbours
+        growth = numbers_of(config.growth)
         shape, n_candidates = (len(theta), len(frame.knots)), len(frame.candidates.r)
         is_latent = config.length_scale.model == 'latent'
         if is_latent:
@@ -185,23 +185,19 @@ class NumbaBackend:
             knot_u,
             take('seed', (n_candidates,), np.bool_),
             np.empty(n_candidates, np.bool_),
-            *take('candidate_surface', (2, n_candidates), np.float64),
-            *take('knot_surface', (2, *shape), np.float64),
-            take('n_knots', shape[:1], np.int64),
+            *take('surfaces', (2, *shape), np.float64),
         )
-        looks_aside, slope_std = uses_evidence(frame, config), observation.slope_std
+        looks_aside, slope_std, knots = (
+            looks_aside_in(frame, config),
+            observation.slope_std,
+            frame.knots,
+        )
         max_slope = growth.max_standardised_residual * slope_std if looks_aside else -1.0
         room, aside = take('aside', (2, 2, *shape), np.float64)
+        nothing = aside[:, :0]
         evidence.find_seeds(frame, theta, growth, max_slope, room[0], own.seed)
 
-        def grow_surfaces(part: Part) -> None:
-            if is_latent:
-                latent_.latent_log_length_scales(part, frame, theta, u, knot_u)
-            ground.grow_surfaces(part, frame, theta, observation, growth, aside[:, :0], own)
-
-        self.workers.run(grow_surfaces, self.n_threads)
-        for _ in range(N_ROUNDS * looks_aside):
-            evidence.find_evidence(own.mean, own.std, theta, frame.knots, slope_std, room, aside)
+        def grow(aside: FloatArray, step: int) -> None:
             self.workers.run(
                 ground.grow_surfaces,
                 self.n_threads,
@@ -210,19 +206,26 @@ class NumbaBackend:
                 observation,
                 growth,
                 aside,
+                step,
                 own,
             )
+
+        if is_latent:
+            self.workers.run(
+                latent_.latent_log_length_scales, self.n_threads, frame, theta, u, knot_u
+            )
+        if looks_aside:
+            own.mean.fill(np.nan)
+            own.std.fill(np.nan)
+            grow(nothing, STEP)
+            evidence.find_evidence(own.mean, own.std, theta, knots, slope_std, room, aside)
+        grow(aside if looks_aside else nothing, 1)
         mean, std = np.empty((2, *shape))
-        ground.fuse_neighbours(
-            own,
-            frame.knots,
-            observation.slope_std,
-            n_neighbours,
-            frame.prior_mean,
-            mean,
-            std,
-        )
-        return GroundSurface(frame.knots, mean, std, own.inlier), knot_u, u
+        if looks_aside:
+            evidence.find_evidence(own.mean, own.std, theta, knots, slope_std, room, aside)
+        shown = aside if looks_aside else nothing
+        evidence.combine(own, shown, theta, knots, slope_std, frame.prior_mean, mean, std)
+        return GroundSurface(knots, mean, std, own.inlier), knot_u, u
 
     def label_points(
         self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config

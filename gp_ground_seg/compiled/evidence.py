@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from gp_ground_seg.compiled.ground import SegmentSurfaces
 from gp_ground_seg.frame import BoolArray, FloatArray, Frame
 from gp_ground_seg.gp.evidence import LEAST_PRECISION, LEAST_STD
 from gp_ground_seg.jit import jit
@@ -42,15 +43,14 @@ def find_seeds(
             if seed[i]:
                 table[m, candidates.bin[i]] = candidates.z[i] - frame.prior_mean
     rise_along(table, n_bins, max_slope, knots)
-    around = max_slope * 2.0 * math.pi / n_segments
+    rise = np.empty(n_bins)
+    for j in range(n_bins):
+        rise[j] = max_slope * 2.0 * math.pi / n_segments * knots[j]
+    # Twice around, as the segments form a ring.
     for m in range(1, 2 * n_segments):
-        own, other = table[m % n_segments], table[(m - 1) % n_segments]
-        for j in range(n_bins):
-            own[j] = min(own[j], other[j] + around * knots[j])
+        rise_from(table[m % n_segments], table[(m - 1) % n_segments], rise)
     for m in range(2 * n_segments - 2, -1, -1):
-        own, other = table[m % n_segments], table[(m + 1) % n_segments]
-        for j in range(n_bins):
-            own[j] = min(own[j], other[j] + around * knots[j])
+        rise_from(table[m % n_segments], table[(m + 1) % n_segments], rise)
     rise_along(table, n_bins, max_slope, knots)
     limit = growth.max_standardised_residual
     for m in range(n_segments):
@@ -59,6 +59,14 @@ def find_seeds(
             if seed[i]:
                 z = candidates.z[i] - frame.prior_mean
                 seed[i] = z <= table[m, candidates.bin[i]] + noise
+
+
+@jit(fastmath=True)
+def rise_from(own: FloatArray, other: FloatArray, rise: FloatArray) -> None:
+    """Let the ground rise from one segment to the next."""
+    for j in range(len(rise)):
+        highest = other[j] + rise[j]
+        own[j] = highest if highest < own[j] else own[j]
 
 
 @jit(fastmath=True)
@@ -99,24 +107,61 @@ def find_evidence(
             if precision > LEAST_PRECISION:
                 height[m, j] = mean[m, j] / (square * precision)
                 own_std[m, j] = 1.0 / math.sqrt(precision)
-    around = slope_std * 2.0 * math.pi / n_segments
-    nearest, nearest_std = np.empty(n_knots), np.empty(n_knots)
-    for step in (1, -1):
-        for j in range(n_knots):
-            nearest[j], nearest_std[j] = 0.0, np.inf
+    nearest, nearest_std, rise = np.empty(n_knots), np.empty(n_knots), np.empty(n_knots)
+    for j in range(n_knots):
+        rise[j] = slope_std * 2.0 * math.pi / n_segments * knots[j]
+    for side in range(2):
+        nearest[:], nearest_std[:] = 0.0, np.inf
         for k in range(2 * n_segments):
-            m = k % n_segments if step > 0 else n_segments - 1 - k % n_segments
+            m = k % n_segments if side == 0 else n_segments - 1 - k % n_segments
             for j in range(n_knots):
-                carried = nearest_std[j] + around * knots[j]
-                # The first time around finds what the second begins with.
-                if k >= n_segments:
-                    weight = 1.0 / carried**2
+                nearest_std[j] += rise[j]
+            # The first time around finds what the second begins with.
+            if k >= n_segments:
+                for j in range(n_knots):
+                    weight = 1.0 / (nearest_std[j] * nearest_std[j])
                     total[m, j] += weight
                     total_height[m, j] += weight * nearest[j]
-                if own_std[m, j] <= carried:
-                    nearest[j], carried = height[m, j], own_std[m, j]
-                nearest_std[j] = carried
+            for j in range(n_knots):
+                is_own = own_std[m, j] <= nearest_std[j]
+                nearest[j] = height[m, j] if is_own else nearest[j]
+                nearest_std[j] = own_std[m, j] if is_own else nearest_std[j]
     for m in range(n_segments):
         for j in range(n_knots):
             if total[m, j] > 0.0:
                 total_height[m, j] /= total[m, j]
+
+
+@jit(entry=True, fastmath=True)
+def combine(
+    own: SegmentSurfaces,
+    aside: FloatArray,
+    theta: FloatArray,
+    knots: FloatArray,
+    slope_std: float,
+    prior_mean: float,
+    mean: FloatArray,
+    std: FloatArray,
+) -> None:
+    """Do what `combined_surface` of the twin does, into `mean` and `std`, about no prior mean.
+
+    `aside` (2, M, K) is the evidence, (2, 0, 0) if none is wanted.
+    """
+    for m in range(len(mean)):
+        sill = math.exp(theta[m, 0]) ** 2
+        for j in range(len(knots)):
+            mean[m, j] = own.mean[m, j] + prior_mean
+            std[m, j] = own.std[m, j]
+            if aside.shape[1] == 0:
+                continue
+            has_own = not math.isnan(own.std[m, j])
+            height, precision = aside[0, m, j], aside[1, m, j]
+            if math.isnan(own.knot_log_length_scale[m, j]) or not (has_own or precision > 0.0):
+                mean[m, j] = std[m, j] = np.nan
+                continue
+            variance, own_height = sill + slope_std**2 * knots[j] ** 2, 0.0
+            if has_own:
+                variance, own_height = max(own.std[m, j], LEAST_STD) ** 2, own.mean[m, j]
+            own_share = 1.0 / (1.0 + variance * precision)
+            mean[m, j] = own_share * own_height + (1.0 - own_share) * height + prior_mean
+            std[m, j] = math.sqrt(own_share * variance)

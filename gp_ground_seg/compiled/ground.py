@@ -15,7 +15,7 @@ import numpy as np
 
 from gp_ground_seg.compiled.numerics import LANES, exp_neg
 from gp_ground_seg.compiled.threads import Part
-from gp_ground_seg.frame import BoolArray, FloatArray, Frame, IntArray
+from gp_ground_seg.frame import BoolArray, FloatArray, Frame
 from gp_ground_seg.jit import jit
 from gp_ground_seg.parameters.config import GrowthConfig, ObservationConfig
 
@@ -33,23 +33,17 @@ class SegmentSurfaces(NamedTuple):
         Candidates that start the inlier set.
     inlier : (C,) bool
         Candidates that the surface rests on.
-    height, variance : (C,) float64
-        Height about the prior mean [m] at the candidates that are no inliers, and its variance.
     mean, std : (M, K) float64
-        Height about the prior mean and its standard deviation at the knots [m].
-    n_knots : (M,) int64
-        Knots up to which there is a surface.
+        Height about the prior mean and its standard deviation at the knots [m]; NaN where there
+        is none.
     """
 
     log_length_scale: FloatArray
     knot_log_length_scale: FloatArray
     seed: BoolArray
     inlier: BoolArray
-    height: FloatArray
-    variance: FloatArray
     mean: FloatArray
     std: FloatArray
-    n_knots: IntArray
 
 
 @jit(entry=True, fastmath=True)
@@ -60,19 +54,19 @@ def grow_surfaces(
     observation: ObservationConfig,
     growth: GrowthConfig,
     aside: FloatArray,
+    step: int,
     own: SegmentSurfaces,
 ) -> None:
-    """Inliers and surface of the segments of a part, into `own`.
+    """Inliers and surface of one of `step` segments of a part, into `own`.
 
-    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) where there is none
-    yet: all segments then begin.
+    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none.
     """
     candidates, knots = frame.candidates, frame.knots
     offsets, r = candidates.offsets, candidates.r
     inlier, mean, std = own.inlier, own.mean, own.std
     looks_aside = aside.shape[1] > 0
     most = 0
-    for m in range(part.number, len(mean), part.n_parts):
+    for m in range(part.number * step, len(mean), part.n_parts * step):
         most = max(most, offsets[m + 1] - offsets[m])
     room = (most + len(knots) + LANES - 1) & -LANES
     columns, whitened = np.empty((8, room)), np.empty((most, room))
@@ -83,12 +77,14 @@ def grow_surfaces(
     above = np.zeros(most, np.bool_)
     new = np.empty(most, np.int64)
     slope = observation.slope_std**2
-    for m in range(part.number, len(mean), part.n_parts):
+    for m in range(part.number * step, len(mean), part.n_parts * step):
         first = offsets[m]
         n = offsets[m + 1] - first
         sigma_n = math.exp(theta[m, 1])
         sill, noise = math.exp(theta[m, 0]) ** 2, sigma_n**2
-        begins, goes_on = not looks_aside, False
+        for j in range(len(knots)):
+            mean[m, j] = std[m, j] = np.nan
+        n_new, has_aside = 0, False
         for i in range(n):
             observed[i] = candidates.z[first + i] - frame.prior_mean
             if not looks_aside:
@@ -101,32 +97,17 @@ def grow_surfaces(
             aside_height[i] = height[j] + share * (height[j + 1] - height[j])
             weight = precision[j] + share * (precision[j + 1] - precision[j])
             aside_precision[i] = weight
-            above[i] = False
-            if weight > 0.0:
-                spread = math.sqrt(1.0 / weight + noise)
-                residual = observed[i] - aside_height[i]
-                above[i] = residual > growth.max_standardised_residual * spread
-                if inlier[first + i]:
-                    begins |= above[i]
-                else:
-                    goes_on |= fits(
-                        observed[i],
-                        own.height[first + i],
-                        own.variance[first + i],
-                        aside_height[i],
-                        weight,
-                        noise,
-                        growth,
-                    )
-        if not begins and not goes_on:
-            continue
-        n_new = 0
+            has_aside |= weight > 0.0
+            spread = math.sqrt(1.0 / weight + noise)
+            residual = observed[i] - aside_height[i]
+            above[i] = weight > 0.0 and residual > growth.max_standardised_residual * spread
         for i in range(n):
-            starts = own.seed[first + i] and not above[i] if begins else inlier[first + i]
             inlier[first + i] = False
-            if starts:
+            if own.seed[first + i] and not above[i]:
                 new[n_new] = i
                 n_new += 1
+        if n_new == 0 and not has_aside:
+            continue
         n_knots = 0
         while n_knots < len(knots) and not math.isnan(own.knot_log_length_scale[m, n_knots]):
             n_knots += 1
@@ -191,6 +172,9 @@ def grow_surfaces(
                 if inlier[first + i]:
                     continue
                 follows = i > 0 and inlier[first + i - 1] and frame.continues_line[first + i]
+                # Before anything has joined, only evidence from aside decides.
+                if n_inliers == 0 and aside_precision[i] == 0.0:
+                    continue
                 if (follows and not above[i]) or fits(
                     observed[i],
                     predicted[i],
@@ -204,12 +188,9 @@ def grow_surfaces(
                     n_new += 1
             if n_new == 0:
                 break
-        for i in range(done, n):
-            own.height[first + i], own.variance[first + i] = predicted[i], variance[i]
-        for j in range(len(knots)):
-            mean[m, j] = std[m, j] = np.nan
-        own.n_knots[m] = n_knots if n_inliers > 0 else 0
-        for j in range(own.n_knots[m]):
+        if n_inliers == 0:
+            continue
+        for j in range(n_knots):
             mean[m, j] = predicted[n + j]
             std[m, j] = math.sqrt(max(variance[n + j], 0.0))
 
@@ -236,43 +217,3 @@ def fits(
         limit = growth.max_standardised_residual
     spread = max(variance, 0.0) + noise
     return variance <= growth.max_std**2 and residual * residual <= limit * limit * spread
-
-
-@jit(entry=True, fastmath=True)
-def fuse_neighbours(
-    own: SegmentSurfaces,
-    knots: FloatArray,
-    slope_std: float,
-    n_neighbours: int,
-    prior_mean: float,
-    fused_mean: FloatArray,
-    fused_std: FloatArray,
-) -> None:
-    """Do what the twin does; `own` is about `prior_mean`, and the result is not."""
-    mean, std = own.mean, own.std
-    n_segments, n_knots = mean.shape
-    aside = slope_std * 2.0 * math.pi / n_segments
-    total_weight, weighted = np.empty(n_knots), np.empty(n_knots)
-    for m in range(n_segments):
-        if n_neighbours == 0:
-            for j in range(n_knots):
-                fused_mean[m, j], fused_std[m, j] = mean[m, j] + prior_mean, std[m, j]
-            continue
-        for j in range(n_knots):
-            total_weight[j] = weighted[j] = 0.0
-        n_fused = 0
-        for k in range(-n_neighbours, n_neighbours + 1):
-            other = (m - k) % n_segments
-            n_fused = max(n_fused, own.n_knots[other])
-            slope = k * aside
-            their_mean, their_std = mean[other], std[other]
-            for j in range(own.n_knots[other]):
-                away = slope * knots[j]
-                weight = 1.0 / max(their_std[j] * their_std[j] + away * away, 1e-8)
-                total_weight[j] += weight
-                weighted[j] += weight * their_mean[j]
-        for j in range(n_fused):
-            fused_mean[m, j] = weighted[j] / total_weight[j] + prior_mean
-            fused_std[m, j] = 1.0 / math.sqrt(total_weight[j])
-        for j in range(n_fused, n_knots):
-            fused_mean[m, j] = fused_std[m, j] = math.nan
