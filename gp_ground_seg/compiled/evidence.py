@@ -64,7 +64,8 @@ def find_seeds(
 @jit(fastmath=True)
 def rise_from(own: FloatArray, other: FloatArray, rise: FloatArray) -> None:
     """Let the ground rise from one segment to the next."""
-    for j in range(len(rise)):
+    # Unsigned, as a signed index could count from the end.
+    for j in range(np.uintp(0), np.uintp(len(rise))):
         highest = other[j] + rise[j]
         own[j] = highest if highest < own[j] else own[j]
 
@@ -95,41 +96,46 @@ def find_evidence(
     `shown` (2, M, K) is overwritten.
     """
     n_segments, n_knots = mean.shape
-    height, own_std = shown[0], shown[1]
-    total_height, total = aside[0], aside[1]
+    # Unsigned, as a signed index could count from the end.
+    start, end = np.uintp(0), np.uintp(n_knots)
+    nearest, nearest_std, rise = np.empty(n_knots), np.empty(n_knots), np.empty(n_knots)
+    for j in range(start, end):
+        rise[j] = slope_std * 2.0 * math.pi / n_segments * knots[j]
     for m in range(n_segments):
         sill = math.exp(theta[m, 0]) ** 2
-        for j in range(n_knots):
-            total_height[m, j] = total[m, j] = height[m, j] = 0.0
-            own_std[m, j] = np.inf
-            square = max(std[m, j], LEAST_STD) ** 2
-            precision = 1.0 / square - 1.0 / (sill + slope_std**2 * knots[j] ** 2)
-            if precision > LEAST_PRECISION:
-                height[m, j] = mean[m, j] / (square * precision)
-                own_std[m, j] = 1.0 / math.sqrt(precision)
-    nearest, nearest_std, rise = np.empty(n_knots), np.empty(n_knots), np.empty(n_knots)
-    for j in range(n_knots):
-        rise[j] = slope_std * 2.0 * math.pi / n_segments * knots[j]
+        own_mean, std_m, height, own_std = mean[m], std[m], shown[0, m], shown[1, m]
+        for j in range(start, end):
+            square = std_m[j] * std_m[j]
+            square = square if square > LEAST_STD**2 else LEAST_STD**2
+            precision = 1.0 / square - 1.0 / (sill + slope_std**2 * knots[j] * knots[j])
+            # False where there is no surface, too.
+            is_known = precision > LEAST_PRECISION and std_m[j] >= 0.0
+            safe = precision if is_known else 1.0
+            height[j] = own_mean[j] / (square * safe) if is_known else 0.0
+            own_std[j] = 1.0 / math.sqrt(safe) if is_known else np.inf
+    aside[:] = 0.0
     for side in range(2):
         nearest[:], nearest_std[:] = 0.0, np.inf
         for k in range(2 * n_segments):
             m = k % n_segments if side == 0 else n_segments - 1 - k % n_segments
-            for j in range(n_knots):
-                nearest_std[j] += rise[j]
+            height, own_std = shown[0, m], shown[1, m]
+            weighted, total = aside[0, m], aside[1, m]
             # The first time around finds what the second begins with.
             if k >= n_segments:
-                for j in range(n_knots):
-                    weight = 1.0 / (nearest_std[j] * nearest_std[j])
-                    total[m, j] += weight
-                    total_height[m, j] += weight * nearest[j]
-            for j in range(n_knots):
-                is_own = own_std[m, j] <= nearest_std[j]
-                nearest[j] = height[m, j] if is_own else nearest[j]
-                nearest_std[j] = own_std[m, j] if is_own else nearest_std[j]
+                for j in range(start, end):
+                    carried = nearest_std[j] + rise[j]
+                    weight = 1.0 / (carried * carried)
+                    total[j] += weight
+                    weighted[j] += weight * nearest[j]
+            for j in range(start, end):
+                carried = nearest_std[j] + rise[j]
+                is_own = own_std[j] <= carried
+                nearest[j] = height[j] if is_own else nearest[j]
+                nearest_std[j] = own_std[j] if is_own else carried
     for m in range(n_segments):
-        for j in range(n_knots):
-            if total[m, j] > 0.0:
-                total_height[m, j] /= total[m, j]
+        weighted, total = aside[0, m], aside[1, m]
+        for j in range(start, end):
+            weighted[j] /= total[j] if total[j] > 0.0 else 1.0
 
 
 @jit(entry=True, fastmath=True)
@@ -148,20 +154,21 @@ def combine(
     `aside` (2, M, K) is the evidence, (2, 0, 0) if none is wanted.
     """
     for m in range(len(mean)):
-        sill = math.exp(theta[m, 0]) ** 2
         for j in range(len(knots)):
             mean[m, j] = own.mean[m, j] + prior_mean
             std[m, j] = own.std[m, j]
-            if aside.shape[1] == 0:
-                continue
-            has_own = not math.isnan(own.std[m, j])
-            height, precision = aside[0, m, j], aside[1, m, j]
-            if math.isnan(own.knot_log_length_scale[m, j]) or not (has_own or precision > 0.0):
-                mean[m, j] = std[m, j] = np.nan
-                continue
+        if aside.shape[1] == 0:
+            continue
+        sill = math.exp(theta[m, 0]) ** 2
+        height, precision = aside[0, m], aside[1, m]
+        for j in range(len(knots)):
+            if math.isnan(own.knot_log_length_scale[m, j]):
+                break
             variance, own_height = sill + slope_std**2 * knots[j] ** 2, 0.0
-            if has_own:
+            if not math.isnan(own.std[m, j]):
                 variance, own_height = max(own.std[m, j], LEAST_STD) ** 2, own.mean[m, j]
-            own_share = 1.0 / (1.0 + variance * precision)
-            mean[m, j] = own_share * own_height + (1.0 - own_share) * height + prior_mean
+            elif precision[j] == 0.0:
+                continue
+            own_share = 1.0 / (1.0 + variance * precision[j])
+            mean[m, j] = own_share * own_height + (1.0 - own_share) * height[j] + prior_mean
             std[m, j] = math.sqrt(own_share * variance)
