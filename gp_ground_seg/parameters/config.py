@@ -63,7 +63,7 @@ class GridConfig:
     n_bins: int = advanced(80, (4, 1024), 'radial bins of each segment', symbol='N')
     r_min: float = advanced(2.0, (0.0, 50.0),
         'horizontal range where the first bin starts; nearer points belong to that bin', 'm')
-    r_max: float = basic(90.0, (1.0, 500.0),
+    r_max: float = basic(120.0, (1.0, 500.0),
         'horizontal range where the last bin ends; beyond it there is no model', 'm')
     bin_growth: float = advanced(1.5, (1.0, 4.0),
         'exponent of the bin edges over range: 1 = equal bins, more = finer bins near the sensor')
@@ -81,7 +81,7 @@ class LinesConfig:
         'distance of a point to the line that ends it', 'm', 'delta')
     max_gap: float = advanced(1.5, (0.05, 50.0),
         'horizontal gap to the next candidate that ends a line, next to the sensor', 'm')
-    max_gap_growth: float = advanced(0.15, (0.0, 2.0),
+    max_gap_growth: float = advanced(0.3, (0.0, 2.0),
         'growth of the largest gap with range', 'm/m')
     max_density_ratio: float = advanced(8.0, (1.0, 1e6),
         'ratio of the vertical densities of two successive bins that ends a line')
@@ -141,7 +141,7 @@ class GrowthConfig:
         'horizontal range within which low candidates start the inlier set', 'm')
     seed_height_tolerance: float = basic(0.45, (0.01, 5.0),
         'largest height of a seed above or below the expected ground', 'm')
-    max_std: float = advanced(0.25, (0.001, 10.0),
+    max_std: float = advanced(0.35, (0.001, 10.0),
         'predictive standard deviation above which a candidate is not decided yet', 'm')
     max_standardised_residual: float = advanced(2.0, (0.1, 50.0),
         'residual over predictive standard deviation above which a candidate is an outlier')
