@@ -81,7 +81,7 @@ class LinesConfig:
         'distance of a point to the line that ends it', 'm', 'delta')
     max_gap: float = advanced(1.5, (0.05, 50.0),
         'horizontal gap to the next candidate that ends a line, next to the sensor', 'm')
-    max_gap_growth: float = advanced(0.3, (0.0, 2.0),
+    max_gap_growth: float = advanced(0.6, (0.0, 2.0),
         'growth of the largest gap with range', 'm/m')
     max_density_ratio: float = advanced(8.0, (1.0, 1e6),
         'ratio of the vertical densities of two successive bins that ends a line')
