@@ -211,7 +211,7 @@ class GroundSurface(NamedTuple):
 
     knots: FloatArray  # (K,) ranges [m]: the bin edges
     # (M, K) ground height in the level frame [m]; NaN in segments without a model, and behind the
-    # last bin with a return in a segment and in those that are fused with it
+    # last bin with a return in a segment
     mean: FloatArray
     std: FloatArray  # (M, K) its standard deviation [m]; NaN in the same places
     inlier: BoolArray  # (C,) candidates that the surface rests on

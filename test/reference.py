@@ -238,60 +238,126 @@ def log_length_scales(frame, theta, config, m):
 
 
 def estimate_surface(frame, theta, config):
-    """Inliers that join until none does, and the surface fused over neighbours."""
-    growth, slope_std = config.growth, config.observation.slope_std
-    shape = len(theta), len(frame.knots)
-    mean, std, knot_u = np.full((3, *shape), np.nan)
-    inlier, u_all = (
-        np.zeros(len(frame.candidates.r), dtype=bool),
-        np.zeros(len(frame.candidates.r)),
-    )
-    for m in range(len(theta)):
-        own = slice(*frame.candidates.offsets[m : m + 2])
-        r, z = frame.candidates.r[own], frame.candidates.z[own] - frame.prior_mean
-        if len(r) == 0:
-            continue
-        u, u_star = log_length_scales(frame, theta, config, m)
-        knot_u[m, : len(u_star)], u_all[own] = u_star, u
-        sigma_f, sigma_n = np.exp(theta[m, :2])
-        chosen = np.zeros(len(r), dtype=bool)
-        joining = (r <= growth.seed_range) & (abs(z) <= growth.seed_height_tolerance)
-        while joining.any():
-            chosen |= joining
-            data = r[chosen], z[chosen], np.exp(u[chosen])
-            height, variance = posterior(*data, r, np.exp(u), sigma_f, sigma_n, slope_std)
-            residual = (z - height) / np.sqrt(variance + sigma_n**2)
-            joining = variance <= growth.max_std**2
-            joining &= residual <= growth.max_standardised_residual
-            joining &= residual >= -growth.max_standardised_depth
-            joining[1:] |= frame.continues_line[own][1:] & chosen[:-1]
-            joining &= ~chosen
-        inlier[own] = chosen
-        if chosen.any():
-            wanted = slice(len(u_star))
-            at = frame.knots[wanted], np.exp(u_star), sigma_f, sigma_n, slope_std
-            mean[m, wanted], variance = posterior(*data, *at)
-            std[m, wanted] = np.sqrt(variance)
-    mean, std = fuse(mean, std, frame.knots, config.surface.n_neighbours, slope_std)
+    """Inliers that join until none does, and the surface, with what the segments beside show."""
+    growth, slope_std, n = config.growth, config.observation.slope_std, len(theta)
+    looks_aside = config.surface.look_aside and slope_std > 0.0 and len(frame.knots) > 0
+    z, first = frame.candidates.z - frame.prior_mean, frame.candidates.offsets
+    seed = (frame.candidates.r <= growth.seed_range) & (abs(z) <= growth.seed_height_tolerance)
+    nothing = np.zeros((2, n, max(len(frame.knots), 1)))
+    evidence = nothing
+    if looks_aside:
+        seed = unlifted(frame, z, seed, np.exp(theta[:, 1]), config)
+        rows = [(m, grow(frame, theta, config, m, z, seed, nothing)) for m in range(0, n, 4)]
+        evidence = evidence_beside(dict(rows), theta, frame.knots, slope_std, n)
+    own = {m: grow(frame, theta, config, m, z, seed, evidence) for m in range(n)}
+    mean, std, knot_u = np.full((3, n, len(frame.knots)), np.nan)
+    inlier, u_all = np.zeros(len(z), dtype=bool), np.zeros(len(z))
+    if looks_aside:
+        evidence = evidence_beside(own, theta, frame.knots, slope_std, n)
+    for m, (chosen, u, u_star, height, deviation) in own.items():
+        inlier[first[m] : first[m + 1]], u_all[first[m] : first[m + 1]] = chosen, u
+        knot_u[m, : len(u_star)] = u_star
+        for j in range(len(u_star)):
+            known = [(height[j], deviation[j] ** 2)] if chosen.any() else []
+            if looks_aside and evidence[1, m, j] > 0.0:
+                prior = 0.0, np.exp(2 * theta[m, 0]) + (slope_std * frame.knots[j]) ** 2
+                known = (known or [prior]) + [(evidence[0, m, j], 1 / evidence[1, m, j])]
+            if known:
+                weights = [1 / max(variance, 1e-6) for _, variance in known]
+                mean[m, j] = np.average([height for height, _ in known], weights=weights)
+                std[m, j] = sum(weights) ** -0.5
     return GroundSurface(frame.knots, mean + frame.prior_mean, std, inlier), knot_u, u_all
 
 
-def fuse(mean, std, knots, n_neighbours, slope_std):
-    """Mean weighted by inverse variances, which grow with the arc to the neighbour [m]."""
-    if n_neighbours == 0:
-        return mean, std
-    n_segments, fused = len(mean), np.full((2, *mean.shape), np.nan)
-    for m in range(n_segments):
+def unlifted(frame, z, seed, sigma_n, config):
+    """Seeds that do not stand higher over another seed than noise and prior slope explain."""
+    candidates, n = frame.candidates, len(frame.candidates.offsets) - 1
+    slope = config.growth.max_standardised_residual * config.observation.slope_std
+    noise = config.growth.max_standardised_residual * math.sqrt(2) * sigma_n
+    kept, segment, r = seed.copy(), candidates.segment, frame.knots[candidates.bin]
+    for i in np.flatnonzero(seed):
+        lowest = math.inf
+        for k in np.flatnonzero(seed):
+            steps = abs(segment[i] - segment[k])
+            turn = min(steps, n - steps) * 2 * math.pi / n
+            # The arc is shortest at the nearest bin with a seed, on the way from one to the other.
+            arcs = (
+                abs(r[i] - at) + abs(r[k] - at) + turn * at
+                for at in frame.knots[: candidates.bin[seed].max() + 1]
+            )
+            lowest = min(lowest, z[k] + slope * min(arcs))
+        kept[i] = z[i] <= lowest + noise[segment[i]]
+    return kept
+
+
+def grow(frame, theta, config, m, z, seed, evidence):
+    """Inliers of a segment, log length-scales, height and deviation at the knots."""
+    growth, slope_std = config.growth, config.observation.slope_std
+    own = slice(*frame.candidates.offsets[m : m + 2])
+    r, z, seed = frame.candidates.r[own], z[own], seed[own]
+    if len(r) == 0:
+        return np.zeros(0, dtype=bool), [], [], [], []
+    u, u_star = log_length_scales(frame, theta, config, m)
+    sigma_f, sigma_n = np.exp(theta[m, :2])
+    shown, weight = np.zeros((2, len(r)))
+    if evidence.any():
+        shown, weight = (np.interp(r, frame.knots, row) for row in evidence[:, m])
+    limit = growth.max_standardised_residual
+    is_above = [
+        w > 0 and height - s > limit * math.sqrt(1 / w + sigma_n**2)
+        for height, s, w in zip(z, shown, weight, strict=True)
+    ]
+    chosen = np.zeros(len(r), dtype=bool)
+    joining = seed & ~np.array(is_above)
+    while True:
+        chosen |= joining
+        height, variance = np.zeros(len(r)), sigma_f**2 + slope_std**2 * r**2
+        if chosen.any():
+            data = r[chosen], z[chosen], np.exp(u[chosen])
+            height, variance = posterior(*data, r, np.exp(u), sigma_f, sigma_n, slope_std)
+        precision = 1 / np.maximum(variance, 1e-12) + weight
+        height = (height / np.maximum(variance, 1e-12) + shown * weight) / precision
+        residual = (z - height) / np.sqrt(1 / precision + sigma_n**2)
+        joining = (1 / precision <= growth.max_std**2) & (residual <= limit)
+        joining &= residual >= -growth.max_standardised_depth
+        joining &= chosen.any() | (weight > 0)
+        joining[1:] |= frame.continues_line[own][1:] & chosen[:-1] & ~np.array(is_above[1:], bool)
+        joining &= ~chosen
+        if not joining.any():
+            break
+    if not chosen.any():
+        return chosen, u, u_star, [], []
+    at = frame.knots[: len(u_star)], np.exp(u_star), sigma_f, sigma_n, slope_std
+    height, variance = posterior(r[chosen], z[chosen], np.exp(u[chosen]), *at)
+    return chosen, u, u_star, height, np.sqrt(variance)
+
+
+def evidence_beside(own, theta, knots, slope_std, n):
+    """Height and precision at every knot, by the nearest segment on either side that knows."""
+    shown = {}
+    for m, (chosen, _, _, height, deviation) in own.items():
+        for j in range(len(height) if chosen.any() else 0):
+            square = max(deviation[j], 1e-3) ** 2
+            precision = 1 / square - 1 / (np.exp(2 * theta[m, 0]) + (slope_std * knots[j]) ** 2)
+            if precision > 1e-3:
+                shown[m, j] = height[j] / square / precision, precision**-0.5
+    result = np.zeros((2, n, len(knots)))
+    for m in range(n):
         for j, r in enumerate(knots):
-            others = [(m + k) % n_segments for k in range(-n_neighbours, n_neighbours + 1)]
-            arcs = abs(np.arange(-n_neighbours, n_neighbours + 1)) * r * 2 * np.pi / n_segments
-            variance = np.maximum(std[others, j] ** 2 + (slope_std * arcs) ** 2, 1e-8)
-            known = np.isfinite(variance)
-            if known.any():
-                weight = 1.0 / variance[known]
-                fused[0, m, j] = (weight * mean[others, j][known]).sum() / weight.sum()
-                fused[1, m, j] = weight.sum() ** -0.5
-    return fused
+            both = []
+            for side in (-1, 1):
+                # A whole turn comes back to the segment itself.
+                away = [
+                    (shown[other, j][1] + k * slope_std * 2 * math.pi / n * r, shown[other, j][0])
+                    for k in range(1, n + 1)
+                    if ((other := (m + side * k) % n), j) in shown
+                ]
+                both += [min(away)] if away else []
+            weights = [deviation**-2 for deviation, _ in both]
+            if both:
+                heights = [height for _, height in both]
+                result[:, m, j] = np.average(heights, weights=weights), sum(weights)
+    return result
 
 
 def log_likelihood(theta, inliers, slope_std, latent_terms):

@@ -174,8 +174,6 @@ def test_rules_between_values(lower, upper, low, high):
         message = re.escape(f'{lower} = {wrong:g}: must be below {upper} = {low:g}')
         with pytest.raises(ConfigError, match=message):
             Config().replace(**{lower: wrong, upper: low})
-    with pytest.raises(ConfigError, match='must be below half of'):
-        Config().replace(**{'surface.n_neighbours': 4, 'grid.n_segments': 8})
 
 
 @settings(max_examples=40)

@@ -25,17 +25,18 @@ def frame_of(xyz, config):
     return Frame(*found, scan.grid.edges, prior_mean=-1.73)
 
 
-def config_of(model='latent', slope_std=0.05, n_neighbours=0, **growth):
+def config_of(model='latent', slope_std=0.05, look_aside=False, **growth):
     values = {f'growth.{name}': value for name, value in growth.items()}
     return Config().replace(
         **values,
         **{
+            'grid.r_max': 90.0,
             'length_scale.model': model,
             'length_scale.constant': 8.0,
             'observation.sigma_f': 0.2,
             'observation.sigma_n': 0.07,
             'observation.slope_std': slope_std,
-            'surface.n_neighbours': n_neighbours,
+            'surface.look_aside': look_aside,
         },
     )
 
@@ -45,7 +46,7 @@ def test_surfaces_are_the_reference(backend, seed):
     rng = np.random.default_rng(seed)
     model = rng.choice(['latent', 'latent', 'line_gradient', 'constant'])
     # Fewer segments than fit into one batch, or more; some of them empty.
-    config = config_of(model, rng.choice([0.0, 0.05]), int(rng.integers(0, 3))).replace(
+    config = config_of(model, rng.choice([0.0, 0.05]), bool(rng.integers(0, 2))).replace(
         **{'grid.n_segments': int(rng.choice([5, 7, 35, fewer(96, 12)])), 'grid.n_bins': 80}
     )
     xyz = hilly_scan(int(rng.choice([0, 30, 900])), seed)
@@ -173,21 +174,33 @@ def test_a_line_is_followed_from_inliers_on(backend):
     assert mean[np.searchsorted(knots, 14.0)] > 1.0
 
 
+def ring_of_ground(backend, lift, **values):
+    """Surface of 180 segments of level ground, eight of them with a car of height `lift` [m]."""
+    config = config_of(seed_height_tolerance=0.45, **values)
+    azimuth = (np.arange(180) + 0.5) * 2.0 * np.pi / 180.0
+    r, azimuth = (a.ravel() for a in np.meshgrid(np.arange(3.0, 30.0), azimuth))
+    z = np.where(azimuth < 8 * 2.0 * np.pi / 180.0, lift - 1.73, -1.73)
+    frame = frame_of(np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z]), config)
+    surface = backend.estimate_surface(frame, theta_of(config), config)[0]
+    on_car = frame.candidates.z > 0.5 * lift - 1.73
+    return frame.knots, surface, on_car
+
+
 def test_a_segment_without_a_model_gets_its_neighbours(backend):
-    config = config_of(n_neighbours=1)
-    xyz = hilly_scan(fewer(4000, 1000))
-    frame = frame_of(xyz[xyz[:, 1] > 0.0], config)
-    theta = theta_of(config)
-    fused, alone = (
-        backend.estimate_surface(frame, theta, config.replace(**{'surface.n_neighbours': n}))[0]
-        for n in (1, 0)
-    )
-    has_model, had_model = (np.isfinite(s.mean[:, 5]) for s in (fused, alone))
-    beside = np.roll(had_model, 1) | np.roll(had_model, -1)
-    np.testing.assert_array_equal(has_model, had_model | beside)
-    (m, *_) = np.flatnonzero(has_model & ~had_model)
-    source = m - 1 if had_model[m - 1] else (m + 1) % len(had_model)
-    assert fused.mean[m, 5] == pytest.approx(alone.mean[source, 5])
-    arc = frame.knots[5] * 2.0 * np.pi / len(had_model)
-    slope_std = config.observation.slope_std
-    assert fused.std[m, 5] == pytest.approx(np.hypot(alone.std[source, 5], slope_std * arc))
+    knots, surface, on_car = ring_of_ground(backend, 1.4, look_aside=True)
+    _, alone, _ = ring_of_ground(backend, 1.4)
+    (m,) = np.flatnonzero(np.isnan(alone.mean[:, 20]))[[4]]
+    assert np.isfinite(surface.mean[:, 20]).all()
+    assert surface.mean[m, 20] == pytest.approx(-1.73, abs=0.02)
+    # As uncertain as the ground on either side is far away.
+    arc = knots[20] * 2.0 * np.pi / 180.0 * 4.5
+    assert 0.6 * arc * 0.05 < surface.std[m, 20] < arc * 0.05
+    assert not surface.inlier[on_car].any() and surface.inlier[~on_car].all()
+
+
+def test_what_stands_over_the_ground_beside_it_starts_nothing(backend):
+    # 0.35 m over the plane is low enough for a seed: by itself the segment would grow on it.
+    _, surface, on_car = ring_of_ground(backend, 0.35, look_aside=True)
+    assert not surface.inlier[on_car].any() and surface.inlier[~on_car].all()
+    _, alone, _ = ring_of_ground(backend, 0.35)
+    assert alone.inlier.all()

@@ -19,7 +19,7 @@ CONFIGS = [
     Config().replace(**{'learning.mode': 'fixed', **changes})
     for changes in (
         {},
-        {'surface.n_neighbours': 0, 'grid.r_min': 0.0, 'grid.n_segments': 17},
+        {'surface.look_aside': False, 'grid.r_min': 0.0, 'grid.n_segments': 17},
         {'grid.n_bins': 5, 'grid.r_max': 30.0, 'grid.bin_growth': 1.0},
     )
 ]

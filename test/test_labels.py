@@ -18,7 +18,7 @@ CONFIG = Config().replace(
         'grid.r_min': 2.0,
         'grid.r_max': 10.0,
         'grid.bin_growth': 1.0,
-        'surface.n_neighbours': 1,
+        'surface.look_aside': True,
     }
 )
 KNOTS = np.array([2.0, 4.0, 6.0, 8.0, 10.0])

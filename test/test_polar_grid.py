@@ -20,7 +20,7 @@ PLACE = st.floats(-120, 120)
 
 def config_of(cell_size=0.5, **grid):
     values = {f'grid.{name}': value for name, value in grid.items()}
-    return Config().replace(**values, **{'faces.cell_size': cell_size, 'surface.n_neighbours': 0})
+    return Config().replace(**values, **{'faces.cell_size': cell_size})
 
 
 def assert_same_scan(found, expected):

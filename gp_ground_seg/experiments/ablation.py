@@ -60,7 +60,7 @@ DEPARTURES: tuple[Departure, ...] = (
     Departure('learning in every frame', {'learning.mode': 'fixed'}),
     Departure('objective without the latent terms', {'learning.objective': 'paper'}),
     Departure('sloping mean', {'observation.slope_std': 0.0}),
-    Departure('neighbouring segments fused', {'surface.n_neighbours': 0}),
+    Departure('segments look aside', {'surface.look_aside': False}),
     Departure('asymmetric gate of the growth', {'growth.max_standardised_depth': 2.0}),
     Departure('vertical faces', {'faces.max_normal_z': 0.0}),
     Departure('vertical faces with occluded base', {'faces.max_foot_distance': 0.0}),
@@ -73,7 +73,6 @@ DEPARTURES: tuple[Departure, ...] = (
     Departure('learning from every 30th segment', {'learning.segment_step': 1}),
     Departure('one theta for the frame', {'learning.scope': 'segment'}),
     Departure('240 segments', {'grid.n_segments': 240}, kept=False),
-    Departure('twice the neighbours fused', {'surface.n_neighbours': 4}, kept=False),
     Departure('a wider gate (3)', {'growth.max_standardised_residual': 3.0}, kept=False),
     Departure('obstacles from 0.3 m on', {'label.obstacle_min_height': 0.3}, kept=False),
 )

@@ -19,7 +19,7 @@ STEPS = {
     'vertical faces': ('faces.',),
     'labels by the predictive distribution': ('label.',),
     'sloping mean': ('observation.slope_std',),
-    'neighbouring segments fused': ('surface.',),
+    'segments look aside': ('surface.',),
     'gate and lines of the growth': ('growth.', 'lines.'),
     'all else: bins, learning, sensor pose': ('',),
 }

@@ -50,7 +50,6 @@ class Evidence(NamedTuple):
         own_share = 1.0 / (1.0 + np.maximum(variance, 0.0) * self.precision)
         return own_share * height + (1.0 - own_share) * self.height, own_share * variance
 
-
     def combined_surface(
         self, mean: FloatArray, std: FloatArray, prior_variance: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -66,7 +65,7 @@ class Evidence(NamedTuple):
 
 
 def looks_aside_in(frame: Frame, config: Config) -> bool:
-    """Whether segments look aside; without a prior slope, others would be right at any distance."""
+    """Whether segments look aside: not without a prior slope, which bounds how far others reach."""
     wanted = config.surface.look_aside and config.observation.slope_std > 0.0
     return wanted and len(frame.knots) > 0
 
@@ -88,9 +87,7 @@ def seeds(frame: Frame, theta: FloatArray, config: Config) -> BoolArray:
     return seed
 
 
-def highest_ground(
-    frame: Frame, z: FloatArray, seed: BoolArray, max_slope: float
-) -> FloatArray:
+def highest_ground(frame: Frame, z: FloatArray, seed: BoolArray, max_slope: float) -> FloatArray:
     """Largest height of ground that rises by `max_slope` from the seeds, (C,) [m].
 
     Distances are taken along ranges and arcs, between the near edges of bins: outwards and
@@ -140,7 +137,11 @@ def _rise_around(table: FloatArray, rise: FloatArray) -> None:
 
 
 def evidence_aside(
-    mean: FloatArray, std: FloatArray, prior_variance: FloatArray, knots: FloatArray, slope_std: float
+    mean: FloatArray,
+    std: FloatArray,
+    prior_variance: FloatArray,
+    knots: FloatArray,
+    slope_std: float,
 ) -> Evidence:
     """Evidence at the knots of every segment from the surfaces of the others, (M, K).
 

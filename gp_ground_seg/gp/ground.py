@@ -112,7 +112,11 @@ class _Model(NamedTuple):
 
 
 def _fits(
-    z: FloatArray, height: FloatArray, variance: FloatArray, noise: FloatArray, growth: GrowthConfig
+    z: FloatArray,
+    height: FloatArray,
+    variance: FloatArray,
+    noise: FloatArray,
+    growth: GrowthConfig,
 ) -> BoolArray:
     """Whether heights are predicted well enough, and near enough, to join."""
     residual = (z - height) / np.sqrt(np.maximum(variance, 0.0) + noise)

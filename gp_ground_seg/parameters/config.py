@@ -160,7 +160,7 @@ class SurfaceConfig:
     """From the segments' surfaces to the surface of the frame."""
 
     look_aside: bool = advanced(True, (),
-        'whether the segments beside one decide with it what its ground is; false = each by itself')
+        'whether the segments beside one decide with it what is ground; false = each by itself')
 
 
 @dataclass(frozen=True)
