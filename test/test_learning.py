@@ -182,7 +182,7 @@ def test_what_is_learned_does_not_hang_on_the_given_values(factor):
 
 @pytest.mark.parametrize('step', [1, 7])
 def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame(step):
-    config = Config()
+    config = Config().replace(**{'surface.look_aside': False})
     found = GroundSegmenter(config.replace(**{'learning.mode': 'fixed'})).segment(hilly_scan(900))
     continues = np.zeros(len(found.candidates.r), dtype=bool)
     edges = found.surface.knots

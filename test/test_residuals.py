@@ -161,7 +161,8 @@ def test_ground_that_a_car_hides_is_uncertain():
     assert roof.sum() > 20
     wrong = np.abs(found.surface.at(found.grid)[0] - made.ground_z)[roof]
     sure = found.surface.at(found.grid)[1][roof]
-    assert np.median(wrong / sure) > 5.0  # as if it had been seen
+    # The segments beside the car see the street climb.
+    assert np.median(wrong) < 0.15
     error = np.abs(found.ground_z - made.ground_z)[roof]
     assert np.median(error) < np.median(wrong)
     assert np.median(error / found.ground_std[roof]) < 2.0

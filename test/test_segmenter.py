@@ -17,6 +17,7 @@ from reference import Reference
 from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
+from gp_ground_seg.gp.evidence import STEP
 from gp_ground_seg.jit import HAVE_NUMBA, JIT_ENABLED
 
 # Without compilation the twins take a microsecond for each cell and point.
@@ -123,14 +124,15 @@ def test_raising_sensor_and_points_together_shifts_heights_only(backend, seed, l
     np.testing.assert_allclose(b.ground_z, a.ground_z - lift, atol=1e-6)
 
 
-def test_rotating_by_a_segment_shifts_the_surface(backend, scan):
-    angle = 2 * np.pi / CONFIG.grid.n_segments
+def test_rotating_by_segments_shifts_the_surface(backend, scan):
+    # Those that grow first are fixed, one of `STEP`.
+    angle = STEP * 2 * np.pi / CONFIG.grid.n_segments
     c, s = np.cos(angle), np.sin(angle)
     turned = scan @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
     # The segments that are learned from are fixed; here all are.
     segmenter = segmenter_of(backend, **{'sensor.height': 1.73, 'learning.segment_step': 1})
     a, b = segmenter.segment(scan), segmenter.segment(turned)
-    np.testing.assert_allclose(b.surface.mean, np.roll(a.surface.mean, 1, axis=0), atol=1e-6)
+    np.testing.assert_allclose(b.surface.mean, np.roll(a.surface.mean, STEP, axis=0), atol=1e-6)
 
 
 def test_layouts_of_the_same_points_give_the_same(backend, scan):

@@ -65,7 +65,7 @@ class Evidence(NamedTuple):
 
 
 def looks_aside_in(frame: Frame, config: Config) -> bool:
-    """Whether segments look aside: not without a prior slope, which bounds how far others reach."""
+    """Whether segments look aside: without a prior slope others would be right at any distance."""
     wanted = config.surface.look_aside and config.observation.slope_std > 0.0
     return wanted and len(frame.knots) > 0
 
