@@ -12,7 +12,6 @@ from scipy.optimize import minimize
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.frame import Candidates, Faces
-from gp_ground_seg.parameters.presets import find_preset
 from gp_ground_seg.pipeline.lines import deming_slope, differs_in_direction
 from gp_ground_seg.simulation import SCENES, VLP_16, simulate_scan
 
@@ -200,7 +199,7 @@ def test_lines_that_are_short_or_steep_or_of_two_candidates_start_at_no_break(ba
 
 def test_a_ramp_seen_by_few_rings_is_ground():
     scan = simulate_scan(SCENES['ramp'](0), VLP_16, np.random.default_rng(0))
-    config = find_preset('vlp16').config
+    config = Config()
     far = scan.is_ground & (np.hypot(*scan.points[:, :2].T) > 25.0)
     missed = {}
     for extent in (config.growth.min_bend_extent, 1000.0):
