@@ -173,7 +173,7 @@ def test_a_file_as_the_readme_has_it(tmp_path):
     with Process(*words, folder=tmp_path, start=('-m', 'gp_ground_seg')) as node:
         node.wait_until_ready()
         assert 'listening to /velodyne_points' in node.log
-        assert 'sensor.height: 1.2  (default auto)' in node.log
+        assert 'sensor.height: 1.2 m  (default auto)' in node.log
         assert 'grid.n_bins: 55  (default 80)' in node.log
         assert_good_end(node, signal.SIGINT)
 
