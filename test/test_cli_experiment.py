@@ -19,7 +19,6 @@ from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.experiments import ablation, sensor_pose, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, VARIANCES, Choice, table1
-from gp_ground_seg.experiments.variants import PRESET_OF
 from gp_ground_seg.parameters.presets import PRESETS
 from gp_ground_seg.simulation import HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
 
@@ -85,7 +84,7 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
         assert len(row) in map(len, rows), row
     assert max(map(len, lines)) <= 100
     assert document['n_threads'] >= 1 and document['environment']['cpu']
-    if case != 'scenes' and 'grid.n_bins=40' in words:
+    if 'grid.n_bins=40' in words:
         assert document['config_changes']['grid.n_bins'] == 40
 
 
@@ -99,21 +98,18 @@ def test_tables_as_markdown(capsys):
     assert row.startswith('| vlp-16 | kerb | ') and machine.startswith('machine: ')
 
 
-def test_scenes_have_the_presets_of_their_sensors(monkeypatch):
-    found = {}
+def test_all_sensors_have_the_parameters_given(monkeypatch):
+    found = []
 
-    def note(configs, *_):
-        found.update(configs)
+    def note(sensors, scenes, n_seeds, config, *_):
+        found.append((sensors, config))
         raise DataError('enough')
 
     monkeypatch.setattr(variants, 'score_scenes', note)
-    words = ['--sensors', ','.join(PRESET_OF)]
-    for extra, expected in (
-        ([], {sensor: PRESETS[preset].config for sensor, preset in PRESET_OF.items()}),
-        (['--preset', 'default'], dict.fromkeys(PRESET_OF, Config())),
-    ):
-        assert run('experiment', 'scenes', *words, *extra) == 2
-        assert found == expected
+    sensors = ['mid-360', 'hdl-64e']
+    for extra, config in (([], Config()), (['--preset', 'paper'], PRESETS['paper'].config)):
+        assert run('experiment', 'scenes', '--sensors', ','.join(sensors), *extra) == 2
+        assert found.pop() == (sensors, config)
 
 
 def test_simulated_poses_have_their_own_options(monkeypatch, capsys):
@@ -167,7 +163,7 @@ def test_a_departure_in_words():
         (['coverage'], 'coverage: give either ROOT or --simulated'),
         (['sensor-pose', 'ROOT', '--set', 'sensor.height=1.0'], 'sensor.height = 1.0: the exp'),
         (['sensor-pose', 'ROOT', '--set', 'sensor.roll=1.0'], 'sensor.roll = 1.0: the exp'),
-        (['scenes', '--preset', 'vlp-16'], 'vlp16'),
+        (['scenes', '--preset', 'papr'], 'did you mean paper?'),
         *(([name, 'ROOT', '--json', 'MINE'], '--force') for name in EXPERIMENTS
           if name not in ('scenes', 'cross-validation')),
     ],
@@ -220,7 +216,6 @@ def test_commands_of_the_docs_are_accepted():
                 for name, values in grid.items():
                     for value in values:
                         Config().replace(**{name: value})
-            arguments.preset = arguments.preset or 'default'  # scenes: one for each sensor
             read_config(arguments)
     assert names == set(EXPERIMENTS)
 

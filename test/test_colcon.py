@@ -88,13 +88,13 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
     assert os.access(executable.with_name('gp-ground-seg'), os.X_OK)
     words = [
         '--ros-args', '-r', f'__ns:={NAMESPACE}', '-p', 'learning.mode:=fixed',
-        '--params-file', prefix / 'share' / PACKAGE / 'config' / 'vlp16.yaml',
+        '--params-file', prefix / 'share' / PACKAGE / 'config' / 'paper.yaml',
     ]  # fmt: skip
     command = sourced(workspace, 'exec "$0" "$@"', executable, *words)
     with Process(folder=tmp_path, command=command, **ENVIRONMENT) as node:
         node.wait_until_ready()
         assert f'listening to {NAMESPACE}/points' in node.log
-        assert 'grid.n_segments: 120  (default 180)' in node.log
+        assert 'grid.n_bins: 120  (default 80)' in node.log
         code, _ = node.stop(signal.SIGINT)
     assert code == 0, node.log
     assert 'Traceback' not in node.log

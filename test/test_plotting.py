@@ -184,7 +184,7 @@ def test_picture_shows_ground_obstacles_and_model(tmp_path):
 
 def test_command_draws_a_scan_and_keeps_what_is_there(tmp_path, capsys):
     path = tmp_path / 'a.png'
-    words = ['plot', 'scan', '--simulate', 'flat', '--sensor', 'vlp-16', '--preset', 'vlp16', '-o']
+    words = ['plot', 'scan', '--simulate', 'flat', '--sensor', 'vlp-16', '-o']
     assert run(*words, path) == 0
     said = r'[\d ]+ points: [\d ]+ ground, [\d ]+ obstacle, written to .*a\.png\n'
     assert re.fullmatch(said, capsys.readouterr().out)

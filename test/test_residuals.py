@@ -10,9 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.experiments.variants import PRESET_OF
 from gp_ground_seg.frame import GroundSurface, Labelled, PolarGrid
-from gp_ground_seg.parameters.presets import PRESETS
 from gp_ground_seg.pipeline.residuals import correct_surface
 from gp_ground_seg.simulation import SCENES, SENSORS, VLP_16, objects, simulate_scan
 from gp_ground_seg.simulation.scenes import Scene, ramp
@@ -135,7 +133,7 @@ def test_height_and_ground_z_are_of_one_surface(tilt):
 @pytest.mark.parametrize('sensor', SENSORS)
 def test_errors_against_exact_heights_are_as_large_as_said(sensor):
     """Every scene once; docs/accuracy.md has the table of two seeds."""
-    segmenter = GroundSegmenter(PRESETS[PRESET_OF[sensor]].config)
+    segmenter = GroundSegmenter()
     ratios, errors = [], []
     for scene in SCENES.values():
         made = simulate_scan(scene(0), SENSORS[sensor], np.random.default_rng(0))

@@ -154,17 +154,18 @@ def test_two_nodes_side_by_side_read_their_parts_of_one_file(tmp_path):
         assert 'did you mean grid.n_bins?' in line
 
 
-def test_a_preset_as_the_readme_has_it(tmp_path):
-    """The block that makes a copy of a preset, line for line, but for where the files are."""
+def test_a_file_as_the_readme_has_it(tmp_path):
+    """The block that writes a file of parameters, line for line, but for where the files are."""
     readme = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
     blocks = re.findall(r'```sh\n(.*?)```', readme, re.DOTALL)
-    (block,) = [block for block in blocks if 'config dump --preset' in block]
+    (block,) = [block for block in blocks if 'config dump' in block]
     *commands, node_command = block.splitlines()
     script = f'gp-ground-seg() {{ {sys.executable} -m gp_ground_seg "$@"; }}; set -e\n'
     command = ['bash', '-c', script + '\n'.join(commands)]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 1, done.stderr  # of diff: they differ
     assert 'my.yaml: good; ' in done.stdout
+    assert done.stdout.endswith('sensor.height: auto -> 1.2 m\n')
     program, *words = node_command.split()
     assert program == 'gp-ground-seg'
     words[words.index('my.yaml')] = str(tmp_path / 'my.yaml')
@@ -172,7 +173,7 @@ def test_a_preset_as_the_readme_has_it(tmp_path):
     with Process(*words, folder=tmp_path, start=('-m', 'gp_ground_seg')) as node:
         node.wait_until_ready()
         assert 'listening to /velodyne_points' in node.log
-        assert 'grid.n_segments: 120  (default 180)' in node.log
+        assert 'sensor.height: 1.2 m  (default auto)' in node.log
         assert 'grid.n_bins: 55  (default 80)' in node.log
         assert_good_end(node, signal.SIGINT)
 

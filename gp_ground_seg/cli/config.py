@@ -17,7 +17,7 @@ from gp_ground_seg.parameters.schema import read_parameters
 EXAMPLES = """\
   gp-ground-seg config dump > my.yaml            every parameter, explained, with its default
   gp-ground-seg config dump --config my.yaml --set label.ground_tolerance=0.15
-  gp-ground-seg config dump --preset vlp16       those for a sensor, with the reasons
+  gp-ground-seg config dump --preset paper       those of the paper, with the reasons
   gp-ground-seg config check my.yaml             unknown names, types, ranges
   gp-ground-seg config diff default my.yaml      what a file, or a preset, changes
   gp-ground-seg config table                     every parameter as a Markdown table

@@ -79,8 +79,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         options.add(own, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
         options.add_config(own)
         own.set_defaults(run=run)
-        if name in ('scenes', 'coverage'):  # there each sensor has the preset of its own
-            own.set_defaults(preset=None)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -152,32 +150,21 @@ def _wrong_values(arguments: argparse.Namespace) -> Report:
     return stepwise.score_wrong_values(frames_from_options(arguments), config, bar)
 
 
-def _configs_of(arguments: argparse.Namespace, sensors: Sequence[str]) -> dict[str, Config]:
-    """Parameters of each sensor: those of its preset, or of the one that is named for all."""
-    given, configs = vars(arguments), {}
-    for sensor in sensors:
-        preset = arguments.preset or variants.PRESET_OF.get(sensor, options.DEFAULT_PRESET)
-        configs[sensor] = options.read_config(argparse.Namespace(**{**given, 'preset': preset}))
-    return configs
-
-
 def _scenes(arguments: argparse.Namespace) -> Report:
-    configs = _configs_of(arguments, arguments.sensors or DEFAULT_SENSORS)
-    scenes, seeds = arguments.scenes or list(SCENES), arguments.seeds or 3
-    bar = options.progress('scenes')
-    return variants.score_scenes(configs, scenes, seeds, not arguments.no_peer, bar)
+    sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(SCENES)
+    config, bar = options.read_config(arguments), options.progress('scenes')
+    seeds, with_peer = arguments.seeds or 3, not arguments.no_peer
+    return variants.score_scenes(sensors, scenes, seeds, config, with_peer, bar)
 
 
 def _coverage(arguments: argparse.Namespace) -> Report:
-    bar = options.progress('coverage')
+    config, bar = options.read_config(arguments), options.progress('coverage')
     if not arguments.simulated:
-        configs = _configs_of(arguments, ['KITTI'])
-        frames = {'KITTI': frames_from_options(arguments)}
-        return coverage.compare_coverage(frames, load_kitti, configs, coverage.LABELLED, bar)
+        frames = frames_from_options(arguments)
+        return coverage.compare_coverage(frames, load_kitti, config, coverage.LABELLED, bar)
     sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or list(SCENES)
-    seeds, configs = arguments.seeds or 2, _configs_of(arguments, sensors)
-    scans = {one: simulated_frames([one], scenes, seeds, (0.0,)) for one in sensors}
-    return coverage.compare_coverage(scans, load_simulated, configs, coverage.SIMULATED, bar)
+    scans = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
+    return coverage.compare_coverage(scans, load_simulated, config, coverage.SIMULATED, bar)
 
 
 def _cross_validation(arguments: argparse.Namespace) -> Report:
@@ -249,7 +236,7 @@ gp_ground_seg/experiments/ablation.py; --switch measures another without touchin
         """\
 Compare errors of the ground's height with their standard deviations: how many lie within one
 and two, by sequence and range. On labelled frames that of the returns (return_std), with
---simulated that of the ground (ground_std) by exact heights, each sensor with its preset.
+--simulated that of the ground (ground_std) by exact heights.
 """,
         (OPTIONAL_ROOT, SIMULATED, *OF_FRAMES, EVERY_SENSOR, SCENE_LIST, SEEDS),
         _coverage,
@@ -271,9 +258,8 @@ Give hyper-parameters that are wrong by factors of 3 and 10, with and without le
     ),
     'scenes': Experiment(
         """\
-Score simulated scans by exact labels and heights, beside Patchwork++. Each sensor has the
-parameters of its preset unless --preset names one for all; Patchwork++ has its published
-parameters and the true height of the sensor.
+Score simulated scans by exact labels and heights, beside Patchwork++ with its published
+parameters and the true height of the sensor. All sensors have one set of parameters.
 """,
         (SENSOR_LIST, SCENE_LIST, SEEDS, NO_PEER),
         _scenes,

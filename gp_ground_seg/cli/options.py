@@ -114,7 +114,7 @@ def some_of(known: Iterable[str]) -> Callable[[str], list[str]]:
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     """Add ``--preset NAME``, ``--config FILE`` and ``--set NAME=VALUE``."""
-    presets = f'parameters of a sensor: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})'
+    presets = f'set of parameters: {", ".join(PRESETS)} (default: {DEFAULT_PRESET})'
     setting = 'one parameter, as in --set label.ground_tolerance=0.15 (may be repeated)'
     repeated = {'action': 'append', 'default': [], 'dest': 'settings'}
     add(

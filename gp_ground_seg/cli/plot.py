@@ -29,7 +29,7 @@ model as profiles with twice its standard deviation, coloured by length-scale.
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
   gp-ground-seg plot scan --simulate road_then_rubble -o scan.png
-  gp-ground-seg plot scan --simulate urban --sensor vlp-16 --preset vlp16 -o scan.png
+  gp-ground-seg plot scan --simulate urban --sensor vlp-16 -o scan.png
 """
 
 ABOVE = """\

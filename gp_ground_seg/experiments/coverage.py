@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
@@ -125,26 +125,21 @@ SIMULATED = Kind(
 
 
 def compare_coverage(
-    items: Mapping[str, Sequence[Any]],
+    items: Sequence[Any],
     load: Callable[[Any], KnownScan],
-    configs: Mapping[str, Config],
+    config: Config,
     kind: Kind,
     progress: Progress = iter,
 ) -> Report:
-    """Segment each scan, with the configuration of its group and without a past."""
-    changes = {name: results.changed_parameters(config) for name, config in configs.items()}
-    nested = {name: config.nested() for name, config in configs.items()}
-    facts: dict[str, dict[str, Any]] = {'config_changes': changes, 'config': nested}
-    if kind is LABELLED:  # of one sensor
-        facts = {key: next(iter(value.values())) for key, value in facts.items()}
+    """Segment each scan, without a past."""
+    facts = {'config_changes': results.changed_parameters(config), 'config': config.nested()}
     rings: list[RingCoverage] = []
-    for name, own in items.items():
-        with closing(GroundSegmenter(configs[name])) as segmenter:
-            for item in progress(own):
-                segmenter.reset()
-                scan = load(item)
-                found = segmenter.segment(scan.points)
-                rings += ring_coverages(scan, found, kind.std)
+    with closing(GroundSegmenter(config)) as segmenter:
+        for item in progress(items):
+            segmenter.reset()
+            scan = load(item)
+            found = segmenter.segment(scan.points)
+            rings += ring_coverages(scan, found, kind.std)
     return Report(
         {name: _table(rings, name, kind) for name in kind.keys},
         [_row_of(one) for one in rings],

@@ -24,11 +24,6 @@ from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 Changes = Mapping[str, ParameterValue]
 """Values of parameters, by dotted name."""
 
-PRESET_OF = {
-    'hdl-64e': 'hdl64', 'hdl-32e': 'hdl32', 'vlp-16': 'vlp16', 'os1-128': 'os1_128',
-    'mid-360': 'mid360',
-}  # fmt: skip
-"""Preset that goes with each simulated sensor."""
 SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
 PEER = methods.TITLES[methods.PATCHWORKPP]
@@ -128,18 +123,19 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
 
 
 def score_scenes(
-    configs: Mapping[str, Config],
+    sensors: Sequence[str],
     scenes: Sequence[str],
     n_seeds: int,
+    config: Config,
     with_peer: bool,
     progress: Progress = iter,
 ) -> Report:
-    """Segment `n_seeds` simulated scenes of each name by each sensor of `configs`.
+    """Segment `n_seeds` simulated scenes of each name by each of the sensors.
 
     Patchwork++ runs on the same clouds with the true height of the sensor.
     """
     ours, theirs = [], []
-    for sensor, config in configs.items():
+    for sensor in sensors:
         frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
         peers = [methods.PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
         own, *other = score_variants(
@@ -149,11 +145,7 @@ def score_scenes(
         theirs += other
     pairs = [(methods.OURS, ours), (methods.PATCHWORKPP, theirs)]
     scores = [methods.pool(name, own) for name, own in pairs if own]
-    return make_report(
-        {'scenes': scene_table(*scores)}, scores, Config(),
-        config_changes={name: results.changed_parameters(own) for name, own in configs.items()},
-        config={name: own.nested() for name, own in configs.items()},
-    )  # fmt: skip
+    return make_report({'scenes': scene_table(*scores)}, scores, config)
 
 
 def scene_parts(score: MethodScore) -> list[MethodScore]:

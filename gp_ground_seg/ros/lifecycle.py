@@ -39,7 +39,7 @@ def initialize(words: Sequence[str]) -> None:
         prog=words[0],
         usage='%(prog)s [--ros-args ...]',
         description='Split the clouds of a topic into ground and obstacles.',
-        epilog='example: %(prog)s --ros-args -r points:=/lidar --params-file vlp16.yaml',
+        epilog='example: %(prog)s --ros-args -r points:=/lidar --params-file my.yaml',
     )
     parser.parse_args(other_words)
     _init(words)
