@@ -17,7 +17,7 @@ from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
-from gp_ground_seg.simulation import SCENES, SENSORS
+from gp_ground_seg.simulation import DRIVES, SCENES, SENSORS
 
 Option = tuple[str, str, dict[str, Any]]
 
@@ -27,7 +27,7 @@ OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
 SEEDS = ('--seeds', 'simulated scenes of each kind', options.NUMBER)
 SCENE_LIST = (
-    '--scenes', f'simulated scenes, some of {",".join(SCENES)} (default: all)',
+    '--scenes', f'simulated scenes, some of {",".join(SCENES)} (default: {",".join(DRIVES)})',
     {'metavar': 'LIST', 'type': options.some_of(SCENES)},
 )  # fmt: skip
 SENSOR_LIST = (
@@ -35,7 +35,8 @@ SENSOR_LIST = (
     {'metavar': 'LIST', 'type': options.some_of(SENSORS)},
 )  # fmt: skip
 EVERY_SENSOR = (
-    SENSOR_LIST[0], f'some of {",".join(SENSORS)} (default: all)', SENSOR_LIST[2],
+    SENSOR_LIST[0], f'some of {",".join(SENSORS)} (default: {",".join(variants.PRESET_OF)})',
+    SENSOR_LIST[2],
 )  # fmt: skip
 NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
 SWITCH = (
@@ -163,7 +164,7 @@ def _configs_of(arguments: argparse.Namespace, sensors: Sequence[str]) -> dict[s
 
 def _scenes(arguments: argparse.Namespace) -> Report:
     configs = _configs_of(arguments, arguments.sensors or DEFAULT_SENSORS)
-    scenes, seeds = arguments.scenes or list(SCENES), arguments.seeds or 3
+    scenes, seeds = arguments.scenes or list(DRIVES), arguments.seeds or 3
     bar = options.progress('scenes')
     return variants.score_scenes(configs, scenes, seeds, not arguments.no_peer, bar)
 
@@ -174,7 +175,10 @@ def _coverage(arguments: argparse.Namespace) -> Report:
         configs = _configs_of(arguments, ['KITTI'])
         frames = {'KITTI': frames_from_options(arguments)}
         return coverage.compare_coverage(frames, load_kitti, configs, coverage.LABELLED, bar)
-    sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or list(SCENES)
+    sensors, scenes = (
+        arguments.sensors or list(variants.PRESET_OF),
+        arguments.scenes or list(DRIVES),
+    )
     seeds, configs = arguments.seeds or 2, _configs_of(arguments, sensors)
     scans = {one: simulated_frames([one], scenes, seeds, (0.0,)) for one in sensors}
     return coverage.compare_coverage(scans, load_simulated, configs, coverage.SIMULATED, bar)
@@ -213,7 +217,7 @@ def _sensor_pose(arguments: argparse.Namespace) -> Report:
     if not arguments.simulated:
         frames, mounts = frames_from_options(arguments), sensor_pose.MOUNTS
         return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, bar)
-    scenes, mounts = arguments.scenes or list(SCENES), sensor_pose.SIMULATED_MOUNTS
+    scenes, mounts = arguments.scenes or list(DRIVES), sensor_pose.SIMULATED_MOUNTS
     scans = simulated_frames(DEFAULT_SENSORS, scenes, arguments.seeds or 1, (0.0,))
     return sensor_pose.score_poses(scans, sensor_pose.load_mounted, mounts, config, bar)
 

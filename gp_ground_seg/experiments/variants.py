@@ -19,7 +19,7 @@ from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
-from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
+from gp_ground_seg.simulation import PLACES, SCENES, SENSORS, simulate_scan
 
 Changes = Mapping[str, ParameterValue]
 """Values of parameters, by dotted name."""
@@ -28,7 +28,7 @@ PRESET_OF = {
     'hdl-64e': 'hdl64', 'hdl-32e': 'hdl32', 'vlp-16': 'vlp16', 'os1-128': 'os1_128',
     'mid-360': 'mid360',
 }  # fmt: skip
-"""Preset that goes with each simulated sensor."""
+"""Preset that goes with each simulated sensor; others have the defaults."""
 SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
 PEER = methods.TITLES[methods.PATCHWORKPP]
@@ -62,9 +62,9 @@ def load_simulated(frame: SimulatedFrame) -> KnownScan:
 def simulated_frames(
     sensors: Sequence[str], scenes: Sequence[str], n_seeds: int, places: Sequence[float]
 ) -> list[SimulatedFrame]:
-    """Sensors by scenes by seeds by places."""
+    """Sensors by scenes by seeds by places; scenes without a free lane from the origin only."""
     cases = itertools.product(sensors, scenes, range(n_seeds), places)
-    return [SimulatedFrame(*case) for case in cases]
+    return [SimulatedFrame(*case) for case in cases if not case[3] or case[1] not in PLACES]
 
 
 def refuse_changed(config: Config, names: Iterable[str]) -> None:
