@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from gp_ground_seg.data.boxes import Boxes
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation.metrics import CLASS_NAMES, Labels, ratio
 from gp_ground_seg.frame import BoolArray, FloatArray, IntArray, Label
@@ -149,28 +150,32 @@ def pool_objects(counts: Sequence[ObjectCounts]) -> ObjectCounts:
 def _rank(name: str) -> tuple[bool, str]:
     """Those of `GROUPS` first, in their order."""
     names = [*GROUPS]
-    return (False, f'{names.index(name)}') if name in names else (True, name)
+    return (False, str(names.index(name))) if name in names else (True, name)
 
 
-def local_ground(points: npt.NDArray[np.floating], is_ground: BoolArray) -> FloatArray:
-    """Height of the ground about each of the points (N, >=3), by those `is_ground` (N,) [m].
+def local_ground(
+    points: npt.NDArray[np.floating], is_ground: BoolArray, wanted: BoolArray
+) -> FloatArray:
+    """Height of the ground about points (N, >=3), by those that are ground (N,) [m].
 
-    The ground is reduced to the median height of its returns in cells of `CELL_SIZE`; about a point
-    it is the median of the `N_CELLS` nearest of these. NaN where the farthest of them is more than
-    `MAX_GROUND_DISTANCE` away.
+    The ground is reduced to the median height of its returns in cells of `CELL_SIZE`; about a
+    point it is the median of the `N_CELLS` nearest of these. NaN where the farthest of them is
+    more than `MAX_GROUND_DISTANCE` away, and where it is not `wanted` (N,).
     """
     xyz = points[:, :3].astype(np.float64)
     finite = np.isfinite(xyz).all(axis=1)
+    ground, wanted = xyz[finite & is_ground], finite & wanted
     result = np.full(len(xyz), np.nan)
-    cell, z = np.floor(xyz[finite & is_ground, :2] / CELL_SIZE), xyz[finite & is_ground, 2]
-    places, number = np.unique(cell, axis=0, return_inverse=True)
-    if len(places) < N_CELLS or not finite.any():
+    # One complex number for each cell, which sorts much faster than a pair.
+    cell = np.floor(ground[:, 0] / CELL_SIZE) + 1j * np.floor(ground[:, 1] / CELL_SIZE)
+    places, number = np.unique(cell, return_inverse=True)
+    if len(places) < N_CELLS or not wanted.any():
         return result
-    height = np.asarray(ndimage.median(z, number.reshape(-1), np.arange(len(places))))
-    tree = KDTree((places + 0.5) * CELL_SIZE)
-    distance, nearest = tree.query(xyz[finite, :2], k=N_CELLS)
+    height = np.asarray(ndimage.median(ground[:, 2], number, np.arange(len(places))))
+    tree = KDTree((np.column_stack([places.real, places.imag]) + 0.5) * CELL_SIZE)
+    distance, nearest = tree.query(xyz[wanted, :2], k=N_CELLS)
     median = np.median(height[nearest], axis=1)
-    result[finite] = np.where(distance[:, -1] <= MAX_GROUND_DISTANCE, median, np.nan)
+    result[wanted] = np.where(distance[:, -1] <= MAX_GROUND_DISTANCE, median, np.nan)
     return result
 
 
@@ -180,16 +185,39 @@ def group_of(word: str) -> str:
     return next((name for name, words in GROUPS.items() if own in words), own)
 
 
-def labelled_objects(entries: npt.NDArray[np.uint32], ground_z: FloatArray) -> Objects:
-    """Objects of the entries of a ``.label`` file (N,): class below, instance in the upper half.
+def labelled_objects(
+    points: npt.NDArray[np.floating], entries: npt.NDArray[np.uint32], is_ground: BoolArray
+) -> Objects:
+    """Objects by the entries of a ``.label`` file (N,), and the local ground by what is ground.
 
     Instances are numbered by class, so that the whole entry is the number of an object.
     """
-    classes = tuple(GROUPS)
-    semantic = (entries & 0xFFFF).astype(np.int64)
-    class_of = np.full(len(entries), -1)
+    classes, class_of = tuple(GROUPS), np.full(len(entries), -1)
     for number, word in CLASS_NAMES.items():
         if (group := group_of(word)) in classes:
-            class_of[semantic == number] = classes.index(group)
+            class_of[entries & 0xFFFF == number] = classes.index(group)
     object_id = np.where(entries >> 16 > 0, entries, 0).astype(np.int64)
+    return Objects(classes, class_of, object_id, local_ground(points, is_ground, class_of >= 0))
+
+
+def boxed_objects(
+    points: npt.NDArray[np.floating], boxes: Boxes, is_ground: BoolArray | None = None
+) -> Objects:
+    """Objects by boxes: what is in a box lies on its object, in several on that of the smallest.
+
+    The local ground is that of `local_ground`, and where it is not known which returns are
+    ground the bottom of the box.
+    """
+    words = [group_of(name) for name in boxes.names]
+    classes = tuple(sorted(set(words), key=_rank))
+    class_of, object_id = np.full(len(points), -1), np.zeros(len(points), dtype=np.int64)
+    ground_z = np.full(len(points), np.nan)
+    xyz = points[:, :3].astype(np.float64)
+    for k in np.argsort(-boxes.size.prod(axis=1), kind='stable'):
+        own, half = (xyz - boxes.center[k]) @ boxes.rotation[k].T, 0.5 * boxes.size[k]
+        found = (np.abs(own) <= half).all(axis=1)
+        class_of[found], object_id[found] = classes.index(words[k]), k + 1
+        ground_z[found] = (xyz[:, 2] - own[:, 2] - half[2])[found]
+    if is_ground is not None:
+        ground_z = local_ground(points, is_ground, class_of >= 0)
     return Objects(classes, class_of, object_id, ground_z)
