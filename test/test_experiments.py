@@ -17,6 +17,7 @@ from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore, labelled_frames
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
+from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.experiments import (
     ablation,
     coverage,
@@ -267,7 +268,7 @@ def test_scene_scores_follow_their_definitions(monkeypatch):
     (row,) = report.tables['scenes'].json()
     total, its_total = Confusion(), Confusion()
     errors, its_errors = [], []
-    segmenter, method = GroundSegmenter(config), runner.PatchworkppMethod(SENSORS['vlp-16'].height)
+    segmenter, method = GroundSegmenter(config), PatchworkppMethod(SENSORS['vlp-16'].height)
     for seed in (0, 1):
         scan = load_simulated(SimulatedFrame('vlp-16', 'kerb', seed, 6.0))
         ground, z = scan.is_ground, scan.ground_z

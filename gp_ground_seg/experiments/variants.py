@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -15,6 +16,8 @@ from gp_ground_seg.evaluation import report as results
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
+from gp_ground_seg.evaluation.objects import BAND_TITLES
+from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
@@ -118,6 +121,11 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
             main = class_errors(scan.classes)[0]
             row['points'] = sum(count.n_points for count in scan.classes.values())
             row['main_error_class'] = class_name(main.number) if main.errors else ''
+        if scan.objects:
+            row['objects'] = {
+                name: dict(zip(BAND_TITLES, map(dataclasses.asdict, bands), strict=True))
+                for name, bands in scan.objects.items()
+            }
         if scan.fit is not None and scan.pose is not None:
             pose = scan.pose
             row |= {'status': scan.fit.status, 'n_segments': scan.fit.n_segments}
@@ -141,7 +149,7 @@ def score_scenes(
     ours, theirs = [], []
     for sensor, config in configs.items():
         frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
-        peers = [methods.PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
+        peers = [PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
         own, *other = score_variants(
             frames, load_simulated, {methods.OURS: config}, peers, progress=progress
         )
