@@ -12,7 +12,7 @@ from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, sta
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.evaluate import load_kitti
 from gp_ground_seg.evaluation.report import Report, describe_environment, machine_line, written
-from gp_ground_seg.experiments import ablation, coverage, sensor_pose, stepwise, variants
+from gp_ground_seg.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
@@ -37,6 +37,13 @@ SENSOR_LIST = (
 EVERY_SENSOR = (
     SENSOR_LIST[0], f'some of {",".join(SENSORS)} (default: {",".join(variants.PRESET_OF)})',
     SENSOR_LIST[2],
+)  # fmt: skip
+EVERY_MOUNT = (
+    SENSOR_LIST[0], f'some of {",".join(SENSORS)} (default: all)', SENSOR_LIST[2],
+)  # fmt: skip
+CROWDED_LIST = (
+    SCENE_LIST[0], f'some of {",".join(SCENES)} (default: {",".join(lost.SCENES)})',
+    SCENE_LIST[2],
 )  # fmt: skip
 NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
 SWITCH = (
@@ -169,6 +176,13 @@ def _scenes(arguments: argparse.Namespace) -> Report:
     return variants.score_scenes(configs, scenes, seeds, not arguments.no_peer, bar)
 
 
+def _objects(arguments: argparse.Namespace) -> Report:
+    scenes, seeds = arguments.scenes or lost.SCENES, arguments.seeds or 2
+    config, bar = options.read_config(arguments), options.progress('objects')
+    sensors = arguments.sensors or list(SENSORS)
+    return lost.score_objects(sensors, scenes, seeds, config, not arguments.no_peer, bar)
+
+
 def _coverage(arguments: argparse.Namespace) -> Report:
     bar = options.progress('coverage')
     if not arguments.simulated:
@@ -281,6 +295,15 @@ parameters and the true height of the sensor.
 """,
         (SENSOR_LIST, SCENE_LIST, SEEDS, NO_PEER),
         _scenes,
+    ),
+    'objects': Experiment(
+        """\
+Count vehicles, persons and cyclists of simulated scans that are called ground, beside
+Patchwork++ with its published parameters and the true height of the cloud. All sensors have one
+set of parameters.
+""",
+        (EVERY_MOUNT, CROWDED_LIST, SEEDS, NO_PEER),
+        _objects,
     ),
     'cross-validation': Experiment(
         """\

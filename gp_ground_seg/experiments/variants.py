@@ -16,13 +16,13 @@ from gp_ground_seg.evaluation import report as results
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
-from gp_ground_seg.evaluation.objects import BAND_TITLES
+from gp_ground_seg.evaluation.objects import BAND_TITLES, GROUPS, Objects
 from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
-from gp_ground_seg.simulation import PLACES, SCENES, SENSORS, simulate_scan
+from gp_ground_seg.simulation import PLACES, SCENES, SENSORS, Kind, simulate_scan
 
 Changes = Mapping[str, ParameterValue]
 """Values of parameters, by dotted name."""
@@ -34,6 +34,8 @@ PRESET_OF = {
 """Preset that goes with each simulated sensor; others have the defaults."""
 SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
+OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
+"""What rays hit of objects, by the classes of `GROUPS`; crates are boxes too, but no objects."""
 PEER = methods.TITLES[methods.PATCHWORKPP]
 
 
@@ -56,9 +58,13 @@ def load_simulated(frame: SimulatedFrame) -> KnownScan:
     scene, rng = SCENES[frame.scene](frame.seed), np.random.default_rng(frame.seed)
     made = simulate_scan(scene, SENSORS[frame.sensor], rng, x=frame.x)
     truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
+    class_of = np.full(len(truth), -1)
+    for number, name in enumerate(GROUPS):
+        class_of[(made.kind == OBJECT_KINDS[name]) & (made.object_id > 0)] = number
+    objects = Objects(tuple(GROUPS), class_of, made.object_id, made.ground_z)
     return KnownScan(
         frame.sequence, f'{frame.seed}/{frame.x:g}', made.points, {'exact': truth},
-        ground_z=made.ground_z, is_ground=made.is_ground,
+        ground_z=made.ground_z, is_ground=made.is_ground, objects=objects,
     )  # fmt: skip
 
 
@@ -149,7 +155,7 @@ def score_scenes(
     ours, theirs = [], []
     for sensor, config in configs.items():
         frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
-        peers = [PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
+        peers = [PatchworkppMethod(SENSORS[sensor].height_of_cloud)] if with_peer else []
         own, *other = score_variants(
             frames, load_simulated, {methods.OURS: config}, peers, progress=progress
         )

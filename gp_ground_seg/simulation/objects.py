@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import TypeAlias
@@ -129,7 +129,7 @@ def slab(low: float, high: float, position: FloatArray, rate: FloatArray) -> Int
 
 
 def nearest_solid(
-    solids: Iterable[Solid], origin: FloatArray, direction: FloatArray
+    solids: Sequence[Solid], origin: FloatArray, direction: FloatArray
 ) -> tuple[FloatArray, IntArray]:
     """Range [m] at which each ray first meets a solid, and its index: two (R,); inf, -1 if none.
 
@@ -142,8 +142,13 @@ def nearest_solid(
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     order = np.argsort(azimuth)
     azimuth = azimuth[order]
-    for k, solid in enumerate(solids):
-        rays = order if origin.ndim > 1 else order[_find_towards(solid, origin, azimuth)]
+    x, y = starts[0, :2] if origin.ndim == 1 else np.full(2, np.nan)
+    gaps = [math.hypot(solid.x - x, solid.y - y) - solid.radius for solid in solids]
+    for k in np.argsort(gaps, kind='stable').tolist():
+        solid, rays = solids[k], order
+        if origin.ndim == 1:
+            rays = order[_find_towards(solid, origin, azimuth)]
+            rays = rays[distance[rays] > gaps[k]]  # the others end before it
         entry = solid.entry(starts[rays], direction[rays])
         nearer = entry < distance[rays]
         distance[rays[nearer]], index[rays[nearer]] = entry[nearer], k

@@ -52,6 +52,11 @@ class SensorModel:
     sector: float = 2.0 * math.pi  # of azimuths in one turn, its middle straight ahead [rad]
     others: tuple[SensorModel, ...] = ()  # merged into the same cloud; each has an `origin`
 
+    @property
+    def height_of_cloud(self) -> float:
+        """Height of the origin of the cloud above the ground under the sensor [m]."""
+        return self.height - self.origin[2] if self.origin else self.height
+
     def directions(self, phase: float) -> FloatArray:
         """Return the unit vectors of all rays in the sensor frame, (R, 3).
 
@@ -175,8 +180,8 @@ def simulate_scan(
     same generator state gives the same noise in another scene.
     """
     ground = float(scene.terrain.height(x, 0.0))
-    start = sensor.origin or (0.0, 0.0, 0.0)
-    position = np.array([x - start[0], 0.0 - start[1], ground + sensor.height - start[2]])
+    ahead, left, _ = sensor.origin or (0.0, 0.0, 0.0)
+    position = np.array([x - ahead, 0.0 - left, ground + sensor.height_of_cloud])
     rotation = np.eye(3) if sensor.origin else sensor.rotation()
     parts = [_cast(scene, one, rng, position) for one in (sensor, *sensor.others)]
     points, kind, object_id = (np.concatenate(columns) for columns in zip(*parts, strict=True))

@@ -33,14 +33,12 @@ class Hull(Solid):
     limits: FloatArray  # (K,) [m]
 
     def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
-        intervals = []
-        for normal, limit in zip(self.normals, self.limits, strict=True):
-            outward = rate @ normal
-            outward = np.where(np.abs(outward) < SMALLEST_RATE, SMALLEST_RATE, outward)
-            at = (limit - offset @ normal) / outward
-            leaves = outward > 0.0
-            intervals.append((np.where(leaves, -np.inf, at), np.where(leaves, at, np.inf)))
-        return intervals
+        outward = self.normals @ rate.T
+        outward[np.abs(outward) < SMALLEST_RATE] = SMALLEST_RATE
+        at = (self.limits[:, None] - self.normals @ offset.T) / outward
+        leaves = outward > 0.0
+        enter, leave = np.where(leaves, -np.inf, at), np.where(leaves, at, np.inf)
+        return [(enter.max(axis=0), leave.min(axis=0))]
 
 
 class Model(NamedTuple):
