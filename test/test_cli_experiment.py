@@ -56,6 +56,9 @@ CASES = {
         'scenes', 2 * 4,
     ),
     'scenes --no-peer': (['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', '1'], 'scenes', 1),
+    'objects': (
+        ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
+    ),
     'cross-validation': (['ROOT', '--set', 'grid.r_max=5,20.0,60', *SMALL], 'scores', 3 * 4),
     'sensor-pose': (
         ['ROOT', '--sequences', '08', '--set', 'learning.mode=fixed'], 'turns', 27,

@@ -255,8 +255,8 @@ def test_scores_of_the_search_are_those_of_evaluate(frames):
         ablation.cross_validate(frames[:2], FAR, {name: [15.0]})
 
 
-def test_every_sensor_has_a_preset_of_its_height():
-    assert set(PRESET_OF) == set(SENSORS)
+def test_presets_have_the_heights_of_their_sensors():
+    assert set(PRESET_OF) <= set(SENSORS)
     for sensor, preset in PRESET_OF.items():
         assert PRESETS[preset].config.sensor.height in ('auto', SENSORS[sensor].height)
 

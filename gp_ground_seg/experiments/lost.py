@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation import evaluate as methods
@@ -25,6 +27,9 @@ SCENES = (*PLACES, 'urban')
 BANDS = {'0-10 m': slice(0, 1), '10-20 m': slice(1, 2), '> 20 m': slice(2, None)}
 """Bands of range of the columns, as parts of `evaluation.objects.BAND_TITLES`."""
 
+COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
+"""Classes of `evaluation.objects.GROUPS` by column."""
+
 
 def score_objects(
     sensors: Sequence[str],
@@ -36,7 +41,8 @@ def score_objects(
 ) -> Report:
     """Segment `n_seeds` simulated scenes of each name by each sensor, and count lost objects.
 
-    A sensor and scene of which a scan is refused is left out, and a note says why.
+    All sensors have the parameters `config`. A sensor and scene of which a scan is refused is left
+    out, and a note says why.
     """
     found: list[list[MethodScore]] = []
     refused = []
@@ -53,57 +59,59 @@ def score_objects(
     if not found:
         raise PointCloudError('; '.join(refused))
     pooled = [methods.pool(own[0].name, own) for own in zip(*found, strict=True)]
-    return make_report({'objects': lost_table(pooled, refused)}, pooled, config)
+    return make_report(lost_tables(pooled, refused), pooled, config)
 
 
-def lost_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> Table:
-    """One row for each sensor and scene: ours, then the peer if there is one."""
-    rows: list[Row] = []
-    behind: dict[str, list[str]] = {'IoU': [], 'vehicles': [], 'lost': []}
+def lost_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> dict[str, Table]:
+    """Objects lost, and returns on vehicles by range; ours, then the peer if there is one."""
+    objects: list[Row] = []
+    returns: list[Row] = []
+    behind: list[str] = []
+    more: list[str] = []
+    lost: list[str] = []
     for group in scores[0].sequences:
         own = [score.of(group) for score in scores]
-        sensor, scene = group.split()
-        row: Row = [(Column('sensor'), sensor), (Column('scene'), scene)]
-        row += _of_each(percent('IoU', 'iou'), [score.iou for score in own])
+        names: Row = list(zip((Column('sensor'), Column('scene')), group.split(), strict=True))
+        row = [*names, *_of_each(percent('IoU', 'iou'), [score.iou for score in own])]
         if own[0].iou < own[-1].iou:
-            behind['IoU'].append(group)
-        for title, band in BANDS.items():
-            bands = [score.objects.get('vehicle', ())[band] for score in own]
-            shares = [sum(one, ObjectCount()).share_ground for one in bands]
-            row += _of_each(percent(title), shares)
-            if shares[0] > shares[-1]:
-                behind['vehicles'].append(f'{group} {title}')
-        for title, names in (('vehicles', ('vehicle',)), ('persons', ('person', 'cyclist'))):
-            counts = [
-                sum((one for name in names for one in score.objects.get(name, ())), ObjectCount())
-                for score in own
-            ]
+            behind.append(group)
+        for title, classes in COUNTED.items():
+            bands = [[one.objects.get(name, ()) for name in classes] for one in own]
+            counts = [sum(itertools.chain(*found), ObjectCount()) for found in bands]
             row.append((Column(title, '_d'), counts[0].n_objects))
             row += _of_each(Column('lost', '_d', f'lost_{title}'), [c.n_lost for c in counts])
             if counts[0].n_lost:
-                behind['lost'].append(f'{group} {counts[0].n_lost} {title}')
-        rows.append(row)
-    title = (
-        f'IoU of the ground against exact labels [%]; share of the returns on vehicles from '
-        f'{MIN_HEIGHT:g} m above the exact ground that is called ground, by range [%]; vehicles, '
-        f'persons and cyclists with at least {MIN_RETURNS} such returns, and how many are lost: '
-        f'more than half of these returns called ground'
+                lost.append(f'{group} {counts[0].n_lost} of {counts[0].n_objects} {title}')
+        objects.append(row)
+        row = names
+        for title, band in BANDS.items():
+            counts = [sum(one.objects.get('vehicle', ())[band], ObjectCount()) for one in own]
+            shares = [count.share_ground for count in counts]
+            row = [*row, *_of_each(percent(title), shares)]
+            if shares[0] > shares[-1]:
+                more.append(f'{group} {title}')
+        returns.append(row)
+    above = f'from {MIN_HEIGHT:g} m above the exact ground'
+    of_objects = (
+        'IoU of the ground against exact labels [%]; vehicles, persons and cyclists with at least '
+        f'{MIN_RETURNS} returns {above}, and how many are lost: more than half of these returns '
+        'called ground'
     )
-    notes = [*refused]
+    of_returns = f'Share of the returns on vehicles {above} that is called ground, by range [%]'
+    objects_notes = [*refused, f'objects lost: {", ".join(lost) or "none"}']
+    returns_notes = []
     if len(scores) > 1:
-        title += f'; its: of {PEER}, which has the true height of the cloud'
-        notes += [
-            f'IoU behind {PEER}: {", ".join(behind["IoU"]) or "nowhere"}',
-            f'more of vehicles than {PEER}: {", ".join(behind["vehicles"]) or "nowhere"}',
-        ]
-    notes.append(f'objects lost: {", ".join(behind["lost"]) or "none"}')
-    return Table.of(rows, title=title, notes=notes)
+        of_objects += f'; its: of {PEER}, which has the true height of the cloud'
+        objects_notes.append(f'IoU behind {PEER}: {", ".join(behind) or "nowhere"}')
+        returns_notes = [f'more than {PEER}: {", ".join(more) or "nowhere"}']
+    return {
+        'objects': Table.of(objects, title=of_objects, notes=objects_notes),
+        'vehicles': Table.of(returns, title=of_returns, notes=returns_notes),
+    }
 
 
 def _of_each(column: Column, values: Sequence[float | int]) -> Row:
-    """Cells of ours and of the peer."""
-    key = column.key or column.title
-    its = Column('its', column.format, f'peer_{key}', column.scale)
-    return list(
-        zip((Column(column.title, column.format, key, column.scale), its), values, strict=False)
-    )
+    """Cells of ours and of the peer, if there is one."""
+    ours = replace(column, key=column.key or column.title)
+    columns = ours, replace(ours, title='its', key=f'peer_{ours.key}')
+    return list(zip(columns[: len(values)], values, strict=True))
