@@ -22,6 +22,7 @@ from gp_ground_seg.simulation import (
 from gp_ground_seg.simulation import scenes as landforms
 
 EXACT = dataclasses.replace(HDL_64E, n_columns=700, range_std=0.0, dropout=0.0)
+TALL = dataclasses.replace(EXACT, elevations=SENSORS['os1-128'].elevations)
 FLAT = landforms.flat()
 OF_OBJECTS = (Kind.BOX, Kind.PERSON, Kind.CYCLIST)
 
@@ -74,7 +75,7 @@ def test_returns_of_a_vehicle_lie_on_it(name, yaw, gradient):
     model, heading = traffic.MODELS[name], 0.4
     terrain = landforms.slope(gradient, heading)
     x, y = 8.0, 2.0
-    made = scan(Scene('one', terrain, traffic.vehicle(terrain, name, x, y, yaw)))
+    made = scan(Scene('one', terrain, traffic.vehicle(terrain, name, x, y, yaw)), TALL)
     dx, dy, z = in_world(made)[made.object_id == 1].T - np.array([[x], [y], [0.0]])
     assert len(z) > 300
     ahead = dx * math.cos(yaw) + dy * math.sin(yaw)
@@ -85,7 +86,7 @@ def test_returns_of_a_vehicle_lie_on_it(name, yaw, gradient):
     assert above.min() >= -1e-4
     top = profile(model, ahead)
     assert (above <= np.maximum(top, 2.0 * model.wheel) + 1e-3).all()
-    assert above.max() > 0.55 * top.max()
+    assert above.max() > 0.95 * top.max()
 
 
 def test_a_bonnet_is_lower_than_the_roof_and_ground_is_seen_below_the_car():
@@ -190,8 +191,7 @@ def test_a_car_park_has_rows_with_narrow_gaps_beside_a_free_aisle(seed):
 @pytest.mark.parametrize('seed', range(3))
 def test_a_climb_is_hidden_by_the_parked_cars(seed):
     scene = SCENES['hidden_climb'](seed)
-    rise = np.linalg.norm(scene.terrain.gradient(100.0 * np.eye(2)[:, :1] * 0.0), axis=1)
-    assert not rise.any()  # level at the sensor
+    assert not scene.terrain.gradient(np.zeros((1, 2))).any()  # level at the sensor
     heading, foot = scene.terrain.heading, float(scene.terrain.edges[0])
     at = (foot + 5.0) * np.array([[math.cos(heading), math.sin(heading)]])
     assert 0.1 <= np.linalg.norm(scene.terrain.gradient(at)) <= 0.15
@@ -215,7 +215,8 @@ def test_a_slope_begins_in_the_blind_spot(seed):
     at = np.array([-20.0, -1.6, -0.99, 0.99, 1.6, 20.0])
     down, lower, *level, upper, up = (terrain.gradient(at[:, None] * across) @ across).tolist()
     assert level == [0.0, 0.0]
-    assert 0.1 <= down == pytest.approx(lower) == pytest.approx(up) == pytest.approx(upper) <= 0.15
+    assert [lower, upper, up] == pytest.approx([down] * 3)
+    assert 0.1 <= down <= 0.15
     nearest = np.hypot(*scan(SCENES['blind_slope'](seed)).points[:, :2].T).min()
     assert nearest > 1.6
 
@@ -274,7 +275,11 @@ def test_a_merged_cloud_is_of_both_sensors_in_one_frame():
         rays = points[:, :3].astype(float) - sensor.origin
         elevation = sign * np.degrees(np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1)))
         beams = np.degrees(sensor.elevations)
-        assert (len(beams), beams.max(), beams.min()) == (32, 15.0, pytest.approx(-25.0))
+        assert (len(beams), beams.max(), beams.min()) == (
+            32,
+            pytest.approx(15.0),
+            pytest.approx(-25.0),
+        )
         assert np.abs(elevation[:, None] - beams).min(axis=1).max() < 1e-3
         assert len(points) > 10_000
     # One ground in both: that of the terrain.

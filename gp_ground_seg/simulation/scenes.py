@@ -279,12 +279,11 @@ def _traffic_jam(seed: int) -> Scene:
                 if rng.random() < 0.12:
                     solids += traffic.person(terrain, *line.at(along, rng.uniform(-1.0, 1.0)))
         if lane < 2:
-            for x in rng.uniform(-25.0, 25.0, 2):
-                if abs(x) > 3.0:
-                    solids += traffic.cyclist(terrain, x, 3.2 * lane + 1.6)
+            for x in rng.uniform((-25.0, 3.0), (-3.0, 25.0)).tolist():
+                solids += traffic.cyclist(terrain, x, 3.2 * lane + 1.6)
     for side in (-1.0, 1.0):
         solids += objects.wall(terrain, (-60.0, side * 13.0), (70.0, side * 13.0), 7.0)
-        for x in rng.uniform(-25.0, 25.0, 5):
+        for x in np.arange(-25.0, 25.0, 10.0) + rng.uniform(0.0, 8.0):
             solids += traffic.person(terrain, x, side * rng.uniform(9.0, 12.0))
     return Scene('traffic_jam', terrain, tuple(solids))
 
@@ -298,8 +297,9 @@ def _car_park(seed: int) -> Scene:
         line = _Line(terrain, rng, 0.0, side * aside)
         turned = rng.choice([-1.0, 1.0]) * math.pi / 2.0
         solids += line.fill((-45.0, 55.0), (0.6, 1.0), turned, CARS, share=0.88)[0]
-    for x in (*rng.uniform(3.0, 12.0, 3), *rng.uniform(-12.0, -3.0, 3), *rng.uniform(12, 30, 3)):
-        solids += traffic.person(terrain, x, rng.uniform(-2.6, 2.6))
+    for x in (-12.0, -7.5, 3.0, 7.5, 12.0, 16.5, 21.0, 25.5):
+        place = x + rng.uniform(0.0, 3.0), rng.uniform(-2.6, 2.6)
+        solids += traffic.person(terrain, *place)
     return Scene('car_park', terrain, tuple(solids))
 
 
@@ -312,7 +312,8 @@ def _hidden_climb(seed: int) -> Scene:
     row = _Line(terrain, rng, heading - math.pi / 2.0, near)
     solids, _ = row.fill((-28.0, 34.0), (0.6, 1.2), models=CARS)
     for k in range(10):
-        place = row.at(rng.uniform(-18.0, 18.0), foot - near + rng.uniform(8.0, 35.0))
+        beside = 4.0 * k - 18.0 + rng.uniform(-0.7, 0.7)
+        place = row.at(beside, foot - near + rng.uniform(8.0, 35.0))
         if k % 2:
             solids += traffic.person(terrain, *place)
         else:
