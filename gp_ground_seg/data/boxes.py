@@ -41,7 +41,9 @@ def find_boxes(where: str | Path, frames: Sequence[Frame]) -> list[Path]:
     where, sequences = Path(where), {frame.sequence for frame in frames}
     if not where.is_dir():
         names = [frame.index for frame in frames]
-        if where.exists() and names != [where.stem]:
+        if not where.exists():
+            raise DataError(f'{where}: no such file or folder')
+        if names != [where.stem]:
             wanted = 'a folder with a file for each' if len(names) > 1 else f'those of {names[0]}'
             raise DataError(f'{where}: boxes of one scan, {where.stem}; give {wanted}')
         return [where]
