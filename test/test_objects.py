@@ -69,7 +69,8 @@ def test_returns_count_from_the_least_height_above_their_ground():
     rows = returns(20, 5.0, z=2.01 + MIN_HEIGHT)
     rows += returns(20, 5.0, z=1.99 + MIN_HEIGHT, n_ground=20)
     assert of(count(rows, ground_z=2.0), 'vehicle', 0) == (20, 0, 1, 0)
-    assert count(rows, ground_z=math.nan) == {}
+    unknown = count(rows, ground_z=math.nan)
+    assert of(unknown, 'vehicle', 0) == (0, 0, 0, 0) and unknown['vehicle'][0].n_unknown == 40
     assert count(returns(20, math.inf)) == count(returns(20, 5.0, kind=-1)) == {}
 
 
@@ -100,12 +101,14 @@ def test_unknown_is_not_ground_and_shares_of_nothing_are_nan():
 
 def counted_by_loops(points, label, objects):
     """Count as the module says it does, one return after the other."""
-    share, own = {}, {}
+    share, own, unknown = {}, {}, []
     for k, (x, y, z) in enumerate(points):
         kind, number = objects.class_of[k], objects.object_id[k]
+        reach, is_ground = math.hypot(x, y), label[k] == Label.GROUND
+        if kind >= 0 and math.isnan(objects.ground_z[k]):
+            unknown.append((kind, band_of(reach)))
         if kind < 0 or not z - objects.ground_z[k] >= MIN_HEIGHT:
             continue
-        reach, is_ground = math.hypot(x, y), label[k] == Label.GROUND
         share.setdefault((kind, band_of(reach)), []).append(is_ground)
         if number:
             own.setdefault((kind, number), []).append((reach, is_ground))
@@ -120,10 +123,11 @@ def counted_by_loops(points, label, objects):
             ObjectCount(*(
                 number for counted in (share, found)
                 for own in [counted.get((kind, band), [])] for number in (len(own), sum(own))
-            ))
+            ), unknown.count((kind, band)))
             for band in range(4)
         )
-        for kind, name in enumerate(objects.classes) if any(k == kind for k, _ in share)
+        for kind, name in enumerate(objects.classes)
+        if any(k == kind for k, _ in [*share, *unknown])
     }  # fmt: skip
 
 
@@ -458,6 +462,10 @@ def test_where_nothing_stands_or_nothing_has_a_number_it_is_said(tmp_path, capsy
     assert row['returns'] > 300 and row['share_ground'] is not None
     assert (row['objects'], row['lost']) == (0, None)
     assert 'no object with enough returns' in capsys.readouterr().out
+    entries[np.isin(entries & 0xFFFF, GROUND_CLASSES)] = 0
+    write_frame(tmp_path / 'c', '00', 0, points, entries)
+    assert row_of(evaluated(tmp_path / 'c', tmp_path), 'vehicle', 'all')['share_ground'] is None
+    assert '600 returns on objects do not count: no labels of the g' in capsys.readouterr().out
 
 
 def test_boxes_count_without_labels_in_folders_and_files(tmp_path, capsys):

@@ -6,6 +6,7 @@ called ground. What lies below does not count: there the feet of an object and t
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Sequence
@@ -71,11 +72,12 @@ class ObjectCount:
     n_ground: int = 0  # of these called ground
     n_objects: int = 0  # with at least `MIN_RETURNS` of them
     n_lost: int = 0  # of these objects, with more than half of them called ground
+    n_unknown: int = 0  # returns at any height that do not count, as their ground is not known
 
     def __add__(self, other: ObjectCount) -> ObjectCount:
         """Add the counts of both."""
-        names = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
-        return ObjectCount(*(getattr(self, name) + getattr(other, name) for name in names))
+        pairs = zip(dataclasses.astuple(self), dataclasses.astuple(other), strict=True)
+        return ObjectCount(*(a + b for a, b in pairs))
 
     @property
     def share_ground(self) -> float:
@@ -94,7 +96,7 @@ def count_objects(
 
     `points` (N, >=3) are x, y, z [m], `label` (N,) what a method says of them; UNKNOWN is not
     ground. A return counts in the band of its own horizontal range, an object in that of the
-    median of its returns that count. Classes without a return from `MIN_HEIGHT` on are left out.
+    median of its returns that count. Classes without a return that counts, or would, are left out.
     """
     n = len(points)
     for name in ('class_of', 'object_id', 'ground_z'):
@@ -102,9 +104,11 @@ def count_objects(
             raise PointCloudError(f'{name} of shape {shape} for {n} points: must be ({n},)')
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
-    counts = (objects.class_of >= 0) & (z - objects.ground_z >= MIN_HEIGHT) & np.isfinite(reach)
+    on, n_classes = (objects.class_of >= 0) & np.isfinite(reach + z), len(objects.classes)
+    counts, lacks = on & (z - objects.ground_z >= MIN_HEIGHT), on & np.isnan(objects.ground_z)
+    unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks], n_classes)
     kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
-    returns = _by_class_and_band(kind, reach, is_ground, len(objects.classes))
+    returns = _by_class_and_band(kind, reach, is_ground, n_classes)
 
     known = (own_id := objects.object_id[counts]) != 0
     pairs = np.column_stack([kind, own_id])[known]
@@ -114,10 +118,11 @@ def count_objects(
     middle = _medians(reach[known], number, len(n_own))
     enough = n_own >= MIN_RETURNS
     lost = 2 * n_ground[enough] > n_own[enough]
-    found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, len(objects.classes))
+    found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, n_classes)
+    bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
     return {
-        name: tuple(ObjectCount(*map(int, numbers)) for numbers in np.hstack([own, its]))
-        for name, own, its in zip(objects.classes, returns, found, strict=True)
+        name: tuple(ObjectCount(*numbers) for numbers in own.tolist())
+        for name, own in zip(objects.classes, bands, strict=True)
         if own.any()
     }
 
