@@ -21,6 +21,10 @@ ARRAYS = {'box_class': (), 'box_center': (3,), 'box_size': (3,), 'box_rotation':
 COLUMNS = ('class', 'x', 'y', 'z', 'length', 'width', 'height', 'yaw')
 """Columns of a ``.csv`` file: centre and size [m], `yaw` about z, from x towards y [rad]."""
 _MAX_BYTES = 1 << 28  # a file may hold its scan too
+# What numpy, zipfile and csv raise; RuntimeError: encrypted, or of an unknown kind.
+_UNREADABLE = (
+    ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, csv.Error,
+)  # fmt: skip
 _MAX_SKEW = 1e-3  # of the axes of a box, which are orthonormal
 
 
@@ -41,7 +45,9 @@ def find_boxes(where: str | Path, frames: Sequence[Frame]) -> list[Path]:
     where, sequences = Path(where), {frame.sequence for frame in frames}
     if not where.is_dir():
         names = [frame.index for frame in frames]
-        if where.exists() and names != [where.stem]:
+        if not where.exists():
+            raise DataError(f'{where}: no such file or folder')
+        if names != [where.stem]:
             wanted = 'a folder with a file for each' if len(names) > 1 else f'those of {names[0]}'
             raise DataError(f'{where}: boxes of one scan, {where.stem}; give {wanted}')
         return [where]
@@ -66,7 +72,7 @@ def read_boxes(path: str | Path) -> Boxes:
     try:
         boxes = _read_npz(data) if suffix == '.npz' else _read_csv(data)
         _check(boxes)
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error, csv.Error) as error:
+    except _UNREADABLE as error:
         raise DataError(f'{path}: {" ".join(str(error).split())}') from error
     return boxes
 

@@ -50,6 +50,9 @@ def object_table(scores: Sequence[MethodScore], clusters: str) -> Table:
         notes = ['no return on an object: no class of objects in the labels, or no box holds one']
     elif not any(found[name][-1].n_objects for found in counts for name in found):
         notes = ['no object with enough returns: only classes, if labels have no instances']
+    if n_unknown := sum(own[-1].n_unknown for own in counts[0].values()):
+        shown = Column('', '_d').show(n_unknown)
+        notes.append(f'{shown} returns on objects do not count: no labels of the ground near them')
     return Table(columns, rows, title, notes)
 
 

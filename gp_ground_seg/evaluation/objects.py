@@ -6,9 +6,10 @@ called ground. What lies below does not count: there the feet of an object and t
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,21 +72,17 @@ class ObjectCount:
     n_ground: int = 0  # of these called ground
     n_objects: int = 0  # with at least `MIN_RETURNS` of them
     n_lost: int = 0  # of these objects, with more than half of them called ground
+    n_unknown: int = 0  # returns at any height that do not count, as their ground is not known
 
     def __add__(self, other: ObjectCount) -> ObjectCount:
         """Add the counts of both."""
-        names = ('n_returns', 'n_ground', 'n_objects', 'n_lost')
-        return ObjectCount(*(getattr(self, name) + getattr(other, name) for name in names))
+        pairs = zip(dataclasses.astuple(self), dataclasses.astuple(other), strict=True)
+        return ObjectCount(*(a + b for a, b in pairs))
 
     @property
     def share_ground(self) -> float:
         """Share of the returns that is called ground."""
         return ratio(self.n_ground, self.n_returns)
-
-    @property
-    def share_lost(self) -> float:
-        """Share of the objects that is lost."""
-        return ratio(self.n_lost, self.n_objects)
 
 
 ObjectCounts = dict[str, tuple[ObjectCount, ...]]
@@ -99,7 +96,7 @@ def count_objects(
 
     `points` (N, >=3) are x, y, z [m], `label` (N,) what a method says of them; UNKNOWN is not
     ground. A return counts in the band of its own horizontal range, an object in that of the
-    median of its returns that count. Classes without a return from `MIN_HEIGHT` on are left out.
+    median of its returns that count. Classes without a return that counts, or would, are left out.
     """
     n = len(points)
     for name in ('class_of', 'object_id', 'ground_z'):
@@ -107,22 +104,25 @@ def count_objects(
             raise PointCloudError(f'{name} of shape {shape} for {n} points: must be ({n},)')
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
-    counts = (objects.class_of >= 0) & (z - objects.ground_z >= MIN_HEIGHT) & np.isfinite(reach)
+    on, n_classes = (objects.class_of >= 0) & np.isfinite(reach + z), len(objects.classes)
+    counts, lacks = on & (z - objects.ground_z >= MIN_HEIGHT), on & np.isnan(objects.ground_z)
+    unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks], n_classes)
     kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
-    returns = _by_class_and_band(kind, reach, is_ground, len(objects.classes))
+    returns = _by_class_and_band(kind, reach, is_ground, n_classes)
 
     known = (own_id := objects.object_id[counts]) != 0
     pairs = np.column_stack([kind, own_id])[known]
     of_object, number, n_own = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
     number = number.reshape(-1)
     n_ground = np.bincount(number, is_ground[known], minlength=len(n_own))
-    middle = np.asarray(ndimage.median(reach[known], number, np.arange(len(n_own))))
+    middle = _medians(reach[known], number, len(n_own))
     enough = n_own >= MIN_RETURNS
     lost = 2 * n_ground[enough] > n_own[enough]
-    found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, len(objects.classes))
+    found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, n_classes)
+    bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
     return {
-        name: tuple(ObjectCount(*map(int, numbers)) for numbers in np.hstack([own, its]))
-        for name, own, its in zip(objects.classes, returns, found, strict=True)
+        name: tuple(ObjectCount(*numbers) for numbers in own.tolist())
+        for name, own in zip(objects.classes, bands, strict=True)
         if own.any()
     }
 
@@ -137,20 +137,24 @@ def _by_class_and_band(
     return np.column_stack(n).reshape(n_classes, n_bands, 2)
 
 
+def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
+    """Median of the values of each group; `ndimage` refuses none at all."""
+    return np.asarray(ndimage.median(values, group, range(n_groups)) if n_groups else values)
+
+
 def pool_objects(counts: Sequence[ObjectCounts]) -> ObjectCounts:
     """Sum up the counts of several scans."""
-    names = sorted({name for one in counts for name in one}, key=_rank)
-    of_class = {name: [one[name] for one in counts if name in one] for name in names}
-    return {
-        name: tuple(sum(band, ObjectCount()) for band in zip(*own, strict=True))
-        for name, own in of_class.items()
-    }
+    pooled: ObjectCounts = {}
+    for name, bands in (item for one in counts for item in one.items()):
+        before = pooled.get(name, (ObjectCount(),) * len(bands))
+        pooled[name] = tuple(a + b for a, b in zip(before, bands, strict=True))
+    return {name: pooled[name] for name in _in_order(pooled)}
 
 
-def _rank(name: str) -> tuple[bool, str]:
-    """Those of `GROUPS` first, in their order."""
-    names = [*GROUPS]
-    return (False, str(names.index(name))) if name in names else (True, name)
+def _in_order(names: Iterable[str]) -> list[str]:
+    """Names of classes, each once: those of `GROUPS`, then the others by name."""
+    unique = sorted(set(names))
+    return [name for name in GROUPS if name in unique] + [n for n in unique if n not in GROUPS]
 
 
 def local_ground(
@@ -166,12 +170,14 @@ def local_ground(
     finite = np.isfinite(xyz).all(axis=1)
     ground, wanted = xyz[finite & is_ground], finite & wanted
     result = np.full(len(xyz), np.nan)
+    if not wanted.any():
+        return result
     # One complex number for each cell, which sorts much faster than a pair.
     cell = np.floor(ground[:, 0] / CELL_SIZE) + 1j * np.floor(ground[:, 1] / CELL_SIZE)
     places, number = np.unique(cell, return_inverse=True)
-    if len(places) < N_CELLS or not wanted.any():
+    if len(places) < N_CELLS:
         return result
-    height = np.asarray(ndimage.median(ground[:, 2], number, np.arange(len(places))))
+    height = _medians(ground[:, 2], number, len(places))
     tree = KDTree((np.column_stack([places.real, places.imag]) + 0.5) * CELL_SIZE)
     distance, nearest = tree.query(xyz[wanted, :2], k=N_CELLS)
     median = np.median(height[nearest], axis=1)
@@ -193,9 +199,10 @@ def labelled_objects(
     Instances are numbered by class, so that the whole entry is the number of an object.
     """
     classes, class_of = tuple(GROUPS), np.full(len(entries), -1)
+    semantic = entries & 0xFFFF
     for number, word in CLASS_NAMES.items():
         if (group := group_of(word)) in classes:
-            class_of[entries & 0xFFFF == number] = classes.index(group)
+            class_of[semantic == number] = classes.index(group)
     object_id = np.where(entries >> 16 > 0, entries, 0).astype(np.int64)
     return Objects(classes, class_of, object_id, local_ground(points, is_ground, class_of >= 0))
 
@@ -209,7 +216,7 @@ def boxed_objects(
     ground the bottom of the box.
     """
     words = [group_of(name) for name in boxes.names]
-    classes = tuple(sorted(set(words), key=_rank))
+    classes = tuple(_in_order(words))
     class_of, object_id = np.full(len(points), -1), np.zeros(len(points), dtype=np.int64)
     ground_z = np.full(len(points), np.nan)
     xyz = points[:, :3].astype(np.float64)
