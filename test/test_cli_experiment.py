@@ -21,7 +21,7 @@ from gp_ground_seg.experiments import ablation, sensor_pose, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, VARIANCES, Choice, table1
 from gp_ground_seg.experiments.variants import PRESET_OF
 from gp_ground_seg.parameters.presets import PRESETS
-from gp_ground_seg.simulation import HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
+from gp_ground_seg.simulation import DRIVES, HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
 
 SMALL = ['--set', 'grid.n_bins=40']
 
@@ -105,7 +105,8 @@ def test_tables_as_markdown(capsys):
 def test_scenes_have_the_presets_of_their_sensors(monkeypatch):
     found = {}
 
-    def note(configs, *_):
+    def note(configs, scenes, *_):
+        assert scenes == list(DRIVES)  # those of the page
         found.update(configs)
         raise DataError('enough')
 
