@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.backend import Backend, make_backend
-from gp_ground_seg.frame import Candidates, FloatArray, Frame, PointArray, Scan
+from gp_ground_seg.frame import FloatArray, Frame, PointArray, Scan
 from gp_ground_seg.gp.learning import Learned, given_theta, in_rows, learn_frame
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config, SensorConfig
@@ -184,15 +184,15 @@ class GroundSegmenter:
         scan = backend.build_grid(given.level(xyz), config)
         timer.mark('grid')
 
-        def candidates_rotated(matrix: FloatArray) -> Candidates:
+        def scan_rotated(matrix: FloatArray) -> Scan:
             # `backend` would overwrite the scan in its buffers.
             if self._sample_backend is None:
                 runtime = dataclasses.replace(config.runtime, n_threads=1, backend=backend.name)
                 self._sample_backend = make_backend(runtime)
             sample = rotate_sample(scan.xyz, matrix)
-            return self._sample_backend.build_grid(sample, config).candidates
+            return self._sample_backend.build_grid(sample, config)
 
-        pose = estimate_pose(scan.candidates, sensor, backend.fit_plane, candidates_rotated)
+        pose = estimate_pose(scan, sensor, backend.fit_plane, scan_rotated)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
             scan = backend.build_grid(pose.level(xyz), config)
         timer.mark('pose')
