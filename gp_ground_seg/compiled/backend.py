@@ -38,10 +38,10 @@ from gp_ground_seg.frame import (
 from gp_ground_seg.gp.latent import given_log_length_scales
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.pipeline.tilt import Direction
 from gp_ground_seg.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.pipeline.labels import square_units
 from gp_ground_seg.pipeline.points import copy_points, points_in
+from gp_ground_seg.pipeline.tilt import Direction
 
 
 class NumbaBackend:

@@ -20,6 +20,7 @@ from gp_ground_seg.parameters.schema import (
     basic,
 )
 
+NO_FRAME = 'none'
 SENSOR_HEIGHTS = -5.0, 20.0
 """Lowest and highest origin of a cloud over the ground near it [m]."""
 
@@ -49,12 +50,12 @@ class SensorConfig:
 
 @dataclass(frozen=True)
 class FrameConfig:
-    """Where the tilt of the sensor is taken from; the node only."""
+    """Where tilt and place of the sensor are taken from; the node only."""
 
     level: str = basic('sensor', ('sensor', 'tf'),
         'where the tilt of the sensor is taken from: sensor.roll and sensor.pitch, or TF')
     base: str = basic('base_link', (), 'frame that is level to TF, with frame.level = tf')
-    sensor: str = advanced('none', (),
+    sensor: str = advanced(NO_FRAME, (),
         "frame of the sensor, whose place in the cloud's frame is looked up in TF; none = by "
         'sensor.origin_x, origin_y, origin_z')
 
