@@ -103,7 +103,7 @@ def test_a_change_takes_effect_with_the_next_cloud(b):
     assert n_ground(points, Config()) != n_ground(points, narrow)
 
 
-HEIGHT = 'must be auto or a number in [0.05, 20] m'
+HEIGHT = 'must be auto or a number in [-5, 20] m'
 
 
 @pytest.mark.parametrize(
