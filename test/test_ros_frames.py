@@ -214,7 +214,7 @@ def test_place_of_the_sensor_by_tf(monkeypatch):
             if reason:
                 b.publisher.publish(message)
                 b.wait_for_status('input', lambda v, s, reason=reason: reason in s.message)
-        assert b.segment(message)[0].width > 0.2 * len(points)
+        assert b.segment(message)[0].width > 0.05 * len(points)
         b.wait_for_status('model', lambda v, s: v['Taken from the scan'] == 'height')
         # Without it the height is not known, and nothing is ground.
         assert b.set('frame.sensor', 'none').successful

@@ -132,7 +132,7 @@ ROOM = room('room', [(-5.0, -5.0), (5.0, -5.0), (5.0, 5.0), (-5.0, 5.0)], ceilin
 
 def moved(points, lift):
     """Points of a frame whose origin is `lift` lower [m]."""
-    return points[:, :3].astype(np.float64) + [0.0, 0.0, lift]
+    return points[:, :3].astype(np.float64) + np.array([0.0, 0.0, lift])
 
 
 @pytest.mark.parametrize('sensor', [SMALL_HDL, SMALL_VLP], ids=lambda s: s.name)
