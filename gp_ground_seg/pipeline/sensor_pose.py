@@ -14,7 +14,7 @@ from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.frame import Candidates, FloatArray, PointArray, Scan
 from gp_ground_seg.parameters.config import SensorConfig
 from gp_ground_seg.parameters.schema import AUTO
-from gp_ground_seg.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.pipeline.ground_plane import FARTHEST, GroundPlane
 from gp_ground_seg.pipeline.tilt import (
     Direction,
     angles_of,
@@ -49,9 +49,9 @@ lean stay below it."""
 MAX_TILT = math.radians(30.0)
 """Steepest ground plane that is searched [rad]."""
 
-ABOVE, MIN_ABOVE = 0.3, 0.01
-"""Height over a plane [m], and share of the points higher than that over ground: over a ceiling, a
-scan of one beam, or the ground seen from a sensor upside down there are none."""
+CLEAR = 0.3
+"""Height from which a return counts as above a plane, or below it [m]: over a ceiling, or the ground
+seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
 LEAST_COSINE = 0.1
 """Cosine of the tilt from which the sensor's z axis meets the ground."""
 HEIGHT_CONTRADICTION = 0.3
@@ -181,7 +181,7 @@ def estimate_pose(
         if plane is None:
             return None
         is_below = float(plane.below(x, y, z)) >= MIN_CLEARANCE
-        if not is_below and not _has_returns_above(plane, own.xyz):
+        if not is_below and not _is_lower_side(plane, own):
             return None
         return View(
             plane, plane.normal if turn is None else turned_back(plane.normal, turn), is_below
@@ -227,10 +227,10 @@ def estimate_pose(
     )
 
 
-def _has_returns_above(plane: GroundPlane, xyz: PointArray) -> bool:
-    with np.errstate(over='ignore', invalid='ignore'):
-        height = plane.below(*xyz.T)
-    return bool(np.count_nonzero(height > ABOVE) > MIN_ABOVE * len(xyz))
+def _is_lower_side(plane: GroundPlane, scan: Scan) -> bool:
+    """Whether more returns are clearly above the plane than below it."""
+    height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
+    return bool(np.count_nonzero(height > CLEAR) > np.count_nonzero(height < -CLEAR))
 
 
 def _levelled(up: Direction, sensor: SensorConfig) -> tuple[float, float]:
