@@ -50,7 +50,7 @@ MAX_TILT = math.radians(30.0)
 """Steepest ground plane that is searched [rad]."""
 
 CLEAR = 0.3
-"""Height from which a return counts as above a plane, or below it [m]: over a ceiling, or the ground
+"""Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
 seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
 LEAST_COSINE = 0.1
 """Cosine of the tilt from which the sensor's z axis meets the ground."""
