@@ -15,7 +15,6 @@ from gp_ground_seg.cli import main as cli
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, find_doubt
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
 from gp_ground_seg.errors import DataError
-from gp_ground_seg.experiments.variants import PRESET_OF
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 
 SPARSE = 300 * 10**9
@@ -91,7 +90,7 @@ WRONG = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope='module', params=[*PRESET_OF, 'kitti'])
+@pytest.fixture(scope='module', params=[*SENSORS, 'kitti'])
 def scans(request):
     if request.param == 'kitti':
         root = request.getfixturevalue('kitti')

@@ -42,6 +42,9 @@ instances of the labels (their upper 16 bits), or given as boxes, a file for eac
                rows of the matrix are the axes of the box in the frame of the cloud
 
 Without labels only objects are counted, from the bottom of their boxes.
+
+Patchwork++ (--peer) has its published parameters; a height and a place of the sensor that are
+given (sensor.height, sensor.origin_x, ...) are given to it too.
 """
 EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
@@ -96,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
         items, load = _items_from_options(arguments)
         chosen: list[methods.Method] = [stack.enter_context(closing(methods.OurMethod(config)))]
         if arguments.peer is not None:
-            chosen.append(PatchworkppMethod())
+            chosen.append(PatchworkppMethod.of_sensor(config.sensor))
         bar = options.progress('evaluate')
         scores = methods.score_methods(items, load, chosen, progress=bar)
         report = make_report(

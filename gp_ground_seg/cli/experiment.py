@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
@@ -26,25 +26,19 @@ DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
 SEEDS = ('--seeds', 'simulated scenes of each kind', options.NUMBER)
-SCENE_LIST = (
-    '--scenes', f'simulated scenes, some of {",".join(SCENES)} (default: {",".join(DRIVES)})',
-    {'metavar': 'LIST', 'type': options.some_of(SCENES)},
-)  # fmt: skip
-SENSOR_LIST = (
-    '--sensors', f'some of {",".join(SENSORS)} (default: {",".join(DEFAULT_SENSORS)})',
-    {'metavar': 'LIST', 'type': options.some_of(SENSORS)},
-)  # fmt: skip
-EVERY_SENSOR = (
-    SENSOR_LIST[0], f'some of {",".join(SENSORS)} (default: {",".join(variants.PRESET_OF)})',
-    SENSOR_LIST[2],
-)  # fmt: skip
-EVERY_MOUNT = (
-    SENSOR_LIST[0], f'some of {",".join(SENSORS)} (default: all)', SENSOR_LIST[2],
-)  # fmt: skip
-CROWDED_LIST = (
-    SCENE_LIST[0], f'some of {",".join(SCENES)} (default: {",".join(lost.SCENES)})',
-    SCENE_LIST[2],
-)  # fmt: skip
+
+
+def _some_of(option: str, known: Iterable[str], default: Iterable[str]) -> Option:
+    """Option that takes names of scenes or sensors."""
+    text = f'some of {",".join(known)} (default: {",".join(default)})'
+    return option, text, {'metavar': 'LIST', 'type': options.some_of(known)}
+
+
+SCENE_LIST = _some_of('--scenes', SCENES, DRIVES)
+CROWDED_LIST = _some_of('--scenes', SCENES, lost.SCENES)
+SENSOR_LIST = _some_of('--sensors', SENSORS, DEFAULT_SENSORS)
+EVERY_SENSOR = _some_of('--sensors', SENSORS, variants.PRESET_OF)
+EVERY_MOUNT = _some_of('--sensors', SENSORS, ['all'])
 NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
 SWITCH = (
     '--switch',
@@ -189,10 +183,7 @@ def _coverage(arguments: argparse.Namespace) -> Report:
         configs = _configs_of(arguments, ['KITTI'])
         frames = {'KITTI': frames_from_options(arguments)}
         return coverage.compare_coverage(frames, load_kitti, configs, coverage.LABELLED, bar)
-    sensors, scenes = (
-        arguments.sensors or list(variants.PRESET_OF),
-        arguments.scenes or list(DRIVES),
-    )
+    sensors, scenes = arguments.sensors or list(variants.PRESET_OF), arguments.scenes or [*DRIVES]
     seeds, configs = arguments.seeds or 2, _configs_of(arguments, sensors)
     scans = {one: simulated_frames([one], scenes, seeds, (0.0,)) for one in sensors}
     return coverage.compare_coverage(scans, load_simulated, configs, coverage.SIMULATED, bar)
@@ -299,8 +290,8 @@ parameters and the true height of the sensor.
     'objects': Experiment(
         """\
 Count vehicles, persons and cyclists of simulated scans that are called ground, beside
-Patchwork++ with its published parameters and the true height of the cloud. All sensors have one
-set of parameters.
+Patchwork++ with its published parameters and the true height and place of the sensor. All
+sensors have one set of parameters.
 """,
         (EVERY_MOUNT, CROWDED_LIST, SEEDS, NO_PEER),
         _objects,

@@ -6,8 +6,6 @@ called ground. What lies below does not count: there the feet of an object and t
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,7 +17,7 @@ from scipy.spatial import KDTree
 
 from gp_ground_seg.data.boxes import Boxes
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation.metrics import CLASS_NAMES, Labels, ratio
+from gp_ground_seg.evaluation.metrics import CLASS_NAMES, Labels, Sums, range_titles, ratio
 from gp_ground_seg.frame import BoolArray, FloatArray, IntArray, Label
 
 MIN_HEIGHT = 0.3
@@ -29,10 +27,7 @@ MIN_RETURNS = 10
 
 BAND_EDGES = (0.0, 10.0, 20.0, 40.0, math.inf)
 """Edges of the bands of horizontal range [m]; each holds its inner edge, not its outer one."""
-BAND_TITLES = tuple(
-    f'> {low:g} m' if math.isinf(high) else f'{low:g}-{high:g} m'
-    for low, high in itertools.pairwise(BAND_EDGES)
-)
+BAND_TITLES = range_titles(BAND_EDGES)
 
 CELL_SIZE = 0.5  # of the cells of ground that is known [m]
 N_CELLS = 5  # of them that make the local ground
@@ -65,7 +60,7 @@ class Objects:
 
 
 @dataclass(frozen=True)
-class ObjectCount:
+class ObjectCount(Sums):
     """Returns on objects, from `MIN_HEIGHT` above the ground, and objects; over nothing NaN."""
 
     n_returns: int = 0
@@ -73,11 +68,6 @@ class ObjectCount:
     n_objects: int = 0  # with at least `MIN_RETURNS` of them
     n_lost: int = 0  # of these objects, with more than half of them called ground
     n_unknown: int = 0  # returns at any height that do not count, as their ground is not known
-
-    def __add__(self, other: ObjectCount) -> ObjectCount:
-        """Add the counts of both."""
-        pairs = zip(dataclasses.astuple(self), dataclasses.astuple(other), strict=True)
-        return ObjectCount(*(a + b for a, b in pairs))
 
     @property
     def share_ground(self) -> float:

@@ -10,17 +10,17 @@ from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation.evaluate import MethodScore, Progress
 from gp_ground_seg.evaluation.objects import MIN_HEIGHT, MIN_RETURNS, ObjectCount
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.experiments.variants import (
     PEER,
     load_simulated,
     make_report,
+    peer_of,
     score_variants,
     simulated_frames,
 )
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.simulation import PLACES, SENSORS
+from gp_ground_seg.simulation import PLACES
 
 SCENES = (*PLACES, 'urban')
 """Scenes where objects hide the ground."""
@@ -49,7 +49,7 @@ def score_objects(
     cases = [(sensor, scene) for sensor in sensors for scene in scenes]
     for sensor, scene in progress(cases):
         frames = simulated_frames([sensor], [scene], n_seeds, (0.0,))
-        peers = [PatchworkppMethod(SENSORS[sensor].height_of_cloud)] if with_peer else []
+        peers = [peer_of(sensor)] if with_peer else []
         try:
             scores = score_variants(frames, load_simulated, {methods.OURS: config}, peers)
         except PointCloudError as error:
@@ -101,7 +101,7 @@ def lost_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> d
     objects_notes = [*refused, f'objects lost: {", ".join(lost) or "none"}']
     returns_notes = []
     if len(scores) > 1:
-        of_objects += f'; its: of {PEER}, which has the true height of the cloud'
+        of_objects += f'; its: of {PEER}, which has the true height and place of the sensor'
         objects_notes.append(f'IoU behind {PEER}: {", ".join(behind) or "nowhere"}')
         returns_notes = [f'more than {PEER}: {", ".join(more) or "nowhere"}']
     return {

@@ -76,6 +76,12 @@ def simulated_frames(
     return [SimulatedFrame(*case) for case in cases if not case[3] or case[1] not in PLACES]
 
 
+def peer_of(sensor: str) -> PatchworkppMethod:
+    """Return Patchwork++, told where a simulated sensor is in its cloud and above the ground."""
+    model = SENSORS[sensor]
+    return PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
+
+
 def refuse_changed(config: Config, names: Iterable[str]) -> None:
     """Raise ConfigError if `config` changes what an experiment compares."""
     for name in sorted(names):
@@ -150,12 +156,12 @@ def score_scenes(
 ) -> Report:
     """Segment `n_seeds` simulated scenes of each name by each sensor of `configs`.
 
-    Patchwork++ runs on the same clouds with the true height of the sensor.
+    Patchwork++ runs on the same clouds, as `peer_of` makes it.
     """
     ours, theirs = [], []
     for sensor, config in configs.items():
         frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
-        peers = [PatchworkppMethod(SENSORS[sensor].height_of_cloud)] if with_peer else []
+        peers = [peer_of(sensor)] if with_peer else []
         own, *other = score_variants(
             frames, load_simulated, {methods.OURS: config}, peers, progress=progress
         )

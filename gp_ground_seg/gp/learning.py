@@ -168,25 +168,9 @@ def learn_frame(
 ) -> tuple[FloatArray, list[Learned]]:
     """Learn theta on the inliers that grow under it, then again on those under what was learned.
 
-    Parameters
-    ----------
-    frame : Frame
-        Candidates and pseudo-inputs.
-    before : (M, 6) float64, optional
-        Where to begin, if not at `first_theta`.
-    config : Config
-        Scope, objective, budget, priors.
-    model : Model
-        Backend.
-    out_of_time : callable
-        See `maximise`.
-
-    Returns
-    -------
-    theta : (M, 6) float64
-        Hyper-parameters of each segment.
-    learned : list of Learned
-        One outcome for the frame, or one for each segment.
+    `before`, (M, 6), is where to begin, if not at `first_theta`; for `out_of_time` see `maximise`.
+    Returns the hyper-parameters of each segment, (M, 6), and one outcome for the frame, or one
+    for each segment.
     """
     learning, n_segments = config.learning, len(frame.candidates.offsets) - 1
     by_frame, space = learning.scope == 'frame', theta_space(config)
@@ -268,16 +252,8 @@ def every_segment(frame: Frame, step: int) -> Frame:
 def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: bool) -> Inliers:
     """Inliers of a frame.
 
-    Parameters
-    ----------
-    frame : Frame
-        Candidates and pseudo-inputs.
-    inlier : (C,) bool
-        Which candidates are inliers.
-    u : (C,) float64
-        Log length-scales at the candidates [log m].
-    has_latent : bool
-        Whether the pseudo-inputs go with them, and give the length-scales instead of `u`.
+    `inlier` (C,) says which candidates they are, `u` (C,) are log length-scales there [log m].
+    With `has_latent` the pseudo-inputs go with them, and give the length-scales instead of `u`.
     """
     candidates, pseudo = frame.candidates, frame.pseudo
     taken = np.concatenate([[0], np.cumsum(inlier)])

@@ -6,6 +6,7 @@ import functools
 import importlib
 from array import array
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from std_msgs.msg import Header
 
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
-from gp_ground_seg.parameters.config import NO_FRAME, FrameConfig
+from gp_ground_seg.parameters.config import NO_FRAME, Config, FrameConfig, SensorConfig
 from gp_ground_seg.pipeline.tilt import angles_of
 
 OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
@@ -124,11 +125,10 @@ class TimeJumps:
 
 def require_tf2(frame: FrameConfig) -> Any:
     """Return the module tf2_ros; raise a MissingDependencyError if it is not installed."""
-    asked, instead = f'frame.sensor = {frame.sensor}', 'frame.sensor = none with sensor.origin_x, '
-    instead += 'origin_y and origin_z'
-    if frame.level == 'tf':
-        asked = 'frame.level = tf'
-        instead = 'frame.level = sensor with sensor.roll and sensor.pitch'
+    asked, instead = 'frame.level = tf', 'frame.level = sensor with sensor.roll and sensor.pitch'
+    if frame.level != 'tf':
+        asked = f'frame.sensor = {frame.sensor}'
+        instead = 'frame.sensor = none with sensor.origin_x, origin_y and origin_z'
     try:
         return importlib.import_module('tf2_ros')
     except ImportError as error:
@@ -165,26 +165,24 @@ class TfListener:
         self._buffer = self._tf2_ros.Buffer()
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
-    def tilt(self, header: Header, frame: FrameConfig) -> tuple[float, float] | None:
-        """Return roll and pitch [rad] of a cloud in the base, if asked for.
+    def sensor(self, header: Header, config: Config) -> SensorConfig:
+        """Return ``config.sensor`` with what TF is asked for: tilt, place in a cloud's frame.
 
-        Raises a PointCloudError if TF does not have them.
+        Raises a PointCloudError if TF does not have it.
         """
-        if frame.level != 'tf':
-            return None
-        way = f'from its frame {header.frame_id!r} to frame.base = {frame.base!r}'
-        return tilt_of(self._look_up(frame.base, header.frame_id, header, way).rotation)
-
-    def origin(self, header: Header, frame: FrameConfig) -> tuple[float, float, float] | None:
-        """Return where the sensor is in the frame of a cloud [m], if asked for; see `tilt`."""
-        if frame.sensor == NO_FRAME:
-            return None
-        way = f'from frame.sensor = {frame.sensor!r} to its frame {header.frame_id!r}'
-        place = self._look_up(header.frame_id, frame.sensor, header, way).translation
-        origin = place.x, place.y, place.z
-        if not np.isfinite(origin).all():
-            raise PointCloudError(f'transform {way}: its translation is {origin}')
-        return origin
+        sensor, frame, own = config.sensor, config.frame, header.frame_id
+        if frame.level == 'tf':
+            way = f'from its frame {own!r} to frame.base = {frame.base!r}'
+            roll, pitch = tilt_of(self._look_up(frame.base, own, header, way).rotation)
+            sensor = replace(sensor, roll=roll, pitch=pitch)
+        if frame.sensor != NO_FRAME:
+            way = f'from frame.sensor = {frame.sensor!r} to its frame {own!r}'
+            place = self._look_up(own, frame.sensor, header, way).translation
+            x, y, z = place.x, place.y, place.z
+            if not np.isfinite([x, y, z]).all():
+                raise PointCloudError(f'transform {way}: its translation is {(x, y, z)}')
+            sensor = replace(sensor, origin_x=x, origin_y=y, origin_z=z)
+        return sensor
 
     def _look_up(self, target: str, source: str, header: Header, way: str) -> Any:
         try:

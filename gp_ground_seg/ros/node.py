@@ -129,11 +129,8 @@ class GroundSegmentationNode(ConfiguredNode):
             self._check_size(cloud)
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
-            tilt, origin = None, None
-            if self._tf is not None:
-                tilt = self._tf.tilt(cloud.header, self.config.frame)
-                origin = self._tf.origin(cloud.header, self.config.frame)
-            segmentation = self._segmenter.segment(points, tilt, origin)
+            sensor = self._tf.sensor(cloud.header, self.config) if self._tf else None
+            segmentation = self._segmenter.segment(points, sensor)
             segmented = time.monotonic()
             topics = self._outputs.publish(cloud, segmentation, self.config)
         except PointCloudError as error:
