@@ -31,25 +31,13 @@ NO_GROUND = 'next to nothing of the scan is ground: is sensor.height right, and 
 
 @dataclass(frozen=True)
 class Fitting:
-    """What `FitReport` cannot learn from the results.
+    """What `FitReport` cannot learn from the results."""
 
-    Attributes
-    ----------
-    mode : str
-        ``learning.mode`` of the frame.
-    learned : list of Learned
-        Outcome of the learning, of each segment where each has its own; empty when
-        nothing was learned on this frame.
-    backend : str
-        ``numba`` or ``numpy``.
-    n_threads : int
-        Threads used.
-    """
-
-    mode: str
+    mode: str  # ``learning.mode`` of the frame
+    # Outcome of the learning, of each segment where each has its own; empty where there was none.
     learned: list[Learned]
-    backend: str
-    n_threads: int
+    backend: str  # ``numba`` or ``numpy``
+    n_threads: int  # that were used
 
 
 @dataclass(frozen=True)

@@ -60,15 +60,24 @@ class GroundSegmenter:
         self._warned: set[str] = set()
         self._lock, self._pid = threading.RLock(), os.getpid()
 
-    def segment(self, points: npt.ArrayLike, sensor: SensorConfig | None = None) -> Segmentation:
+    def segment(
+        self,
+        points: npt.ArrayLike,
+        tilt: tuple[float, float] | None = None,
+        origin: tuple[float, float, float] | None = None,
+    ) -> Segmentation:
         """Label every point of a scan (paper, Algorithm 2).
 
         Parameters
         ----------
         points : (N, >=3) float array
             x forward, y left, z up in the sensor frame [m]; never written to.
-        sensor : SensorConfig, optional
-            Where the sensor was in this scan, instead of ``config.sensor``.
+        tilt : tuple of float, optional
+            Roll and pitch of the sensor in this scan [rad], instead of ``sensor.roll``
+            and ``sensor.pitch``.
+        origin : tuple of float, optional
+            Where the sensor was in the frame of this scan [m], instead of ``sensor.origin_x``,
+            ``sensor.origin_y`` and ``sensor.origin_z``.
 
         Raises
         ------
@@ -77,7 +86,12 @@ class GroundSegmenter:
         """
         with self._exclusive():
             config, backend, timer = self._config, self._backend, StageTimer(self._clock)
-            sensor = config.sensor if sensor is None else sensor
+            sensor = config.sensor
+            if tilt is not None:
+                sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
+            if origin is not None:
+                x, y, z = origin
+                sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
 
             # 1. Polar grid: the lowest point of each cell is a ground candidate.
             # 2. Sensor pose: height and tilt, from a plane through the candidates near the

@@ -16,7 +16,6 @@ from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.jit import JIT_ENABLED
-from gp_ground_seg.parameters.config import SensorConfig
 from gp_ground_seg.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
 from gp_ground_seg.pipeline.tilt import angles_of, rotate, rotation
 from gp_ground_seg.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan
@@ -187,7 +186,7 @@ def test_where_the_rays_start_tells_a_floor_from_a_cone_on_the_walls():
     points = moved(scan_of(ROOM, SMALL_VLP, 1.2).points, 1.2)
     assert not pose_of(points).height_estimated
     assert pose_of(points, origin_z=1.2).height == pytest.approx(0.0, abs=0.03)
-    assert SEGMENTER.segment(points, SensorConfig(origin_z=1.2)).pose.height_estimated
+    assert SEGMENTER.segment(points, origin=(0.0, 0.0, 1.2)).pose.height_estimated
     # Turned with the cloud.
     lean = tilted(points, 0.1, 0.0)
     x, y, z = (rotation(0.1, 0.0).T @ (0.0, 0.0, 1.2)).tolist()
@@ -274,7 +273,7 @@ def test_what_is_given_is_used_and_contradicted():
     assert (rolled.roll, rolled.pitch) == (0.3, 0.0)
     assert any('sensor.roll = 0.3' in line for line in rolled.contradictions)
     # Angles of one scan, as from tf, are given ones too.
-    assert SEGMENTER.segment(points, SensorConfig(roll=0.3, pitch=0.0)).pose.roll == 0.3
+    assert SEGMENTER.segment(points, tilt=(0.3, 0.0)).pose.roll == 0.3
 
 
 def test_angles_given_are_kept_and_the_other_is_found():

@@ -48,7 +48,7 @@ class PatchworkppMethod:
         if height <= 0.0:
             raise ConfigError(
                 f'patchworkpp: takes the sensor to be above the ground; with sensor.height = '
-                f'{sensor.height:g} set sensor.origin_z above {-sensor.height:g}'
+                f'{sensor.height:g} set sensor.origin_z above {0.0 - sensor.height:g}'
             )
         return cls(height, origin)
 

@@ -59,19 +59,13 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
 class LocalHeights(NamedTuple):
     """Heights over the surface of the returns in each cell and the eight around it.
 
-    Attributes
-    ----------
-    n_near : (M * n_bins,) float64
-        Returns within ``label.obstacle_min_height`` of the surface, but for those of faces.
-    roughness : (M * n_bins,) float64
-        Their root mean square height [m]; 0 where there are none.
-    n_obstacles : (M * n_bins,) float64
-        Returns from that height to ``label.obstacle_max_height``.
+    Each is (M * n_bins,).
     """
 
+    # Returns within ``label.obstacle_min_height`` of the surface, but for those of faces.
     n_near: FloatArray
-    roughness: FloatArray
-    n_obstacles: FloatArray
+    roughness: FloatArray  # their root mean square height [m]; 0 where there are none
+    n_obstacles: FloatArray  # returns from that height to ``label.obstacle_max_height``
 
 
 def ground_band(near: LocalHeights, config: Config) -> FloatArray:

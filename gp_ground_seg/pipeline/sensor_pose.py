@@ -154,22 +154,10 @@ def estimate_pose(
 ) -> SensorPose:
     """Estimate what is auto, and check what is not against the scan.
 
-    Parameters
-    ----------
-    scan : Scan
-        Points in the frame levelled by `given_pose`.
-    sensor : SensorConfig
-        Parameters.
-    fit_plane : callable
-        See `gp_ground_seg.pipeline.ground_plane.fit_plane`.
-    scan_rotated : callable
-        Returns the same scan, rotated further by a matrix (3, 3); called only where z does not
-        seem to be up.
-
-    Raises
-    ------
-    PointCloudError
-        If roll or pitch is auto and z is clearly not up.
+    `scan` is in the frame levelled by `given_pose`; `fit_plane` is that of `ground_plane`, and
+    `scan_rotated` returns the same scan, rotated further by a matrix (3, 3): it is called only
+    where z does not seem to be up. Raises a PointCloudError if roll or pitch is auto and z is
+    clearly not up.
     """
     given = given_pose(sensor)
     origin = given.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)

@@ -6,7 +6,6 @@ import functools
 import importlib
 from array import array
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from std_msgs.msg import Header
 
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
-from gp_ground_seg.parameters.config import NO_FRAME, Config, FrameConfig, SensorConfig
+from gp_ground_seg.parameters.config import NO_FRAME, FrameConfig
 from gp_ground_seg.pipeline.tilt import angles_of
 
 OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
@@ -165,26 +164,26 @@ class TfListener:
         self._buffer = self._tf2_ros.Buffer()
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
-    def sensor(self, header: Header, config: Config) -> SensorConfig:
-        """Return ``config.sensor`` with what TF is asked for: tilt, place in a cloud's frame.
+    def look_up(
+        self, header: Header, frame: FrameConfig
+    ) -> tuple[tuple[float, float] | None, tuple[float, float, float] | None]:
+        """Return tilt [rad] and place [m] of the sensor in a cloud; None for what is not asked.
 
-        Raises a PointCloudError if TF does not have it.
+        Raises a PointCloudError if TF does not have them.
         """
-        sensor, frame, own = config.sensor, config.frame, header.frame_id
+        tilt, origin, own = None, None, header.frame_id
         if frame.level == 'tf':
             way = f'from its frame {own!r} to frame.base = {frame.base!r}'
-            roll, pitch = tilt_of(self._look_up(frame.base, own, header, way).rotation)
-            sensor = replace(sensor, roll=roll, pitch=pitch)
+            tilt = tilt_of(self._transform(frame.base, own, header, way).rotation)
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {own!r}'
-            place = self._look_up(own, frame.sensor, header, way).translation
-            x, y, z = place.x, place.y, place.z
-            if not np.isfinite([x, y, z]).all():
-                raise PointCloudError(f'transform {way}: its translation is {(x, y, z)}')
-            sensor = replace(sensor, origin_x=x, origin_y=y, origin_z=z)
-        return sensor
+            place = self._transform(own, frame.sensor, header, way).translation
+            origin = place.x, place.y, place.z
+            if not np.isfinite(origin).all():
+                raise PointCloudError(f'transform {way}: its translation is {origin}')
+        return tilt, origin
 
-    def _look_up(self, target: str, source: str, header: Header, way: str) -> Any:
+    def _transform(self, target: str, source: str, header: Header, way: str) -> Any:
         try:
             try:
                 stamp = Time.from_msg(header.stamp)

@@ -129,8 +129,8 @@ class GroundSegmentationNode(ConfiguredNode):
             self._check_size(cloud)
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
-            sensor = self._tf.sensor(cloud.header, self.config) if self._tf else None
-            segmentation = self._segmenter.segment(points, sensor)
+            seen = self._tf.look_up(cloud.header, self.config.frame) if self._tf else ()
+            segmentation = self._segmenter.segment(points, *seen)
             segmented = time.monotonic()
             topics = self._outputs.publish(cloud, segmentation, self.config)
         except PointCloudError as error:
