@@ -203,7 +203,7 @@ def test_the_peer_has_the_height_of_its_sensor():
 
 def test_the_peer_is_told_where_the_sensor_is():
     """It takes the origin of a cloud to be the sensor, which that of a vehicle's frame is not."""
-    scan, own = run_peer('slope', 'hdl-64e', sensor_height=1.73)
+    scan, own = run_peer('flat', 'hdl-64e', sensor_height=1.73)
     expected, place = own.result(), np.array([1.35, -0.2, 1.73, 0.0], dtype=np.float32)
     told = PatchworkppMethod.of_sensor(SensorConfig(0.0, 0.0, 0.0, *place[:3].tolist()))
     told.run(moved := scan.points + place)
@@ -215,7 +215,7 @@ def test_the_peer_is_told_where_the_sensor_is():
     untold.run(moved)
     assert np.mean(untold.result().label == expected.label) < 0.8
     of_scenes = peer_of('hdl-64e-vehicle')
-    vehicle = load_simulated(SimulatedFrame('hdl-64e-vehicle', 'slope', 0, 0.0))
+    vehicle = load_simulated(SimulatedFrame('hdl-64e-vehicle', 'flat', 0, 0.0))
     of_scenes.run(vehicle.points)
     assert np.mean(of_scenes.result().label == expected.label) > 0.999
 
