@@ -172,8 +172,8 @@ def test_a_departure_in_words():
         (['sensor-pose', 'ROOT', '--set', 'sensor.height=1.0'], 'sensor.height = 1.0: the exp'),
         (['sensor-pose', 'ROOT', '--set', 'sensor.roll=1.0'], 'sensor.roll = 1.0: the exp'),
         (['scenes', '--preset', 'vlp-16'], 'vlp16'),
-        *(([name, '--json', 'MINE', *([] if name in ('scenes', 'objects') else ['ROOT'])], '--force')
-          for name in EXPERIMENTS if name != 'cross-validation'),
+        *(([name, '--json', 'MINE', *(['ROOT'] if name not in ('scenes', 'objects') else [])],
+           '--force') for name in EXPERIMENTS if name != 'cross-validation'),
     ],
 )  # fmt: skip
 def test_errors_are_said_before_any_frame_is_read(
