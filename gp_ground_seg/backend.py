@@ -24,6 +24,7 @@ from gp_ground_seg.gp import ground, likelihood
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config, RuntimeConfig
 from gp_ground_seg.pipeline import ground_plane, labels, lines, polar_grid, vertical_faces
+from gp_ground_seg.pipeline.tilt import Direction
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 _warned_slow = False
@@ -48,7 +49,7 @@ class Backend(Protocol):
         """See `gp_ground_seg.pipeline.polar_grid.build_scan`."""
 
     def fit_plane(
-        self, candidates: Candidates, max_slope: float
+        self, candidates: Candidates, max_slope: float, origin: Direction
     ) -> ground_plane.GroundPlane | None:
         """See `gp_ground_seg.pipeline.ground_plane.fit_plane`."""
 

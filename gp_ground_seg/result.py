@@ -24,28 +24,20 @@ from gp_ground_seg.pipeline.labels import ground_probability
 from gp_ground_seg.pipeline.residuals import CorrectedSurface, correct_surface
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 
+LEAST_GROUND = 0.001
+"""Share of the points below which next to nothing of a scan is ground."""
+NO_GROUND = 'next to nothing of the scan is ground: is sensor.height right, and z up?'
+
 
 @dataclass(frozen=True)
 class Fitting:
-    """What `FitReport` cannot learn from the results.
+    """What `FitReport` cannot learn from the results."""
 
-    Attributes
-    ----------
-    mode : str
-        ``learning.mode`` of the frame.
-    learned : list of Learned
-        Outcome of the learning, of each segment where each has its own; empty when
-        nothing was learned on this frame.
-    backend : str
-        ``numba`` or ``numpy``.
-    n_threads : int
-        Threads used.
-    """
-
-    mode: str
+    mode: str  # ``learning.mode`` of the frame
+    # Outcome of the learning, of each segment where each has its own; empty where there was none.
     learned: list[Learned]
-    backend: str
-    n_threads: int
+    backend: str  # ``numba`` or ``numpy``
+    n_threads: int  # that were used
 
 
 @dataclass(frozen=True)
@@ -187,6 +179,16 @@ class Segmentation:
         return self.labelled.roughness
 
     # What follows is computed when it is first asked for: not every user asks.
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know of the scan, a line for each; logged by the segmenter."""
+        n_ground = np.count_nonzero(self.label == Label.GROUND)
+        n_finite = np.count_nonzero(self.label != Label.UNKNOWN)
+        if not n_finite:
+            return ()
+        is_lost = n_ground < LEAST_GROUND * n_finite
+        return (*self.pose.warnings, *((NO_GROUND,) if is_lost else ()))
 
     @cached_property
     def fit(self) -> FitReport:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import os
 import threading
 import time
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.backend import Backend, make_backend
-from gp_ground_seg.frame import Candidates, FloatArray, Frame, PointArray, Scan
+from gp_ground_seg.frame import FloatArray, Frame, PointArray, Scan
 from gp_ground_seg.gp.learning import Learned, given_theta, in_rows, learn_frame
 from gp_ground_seg.jit import keep_code
 from gp_ground_seg.parameters.config import Config, SensorConfig
@@ -20,6 +21,8 @@ from gp_ground_seg.pipeline.points import take_points
 from gp_ground_seg.pipeline.sensor_pose import SensorPose, estimate_pose, given_pose
 from gp_ground_seg.pipeline.tilt import rotate_sample
 from gp_ground_seg.result import Fitting, Segmentation
+
+_LOGGER = logging.getLogger('gp_ground_seg')
 
 
 class GroundSegmenter:
@@ -54,10 +57,14 @@ class GroundSegmenter:
         self._sample_backend: Backend | None = None
         self._theta: FloatArray | None = None
         self._frames_since_learning = 0
+        self._warned: set[str] = set()
         self._lock, self._pid = threading.RLock(), os.getpid()
 
     def segment(
-        self, points: npt.ArrayLike, tilt: tuple[float, float] | None = None
+        self,
+        points: npt.ArrayLike,
+        tilt: tuple[float, float] | None = None,
+        origin: tuple[float, float, float] | None = None,
     ) -> Segmentation:
         """Label every point of a scan (paper, Algorithm 2).
 
@@ -68,6 +75,9 @@ class GroundSegmenter:
         tilt : tuple of float, optional
             Roll and pitch of the sensor in this scan [rad], instead of ``sensor.roll``
             and ``sensor.pitch``.
+        origin : tuple of float, optional
+            Where the sensor was in the frame of this scan [m], instead of ``sensor.origin_x``,
+            ``sensor.origin_y`` and ``sensor.origin_z``.
 
         Raises
         ------
@@ -79,6 +89,9 @@ class GroundSegmenter:
             sensor = config.sensor
             if tilt is not None:
                 sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
+            if origin is not None:
+                x, y, z = origin
+                sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
 
             # 1. Polar grid: the lowest point of each cell is a ground candidate.
             # 2. Sensor pose: height and tilt, from a plane through the candidates near the
@@ -110,7 +123,7 @@ class GroundSegmenter:
             tilted_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
             timer.mark('label')
 
-            return Segmentation(
+            result = Segmentation(
                 labelled,
                 timer.seconds,
                 Fitting(config.learning.mode, learned, backend.name, backend.n_threads),
@@ -125,6 +138,8 @@ class GroundSegmenter:
                 tilted_z,
                 config.observation.slope_std,
             )
+            self._warn(result.warnings)
+            return result
 
     def estimate_pose(self, points: npt.ArrayLike) -> SensorPose:
         """Estimate height and tilt of the sensor as `segment` does, and no more.
@@ -133,7 +148,9 @@ class GroundSegmenter:
         """
         with self._exclusive():
             xyz, timer = take_points(points), StageTimer(self._clock)
-            return self._level(xyz, self._config.sensor, timer)[1]
+            pose = self._level(xyz, self._config.sensor, timer)[1]
+            self._warn(pose.warnings)
+            return pose
 
     @property
     def config(self) -> Config:
@@ -153,6 +170,7 @@ class GroundSegmenter:
             if dataclasses.replace(config, diagnostics=self._config.diagnostics) != self._config:
                 self.reset()
             self._config = config
+            self._warned.clear()
 
     def use_backend(self, backend: Backend) -> None:
         """Use `backend` from the next scan on, and close the one before."""
@@ -169,6 +187,13 @@ class GroundSegmenter:
         with self._exclusive():
             self._backend.close()
 
+    def _warn(self, warnings: tuple[str, ...]) -> None:
+        """Log each warning once, until the parameters change: scans come ten times a second."""
+        for line in warnings:
+            if line not in self._warned:
+                self._warned.add(line)
+                _LOGGER.warning(line)
+
     def _exclusive(self) -> threading.RLock:
         """Lock that callers from several threads hold in turn."""
         if self._pid != os.getpid():
@@ -184,15 +209,15 @@ class GroundSegmenter:
         scan = backend.build_grid(given.level(xyz), config)
         timer.mark('grid')
 
-        def candidates_rotated(matrix: FloatArray) -> Candidates:
+        def scan_rotated(matrix: FloatArray) -> Scan:
             # `backend` would overwrite the scan in its buffers.
             if self._sample_backend is None:
                 runtime = dataclasses.replace(config.runtime, n_threads=1, backend=backend.name)
                 self._sample_backend = make_backend(runtime)
             sample = rotate_sample(scan.xyz, matrix)
-            return self._sample_backend.build_grid(sample, config).candidates
+            return self._sample_backend.build_grid(sample, config)
 
-        pose = estimate_pose(scan.candidates, sensor, backend.fit_plane, candidates_rotated)
+        pose = estimate_pose(scan, sensor, backend.fit_plane, scan_rotated)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
             scan = backend.build_grid(pose.level(xyz), config)
         timer.mark('pose')

@@ -20,7 +20,7 @@ from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.experiments import ablation, sensor_pose, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, VARIANCES, Choice, table1
 from gp_ground_seg.parameters.presets import PRESETS
-from gp_ground_seg.simulation import HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
+from gp_ground_seg.simulation import DRIVES, HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
 
 SMALL = ['--set', 'grid.n_bins=40']
 
@@ -55,6 +55,9 @@ CASES = {
         'scenes', 2 * 4,
     ),
     'scenes --no-peer': (['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', '1'], 'scenes', 1),
+    'objects': (
+        ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
+    ),
     'cross-validation': (['ROOT', '--set', 'grid.r_max=5,20.0,60', *SMALL], 'scores', 3 * 4),
     'sensor-pose': (
         ['ROOT', '--sequences', '08', '--set', 'learning.mode=fixed'], 'turns', 27,
@@ -103,6 +106,7 @@ def test_all_sensors_have_the_parameters_given(monkeypatch):
 
     def note(sensors, scenes, n_seeds, config, *_):
         found.append((sensors, config))
+        assert scenes == list(DRIVES)  # those of the page
         raise DataError('enough')
 
     monkeypatch.setattr(variants, 'score_scenes', note)
@@ -164,8 +168,8 @@ def test_a_departure_in_words():
         (['sensor-pose', 'ROOT', '--set', 'sensor.height=1.0'], 'sensor.height = 1.0: the exp'),
         (['sensor-pose', 'ROOT', '--set', 'sensor.roll=1.0'], 'sensor.roll = 1.0: the exp'),
         (['scenes', '--preset', 'papr'], 'did you mean paper?'),
-        *(([name, 'ROOT', '--json', 'MINE'], '--force') for name in EXPERIMENTS
-          if name not in ('scenes', 'cross-validation')),
+        *(([name, '--json', 'MINE', *(['ROOT'] if name not in ('scenes', 'objects') else [])],
+           '--force') for name in EXPERIMENTS if name != 'cross-validation'),
     ],
 )  # fmt: skip
 def test_errors_are_said_before_any_frame_is_read(

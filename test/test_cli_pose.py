@@ -65,3 +65,16 @@ def test_segment_names_the_scan_that_it_refuses(tmp_path, capsys):
     roll, pitch = (re.search(rf'sensor\.{n} to (\S+)', said)[1] for n in ('roll', 'pitch'))
     assert run(*words, '--set', f'sensor.roll={roll}', '--set', f'sensor.pitch={pitch}') == 0
     assert (tmp_path / 'a.label').exists()
+
+
+def test_a_scan_without_ground_is_named_on_stderr_and_never_a_silent_zero(tmp_path, capsys):
+    flat_beam = dataclasses.replace(SMALL, elevations=(0.0,))
+    points = simulate_scan(SCENES['urban'](1), flat_beam, np.random.default_rng(1)).points
+    (tmp_path / 'a.bin').write_bytes(points.astype('<f4').tobytes())
+    words = ['segment', tmp_path / 'a.bin', '--quiet', '-o', tmp_path / 'a.label']
+    assert run(*words) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert [line for line in lines if 'does not show the ground' in line and '1.73 m' in line]
+    assert [line for line in lines if 'next to nothing of the scan is ground' in line]
+    assert run(*words, '--force', '--set', 'sensor.origin_z=up') == 2
+    assert "sensor.origin_z = 'up': must be a number in [-50, 50] m" in error_line(capsys)

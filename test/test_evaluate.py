@@ -17,9 +17,11 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation import metrics
-from gp_ground_seg.evaluation.evaluate import OurMethod, PatchworkppMethod, labelled_frames
+from gp_ground_seg.evaluation.evaluate import OurMethod, labelled_frames
 from gp_ground_seg.evaluation.metrics import ClassCount, Confusion, height_error
-from gp_ground_seg.experiments.variants import SimulatedFrame, load_simulated
+from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.experiments.variants import SimulatedFrame, load_simulated, peer_of
+from gp_ground_seg.parameters.config import SensorConfig
 
 
 def evaluate(root, *methods, **options):
@@ -199,6 +201,25 @@ def test_the_peer_has_the_height_of_its_sensor():
     assert labels[0] == labels[1] != labels[2]
 
 
+def test_the_peer_is_told_where_the_sensor_is():
+    """It takes the origin of a cloud to be the sensor, which that of a vehicle's frame is not."""
+    scan, own = run_peer('flat', 'hdl-64e', sensor_height=1.73)
+    expected, place = own.result(), np.array([1.35, -0.2, 1.73, 0.0], dtype=np.float32)
+    told = PatchworkppMethod.of_sensor(SensorConfig(0.0, 0.0, 0.0, *place[:3].tolist()))
+    told.run(moved := scan.points + place)
+    found = told.result()
+    # But for rounding to the single precision of the points.
+    assert np.mean(found.label == expected.label) > 0.999
+    assert np.median(np.abs(found.ground_z - 1.73 - expected.ground_z)) < 1e-3
+    untold = PatchworkppMethod(0.0)
+    untold.run(moved)
+    assert np.mean(untold.result().label == expected.label) < 0.8
+    of_scenes = peer_of('hdl-64e-vehicle')
+    vehicle = load_simulated(SimulatedFrame('hdl-64e-vehicle', 'flat', 0, 0.0))
+    of_scenes.run(vehicle.points)
+    assert np.mean(of_scenes.result().label == expected.label) > 0.999
+
+
 def test_the_surface_of_the_peer_is_that_of_its_planes():
     scan, method = run_peer('slope', 'hdl-64e')
     near = scan.is_ground & (np.hypot(*scan.points[:, :2].T) < 15.0)
@@ -363,6 +384,10 @@ def test_a_run_that_fails_leaves_nothing(tmp_path, capsys):
         (['--sequences', '../sequences/00'], 'no sequence ../sequences/00'),
         (['--set', 'label.ground_tolerence=1'], 'label.ground_tolerance'),
         (['--json', '/no/such/folder/x.json'], '/no/such/folder'),
+        (
+            ['--set', 'sensor.height=0', '--peer', 'patchworkpp'],
+            'sensor.height = 0 set sensor.origin_z above 0',
+        ),
     ],
 )
 def test_errors_are_said(root, words, message, capsys):

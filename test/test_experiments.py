@@ -13,14 +13,16 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label, simulation
 from gp_ground_seg.data.semantic_kitti import Frame
-from gp_ground_seg.errors import ConfigError, DataError
+from gp_ground_seg.errors import ConfigError, DataError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore, labelled_frames
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
+from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.experiments import (
     ablation,
     coverage,
     interpolation,
+    lost,
     sensor_pose,
     stepwise,
     variants,
@@ -43,7 +45,7 @@ def frames(tmp_path_factory):
 def test_only_what_the_ray_hit_of_the_terrain_is_ground():
     scan = load_simulated(SimulatedFrame('hdl-64e', 'urban', 0, 0.0))
     made = simulate_scan(SCENES['urban'](0), HDL_64E, np.random.default_rng(0))
-    assert set(made.kind) == set(Kind)
+    assert set(made.kind) == set(Kind) - {Kind.PERSON, Kind.CYCLIST}
     ground = scan.truths['exact'] == Label.GROUND
     np.testing.assert_array_equal(ground, made.kind == Kind.TERRAIN)
     np.testing.assert_array_equal(~ground, scan.truths['exact'] == Label.OBSTACLE)
@@ -259,7 +261,7 @@ def test_scene_scores_follow_their_definitions(monkeypatch):
     (row,) = report.tables['scenes'].json()
     total, its_total = Confusion(), Confusion()
     errors, its_errors = [], []
-    segmenter, method = GroundSegmenter(config), runner.PatchworkppMethod(SENSORS['vlp-16'].height)
+    segmenter, method = GroundSegmenter(config), PatchworkppMethod(SENSORS['vlp-16'].height)
     for seed in (0, 1):
         scan = load_simulated(SimulatedFrame('vlp-16', 'kerb', seed, 6.0))
         ground, z = scan.is_ground, scan.ground_z
@@ -279,6 +281,56 @@ def test_scene_scores_follow_their_definitions(monkeypatch):
     assert row['share_without_model'] == pytest.approx(missing)
     medians = [error.median_absolute for error in its_errors]
     assert row['peer_median_absolute'] == pytest.approx(np.median(medians))
+
+
+def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
+    frames = variants.simulated_frames(['vlp-16'], ['kerb', 'hedge'], 1, (0.0, 6.0))
+    places = [(frame.scene, frame.x) for frame in frames]
+    assert places == [('kerb', 0.0), ('kerb', 6.0), ('hedge', 0.0)]
+
+
+def test_lost_objects_follow_their_definitions(monkeypatch):
+    sensor, scene = 'vlp-16-low', 'traffic_jam'
+    score = lost.score_variants
+
+    def refuse_hedges(frames, *rest):
+        if frames[0].scene == 'hedge':
+            raise PointCloudError('hedge: z does not point up')
+        return score(frames, *rest)
+
+    monkeypatch.setattr(lost, 'score_variants', refuse_hedges)
+    report = lost.score_objects([sensor], [scene, 'hedge'], 1, FIXED, with_peer=True)
+    (row,), (shares,) = (report.tables[name].json() for name in ('objects', 'vehicles'))
+    made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
+    x, y, z, _ = made.points.T.astype(float)
+    reach, high = np.hypot(x, y), z - made.ground_z >= 0.3
+    method = PatchworkppMethod(0.15)
+    method.run(made.points)
+    labels = {
+        '': GroundSegmenter(FIXED).segment(made.points).label,
+        'peer_': method.result().label,
+    }
+    for prefix, label in labels.items():
+        is_ground = label == Label.GROUND
+        assert row[f'{prefix}iou'] == count_confusion(
+            label, np.where(made.is_ground, Label.GROUND, Label.OBSTACLE)).iou  # fmt: skip
+        for title, kinds in (('vehicles', [Kind.BOX]), ('persons', [Kind.PERSON, Kind.CYCLIST])):
+            own = np.isin(made.kind, kinds) & high
+            parts = [own & (made.object_id == k) for k in range(1, made.object_id.max() + 1)]
+            parts = [part for part in parts if part.sum() >= 10]
+            assert row[title] == len(parts) > 0
+            n_lost = sum(is_ground[part].mean() > 0.5 for part in parts)
+            assert row[f'{prefix}lost_{title}'] == n_lost
+        own = (made.kind == Kind.BOX) & high
+        for title, low, far in (('0-10 m', 0, 10), ('10-20 m', 10, 20), ('> 20 m', 20, 1e9)):
+            band = own & (reach >= low) & (reach < far)
+            expected = is_ground[band].mean() if band.any() else None
+            assert shares[f'{prefix}{title}'] == pytest.approx(expected)
+    notes = report.tables['objects'].notes
+    assert notes[0] == 'refused: hedge: z does not point up'
+    assert notes[1].startswith(f'objects lost: {sensor} {scene} {row["lost_vehicles"]} of')
+    with pytest.raises(PointCloudError, match='refused: hedge'):
+        lost.score_objects([sensor], ['hedge'], 1, FIXED, with_peer=False)
 
 
 def test_behind_is_said():

@@ -15,6 +15,7 @@ from gp_ground_seg.pipeline.ground_plane import MIN_CELLS, N_SECTORS, RING_EDGES
 from gp_ground_seg.pipeline.tilt import rotation
 
 BACKENDS = NumpyBackend(), NumbaBackend(1)
+ORIGIN = (0.0, 0.0, 0.0)
 
 
 def cluttered_plane(seed, height, roll, pitch):
@@ -68,9 +69,10 @@ def assert_lowest(candidates):
 @settings(max_examples=fewer(60, 10))
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.integers(0, 40), st.floats(0.0, 1.0))
 def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
+    origin = tuple(np.random.default_rng(seed).choice([0.0, -1.3, 2.0], 3).tolist())
     candidates = random_candidates(seed, n_segments, n_bins, share)
     assert_lowest(candidates)
-    a, b = (backend.fit_plane(candidates, 0.577) for backend in BACKENDS)
+    a, b = (backend.fit_plane(candidates, 0.577, origin) for backend in BACKENDS)
     assert (a is None) == (b is None)
     if a is not None:
         np.testing.assert_allclose(a, b, atol=1e-9)
@@ -84,7 +86,7 @@ def test_a_cluttered_plane_is_found(seed, height, slope):
     points = cluttered_plane(seed, height, 0.0, slope)
     candidates = BACKENDS[0].build_grid(points, Config()).candidates
     assert_lowest(candidates)
-    plane, same = (backend.fit_plane(candidates, 0.5) for backend in BACKENDS)
+    plane, same = (backend.fit_plane(candidates, 0.5, ORIGIN) for backend in BACKENDS)
     np.testing.assert_allclose(plane, same, atol=1e-9)
     assert plane.height == pytest.approx(height, abs=0.04)
     np.testing.assert_allclose(plane.up, rotation(0.0, slope)[2], atol=0.01)
@@ -96,11 +98,11 @@ def test_a_cluttered_plane_is_found(seed, height, slope):
 def test_no_plane(backend):
     few = random_candidates(0, 1, 40, 1.0)
     few = Candidates(*(a[: MIN_CELLS - 1] for a in few[:4]), np.array([0, 2]), few.tile[:2])
-    assert backend.fit_plane(few, 0.5) is None
+    assert backend.fit_plane(few, 0.5, ORIGIN) is None
     above = random_candidates(1, 90, 20, 1.0)
-    assert backend.fit_plane(above, 0.5) is not None
-    # Nothing lies below the sensor.
-    assert backend.fit_plane(above._replace(z=np.full(len(above.z), 3.0)), 0.5) is None
+    assert backend.fit_plane(above, 0.5, ORIGIN) is not None
+    # Nothing lies where the ground may be.
+    assert backend.fit_plane(above._replace(z=np.full(len(above.z), 6.0)), 0.5, ORIGIN) is None
 
 
 def test_moments_that_determine_no_plane_or_no_slope():
@@ -114,7 +116,7 @@ def test_moments_that_determine_no_plane_or_no_slope():
 def test_a_refinement_that_leaves_the_ground_is_not_used(monkeypatch):
     candidates = BACKENDS[0].build_grid(cluttered_plane(0, 1.5, 0.0, 0.0), Config()).candidates
     monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (99.0, 0.0, 0.0))
-    assert ground_plane.fit_plane(candidates, 0.5).height == pytest.approx(1.5, abs=0.1)
+    assert ground_plane.fit_plane(candidates, 0.5, ORIGIN).height == pytest.approx(1.5, abs=0.1)
     # Nor is a plane that no point lies on.
     monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (19.0, 0.0, 0.0))
-    assert ground_plane.fit_plane(candidates, 0.5) is None
+    assert ground_plane.fit_plane(candidates, 0.5, ORIGIN) is None

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.frame import GroundSurface, Labelled, PolarGrid
 from gp_ground_seg.pipeline.residuals import correct_surface
-from gp_ground_seg.simulation import SCENES, SENSORS, VLP_16, objects, simulate_scan
+from gp_ground_seg.simulation import DRIVES, SENSORS, VLP_16, objects, simulate_scan
 from gp_ground_seg.simulation.scenes import Scene, ramp
 
 N_SEGMENTS = 7
@@ -130,12 +130,12 @@ def test_height_and_ground_z_are_of_one_surface(tilt):
     assert abs(np.mean(corrected)) < 0.003
 
 
-@pytest.mark.parametrize('sensor', SENSORS)
+@pytest.mark.parametrize('sensor', ['hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360'])
 def test_errors_against_exact_heights_are_as_large_as_said(sensor):
     """Every scene once; docs/accuracy.md has the table of two seeds."""
     segmenter = GroundSegmenter()
     ratios, errors = [], []
-    for scene in SCENES.values():
+    for scene in DRIVES.values():
         made = simulate_scan(scene(0), SENSORS[sensor], np.random.default_rng(0))
         found = segmenter.segment(made.points[:, :3])
         own = made.is_ground & np.isfinite(found.ground_z)

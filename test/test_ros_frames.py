@@ -1,5 +1,6 @@
 """Tilt of the sensor by TF, and what of it is seen outside: nothing but better labels."""
 
+import dataclasses
 import importlib.util
 import math
 import sys
@@ -18,12 +19,14 @@ from rclpy.time import Time
 from ros_helpers import bench, street, to_message, wait_for, xyz_of
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
+from test_sensor_pose import ROOM
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.pipeline.tilt import rotation
 from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.input import tilt_of
+from gp_ground_seg.simulation import VLP_16, simulate_scan
 
 HAS_TF2 = importlib.util.find_spec('tf2_ros') is not None
 VALUES = {'learning.mode': 'fixed', 'sensor.height': 1.73}
@@ -120,6 +123,7 @@ class StandInBuffer:
     """
 
     known: dict = {}  # noqa: RUF012
+    place = 0.0, 0.0, 0.0
     cleared = 0
 
     def lookup_transform(self, target, source, time):
@@ -129,6 +133,8 @@ class StandInBuffer:
             raise IndexError('would require extrapolation into the future')
         message = TransformStamped()
         message.transform.rotation = self.known[target, source]
+        place = message.transform.translation
+        place.x, place.y, place.z = self.place
         return message
 
     def clear(self):
@@ -184,6 +190,37 @@ def test_tilt_by_tf_is_as_good_as_given(monkeypatch):
         assert StandInListener.alive == 0
         assert b.set('frame.level', 'tf').successful
         assert StandInListener.alive == 1
+
+
+def test_place_of_the_sensor_by_tf(monkeypatch):
+    """A room in the frame of a vehicle: which of its planes is the floor, the origin tells."""
+    errors = {'TransformException': LookupError, 'ExtrapolationException': IndexError}
+    parts = {'Buffer': StandInBuffer, 'TransformListener': StandInListener, **errors}
+    monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(**parts))
+    sensor = dataclasses.replace(VLP_16, n_columns=600, height=1.2)
+    xyz = simulate_scan(ROOM, sensor, np.random.default_rng(0)).points[:, :3]
+    points = street(len(xyz))
+    for k, axis in enumerate('xyz'):
+        points[axis] = xyz[:, k] + (1.2 if axis == 'z' else 0.0)
+    values = {'learning.mode': 'fixed', 'frame.sensor': 'lidar', 'diagnostics.period': 0.1}
+    with bench(*ros.given(values)) as b:
+        message = to_message(points, stamp=(3, 4), frame='base_footprint')
+        b.publisher.publish(message)
+        status = b.wait_for_status('input', lambda v, s: 'no transform' in s.message)
+        assert "frame.sensor = 'lidar'" in status.message and 'base_footprint' in status.message
+        for x, reason in ((math.nan, 'its translation is (nan'), (0.0, '')):
+            StandInBuffer.known['base_footprint', 'lidar'] = quaternion(np.eye(3))
+            StandInBuffer.place = x, 0.0, 1.2
+            if reason:
+                b.publisher.publish(message)
+                b.wait_for_status('input', lambda v, s, reason=reason: reason in s.message)
+        assert b.segment(message)[0].width > 0.05 * len(points)
+        b.wait_for_status('model', lambda v, s: v['Taken from the scan'] == 'height')
+        # Without it the height is not known, and nothing is ground.
+        n_alive = StandInListener.alive
+        assert b.set('frame.sensor', 'none').successful
+        assert StandInListener.alive == n_alive - 1
+        assert b.segment(message)[0].width == 0
 
 
 @pytest.mark.skipif(not HAS_TF2, reason='tf2_ros is not installed (it has no wheel)')

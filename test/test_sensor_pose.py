@@ -126,6 +126,115 @@ def test_a_room_too_small_to_see_the_floor_determines_nothing():
     assert pose.height == DEFAULT_HEIGHT
 
 
+SMALL_VLP, SMALL_HDL = (dataclasses.replace(s, n_columns=600) for s in (VLP_16, HDL_64E))
+ROOM = room('room', [(-5.0, -5.0), (5.0, -5.0), (5.0, 5.0), (-5.0, 5.0)], ceiling=True)
+
+
+def moved(points, lift):
+    """Points of a frame whose origin is `lift` lower [m]."""
+    return points[:, :3].astype(np.float64) + np.array([0.0, 0.0, lift])
+
+
+@pytest.mark.parametrize('sensor', [SMALL_HDL, SMALL_VLP], ids=lambda s: s.name)
+@pytest.mark.parametrize('scene', ['flat', 'kerb', 'urban', 'rough'])
+@pytest.mark.parametrize('height', [0.4, 1.73])
+def test_the_origin_may_be_at_any_height(sensor, scene, height):
+    """In the frame of a vehicle z is 0 on the ground, and labels are those of the sensor's own."""
+    points = scan_of(scene, sensor, height).points
+    own = SEGMENTER.segment(points)
+    assert own.pose.height_estimated and own.warnings == ()
+    for lift in (height, height - 0.1, height + 0.33, height + 3.0, height - 15.0):
+        found = SEGMENTER.segment(moved(points, lift))
+        assert found.pose.height_estimated and found.warnings == ()
+        assert found.pose.height == pytest.approx(own.pose.height - lift, abs=1e-4)
+        assert (found.label != own.label).mean() < 0.002
+        np.testing.assert_allclose(found.height, own.height, atol=0.01)
+
+
+@pytest.mark.parametrize('height', [0.0, -0.3])
+def test_a_height_of_zero_or_below_can_be_given(height):
+    points = moved(scan_of('urban', SMALL_HDL, 1.73).points, 1.73 - height)
+    own, told = SEGMENTER.segment(points), segmenter(height=height).segment(points)
+    assert told.pose.height == height and told.pose.contradictions == () == told.warnings
+    assert (told.label != own.label).mean() < 0.002
+    wrong = segmenter(height=height - 0.5).segment(points)
+    (line,) = wrong.pose.contradictions
+    assert "above the cloud's origin" in line or "below the cloud's origin" in line
+
+
+@pytest.mark.parametrize('lift', [0.0, 0.3])
+@pytest.mark.parametrize('scene', ['urban', ROOM], ids=['urban', 'room'])
+def test_a_scan_of_one_beam_shows_no_ground(scene, lift):
+    laser = dataclasses.replace(VLP_16, elevations=(0.0,))
+    pose = pose_of(moved(scan_of(scene, laser, 0.3).points, lift))
+    assert not pose.height_estimated
+    assert 'sensor.height' in pose.warnings[0]
+
+
+@pytest.mark.parametrize('lift', [0.0, 1.8])
+def test_a_ceiling_is_no_ground(lift):
+    """Of this room the sensor sees the ceiling well and the floor hardly."""
+    wide = dataclasses.replace(
+        SMALL_HDL, elevations=tuple(np.radians(np.linspace(52.0, -7.0, 60)))
+    )
+    pose = pose_of(moved(scan_of(ROOM, wide, 1.8).points, lift))
+    assert not pose.height_estimated and pose.measured is None
+
+
+def test_where_the_rays_start_tells_a_floor_from_a_cone_on_the_walls():
+    """In the frame of a vehicle, and with a ring or two on the floor, or none."""
+    points = moved(scan_of(ROOM, SMALL_VLP, 1.2).points, 1.2)
+    assert not pose_of(points).height_estimated
+    assert pose_of(points, origin_z=1.2).height == pytest.approx(0.0, abs=0.03)
+    assert SEGMENTER.segment(points, origin=(0.0, 0.0, 1.2)).pose.height_estimated
+    # Turned with the cloud.
+    lean = tilted(points, 0.1, 0.0)
+    x, y, z = (rotation(0.1, 0.0).T @ (0.0, 0.0, 1.2)).tolist()
+    given_angles = {'roll': 0.1, 'pitch': 0.0, 'origin_x': x, 'origin_y': y, 'origin_z': z}
+    assert pose_of(lean, **given_angles).height == pytest.approx(0.0, abs=0.03)
+    # Here the lowest beam ends on the walls: seen from where it starts, that is a cone.
+    walls = moved(scan_of(ROOM, SMALL_VLP, 1.8).points, 1.0)
+    assert not pose_of(walls).height_estimated
+    assert not pose_of(walls, origin_z=1.0).height_estimated
+
+
+@pytest.mark.parametrize('height', [0.13, 0.25])
+@pytest.mark.parametrize('scene', ['flat', 'kerb', ROOM], ids=['flat', 'kerb', 'room'])
+def test_low_robots(scene, height):
+    points = scan_of(scene, SMALL_VLP, height).points
+    for lift in (0.0, height):
+        assert pose_of(moved(points, lift)).height == pytest.approx(height - lift, abs=0.04)
+
+
+@pytest.mark.parametrize('degrees', [35, 40, 45])
+@pytest.mark.parametrize('sensor', [SMALL_HDL, SMALL_VLP], ids=lambda s: s.name)
+def test_a_large_tilt_is_levelled(sensor, degrees):
+    """Beyond what is searched below z: in a frame of its own the ground is found all the same."""
+    for direction in (0.0, 0.8, 2.5):
+        tilt = math.radians(degrees)
+        roll, pitch = tilt * math.cos(direction), tilt * math.sin(direction)
+        pose = pose_of(scan_of('urban', sensor, 1.5, roll=roll, pitch=pitch).points)
+        assert pose.roll_estimated and pose.height == pytest.approx(1.5, abs=0.15)
+        lean = pose.rotation[2] @ rotation(roll, pitch)[2]
+        assert math.acos(min(lean, 1.0)) < 0.03
+
+
+def test_what_is_not_known_is_said_once(caplog):
+    closet = room('closet', [(-1.5, -1.0), (1.5, -1.0), (1.5, 2.0), (-1.5, 2.0)])
+    points = scan_of(closet, SMALL_VLP, 1.2).points
+    own = segmenter()
+    results = [own.segment(points) for _ in range(3)]
+    own.estimate_pose(points)
+    said = [record.getMessage() for record in caplog.records if record.name == 'gp_ground_seg']
+    assert results[0].pose.is_height_default
+    assert said == list(results[0].warnings)
+    assert 'does not show the ground' in said[0] and 'next to nothing' in said[-1]
+    # An empty cloud has no ground to show; a height that is given is not guessed.
+    assert own.segment(points[:0]).warnings == ()
+    told = segmenter(height=30.0 - 11.0).segment(points)
+    assert [line.split(' of the scan')[0] for line in told.warnings] == ['next to nothing']
+
+
 def test_the_roof_of_the_own_vehicle_is_not_the_ground():
     roof = np.random.default_rng(0).uniform(-1.5, 1.5, (20000, 3))
     roof[:, 2] = -0.3

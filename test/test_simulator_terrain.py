@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg.simulation import SCENES, Kind, objects
+from gp_ground_seg.simulation import DRIVES, SCENES, Kind, objects
 from gp_ground_seg.simulation import scenes as landforms
 from gp_ground_seg.simulation.objects import Box, Cylinder, nearest_solid
 from gp_ground_seg.simulation.scenes import polyline
@@ -287,7 +287,7 @@ def test_standing_and_floating_solids_follow_the_terrain():
     assert {panel.kind for panel in panels} == {Kind.WALL}
 
 
-@pytest.mark.parametrize('name', SCENES)
+@pytest.mark.parametrize('name', DRIVES)
 @pytest.mark.parametrize('seed', range(3))
 def test_lane_of_the_drive_is_free(name, seed):
     """No solid is where a car 2 m wide and 2 m high drives along x."""

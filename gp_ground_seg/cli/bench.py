@@ -20,7 +20,8 @@ from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation import report
 from gp_ground_seg.evaluation.benchmark import BenchFrame, bench_cases, bench_document, run_cases
-from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, TITLES, PatchworkppMethod
+from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, TITLES
+from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.evaluation.report import Cell, Column, Table
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config

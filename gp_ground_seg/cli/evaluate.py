@@ -6,19 +6,24 @@ import argparse
 import itertools
 import math
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
+from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.atomic_output import staged_file
+from gp_ground_seg.data.boxes import find_boxes
 from gp_ground_seg.data.semantic_kitti import Frame
+from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import metrics
 from gp_ground_seg.evaluation import report as tables
-from gp_ground_seg.evaluation.evaluate import MethodScore
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore
 from gp_ground_seg.evaluation.intervals import INTERVAL, Sums, interval_note, interval_text
+from gp_ground_seg.evaluation.object_table import object_table
+from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
@@ -26,7 +31,20 @@ from gp_ground_seg.plotting.charts import plot_reliability
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in both conventions of the field: precision,
-recall, F1, accuracy, IoU, time per frame.
+recall, F1, accuracy, IoU, time per frame; and count what is lost on vehicles, persons
+and cyclists: the share of their returns from 0.3 m above the local ground that is called
+ground, and the objects of which more than half of these returns are. Objects are the
+instances of the labels (their upper 16 bits), or given as boxes, a file for each scan:
+
+  000007.csv   class,x,y,z,length,width,height,yaw   as first line; centre and size [m] in
+               the frame of the cloud, yaw about z, from x towards y [rad]
+  000007.npz   box_class (K,), box_center (K, 3), box_size (K, 3), box_rotation (K, 3, 3):
+               rows of the matrix are the axes of the box in the frame of the cloud
+
+Without labels only objects are counted, from the bottom of their boxes.
+
+Patchwork++ (--peer) has its published parameters; a height and a place of the sensor that are
+given (sensor.height, sensor.origin_x, ...) are given to it too.
 """
 EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
@@ -35,6 +53,9 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
   gp-ground-seg evaluate KITTI_ROOT --worst 9
   gp-ground-seg evaluate KITTI_ROOT --reliability reliability.png
+  gp-ground-seg evaluate KITTI_ROOT --boxes boxes --peer patchworkpp      boxes/00/000000.csv, ...
+  gp-ground-seg evaluate scans --boxes boxes                scans/a.bin with boxes/a.csv, ...
+  gp-ground-seg evaluate a.bin --boxes a.npz
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI).
 """
@@ -59,11 +80,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         *OF_FRAMES,
         ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
         ('--reliability', 'draw share of ground over p_ground (PNG)', {'metavar': 'FILE'}),
+        ('--boxes', 'objects: a file, or a folder of files; ROOT may be .bin scans without labels',
+         {'metavar': 'PATH'}),
         ('--peer', 'run this one on the same frames, alternately', peers),
         options.MARKDOWN,
         options.TO_JSON,
         options.FORCE,
-    )
+    )  # fmt: skip
     options.add_config(parser)
     parser.set_defaults(run=run)
 
@@ -73,12 +96,12 @@ def run(arguments: argparse.Namespace) -> int:
     config = options.read_config(arguments)
     files = {'json': 'every number', 'reliability': 'reliability diagram'}
     with staged_options(arguments, *files) as parts, ExitStack() as stack:
-        frames = frames_from_options(arguments)
+        items, load = _items_from_options(arguments)
         chosen: list[methods.Method] = [stack.enter_context(closing(methods.OurMethod(config)))]
         if arguments.peer is not None:
-            chosen.append(methods.PatchworkppMethod())
+            chosen.append(PatchworkppMethod.of_sensor(config.sensor))
         bar = options.progress('evaluate')
-        scores = methods.score_methods(frames, methods.load_kitti, chosen, progress=bar)
+        scores = methods.score_methods(items, load, chosen, progress=bar)
         report = make_report(
             score_tables(scores, arguments.worst), scores, config,
             data=arguments.root, reliability=reliability_rows(scores[0]),
@@ -88,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
         if 'json' in parts:
             report.write(parts['json'], environment)
         if 'reliability' in parts:
-            title = f'Reliability, {len(frames)} frames'
+            title = f'Reliability, {len(items)} frames'
             plot_reliability(_calibrations(scores[0]), parts['reliability'], title)
     print(f'{_headline(scores)}\n')
     lines = [tables.parameters_line(report.facts['config_changes'])]
@@ -99,22 +122,42 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _items_from_options(
+    arguments: argparse.Namespace,
+) -> tuple[Sequence[Any], Callable[[Any], KnownScan]]:
+    """Return what is scored, frames or frames and files of boxes, and what reads one of them."""
+    frames = frames_from_options(arguments)
+    if arguments.boxes is None:
+        return frames, methods.load_kitti
+    for name in ('worst', 'reliability'):
+        if getattr(arguments, name) is not None and frames[0].labels_path is None:
+            raise DataError(f'--{name}: needs labels of the ground, which {arguments.root} lacks')
+    return [*zip(frames, find_boxes(arguments.boxes, frames), strict=True)], methods.load_boxed
+
+
 def _headline(scores: Sequence[MethodScore]) -> str:
-    ious = [f'{one.title} {100.0 * one.iou:.2f} %' for one in scores]
+    ious = [f'{one.title} {100.0 * one.iou:.2f} %' for one in scores if one.has_labels]
     times = [f'{one.title} {1e3 * one.seconds():.1f} ms' for one in scores]
     frames, sequences = len(scores[0].scans), len(scores[0].sequences)
     pooled = f'{options.count(frames, "frame")} of {options.count(sequences, "sequence")}'
     iou, seconds = (', '.join(own).removeprefix(methods.OURS).strip() for own in (ious, times))
-    return f'IoU {iou}  (GroundGrid convention, {pooled})\n{seconds} per frame  (median)'
+    first = f'IoU {iou}  (GroundGrid convention, {pooled})'
+    if not scores[0].has_labels:
+        first = f'IoU not available, no labels of the ground  ({pooled})'
+    return f'{first}\n{seconds} per frame  (median)'
 
 
 def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str, Table]:
     """Tables of an evaluation by name, ours first in `scores`."""
+    objects = object_table(scores, options.count(len(scores[0].sequences), 'sequence'))
+    if not scores[0].has_labels:
+        return {'objects': objects, 'times': _time_table(scores)}
     return {
         **{one.key: _convention_table(scores, one) for one in metrics.CONVENTIONS},
         **({'differences': _difference_table(*scores)} if len(scores) > 1 else {}),
         'rings': _ring_table(scores),
         'classes': _class_table(scores[0]),
+        'objects': objects,
         'probabilities': _calibration_table(scores[0]),
         'heights': _height_table(scores),
         **({'worst': _worst_table(scores[0], n_worst)} if n_worst else {}),
@@ -290,10 +333,17 @@ def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
 
 
 def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
-    """Labelled frames of the options, grouped by sequence."""
+    """Frames of the options, grouped by sequence; labelled, unless objects are given as boxes."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
-    frames = methods.labelled_frames(arguments.root, chosen, options.scan_layout(arguments))
+    root, layout = Path(arguments.root), options.scan_layout(arguments)
+    if getattr(arguments, 'boxes', None) is None:
+        frames = methods.labelled_frames(root, chosen, layout)
+    elif chosen is None and not any(root.glob('sequences/*/velodyne')):
+        name = root.resolve().stem
+        frames = [Frame(name, path.stem, path, None, 0.0, layout) for path in find_scans(root)]
+    else:
+        frames = methods.boxed_frames(root, chosen, layout)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
@@ -12,31 +12,34 @@ from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, sta
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.evaluate import load_kitti
 from gp_ground_seg.evaluation.report import Report, describe_environment, machine_line, written
-from gp_ground_seg.experiments import ablation, coverage, sensor_pose, stepwise, variants
+from gp_ground_seg.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
-from gp_ground_seg.simulation import SCENES, SENSORS
+from gp_ground_seg.simulation import DRIVES, SCENES, SENSORS
 
 Option = tuple[str, str, dict[str, Any]]
 
 DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
+SURVEYED = ('hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360')  # by `coverage`
 
 OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
 SEEDS = ('--seeds', 'simulated scenes of each kind', options.NUMBER)
-SCENE_LIST = (
-    '--scenes', f'simulated scenes, some of {",".join(SCENES)} (default: all)',
-    {'metavar': 'LIST', 'type': options.some_of(SCENES)},
-)  # fmt: skip
-SENSOR_LIST = (
-    '--sensors', f'some of {",".join(SENSORS)} (default: {",".join(DEFAULT_SENSORS)})',
-    {'metavar': 'LIST', 'type': options.some_of(SENSORS)},
-)  # fmt: skip
-EVERY_SENSOR = (
-    SENSOR_LIST[0], f'some of {",".join(SENSORS)} (default: all)', SENSOR_LIST[2],
-)  # fmt: skip
+
+
+def _some_of(option: str, known: Iterable[str], default: Iterable[str]) -> Option:
+    """Option that takes names of scenes or sensors."""
+    text = f'some of {",".join(known)} (default: {",".join(default)})'
+    return option, text, {'metavar': 'LIST', 'type': options.some_of(known)}
+
+
+SCENE_LIST = _some_of('--scenes', SCENES, DRIVES)
+CROWDED_LIST = _some_of('--scenes', SCENES, lost.SCENES)
+SENSOR_LIST = _some_of('--sensors', SENSORS, DEFAULT_SENSORS)
+EVERY_SENSOR = _some_of('--sensors', SENSORS, SURVEYED)
+EVERY_MOUNT = _some_of('--sensors', SENSORS, ['all'])
 NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
 SWITCH = (
     '--switch',
@@ -151,10 +154,17 @@ def _wrong_values(arguments: argparse.Namespace) -> Report:
 
 
 def _scenes(arguments: argparse.Namespace) -> Report:
-    sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(SCENES)
+    sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(DRIVES)
     config, bar = options.read_config(arguments), options.progress('scenes')
     seeds, with_peer = arguments.seeds or 3, not arguments.no_peer
     return variants.score_scenes(sensors, scenes, seeds, config, with_peer, bar)
+
+
+def _objects(arguments: argparse.Namespace) -> Report:
+    scenes, seeds = arguments.scenes or lost.SCENES, arguments.seeds or 2
+    config, bar = options.read_config(arguments), options.progress('objects')
+    sensors = arguments.sensors or list(SENSORS)
+    return lost.score_objects(sensors, scenes, seeds, config, not arguments.no_peer, bar)
 
 
 def _coverage(arguments: argparse.Namespace) -> Report:
@@ -162,7 +172,7 @@ def _coverage(arguments: argparse.Namespace) -> Report:
     if not arguments.simulated:
         frames = frames_from_options(arguments)
         return coverage.compare_coverage(frames, load_kitti, config, coverage.LABELLED, bar)
-    sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or list(SCENES)
+    sensors, scenes = arguments.sensors or list(SURVEYED), arguments.scenes or list(DRIVES)
     scans = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
     return coverage.compare_coverage(scans, load_simulated, config, coverage.SIMULATED, bar)
 
@@ -200,7 +210,7 @@ def _sensor_pose(arguments: argparse.Namespace) -> Report:
     if not arguments.simulated:
         frames, mounts = frames_from_options(arguments), sensor_pose.MOUNTS
         return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, bar)
-    scenes, mounts = arguments.scenes or list(SCENES), sensor_pose.SIMULATED_MOUNTS
+    scenes, mounts = arguments.scenes or list(DRIVES), sensor_pose.SIMULATED_MOUNTS
     scans = simulated_frames(DEFAULT_SENSORS, scenes, arguments.seeds or 1, (0.0,))
     return sensor_pose.score_poses(scans, sensor_pose.load_mounted, mounts, config, bar)
 
@@ -263,6 +273,15 @@ parameters and the true height of the sensor. All sensors have one set of parame
 """,
         (SENSOR_LIST, SCENE_LIST, SEEDS, NO_PEER),
         _scenes,
+    ),
+    'objects': Experiment(
+        """\
+Count vehicles, persons and cyclists of simulated scans that are called ground, beside
+Patchwork++ with its published parameters and the true height and place of the sensor. All
+sensors have one set of parameters.
+""",
+        (EVERY_MOUNT, CROWDED_LIST, SEEDS, NO_PEER),
+        _objects,
     ),
     'cross-validation': Experiment(
         """\

@@ -43,6 +43,7 @@ from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.pipeline.labels import square_units
 from gp_ground_seg.pipeline.points import copy_points, points_in
+from gp_ground_seg.pipeline.tilt import Direction
 
 
 class NumbaBackend:
@@ -114,9 +115,11 @@ class NumbaBackend:
             room.first(n),
         )
 
-    def fit_plane(self, candidates: Candidates, max_slope: float) -> GroundPlane | None:
+    def fit_plane(
+        self, candidates: Candidates, max_slope: float, origin: Direction
+    ) -> GroundPlane | None:
         """Plane of the ground around the sensor."""
-        return ground_plane.fit_plane(candidates, max_slope)
+        return ground_plane.fit_plane(candidates, max_slope, origin)
 
     def find_faces(self, scan: Scan, config: Config) -> Faces:
         """Tiles that hold a vertical face."""

@@ -33,6 +33,7 @@ from gp_ground_seg.pipeline.ground_plane import (
     GroundPlane,
     segment_directions,
 )
+from gp_ground_seg.pipeline.tilt import Direction
 
 X, Y, Z, RANGE, ALLOWED, INVERSE = range(6)
 """Rows of the table of lowest points; `ALLOWED` is the tolerance, `INVERSE` one over it."""
@@ -55,7 +56,7 @@ NumbersOfPlane = tuple[
 _solve_plane = jit()(ground_plane.solve_plane)
 
 
-def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
+def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
     """Do what `gp_ground_seg.pipeline.ground_plane.fit_plane` does, to rounding."""
     cells, sectors = np.empty((6, N_LARGEST)), np.empty(N_LARGEST, dtype=np.int64)
     directions = segment_directions(len(candidates.offsets) - 1)
@@ -65,7 +66,7 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     found, best = _best_hypothesis(cells, n, max_slope)
     if not found:
         return None
-    values = _describe(cells, sectors, n, _refine(cells, n, max_slope, best))
+    values = _describe(cells, sectors, n, _refine(cells, n, max_slope, best), origin)
     return GroundPlane(*values) if values[-1] > 0 else None
 
 
@@ -205,7 +206,11 @@ def _refine(
 
 @jit(entry=True)
 def _describe(
-    cells: FloatArray, sectors: IntArray, n: int, plane: tuple[float, float, float]
+    cells: FloatArray,
+    sectors: IntArray,
+    n: int,
+    plane: tuple[float, float, float],
+    origin: Direction,
 ) -> NumbersOfPlane:
     """Evidence for a plane: fields of the `GroundPlane`; cells come sector by sector."""
     height, slope_x, slope_y = plane
@@ -221,7 +226,9 @@ def _describe(
         distance = cells[Z, c] - (slope_x * cells[X, c] + slope_y * cells[Y, c] - height)
         if not abs(distance) <= cells[ALLOWED, c]:
             continue
-        ranges[n_on_it], drops[n_on_it] = r, -cells[Z, c] / r
+        ranges[n_on_it] = r
+        away = math.hypot(cells[X, c] - origin[0], cells[Y, c] - origin[1])
+        drops[n_on_it] = math.atan2(origin[2] - cells[Z, c], away)
         n_on_it += 1
         squares += distance * distance
         if r < NEAR:
@@ -234,12 +241,12 @@ def _describe(
     if n_on_it == 0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
     few, most = n_on_it // 10, (9 * n_on_it) // 10
-    steep = math.atan(_ranked(drops[:n_on_it], most))
+    steep = _ranked(drops[:n_on_it], most)
     lift = _ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
     return (
         height, slope_x, slope_y, height - lift, n_on_it / n, n_covered / N_SECTORS,
         n_far / n_any, _ranked(ranges[:n_on_it], most),
-        steep - math.atan(_ranked(drops[:n_on_it], few)), math.sqrt(squares / n_on_it),
+        steep - _ranked(drops[:n_on_it], few), math.sqrt(squares / n_on_it),
         n, n_on_it,
     )  # fmt: skip
 

@@ -100,11 +100,7 @@ def _objection(points: _Numbers) -> str:
     """Return what is wrong with x, y, z, or ''."""
     if not len(points):
         return ''
-    # Some drivers put rays without a return at the origin.
-    xyz = points[:: 1 + points.size // _N_JUDGED, :3].astype(np.float64)
-    if np.count_nonzero(np.isfinite(xyz) & (xyz != 0.0)) < 3 * _MIN_POINTS:
-        xyz = points[:, :3].astype(np.float64)
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    xyz = _sample(points)
     if not len(xyz):
         return f'none of {len(points)} points is finite'
     if len(points) < _MIN_POINTS:
@@ -115,10 +111,26 @@ def _objection(points: _Numbers) -> str:
     share = float(np.mean((size < _LEAST) | (size > _LARGEST)))
     if share > _MAX_UNMEASURABLE:
         return f'{share:.0%} of the coordinates are below 1e-6 m or above 1e6 m'
-    middle = float(np.median(np.linalg.norm(size, axis=1)))
+    middle = _middle(size)
     if middle > MAX_RANGE:
         return f'half of the points are farther than {middle:.0f} m'
+    # The lower halves of doubles are no float32 that can be measured.
+    if points.dtype.itemsize == 8 and not _objection(points.view('<f4')):
+        return 'halves of its numbers are coordinates by themselves'
     return ''
+
+
+def _sample(points: _Numbers) -> _Numbers:
+    """Return x, y, z of some points, of those that are finite."""
+    # Some drivers put rays without a return at the origin.
+    xyz = points[:: 1 + points.size // _N_JUDGED, :3].astype(np.float64)
+    if np.count_nonzero(np.isfinite(xyz) & (xyz != 0.0)) < 3 * _MIN_POINTS:
+        xyz = points[:, :3].astype(np.float64)
+    return xyz[np.isfinite(xyz).all(axis=1)]
+
+
+def _middle(xyz: _Numbers) -> float:
+    return float(np.median(np.linalg.norm(xyz, axis=1)))
 
 
 def _spreads(numbers: _Numbers) -> dict[int, float]:
@@ -175,9 +187,9 @@ def _likely_layout(data: bytes, layout: ScanLayout) -> ScanLayout | None:
 
 def _guess(points: _Numbers) -> str:
     """Return what points that have no likely layout look like, or ''."""
-    xyz = points[:, :3]
-    size = np.abs(xyz[np.isfinite(xyz) & (xyz != 0.0)].astype(np.float64))
-    middle = float(np.median(size)) if len(size) else 0.0
+    xyz = _sample(points)
+    xyz = xyz[(xyz != 0.0).any(axis=1)]
+    middle = _middle(xyz) if len(xyz) else 0.0
     if 0.0 < middle < np.finfo(np.float32).tiny:
         return 'looks like whole numbers, as of a .label file'
     if MAX_RANGE < middle < 1000.0 * MAX_RANGE:

@@ -63,7 +63,7 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
     if not path.exists():
         return [FRAME_PERIOD * k for k in range(len(frames))]
     try:
-        lines = [float(word) for word in _read_bytes(path, _MAX_TIMES_BYTES).split()]
+        lines = [float(word) for word in read_bytes(path, _MAX_TIMES_BYTES).split()]
     except ValueError as error:
         raise DataError(f'{path}: {error}') from error
     times: list[float] = []
@@ -85,7 +85,7 @@ def read_points(path: str | Path, layout: ScanLayout = KITTI) -> npt.NDArray[np.
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
     points, or, where the layout asks for that, its numbers can be no scan.
     """
-    data = _read_bytes(path, MAX_SCAN_BYTES)
+    data = read_bytes(path, MAX_SCAN_BYTES)
     doubt = '' if layout.doubts == 'ignore' else find_doubt(data, layout)
     if len(data) % layout.bytes_per_point:
         problem = f'is not a whole number of points ({layout.bytes_per_point} bytes each)'
@@ -99,14 +99,19 @@ def read_points(path: str | Path, layout: ScanLayout = KITTI) -> npt.NDArray[np.
 
 def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
     """Semantic classes of a ``.label`` file, (n_points,); DataError if it has another number."""
+    return (read_entries(path, n_points) & 0xFFFF).astype(np.uint16)
+
+
+def read_entries(path: str | Path, n_points: int) -> npt.NDArray[np.uint32]:
+    """Entries of a ``.label`` file, (n_points,): class below, instance in the upper 16 bits."""
     expected = f'expected {4 * n_points} for {n_points} points'
-    data = _read_bytes(path, 4 * n_points, expected)
+    data = read_bytes(path, 4 * n_points, expected)
     if len(data) != 4 * n_points:
         raise DataError(f'{path}: {len(data)} bytes, {expected}')
-    return (np.frombuffer(data, dtype='<u4') & 0xFFFF).astype(np.uint16)
+    return np.frombuffer(data, dtype='<u4').astype(np.uint32)
 
 
-def _read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:
+def read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:
     """Read a file; DataError if it cannot be read or has more than `most` bytes."""
     try:
         with open(path, 'rb') as file:

@@ -1,35 +1,40 @@
-"""Methods over scans whose truth is known: ours and Patchwork++, scores by scan, their sums."""
+"""Methods over scans whose truth is known: scores by scan, and their sums."""
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
-import os
 import statistics
-import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import KDTree
 
 from gp_ground_seg.backend import Backend
+from gp_ground_seg.data.boxes import read_boxes
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import (
     Frame,
     list_frames,
     list_sequences,
-    read_labels,
+    read_entries,
     read_points,
 )
-from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation import metrics
 from gp_ground_seg.evaluation.metrics import CONVENTIONS, GROUNDGRID, Confusion, Labels
+from gp_ground_seg.evaluation.objects import (
+    ObjectCounts,
+    Objects,
+    boxed_objects,
+    count_objects,
+    labelled_objects,
+    pool_objects,
+)
 from gp_ground_seg.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
@@ -105,68 +110,6 @@ class OurMethod:
         self._segmenter.close()
 
 
-class PatchworkppMethod:
-    """Patchwork++ (Lee, Lim, Myung, IROS 2022) from PyPI, with its published parameters.
-
-    Its thresholds adapt over a sequence. The default sensor height [m] is that of KITTI.
-    """
-
-    name = PATCHWORKPP
-
-    def __init__(self, sensor_height: float | None = None) -> None:
-        try:
-            import pypatchworkpp
-        except ImportError as error:
-            raise MissingDependencyError('patchworkpp: pip install pypatchworkpp') from error
-        self._module = pypatchworkpp
-        self._sensor_height = sensor_height
-        self.reset()
-
-    def reset(self) -> None:
-        """Start anew with its default thresholds."""
-        with _c_stdout_silenced():  # it greets on standard output, which is for tables
-            parameters = self._module.Parameters()
-            if self._sensor_height is not None:
-                parameters.sensor_height = self._sensor_height
-            self._uprightness = float(parameters.uprightness_thr)
-            self._estimator = self._module.patchworkpp(parameters)
-
-    def run(self, points: Points) -> None:
-        """Segment a scan."""
-        self._points = points
-        self._estimator.estimateGround(points)
-
-    def result(self) -> MethodResult:
-        """Labels, and the plane of the nearest upright patch: it has no surface of its own."""
-        label = np.full(len(self._points), Label.OBSTACLE, dtype=np.uint8)
-        label[self._estimator.getGroundIndices()] = Label.GROUND
-        centre = np.asarray(self._estimator.getCenters(), dtype=np.float64).reshape(-1, 3)
-        normal = np.asarray(self._estimator.getNormals(), dtype=np.float64).reshape(-1, 3)
-        upright = np.abs(normal[:, 2]) > self._uprightness
-        centre, normal = centre[upright], normal[upright]
-        if not len(centre):
-            return MethodResult(label, np.full(len(label), np.nan))
-        xy = self._points[:, :2].astype(np.float64)
-        _, nearest = KDTree(centre[:, :2]).query(xy)
-        centre, normal = centre[nearest], normal[nearest]
-        fall = np.sum((xy - centre[:, :2]) * normal[:, :2], axis=1) / normal[:, 2]
-        return MethodResult(label, np.asarray(centre[:, 2] - fall))
-
-
-@contextlib.contextmanager
-def _c_stdout_silenced() -> Iterator[None]:
-    """Keep what C++ code writes to standard output away from it."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    try:
-        with open(os.devnull, 'wb') as sink:
-            os.dup2(sink.fileno(), 1)
-            yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
-
-
 @dataclass(frozen=True)
 class KnownScan:
     """A scan of N points whose truth is known."""
@@ -179,6 +122,7 @@ class KnownScan:
     semantic: npt.NDArray[np.integer] | None = None  # (N,) classes, if known
     ground_z: npt.NDArray[np.floating] | None = None  # (N,) true height of the ground [m]
     is_ground: BoolArray | None = None  # (N,) points under which the surface is compared with it
+    objects: Objects | None = None  # what stands on the ground, if known
 
 
 @dataclass(frozen=True)
@@ -194,6 +138,7 @@ class ScanScore:
     classes: dict[int, metrics.ClassCount] = field(default_factory=dict)
     rings: tuple[Confusion, ...] = ()  # by `RING_TITLES`
     calibration: metrics.Calibration | None = None  # where the method has probabilities
+    objects: ObjectCounts = field(default_factory=dict)
     pose: SensorPose | None = None  # of our own method
     fit: FitReport | None = None
 
@@ -214,6 +159,11 @@ class MethodScore:
     def title(self) -> str:
         """Name in tables."""
         return TITLES.get(self.name, self.name)
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether the ground of the scans is known."""
+        return any(scan.confusions for scan in self.scans)
 
     @property
     def sequences(self) -> list[str]:
@@ -267,6 +217,11 @@ class MethodScore:
         return tuple(sum(ring, Confusion()) for ring in zip(*of_scans, strict=True))
 
     @property
+    def objects(self) -> ObjectCounts:
+        """Sum of the counts of objects."""
+        return pool_objects([scan.objects for scan in self.scans])
+
+    @property
     def calibration(self) -> metrics.Calibration | None:
         """Sum over the scans; None unless every scan has one."""
         found = [scan.calibration for scan in self.scans if scan.calibration is not None]
@@ -304,13 +259,8 @@ def labelled_frames(
     DataError if a sequence is not there, a named one or a single frame has no labels, or all.
     """
     known = list_sequences(root)
-    chosen = list(dict.fromkeys(known if sequences is None else sequences))
-    unknown = [name for name in chosen if name not in known]
-    if unknown or not chosen:
-        problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
-        raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
     frames, left_out = [], []
-    for name in chosen:
+    for name in _chosen(root, sequences):
         own = list_frames(root, name, layout)
         bare = [frame.index for frame in own if frame.labels_path is None]
         if sequences is None and len(bare) == len(own):
@@ -326,16 +276,53 @@ def labelled_frames(
     return frames
 
 
+def _chosen(root: str | Path, sequences: Sequence[str] | None) -> list[str]:
+    """Sequences below `root` that are named, or all; raises DataError if one is not there."""
+    known = list_sequences(root)
+    chosen = list(dict.fromkeys(known if sequences is None else sequences))
+    unknown = [name for name in chosen if name not in known]
+    if unknown or not chosen:
+        problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
+        raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
+    return chosen
+
+
+def boxed_frames(
+    root: str | Path, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
+) -> list[Frame]:
+    """Frames of the named sequences, or of all; labels count where each frame has some."""
+    found = [one for name in _chosen(root, sequences) for one in list_frames(root, name, layout)]
+    n_bare = sum(frame.labels_path is None for frame in found)
+    if 0 < n_bare < len(found):
+        _LOGGER.info('labels left out: %d of %d frames have none', n_bare, len(found))
+        return [replace(frame, labels_path=None) for frame in found]
+    return found
+
+
 def load_kitti(frame: Frame) -> KnownScan:
     """Read a labelled frame; the ground whose height counts is what is labelled ground."""
     if frame.labels_path is None:
         raise DataError(f'{frame.points_path}: has no labels')
     points = read_points(frame.points_path, frame.layout)
-    semantic = read_labels(frame.labels_path, len(points))
+    entries = read_entries(frame.labels_path, len(points))
+    semantic = (entries & 0xFFFF).astype(np.uint16)
     z = points[:, 2].astype(np.float64)
     truths = {one.key: one.truth(semantic, points[:, 2]) for one in CONVENTIONS}
     is_ground = truths[GROUNDGRID.key] == Label.GROUND
-    return KnownScan(frame.sequence, frame.index, points, truths, semantic, z, is_ground)
+    objects = labelled_objects(points, entries, is_ground)
+    return KnownScan(frame.sequence, frame.index, points, truths, semantic, z, is_ground, objects)
+
+
+def load_boxed(item: tuple[Frame, Path]) -> KnownScan:
+    """Read a frame and the boxes of its objects; without labels its ground is not known."""
+    frame, path = item
+    boxes = read_boxes(path)
+    if frame.labels_path is not None:
+        scan = load_kitti(frame)
+        return replace(scan, objects=boxed_objects(scan.points, boxes, scan.is_ground))
+    points = read_points(frame.points_path, frame.layout)
+    objects = boxed_objects(points, boxes)
+    return KnownScan(frame.sequence, frame.index, points, {}, objects=objects)
 
 
 def score_methods(
@@ -381,7 +368,7 @@ def _run(method: Method, scan: KnownScan) -> None:
 def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
     result = method.result()
     label, p_ground = result.label, result.p_ground
-    truth = next(iter(scan.truths.values()))
+    truth = next(iter(scan.truths.values()), None)
     height = None
     if scan.ground_z is not None:
         own = scan.is_ground
@@ -391,7 +378,8 @@ def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
         {key: metrics.count_confusion(label, one) for key, one in scan.truths.items()},
         height,
         {} if scan.semantic is None else metrics.count_classes(label, scan.semantic),
-        metrics.count_rings(label, truth, scan.points),
-        None if p_ground is None else metrics.count_calibration(p_ground, truth),
+        () if truth is None else metrics.count_rings(label, truth, scan.points),
+        None if p_ground is None or truth is None else metrics.count_calibration(p_ground, truth),
+        {} if scan.objects is None else count_objects(scan.points, label, scan.objects),
         result.pose, result.fit,
     )  # fmt: skip

@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,17 +15,26 @@ import numpy.typing as npt
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.frame import FloatArray, Label
 
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
 Labels = npt.NDArray[np.uint8]
 
 RATIOS = ('precision', 'recall', 'f1', 'accuracy', 'iou')
 """Ratios of a `Confusion`, by name of its property."""
 
+
+def range_titles(edges: Sequence[float]) -> tuple[str, ...]:
+    """Names of the bands of range between edges [m], the last of which may be infinite."""
+    return tuple(
+        f'> {low:g} m' if math.isinf(high) else f'{low:g}-{high:g} m'
+        for low, high in itertools.pairwise(edges)
+    )
+
+
 RING_EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, math.inf)
 """Edges of the rings of horizontal range [m]; each holds its inner edge, not its outer one."""
-RING_TITLES = tuple(
-    f'> {low:g} m' if math.isinf(high) else f'{low:g}-{high:g} m'
-    for low, high in itertools.pairwise(RING_EDGES)
-)
+RING_TITLES = range_titles(RING_EDGES)
 
 BIN_EDGES = np.linspace(0.0, 1.0, 16)
 """Edges of the bins of probability in the expected calibration error."""
@@ -97,18 +106,24 @@ CONVENTIONS = (GROUNDGRID, PATCHWORK)
 
 
 @dataclass(frozen=True)
-class Confusion:
+class Sums:
+    """A dataclass of counts and sums, which add up."""
+
+    def __add__(self, other: Self) -> Self:
+        """Add the sums of both."""
+        names = [field.name for field in dataclasses.fields(self)]
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
+        return dataclasses.replace(self, **sums)
+
+
+@dataclass(frozen=True)
+class Confusion(Sums):
     """Points by true and given label, ground being positive; ratios over nothing are NaN."""
 
     tp: int = 0
     fp: int = 0
     fn: int = 0
     tn: int = 0
-
-    def __add__(self, other: Confusion) -> Confusion:
-        """Add the counts of both."""
-        names = ('tp', 'fp', 'fn', 'tn')
-        return Confusion(*(getattr(self, name) + getattr(other, name) for name in names))
 
     @property
     def precision(self) -> float:
@@ -221,7 +236,7 @@ def class_errors(classes: Mapping[int, ClassCount]) -> list[ClassErrors]:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(Sums):
     """Probabilities of ground against the truth, as sums; ratios over nothing are NaN.
 
     Sums by bin of probability, (N_BINS,); a bin holds its lower edge, the last one 1 as well.
@@ -231,11 +246,6 @@ class Calibration:
     n_ground: npt.NDArray[np.int64]
     sum_p: FloatArray
     sum_squared_error: float  # of probability minus truth, 1 for ground, over all bins
-
-    def __add__(self, other: Calibration) -> Calibration:
-        """Add the sums of both."""
-        names = [field.name for field in dataclasses.fields(self)]
-        return Calibration(*(getattr(self, name) + getattr(other, name) for name in names))
 
     @property
     def n_total(self) -> int:

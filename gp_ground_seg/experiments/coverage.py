@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from gp_ground_seg.evaluation.metrics import (
     RING_EDGES,
     RING_TITLES,
     Calibration,
+    Sums,
     count_calibration,
     ratio,
 )
@@ -32,7 +33,7 @@ density of a handful of returns that happen to agree would outweigh all others."
 
 
 @dataclass(frozen=True)
-class Coverage:
+class Coverage(Sums):
     """Errors of the ground's height against their standard deviations, as sums.
 
     Ratios over nothing are NaN. The error is estimate minus truth.
@@ -44,11 +45,6 @@ class Coverage:
     sum_error: float = 0.0  # [m]
     sum_squared_error: float = 0.0  # [m^2]
     sum_nlpd: float = 0.0  # negative logs of the predictive density, [nat] of a density per metre
-
-    def __add__(self, other: Coverage) -> Coverage:
-        """Add the sums of both."""
-        names = (field.name for field in fields(self))
-        return Coverage(*(getattr(self, name) + getattr(other, name) for name in names))
 
     @property
     def within_1(self) -> float:

@@ -7,8 +7,9 @@ from contextlib import closing
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.evaluation import report as results
-from gp_ground_seg.evaluation.evaluate import Method, PatchworkppMethod, Progress, load_kitti
+from gp_ground_seg.evaluation.evaluate import Method, Progress, load_kitti
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
+from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, changed_parameters, percent
 from gp_ground_seg.experiments.interpolation import interpolation_method
 from gp_ground_seg.experiments.variants import make_report, refuse_changed, score_variants

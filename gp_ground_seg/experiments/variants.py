@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -15,17 +16,21 @@ from gp_ground_seg.evaluation import report as results
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
+from gp_ground_seg.evaluation.objects import BAND_TITLES, GROUPS, Objects
+from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
-from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
+from gp_ground_seg.simulation import PLACES, SCENES, SENSORS, Kind, simulate_scan
 
 Changes = Mapping[str, ParameterValue]
 """Values of parameters, by dotted name."""
 
 SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
+OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
+"""What rays hit of objects, by the classes of `GROUPS`; crates are boxes too, but no objects."""
 PEER = methods.TITLES[methods.PATCHWORKPP]
 
 
@@ -48,18 +53,28 @@ def load_simulated(frame: SimulatedFrame) -> KnownScan:
     scene, rng = SCENES[frame.scene](frame.seed), np.random.default_rng(frame.seed)
     made = simulate_scan(scene, SENSORS[frame.sensor], rng, x=frame.x)
     truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
+    class_of = np.full(len(truth), -1)
+    for number, name in enumerate(GROUPS):
+        class_of[(made.kind == OBJECT_KINDS[name]) & (made.object_id > 0)] = number
+    objects = Objects(tuple(GROUPS), class_of, made.object_id, made.ground_z)
     return KnownScan(
         frame.sequence, f'{frame.seed}/{frame.x:g}', made.points, {'exact': truth},
-        ground_z=made.ground_z, is_ground=made.is_ground,
+        ground_z=made.ground_z, is_ground=made.is_ground, objects=objects,
     )  # fmt: skip
 
 
 def simulated_frames(
     sensors: Sequence[str], scenes: Sequence[str], n_seeds: int, places: Sequence[float]
 ) -> list[SimulatedFrame]:
-    """Sensors by scenes by seeds by places."""
+    """Sensors by scenes by seeds by places; scenes without a free lane from the origin only."""
     cases = itertools.product(sensors, scenes, range(n_seeds), places)
-    return [SimulatedFrame(*case) for case in cases]
+    return [SimulatedFrame(*case) for case in cases if not case[3] or case[1] not in PLACES]
+
+
+def peer_of(sensor: str) -> PatchworkppMethod:
+    """Return Patchwork++, told where a simulated sensor is in its cloud and above the ground."""
+    model = SENSORS[sensor]
+    return PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
 
 
 def refuse_changed(config: Config, names: Iterable[str]) -> None:
@@ -113,6 +128,11 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
             main = class_errors(scan.classes)[0]
             row['points'] = sum(count.n_points for count in scan.classes.values())
             row['main_error_class'] = class_name(main.number) if main.errors else ''
+        if scan.objects:
+            row['objects'] = {
+                name: dict(zip(BAND_TITLES, map(dataclasses.asdict, bands), strict=True))
+                for name, bands in scan.objects.items()
+            }
         if scan.fit is not None and scan.pose is not None:
             pose = scan.pose
             row |= {'status': scan.fit.status, 'n_segments': scan.fit.n_segments}
@@ -132,12 +152,12 @@ def score_scenes(
 ) -> Report:
     """Segment `n_seeds` simulated scenes of each name by each of the sensors.
 
-    Patchwork++ runs on the same clouds with the true height of the sensor.
+    Patchwork++ runs on the same clouds, as `peer_of` makes it.
     """
     ours, theirs = [], []
     for sensor in sensors:
         frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
-        peers = [methods.PatchworkppMethod(SENSORS[sensor].height)] if with_peer else []
+        peers = [peer_of(sensor)] if with_peer else []
         own, *other = score_variants(
             frames, load_simulated, {methods.OURS: config}, peers, progress=progress
         )

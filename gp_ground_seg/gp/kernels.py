@@ -14,19 +14,8 @@ def paciorek(
 
     ``sigma_f^2 sqrt(2 l_a l_b / (l_a^2 + l_b^2)) exp(-(r_a - r_b)^2 / (l_a^2 + l_b^2))``
 
-    Parameters
-    ----------
-    r_a, l_a : (S, A) float64
-        Ranges and length-scales [m].
-    r_b, l_b : (S, B) float64
-        Ranges and length-scales [m].
-    sigma_f : (S,) float64
-        Prior standard deviation of each segment [m].
-
-    Returns
-    -------
-    (S, A, B) float64
-        Covariances [m^2].
+    Of ranges and length-scales (S, A) and (S, B) [m], and the prior standard deviation `sigma_f`
+    of each segment, (S,) [m]; returns (S, A, B) [m^2].
     """
     inverse = 1.0 / (l_a[:, :, None] ** 2 + l_b[:, None, :] ** 2)
     exponent: FloatArray = r_a[:, :, None] - r_b[:, None, :]
@@ -48,21 +37,8 @@ def squared_exponential(
 
     ``sigma_f^2 exp(-(r_a - r_b)^2 / (2 length_scale^2))``
 
-    Parameters
-    ----------
-    r_a : (S, A) float64
-        Ranges [m].
-    r_b : (S, B) float64
-        Ranges [m].
-    sigma_f : (S,) float64
-        Prior standard deviation, in the unit of the process.
-    length_scale : (S,) float64
-        Length-scale [m].
-
-    Returns
-    -------
-    (S, A, B) float64
-        Covariances.
+    Of ranges (S, A) and (S, B) [m], with a prior standard deviation `sigma_f`, (S,), in the unit
+    of the process, and a `length_scale`, (S,) [m]; returns (S, A, B).
     """
     result: FloatArray = r_a[:, :, None] - r_b[:, None, :]
     result *= result

@@ -24,19 +24,9 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
     The pseudo-inputs are centred on their mean, so that equal ones give that very value
     everywhere.
 
-    Parameters
-    ----------
-    frame : Frame
-        Candidates, pseudo-inputs and knots.
-    theta : (M, 6) float64
-        Hyper-parameters of each segment (see `gp_ground_seg.gp.learning`).
-
-    Returns
-    -------
-    at_candidates : (C,) float64
-        Log length-scales [log m].
-    at_knots : (M, K) float64
-        The same at the knots; NaN behind the bin of the last candidate.
+    `theta`, (M, 6), are the hyper-parameters of each segment (see `gp_ground_seg.gp.learning`).
+    Returns log length-scales at the candidates, (C,), and at the knots, (M, K) [log m]; NaN there
+    behind the bin of the last candidate.
     """
     candidates, pseudo, knots = frame.candidates, frame.pseudo, frame.knots
     n_knots = n_wanted_knots(frame)

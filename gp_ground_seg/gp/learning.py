@@ -45,25 +45,13 @@ _SHRINK = 0.3
 
 
 class ThetaSpace(NamedTuple):
-    """Bounds and priors of the hyper-parameters, all in log space.
+    """Bounds and priors of the hyper-parameters, all in log space."""
 
-    Attributes
-    ----------
-    centre : (6,) float64
-        Values given by the configuration; centres of the priors.
-    lower, upper : (6,) float64
-        Bounds.
-    free : (6,) bool
-        Entries that are learned.
-    prior_std : float
-        Standard deviation of the priors.
-    """
-
-    centre: FloatArray
-    lower: FloatArray
+    centre: FloatArray  # (6,) values given by the configuration; centres of the priors
+    lower: FloatArray  # (6,) bounds
     upper: FloatArray
-    free: BoolArray
-    prior_std: float
+    free: BoolArray  # (6,) entries that are learned
+    prior_std: float  # standard deviation of the priors
 
 
 def given_theta(config: Config) -> FloatArray:
@@ -122,27 +110,13 @@ def first_theta(frame: Frame, config: Config) -> FloatArray:
 
 
 class Learned(NamedTuple):
-    """Outcome of one learning.
+    """Outcome of one learning."""
 
-    Attributes
-    ----------
-    theta : (6,) float64
-        Best hyper-parameters evaluated, log space.
-    objective : float
-        Objective there, with the priors if any.
-    n_evaluations : int
-        Evaluations of objective and gradient.
-    status : str
-        ``converged``, ``budget`` or ``failed`` (no finite objective found).
-    at_bound : (6,) bool
-        Free entries that ended at a bound.
-    """
-
-    theta: FloatArray
-    objective: float
-    n_evaluations: int
-    status: str
-    at_bound: BoolArray
+    theta: FloatArray  # (6,) best hyper-parameters evaluated, log space
+    objective: float  # there, with the priors if any
+    n_evaluations: int  # of objective and gradient
+    status: str  # ``converged``, ``budget`` or ``failed`` (no finite objective found)
+    at_bound: BoolArray  # (6,) free entries that ended at a bound
 
 
 class Model(Protocol):
@@ -168,25 +142,9 @@ def learn_frame(
 ) -> tuple[FloatArray, list[Learned]]:
     """Learn theta on the inliers that grow under it, then again on those under what was learned.
 
-    Parameters
-    ----------
-    frame : Frame
-        Candidates and pseudo-inputs.
-    before : (M, 6) float64, optional
-        Where to begin, if not at `first_theta`.
-    config : Config
-        Scope, objective, budget, priors.
-    model : Model
-        Backend.
-    out_of_time : callable
-        See `maximise`.
-
-    Returns
-    -------
-    theta : (M, 6) float64
-        Hyper-parameters of each segment.
-    learned : list of Learned
-        One outcome for the frame, or one for each segment.
+    `before`, (M, 6), is where to begin, if not at `first_theta`; for `out_of_time` see `maximise`.
+    Returns the hyper-parameters of each segment, (M, 6), and one outcome for the frame, or one
+    for each segment.
     """
     learning, n_segments = config.learning, len(frame.candidates.offsets) - 1
     by_frame, space = learning.scope == 'frame', theta_space(config)
@@ -268,16 +226,8 @@ def every_segment(frame: Frame, step: int) -> Frame:
 def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: bool) -> Inliers:
     """Inliers of a frame.
 
-    Parameters
-    ----------
-    frame : Frame
-        Candidates and pseudo-inputs.
-    inlier : (C,) bool
-        Which candidates are inliers.
-    u : (C,) float64
-        Log length-scales at the candidates [log m].
-    has_latent : bool
-        Whether the pseudo-inputs go with them, and give the length-scales instead of `u`.
+    `inlier` (C,) says which candidates they are, `u` (C,) are log length-scales there [log m].
+    With `has_latent` the pseudo-inputs go with them, and give the length-scales instead of `u`.
     """
     candidates, pseudo = frame.candidates, frame.pseudo
     taken = np.concatenate([[0], np.cumsum(inlier)])
@@ -323,22 +273,9 @@ def maximise(
     gradient-based optimisation). SciPy's L-BFGS-B takes longer between two evaluations than
     most evaluations take.
 
-    Parameters
-    ----------
-    objective : callable
-        theta -> log marginal likelihood and its gradient; ``-inf`` is allowed.
-    space : ThetaSpace
-        Bounds, priors, and which entries are free.
-    start : (T,) float64
-        Where to begin, log space.
-    n_data : int
-        Number of inliers.
-    use_priors : bool
-        Whether the log-normal priors are added.
-    max_evaluations : int
-        Budget; the best theta so far is returned when it is spent.
-    out_of_time : callable
-        Called before each evaluation after the first; True ends the learning.
+    `objective` gives the log marginal likelihood of a theta and its gradient, ``-inf`` is allowed;
+    `start` is in log space, `n_data` the number of inliers. The best theta so far is returned
+    after `max_evaluations`, or when `out_of_time`, called before each but the first, says so.
     """
     free, theta = space.free, np.clip(start, space.lower, space.upper)
     lower, upper = space.lower[free], space.upper[free]

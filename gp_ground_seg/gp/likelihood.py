@@ -20,27 +20,15 @@ def log_likelihood(
 ) -> tuple[float, FloatArray]:
     """Log marginal likelihood of a frame and its gradient (paper, eqs. 19 and 20).
 
-    Parameters
-    ----------
-    theta : (6,) float64
-        Logarithms of sigma_f, sigma_n [m], sigma_f_bar [log m], sigma_l_bar [m],
-        sigma_n_bar [log m], and the factor on the length-scales of the lines.
-    inliers : Inliers
-        Inliers and pseudo-inputs.
-    slope_std : float
-        Prior standard deviation of the mean line's slope. The line through the sensor's
-        base is marginalised, which adds ``slope_std^2 r r'`` to the kernel (Rasmussen and
-        Williams 2006, section 2.7).
-    latent_terms : bool
-        Whether the terms of the latent process, ``-1/2 log|B_m|``, are in: with
-        them the objective is the printed one, which has no upper bound.
+    `theta`, (6,), holds the logarithms of sigma_f, sigma_n [m], sigma_f_bar [log m],
+    sigma_l_bar [m], sigma_n_bar [log m], and of the factor on the length-scales of the lines.
+    `slope_std` is the prior standard deviation of the mean line's slope: the line through the
+    sensor's base is marginalised, which adds ``slope_std^2 r r'`` to the kernel (Rasmussen and
+    Williams 2006, section 2.7). With `latent_terms` the terms of the latent process,
+    ``-1/2 log|B_m|``, are in: the objective is the printed one, which has no upper bound.
 
-    Returns
-    -------
-    value : float
-        Log marginal likelihood; ``-inf`` where a covariance is not positive definite.
-    gradient : (6,) float64
-        Its gradient in `theta`.
+    Returns the value, ``-inf`` where a covariance is not positive definite, and its gradient in
+    `theta`, (6,).
     """
     value, gradient = 0.0, np.zeros(len(theta))
     try:

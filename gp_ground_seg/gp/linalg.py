@@ -23,18 +23,10 @@ calls."""
 
 
 class Padded(NamedTuple):
-    """Where the values of S segments are in a ragged array, padded to the longest, n.
+    """Where the values of S segments are in a ragged array, padded to the longest, n."""
 
-    Attributes
-    ----------
-    place : (S, n) int64
-        Places in the ragged array; arbitrary where there is padding.
-    mask : (S, n) bool
-        False where there is padding.
-    """
-
-    place: IntArray
-    mask: BoolArray
+    place: IntArray  # (S, n) in the ragged array; arbitrary where there is padding
+    mask: BoolArray  # (S, n) False where there is padding
 
     @classmethod
     def of(cls, segments: IntArray, offsets: IntArray) -> Padded:
@@ -63,14 +55,8 @@ def batches(offsets: IntArray) -> list[IntArray]:
 def add_noise(covariance: FloatArray, noise: FloatArray, mask: BoolArray) -> FloatArray:
     """Add noise to the diagonals; padding becomes a unit matrix, which changes nothing.
 
-    Parameters
-    ----------
-    covariance : (S, n, n) float64
-        Changed in place and returned.
-    noise : (S, n), (S, 1) or (1, 1) float64
-        Variances.
-    mask : (S, n) bool
-        False where there is padding.
+    `covariance` (S, n, n) is changed in place and returned; `noise` (S, n), (S, 1) or (1, 1) are
+    variances, `mask` (S, n) is False where there is padding.
     """
     covariance *= mask[:, :, None] & mask[:, None, :]
     n = mask.shape[1]

@@ -20,6 +20,10 @@ from gp_ground_seg.parameters.schema import (
     basic,
 )
 
+NO_FRAME = 'none'
+SENSOR_HEIGHTS = -5.0, 20.0
+"""Lowest and highest origin of a cloud over the ground near it [m]."""
+
 # Default, accepted values, description, unit, symbol in the paper. `basic` are those that are
 # set for a robot: its sensor and frames, the range and height of what is ground to it, its CPU.
 # fmt: off
@@ -29,22 +33,31 @@ from gp_ground_seg.parameters.schema import (
 class SensorConfig:
     """Where the sensor is; auto = estimated from every scan (docs/pose.md)."""
 
-    height: float | Literal['auto'] = basic(AUTO, (0.05, 20.0),
-        'height of the sensor above the ground it stands on', 'm')
+    height: float | Literal['auto'] = basic(AUTO, SENSOR_HEIGHTS,
+        "height of the cloud's origin above the ground; 0 = that of a vehicle frame on the ground",
+        'm')
     roll: float | Literal['auto'] = basic(AUTO, (-3.15, 3.15),
         'roll of the sensor, positive with its left side up; auto = none unless it is clear',
         'rad')
     pitch: float | Literal['auto'] = basic(AUTO, (-1.58, 1.58),
         'pitch of the sensor, positive with its nose down; auto = none unless it is clear', 'rad')
+    origin_x: float = advanced(0.0, (-50.0, 50.0),
+        "where the sensor is in the cloud's frame, which is not its own where clouds are turned "
+        'into that of a vehicle: forward', 'm')
+    origin_y: float = advanced(0.0, (-50.0, 50.0), 'the same: to the left', 'm')
+    origin_z: float = advanced(0.0, (-50.0, 50.0), 'the same: upwards', 'm')
 
 
 @dataclass(frozen=True)
 class FrameConfig:
-    """Where the tilt of the sensor is taken from; the node only."""
+    """Where tilt and place of the sensor are taken from; the node only."""
 
     level: str = basic('sensor', ('sensor', 'tf'),
         'where the tilt of the sensor is taken from: sensor.roll and sensor.pitch, or TF')
     base: str = basic('base_link', (), 'frame that is level to TF, with frame.level = tf')
+    sensor: str = advanced(NO_FRAME, (),
+        "frame of the sensor, whose place in the cloud's frame is looked up in TF; none = by "
+        'sensor.origin_x, origin_y, origin_z')
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.frame import Candidates, FloatArray, IntArray
+from gp_ground_seg.parameters.config import SENSOR_HEIGHTS
+from gp_ground_seg.pipeline.tilt import Direction
 
 N_SECTORS = 36
 NEAREST, FARTHEST = 0.5, 40.0
@@ -32,8 +34,9 @@ NEAR, ENOUGH_NEAR = 8.0, 12
 lift or lower the plane as a whole."""
 FAR = 10.0
 """Range that the ground reaches outdoors, and walls and ceilings of rooms seldom [m]."""
-MIN_HEIGHT, MAX_HEIGHT = 0.05, 20.0
-"""Heights of the sensor over a plane that can be the ground [m]."""
+MIN_HEIGHT, MAX_HEIGHT = SENSOR_HEIGHTS
+"""Heights of the origin over a plane that can be the ground [m]; in the frame of a vehicle the
+ground may lie above it."""
 CLEARLY_BELOW = 2.0
 """Distance below the plane, in tolerances, from which a point is evidence against it."""
 PENALTY = 1.0
@@ -114,7 +117,7 @@ def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> IntArray:
 class GroundPlane(NamedTuple):
     """The plane z = -height + slope_x x + slope_y y."""
 
-    height: float  # how far below the sensor it is, along z [m]
+    height: float  # how far below the origin of the cloud it is, along z [m]
     slope_x: float  # rise per metre
     slope_y: float  # rise per metre
     # as `height`, for the parallel plane through the middle of the near cells [m]
@@ -123,16 +126,26 @@ class GroundPlane(NamedTuple):
     coverage: float  # share of all sectors around the sensor with such a cell
     far_coverage: float  # share of the sectors with any cell that have such a cell `FAR` away
     reach: float  # range within which nine of ten of these cells are [m]
-    # Difference of the angles of depression of these cells [rad], a tenth of them left out at
-    # either end: the lowest beam alone, on walls, makes a cone that looks like a plane.
+    # Difference of the angles of depression, seen from the sensor, of these cells [rad], a tenth
+    # of them left out at either end: the lowest beam alone, on walls, makes a cone that looks
+    # like a plane.
     spread: float
     residual: float  # root mean square of the distances along z of these cells to it [m]
     n_cells: int  # how many cells there were
     n_support: int  # how many of them lie on it
 
     @property
-    def normal(self) -> tuple[float, float, float]:
-        """Unit normal that points to the sensor's side."""
+    def depth(self) -> float:
+        """Mean number of cells that lie on it, one behind the other, of the sectors with any."""
+        return self.n_support / (self.coverage * N_SECTORS)
+
+    def below(self, x: FloatArray | float, y: FloatArray | float, z: FloatArray | float) -> Any:
+        """How far below points it is, along z [m]."""
+        return z - (self.slope_x * x + self.slope_y * y - self.height)
+
+    @property
+    def normal(self) -> Direction:
+        """Upward unit normal."""
         length = math.sqrt(self.slope_x**2 + self.slope_y**2 + 1.0)
         return -self.slope_x / length, -self.slope_y / length, 1.0 / length
 
@@ -142,13 +155,13 @@ class GroundPlane(NamedTuple):
         return np.array(self.normal)
 
 
-def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
+def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
     """Fit the plane that most of the lowest points lie on and few below; None without one.
 
     Consensus (Fischler & Bolles, CACM 1981) over planes through a fixed, evenly spread
     choice of three cells and level planes through one, then a redescending M-estimator
     (Beaton & Tukey, Technometrics 1974) from the best of them. `max_slope` is that of the
-    steepest plane to look for, as rise per metre.
+    steepest plane to look for, as rise per metre; `origin` is where the sensor is [m].
     """
     cells = lowest_points(candidates)
     if len(cells.z) < MIN_CELLS:
@@ -164,20 +177,23 @@ def fit_plane(candidates: Candidates, max_slope: float) -> GroundPlane | None:
     ):
         # The refinement has drifted off to a plane that cannot be the ground.
         height, slope_x, slope_y = best
-    return _describe(cells, float(height), float(slope_x), float(slope_y))
+    return _describe(cells, (float(height), float(slope_x), float(slope_y)), origin)
 
 
 def _describe(
-    cells: LowestPoints, height: float, slope_x: float, slope_y: float
+    cells: LowestPoints, plane: tuple[float, float, float], origin: Direction
 ) -> GroundPlane | None:
     """Plane with the evidence for it; None if no point lies on it."""
+    height, slope_x, slope_y = plane
+    x, y, z = origin
     distance = cells.z - (slope_x * cells.x + slope_y * cells.y - height)
     on_it = np.abs(distance) <= cells.tolerance
     n_on_it = int(np.count_nonzero(on_it))
     if n_on_it == 0:
         return None
     r, sector = cells.r[on_it], cells.sector[on_it]
-    drop = np.sort(-cells.z[on_it] / r)
+    away = np.hypot(cells.x[on_it] - x, cells.y[on_it] - y)
+    depression = np.sort(np.arctan2(z - cells.z[on_it], away))
     near = np.sort(distance[on_it][r < NEAR])
     few, most = n_on_it // 10, (9 * n_on_it) // 10
     return GroundPlane(
@@ -189,7 +205,7 @@ def _describe(
         coverage=_n_different(sector) / N_SECTORS,
         far_coverage=_n_different(sector[r >= FAR]) / _n_different(cells.sector),
         reach=float(np.sort(r)[most]),
-        spread=math.atan(drop[most]) - math.atan(drop[few]),
+        spread=float(depression[most] - depression[few]),
         residual=float(np.sqrt(np.mean(distance[on_it] ** 2))),
         n_cells=len(distance),
         n_support=n_on_it,

@@ -32,17 +32,6 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     A point within the paper's tolerance is ground; above it, the returns about the cell decide
     (see `ground_band`); and below the surface there is no obstacle. Of a vertical face only
     returns near its lowest one are ground; none are where its base is occluded.
-
-    Parameters
-    ----------
-    scan : Scan
-        Points, cells and tiles.
-    faces : Faces
-        Vertical faces.
-    surface : GroundSurface
-        Height of the ground.
-    config : Config
-        Tolerances.
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
     z = scan.xyz[:, 2].astype(np.float64)
@@ -70,19 +59,13 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
 class LocalHeights(NamedTuple):
     """Heights over the surface of the returns in each cell and the eight around it.
 
-    Attributes
-    ----------
-    n_near : (M * n_bins,) float64
-        Returns within ``label.obstacle_min_height`` of the surface, but for those of faces.
-    roughness : (M * n_bins,) float64
-        Their root mean square height [m]; 0 where there are none.
-    n_obstacles : (M * n_bins,) float64
-        Returns from that height to ``label.obstacle_max_height``.
+    Each is (M * n_bins,).
     """
 
+    # Returns within ``label.obstacle_min_height`` of the surface, but for those of faces.
     n_near: FloatArray
-    roughness: FloatArray
-    n_obstacles: FloatArray
+    roughness: FloatArray  # their root mean square height [m]; 0 where there are none
+    n_obstacles: FloatArray  # returns from that height to ``label.obstacle_max_height``
 
 
 def ground_band(near: LocalHeights, config: Config) -> FloatArray:
@@ -92,13 +75,6 @@ def ground_band(near: LocalHeights, config: Config) -> FloatArray:
     roughness and the noise; returns of obstacles are spread evenly over height, as densely as
     those that are too high for ground. Up to the band a return is more likely ground. One more
     obstacle return is counted than there is: that none was seen does not exclude any.
-
-    Parameters
-    ----------
-    near : LocalHeights
-        Heights about each cell.
-    config : Config
-        Heights of obstacles, noise, and the least and largest band.
     """
     label = config.label
     variance = near.roughness**2 + config.observation.sigma_n**2
@@ -119,16 +95,8 @@ def local_heights(
 ) -> LocalHeights:
     """Count the returns about each cell.
 
-    Parameters
-    ----------
-    height : (N,) float64
-        Heights over the surface [m]; NaN where there is none.
-    grid : PolarGrid
-        Cells of the points.
-    in_face : (N,) bool
-        Points of vertical faces, which are no roughness of the ground.
-    label : LabelConfig
-        Heights of obstacles.
+    `height` (N,) is over the surface [m], NaN where there is none; points `in_face` (N,), of
+    vertical faces, are no roughness of the ground.
     """
     low, high = label.obstacle_min_height, label.obstacle_max_height
     units = square_units(len(height), low)
@@ -172,19 +140,9 @@ def ground_probability(
     surface, the noise and the roughness together. The result is the probability that it
     lies within the band of ground.
 
-    Parameters
-    ----------
-    margin : (N,) float64
-        See `Labelled.margin` [m].
-    ground_std, roughness : (N,) float64
-        Standard deviation of the surface and roughness at the point [m].
-    noise : float
-        Standard deviation of the noise [m].
-
-    Returns
-    -------
-    (N,) float32
-        At least 0.5 where the margin is not negative; 0 where it is NaN.
+    For `margin` (N,) see `Labelled.margin` [m]; `ground_std` and `roughness` (N,) are those at the
+    point, `noise` is a standard deviation [m]. Returns (N,), at least 0.5 where the margin is not
+    negative; 0 where it is NaN.
     """
     from scipy.special import ndtr
 

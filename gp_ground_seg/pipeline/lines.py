@@ -24,25 +24,8 @@ def find_lines(
 ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
     """Lines through the candidates that show ground, and what follows from the lines.
 
-    Parameters
-    ----------
-    candidates : Candidates
-        Lowest point of each occupied cell.
-    faces : Faces
-        Vertical faces; the lowest point of one with occluded base is no candidate.
-    config : Config
-        Tolerances.
-
-    Returns
-    -------
-    candidates : Candidates
-        Those kept.
-    lines : Lines
-        See `extract_lines`.
-    pseudo : PseudoInputs
-        See `select_pseudo_inputs`.
-    continues_line : (C,) bool
-        See `candidates_on_lines`.
+    The lowest point of a face with occluded base is no candidate. Returns the candidates kept;
+    see `extract_lines`, `select_pseudo_inputs` and `candidates_on_lines` for the others.
     """
     kept = candidates.where(~faces.has_occluded_base[candidates.tile])
     lines = extract_lines(kept, config.lines)
@@ -124,17 +107,8 @@ def deming_slope(s_rr: float, s_zz: float, s_rz: float, error_ratio: float) -> f
 
     The paper's distance-oriented regression (section III-D).
 
-    Parameters
-    ----------
-    s_rr, s_zz, s_rz : float
-        Sums of squares and products about the mean [m^2].
-    error_ratio : float
-        Variance of the height error over that of the range error.
-
-    Returns
-    -------
-    float
-        Infinite for a vertical line.
+    The first three are sums of squares and products about the mean [m^2], `error_ratio` is the
+    variance of the height error over that of the range error. Infinite for a vertical line.
     """
     difference = s_zz - error_ratio * s_rr
     root = math.sqrt(difference * difference + 4.0 * error_ratio * s_rz * s_rz)
@@ -161,14 +135,7 @@ def differs_in_direction(slope: float, new_slope: float, tolerance: float) -> bo
 def select_pseudo_inputs(candidates: Candidates, lines: Lines, config: Config) -> PseudoInputs:
     """Spread pseudo-inputs evenly over the candidates of each line (paper, section III-C).
 
-    Parameters
-    ----------
-    candidates : Candidates
-        Ground candidates.
-    lines : Lines
-        Lines through them; every line gets at least one pseudo-input.
-    config : Config
-        Number of pseudo-inputs, bounds of the length-scale.
+    Every line gets at least one.
     """
     limits, size = config.length_scale, np.diff(lines.start)
     wanted = np.rint(size / config.latent.candidates_per_pseudo_input).astype(np.int64)
@@ -191,15 +158,6 @@ def candidates_on_lines(lines: Lines, candidates: Candidates, config: Config) ->
 
     They continue a line that is longer and flatter than an obstacle, or their line starts
     at a slope break (see `starts_at_slope_break`).
-
-    Parameters
-    ----------
-    lines : Lines
-        Lines through the candidates.
-    candidates : Candidates
-        Ground candidates.
-    config : Config
-        Tolerance of the lines; least size, least extent and steepest slope.
     """
     growth = config.growth
     is_long = np.diff(lines.start) >= growth.min_line_size

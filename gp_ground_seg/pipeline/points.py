@@ -15,21 +15,9 @@ COMPUTED = (np.dtype(np.float32), np.dtype(np.float64))
 def take_points(points: npt.ArrayLike) -> PointArray:
     """Return x, y, z, as they lie in memory if their type is one that is computed with.
 
-    Parameters
-    ----------
-    points : (N, >=3) float array
-        Points; columns after the third are ignored.
-
-    Returns
-    -------
-    xyz : (N, 3) float32 or float64
-        Shares memory with `points`, if it can. Single precision for types of up to four
-        bytes.
-
-    Raises
-    ------
-    PointCloudError
-        If the shape or type is another, or the array is masked.
+    Of `points` (N, >=3) columns after the third are ignored. The result (N, 3) shares memory with
+    them, if it can; it is of single precision for types of up to four bytes. Raises a
+    PointCloudError if the shape or type is another, or the array is masked.
     """
     if isinstance(points, np.ma.MaskedArray):
         raise PointCloudError('points are a masked array: pass points.filled(numpy.nan)')

@@ -25,12 +25,7 @@ from gp_ground_seg.pipeline.points import copy_points, points_in
 def build_scan(xyz: PointArray, config: Config) -> Scan:
     """Copy points, sort them into cells and tiles, and take the lowest point of each cell.
 
-    Parameters
-    ----------
-    xyz : (N, 3) float32 or float64
-        Points of a level frame [m]; ranges and angles are computed in their precision.
-    config : Config
-        Size of the grid and of the tiles; least height of a cell in the density.
+    `xyz` (N, 3) are of a level frame [m]; ranges and angles are computed in their precision.
     """
     columns = np.empty((3, len(xyz)), dtype=xyz.dtype)
     copy_points(xyz, columns)
@@ -64,11 +59,7 @@ def azimuth_key(x: PointArray, y: PointArray) -> PointArray:
 
     The position on the unit diamond, which needs one division and no arctangent. Points are
     sorted into segments by comparing it with that of the segments' edges.
-
-    Parameters
-    ----------
-    x, y : (N,) float32 or float64
-        Coordinates; the origin counts as lying on +x.
+    The origin counts as lying on +x.
     """
     size = np.abs(x) + np.abs(y)
     two, four = size.dtype.type(2.0), size.dtype.type(4.0)
@@ -114,14 +105,7 @@ def tiles_per_side(r_max: float, tile_size: float) -> int:
 def build_tiles(xyz: PointArray, grid: PolarGrid, tile_size: float) -> Tiles:
     """Sort points into square tiles.
 
-    Parameters
-    ----------
-    xyz : (N, 3) float32 or float64
-        Points [m].
-    grid : PolarGrid
-        Cells of the points; those outside belong to no tile.
-    tile_size : float
-        Side of a tile [m].
+    Points (N, 3) outside the cells of `grid` belong to no tile; `tile_size` is their side [m].
     """
     half = round_up_to(xyz.dtype, grid.edges[-1])
     side = tiles_per_side(float(grid.edges[-1]), tile_size)
@@ -146,22 +130,11 @@ def reduce_cells(grid: PolarGrid, z: PointArray, tile: CellArray) -> tuple[Point
     Of equally low points the nearest counts, then the one in the first tile, so that the
     order of the points does not matter.
 
-    Parameters
-    ----------
-    grid : PolarGrid
-        Cells of the points.
-    z : (N,) float32 or float64
-        Heights [m].
-    tile : (N,) int32
-        Tiles of the points.
+    Returns, for heights `z` (N,) [m] and the `tile` (N,) of each point:
 
-    Returns
-    -------
-    extremes : (M * n_bins, 3) float32 or float64
-        Height of the lowest point, its range, and height of the highest point [m], in
-        the precision of the points; infinite, infinite and minus infinite in empty cells.
-    numbers : (M * n_bins, 2) int32
-        Number of points; tile of the lowest point, or `NO_TILE`.
+    extremes, (M * n_bins, 3), in the precision of the points: height of the lowest point, its
+    range, and height of the highest point [m]; infinite, infinite, minus infinite in empty cells;
+    numbers, (M * n_bins, 2): number of points; tile of the lowest point, or `NO_TILE`.
     """
     size = grid.n_segments * grid.n_bins
     inside = grid.inside
@@ -192,15 +165,9 @@ def ground_candidates(
     area. The slices are equally high, so whatever j is, that mean is the number
     of points over the area of the whole bin, width by height.
 
-    Parameters
-    ----------
-    extremes, numbers
-        See `reduce_cells`.
-    edges : (n_bins + 1,) float64
-        Ranges of the bin edges [m].
-    min_extent : float
-        Least height of a cell in the density [m]: the points of a flat cell are no
-        closer together than the sensor's noise.
+    For `extremes` and `numbers` see `reduce_cells`; `edges`, (n_bins + 1,), are the ranges of the
+    bin edges [m]. `min_extent` is the least height of a cell in the density [m]: the points of a
+    flat cell are no closer together than the sensor's noise.
     """
     n_bins = len(edges) - 1
     occupied = np.flatnonzero(numbers[:, 0])

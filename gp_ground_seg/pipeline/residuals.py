@@ -53,18 +53,8 @@ def correct_surface(
     variances. The result is as uncertain as evidence so far away, or as the process where that is
     more, plus the variance between the two.
 
-    Parameters
-    ----------
-    surface : GroundSurface
-        Height of the ground by the process.
-    labelled : Labelled
-        Labels, and heights over `surface`.
-    grid : PolarGrid
-        Cells of the points.
-    noise_std : (M, 1) float64
-        Standard deviation of the process's noise in each segment [m].
-    slope_std : float
-        Prior standard deviation of the ground's slope.
+    `noise_std`, (M, 1), is that of the process in each segment [m], `slope_std` the prior standard
+    deviation of the ground's slope.
     """
     has_model = np.isfinite(surface.mean)
     is_touched, (n_cells, n_returns, total, squares, squared_means) = _sums(labelled, grid)

@@ -11,40 +11,47 @@ from functools import lru_cache
 import numpy as np
 
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.frame import Candidates, FloatArray, PointArray
+from gp_ground_seg.frame import Candidates, FloatArray, PointArray, Scan
 from gp_ground_seg.parameters.config import SensorConfig
 from gp_ground_seg.parameters.schema import AUTO
-from gp_ground_seg.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.pipeline.ground_plane import FARTHEST, GroundPlane
 from gp_ground_seg.pipeline.tilt import (
     Direction,
     angles_of,
     rotate,
     rotation,
     rounded,
+    turned_back,
     vertical,
 )
+from gp_ground_seg.pipeline.up_axis import (
+    MIN_CLEARANCE,
+    MIN_SUPPORT,
+    UP_MAX_TILT,
+    View,
+    find_up_axis,
+    is_up_axis_doubtful,
+    refusal,
+)
 
-FitPlane = Callable[[Candidates, float], GroundPlane | None]
-CandidatesRotated = Callable[[FloatArray], Candidates]
+FitPlane = Callable[[Candidates, float, Direction], GroundPlane | None]
+ScanRotated = Callable[[FloatArray], Scan]
 
 DEFAULT_HEIGHT = 1.73
 """Height where `sensor.height` is auto and the scan does not determine it: a car's roof [m]."""
+NO_HEIGHT = (
+    f'the scan does not show the ground near the sensor: sensor.height = {DEFAULT_HEIGHT:g} m is '
+    'assumed; set it'
+)
 CLEAR_TILT = 0.05
 """Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
 lean stay below it."""
 MAX_TILT = math.radians(30.0)
 """Steepest ground plane that is searched [rad]."""
 
-MIN_SUPPORT = 0.35
-"""Share of the lowest points on the plane from which a scan determines the tilt."""
-MIN_CELLS = 12
-"""Points on the plane from which a scan determines the height."""
-MIN_SPREAD = 0.06
-"""Spread of their angles of depression for the same [rad]: more than one beam."""
-MIN_COVERAGE = 0.25
-"""Share of the sectors with ground in them from which a scan determines the tilt."""
-MIN_REACH = 5.0
-"""Range that the ground must reach for the same [m]."""
+CLEAR = 0.3
+"""Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
+seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
 LEAST_COSINE = 0.1
 """Cosine of the tilt from which the sensor's z axis meets the ground."""
 HEIGHT_CONTRADICTION = 0.3
@@ -52,50 +59,19 @@ HEIGHT_CONTRADICTION = 0.3
 TILT_CONTRADICTION = 0.15
 """Tilt left under given angles from which the scan contradicts them [rad]: no usual slope."""
 
-UP_MAX_TILT = math.radians(46.0)
-"""Angle from each axis within which up is searched; these cones cover all directions."""
-POOR_SUPPORT, GOOD_SUPPORT = 0.35, 0.9
-"""Support of the plane below z under which other axes are tried: near, and `TALL`."""
-TALL = 6.0
-"""Height from which the plane below z may well be a facade [m]."""
-UP_MIN_SUPPORT = 0.5
-"""Support from which a plane shows where the ground is."""
-UP_SUPPORT_RATIO, UP_SUPPORT_RATIO_TALL = 2.0, 0.8
-"""Least support of another plane over that of the plane below z: near, and `TALL`."""
-UP_DISTANCE_RATIO = 3.0
-"""Distance of a `TALL` plane over the largest of another one."""
-UP_FIRST_SUPPORT = 0.15
-"""Support from which a plane is fitted again in its own level frame."""
-UP_CLEAR_TILT = math.radians(25.0)
-"""Tilt below which z counts as up all the same."""
-UP_MIN_CELLS = 60
-"""Lowest points that must exist for another plane to count."""
-UP_MIN_FAR_COVERAGE = 0.5
-"""Share of the sectors in which it must reach far: the ceiling of a room does not."""
-
-_QUARTER = math.pi / 2.0
-_AXES = (
-    (0.0, 0.0),
-    (math.pi, 0.0),
-    (_QUARTER, 0.0),
-    (-_QUARTER, 0.0),
-    (0.0, _QUARTER),
-    (0.0, -_QUARTER),
-)
-"""Roll and pitch that turn each of the six axes up [rad]."""
-
 
 @dataclass(frozen=True)
 class MeasuredPose:
     """What one scan says of the sensor, whatever was given."""
 
-    # over the ground plane under the sensor, along the vertical of the pose used [m]
+    # of the cloud's origin over the ground plane, along the vertical of the pose used [m]
     height: float
     roll: float  # angle that would make the ground plane level [rad]
     pitch: float  # as `roll`
     tells_height: bool  # whether the scan shows enough ground for the height
     tells_tilt: bool  # the same for the tilt
-    plane: GroundPlane  # in the frame levelled by the angles given
+    # in the frame levelled by the angles given, or where that is far from level in its own
+    plane: GroundPlane
 
 
 @dataclass(frozen=True)
@@ -105,7 +81,7 @@ class SensorPose:
     Attributes
     ----------
     height : float
-        Height of the sensor above the ground it stands on [m].
+        Height of the cloud's origin above the ground near it, negative below it [m].
     roll, pitch : float
         Fixed-axis angles that turn the sensor frame level, as those of a URDF [rad]:
         positive roll lifts the left side, positive pitch lowers the nose (REP-103).
@@ -115,6 +91,8 @@ class SensorPose:
         What the scan says; None if it shows no plane at all.
     contradictions : tuple of str
         Parameters that the scan clearly contradicts, a line for each; they are used as given.
+    is_height_default : bool
+        Whether the height is neither given nor shown by the scan.
     """
 
     height: float
@@ -125,11 +103,17 @@ class SensorPose:
     pitch_estimated: bool = False
     measured: MeasuredPose | None = None
     contradictions: tuple[str, ...] = ()
+    is_height_default: bool = False
 
     @property
     def is_level(self) -> bool:
         """Whether the level frame is the sensor's own."""
         return self.roll == 0.0 and self.pitch == 0.0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know, a line for each."""
+        return (NO_HEIGHT,) if self.is_height_default else ()
 
     @property
     def rotation(self) -> FloatArray:
@@ -161,53 +145,52 @@ def given_pose(sensor: SensorConfig) -> SensorPose:
         DEFAULT_HEIGHT if sensor.height == AUTO else sensor.height,
         0.0 if sensor.roll == AUTO else sensor.roll,
         0.0 if sensor.pitch == AUTO else sensor.pitch,
+        is_height_default=sensor.height == AUTO,
     )
 
 
 def estimate_pose(
-    candidates: Candidates,
-    sensor: SensorConfig,
-    fit_plane: FitPlane,
-    candidates_rotated: CandidatesRotated,
+    scan: Scan, sensor: SensorConfig, fit_plane: FitPlane, scan_rotated: ScanRotated
 ) -> SensorPose:
     """Estimate what is auto, and check what is not against the scan.
 
-    Parameters
-    ----------
-    candidates : Candidates
-        Lowest points of the bins, in the frame levelled by `given_pose`.
-    sensor : SensorConfig
-        Parameters.
-    fit_plane : callable
-        See `gp_ground_seg.pipeline.ground_plane.fit_plane`.
-    candidates_rotated : callable
-        Returns the candidates of the same scan, rotated further by a matrix (3, 3);
-        called only where z does not seem to be up.
-
-    Raises
-    ------
-    PointCloudError
-        If roll or pitch is auto and z is clearly not up.
+    `scan` is in the frame levelled by `given_pose`; `fit_plane` is that of `ground_plane`, and
+    `scan_rotated` returns the same scan, rotated further by a matrix (3, 3): it is called only
+    where z does not seem to be up. Raises a PointCloudError if roll or pitch is auto and z is
+    clearly not up.
     """
     given = given_pose(sensor)
-    plane = fit_plane(candidates, math.tan(MAX_TILT))
+    origin = given.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
+
+    def look(turn: FloatArray | None, max_tilt: float) -> View | None:
+        own = scan if turn is None else scan_rotated(turn)
+        x, y, z = (origin if turn is None else turn @ origin).tolist()
+        plane = fit_plane(own.candidates, math.tan(max_tilt), (x, y, z))
+        if plane is None:
+            return None
+        is_below = float(plane.below(x, y, z)) >= MIN_CLEARANCE
+        if not is_below and not _is_lower_side(plane, own):
+            return None
+        return View(
+            plane, plane.normal if turn is None else turned_back(plane.normal, turn), is_below
+        )
+
+    view = look(None, MAX_TILT)
     not_up = None
-    if is_up_axis_doubtful(plane):
-        not_up = find_up_axis(given.rotation, plane, fit_plane, candidates_rotated)
-    if not_up is not None and AUTO in (sensor.roll, sensor.pitch):
-        raise PointCloudError(not_up)
+    if is_up_axis_doubtful(None if view is None else view.plane):
+        found = find_up_axis(None if view is None else view.plane, look)
+        if found is not None and found.up[2] >= math.cos(UP_MAX_TILT):
+            view = found
+        elif found is not None:
+            not_up = refusal(found, given.rotation)
+            if AUTO in (sensor.roll, sensor.pitch):
+                raise PointCloudError(not_up)
     contradictions = () if not_up is None else (not_up,)
-    if plane is None:
+    if view is None:
         return dataclasses.replace(given, contradictions=contradictions)
-    tells_height = plane.n_support >= MIN_CELLS and plane.spread >= MIN_SPREAD
-    tells_tilt = (
-        tells_height
-        and plane.support >= MIN_SUPPORT
-        and plane.coverage >= MIN_COVERAGE
-        and plane.reach >= MIN_REACH
-    )
-    own_up = plane.normal
-    up = own_up if given.is_level else _turned_back(own_up, given.rotation)
+    plane, own_up = view.plane, view.up
+    tells_height, tells_tilt = view.tells_height, view.tells_tilt
+    up = own_up if given.is_level else turned_back(own_up, given.rotation)
     roll, pitch = _levelled(up, sensor)
     levelled = vertical(roll, pitch)
     corrects = tells_tilt and _angle(levelled, vertical(given.roll, given.pitch)) >= CLEAR_TILT
@@ -215,7 +198,7 @@ def estimate_pose(
     along = _product(levelled, up) if corrects else own_up[2]
     if not corrects:
         roll, pitch = given.roll, given.pitch
-    height = rounded(plane.near_height * own_up[2] / along)
+    height = rounded(plane.near_height * plane.normal[2] / along)
     own_roll, own_pitch = angles_of(up)
     measured = MeasuredPose(height, own_roll, own_pitch, tells_height, tells_tilt, plane)
     estimates_height = sensor.height == AUTO and tells_height
@@ -227,13 +210,15 @@ def estimate_pose(
         roll_estimated=sensor.roll == AUTO and corrects,
         pitch_estimated=sensor.pitch == AUTO and corrects,
         measured=measured,
-        contradictions=contradictions or _contradictions(sensor, measured),
+        contradictions=contradictions or _contradictions(sensor, measured, own_up),
+        is_height_default=sensor.height == AUTO and not tells_height,
     )
 
 
-def _turned_back(up: Direction, matrix: FloatArray) -> Direction:
-    x, y, z = (matrix.T @ up).tolist()
-    return x, y, z
+def _is_lower_side(plane: GroundPlane, scan: Scan) -> bool:
+    """Whether more returns are clearly above the plane than below it."""
+    height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
+    return bool(np.count_nonzero(height > CLEAR) > np.count_nonzero(height < -CLEAR))
 
 
 def _levelled(up: Direction, sensor: SensorConfig) -> tuple[float, float]:
@@ -253,17 +238,20 @@ def _angle(a: Direction, b: Direction) -> float:
     return math.acos(min(max(_product(a, b), -1.0), 1.0))
 
 
-def _contradictions(sensor: SensorConfig, measured: MeasuredPose) -> tuple[str, ...]:
+def _contradictions(
+    sensor: SensorConfig, measured: MeasuredPose, up: Direction
+) -> tuple[str, ...]:
+    """Say which parameters are clearly wrong; `up` is that of the ground, as they level it."""
     found = []
-    plane = measured.plane
-    if measured.tells_height and plane.support >= MIN_SUPPORT and sensor.height != AUTO:
+    if measured.tells_height and measured.plane.support >= MIN_SUPPORT and sensor.height != AUTO:
         difference = abs(sensor.height - measured.height)
-        if difference > max(HEIGHT_CONTRADICTION, 0.1 * sensor.height):
+        if difference > max(HEIGHT_CONTRADICTION, 0.1 * abs(sensor.height)):
+            side = 'below' if measured.height >= 0.0 else 'above'
             found.append(
                 f'sensor.height = {sensor.height:g}: the ground near the sensor is '
-                f'{measured.height:.2f} m below it'
+                f"{abs(measured.height):.2f} m {side} the cloud's origin"
             )
-    if measured.tells_tilt and math.acos(min(plane.normal[2], 1.0)) > TILT_CONTRADICTION:
+    if measured.tells_tilt and math.acos(min(up[2], 1.0)) > TILT_CONTRADICTION:
         names = [n for n in ('roll', 'pitch') if getattr(sensor, n) != AUTO]
         if names:
             words = ', '.join(f'sensor.{name} = {getattr(sensor, name):g}' for name in names)
@@ -272,74 +260,3 @@ def _contradictions(sensor: SensorConfig, measured: MeasuredPose) -> tuple[str, 
                 f'{measured.roll:.3f}, pitch = {measured.pitch:.3f}'
             )
     return tuple(found)
-
-
-def is_up_axis_doubtful(plane: GroundPlane | None) -> bool:
-    """Whether the plane below z is so poor, or so far away, that z may not be up."""
-    return (
-        plane is None
-        or plane.support < POOR_SUPPORT
-        or (_is_tall(plane) and plane.support < GOOD_SUPPORT)
-    )
-
-
-def _is_tall(plane: GroundPlane | None) -> bool:
-    return plane is not None and plane.height > TALL
-
-
-def _is_ground(plane: GroundPlane, support: float) -> bool:
-    return (
-        plane.support >= support
-        and plane.n_cells >= UP_MIN_CELLS
-        and plane.coverage >= MIN_COVERAGE
-        and plane.far_coverage >= UP_MIN_FAR_COVERAGE
-        and plane.spread >= MIN_SPREAD
-    )
-
-
-def find_up_axis(
-    given: FloatArray,
-    plane: GroundPlane | None,
-    fit_plane: FitPlane,
-    candidates_rotated: CandidatesRotated,
-) -> str | None:
-    """Return one line on where the ground clearly lies if not along z; None otherwise.
-
-    `given` is the rotation (3, 3) from the sensor frame to that of `plane`, in which z should be
-    up; for the callables see `estimate_pose`.
-    """
-    support = 0.0 if plane is None else plane.support
-    ratio = UP_SUPPORT_RATIO_TALL if _is_tall(plane) else UP_SUPPORT_RATIO
-    needed = max(UP_MIN_SUPPORT, ratio * support)
-    farthest = (
-        plane.height / UP_DISTANCE_RATIO if plane is not None and _is_tall(plane) else math.inf
-    )
-
-    def look(turn: FloatArray) -> GroundPlane | None:
-        return fit_plane(candidates_rotated(turn), math.tan(UP_MAX_TILT))
-
-    best: tuple[float, FloatArray, float] | None = None
-    for angles in _AXES:
-        turn = rotation(*angles)
-        first = look(turn)
-        if first is None or first.support < UP_FIRST_SUPPORT:
-            continue
-        # Fit again with that plane level: lowest points of a tilted frame are not all ground.
-        turn = rotation(*angles_of(turn.T @ first.up))
-        other = look(turn)
-        if other is not None and other.height <= farthest and _is_ground(other, needed):
-            clarity = other.support * other.far_coverage
-            if best is None or clarity > best[0]:
-                up = turn.T @ other.up
-                best = clarity, up, other.height * float(other.up[2])
-    if best is None or best[1][2] > math.cos(UP_CLEAR_TILT):
-        return None
-    _, up, height = best
-    up = given.T @ up
-    roll, pitch = (round(angle, 3) + 0.0 for angle in angles_of(up))
-    largest = int(np.argmax(np.abs(up)))
-    axis = f'{"-" if up[largest] < 0.0 else ""}{"xyz"[largest]}'
-    return (
-        f'z does not point up: the ground seems to be {height:.2f} m away with {axis} up; turn '
-        f'the cloud, or set sensor.roll to {roll:.3f} and sensor.pitch to {pitch:.3f} [rad]'
-    )

@@ -73,6 +73,12 @@ def angles_of(up: FloatArray | Direction) -> tuple[float, float]:
     return roll if roll > -rounded(math.pi) else -roll, rounded(math.atan2(-up[0], across))
 
 
+def turned_back(direction: Direction, matrix: FloatArray) -> Direction:
+    """Direction in the frame that the rotation `matrix` (3, 3) starts from."""
+    x, y, z = (matrix.T @ direction).tolist()
+    return x, y, z
+
+
 def rounded(value: float) -> float:
     """Round to 5 digits: below what a scan tells, above how backends and orders of sums differ."""
     return round(value, 5) + 0.0

@@ -82,16 +82,8 @@ def normal_z(scatter: FloatArray) -> FloatArray:
     share of the vertical in its trace is the squared vertical part of the normal.
     Of a pole, both horizontal directions count; of a shapeless cluster, all three.
 
-    Parameters
-    ----------
-    scatter : (T, 3, 3) float64
-        Scatter (or covariance) matrices.
-
-    Returns
-    -------
-    (T,) float64
-        0 for vertical planes and poles, 1 for level planes; 1 where there is no scatter, or
-        only along a line.
+    `scatter`, (T, 3, 3), holds scatter (or covariance) matrices. Returns (T,): 0 for vertical
+    planes and poles, 1 for level planes, and 1 where there is no scatter, or only along a line.
     """
     xx, yy, zz = scatter[:, 0, 0], scatter[:, 1, 1], scatter[:, 2, 2]
     xy, xz, yz = scatter[:, 0, 1], scatter[:, 0, 2], scatter[:, 1, 2]
@@ -110,23 +102,9 @@ def is_base_occluded(
 
     Ground would lie off the plane of the returns above.
 
-    Parameters
-    ----------
-    row : (P,) int64
-        Face of each return.
-    xyz : (P, 3) float64
-        Returns, relative to any point of their tile [m].
-    is_foot : (P,) bool
-        Returns at the foot of their face.
-    n_rows : int
-        Number of faces T.
-    max_foot_distance : float
-        See ``faces.max_foot_distance`` [m].
-
-    Returns
-    -------
-    (T,) bool
-        False where fewer than two returns are above the foot.
+    `row` (P,) is the face of each return, of `n_rows` faces T, `xyz` (P, 3) the returns, relative
+    to any point of their tile [m], `is_foot` (P,) whether they are at the foot of their face.
+    Returns (T,), False where fewer than two returns are above the foot.
     """
 
     def total(values: FloatArray, chosen: BoolArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The input: profiles of clouds, time jumps, tilt by TF."""
+"""The input: profiles of clouds, time jumps, tilt and place of the sensor by TF."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from std_msgs.msg import Header
 
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
+from gp_ground_seg.parameters.config import NO_FRAME, FrameConfig
 from gp_ground_seg.pipeline.tilt import angles_of
 
 OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
@@ -121,15 +122,18 @@ class TimeJumps:
         )
 
 
-def require_tf2() -> Any:
+def require_tf2(frame: FrameConfig) -> Any:
     """Return the module tf2_ros; raise a MissingDependencyError if it is not installed."""
+    asked, instead = 'frame.level = tf', 'frame.level = sensor with sensor.roll and sensor.pitch'
+    if frame.level != 'tf':
+        asked = f'frame.sensor = {frame.sensor}'
+        instead = 'frame.sensor = none with sensor.origin_x, origin_y and origin_z'
     try:
         return importlib.import_module('tf2_ros')
     except ImportError as error:
         raise MissingDependencyError(
-            f'frame.level = tf: needs tf2_ros, which cannot be imported ({error}): sudo apt '
-            'install ros-jazzy-tf2-ros-py, or use frame.level = sensor with sensor.roll and '
-            'sensor.pitch'
+            f'{asked}: needs tf2_ros, which cannot be imported ({error}): sudo apt '
+            f'install ros-jazzy-tf2-ros-py, or use {instead}'
         ) from error
 
 
@@ -145,29 +149,50 @@ def tilt_of(rotation: Quaternion) -> tuple[float, float]:
     return angles_of(up / np.linalg.norm(up))
 
 
-class TfTilt:
-    """Listens to TF in the executor of `node`."""
+def is_tf_used(frame: FrameConfig) -> bool:
+    """Return whether the tilt or the place of the sensor comes from TF."""
+    return frame.level == 'tf' or frame.sensor != NO_FRAME
 
-    def __init__(self, node: Node) -> None:
-        self._tf2_ros = require_tf2()
+
+class TfListener:
+    """Listens to TF in the executor of `node`, for what `frame` asks."""
+
+    def __init__(self, node: Node, frame: FrameConfig) -> None:
+        self._tf2_ros = require_tf2(frame)
         # Without the node: given one, the buffer clears itself at jumps of the node's clock,
         # and in some releases raises an error there that ends the executor. See `time_jumped`.
         self._buffer = self._tf2_ros.Buffer()
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
 
-    def tilt(self, header: Header, base: str) -> tuple[float, float]:
-        """Return roll and pitch [rad] of a cloud in `base`; PointCloudError if TF has them not."""
-        frame = header.frame_id
+    def look_up(
+        self, header: Header, frame: FrameConfig
+    ) -> tuple[tuple[float, float] | None, tuple[float, float, float] | None]:
+        """Return tilt [rad] and place [m] of the sensor in a cloud; None for what is not asked.
+
+        Raises a PointCloudError if TF does not have them.
+        """
+        tilt, origin, own = None, None, header.frame_id
+        if frame.level == 'tf':
+            way = f'from its frame {own!r} to frame.base = {frame.base!r}'
+            tilt = tilt_of(self._transform(frame.base, own, header, way).rotation)
+        if frame.sensor != NO_FRAME:
+            way = f'from frame.sensor = {frame.sensor!r} to its frame {own!r}'
+            place = self._transform(own, frame.sensor, header, way).translation
+            origin = place.x, place.y, place.z
+            if not np.isfinite(origin).all():
+                raise PointCloudError(f'transform {way}: its translation is {origin}')
+        return tilt, origin
+
+    def _transform(self, target: str, source: str, header: Header, way: str) -> Any:
         try:
             try:
-                found = self._buffer.lookup_transform(base, frame, Time.from_msg(header.stamp))
+                stamp = Time.from_msg(header.stamp)
+                return self._buffer.lookup_transform(target, source, stamp).transform
             except self._tf2_ros.ExtrapolationException:
                 # The newest: a sensor is fixed to its vehicle, and waiting would delay the cloud.
-                found = self._buffer.lookup_transform(base, frame, Time())
+                return self._buffer.lookup_transform(target, source, Time()).transform
         except self._tf2_ros.TransformException as error:
-            way = f'from its frame {frame!r} to frame.base = {base!r}'
             raise PointCloudError(f'no transform {way}: {error}') from error
-        return tilt_of(found.transform.rotation)
 
     def time_jumped(self, seconds: float) -> None:
         """Forget all transforms after a long jump back."""

@@ -20,7 +20,7 @@ from gp_ground_seg.parameters.schema import NODE_NAME
 from gp_ground_seg.pipeline.points import single_precision
 from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
-from gp_ground_seg.ros.input import THROTTLED, TfTilt, TimeJumps, require_tf2
+from gp_ground_seg.ros.input import THROTTLED, TfListener, TimeJumps, is_tf_used, require_tf2
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.subscription import CloudSubscription
@@ -43,7 +43,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._library_log = LibraryLog(self.get_logger())
         self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
         self._is_compiled = False
-        self._tf: TfTilt | None = None
+        self._tf: TfListener | None = None
         # A guard condition runs in the executor, between two callbacks.
         self._loaded = self.create_guard_condition(self._change_backend)
         self._loader = BackendLoader(self._loaded.trigger)
@@ -69,8 +69,8 @@ class GroundSegmentationNode(ConfiguredNode):
     def check_config(self, config: Config) -> None:
         """Raise a GroundSegError if the backend or TF is asked for and not installed."""
         choose_backend(config.runtime.backend)
-        if config.frame.level == 'tf':
-            require_tf2()
+        if is_tf_used(config.frame):
+            require_tf2(config.frame)
 
     def apply_config(self, config: Config) -> None:
         """Use `config` from the next cloud on; its compiled backend once that is there."""
@@ -102,8 +102,8 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _follow_tf(self, config: Config) -> None:
         """Listen to TF while the parameters ask for it."""
-        if config.frame.level == 'tf':
-            self._tf = self._tf or TfTilt(self)
+        if is_tf_used(config.frame):
+            self._tf = self._tf or TfListener(self, config.frame)
         elif self._tf is not None:
             self._tf.close()
             self._tf = None
@@ -129,9 +129,8 @@ class GroundSegmentationNode(ConfiguredNode):
             self._check_size(cloud)
             # Code for the other precision would have to be compiled at the first start too.
             points = single_precision(read_xyz(cloud))
-            base = self.config.frame.base
-            tilt = None if self._tf is None else self._tf.tilt(cloud.header, base)
-            segmentation = self._segmenter.segment(points, tilt)
+            seen = self._tf.look_up(cloud.header, self.config.frame) if self._tf else ()
+            segmentation = self._segmenter.segment(points, *seen)
             segmented = time.monotonic()
             topics = self._outputs.publish(cloud, segmentation, self.config)
         except PointCloudError as error:

@@ -10,7 +10,8 @@ from gp_ground_seg.simulation.scan import (
     simulate_drive,
     simulate_scan,
 )
-from gp_ground_seg.simulation.scenes import SCENES, Scene
+from gp_ground_seg.simulation.scenes import DRIVES, PLACES, SCENES, Scene
 
-__all__ = ['HDL_32E', 'HDL_64E', 'OS1_128', 'SCENES', 'SENSORS', 'VLP_16', 'Kind', 'Scene']
+__all__ = ['DRIVES', 'HDL_32E', 'HDL_64E', 'OS1_128', 'PLACES', 'SCENES', 'SENSORS', 'VLP_16']
+__all__ += ['Kind', 'Scene']
 __all__ += ['semantic_kitti_labels', 'simulate_drive', 'simulate_scan']

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import TypeAlias
 
@@ -23,7 +23,9 @@ BURIED_DEPTH = 3.0  # of standing solids below the ground at their centre: none 
 WALL_PANEL, WALL_THICKNESS = 4.0, 0.3
 """Longest panel of a wall, each on its own piece of ground, and its thickness [m]."""
 SMALLEST_RATE = 1e-12  # for a zero component of a unit vector; keeps 0 / 0 out of the slab tests
-Kind = IntEnum('Kind', 'TERRAIN BOX WALL POLE OVERHANG REFLECTION VEGETATION', start=0)
+Kind = IntEnum(
+    'Kind', 'TERRAIN BOX WALL POLE OVERHANG REFLECTION VEGETATION PERSON CYCLIST', start=0
+)
 """What a ray hit."""
 
 
@@ -36,6 +38,8 @@ _CLASS_AND_REFLECTANCE: dict[Kind, tuple[int, float]] = {
     Kind.OVERHANG: (52, 0.35),  # other structure; scored as an obstacle, unlike vegetation
     Kind.REFLECTION: (1, 0.05),  # outlier
     Kind.VEGETATION: (70, 0.3),  # vegetation
+    Kind.PERSON: (30, 0.3),  # person
+    Kind.CYCLIST: (31, 0.3),  # bicyclist
 }
 
 
@@ -59,10 +63,15 @@ class Solid(ABC):
     bottom: float
     top: float
     radius: float  # of the vertical cylinder around it
+    # x, y [m] of the vehicle or person that it is a part of.
+    part_of: tuple[float, float] | None = field(default=None, kw_only=True)
 
     @abstractmethod
-    def _outline(self, xy: FloatArray, rate: FloatArray) -> list[Interval]:
-        """Ranges, all of which a ray in its outline is in, seen from above."""
+    def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
+        """Ranges, all of which a ray in its outline is in.
+
+        The ray begins at `offset` from (x, y, 0) and runs along `rate`, both (R, 3).
+        """
 
     def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
         """Range [m] at which each ray (R, 3) enters the solid, infinite if it does not, (R,)."""
@@ -74,8 +83,8 @@ class Solid(ABC):
         near = np.flatnonzero(ahead & (aside <= self.radius * np.hypot(dx, dy)))
         offset, direction = offset[near], direction[near]
 
-        between = _slab(self.bottom, self.top, offset[:, 2], direction[:, 2])
-        intervals = np.array([between, *self._outline(offset[:, :2], direction[:, :2])])
+        between = slab(self.bottom, self.top, offset[:, 2], direction[:, 2])
+        intervals = np.array([between, *self._outline(offset, direction)])
         enter, leave = intervals[:, 0].max(axis=0), intervals[:, 1].min(axis=0)
         result[near] = np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
         return result
@@ -89,17 +98,19 @@ class Box(Solid):
     width: float
     yaw: float
 
-    def _outline(self, xy: FloatArray, rate: FloatArray) -> list[Interval]:
+    def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
+        xy, rate = offset[:, :2], rate[:, :2]
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         sides = (np.array([cos, sin]), self.length), (np.array([-sin, cos]), self.width)
-        return [_slab(-0.5 * size, 0.5 * size, xy @ axis, rate @ axis) for axis, size in sides]
+        return [slab(-0.5 * size, 0.5 * size, xy @ axis, rate @ axis) for axis, size in sides]
 
 
 @dataclass(frozen=True)
 class Cylinder(Solid):
     """Upright cylinder."""
 
-    def _outline(self, xy: FloatArray, rate: FloatArray) -> list[Interval]:
+    def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
+        xy, rate = offset[:, :2], rate[:, :2]
         a = np.maximum(np.sum(rate * rate, axis=1), SMALLEST_RATE**2)
         half_b = np.sum(xy * rate, axis=1)
         c = np.sum(xy * xy, axis=1) - self.radius**2
@@ -110,33 +121,51 @@ class Cylinder(Solid):
         return [(enter, np.where(miss, -np.inf, (-half_b + root) / a))]
 
 
-def _slab(low: float, high: float, position: FloatArray, rate: FloatArray) -> Interval:
-    """Ranges between which a coordinate that grows at `rate` is between `low` and `high`."""
+def slab(low: float, high: float, position: FloatArray, rate: FloatArray) -> Interval:
+    """Ranges between which a coordinate that grows at `rate` is from `low` to `high`."""
     rate = np.where(np.abs(rate) < SMALLEST_RATE, SMALLEST_RATE, rate)
     at_low, at_high = (low - position) / rate, (high - position) / rate
     return np.minimum(at_low, at_high), np.maximum(at_low, at_high)
 
 
 def nearest_solid(
-    solids: Iterable[Solid], origin: FloatArray, direction: FloatArray
-) -> tuple[FloatArray, KindArray]:
-    """Range [m] at which each ray first meets a solid, infinite if none, and its `Kind`: two (R,).
+    solids: Sequence[Solid], origin: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Range [m] at which each ray first meets a solid, and its index: two (R,); inf, -1 if none.
 
     `origin`, (3,) or (R, 3) [m], is the start of all rays, which is much faster, or of each;
     `direction`, (R, 3), holds unit vectors.
     """
     distance = np.full(len(direction), np.inf)
-    kind = np.zeros(len(direction), dtype=np.uint8)
+    index = np.full(len(direction), -1)
     starts = np.broadcast_to(origin, direction.shape)
     azimuth = np.arctan2(direction[:, 1], direction[:, 0])
     order = np.argsort(azimuth)
     azimuth = azimuth[order]
-    for solid in solids:
-        rays = order if origin.ndim > 1 else order[_find_towards(solid, origin, azimuth)]
+    x, y = starts[0, :2] if origin.ndim == 1 else np.full(2, np.nan)
+    gaps = [math.hypot(solid.x - x, solid.y - y) - solid.radius for solid in solids]
+    for k in np.argsort(gaps, kind='stable').tolist():
+        solid, rays = solids[k], order
+        if origin.ndim == 1:
+            rays = order[_find_towards(solid, origin, azimuth)]
+            rays = rays[distance[rays] > gaps[k]]  # the others end before it
         entry = solid.entry(starts[rays], direction[rays])
         nearer = entry < distance[rays]
-        distance[rays[nearer]], kind[rays[nearer]] = entry[nearer], solid.kind
-    return distance, kind
+        distance[rays[nearer]], index[rays[nearer]] = entry[nearer], k
+    return distance, index
+
+
+def number_objects(solids: Iterable[Solid]) -> npt.NDArray[np.int32]:
+    """Return the number of the object that each solid is a part of, from 1 on; 0: of none."""
+    numbers: dict[tuple[float, float], int] = {}
+    parts = [solid.part_of for solid in solids]
+    found = [0 if part is None else numbers.setdefault(part, len(numbers) + 1) for part in parts]
+    return np.array(found, dtype=np.int32)
+
+
+def parts_of(x: float, y: float, solids: Iterable[Solid]) -> tuple[Solid, ...]:
+    """Return the solids as parts of the one object at x, y."""
+    return tuple(replace(solid, part_of=(x, y)) for solid in solids)
 
 
 def _find_towards(solid: Solid, origin: FloatArray, azimuth: FloatArray) -> IntArray:
@@ -178,17 +207,17 @@ def pole(
     return Cylinder(Kind.POLE, x, y, ground - BURIED_DEPTH, ground + height, radius)
 
 
-def car(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Box, ...]:
+def car(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Solid, ...]:
     """Car: a body and a cabin."""
     body, cabin = (4.3, 1.8, 0.9), (2.3, 1.6, 1.5)
-    return tuple(standing_box(terrain, x, y, size, yaw) for size in (body, cabin))
+    return parts_of(x, y, (standing_box(terrain, x, y, size, yaw) for size in (body, cabin)))
 
 
-def truck(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Box, ...]:
+def truck(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Solid, ...]:
     """Truck: a load and a lower cab in front of it."""
     cab_x, cab_y = x + 4.2 * math.cos(yaw), y + 4.2 * math.sin(yaw)
     load = standing_box(terrain, x, y, (6.4, 2.5, 3.6), yaw)
-    return load, standing_box(terrain, cab_x, cab_y, (1.8, 2.3, 2.6), yaw)
+    return parts_of(x, y, (load, standing_box(terrain, cab_x, cab_y, (1.8, 2.3, 2.6), yaw)))
 
 
 def wall(

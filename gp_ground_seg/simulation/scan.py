@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from gp_ground_seg.frame import FloatArray
-from gp_ground_seg.simulation.objects import Kind, KindArray, nearest_solid, reflectance
+from gp_ground_seg.simulation.objects import (
+    Kind,
+    KindArray,
+    nearest_solid,
+    number_objects,
+    reflectance,
+)
 from gp_ground_seg.simulation.scenes import Scene
 from gp_ground_seg.simulation.terrain import Terrain, first_hit
 
@@ -40,14 +46,27 @@ class SensorModel:
     # Tilt against the level vehicle [rad] (REP-103):
     roll: float = 0.0  # positive lowers the right side
     pitch: float = 0.0  # positive lowers the nose
+    # Where the rays start in a cloud with the axes of the level vehicle [m]; None: the cloud is in
+    # the frame of the sensor itself.
+    origin: tuple[float, float, float] | None = None
+    sector: float = 2.0 * math.pi  # of azimuths in one turn, its middle straight ahead [rad]
+    others: tuple[SensorModel, ...] = ()  # merged into the same cloud; each has an `origin`
+
+    @property
+    def height_of_cloud(self) -> float:
+        """Height of the origin of the cloud above the ground under the sensor [m]."""
+        return self.height - self.origin[2] if self.origin else self.height
 
     def directions(self, phase: float) -> FloatArray:
         """Return the unit vectors of all rays in the sensor frame, (R, 3).
 
         Ring by ring from the highest beam down; within a ring counter-clockwise from the
-        azimuth `phase` [rad], 0 = straight ahead, as in KITTI's files.
+        azimuth `phase` [rad], 0 = straight ahead, as in KITTI's files, or the right end of the
+        sector.
         """
-        turn = phase + np.arange(self.n_columns) * (2.0 * math.pi / self.n_columns)
+        turn = phase + np.arange(self.n_columns) * (self.sector / self.n_columns)
+        if self.sector < 2.0 * math.pi:
+            turn -= 0.5 * self.sector
         azimuth, elevation = np.broadcast_arrays(turn, np.asarray(self.elevations)[:, None])
         flat = np.cos(elevation)
         rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1)
@@ -97,7 +116,35 @@ HDL_64E, HDL_32E, VLP_16, OS1_128 = (
 MID_360 = ScatterModel(
     'mid-360', (math.radians(52.0), math.radians(-7.0)), 1, 0.1, 40.0, range_std=0.02, height=0.5
 )
-SENSORS = {sensor.name: sensor for sensor in (HDL_64E, HDL_32E, VLP_16, OS1_128, MID_360)}
+VLP_32C = SensorModel(
+    'vlp-32c',
+    _beams(
+        *((up, up, 1) for up in (15.0, 10.333, 7.0, 4.667, 3.333, 2.333)), (1.667, -4.0, 18),
+        *((up, up, 1) for up in (-4.667, -5.333, -6.148, -7.254, -8.843, -11.31, -15.639, -25.0)),
+    ),
+    1800, 1.0, 200.0, range_std=0.03, height=1.9,
+)  # fmt: skip
+# As on Argoverse 2's cars: the frame of the cloud is on the ground below the rear axle.
+_UPSIDE_DOWN = replace(VLP_32C, height=1.6, roll=math.pi, origin=(1.35, 0.0, 1.6))
+# 128 beams of 0.1 degrees in a sector ahead.
+AT128 = SensorModel(
+    'at128', _beams((12.5, -12.9, 128)), 1200, 1.0, 200.0, 0.02, 1.9,
+    sector=math.radians(120.0),
+)  # fmt: skip
+QT64 = SensorModel('qt64-tilted', _beams((52.1, -52.1, 64)), 600, 0.2, 60.0, 0.02, 1.2)
+SENSORS = {
+    sensor.name: sensor
+    for sensor in (
+        HDL_64E, HDL_32E, VLP_16, OS1_128, MID_360,
+        replace(HDL_64E, name='hdl-64e-vehicle', origin=(0.0, 0.0, HDL_64E.height)),
+        VLP_32C,
+        replace(VLP_32C, name='vlp-32c-pair', origin=(1.35, 0.0, 1.9), others=(_UPSIDE_DOWN,)),
+        AT128,
+        replace(QT64, roll=math.radians(35.0), pitch=math.radians(10.0)),
+        replace(VLP_16, name='vlp-16-low', height=0.15, min_range=0.1),
+    )
+}  # fmt: skip
+"""LiDARs and their mounts by name; ``-vehicle`` and ``-pair``: clouds with z = 0 on the ground."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +161,10 @@ class SimulatedScan:
     # frame [m]; over a vertical step that of one side.
     ground_z: FloatArray
     kind: KindArray  # (N,) `Kind` that the ray hit
+    object_id: npt.NDArray[np.int32]  # (N,) number of the vehicle or person hit, 0: of neither
     time: float  # since the start of the drive [s]
-    position: FloatArray  # (3,) of the sensor in the world [m]
-    rotation: FloatArray  # (3, 3) turns vectors of the sensor frame into the world's
+    position: FloatArray  # (3,) of the origin of the cloud's frame in the world [m]
+    rotation: FloatArray  # (3, 3) turns vectors of the cloud's frame into the world's
 
 
 def simulate_scan(
@@ -126,26 +174,46 @@ def simulate_scan(
     x: float = 0.0,
     time: float = 0.0,
 ) -> SimulatedScan:
-    """Scan the scene at `time` [s] from the place `x` [m] of the drive.
+    """Scan the scene at `time` [s], the (first) sensor over the place `x` [m] of the drive.
 
     Every ray has its own random numbers, drawn from `rng` whether or not it hits anything: the
     same generator state gives the same noise in another scene.
     """
-    beams = sensor.directions(rng.uniform(0.0, 2.0 * np.pi / sensor.n_columns))
+    ground = float(scene.terrain.height(x, 0.0))
+    ahead, left, _ = sensor.origin or (0.0, 0.0, 0.0)
+    position = np.array([x - ahead, 0.0 - left, ground + sensor.height_of_cloud])
+    rotation = np.eye(3) if sensor.origin else sensor.rotation()
+    parts = [_cast(scene, one, rng, position) for one in (sensor, *sensor.others)]
+    points, kind, object_id = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    ground_z = _ground_below(scene.terrain, points, position, rotation)
+    is_ground = kind == Kind.TERRAIN
+    return SimulatedScan(points, is_ground, ground_z, kind, object_id, time, position, rotation)
+
+
+def _cast(
+    scene: Scene, sensor: SensorModel, rng: np.random.Generator, position: FloatArray
+) -> tuple[npt.NDArray[np.float32], KindArray, npt.NDArray[np.int32]]:
+    """Points, kinds and objects that one sensor sees; `position` is of the cloud's frame."""
+    beams = sensor.directions(rng.uniform(0.0, sensor.sector / sensor.n_columns))
     n_rays = len(beams)
     mirror_draw, drop_draw = rng.random(n_rays), rng.random(n_rays)
     range_noise, intensity_noise = rng.standard_normal(n_rays), rng.standard_normal(n_rays)
 
-    rotation = sensor.rotation()
-    direction = beams @ rotation.T
-    position = np.array([x, 0.0, float(scene.terrain.height(x, 0.0)) + sensor.height])
+    direction = beams @ sensor.rotation().T
+    start = np.zeros(3)
+    if sensor.origin:
+        beams, start = direction, np.array(sensor.origin)
+    position = position + start
     origin = np.broadcast_to(position, direction.shape)
 
     distance = first_hit(scene.terrain, origin, direction, sensor.max_range)
-    solid_distance, solid_kind = nearest_solid(scene.solids, position, direction)
+    solid_distance, solid = nearest_solid(scene.solids, position, direction)
     blocked = solid_distance < distance
     distance = np.where(blocked, solid_distance, distance)
-    kind = np.where(blocked, solid_kind, Kind.TERRAIN).astype(np.uint8)
+    # The last row of each table is of rays that meet no solid.
+    solid = np.where(blocked, solid, -1)
+    kind = np.array([*(one.kind for one in scene.solids), Kind.TERRAIN], dtype=np.uint8)[solid]
+    object_id = np.append(number_objects(scene.solids), np.int32(0))[solid]
     _mirror(scene, origin, direction, distance, kind, mirror_draw)
 
     measured = distance + sensor.range_std * range_noise
@@ -153,11 +221,9 @@ def simulate_scan(
     kept = np.flatnonzero(is_in_range & (drop_draw >= sensor.dropout))
     kind = kind[kept]
     points = np.empty((len(kept), 4), dtype=np.float32)
-    points[:, :3] = beams[kept] * measured[kept, None]
+    points[:, :3] = beams[kept] * measured[kept, None] + start
     points[:, 3] = np.clip(reflectance(kind) + 0.05 * intensity_noise[kept], 0.0, 1.0)
-    ground_z = _ground_below(scene.terrain, points, position, rotation)
-    is_ground = kind == Kind.TERRAIN
-    return SimulatedScan(points, is_ground, ground_z, kind, time, position, rotation)
+    return points, kind, object_id[kept]
 
 
 def _mirror(

@@ -10,13 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gp_ground_seg.simulation import objects
-from gp_ground_seg.simulation.objects import Solid
+from gp_ground_seg.simulation import objects, traffic
+from gp_ground_seg.simulation.objects import Kind, Solid
 from gp_ground_seg.simulation.terrain import Profile, Terrain, Waves
 
 N_WAVES = 8
 N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
 """Scattered solids, and their distance from the drive [m], which leaves its lane free."""
+CARS = ('saloon', 'hatchback', 'suv')
+MIXED = (*CARS, *CARS, 'van', 'van', 'truck')
+"""Models of vehicles, among which the parked and the waiting ones are drawn."""
 URBAN_X = (-80.0, 160.0)  # where the street of the urban scene begins and ends [m]
 
 
@@ -212,8 +215,158 @@ def _urban(seed: int) -> Scene:
     return Scene('urban', terrain, tuple(solids), tuple(wet))
 
 
-SCENES: dict[str, Callable[[int], Scene]] = {
+@dataclass(frozen=True)
+class _Line:
+    """A line of vehicles along `heading` [rad], `aside` [m] to the left of the origin."""
+
+    terrain: Terrain
+    rng: np.random.Generator
+    heading: float
+    aside: float
+
+    def at(self, along: float, aside: float = 0.0) -> tuple[float, float]:
+        """x, y [m] of a place."""
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        aside += self.aside
+        return along * cos - aside * sin, along * sin + aside * cos
+
+    def fill(
+        self,
+        ends: tuple[float, float],
+        gaps: tuple[float, float],
+        turned: float = 0.0,
+        models: Sequence[str] = MIXED,
+        share: float = 1.0,
+    ) -> tuple[list[Solid], list[float]]:
+        """Vehicles from one end [m] to the other, and the places of the gaps between them.
+
+        `turned` [rad] is their yaw against the line, `share` that of the places taken.
+        """
+        solids: list[Solid] = []
+        free: list[float] = []
+        along, sign = ends[0], math.copysign(1.0, ends[1] - ends[0])
+        while sign * (ends[1] - along) > 10.0:
+            name, gap = str(self.rng.choice(models)), self.rng.uniform(*gaps)
+            length, width, *_ = traffic.MODELS[name]
+            size = width if abs(math.sin(turned)) > 0.5 else length
+            x, y = self.at(along + sign * (gap + 0.5 * size), self.rng.uniform(-0.15, 0.15))
+            yaw = self.heading + turned + self.rng.normal(0.0, 0.02)
+            if self.rng.random() < share:
+                solids += traffic.vehicle(self.terrain, name, x, y, yaw)
+            free.append(along + sign * 0.5 * gap)
+            along += sign * (gap + size)
+        return solids, free
+
+
+def _traffic_jam(seed: int) -> Scene:
+    """Five lanes of waiting vehicles between kerbs, cyclists between them, persons who cross."""
+    rng = np.random.default_rng(seed)
+    terrain = kerb(8.2, 0.15)
+    solids: list[Solid] = []
+    with_truck = rng.choice([-1, 1])
+    for lane in range(-2, 3):
+        line = _Line(terrain, rng, 0.0, 3.2 * lane)
+        nearest = 2.4 if lane == 0 else rng.uniform(-2.0, 1.0)
+        if lane == with_truck:
+            x, y = line.at(nearest + 5.5)
+            solids += traffic.vehicle(terrain, 'truck', x, y)
+        ahead = nearest + 9.9 if lane == with_truck else nearest
+        turned = math.pi if lane == 2 else 0.0
+        for ends in ((ahead, 70.0), (-abs(nearest), -60.0)):
+            made, gaps = line.fill(ends, (1.2, 3.0), turned)
+            solids += made
+            for along in gaps[1:]:
+                if rng.random() < 0.12:
+                    solids += traffic.person(terrain, *line.at(along, rng.uniform(-1.0, 1.0)))
+        if lane < 2:
+            for x in rng.uniform((-25.0, 3.0), (-3.0, 25.0)).tolist():
+                solids += traffic.cyclist(terrain, x, 3.2 * lane + 1.6)
+    for side in (-1.0, 1.0):
+        solids += objects.wall(terrain, (-60.0, side * 13.0), (70.0, side * 13.0), 7.0)
+        for x in np.arange(-25.0, 25.0, 10.0) + rng.uniform(0.0, 8.0):
+            solids += traffic.person(terrain, x, side * rng.uniform(9.0, 12.0))
+    return Scene('traffic_jam', terrain, tuple(solids))
+
+
+def _car_park(seed: int) -> Scene:
+    """Rows of parked cars, 0.6 to 1 m apart, along aisles 6 m wide with persons in them."""
+    rng = np.random.default_rng(seed)
+    terrain = slope(rng.uniform(0.0, 0.02), rng.uniform(-math.pi, math.pi))
+    solids: list[Solid] = []
+    for aside, side in itertools.product((5.5, 10.6, 21.5, 26.6), (-1.0, 1.0)):
+        line = _Line(terrain, rng, 0.0, side * aside)
+        turned = rng.choice([-1.0, 1.0]) * math.pi / 2.0
+        solids += line.fill((-45.0, 55.0), (0.6, 1.0), turned, CARS, share=0.88)[0]
+    for x in (-12.0, -7.5, 3.0, 7.5, 12.0, 16.5, 21.0, 25.5):
+        place = x + rng.uniform(0.0, 3.0), rng.uniform(-2.6, 2.6)
+        solids += traffic.person(terrain, *place)
+    return Scene('car_park', terrain, tuple(solids))
+
+
+def _hidden_climb(seed: int) -> Scene:
+    """Parked cars in a row, and right behind it a street that climbs by 10 to 15 %."""
+    rng = np.random.default_rng(seed)
+    heading, near = rng.uniform(-math.pi, math.pi), rng.uniform(4.5, 6.5)
+    foot, gradient = near + rng.uniform(1.5, 2.5), rng.uniform(0.1, 0.15)
+    terrain = polyline(heading, [(foot, 0.0), (foot + 50.0, 50.0 * gradient)])
+    row = _Line(terrain, rng, heading - math.pi / 2.0, near)
+    solids, _ = row.fill((-28.0, 34.0), (0.6, 1.2), models=CARS)
+    for k in range(10):
+        beside = 4.0 * k - 18.0 + rng.uniform(-0.7, 0.7)
+        place = row.at(beside, foot - near + rng.uniform(8.0, 35.0))
+        if k % 2:
+            solids += traffic.person(terrain, *place)
+        else:
+            name, yaw = str(rng.choice(CARS)), heading + rng.normal(0.0, 0.1)
+            solids += traffic.vehicle(terrain, name, *place, yaw)
+    return Scene('hidden_climb', terrain, tuple(solids))
+
+
+def _blind_slope(seed: int) -> Scene:
+    """Slope of 10 to 15 % around a level place 2 to 3 m wide: it begins in the blind spot."""
+    rng = np.random.default_rng(seed)
+    gradient, half = rng.uniform(0.1, 0.15), rng.uniform(1.0, 1.5)
+    rise = 40.0 * gradient
+    corners = [(-half - 40.0, -rise), (-half, 0.0), (half, 0.0), (half + 40.0, rise)]
+    terrain = polyline(rng.uniform(-math.pi, math.pi), corners)
+    return Scene('blind_slope', terrain, _scattered(terrain, rng))
+
+
+def _hedge(seed: int) -> Scene:
+    """Path between dense hedges 0.5 to 0.8 m high, with a fence behind one of them."""
+    rng = np.random.default_rng(seed)
+    terrain = rough(rng, 0.02, (1.5, 10.0))
+    solids: list[Solid] = []
+    side = rng.choice([-1.0, 1.0])
+    for y in (side * rng.uniform(3.0, 6.0), -side * rng.uniform(3.0, 6.0)):
+        high, deep = rng.uniform(0.55, 0.75), rng.uniform(0.6, 1.2)
+        for x in np.arange(-30.0, 50.0, 0.25).tolist():
+            # Leaves stick out by some centimetres.
+            size = (0.27, deep + rng.uniform(-0.15, 0.15), high + rng.uniform(-0.05, 0.05))
+            at = x, y + rng.uniform(-0.05, 0.05)
+            solids.append(objects.standing_box(terrain, *at, size, kind=Kind.VEGETATION))
+    fence = side * rng.uniform(8.0, 10.0)
+    for x in np.arange(-40.0, 60.0, 2.0).tolist():
+        solids.append(objects.pole(terrain, x, fence, 1.3, 0.05))
+        for clearance in (0.52, 0.82, 1.12):
+            rail = objects.floating_box(terrain, x + 1.0, fence, (2.0, 0.04, 0.12), clearance)
+            solids.append(rail)
+    solids += traffic.person(terrain, rng.uniform(5.0, 15.0), rng.uniform(-1.0, 1.0))
+    return Scene('hedge', terrain, tuple(solids))
+
+
+DRIVES: dict[str, Callable[[int], Scene]] = {
     **{name: functools.partial(_open_scene, name) for name in _OPEN_COUNTRY},
     'urban': _urban,
 }
+"""Builders of the scenes whose lane along x is free: seed -> scene."""
+PLACES: dict[str, Callable[[int], Scene]] = {
+    'traffic_jam': _traffic_jam,
+    'car_park': _car_park,
+    'hidden_climb': _hidden_climb,
+    'blind_slope': _blind_slope,
+    'hedge': _hedge,
+}
+"""Builders of the scenes around a sensor at the origin."""
+SCENES = {**DRIVES, **PLACES}
 """Builders of the named scenes: seed -> scene."""

@@ -1,0 +1,117 @@
+"""Objects of simulated scans that are called ground, by scene, sensor and range."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+from gp_ground_seg.errors import PointCloudError
+from gp_ground_seg.evaluation import evaluate as methods
+from gp_ground_seg.evaluation.evaluate import MethodScore, Progress
+from gp_ground_seg.evaluation.objects import MIN_HEIGHT, MIN_RETURNS, ObjectCount
+from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
+from gp_ground_seg.experiments.variants import (
+    PEER,
+    load_simulated,
+    make_report,
+    peer_of,
+    score_variants,
+    simulated_frames,
+)
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.simulation import PLACES
+
+SCENES = (*PLACES, 'urban')
+"""Scenes where objects hide the ground."""
+BANDS = {'0-10 m': slice(0, 1), '10-20 m': slice(1, 2), '> 20 m': slice(2, None)}
+"""Bands of range of the columns, as parts of `evaluation.objects.BAND_TITLES`."""
+
+COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
+"""Classes of `evaluation.objects.GROUPS` by column."""
+
+
+def score_objects(
+    sensors: Sequence[str],
+    scenes: Sequence[str],
+    n_seeds: int,
+    config: Config,
+    with_peer: bool,
+    progress: Progress = iter,
+) -> Report:
+    """Segment `n_seeds` simulated scenes of each name by each sensor, and count lost objects.
+
+    All sensors have the parameters `config`. A sensor and scene of which a scan is refused is left
+    out, and a note says why.
+    """
+    found: list[list[MethodScore]] = []
+    refused = []
+    cases = [(sensor, scene) for sensor in sensors for scene in scenes]
+    for sensor, scene in progress(cases):
+        frames = simulated_frames([sensor], [scene], n_seeds, (0.0,))
+        peers = [peer_of(sensor)] if with_peer else []
+        try:
+            scores = score_variants(frames, load_simulated, {methods.OURS: config}, peers)
+        except PointCloudError as error:
+            refused.append(f'refused: {error}')
+        else:
+            found.append(scores)
+    if not found:
+        raise PointCloudError('; '.join(refused))
+    pooled = [methods.pool(own[0].name, own) for own in zip(*found, strict=True)]
+    return make_report(lost_tables(pooled, refused), pooled, config)
+
+
+def lost_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> dict[str, Table]:
+    """Objects lost, and returns on vehicles by range; ours, then the peer if there is one."""
+    objects: list[Row] = []
+    returns: list[Row] = []
+    behind: list[str] = []
+    more: list[str] = []
+    lost: list[str] = []
+    for group in scores[0].sequences:
+        own = [score.of(group) for score in scores]
+        names: Row = list(zip((Column('sensor'), Column('scene')), group.split(), strict=True))
+        row = [*names, *_of_each(percent('IoU', 'iou'), [score.iou for score in own])]
+        if own[0].iou < own[-1].iou:
+            behind.append(group)
+        for title, classes in COUNTED.items():
+            bands = [[one.objects.get(name, ()) for name in classes] for one in own]
+            counts = [sum(itertools.chain(*found), ObjectCount()) for found in bands]
+            row.append((Column(title, '_d'), counts[0].n_objects))
+            row += _of_each(Column('lost', '_d', f'lost_{title}'), [c.n_lost for c in counts])
+            if counts[0].n_lost:
+                lost.append(f'{group} {counts[0].n_lost} of {counts[0].n_objects} {title}')
+        objects.append(row)
+        row = names
+        for title, band in BANDS.items():
+            counts = [sum(one.objects.get('vehicle', ())[band], ObjectCount()) for one in own]
+            shares = [count.share_ground for count in counts]
+            row = [*row, *_of_each(percent(title), shares)]
+            if shares[0] > shares[-1]:
+                more.append(f'{group} {title}')
+        returns.append(row)
+    above = f'from {MIN_HEIGHT:g} m above the exact ground'
+    of_objects = (
+        'IoU of the ground against exact labels [%]; vehicles, persons and cyclists with at least '
+        f'{MIN_RETURNS} returns {above}, and how many are lost: more than half of these returns '
+        'called ground'
+    )
+    of_returns = f'Share of the returns on vehicles {above} that is called ground, by range [%]'
+    objects_notes = [*refused, f'objects lost: {", ".join(lost) or "none"}']
+    returns_notes = []
+    if len(scores) > 1:
+        of_objects += f'; its: of {PEER}, which has the true height and place of the sensor'
+        objects_notes.append(f'IoU behind {PEER}: {", ".join(behind) or "nowhere"}')
+        returns_notes = [f'more than {PEER}: {", ".join(more) or "nowhere"}']
+    return {
+        'objects': Table.of(objects, title=of_objects, notes=objects_notes),
+        'vehicles': Table.of(returns, title=of_returns, notes=returns_notes),
+    }
+
+
+def _of_each(column: Column, values: Sequence[float | int]) -> Row:
+    """Cells of ours and of the peer, if there is one."""
+    ours = replace(column, key=column.key or column.title)
+    columns = ours, replace(ours, title='its', key=f'peer_{ours.key}')
+    return list(zip(columns[: len(values)], values, strict=True))

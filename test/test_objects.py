@@ -1,0 +1,566 @@
+"""Objects lost: counts against plain loops, local ground, boxes and their files, the command."""
+
+import contextlib
+import itertools
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cli_runner import error_line, run
+from evaluation_samples import HeightRule, street, write_frame
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gp_ground_seg import GroundSegmenter, Label
+from gp_ground_seg.data.boxes import COLUMNS, Boxes, read_boxes
+from gp_ground_seg.data.semantic_kitti import read_points
+from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.evaluation.evaluate import labelled_frames, load_kitti, score_methods
+from gp_ground_seg.evaluation.metrics import GROUND_CLASSES
+from gp_ground_seg.evaluation.objects import (
+    BAND_EDGES,
+    MIN_HEIGHT,
+    MIN_RETURNS,
+    ObjectCount,
+    Objects,
+    boxed_objects,
+    count_objects,
+    labelled_objects,
+    local_ground,
+    pool_objects,
+)
+
+CLASSES = ('vehicle', 'person')
+
+
+def returns(n, x, z=1.0, n_ground=0, kind=0, number=1):
+    """Rows of n returns: x, z, class, object, and whether it is called ground."""
+    return [(x, z, kind, number, k < n_ground) for k in range(n)]
+
+
+def count(rows, ground_z=0.0):
+    x, z, kind, number, is_ground = np.array(rows, dtype=float).T
+    points = np.column_stack([x, np.zeros(len(x)), z])
+    label = np.where(is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
+    level = np.full(len(x), ground_z)
+    return count_objects(
+        points, label, Objects(CLASSES, kind.astype(int), number.astype(int), level)
+    )
+
+
+def of(counts, name, band):
+    one = counts[name][band]
+    return (one.n_returns, one.n_ground, one.n_objects, one.n_lost)
+
+
+def test_an_object_is_lost_when_more_than_half_of_its_returns_are_ground():
+    n = MIN_RETURNS
+    assert of(count(returns(n, 5.0, n_ground=n // 2)), 'vehicle', 0) == (n, n // 2, 1, 0)
+    assert of(count(returns(n, 5.0, n_ground=n // 2 + 1)), 'vehicle', 0) == (n, n // 2 + 1, 1, 1)
+    # Of fewer returns the share counts, but they are no object.
+    assert of(count(returns(n - 1, 5.0, n_ground=n - 1)), 'vehicle', 0) == (n - 1, n - 1, 0, 0)
+
+
+def test_returns_count_from_the_least_height_above_their_ground():
+    assert of(count(returns(20, 5.0, z=MIN_HEIGHT)), 'vehicle', 0) == (20, 0, 1, 0)
+    rows = returns(20, 5.0, z=2.01 + MIN_HEIGHT)
+    rows += returns(20, 5.0, z=1.99 + MIN_HEIGHT, n_ground=20)
+    assert of(count(rows, ground_z=2.0), 'vehicle', 0) == (20, 0, 1, 0)
+    unknown = count(rows, ground_z=math.nan)
+    assert of(unknown, 'vehicle', 0) == (0, 0, 0, 0) and unknown['vehicle'][0].n_unknown == 40
+    assert count(returns(20, math.inf)) == count(returns(20, 5.0, kind=-1)) == {}
+
+
+def test_a_return_is_in_the_band_of_its_range_and_an_object_in_that_of_the_median():
+    counts = count(returns(11, 9.99, n_ground=11) + returns(10, 10.0))
+    assert of(counts, 'vehicle', 0) == (11, 11, 1, 1)
+    assert of(counts, 'vehicle', 1) == (10, 0, 0, 0)
+    assert of(count(returns(10, 4000.0)), 'vehicle', 3) == (10, 0, 1, 0)
+
+
+def test_numbers_restart_in_each_class_and_0_is_no_object():
+    rows = returns(10, 5.0) + returns(10, 5.0, kind=1, n_ground=10)
+    counts = count(rows + returns(30, 5.0, number=0, n_ground=30))
+    assert of(counts, 'vehicle', 0) == (40, 30, 1, 0)
+    assert of(counts, 'person', 0) == (10, 10, 1, 1)
+
+
+def test_unknown_is_not_ground_and_shares_of_nothing_are_nan():
+    points, ones = np.full((10, 3), 5.0), np.ones(10, dtype=int)
+    objects = Objects(CLASSES, 0 * ones, ones, 0.0 * ones)
+    counts = count_objects(points, np.full(10, Label.UNKNOWN, dtype=np.uint8), objects)
+    assert of(counts, 'vehicle', 0) == (10, 0, 1, 0)
+    assert counts['vehicle'][0].share_ground == 0.0
+    assert math.isnan(counts['vehicle'][3].share_ground)
+    with pytest.raises(PointCloudError, match=r'object_id of shape \(3,\) for 10 points'):
+        count_objects(points, 0 * ones, replace(objects, object_id=ones[:3]))
+
+
+def counted_by_loops(points, label, objects):
+    """Count as the module says it does, one return after the other."""
+    share, own, unknown = {}, {}, []
+    for k, (x, y, z) in enumerate(points):
+        kind, number = objects.class_of[k], objects.object_id[k]
+        reach, is_ground = math.hypot(x, y), label[k] == Label.GROUND
+        if kind >= 0 and math.isnan(objects.ground_z[k]):
+            unknown.append((kind, band_of(reach)))
+        if kind < 0 or not z - objects.ground_z[k] >= MIN_HEIGHT:
+            continue
+        share.setdefault((kind, band_of(reach)), []).append(is_ground)
+        if number:
+            own.setdefault((kind, number), []).append((reach, is_ground))
+    found = {}
+    for (kind, _), its in own.items():
+        if len(its) >= MIN_RETURNS:
+            band = band_of(np.median([reach for reach, _ in its]))
+            is_lost = sum(is_ground for _, is_ground in its) > len(its) / 2
+            found.setdefault((kind, band), []).append(is_lost)
+    return {
+        name: tuple(
+            ObjectCount(*(
+                number for counted in (share, found)
+                for own in [counted.get((kind, band), [])] for number in (len(own), sum(own))
+            ), unknown.count((kind, band)))
+            for band in range(4)
+        )
+        for kind, name in enumerate(objects.classes)
+        if any(k == kind for k, _ in [*share, *unknown])
+    }  # fmt: skip
+
+
+def band_of(reach):
+    return next(k for k, far in enumerate(BAND_EDGES[1:]) if reach < far)
+
+
+def drawn_scan(seed, n):
+    """Returns on a coarse lattice, so that heights, ranges and cells coincide."""
+    rng = np.random.default_rng(seed)
+    points = rng.integers(-9, 10, (n, 3)) * (0.5 * rng.integers(1, 10), 0.5, 0.1)
+    label = rng.integers(0, 3, n).astype(np.uint8)
+    ground_z = np.where(rng.random(n) < 0.1, np.nan, 0.0)
+    kind, number = rng.integers(-1, 2, n), rng.integers(0, 4, n)
+    return points, label, Objects(CLASSES, kind, number, ground_z)
+
+
+@given(st.integers(0, 2**32), st.integers(0, 200))
+def test_counts_are_those_of_plain_loops_in_any_order(seed, n):
+    points, label, objects = drawn_scan(seed, n)
+    expected = counted_by_loops(points, label, objects)
+    assert count_objects(points, label, objects) == expected
+    order = np.random.default_rng(seed).permutation(n)
+    mixed = Objects(CLASSES, *(getattr(objects, name)[order]
+                               for name in ('class_of', 'object_id', 'ground_z')))  # fmt: skip
+    assert count_objects(points[order], label[order], mixed) == expected
+
+
+def test_counts_of_scans_are_summed_by_class():
+    one = count(returns(10, 5.0, n_ground=10))
+    other = count(returns(12, 5.0, kind=1) + returns(12, 15.0))
+    pooled = pool_objects([other, one, {}, {'tree': (ObjectCount(1),) * 4}])
+    assert [*pooled] == ['vehicle', 'person', 'tree']
+    assert of(pooled, 'vehicle', 0) == (10, 10, 1, 1)
+    assert of(pooled, 'vehicle', 1) == (12, 0, 1, 0)
+    assert of(pooled, 'person', 0) == (12, 0, 1, 0)
+    assert pool_objects([]) == {}
+
+
+# The local ground.
+
+
+def lattice(low, high, step=0.25):
+    ticks = np.arange(low, high, step) + 0.1
+    return np.array([*itertools.product(ticks, ticks)])
+
+
+def test_the_local_ground_follows_a_slope_and_holes_up_to_five_metres():
+    xy = lattice(-15.0, 15.0)
+    xy = xy[np.hypot(*xy.T) > 3.0]
+    ground = np.column_stack([xy, 0.1 * xy[:, 0] - 2.0])
+    asked = np.array([[0.0, 0.0, 5.0], [-8.0, 3.0, 7.0], [18.0, 0.0, 0.0], [20.5, 0.0, 0.0]])
+    points = np.concatenate([ground, asked])
+    is_asked = np.arange(len(points)) >= len(ground)
+    height = local_ground(points, ~is_asked, is_asked)
+    assert np.isnan(height[~is_asked]).all()
+    at_hole, on_slope, beside, far = height[is_asked]
+    assert on_slope == pytest.approx(-2.8, abs=0.05)
+    assert at_hole == pytest.approx(-2.0, abs=0.35)
+    assert beside == pytest.approx(-0.5, abs=0.1) and math.isnan(far)
+
+
+def test_the_local_ground_is_a_median_of_medians():
+    """A cell with a thousand returns weighs as much as one with three; outliers do nothing."""
+    xy = lattice(0.0, 3.0)
+    ground = np.column_stack([xy, np.zeros(len(xy))])
+    ground[::7, 2] = -9.0
+    dense = np.full((1000, 3), (1.6, 1.6, 0.8))
+    points = np.concatenate([ground, dense, [[1.7, 1.7, 2.0], [math.nan, 0.0, math.inf]]])
+    is_ground = np.arange(len(points)) < len(points) - 2
+    is_ground[-1] = True
+    height = local_ground(points, is_ground, ~is_ground | np.isnan(points[:, 0]))
+    assert height[-2] == 0.0 and math.isnan(height[-1])
+
+
+def test_without_enough_ground_it_is_not_known():
+    cells = np.array([[x, 0.25, 0.0] for x in (0.25, 1.25, 2.25, 3.25, 9.25, 4.6, 4.1)])
+    asked = np.arange(7) >= 5  # 4.65 and 5.15 m from the farthest of five cells
+    assert local_ground(cells, ~asked, asked)[5:].tolist() == pytest.approx(
+        [0, np.nan], nan_ok=True
+    )
+    points = np.zeros((10, 3))
+    nothing, everything = np.zeros(10, dtype=bool), np.ones(10, dtype=bool)
+    for is_ground in (nothing, everything):  # ten returns of one cell
+        assert np.isnan(local_ground(points, is_ground, everything)).all()
+    assert len(local_ground(points[:0], nothing[:0], nothing[:0])) == 0
+
+
+@given(st.integers(0, 2**32))
+def test_the_local_ground_does_not_depend_on_the_order(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.integers(-6, 7, (60, 3)) * 0.25
+    is_ground, wanted = rng.random((2, 60)) < 0.6
+    order = rng.permutation(60)
+    first = local_ground(points, is_ground, wanted)
+    again = local_ground(points[order], is_ground[order], wanted[order])
+    np.testing.assert_array_equal(first[order], again)
+
+
+# Objects of labels and of boxes.
+
+
+def test_objects_of_labels_are_instances_by_group():
+    known = {10: 0, 252: 0, 13: 0, 18: 0, 258: 0, 16: 0, 20: 0, 259: 0, 30: 1, 254: 1, 11: 2,
+             31: 2, 32: 2, 15: 2, 253: 2, 255: 2, 40: -1, 50: -1, 0: -1, 77: -1}  # fmt: skip
+    entries = np.array([number | 5 << 16 for number in known] + [10, 30], dtype=np.uint32)
+    points, nothing = np.zeros((len(entries), 3)), np.zeros(len(entries), dtype=bool)
+    found = labelled_objects(points, entries, nothing)
+    assert found.classes == ('vehicle', 'person', 'cyclist')
+    assert found.class_of.tolist() == [*known.values(), 0, 1]
+    assert found.object_id[-2:].tolist() == [0, 0]
+    assert len(set(found.object_id[:-2].tolist())) == len(known)
+    assert np.isnan(found.ground_z).all()
+
+
+def turned(yaw, pitch=0.0):
+    """Axes of a box, as rows."""
+    c, s, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    return np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]]) @ [[c, s, 0], [-s, c, 0], [0, 0, 1]]
+
+
+def test_objects_of_boxes_are_what_is_in_them_over_their_bottom():
+    car = turned(math.radians(60.0), 0.1)
+    boxes = Boxes(
+        ['Car', 'dog', 'Pedestrian'],
+        np.array([[10.0, 5.0, 1.0], [-5.0, 0.0, 0.0], [10.0, 5.0, 1.0]]),
+        np.array([[4.0, 2.0, 1.6], [1.0, 1.0, 1.0], [0.5, 0.5, 1.5]]),
+        np.array([car, np.eye(3), np.eye(3)]),
+    )
+    own = np.array([[1.99, 0.99, 0.79], [2.01, 0.0, 0.0], [0.0, 1.01, 0.0], [0.0, 0.0, -0.81]])
+    points = np.concatenate([own @ car + boxes.center[0], [[10.0, 5.0, 1.5], [-5.5, 0.0, 0.2]]])
+    found = boxed_objects(points, boxes)
+    assert found.classes == ('vehicle', 'person', 'dog')
+    assert found.class_of.tolist() == [0, -1, -1, -1, 1, 2]  # of two boxes the smaller
+    assert found.object_id.tolist() == [1, 0, 0, 0, 3, 2]
+    height = points[:, 2] - found.ground_z
+    assert height[[0, 4, 5]] == pytest.approx([1.59, 1.25, 0.7])
+    assert np.isnan(height[1:4]).all()
+    # Where the ground is known the bottoms do not count.
+    xy = lattice(-8.0, 12.0)
+    ground = np.column_stack([xy, np.full(len(xy), -0.9)])
+    is_ground = np.arange(len(ground) + 6) >= 6
+    found = boxed_objects(np.concatenate([points, ground]), boxes, is_ground)
+    assert found.ground_z[[0, 4, 5]].tolist() == [-0.9] * 3
+    nothing = boxed_objects(points, Boxes([], *(np.zeros((0, *n)) for n in ((3,), (3,), (3, 3)))))
+    assert (nothing.class_of == -1).all() and count_objects(points, np.ones(6), nothing) == {}
+
+
+# Files of boxes.
+
+CSV = f'{",".join(COLUMNS)}\ncar,10,5,1,4,2,1.6,{math.radians(30)}\n"dog, a",0,-2,0,1,1,1,0\n'
+
+
+def box_arrays(**changes):
+    arrays = {
+        'box_class': np.array(['car', 'dog, a']),
+        'box_center': np.array([[10.0, 5, 1], [0, -2, 0]]),
+        'box_size': np.array([[4.0, 2, 1.6], [1, 1, 1]]),
+        'box_rotation': np.array([turned(math.radians(30.0)), np.eye(3)]),
+    }
+    return arrays | changes
+
+
+def test_both_kinds_of_files_hold_the_same_boxes(tmp_path):
+    (tmp_path / 'a.csv').write_text('\ufeff' + CSV.replace(',', ', ', 3))
+    np.savez(tmp_path / 'a.npz', xyzi=np.zeros((5, 4)), **box_arrays())
+    a, b = read_boxes(tmp_path / 'a.csv'), read_boxes(tmp_path / 'a.npz')
+    assert a.names == b.names == ['car', 'dog, a']
+    for own, other in zip(a[1:], b[1:], strict=True):
+        np.testing.assert_allclose(own, other, atol=1e-12)
+    (tmp_path / 'none.csv').write_text(CSV.partition('\n')[0])
+    none = read_boxes(tmp_path / 'none.csv')
+    assert [len(part) for part in none] == [0] * 4 and none.rotation.shape == (0, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'box_size': np.ones((2, 2))}, r'box_size of shape \(2, 2\): must be \(2, 3\)'),
+        ({'box_center': np.ones((3, 3))}, r'box_center of shape \(3, 3\): must be \(2, 3\)'),
+        ({'box_rotation': np.ones((2, 4))}, r'box_rotation of shape .*must be \(2, 3, 3\)'),
+        ({'box_class': np.array('car')}, r'box_class of shape \(\)'),
+        ({'box_size': -np.ones((2, 3))}, r'box 1 \(car\): size -1, -1, -1: must be above 0'),
+        ({'box_center': np.full((2, 3), np.nan)}, r'box 1 \(car\): a number is not finite'),
+        ({'box_rotation': 2.0 * np.array([np.eye(3)] * 2)}, 'no orthonormal axes'),
+        ({'box_center': np.array([['a'] * 3] * 2)}, 'could not convert'),
+        ({'box_class': np.array([None, None])}, 'allow_pickle'),
+    ],
+)
+def test_arrays_that_are_no_boxes_are_refused(tmp_path, changes, message):
+    np.savez(tmp_path / 'a.npz', **box_arrays(**changes))
+    with pytest.raises(DataError, match=message) as caught:
+        read_boxes(tmp_path / 'a.npz')
+    assert str(caught.value).startswith(f'{tmp_path / "a.npz"}: ')
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('name', 'content', 'message'),
+    [
+        ('a.csv', CSV.replace('yaw', 'heading'), 'no column yaw; the first line names class,x,'),
+        ('a.csv', '', 'no column class, x, y'),
+        ('a.csv', CSV.replace(',1.6,', ',tall,'), "line 2: could not convert string to float: 't"),
+        ('a.csv', CSV + 'car,1,2', 'line 4: '),
+        ('a.csv', CSV.replace(',1.6,', ',0,'), r'box 1 \(car\): size 4, 2, 0: must be above 0'),
+        ('a.csv', b'\xff\xfe\x00', "can't decode"),
+        ('a.npz', b'PK\x03\x04nothing', r'a\.npz: '),
+        ('a.npz', CSV, 'not an .npz file'),
+        ('a.txt', CSV, r'boxes are read from \.npz and \.csv files'),
+        ('b.csv', None, 'No such file'),
+    ],
+)
+def test_files_that_hold_no_boxes_are_refused(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(DataError, match=message) as caught:
+        read_boxes(tmp_path / name)
+    assert '\n' not in str(caught.value)
+
+
+def test_an_archive_that_is_damaged_or_has_no_boxes_is_refused(tmp_path):
+    path = tmp_path / 'a.npz'
+    np.savez_compressed(path, **box_arrays())
+    data = path.read_bytes()
+    for end in range(0, len(data) - 1, 97):
+        path.write_bytes(data[:end])
+        with pytest.raises(DataError):
+            read_boxes(path)
+    for at in range(len(data)):
+        path.write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
+        with contextlib.suppress(DataError):  # nothing else; some bytes mean nothing
+            read_boxes(path)
+    np.savez(tmp_path / 'a.npz', points=np.zeros(3))
+    with pytest.raises(DataError, match='no array box_class, box_center, box_size, box_rotation'):
+        read_boxes(tmp_path / 'a.npz')
+
+
+# The command.
+
+CARS = ((8.0, -4.0), (12.0, 3.0))
+
+
+def street_with_cars(seed):
+    """The street of the samples, with two cars of 300 returns: points, entries."""
+    points, semantic = street(seed)
+    rng = np.random.default_rng(seed)
+    parts, entries = [points], [semantic]
+    for k, (x, y) in enumerate(CARS, 1):
+        low, high = (x - 2.0, y - 0.9, -1.6), (x + 2.0, y + 0.9, -0.2)
+        parts.append(np.column_stack([rng.uniform(low, high, (300, 3)), np.ones(300)]))
+        entries.append(np.full(300, 10 | k << 16, dtype='<u4'))
+    return np.concatenate(parts).astype('<f4'), np.concatenate(entries)
+
+
+def write_cars(root, *sequences, with_labels=True):
+    for k, name in enumerate(sequences):
+        points, entries = street_with_cars(k)
+        write_frame(root, name, k, points, entries if with_labels else None)
+    return root
+
+
+def write_boxes(path, names=('Car', 'Van')):
+    """Boxes of the two cars, down to the road."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [f'{n},{x},{y},-0.96,4.1,1.9,1.54,0' for n, (x, y) in zip(names, CARS, strict=True)]
+    path.write_text('\n'.join([','.join(COLUMNS), *rows]))
+
+
+def evaluated(root, folder, *words):
+    assert run('evaluate', root, '--json', folder / 'a.json', '--force', *words) == 0
+    return json.loads((folder / 'a.json').read_text())
+
+
+def row_of(document, name, band):
+    (row,) = (r for r in document['objects'] if (r['class'], r['range']) == (name, band))
+    return row
+
+
+def test_the_table_of_objects_is_that_of_the_labels(tmp_path, capsys):
+    root = write_cars(tmp_path / 'kitti', '00', '08')
+    document = evaluated(root, tmp_path, '--peer', 'patchworkpp')
+    output = capsys.readouterr().out
+    assert max(map(len, output.splitlines())) <= 100
+    segmenter, total, n_ground = GroundSegmenter(), 0, 0
+    for k, name in enumerate(('00', '08')):
+        points, entries = street_with_cars(k)
+        segmenter.reset()
+        label = segmenter.segment(points).label
+        # The road is level.
+        own = (entries & 0xFFFF == 10) & (points[:, 2] > -1.73 + MIN_HEIGHT)
+        total, n_ground = total + own.sum(), n_ground + (label[own] == Label.GROUND).sum()
+        assert np.isin(entries & 0xFFFF, GROUND_CLASSES).sum() == 4000, name
+    row = row_of(document, 'vehicle', 'all')
+    assert row['returns'] == pytest.approx(total, abs=20)
+    assert row['share_ground'] * row['returns'] == pytest.approx(n_ground, abs=3)
+    assert (row['objects'], row['lost']) == (4, 0)
+    near = [row_of(document, 'vehicle', band) for band in ('0-10 m', '10-20 m')]
+    assert sum(own['returns'] for own in near) == row['returns']
+    assert [own['objects'] for own in near] == [2, 2]
+    far = row_of(document, 'vehicle', '> 40 m')
+    assert (far['share_ground'], far['lost'], far['patchworkpp_lost']) == (None, None, None)
+    assert row['patchworkpp_share_ground'] is not None and ' to ' in row['interval']
+    assert re.search(r'^vehicle  all +\d+ \d+ .* 4 +0 +\d$', output, re.MULTILINE)
+    for scan in document['rows']:
+        bands = scan['objects']['vehicle'].values()
+        assert sum(band['n_objects'] for band in bands) == 2
+    ours = [scan for scan in document['rows'] if scan['method'] == 'gp_ground_seg']
+    own = sum(b['n_ground'] for s in ours for b in s['objects']['vehicle'].values())
+    assert own == pytest.approx(row['share_ground'] * row['returns'])
+
+
+def test_a_rule_of_height_loses_what_is_below_it(tmp_path):
+    root = write_cars(tmp_path, '00', '08')
+    frames = labelled_frames(root)
+    for height, n_lost in ((9.0, 4), (-0.5, 4), (-1.2, 0), (-9.0, 0)):
+        (score,) = score_methods(frames, load_kitti, [HeightRule('rule', height)])
+        (found,) = score.objects.values()
+        total = sum(found, ObjectCount())
+        assert (total.n_objects, total.n_lost) == (4, n_lost), height
+        # Cars stand from -1.6 to -0.2 m on a road at -1.73 m.
+        expected = (min(height, -0.2) + 1.43) / 1.23
+        assert total.share_ground == pytest.approx(max(expected, 0.0), abs=0.03)
+
+
+def test_where_nothing_stands_or_nothing_has_a_number_it_is_said(tmp_path, capsys):
+    write_frame(tmp_path / 'a', '00', 0, *street())
+    assert evaluated(tmp_path / 'a', tmp_path)['objects'] == []
+    assert 'no return on an object' in capsys.readouterr().out
+    points, entries = street_with_cars(0)
+    write_frame(tmp_path / 'b', '00', 0, points, entries & np.uint32(0xFFFF))
+    row = row_of(evaluated(tmp_path / 'b', tmp_path), 'vehicle', 'all')
+    assert row['returns'] > 300 and row['share_ground'] is not None
+    assert (row['objects'], row['lost']) == (0, None)
+    assert 'no object with enough returns' in capsys.readouterr().out
+    entries[np.isin(entries & 0xFFFF, GROUND_CLASSES)] = 0
+    write_frame(tmp_path / 'c', '00', 0, points, entries)
+    assert row_of(evaluated(tmp_path / 'c', tmp_path), 'vehicle', 'all')['share_ground'] is None
+    assert '600 returns on objects do not count: no labels of the g' in capsys.readouterr().out
+
+
+def test_boxes_count_without_labels_in_folders_and_files(tmp_path, capsys):
+    root = write_cars(tmp_path / 'kitti', '00', '08', with_labels=False)
+    for k, name in enumerate(('00', '08')):
+        write_boxes(tmp_path / 'boxes' / name / f'{k:06d}.csv')
+    document = evaluated(root, tmp_path, '--boxes', tmp_path / 'boxes', '--peer', 'patchworkpp')
+    assert capsys.readouterr().out.startswith('IoU not available, no labels of the ground  (2 fr')
+    row = row_of(document, 'vehicle', 'all')
+    # Down to 0.3 m over the bottom of the boxes, that is 1.23 of 1.4 m.
+    assert row['returns'] == pytest.approx(1200 * 1.23 / 1.4, rel=0.05)
+    assert (row['objects'], row['lost'], row['patchworkpp_lost']) == (4, 0, 0)
+    assert 'groundgrid' not in document and 'rings' not in document
+    # The same scans, each by itself, and as a folder without sequences.
+    (tmp_path / 'flat').mkdir()
+    shares = []
+    for k, name in enumerate(('00', '08')):
+        scan = root / 'sequences' / name / 'velodyne' / f'{k:06d}.bin'
+        boxes = tmp_path / 'boxes' / name / f'{k:06d}.csv'
+        alone = evaluated(scan, tmp_path, '--boxes', boxes)
+        shares.append(row_of(alone, 'vehicle', 'all'))
+        (tmp_path / 'flat' / scan.name).write_bytes(scan.read_bytes())
+        (tmp_path / 'flat' / boxes.name).write_bytes(boxes.read_bytes())
+    assert sum(own['returns'] for own in shares) == row['returns']
+    flat = evaluated(tmp_path / 'flat', tmp_path, '--boxes', tmp_path / 'flat')
+    assert row_of(flat, 'vehicle', 'all')['returns'] == row['returns']
+
+
+def test_boxes_beside_labels_take_the_ground_from_these(tmp_path, capsys):
+    root = write_cars(tmp_path / 'kitti', '00')
+    write_boxes(tmp_path / '000000.csv', names=('robot', 'Van'))
+    document = evaluated(root, tmp_path, '--boxes', tmp_path / '000000.csv')
+    assert document['groundgrid'][-1]['iou'] > 0.9
+    assert [row['class'] for row in document['objects'][::5]] == ['vehicle', 'robot']
+    labelled = row_of(evaluated(root, tmp_path), 'vehicle', 'all')
+    both = [row_of(document, name, 'all') for name in ('vehicle', 'robot')]
+    assert sum(row['returns'] for row in both) == labelled['returns']
+    # Frames without labels among them: none of the labels count.
+    write_frame(root, '00', 1, street_with_cars(1)[0])
+    write_boxes(tmp_path / 'boxes' / '000000.csv')
+    write_boxes(tmp_path / 'boxes' / '000001.csv')
+    capsys.readouterr()
+    assert 'groundgrid' not in evaluated(root, tmp_path, '--boxes', tmp_path / 'boxes')
+    assert 'note: labels left out: 1 of 2 frames have none' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('words', 'message'),
+    [
+        ('ROOT --boxes BOXES/none', 'BOXES/none: no such file or folder'),
+        ('ROOT --boxes BOXES', 'BOXES/08: 000001.npz and 000001.csv are not there'),
+        ('ROOT --boxes BOXES/00/000000.csv', 'boxes of one scan, 000000; give a folder with a fi'),
+        (
+            'SCAN --boxes BOXES/other.csv',
+            'other.csv: boxes of one scan, other; give those of 00',
+        ),
+        ('SCAN --boxes BOXES/00/000000.csv --worst 3', '--worst: needs labels of the ground'),
+        ('SCAN --boxes BOXES/00/000000.csv --reliability a.png', '--reliability: needs labels'),
+        ('BOXES --boxes BOXES', 'no .bin file in it'),
+        ('SCAN', 'no sequences/*/velodyne folder below it'),
+        ('SCAN --boxes BOXES/00/000000.csv --sequences 00', 'no sequences/*/velodyne folder'),
+    ],
+)
+def test_boxes_that_do_not_fit_are_one_line(tmp_path, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(tmp_path)
+    root = write_cars(tmp_path / 'kitti', '00', '08', with_labels=False)
+    for name in ('00/000000.csv', 'other.csv'):
+        write_boxes(tmp_path / 'boxes' / name)
+    scan = root / 'sequences/00/velodyne/000000.bin'
+    before = sorted(tmp_path.rglob('*'))
+    words = words.replace('ROOT', str(root)).replace('SCAN', str(scan)).replace('BOXES', 'boxes')
+    assert run('evaluate', *words.split(), '--json', tmp_path / 'a.json') == 2
+    assert message.replace('BOXES', 'boxes') in error_line(capsys)
+    assert sorted(tmp_path.rglob('*')) == before
+    both = tmp_path / 'boxes/00/000000.npz'
+    both.touch()
+    (tmp_path / 'boxes/other.csv').unlink()
+    assert run('evaluate', root, '--boxes', tmp_path / 'boxes') == 2
+    assert '000000.npz and 000000.csv are both there, delete one' in error_line(capsys)
+
+
+def test_objects_of_the_frames_at_hand(kitti):
+    """By hand from the label files: instances of things in the first frame of sequence 00."""
+    path = kitti / 'sequences/00/velodyne/000000.bin'
+    points = read_points(path)
+    entries = np.fromfile(path.parent.parent / 'labels/000000.label', '<u4')
+    is_ground = np.isin(entries & 0xFFFF, GROUND_CLASSES)
+    found = labelled_objects(points, entries, is_ground)
+    on = found.class_of >= 0
+    assert set(np.unique(entries[on] & 0xFFFF)) <= {*range(10, 33), *range(252, 260)}
+    assert np.isfinite(found.ground_z[on]).mean() > 0.98
+    # Wheels stand on it.
+    cars = on & (found.object_id > 0) & (np.hypot(*points[:, :2].T) < 15.0)
+    for number in np.unique(found.object_id[cars]):
+        own = cars & (found.object_id == number)
+        if own.sum() > 500:
+            foot = np.quantile(points[own, 2] - found.ground_z[own], 0.01)
+            assert -0.15 < foot < 0.4

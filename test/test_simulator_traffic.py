@@ -1,0 +1,309 @@
+"""Vehicles, persons, cyclists; the scenes around the sensor; mounts and merged clouds."""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from gp_ground_seg import simulation
+from gp_ground_seg.simulation import (
+    HDL_64E,
+    PLACES,
+    SCENES,
+    SENSORS,
+    VLP_16,
+    Kind,
+    Scene,
+    objects,
+    traffic,
+)
+from gp_ground_seg.simulation import scenes as landforms
+
+EXACT = dataclasses.replace(HDL_64E, n_columns=700, range_std=0.0, dropout=0.0)
+TALL = dataclasses.replace(EXACT, elevations=SENSORS['os1-128'].elevations)
+FLAT = landforms.flat()
+OF_OBJECTS = (Kind.BOX, Kind.PERSON, Kind.CYCLIST)
+
+
+def scan(scene, sensor=EXACT, seed=0):
+    return simulation.simulate_scan(scene, sensor, np.random.default_rng(seed))
+
+
+def in_world(made):
+    return made.points[:, :3].astype(float) @ made.rotation.T + made.position
+
+
+@pytest.fixture(params=PLACES, scope='module')
+def place(request):
+    scene = SCENES[request.param](1)
+    return scene, scan(scene)
+
+
+@pytest.mark.parametrize('name', traffic.MODELS)
+def test_outlines_are_convex_and_within_the_measures_of_their_models(name):
+    model = traffic.MODELS[name]
+    ahead, above = np.concatenate([np.array(corners) for _, corners in model.bodies]).T
+    assert (ahead.max(), ahead.min()) == (model.length / 2, -model.length / 2)
+    assert max(width for width, _ in model.bodies) == model.width
+    assert above.min() >= 0.2  # the wheels carry it
+    for _, corners in model.bodies:
+        edges = np.diff(np.array([*corners, *corners[:2]]), axis=0)
+        turns = [a[0] * b[1] - a[1] * b[0] for a, b in itertools.pairwise(edges)]
+        assert min(turns) > 0.0
+
+
+def profile(model, ahead):
+    """Height of the highest body of a vehicle at places along it: by its edges, one by one."""
+    top = np.zeros(len(ahead))
+    for _, corners in model.bodies:
+        for (u0, z0), (u1, z1) in itertools.pairwise((*corners, corners[0])):
+            low, high = sorted(((u0, z0), (u1, z1)))
+            own = (ahead >= low[0] - 1e-4) & (ahead <= high[0] + 1e-4)
+            share = np.clip((ahead - low[0]) / max(high[0] - low[0], 1e-4), 0.0, 1.0)
+            height = low[1] + share * (high[1] - low[1])
+            height = np.where(high[0] - low[0] < 1e-4, max(z0, z1), height)
+            top = np.where(own, np.maximum(top, height), top)
+    return top
+
+
+@pytest.mark.parametrize('name', traffic.MODELS)
+@pytest.mark.parametrize(('yaw', 'gradient'), [(0.7, 0.0), (-2.0, 0.12), (math.pi / 2, 0.15)])
+def test_returns_of_a_vehicle_lie_on_it(name, yaw, gradient):
+    """In its own axes no return is outside its length, width and profile, on slopes too."""
+    model, heading = traffic.MODELS[name], 0.4
+    terrain = landforms.slope(gradient, heading)
+    x, y = 8.0, 2.0
+    made = scan(Scene('one', terrain, traffic.vehicle(terrain, name, x, y, yaw)), TALL)
+    dx, dy, z = in_world(made)[made.object_id == 1].T - np.array([[x], [y], [0.0]])
+    assert len(z) > 300
+    ahead = dx * math.cos(yaw) + dy * math.sin(yaw)
+    left = dy * math.cos(yaw) - dx * math.sin(yaw)
+    above = z - terrain.height(x + dx, y + dy)
+    assert np.abs(ahead).max() <= model.length / 2 + 1e-4
+    assert np.abs(left).max() <= model.width / 2 + 1e-4
+    assert above.min() >= -1e-4
+    top = profile(model, ahead)
+    assert (above <= np.maximum(top, 2.0 * model.wheel) + 1e-3).all()
+    assert above.max() > 0.95 * top.max()
+
+
+def test_a_bonnet_is_lower_than_the_roof_and_ground_is_seen_below_the_car():
+    made = scan(Scene('car', FLAT, traffic.vehicle(FLAT, 'saloon', 8.0, 0.0, math.pi)))
+    x, y, z = in_world(made).T
+    car = made.object_id == 1
+    bonnet, roof = (car & (x > a) & (x < b) for a, b in ((5.9, 6.7), (7.5, 8.5)))
+    assert 0.7 < z[bonnet & (np.abs(y) < 0.5)].max() < 1.0
+    assert 1.38 < z[roof].max() < 1.5
+    assert (made.is_ground & (np.abs(y) < 0.6) & (x > 5.9) & (x < 6.3)).any()
+
+
+@pytest.mark.parametrize(
+    ('make', 'kind', 'label', 'height', 'wide'),
+    [
+        (traffic.person, Kind.PERSON, 30, 1.7, 0.23),
+        (traffic.cyclist, Kind.CYCLIST, 31, 1.75, 0.86),
+    ],
+)
+def test_persons_and_cyclists(make, kind, label, height, wide):
+    made = scan(Scene('one', FLAT, make(FLAT, 6.0, 1.0)))
+    x, y, z = in_world(made)[made.object_id == 1].T
+    assert len(z) > 50
+    assert (made.kind[made.object_id == 1] == kind).all()
+    assert set(simulation.semantic_kitti_labels(made.kind)) == {40, label}
+    assert height - 0.06 < z.max() <= height + 1e-4
+    assert z.min() < 0.1
+    assert np.hypot(x - 6.0, y - 1.0).max() < wide
+
+
+@pytest.mark.parametrize('name', SCENES)
+def test_numbers_of_objects_go_with_their_kinds(name):
+    made = scan(SCENES[name](2))
+    numbered = made.object_id > 0
+    assert np.isin(made.kind[numbered], OF_OBJECTS).all()
+    assert numbered[np.isin(made.kind, [Kind.PERSON, Kind.CYCLIST])].all()
+    assert (made.object_id[~np.isin(made.kind, OF_OBJECTS)] == 0).all()
+    x, y, _ = in_world(made).T
+    for number in np.unique(made.object_id[numbered]):
+        own = made.object_id == number
+        assert len(set(made.kind[own])) == 1
+        assert np.hypot(np.ptp(x[own]), np.ptp(y[own])) < 11.0  # a truck
+
+
+def test_a_vehicle_of_several_solids_is_one_object():
+    cars = [objects.car(FLAT, 8.0, y) for y in (-4.0, 4.0)]
+    crate = objects.standing_box(FLAT, 8.0, 0.0, (1.0, 1.0, 0.6))
+    scene = Scene('two', FLAT, (*cars[0], crate, *cars[1], *objects.truck(FLAT, 16.0, 0.0)))
+    assert objects.number_objects(scene.solids).tolist() == [1, 1, 0, 2, 2, 3, 3]
+    made = scan(scene)
+    y, boxes = made.points[:, 1], made.kind == Kind.BOX
+    assert set(made.object_id[boxes & (y > 2.0) & (made.points[:, 0] < 11.0)]) == {2}
+    assert set(made.object_id[boxes]) == {0, 1, 2, 3}
+
+
+def test_places_leave_room_for_the_own_car(place):
+    scene, made = place
+    world = in_world(made)
+    near = (np.abs(world[:, 0]) < 2.3) & (np.abs(world[:, 1]) < 0.95)
+    assert not (near & ~made.is_ground).any()
+    # No two objects stand in one another: of each pair the parts are apart.
+    at = np.array(sorted({one.part_of for one in scene.solids if one.part_of}))
+    if len(at):
+        apart = np.linalg.norm(at[:, None] - at, axis=-1) + 100.0 * np.eye(len(at))
+        assert apart.min() > 0.5
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_traffic_jam_stands_around_the_sensor(seed):
+    scene = SCENES['traffic_jam'](seed)
+    made = scan(scene)
+    x, y, _ = in_world(made).T
+    car = (made.kind == Kind.BOX) & (np.hypot(x, y) < 8.0)
+    azimuth = np.degrees(np.arctan2(y, x)) % 360.0
+    assert len(set((azimuth[car] // 45.0).astype(int))) >= 7
+    assert np.hypot(x, y)[made.object_id > 0].min() > 1.5
+    assert {Kind.PERSON, Kind.CYCLIST} <= set(made.kind)
+    highest = max(one.top for one in scene.solids if one.kind == Kind.BOX)
+    assert highest > 3.5  # a truck
+    # It hides most of the ground within 15 m.
+    share = [np.sum(one.is_ground & (np.hypot(*one.points[:, :2].T) < 15.0)) for one in (
+        made, scan(Scene('empty', scene.terrain)))]  # fmt: skip
+    assert share[0] < 0.6 * share[1]
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_car_park_has_rows_with_narrow_gaps_beside_a_free_aisle(seed):
+    scene = SCENES['car_park'](seed)
+    cars = {one.part_of: one for one in scene.solids if one.kind == Kind.BOX}
+    x, y = np.array(sorted(cars)).T
+    assert len(cars) > 100
+    for side in (-1.0, 1.0):
+        row = np.sort(x[np.abs(y - side * 5.5) < 0.5])
+        step = np.diff(row)
+        # Widths of 1.7 to 1.9 m, gaps of 0.6 to 1 m; an empty place doubles them.
+        assert step.min() >= 2.3 and np.median(step) < 2.9
+    made = scan(scene)
+    aisle = made.kind[np.abs(in_world(made)[:, 1]) < 2.9]
+    assert set(aisle) <= {Kind.TERRAIN, Kind.PERSON} and (aisle == Kind.PERSON).sum() > 50
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_climb_is_hidden_by_the_parked_cars(seed):
+    scene = SCENES['hidden_climb'](seed)
+    assert not scene.terrain.gradient(np.zeros((1, 2))).any()  # level at the sensor
+    heading, foot = scene.terrain.heading, float(scene.terrain.edges[0])
+    at = (foot + 5.0) * np.array([[math.cos(heading), math.sin(heading)]])
+    assert 0.1 <= np.linalg.norm(scene.terrain.gradient(at)) <= 0.15
+    assert foot < 9.0
+    seen = []
+    for solids in (scene.solids, ()):
+        made = scan(Scene('climb', scene.terrain, solids))
+        along = in_world(made)[:, :2] @ [math.cos(heading), math.sin(heading)]
+        aside = in_world(made)[:, :2] @ [-math.sin(heading), math.cos(heading)]
+        ahead = made.is_ground & (np.abs(aside) < 0.7 * along)
+        seen.append([(ahead & (along > a) & (along < b)).sum() for a, b in ((foot, 13), (20, 60))])
+    (near, far), (all_near, all_far) = seen
+    assert near < 0.5 * all_near
+    assert far > 0.1 * all_far
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_slope_begins_in_the_blind_spot(seed):
+    terrain = SCENES['blind_slope'](seed).terrain
+    across = np.array([math.cos(terrain.heading), math.sin(terrain.heading)])
+    at = np.array([-20.0, -1.6, -0.99, 0.99, 1.6, 20.0])
+    down, lower, *level, upper, up = (terrain.gradient(at[:, None] * across) @ across).tolist()
+    assert level == [0.0, 0.0]
+    assert [lower, upper, up] == pytest.approx([down] * 3)
+    assert 0.1 <= down <= 0.15
+    nearest = np.hypot(*scan(SCENES['blind_slope'](seed)).points[:, :2].T).min()
+    assert nearest > 1.6
+
+
+def test_hedges_are_low_dense_and_beside_the_path():
+    scene = SCENES['hedge'](1)
+    made = scan(scene)
+    world, above = in_world(made), made.points[:, 2] - made.ground_z
+    leaves = made.kind == Kind.VEGETATION
+    assert 0.5 < np.quantile(above[leaves], 0.98) < above[leaves].max() < 0.9
+    y = world[leaves & (np.abs(world[:, 0]) < 20.0), 1]
+    assert 2.2 < np.abs(y).min() < np.abs(y).max() < 6.9
+    assert min((y > 0).sum(), (y < 0).sum()) > 200
+    assert {Kind.POLE, Kind.OVERHANG, Kind.PERSON} <= set(made.kind)
+
+
+# Mounts.
+
+
+@pytest.mark.parametrize('name', ['blind_slope', 'hedge'])
+def test_a_cloud_in_the_vehicle_frame_is_that_of_the_sensor_moved(name):
+    scene = SCENES[name](3)
+    own, moved = (scan(scene, SENSORS[sensor]) for sensor in ('hdl-64e', 'hdl-64e-vehicle'))
+    np.testing.assert_allclose(moved.points[:, :3] - own.points[:, :3], [[0.0, 0.0, 1.73]] * len(
+        own.points), atol=2e-5)  # fmt: skip
+    np.testing.assert_array_equal(moved.kind, own.kind)
+    np.testing.assert_allclose(moved.ground_z - own.ground_z, 1.73)
+    assert moved.position[2] == pytest.approx(float(scene.terrain.height(0.0, 0.0)))
+    assert SENSORS['hdl-64e-vehicle'].height_of_cloud == 0.0
+    assert SENSORS['hdl-64e'].height_of_cloud == 1.73
+
+
+def test_a_tilted_sensor_in_a_vehicle_frame_sees_level_ground_level():
+    tilted = dataclasses.replace(EXACT, roll=0.3, pitch=-0.1, origin=(1.2, -0.4, 1.5))
+    made = scan(Scene('bare', FLAT), tilted)
+    assert tilted.height_of_cloud == pytest.approx(0.23)
+    np.testing.assert_allclose(made.points[:, 2], -0.23, atol=2e-5)
+    np.testing.assert_allclose(made.ground_z, -0.23, atol=1e-9)
+    np.testing.assert_array_equal(made.rotation, np.eye(3))
+    np.testing.assert_allclose(made.position, [-1.2, 0.4, 0.23])
+    # The rays start at the sensor: its beams are cones about its own axis.
+    rays = (made.points[:, :3].astype(float) - tilted.origin) @ tilted.rotation()
+    elevation = np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1))
+    assert np.abs(elevation[:, None] - tilted.elevations).min(axis=1).max() < 1e-5
+
+
+def test_a_merged_cloud_is_of_both_sensors_in_one_frame():
+    pair, scene = SENSORS['vlp-32c-pair'], SCENES['hidden_climb'](1)
+    made, upright = scan(scene, pair), scan(scene, dataclasses.replace(pair, others=()))
+    n = len(upright.points)
+    np.testing.assert_array_equal(made.points[:n], upright.points)
+    np.testing.assert_array_equal(made.object_id[:n], upright.object_id)
+    (other,) = pair.others
+    assert pair.origin[2] - other.origin[2] == pytest.approx(0.3)
+    for points, sensor, sign in ((made.points[:n], pair, 1), (made.points[n:], other, -1)):
+        rays = points[:, :3].astype(float) - sensor.origin
+        elevation = sign * np.degrees(np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1)))
+        beams = np.degrees(sensor.elevations)
+        assert [len(beams), beams.max(), beams.min()] == pytest.approx([32, 15.0, -25.0])
+        assert np.abs(elevation[:, None] - beams).min(axis=1).max() < 1e-3
+        assert len(points) > 10_000
+    # One ground in both: that of the terrain.
+    for part in (slice(None, n), slice(n, None)):
+        error = (made.points[:, 2] - made.ground_z)[part][made.is_ground[part]]
+        assert np.abs(error).max() < 0.1
+    assert made.position[2] == 0.0
+
+
+def test_a_sector_has_limits():
+    sensor = SENSORS['at128']
+    x, y, _ = sensor.directions(0.0).T
+    azimuth = np.degrees(np.arctan2(y, x))
+    assert (len(sensor.elevations), azimuth.min()) == (128, pytest.approx(-60.0))
+    assert azimuth.max() == pytest.approx(60.0 - 0.1)
+    made = scan(Scene('bare', FLAT), sensor)
+    azimuth = np.degrees(np.arctan2(made.points[:, 1], made.points[:, 0]))
+    assert -60.0 <= azimuth.min() < -59.8 and 59.8 < azimuth.max() <= 60.0
+    assert np.histogram(azimuth, 12, (-60.0, 60.0))[0].min() > 0.9 * len(azimuth) / 12
+
+
+def test_the_low_and_the_tilted_sensor():
+    low = scan(Scene('bare', FLAT), SENSORS['vlp-16-low'])
+    assert np.median(low.points[:, 2]) == pytest.approx(-0.15, abs=0.01)
+    tilted = scan(Scene('bare', FLAT), SENSORS['qt64-tilted'])
+    up = tilted.rotation[2]
+    assert math.degrees(math.acos(up[2])) == pytest.approx(36.2, abs=0.1)
+    np.testing.assert_allclose(np.median(tilted.points[:, :3] @ up), -1.2, atol=0.01)
+    assert dataclasses.replace(
+        SENSORS['vlp-16-low'], name='vlp-16', height=0.8, min_range=0.5
+    ) == (VLP_16)
