@@ -73,7 +73,7 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     frames = variants.simulated_frames(['hdl-64e'], [ablation.SCENE], 2, ablation.PLACES)
     report = ablation.compare_models(frames, load_simulated, Config())
     constant, gradient, latent, _ = (row['rmse'] for row in report.tables['models'].json())
-    assert latent < 0.9 * min(constant, gradient)
+    assert latent < 0.95 * min(constant, gradient)
 
 
 def test_steps_go_from_the_paper_to_the_defaults():
@@ -242,8 +242,8 @@ def test_each_sequence_is_scored_with_values_chosen_without_it(monkeypatch):
 
 def test_scores_of_the_search_are_those_of_evaluate(frames):
     name = 'grid.r_max'
-    report = ablation.cross_validate(frames, FAR, {name: [15.0, 90]})
-    assert report.facts['n_configurations'] == 2  # 90 is the given value
+    report = ablation.cross_validate(frames, FAR, {name: [15.0, 120]})
+    assert report.facts['n_configurations'] == 2  # 120 is the given value
     ours = runner.OurMethod(FAR)
     (score,) = runner.score_methods(frames, runner.load_kitti, [ours])
     ours.close()
