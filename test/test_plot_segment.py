@@ -183,7 +183,8 @@ def test_segments_with_nothing_to_see(tmp_path, points):
 )
 def test_errors_are_said(scan, tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
-    assert run('plot', 'segment', scan, *words) == 2
+    # The height is given, as this scan does not show it.
+    assert run('plot', 'segment', scan, '--set', 'sensor.height=1.73', *words) == 2
     assert message in error_line(capsys)
     assert list(tmp_path.iterdir()) == []
 
