@@ -391,3 +391,14 @@ def test_poses_of_simulated_scans(monkeypatch):
     assert pooled['auto'] == turned['auto'] > turned['level']
     assert turned['levelled'] == n_heights
     assert 'by roll +3° pitch -3°' in report.tables['turns'].title
+
+
+@pytest.mark.parametrize('sensor', ['hdl-64e', 'os1-128', 'vlp-32c-pair'])
+def test_in_traffic_no_vehicle_is_lost(sensor):
+    """Cars hide the ground near the sensor; docs/accuracy.md has the table."""
+    scenes = ['traffic_jam', 'car_park']
+    report = lost.score_objects([sensor], scenes, 1, Config(), with_peer=False)
+    for row in report.tables['objects'].json():
+        assert row['vehicles'] > 20 and row['lost_vehicles'] == 0, row
+    for row in report.tables['vehicles'].json():
+        assert row['0-10 m'] <= 0.01, row

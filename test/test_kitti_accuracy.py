@@ -5,6 +5,7 @@ import pytest
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_labels, read_points
+from gp_ground_seg.evaluation import evaluate as runner
 
 GROUND_CLASSES = [40, 44, 48, 49, 60, 72]
 LEFT_OUT = [0, 1, 70]
@@ -34,6 +35,20 @@ def test_iou_on_labelled_frames(kitti):
     for sequence, floor in FLOOR.items():
         if sequence in iou:
             assert iou[sequence] >= floor, sequence
+
+
+def test_no_person_is_lost_and_near_vehicles_are_obstacles(kitti):
+    frames = [frame for one in list_sequences(kitti) for frame in list_frames(kitti, one)]
+    ours = runner.OurMethod(Config())
+    (score,) = runner.score_methods(frames, runner.load_kitti, [ours])
+    ours.close()
+    for name in ('person', 'cyclist'):
+        found = score.objects[name]
+        assert sum(band.n_objects for band in found) > 10
+        assert sum(band.n_lost for band in found) == 0, name
+    near = score.objects['vehicle'][0]
+    assert near.n_returns > 50_000 and near.n_lost == 0
+    assert near.share_ground < 0.002
 
 
 def test_the_tolerance_trades_precision_for_recall(kitti):
