@@ -88,6 +88,16 @@ def test_a_wall_down_to_its_lowest_return_has_an_occluded_base(backend):
         assert is_occluded(backend, np.vstack([wall(low=0.1), ring(away, n=30)])) == occluded
 
 
+def test_returns_above_one_place_have_no_direction(backend):
+    """The torture campaign's: their scatter is rounding, whose direction differed by backend."""
+    rng = np.random.default_rng(0)
+    for x, place in rng.uniform(0.01, 0.49, (fewer(60, 20), 2)):
+        y = rng.uniform(0.01, 0.49, 60)
+        foot = np.column_stack([np.full(60, x), y, np.linspace(0.0, 0.09, 60)])
+        above = [[x, place, z] for z in (0.5, 0.52, 0.55)]
+        assert not is_occluded(backend, CORNER + np.vstack([foot, above]))
+
+
 def test_a_wall_seen_over_an_obstacle_is_no_ground(backend):
     rng, n = np.random.default_rng(4), fewer(20_000, 6000)
     azimuth, r = rng.uniform(-np.pi, np.pi, n), rng.uniform(2.0, 25.0, n)

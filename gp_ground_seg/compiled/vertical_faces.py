@@ -199,7 +199,7 @@ def _is_base_occluded(low: FloatArray, high: FloatArray, max_foot_distance: floa
     low_xy = low[7] - mean_x * low[2] - mean_y * low[1] + n_low * mean_x * mean_y
     size = math.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)
     aligned = 0.0
-    if size > 0.0:
+    if size > FLATNESS * n_high:
         aligned = ((low_xx - low_yy) * (xx - yy) + 4.0 * low_xy * xy) / size
     square: float = 0.5 * (low_xx + low_yy - aligned)
     in_plane: bool = square <= n_low * max_foot_distance * max_foot_distance

@@ -18,8 +18,8 @@ from gp_ground_seg.parameters.config import Config
 MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
 FLATNESS = 1e-9
-"""Scatter across a line, in parts of that along it, which is none: as wide as coordinates are
-rounded to. What is left of it then is rounding, and says nothing of an orientation."""
+"""Scatter across a line, in parts of that along it, or of each return [m^2], which is none: as
+wide as coordinates are rounded to. What is left is rounding, and has no orientation."""
 FOOT_SHARE = 0.2
 """Part of the least height of a face whose returns are its foot, the lowest ones."""
 UNITS_PER_METRE = 2.0**16
@@ -118,7 +118,10 @@ def is_base_occluded(
     foot_along, foot_across = total(x * x - y * y, is_foot), 2.0 * total(x * y, is_foot)
     # Mean square along the direction in which the returns above scatter least.
     size = np.hypot(along, across)
-    aligned = (foot_along * along + foot_across * across) / np.where(size > 0.0, size, 1.0)
+    # Of returns in one place the direction would be rounding: all directions count alike.
+    has_direction = size > FLATNESS * number
+    aligned = (foot_along * along + foot_across * across) / np.where(has_direction, size, 1.0)
+    aligned[~has_direction] = 0.0
     square = 0.5 * (total(x * x + y * y, is_foot) - aligned)
     is_in_plane = square <= n_foot * max_foot_distance**2
     result: BoolArray = is_in_plane & (n_above >= 2) & (max_foot_distance > 0.0)
