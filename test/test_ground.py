@@ -1,4 +1,4 @@
-"""Length-scales, inlier growth and the fused surface: both backends against loops."""
+"""Length-scales, inlier growth and the surface: both backends against loops."""
 
 import numpy as np
 import pytest

@@ -190,11 +190,8 @@ class NumbaBackend:
             np.empty(n_candidates, np.bool_),
             *take('surfaces', (2, *shape), np.float64),
         )
-        looks_aside, slope_std, knots = (
-            looks_aside_in(frame, config),
-            observation.slope_std,
-            frame.knots,
-        )
+        slope_std, knots = observation.slope_std, frame.knots
+        looks_aside = looks_aside_in(frame, config)
         max_slope = growth.max_standardised_residual * slope_std if looks_aside else -1.0
         room, aside = take('aside', (2, 2, *shape), np.float64)
         nothing = aside[:, :0]

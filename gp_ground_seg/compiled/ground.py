@@ -21,7 +21,7 @@ from gp_ground_seg.parameters.config import GrowthConfig, ObservationConfig
 
 
 class SegmentSurfaces(NamedTuple):
-    """Each segment's own surface, before neighbours are fused.
+    """The surface of each segment by itself.
 
     Attributes
     ----------

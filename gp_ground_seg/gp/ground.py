@@ -85,7 +85,7 @@ def estimate_surface(
 
 
 class SegmentSurfaces(NamedTuple):
-    """Each segment's own surface, before neighbours are fused."""
+    """The surface of each segment by itself."""
 
     inlier: BoolArray  # (C,) candidates that the surface rests on
     # (M, K) height about the prior mean and its standard deviation at the knots [m]; NaN where
