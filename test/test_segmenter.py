@@ -1,11 +1,13 @@
 """The segmenter: properties of its results, history, threads, forks, change of backend."""
 
+import concurrent.futures
 import os
 import re
 import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -324,6 +326,28 @@ with sharing(3) as backend:
     caller.join()
     print(codes)
 """
+
+
+def test_what_a_thread_computes_of_a_result_does_not_hold_up_another_result():
+    results = [SEGMENTER.segment(hilly_scan(300)) for _ in range(2)]
+    is_asked, may_go_on = threading.Event(), threading.Event()
+
+    def wait(*_):
+        is_asked.set()
+        assert may_go_on.wait(60.0)
+        return 'late'
+
+    compute = 'gp_ground_seg.result.correct_surface'
+    with ThreadPoolExecutor(2) as pool:
+        with patch(compute, wait):
+            late = pool.submit(lambda: results[0].corrected)
+            assert is_asked.wait(60.0)
+        with patch(compute, lambda *_: 'at once'):
+            other = pool.submit(lambda: results[1].corrected)
+            done = concurrent.futures.wait([other], 20.0).done
+        may_go_on.set()
+        assert done and other.result() == 'at once'
+        assert late.result(60.0) == results[0].corrected == 'late'
 
 
 def test_a_process_forked_while_another_thread_segments_segments_and_ends():
