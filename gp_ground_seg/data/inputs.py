@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
 
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.data.clouds import Cloud, name_columns
+from gp_ground_seg.data.cloud_files import NUSCENES_SUFFIX, SUFFIXES, read_file
+from gp_ground_seg.data.clouds import Cloud
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
-from gp_ground_seg.data.semantic_kitti import read_scan
 from gp_ground_seg.errors import DataError, PointCloudError
 
-NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
-SUFFIXES = ('.bin',)
 # Where the scans of a data set are, in a folder of one of its drives, and these in its root.
 _SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')
 _DRIVES = ('sequences/*/velodyne', 'data_3d_raw/*/velodyne_points', '*/velodyne_points')
@@ -155,14 +153,6 @@ def _find_files(source: Path) -> list[Path]:
 def _stem(path: Path) -> str:
     name = path.name
     return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
-
-
-def read_file(path: Path, layout: ScanLayout = KITTI) -> Cloud:
-    """Read a file of any format, known by its suffix."""
-    if path.name.endswith(NUSCENES_SUFFIX) and layout.columns == KITTI.columns:
-        layout = replace(layout, columns=NUSCENES_COLUMNS)
-    data = read_scan(path, layout)
-    return Cloud(name_columns(layout.view(data)), layout.points(data))
 
 
 def _decode(raw: bytes, place: str) -> Cloud:

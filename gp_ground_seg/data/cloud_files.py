@@ -1,0 +1,86 @@
+"""Point clouds in files, their format known by the suffix; what libraries raise, in one line."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.data.bag_files import in_one_line
+from gp_ground_seg.data.clouds import Cloud, Columns, name_columns
+from gp_ground_seg.data.las import read_las, write_las
+from gp_ground_seg.data.numpy_files import read_npy, read_npz, write_npy, write_npz
+from gp_ground_seg.data.pcd import read_pcd, write_pcd
+from gp_ground_seg.data.ply import read_ply, write_ply
+from gp_ground_seg.data.scan_layout import KITTI, MAX_SCAN_BYTES, ScanLayout, find_objection
+from gp_ground_seg.data.semantic_kitti import read_bytes, read_scan
+from gp_ground_seg.errors import DataError, GroundSegError, PointCloudError
+
+_LOGGER = logging.getLogger('gp_ground_seg')
+NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
+_READERS: dict[str, Callable[[bytes], Cloud]] = {
+    '.pcd': read_pcd,
+    '.ply': read_ply,
+    '.las': read_las,
+    '.laz': read_las,
+    '.npy': read_npy,
+    '.npz': read_npz,
+}
+_WRITERS = {'.pcd': write_pcd, '.ply': write_ply, '.npy': write_npy, '.npz': write_npz}
+SUFFIXES = ('.bin', *_READERS)
+WRITABLE = tuple(_READERS)
+
+
+def read_file(path: Path, layout: ScanLayout = KITTI) -> Cloud:
+    """Read a file; `layout` is that of ``.bin`` files, says what to do in doubt, and the origin.
+
+    Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, or, where the layout
+    asks for that, can be no scan. nuScenes' ``.pcd.bin`` is known by its name.
+    """
+    suffix = path.suffix.lower()
+    if suffix == '.bin':
+        if path.name.endswith(NUSCENES_SUFFIX) and layout.columns == KITTI.columns:
+            layout = replace(layout, columns=NUSCENES_COLUMNS)
+        data = read_scan(path, layout)
+        return Cloud(name_columns(layout.view(data)), layout.points(data))
+    data = read_bytes(path, MAX_SCAN_BYTES)
+    with _named(path, 'cannot be read'), np.errstate(all='ignore'):
+        cloud = _READERS[suffix](data)
+    if layout.origin is not None:
+        cloud = replace(cloud, xyz=cloud.xyz - np.array(layout.origin), origin=layout.origin)
+    doubt = '' if layout.doubts == 'ignore' else find_objection(cloud.xyz)
+    if doubt and layout.doubts == 'raise':
+        raise DataError(f'{path}: {doubt}; --force takes it as it is')
+    if doubt:
+        _LOGGER.warning('%s: %s', path, doubt)
+    return cloud
+
+
+def write_file(path: Path, cloud: Cloud, label: npt.NDArray[np.uint8], results: Columns) -> None:
+    """Write a cloud with a `Label` and further values for each point; DataError if it cannot be.
+
+    The format must be one of `WRITABLE`; LAS has the label as its classification.
+    """
+    with _named(path, 'cannot be written'), np.errstate(all='ignore'):
+        if path.suffix in ('.las', '.laz'):
+            write_las(path, cloud.join(results), label)
+        else:
+            _WRITERS[path.suffix](path, cloud.join({'label': label, **results}))
+
+
+@contextmanager
+def _named(path: Path, what: str) -> Iterator[None]:
+    """Raise what goes wrong in the block as a DataError with the name of the file."""
+    try:
+        yield
+    except PointCloudError as error:
+        raise DataError(f'{path}: {error}') from error
+    except (GroundSegError, MemoryError, OSError):
+        raise
+    except Exception as error:  # Of many types: ValueError, LaspyException, struct, zlib, ...
+        raise DataError(f'{path}: {what}: {in_one_line(error)}') from error
