@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from gp_ground_seg.data.bag_files import in_one_line
 from gp_ground_seg.data.clouds import Cloud, Columns, name_columns
-from gp_ground_seg.data.las import read_las, write_las
-from gp_ground_seg.data.numpy_files import read_npy, read_npz, write_npy, write_npz
-from gp_ground_seg.data.pcd import read_pcd, write_pcd
-from gp_ground_seg.data.ply import read_ply, write_ply
+from gp_ground_seg.data.las import encode_las, read_las
+from gp_ground_seg.data.numpy_files import encode_npy, encode_npz, read_npy, read_npz
+from gp_ground_seg.data.pcd import encode_pcd, read_pcd
+from gp_ground_seg.data.ply import encode_ply, read_ply
 from gp_ground_seg.data.scan_layout import KITTI, MAX_SCAN_BYTES, ScanLayout, find_objection
 from gp_ground_seg.data.semantic_kitti import read_bytes, read_scan
 from gp_ground_seg.errors import DataError, GroundSegError, PointCloudError
@@ -31,7 +31,7 @@ _READERS: dict[str, Callable[[bytes], Cloud]] = {
     '.npy': read_npy,
     '.npz': read_npz,
 }
-_WRITERS = {'.pcd': write_pcd, '.ply': write_ply, '.npy': write_npy, '.npz': write_npz}
+_ENCODERS = {'.pcd': encode_pcd, '.ply': encode_ply, '.npy': encode_npy, '.npz': encode_npz}
 SUFFIXES = ('.bin', *_READERS)
 WRITABLE = tuple(_READERS)
 
@@ -61,16 +61,15 @@ def read_file(path: Path, layout: ScanLayout = KITTI) -> Cloud:
     return cloud
 
 
-def write_file(path: Path, cloud: Cloud, label: npt.NDArray[np.uint8], results: Columns) -> None:
-    """Write a cloud with a `Label` and further values for each point; DataError if it cannot be.
+def encode_file(path: Path, cloud: Cloud, label: npt.NDArray[np.uint8], results: Columns) -> bytes:
+    """File of a cloud with a `Label` and further values for each point; DataError if none can be.
 
-    The format must be one of `WRITABLE`; LAS has the label as its classification.
+    Its format is that of `path`, one of `WRITABLE`. LAS has the label as its classification.
     """
     with _named(path, 'cannot be written'), np.errstate(all='ignore'):
         if path.suffix in ('.las', '.laz'):
-            write_las(path, cloud.join(results), label)
-        else:
-            _WRITERS[path.suffix](path, cloud.join({'label': label, **results}))
+            return encode_las(cloud.join(results), label, path.suffix == '.laz')
+        return _ENCODERS[path.suffix](cloud.join({'label': label, **results}))
 
 
 @contextmanager
@@ -83,4 +82,5 @@ def _named(path: Path, what: str) -> Iterator[None]:
     except (GroundSegError, MemoryError, OSError):
         raise
     except Exception as error:  # Of many types: ValueError, LaspyException, struct, zlib, ...
-        raise DataError(f'{path}: {what}: {in_one_line(error)}') from error
+        said = f'{type(error).__name__}: {in_one_line(error)}'
+        raise DataError(f'{path}: {what} as {path.suffix} ({said})') from error

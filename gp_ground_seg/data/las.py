@@ -9,7 +9,6 @@ import copy
 import io
 import logging
 import struct
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,12 +38,14 @@ def read_las(data: bytes) -> Cloud:
     """Read a file; PointCloudError if its header cannot be right."""
     laspy = _laspy()
     _check_header(data)
-    with laspy.open(io.BytesIO(data)) as reader:
+    with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs) as reader:
         header = reader.header
         size = header.point_count * header.point_format.size
         room = MAX_SCAN_BYTES if header.are_points_compressed else len(data)
         if size > room:
             raise PointCloudError(f'{header.point_count} points ({size} bytes), of {room} bytes')
+        if header.are_points_compressed:
+            _check_chunks(data, header)
         las = reader.read()
     if len(las) != header.point_count:
         raise PointCloudError(f'{len(las)} points, its header says {header.point_count}')
@@ -62,8 +63,22 @@ def _check_header(data: bytes) -> None:
         raise PointCloudError(f'{n_records} variable length records in {len(data)} bytes')
 
 
-def write_las(path: Path, cloud: Cloud, label: npt.NDArray[np.uint8]) -> None:
-    """Write a cloud with its `Label` (N,) as classification.
+def _check_chunks(data: bytes, header: Any) -> None:
+    """Raise PointCloudError for a table of chunks that cannot be; lazrs would end the process."""
+    (start,) = struct.unpack_from('<q', data, header.offset_to_point_data)
+    if start == -1:  # of a writer that could not go back
+        (start,) = struct.unpack_from('<q', data, len(data) - 8)
+    if not header.offset_to_point_data < start <= len(data) - 8:
+        raise PointCloudError(f'table of chunks at byte {start} of {len(data)}; truncated?')
+    version, n_chunks = struct.unpack_from('<II', data, start)
+    (chunk_size,) = struct.unpack_from('<I', header.vlrs.get('LasZipVlr')[0].record_data, 12)
+    least, most = n_chunks, n_chunks * chunk_size
+    if version or n_chunks > len(data) or not least <= header.point_count <= most:
+        raise PointCloudError(f'{header.point_count} points in {n_chunks} chunks of {chunk_size}')
+
+
+def encode_las(cloud: Cloud, label: npt.NDArray[np.uint8], compressed: bool) -> bytes:
+    """File of a cloud with its `Label` (N,) as classification.
 
     A cloud that was read from LAS keeps its header, scale and point format. Fields without a
     dimension there, or of another type than it, become extra dimensions. LAS has no coordinates
@@ -72,7 +87,7 @@ def write_las(path: Path, cloud: Cloud, label: npt.NDArray[np.uint8]) -> None:
     laspy = _laspy()
     known = np.isfinite(cloud.xyz[:, :3]).all(axis=1)
     if n_lost := np.count_nonzero(~known):
-        _LOGGER.warning('%s: without %d points that are not finite', path.name, n_lost)
+        _LOGGER.warning('LAS has no place for points that are not finite: %d left out', n_lost)
     columns = scatter(in_types(cloud.fields[known], _TYPES, 'LAS', flat=True))
     places = {name: columns.pop(name).astype(np.float64) for name in 'xyz'}
     if isinstance(cloud.header, laspy.LasHeader):
@@ -96,7 +111,9 @@ def write_las(path: Path, cloud: Cloud, label: npt.NDArray[np.uint8]) -> None:
     )
     for name, values in {**places, **columns}.items():
         las[name] = values
-    las.write(str(path))
+    result = io.BytesIO()
+    las.write(result, do_compress=compressed)
+    return result.getvalue()
 
 
 def _new_header(laspy: Any, places: Columns) -> Any:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numpy.lib import format as npy
 
-from gp_ground_seg.data.clouds import Cloud, cloud_of, gather, name_columns, scatter
+from gp_ground_seg.data.clouds import Cloud, Columns, cloud_of, gather, name_columns, scatter
 from gp_ground_seg.data.scan_layout import MAX_SCAN_BYTES
 from gp_ground_seg.errors import PointCloudError
 
@@ -47,7 +46,7 @@ def read_npz(data: bytes) -> Cloud:
         return _cloud({name[:-4]: _read_array(archive.read(name)) for name in names})
 
 
-def _cloud(arrays: dict[str, npt.NDArray[Any]]) -> Cloud:
+def _cloud(arrays: Columns) -> Cloud:
     columns, table = arrays, arrays.get(TABLE)
     if table is not None and table.dtype.names is None:
         if table.ndim != 2 or table.shape[1] < 3:
@@ -61,15 +60,24 @@ def _cloud(arrays: dict[str, npt.NDArray[Any]]) -> Cloud:
     return cloud_of(gather(own), aside)
 
 
-def write_npy(path: Path, cloud: Cloud) -> None:
-    """Write a structured array."""
-    np.save(path, cloud.fields)
+def encode_npy(cloud: Cloud) -> bytes:
+    """File of a structured array."""
+    file = io.BytesIO()
+    npy.write_array(file, cloud.fields, allow_pickle=False)
+    return file.getvalue()
 
 
-def write_npz(path: Path, cloud: Cloud) -> None:
-    """Write an array for each field, and those that were kept aside."""
+def encode_npz(cloud: Cloud) -> bytes:
+    """File of an array for each field, and those that were kept aside."""
     aside = cloud.header if isinstance(cloud.header, dict) else {}
-    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive:
-        for name, values in {**aside, **scatter(cloud.fields)}.items():
+    return encode_arrays({**aside, **scatter(cloud.fields)})
+
+
+def encode_arrays(arrays: Columns) -> bytes:
+    """An .npz file; unlike `numpy.savez` with any names."""
+    result = io.BytesIO()
+    with zipfile.ZipFile(result, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name, values in arrays.items():
             with archive.open(f'{name}.npy', 'w', force_zip64=True) as file:
                 npy.write_array(file, np.ascontiguousarray(values), allow_pickle=False)
+    return result.getvalue()

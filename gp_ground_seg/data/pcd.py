@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import re
 import struct
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,6 +43,9 @@ def read_pcd(data: bytes) -> Cloud:
         raise PointCloudError('no DATA line of a PCD header in it')
     lines = data[: end.start()].decode('ascii', 'replace').splitlines()
     entries = {words[0]: words[1:] for words in map(str.split, lines) if words}
+    for key in ('SIZE', 'TYPE', 'WIDTH'):
+        if key not in entries:
+            raise PointCloudError(f'no {key} line in its header')
     names = entries.get('FIELDS', entries.get('COLUMNS', []))
     counts = [int(word) for word in entries.get('COUNT', ['1'] * len(names))]
     width, height = int(entries['WIDTH'][0]), int(entries.get('HEIGHT', '1')[0])
@@ -100,8 +102,8 @@ def _split(columns: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
     return gather(found)
 
 
-def write_pcd(path: Path, cloud: Cloud) -> None:
-    """Write a cloud, binary or, where it was read from such a file, compressed."""
+def encode_pcd(cloud: Cloud) -> bytes:
+    """File of a cloud, binary or, where it was read from such a file, compressed."""
     fields = clouds.in_types(cloud.fields, _TYPES, 'PCD')
     header = cloud.header if isinstance(cloud.header, PcdHeader) else PcdHeader(0, 0)
     size = (header.width, header.height)
@@ -127,4 +129,4 @@ def write_pcd(path: Path, cloud: Cloud) -> None:
         'DATA': [kind],
     }
     lines = ''.join(f'{key} {" ".join(map(str, words))}\n' for key, words in entries.items())
-    path.write_bytes(f'# .PCD v0.7 - Point Cloud Data file format\n{lines}'.encode() + body)
+    return f'# .PCD v0.7 - Point Cloud Data file format\n{lines}'.encode() + body

@@ -8,7 +8,6 @@ Source: http://paulbourke.net/dataformats/ply/.
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 
@@ -54,11 +53,11 @@ def read_ply(data: bytes) -> Cloud:
     return cloud_of(fields.astype(fields.dtype.newbyteorder('=')), tuple(remarks))
 
 
-def write_ply(path: Path, cloud: Cloud) -> None:
-    """Write a cloud as vertices, binary, with the comments it was read with."""
+def encode_ply(cloud: Cloud) -> bytes:
+    """File of a cloud as vertices, binary, with the comments it was read with."""
     fields = in_types(cloud.fields, _NAMES, 'PLY', flat=True)
     remarks = cloud.header if isinstance(cloud.header, tuple) else ()
     lines = ['ply', 'format binary_little_endian 1.0', *remarks, f'element vertex {len(fields)}']
     for name in fields.dtype.names or ():
         lines.append(f'property {_NAMES[fields.dtype[name].str[1:]]} {name}')
-    path.write_bytes('\n'.join([*lines, 'end_header', '']).encode() + fields.tobytes())
+    return '\n'.join([*lines, 'end_header', '']).encode() + fields.tobytes()
