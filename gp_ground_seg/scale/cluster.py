@@ -26,14 +26,16 @@ from gp_ground_seg.parameters.config import Config
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 BLOCK_SIZE = 64
-"""Items of a block, where there are enough for all workers: what a task costs is spread over them."""
+"""Items of a block, where there are enough for all workers: they share what a task costs."""
 MAX_SUBMITTED = 1000  # blocks that the scheduler holds at a time
 _CONFIG = {
     'distributed.admin.tick.limit': '1h',  # it warns where a process had to wait
     'distributed.comm.timeouts.connect': '10s',
-    'distributed.comm.retry.count': 2,
+    # A worker that died and takes its time to start anew is not given up.
+    'distributed.deploy.lost-worker-timeout': '1h',
 }
 
+_NO_BAR = partial(tqdm, disable=True)
 Progress = Callable[[Sequence[Any]], Iterable[Any]]
 """Wraps items to show how far the work is, as tqdm does."""
 Function = Callable[[Sequence[Any], Progress], Any]
@@ -51,9 +53,7 @@ class Runner:
         Of the cluster whose workers compute the blocks.
     """
 
-    def __init__(
-        self, bar: Callable[..., tqdm[Any]] = partial(tqdm, disable=True), client: Any = None
-    ) -> None:
+    def __init__(self, bar: Callable[..., tqdm[Any]] = _NO_BAR, client: Any = None) -> None:
         self._bar, self._client = bar, client
 
     @property
@@ -62,15 +62,17 @@ class Runner:
         return sum(self._client.nthreads().values()) if self._client is not None else 0
 
     def run(
-        self, function: Function, items: Sequence[Any], group: Callable[[Any], Hashable] | None
+        self,
+        function: Function,
+        items: Sequence[Any],
+        group: Callable[[Any], Hashable] | None = None,
     ) -> list[Any]:
         """Return what `function` makes of each block of the items, in their order.
 
         In this process they are one block; else `group` is as in `cut`.
         """
-        blocks = [items]
-        if self._client is not None:
-            blocks = cut(items, group, self.n_workers)
+        on_cluster = self._client is not None
+        blocks = cut(items, group, self.n_workers) if on_cluster else [items]
         found = dict(self.map_blocks(function, blocks))
         return [found[k] for k in range(len(blocks))]
 
@@ -120,6 +122,8 @@ class Runner:
                         'short; fewer --workers have more of it each'
                     ) from error
                 except (CancelledError, OSError) as error:
+                    if future.status == 'error':  # raised by `function`
+                        raise
                     raise DataError(f'the scheduler is lost ({error})') from error
                 for level, line in notes:
                     if line not in said:
@@ -145,7 +149,8 @@ def _tell_loss(run: str, event: tuple[float, Any]) -> None:
     """Say which blocks of a run a worker was computing that has died."""
     _, about = event
     if isinstance(about, dict) and about.get('action') == 'remove-worker':
-        lost = sorted(key[1] for key in about['processing-tasks'] if key[0] == run)
+        keys = [*about['processing-tasks'], *about.get('lost-computed-tasks', ())]
+        lost = sorted(key[1] for key in keys if key[0] == run)
         if lost and not about['expected']:
             numbers = ', '.join(map(str, lost))
             _LOGGER.warning('worker %s died; computed again: block %s', about['worker'], numbers)
@@ -200,7 +205,9 @@ def _compute(
 ) -> tuple[Any, list[tuple[int, str]]]:
     """Compute a block in a worker; return the result and what the library logged meanwhile."""
     here, notes = _versions(), _Notes()
-    other = [f'{name} {v}, not {expected[name]}' for name, v in here.items() if v != expected[name]]
+    other = [
+        f'{name} {v}, not {expected[name]}' for name, v in here.items() if v != expected[name]
+    ]
     if here['gp_ground_seg'] != expected['gp_ground_seg']:
         raise DataError(f'a worker on {platform.node()} has {"; ".join(other)}')
     if other:
@@ -233,7 +240,8 @@ def open_runner(
         raise MissingDependencyError(
             "Dask is not installed: pip install 'gp_ground_seg[scale]'"
         ) from error
-    logging.getLogger('distributed').setLevel(logging.CRITICAL)
+    for name in ('distributed', 'distributed.client'):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack, warnings.catch_warnings():
         # Versions are compared by `_compute`, which says in one line what differs.
         warnings.simplefilter('ignore', VersionMismatchWarning)
