@@ -6,13 +6,13 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.data.bag_files import in_one_line
 from gp_ground_seg.data.clouds import Cloud, Columns, name_columns
+from gp_ground_seg.data.files import AnyPath
 from gp_ground_seg.data.las import encode_las, read_las
 from gp_ground_seg.data.numpy_files import encode_npy, encode_npz, read_npy, read_npz
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
@@ -36,7 +36,7 @@ SUFFIXES = ('.bin', *_READERS)
 WRITABLE = tuple(_READERS)
 
 
-def read_file(path: Path, layout: ScanLayout = KITTI) -> Cloud:
+def read_file(path: AnyPath, layout: ScanLayout = KITTI) -> Cloud:
     """Read a file; `layout` is that of ``.bin`` files, says what to do in doubt, and the origin.
 
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, or, where the layout
@@ -61,7 +61,9 @@ def read_file(path: Path, layout: ScanLayout = KITTI) -> Cloud:
     return cloud
 
 
-def encode_file(path: Path, cloud: Cloud, label: npt.NDArray[np.uint8], results: Columns) -> bytes:
+def encode_file(
+    path: AnyPath, cloud: Cloud, label: npt.NDArray[np.uint8], results: Columns
+) -> bytes:
     """File of a cloud with a `Label` and further values for each point; DataError if none can be.
 
     Its format is that of `path`, one of `WRITABLE`. LAS has the label as its classification.
@@ -73,7 +75,7 @@ def encode_file(path: Path, cloud: Cloud, label: npt.NDArray[np.uint8], results:
 
 
 @contextmanager
-def _named(path: Path, what: str) -> Iterator[None]:
+def _named(path: AnyPath, what: str) -> Iterator[None]:
     """Raise what goes wrong in the block as a DataError with the name of the file."""
     try:
         yield

@@ -74,7 +74,7 @@ def encode_npz(cloud: Cloud) -> bytes:
 
 
 def encode_arrays(arrays: Columns) -> bytes:
-    """An .npz file; unlike `numpy.savez` with any names."""
+    """File .npz of arrays, unlike `numpy.savez` with any names."""
     result = io.BytesIO()
     with zipfile.ZipFile(result, 'w', zipfile.ZIP_DEFLATED) as archive:
         for name, values in arrays.items():

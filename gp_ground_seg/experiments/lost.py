@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.evaluation import evaluate as methods
-from gp_ground_seg.evaluation.evaluate import MethodScore, Progress
+from gp_ground_seg.evaluation.evaluate import MethodScore
 from gp_ground_seg.evaluation.objects import MIN_HEIGHT, MIN_RETURNS, ObjectCount
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.experiments.variants import (
@@ -20,6 +21,7 @@ from gp_ground_seg.experiments.variants import (
     simulated_frames,
 )
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.simulation import PLACES
 
 SCENES = (*PLACES, 'urban')
@@ -37,29 +39,42 @@ def score_objects(
     n_seeds: int,
     config: Config,
     with_peer: bool,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> Report:
     """Segment `n_seeds` simulated scenes of each name by each sensor, and count lost objects.
 
     All sensors have the parameters `config`. A sensor and scene of which a scan is refused is left
     out, and a note says why.
     """
-    found: list[list[MethodScore]] = []
-    refused = []
     cases = [(sensor, scene) for sensor in sensors for scene in scenes]
-    for sensor, scene in progress(cases):
-        frames = simulated_frames([sensor], [scene], n_seeds, (0.0,))
-        peers = [peer_of(sensor)] if with_peer else []
-        try:
-            scores = score_variants(frames, load_simulated, {methods.OURS: config}, peers)
-        except PointCloudError as error:
-            refused.append(f'refused: {error}')
-        else:
-            found.append(scores)
+    count = partial(_score_cases, n_seeds, config, with_peer)
+    outcomes = list(itertools.chain(*runner.run(count, cases)))
+    found = [one for one in outcomes if not isinstance(one, str)]
+    refused = [one for one in outcomes if isinstance(one, str)]
     if not found:
         raise PointCloudError('; '.join(refused))
     pooled = [methods.pool(own[0].name, own) for own in zip(*found, strict=True)]
     return make_report(lost_tables(pooled, refused), pooled, config)
+
+
+def _score_cases(
+    n_seeds: int,
+    config: Config,
+    with_peer: bool,
+    cases: Sequence[tuple[str, str]],
+    progress: Progress,
+) -> list[list[MethodScore] | str]:
+    """Scores of each sensor in each scene, or why a scan is refused."""
+    outcomes: list[list[MethodScore] | str] = []
+    for sensor, scene in progress(cases):
+        frames = simulated_frames([sensor], [scene], n_seeds, (0.0,))
+        peers = [peer_of(sensor)] if with_peer else []
+        try:
+            ours = {methods.OURS: config}
+            outcomes.append(score_variants(frames, load_simulated, ours, peers))
+        except PointCloudError as error:
+            outcomes.append(f'refused: {error}')
+    return outcomes
 
 
 def lost_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> dict[str, Table]:

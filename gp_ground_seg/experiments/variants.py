@@ -13,7 +13,7 @@ import numpy as np
 from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import report as results
-from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
 from gp_ground_seg.evaluation.objects import BAND_TITLES, GROUPS, Objects
@@ -22,6 +22,7 @@ from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
+from gp_ground_seg.scale.cluster import HERE, Runner
 from gp_ground_seg.simulation import PLACES, SCENES, SENSORS, Kind, simulate_scan
 
 Changes = Mapping[str, ParameterValue]
@@ -90,13 +91,13 @@ def score_variants(
     variants: Mapping[str, Config],
     peers: Sequence[methods.Method] = (),
     *,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> list[MethodScore]:
     """Run variants, then `peers`, once on every scan, alternately, each scan without a past."""
     with ExitStack() as stack:
         ours = [stack.enter_context(closing(OurMethod(c, name))) for name, c in variants.items()]
         every = [*ours, *peers]
-        return methods.score_methods(items, load, every, each_alone=True, progress=progress)
+        return methods.score_methods(items, load, every, each_alone=True, runner=runner)
 
 
 def make_report(
@@ -148,7 +149,7 @@ def score_scenes(
     n_seeds: int,
     config: Config,
     with_peer: bool,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> Report:
     """Segment `n_seeds` simulated scenes of each name by each of the sensors.
 
@@ -159,7 +160,7 @@ def score_scenes(
         frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
         peers = [peer_of(sensor)] if with_peer else []
         own, *other = score_variants(
-            frames, load_simulated, {methods.OURS: config}, peers, progress=progress
+            frames, load_simulated, {methods.OURS: config}, peers, runner=runner
         )
         ours.append(own)
         theirs += other
