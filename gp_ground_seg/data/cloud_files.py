@@ -47,12 +47,12 @@ def read_file(path: AnyPath, layout: ScanLayout = KITTI) -> Cloud:
         if path.name.endswith(NUSCENES_SUFFIX) and layout.columns == KITTI.columns:
             layout = replace(layout, columns=NUSCENES_COLUMNS)
         data = read_scan(path, layout)
-        return Cloud(name_columns(layout.view(data)), layout.points(data))
+        cloud = Cloud(name_columns(layout.view(data)), layout.points(data))
+        return cloud.about(layout.origin)
     data = read_bytes(path, MAX_SCAN_BYTES)
     with _named(path, 'cannot be read'), np.errstate(all='ignore'):
         cloud = _READERS[suffix](data)
-    if layout.origin is not None:
-        cloud = replace(cloud, xyz=cloud.xyz - np.array(layout.origin), origin=layout.origin)
+    cloud = cloud.about(layout.origin)
     doubt = '' if layout.doubts == 'ignore' else find_objection(cloud.xyz)
     if doubt and layout.doubts == 'raise':
         raise DataError(f'{path}: {doubt}; --force takes it as it is')

@@ -40,6 +40,12 @@ class Cloud:
     header: Any = None
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    def about(self, origin: tuple[float, float, float] | None) -> Cloud:
+        """Return the cloud with the sensor at another place, if one is given."""
+        if origin is None:
+            return self
+        return replace(self, xyz=self.xyz[:, :3] - np.array(origin), origin=origin)
+
     def take(self, mask: npt.NDArray[np.bool_]) -> Cloud:
         """Return the points where `mask` is true."""
         return replace(self, fields=self.fields[mask], xyz=self.xyz[mask])

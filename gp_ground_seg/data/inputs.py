@@ -55,11 +55,17 @@ class Inputs:
     """
 
     def __init__(
-        self, path: AnyPath, items: Sequence[Input], topic: str | None = None, n_messages: int = 0
+        self,
+        path: AnyPath,
+        items: Sequence[Input],
+        topic: str | None = None,
+        n_messages: int = 0,
+        layout: ScanLayout = KITTI,
     ) -> None:
         self.path = path
         self.topic = topic  # of a bag, else None
         self._items = items
+        self._origin = layout.origin
         self._length = n_messages or len(items)
 
     def __len__(self) -> int:
@@ -74,7 +80,7 @@ class Inputs:
         with BagReader(str(self.path)) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
-                read = partial(_decode, raw, f'{self.path}: {place}')
+                read = partial(_decode, raw, f'{self.path}: {place}', self._origin)
                 yield Input(f'{k:06d}', f'{self.path.name}[{k}]', self.path, read, 1e-9 * time)
 
     def __getitem__(self, index: int) -> Input:
@@ -104,7 +110,7 @@ def list_inputs(
     if isinstance(path, Path) and holds_bag(path):
         with BagReader(path) as bag:
             name = bag.pick_point_cloud_topic(topic)
-            return Inputs(path, (), name, bag.n_messages(name))
+            return Inputs(path, (), name, bag.n_messages(name), layout)
     if topic is not None:
         raise DataError(f'--topic: is for bags, which {source} is not')
     files = _find_files(path)
@@ -156,9 +162,9 @@ def _stem(path: AnyPath) -> str:
     return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
 
 
-def _decode(raw: bytes, place: str) -> Cloud:
+def _decode(raw: bytes, place: str, origin: tuple[float, float, float] | None) -> Cloud:
     try:
         message = decode_cloud(raw)
-        return Cloud(read_fields(message), read_xyz(message), message)
+        return Cloud(read_fields(message), read_xyz(message)).about(origin)
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error
