@@ -15,6 +15,7 @@ version = re.search(
 ).group(1)
 
 BAGS = ['rosbags>=0.11.9']
+FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
 PLOT = ['matplotlib>=3.6']
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
@@ -69,6 +70,7 @@ setup(
     ],
     extras_require={
         'bags': BAGS,
+        'formats': FORMATS,
         'plot': PLOT,
         'ros': ROS + BAGS + PLOT,
         'test': TEST,

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.data.semantic_kitti import read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import read_labels
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation.metrics import GROUNDGRID
 from gp_ground_seg.parameters.config import Config
@@ -28,6 +28,7 @@ model as profiles with twice its standard deviation, coloured by length-scale.
 """
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
+  gp-ground-seg plot scan drive.mcap --frame 20 -o scan.png
   gp-ground-seg plot scan --simulate road_then_rubble -o scan.png
   gp-ground-seg plot scan --simulate urban --sensor vlp-16 -o scan.png
 """
@@ -61,7 +62,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = options.new_parser(subparsers, 'plot', description, examples)
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
     number: dict[str, Any] = {'metavar': 'N', 'type': int}
-    scan = ('input', 'KITTI scan (.bin)', {'metavar': 'INPUT'})
+    scan = ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'})
     labels = ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'})
 
     view = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
@@ -93,7 +94,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for picture in (view, above, segment):
         endings = ('.png', '.pdf') if picture is segment else ('.png',)
         output = (f'{" or ".join(endings)} file', {'metavar': 'OUT', 'required': True})
-        options.add(picture, ('-o --output', *output), *options.SCAN_LAYOUT, options.FORCE)
+        frame = ('--frame', 'which of several, from 0 (default: 0)', {**number, 'default': 0})
+        options.add(picture, ('-o --output', *output), frame, *options.CLOUDS, options.FORCE)
         options.add_config(picture)
         picture.set_defaults(run=run, endings=endings)
 
@@ -124,15 +126,22 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.float32], str]:
-    """Points of a file, and its name as in ``00/000005``."""
-    scan = Path(arguments.input)
-    folder = scan.resolve().parent
-    title = f'{folder.parent.name}/{scan.stem}' if folder.name == 'velodyne' else scan.name
-    return read_points(scan, options.scan_layout(arguments)), title
+def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]:
+    """Points of a scan, and its name as in ``00/000005``."""
+    scans = options.list_clouds(arguments)
+    try:
+        scan = scans[arguments.frame]
+    except IndexError as error:
+        most, n = len(scans) - 1, options.count(len(scans), 'scan')
+        raise DataError(
+            f'--frame {arguments.frame}: must be in [0, {most}]; {n} in {arguments.input}'
+        ) from error
+    folder = Path(str(scan.path)).resolve().parent
+    title = f'{folder.parent.name}/{scan.name}' if folder.name == 'velodyne' else scan.title
+    return scan.read().xyz, title
 
 
-def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.float32], str]:
+def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]:
     options.refuse_scan_layout(arguments, 'a simulated one')
     if arguments.seed < 0:
         raise DataError(f'--seed {arguments.seed}: must not be negative')
