@@ -257,7 +257,7 @@ def test_scores_of_the_search_are_those_of_evaluate(frames):
 def test_scene_scores_follow_their_definitions(monkeypatch):
     monkeypatch.setattr(variants, 'SCENE_PLACES', (6.0,))
     config = Config().replace(**{'grid.n_segments': 120})
-    report = variants.score_scenes(['vlp-16'], ['kerb'], 2, config, with_peer=True)
+    report = variants.score_scenes(['vlp-16'], ['kerb'], 2, config, peer='patchworkpp')
     (row,) = report.tables['scenes'].json()
     total, its_total = Confusion(), Confusion()
     errors, its_errors = [], []
@@ -299,7 +299,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
         return score(frames, *rest)
 
     monkeypatch.setattr(lost, 'score_variants', refuse_hedges)
-    report = lost.score_objects([sensor], [scene, 'hedge'], 1, FIXED, with_peer=True)
+    report = lost.score_objects([sensor], [scene, 'hedge'], 1, FIXED, peer='patchworkpp')
     (row,), (shares,) = (report.tables[name].json() for name in ('objects', 'vehicles'))
     made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
     x, y, z, _ = made.points.T.astype(float)
@@ -330,7 +330,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
     assert notes[0] == 'refused: hedge: z does not point up'
     assert notes[1].startswith(f'objects lost: {sensor} {scene} {row["lost_vehicles"]} of')
     with pytest.raises(PointCloudError, match='refused: hedge'):
-        lost.score_objects([sensor], ['hedge'], 1, FIXED, with_peer=False)
+        lost.score_objects([sensor], ['hedge'], 1, FIXED, peer=None)
 
 
 def test_behind_is_said():
@@ -397,7 +397,7 @@ def test_poses_of_simulated_scans(monkeypatch):
 def test_in_traffic_no_vehicle_is_lost(sensor):
     """Cars hide the ground near the sensor; docs/accuracy.md has the table."""
     scenes = ['traffic_jam', 'car_park']
-    report = lost.score_objects([sensor], scenes, 1, Config(), with_peer=False)
+    report = lost.score_objects([sensor], scenes, 1, Config(), peer=None)
     for row in report.tables['objects'].json():
         assert row['vehicles'] > 20 and row['lost_vehicles'] == 0, row
     for row in report.tables['vehicles'].json():

@@ -93,14 +93,8 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 def run_diff(arguments: argparse.Namespace) -> int:
     """Print the parameters that differ."""
-    first, second = (
-        PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
-        for name in (arguments.a, arguments.b)
-    )
-    different = export.differences(first, second)
-    for spec, before, after in different:
-        unit = f' {spec.unit}' if spec.unit else ''
-        print(f'{spec.name}: {export.yaml_scalar(before)} -> {export.yaml_scalar(after)}{unit}')
+    different = options.changed_lines(*map(options.named_config, (arguments.a, arguments.b)))
+    print(*different, sep='\n', end='\n' * bool(different))
     return 1 if different else 0
 
 

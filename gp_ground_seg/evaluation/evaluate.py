@@ -43,8 +43,8 @@ from gp_ground_seg.segmenter import GroundSegmenter
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 OURS = 'gp_ground_seg'
-PATCHWORKPP = 'patchworkpp'
-TITLES = {PATCHWORKPP: 'Patchwork++'}
+PATCHWORKPP, PATCHWORK = 'patchworkpp', 'patchwork'
+TITLES = {PATCHWORKPP: 'Patchwork++', PATCHWORK: 'Patchwork'}
 """Names of methods in tables, where they differ from those in files."""
 ALL = 'all'
 Progress = Callable[[Sequence[Any]], Iterable[Any]]
@@ -59,6 +59,7 @@ class MethodResult:
     label: Labels  # (N,)
     ground_z: FloatArray  # (N,) height of the ground under each point [m]; NaN = no model
     p_ground: npt.NDArray[np.floating] | None = None  # (N,), where it has probabilities
+    return_std: FloatArray | None = None  # (N,) of a ground return about `ground_z` [m]
     stages: dict[str, float] = field(default_factory=dict)  # seconds
     pose: SensorPose | None = None
     fit: FitReport | None = None
@@ -103,7 +104,9 @@ class OurMethod:
     def result(self) -> MethodResult:
         """Return all there is of the last scan."""
         own = self.last
-        return MethodResult(own.label, own.ground_z, own.p_ground, self.stages, own.pose, own.fit)
+        return MethodResult(
+            own.label, own.ground_z, own.p_ground, own.return_std, self.stages, own.pose, own.fit
+        )
 
     def close(self) -> None:
         """End the worker threads."""
@@ -333,12 +336,14 @@ def score_methods(
     each_alone: bool = False,
     clock: Callable[[], float] = time.perf_counter,
     progress: Progress = iter,
+    watch: Callable[[KnownScan], None] = lambda _scan: None,
 ) -> list[MethodScore]:
     """Run methods alternately on the same scans and score each run, in the order of `methods`.
 
     Which method goes first changes from scan to scan. Each runs once without counting:
     compilation and first allocations are not its speed. `items`, grouped by sequence, are loaded
     one by one. Methods are reset before each sequence, or with `each_alone` before each scan.
+    `watch` is called with each scan after all methods have run on it.
     """
     scores: dict[str, list[ScanScore]] = {method.name: [] for method in methods}
     sequence = None
@@ -355,6 +360,7 @@ def score_methods(
             start = clock()
             _run(method, scan)
             scores[method.name].append(_score(scan, method, clock() - start))
+        watch(scan)
     return [MethodScore(name, tuple(found)) for name, found in scores.items()]
 
 
@@ -372,7 +378,8 @@ def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
     height = None
     if scan.ground_z is not None:
         own = scan.is_ground
-        height = metrics.height_error(scan.ground_z[own], result.ground_z[own])
+        std = None if result.return_std is None else result.return_std[own]
+        height = metrics.height_error(scan.ground_z[own], result.ground_z[own], std)
     return ScanScore(
         scan.sequence, scan.index, seconds, result.stages,
         {key: metrics.count_confusion(label, one) for key, one in scan.truths.items()},

@@ -12,7 +12,6 @@ from gp_ground_seg.evaluation.evaluate import MethodScore, Progress
 from gp_ground_seg.evaluation.objects import MIN_HEIGHT, MIN_RETURNS, ObjectCount
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.experiments.variants import (
-    PEER,
     load_simulated,
     make_report,
     peer_of,
@@ -36,7 +35,7 @@ def score_objects(
     scenes: Sequence[str],
     n_seeds: int,
     config: Config,
-    with_peer: bool,
+    peer: str | None,
     progress: Progress = iter,
 ) -> Report:
     """Segment `n_seeds` simulated scenes of each name by each sensor, and count lost objects.
@@ -49,7 +48,7 @@ def score_objects(
     cases = [(sensor, scene) for sensor in sensors for scene in scenes]
     for sensor, scene in progress(cases):
         frames = simulated_frames([sensor], [scene], n_seeds, (0.0,))
-        peers = [peer_of(sensor)] if with_peer else []
+        peers = [peer_of(sensor, peer)] if peer else []
         try:
             scores = score_variants(frames, load_simulated, {methods.OURS: config}, peers)
         except PointCloudError as error:
@@ -101,9 +100,11 @@ def lost_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> d
     objects_notes = [*refused, f'objects lost: {", ".join(lost) or "none"}']
     returns_notes = []
     if len(scores) > 1:
-        of_objects += f'; its: of {PEER}, which has the true height and place of the sensor'
-        objects_notes.append(f'IoU behind {PEER}: {", ".join(behind) or "nowhere"}')
-        returns_notes = [f'more than {PEER}: {", ".join(more) or "nowhere"}']
+        of_objects += (
+            f'; its: of {scores[1].title}, which has the true height and place of the sensor'
+        )
+        objects_notes.append(f'IoU behind {scores[1].title}: {", ".join(behind) or "nowhere"}')
+        returns_notes = [f'more than {scores[1].title}: {", ".join(more) or "nowhere"}']
     return {
         'objects': Table.of(objects, title=of_objects, notes=objects_notes),
         'vehicles': Table.of(returns, title=of_returns, notes=returns_notes),

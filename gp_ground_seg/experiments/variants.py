@@ -17,7 +17,7 @@ from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod,
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
 from gp_ground_seg.evaluation.objects import BAND_TITLES, GROUPS, Objects
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS, PatchworkppMethod
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
@@ -31,7 +31,6 @@ SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
 OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
 """What rays hit of objects, by the classes of `GROUPS`; crates are boxes too, but no objects."""
-PEER = methods.TITLES[methods.PATCHWORKPP]
 
 
 class SimulatedFrame(NamedTuple):
@@ -71,10 +70,10 @@ def simulated_frames(
     return [SimulatedFrame(*case) for case in cases if not case[3] or case[1] not in PLACES]
 
 
-def peer_of(sensor: str) -> PatchworkppMethod:
-    """Return Patchwork++, told where a simulated sensor is in its cloud and above the ground."""
+def peer_of(sensor: str, peer: str = methods.PATCHWORKPP) -> PatchworkppMethod:
+    """Return one of `PEERS`, told where a simulated sensor is in its cloud and how high."""
     model = SENSORS[sensor]
-    return PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
+    return PEERS[peer](model.height, model.origin or (0.0, 0.0, 0.0))
 
 
 def refuse_changed(config: Config, names: Iterable[str]) -> None:
@@ -147,23 +146,23 @@ def score_scenes(
     scenes: Sequence[str],
     n_seeds: int,
     config: Config,
-    with_peer: bool,
+    peer: str | None,
     progress: Progress = iter,
 ) -> Report:
     """Segment `n_seeds` simulated scenes of each name by each of the sensors.
 
-    Patchwork++ runs on the same clouds, as `peer_of` makes it.
+    The one of `PEERS` named runs on the same clouds, as `peer_of` makes it.
     """
     ours, theirs = [], []
     for sensor in sensors:
         frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
-        peers = [peer_of(sensor)] if with_peer else []
+        peers = [peer_of(sensor, peer)] if peer else []
         own, *other = score_variants(
             frames, load_simulated, {methods.OURS: config}, peers, progress=progress
         )
         ours.append(own)
         theirs += other
-    pairs = [(methods.OURS, ours), (methods.PATCHWORKPP, theirs)]
+    pairs = [(methods.OURS, ours), (peer or '', theirs)]
     scores = [methods.pool(name, own) for name, own in pairs if own]
     return make_report({'scenes': scene_table(*scores)}, scores, config)
 
@@ -217,11 +216,12 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
     notes = []
     if peer is not None:
         title += (
-            f'; its: of {PEER}, which has the true sensor height, and as surface its nearest patch'
+            f'; its: of {peer.title}, which has the true sensor height, and as surface its '
+            'nearest patch'
         )
         title += f'; {interval_note("scenes of each row")}'
         n_ahead = len(rows) - len(behind) - len(ties)
         where = f'; ties on {", ".join(ties)}' if ties else ''
         where += f'; behind on {", ".join(behind)}' if behind else ''
-        notes = [f'ahead of {PEER} on {n_ahead} of {len(rows)} rows{where}']
+        notes = [f'ahead of {peer.title} on {n_ahead} of {len(rows)} rows{where}']
     return Table.of(rows, title=title, notes=notes)
