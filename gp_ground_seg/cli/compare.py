@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, frames_from_options, staged_options
@@ -16,7 +18,9 @@ from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import comparison, report
 from gp_ground_seg.evaluation.evaluate import KnownScan, OurMethod, load_kitti, score_methods
+from gp_ground_seg.evaluation.metrics import Labels
 from gp_ground_seg.evaluation.report import Column, Table, percent
+from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.scan import plot_two_labels
 
 DESCRIPTION = """\
@@ -26,16 +30,18 @@ standard deviations, time; each difference with a bootstrap interval over the se
 blocks of frames of a single one. A tie: the interval holds 0. With -o the frames in which most
 points have two labels are drawn.
 
-A and B are parameter files or names of presets. Frames without labels, as of any folder of
-scans, tell the points that have two labels, and the time.
+A and B are parameter files or names of presets. Scans without labels, as of any folder, tell
+the points that have two labels, and the time.
 """
 EXAMPLES = """\
   gp-ground-seg compare default paper KITTI_ROOT
   gp-ground-seg compare default my.yaml KITTI_ROOT --sequences 00,08 -o pictures
   gp-ground-seg compare old.yaml new.yaml scans --json differences.json    scans/*.bin, no labels
 """
-
-NAMES = ('A', 'B')
+COLUMNS = (
+    *(Column('sequence'), Column('frame'), Column('points', '_d'), percent('differ')),
+    *(percent('ground in A only'), percent('ground in B only')),
+)
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -44,7 +50,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     root = 'folder in SemanticKITTI layout, a scan, or a folder of scans'
     options.add(
         parser,
-        *((name.lower(), 'parameter file or preset', {'metavar': name}) for name in NAMES),
+        *((name, 'parameter file or preset', {'metavar': name.upper()}) for name in 'ab'),
         ('root', root, {'metavar': 'ROOT'}),
         *OF_FRAMES,
         ('--frames', 'list, and draw, so many frames that differ most (default: %(default)s)',
@@ -59,51 +65,64 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare, write the files, print the tables."""
-    given = arguments.a, arguments.b
+    given = [arguments.a, arguments.b]
     configs = [options.named_config(name) for name in given]
     changed = options.changed_lines(*configs)
     if not changed:
-        raise ConfigError(f'{given[0]}, {given[1]}: the same parameters, nothing to compare')
+        raise ConfigError(f'{" and ".join(given)}: the same parameters, nothing to compare')
     items, load = _items(arguments)
-    pictures = [f'differs_{k + 1}.png' for k in range(min(arguments.frames, len(items)))]
-    with staged_options(arguments, 'json') as parts, ExitStack() as stack:
-        folder = None
-        if arguments.output is not None:
-            staged = staged_files(arguments.output, pictures, force=arguments.force)
-            folder = stack.enter_context(staged)
+    target, n_drawn = arguments.output, min(arguments.frames, len(items))
+    pictures = [f'differs_{k + 1}.png' for k in range(n_drawn)]
+    rows: list[list[Any]] = []
+    worst: list[tuple[list[Any], KnownScan, list[Labels]]] = []
+
+    def watch(scan: KnownScan) -> None:
+        one, other = labels = [method.last.label for method in methods]
+        ground_a, ground_b = (label == Label.GROUND for label in labels)
+        parts = one != other, ground_a & ~ground_b, ground_b & ~ground_a
+        shares = [float(part.mean()) if len(part) else 0.0 for part in parts]
+        rows.append([scan.sequence, scan.index, len(one), *shares])
+        worst.append((rows[-1], scan, labels))
+        worst.sort(key=lambda one: one[0][3], reverse=True)
+        del worst[n_drawn:]
+
+    staged = staged_files(target, pictures, force=arguments.force) if target else nullcontext()
+    with staged_options(arguments, 'json') as parts, staged as folder, ExitStack() as stack:
         methods = [
             stack.enter_context(closing(OurMethod(config, name)))
-            for config, name in zip(configs, NAMES, strict=True)
+            for config, name in zip(configs, 'AB', strict=True)
         ]
-        seen = comparison.DisagreementWatch(*methods, len(pictures))
         bar = options.progress('compare')
-        scores = score_methods(items, load, methods, progress=bar, watch=seen.watch)
-        differences = comparison.find_differences(*scores)
-        tables = {
-            'measures': comparison.difference_table(differences, scores[0], NAMES),
-            'labels': comparison.disagreement_table(seen.scans, NAMES),
-            'frames': _frame_table(seen.kept),
-        }
-        for name, (found, scan, labels) in zip(pictures if folder else [], seen.kept):
-            title = f'{found.sequence}/{found.index}: {found.share:.2%} of the points differ'
+        scores = score_methods(items, load, methods, progress=bar, watch=watch)
+        for name, (row, scan, labels) in zip(pictures if folder else [], worst, strict=False):
             truth = next(iter(scan.truths.values()), None)
-            assert folder is not None
+            title = f'{row[0]}/{row[1]}: {row[3]:.2%} of the points have two labels'
             plot_two_labels(scan.points, labels, folder / name, truth, title)
+        differences = comparison.find_differences(*scores)
         environment = report.describe_environment()
         if 'json' in parts:
             document = {
-                'configs': dict(zip(given, (c.nested() for c in configs), strict=True)),
+                'configs': [
+                    {'given': g, **c.nested()} for g, c in zip(given, configs, strict=True)
+                ],
                 'environment': environment,
-                **{name: table.json() for name, table in tables.items()},
-                'measures': [one.json() for one in differences],
-                'scans': [scan._asdict() for scan in seen.scans],
+                'measures': [one._asdict() for one in differences],
+                'scans': Table(COLUMNS, rows).json(),
             }
             report.write_json(document, parts['json'])
+    shares = np.average([row[3:] for row in rows], axis=0, weights=[row[2] for row in rows])
+    n_points = sum(row[2] for row in rows)
+    last = ['all', options.count(len(rows), 'frame'), n_points, *shares.tolist()]
+    title = 'Points with two labels, in the frames with most and in all  [%]'
+    tables = [
+        comparison.difference_table(scores[0], differences, ['A', 'B']),
+        Table(COLUMNS, [*(row for row, *_ in worst), last], title, n_sums=1),
+    ]
     print(f'A: {given[0]}, B: {given[1]}', *changed, '', sep='\n')
     lines = [report.machine_line(environment, scores[0].scans[-1].fit)]
-    print(report.written(tables.values(), lines, markdown=arguments.markdown))
-    if arguments.output is not None:
-        print(f'drawn: {", ".join(pictures)} in {arguments.output}')
+    print(report.written(tables, lines, markdown=arguments.markdown))
+    if target:
+        print(f'drawn: {", ".join(pictures)} in {target}')
     return 0
 
 
@@ -119,10 +138,3 @@ def _items(
     group = root.resolve().stem
     scans = find_scans(root)[:: arguments.frame_step or 1]
     return scans, lambda path: KnownScan(group, path.stem, read_points(path, layout), {})
-
-
-def _frame_table(kept: Sequence[Any]) -> Table:
-    columns = [Column('sequence'), Column('frame'), Column('points', '_d')]
-    rows = [[found.sequence, found.index, found.n_points, found.share] for found, *_ in kept]
-    columns.append(percent('differ', 'share_different'))
-    return Table(columns, rows, 'Frames that differ most  [% of their points]')

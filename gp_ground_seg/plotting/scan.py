@@ -180,7 +180,7 @@ def plot_birds_eye(
 
 def plot_two_labels(
     points: npt.ArrayLike,
-    labels: tuple[Labels, Labels],
+    labels: Sequence[Labels],
     path: str | Path,
     truth: Labels | None = None,
     title: str = '',
