@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,8 @@ import numpy as np
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, frames_from_options, staged_options
-from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.atomic_output import staged_files
-from gp_ground_seg.data.semantic_kitti import read_points
+from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import comparison, report
 from gp_ground_seg.evaluation.evaluate import KnownScan, OurMethod, load_kitti, score_methods
@@ -30,8 +29,8 @@ standard deviations, time; each difference with a bootstrap interval over the se
 blocks of frames of a single one. A tie: the interval holds 0. With -o the frames in which most
 points have two labels are drawn.
 
-A and B are parameter files or names of presets. Scans without labels, as of any folder, tell
-the points that have two labels, and the time.
+A and B are parameter files or names of presets. Scans without labels, as of any folder or bag,
+tell the points that have two labels, and the time.
 """
 EXAMPLES = """\
   gp-ground-seg compare default paper KITTI_ROOT
@@ -39,15 +38,16 @@ EXAMPLES = """\
   gp-ground-seg compare old.yaml new.yaml scans --json differences.json    scans/*.bin, no labels
 """
 COLUMNS = (
-    *(Column('sequence'), Column('frame'), Column('points', '_d'), percent('differ')),
-    *(percent('ground in A only'), percent('ground in B only')),
+    *(Column('sequence'), Column('frame'), Column('points', '_d')),
+    percent('differ', 'share_different'),
+    *(percent(f'ground in {name} only', f'share_{name}_only') for name in 'AB'),
 )
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'compare', DESCRIPTION, EXAMPLES)
-    root = 'folder in SemanticKITTI layout, a scan, or a folder of scans'
+    root = 'folder in SemanticKITTI layout; or a scan, a folder of scans, or a bag'
     options.add(
         parser,
         *((name, 'parameter file or preset', {'metavar': name.upper()}) for name in 'ab'),
@@ -94,10 +94,11 @@ def run(arguments: argparse.Namespace) -> int:
         ]
         bar = options.progress('compare')
         scores = score_methods(items, load, methods, progress=bar, watch=watch)
-        for name, (row, scan, labels) in zip(pictures if folder else [], worst, strict=False):
+        paths = [folder / name for name in pictures] if folder else []
+        for path, (row, scan, labels) in zip(paths, worst, strict=False):
             truth = next(iter(scan.truths.values()), None)
             title = f'{row[0]}/{row[1]}: {row[3]:.2%} of the points have two labels'
-            plot_two_labels(scan.points, labels, folder / name, truth, title)
+            plot_two_labels(scan.points, labels, path, truth, title)
         differences = comparison.find_differences(*scores)
         environment = report.describe_environment()
         if 'json' in parts:
@@ -126,15 +127,14 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _items(
-    arguments: argparse.Namespace,
-) -> tuple[Sequence[Any], Callable[[Any], KnownScan]]:
-    """Return labelled frames, or scans, and what reads one of them."""
+def _items(arguments: argparse.Namespace) -> tuple[Any, Callable[[Any], KnownScan]]:
+    """Return labelled frames, or clouds, and what reads one of them."""
     root, layout = Path(arguments.root), options.scan_layout(arguments)
     if any(root.glob('sequences/*/velodyne')):
         return frames_from_options(arguments), load_kitti
-    if arguments.sequences is not None:
-        raise DataError(f'--sequences: {root} has no sequences/*/velodyne below it')
+    for name in ('sequences', 'frame_step'):
+        if getattr(arguments, name) is not None:
+            option = name.replace('_', '-')
+            raise DataError(f'--{option}: {root} has no sequences/*/velodyne below it')
     group = root.resolve().stem
-    scans = find_scans(root)[:: arguments.frame_step or 1]
-    return scans, lambda path: KnownScan(group, path.stem, read_points(path, layout), {})
+    return list_inputs(root, layout), lambda one: KnownScan(group, one.name, one.read().xyz, {})

@@ -148,7 +148,7 @@ class ScanScore:
     @property
     def confusion(self) -> Confusion:
         """Counts in the convention that counts."""
-        return next(iter(self.confusions.values()))
+        return next(iter(self.confusions.values()), Confusion())
 
 
 @dataclass(frozen=True)
