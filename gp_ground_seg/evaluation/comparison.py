@@ -72,9 +72,11 @@ def difference_table(score: MethodScore, found: Sequence[Difference], names: lis
         if not math.isnan(one.first):
             cells = [show(one.first), show(one.second), signed(one.difference)]
             rows.append([column.title, *cells, None if math.isnan(one.low) else words])
-    drawn = f'{len(intervals.clusters(score))} blocks of successive frames'
-    if len(score.sequences) > 1:
-        drawn = f'{len(score.sequences)} sequences'
-    title = f'difference: {names[1]} minus {names[0]}; {intervals.interval_note(drawn)}'
+    n_parts = len(intervals.clusters(score))
+    kind = 'sequences' if len(score.sequences) > 1 else 'blocks of successive frames'
+    note = intervals.interval_note(f'{n_parts} {kind}')
+    if n_parts < 2:
+        note = 'no intervals: they need two sequences, or ten frames of one'
+    title = f'difference: {names[1]} minus {names[0]}; {note}'
     columns = [Column('measure'), *(Column(name, 's') for name in [*names, 'difference'])]
     return Table([*columns, intervals.INTERVAL], rows, title)
