@@ -274,7 +274,7 @@ def test_a_broken_cloud_of_a_bag_is_named(tmp_path, monkeypatch):
     def refuse(_):
         raise PointCloudError('no field x')
 
-    monkeypatch.setattr('gp_ground_seg.cli.bench.decode_cloud', refuse)
+    monkeypatch.setattr('gp_ground_seg.data.inputs.decode_cloud', refuse)
     write_ros2_bag(tmp_path / 'drive.mcap', n_clouds=2)
     with pytest.raises(DataError, match=r'drive\.mcap: message 0 of topic .*: no field x'):
         load_frames(tmp_path / 'drive.mcap', 60)

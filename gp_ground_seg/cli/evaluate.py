@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.segment import find_scans
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.boxes import find_boxes
+from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation import evaluate as methods
@@ -341,7 +341,7 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
         frames = methods.labelled_frames(root, chosen, layout)
     elif chosen is None and not any(root.glob('sequences/*/velodyne')):
         name = root.resolve().stem
-        frames = [Frame(name, path.stem, path, None, 0.0, layout) for path in find_scans(root)]
+        frames = [Frame(name, one.name, one.path, None, 0.0, layout) for one in list_inputs(root)]
     else:
         frames = methods.boxed_frames(root, chosen, layout)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)

@@ -6,7 +6,7 @@ import argparse
 import math
 import re
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -14,10 +14,10 @@ import numpy as np
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE, is_bag
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.inputs import Inputs, holds_bag, list_inputs
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
-from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.frame import Label
@@ -109,7 +109,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = options.new_parser(subparsers, 'pose', POSE_DESCRIPTION, POSE_EXAMPLES)
     options.add(
         parser,
-        ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}),
+        ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
+        ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
         *options.SCAN_LAYOUT,
         options.FORCE,
     )
@@ -121,26 +122,22 @@ def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
     config = options.read_config(arguments)
     source = Path(arguments.input)
-    holds_bag = is_bag(source)
-    if source.is_dir() and not any(source.glob('*.bin')):
-        # A folder of bag files and no scans: `BagReader` says what is missing there.
-        holds_bag |= any(child.suffix in BAG_SUFFIXES for child in source.iterdir())
-    scans = [] if holds_bag else find_scans(source)
-    kind, foreign = ('scans', ['raw']) if holds_bag else ('bags', FOR_BAGS)
+    is_bag = holds_bag(source)
+    kind, foreign = ('scans', ['raw']) if is_bag else ('bags', FOR_BAGS)
     for name in foreign:
         if getattr(arguments, name):
             option = name.replace('_', '-')
             raise DataError(f'--{option}: is for {kind}, which {source} is not')
-    if holds_bag:
+    if is_bag:
         options.refuse_scan_layout(arguments, source)
     target = Path(arguments.output) if arguments.output else _default_output(source)
     n_points = n_ground = 0
     seconds = []
     with closing(GroundSegmenter(config)) as segmenter:
-        if holds_bag:
+        if is_bag:
             results = _segment_bag(target, arguments, segmenter)
         else:
-            results = _segment_scans(scans, target, arguments, segmenter)
+            results = _segment_scans(target, arguments, segmenter)
         for result in results:
             n_points += len(result.label)
             n_ground += int((result.label == Label.GROUND).sum())
@@ -164,34 +161,13 @@ def _default_output(source: Path) -> Path:
     return named.with_name(f'{named.stem}_ground{suffix}')
 
 
-def find_scans(source: Path) -> list[Path]:
-    """Return the .bin files of a file, folder, sequence or KITTI raw drive, or raise DataError."""
-    if not source.exists():
-        raise DataError(f'{source}: no such file or folder')
-    if source.is_file():
-        if source.suffix != '.bin':
-            raise DataError(
-                f'{source}: not a scan or bag; accepted are .bin, .bag, .mcap and .db3 files, '
-                'folders of .bin files and rosbag2 folders'
-            )
-        return [source]
-    for name in ('.', 'velodyne', 'velodyne_points/data'):
-        if scans := sorted((source / name).glob('*.bin')):
-            return scans
-    sequences = sorted(path.parent for path in source.glob('sequences/*/velodyne'))
-    hint = ''
-    if sequences:
-        names = ', '.join(path.name for path in sequences)
-        hint = f'; give one of its sequences ({names}), as in {sequences[0]}'
-    raise DataError(f'{source}: no .bin file in it, and not a rosbag2 folder{hint}')
-
-
 def _segment_scans(
-    scans: Sequence[Path], target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
+    target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
 ) -> Iterator[Segmentation]:
     """Write one label file per scan; yield what each holds."""
     codes = sorted(Label) if arguments.raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
-    code, layout = np.array(codes, dtype='<u4'), options.scan_layout(arguments)
+    code = np.array(codes, dtype='<u4')
+    scans = list_inputs(arguments.input, options.scan_layout(arguments))
     if not arguments.quiet:
         options.note_leftovers(target)
     with (
@@ -200,9 +176,9 @@ def _segment_scans(
     ):
         for scan, label_path in zip(scans, label_paths, strict=True):
             try:
-                result = segmenter.segment(read_points(scan, layout))
+                result = segmenter.segment(scan.read().xyz)
             except PointCloudError as error:
-                raise PointCloudError(f'{scan}: {error}') from error
+                raise PointCloudError(f'{scan.path}: {error}') from error
             label_path.write_bytes(code[result.label].tobytes())
             yield result
             bar.update()
@@ -210,7 +186,7 @@ def _segment_scans(
 
 @contextmanager
 def _label_files(
-    scans: Sequence[Path], target: Path, arguments: argparse.Namespace
+    scans: Inputs, target: Path, arguments: argparse.Namespace
 ) -> Iterator[list[Path]]:
     """Yield where to write the labels of each scan; all take their names at the end."""
     if target.suffix == '.label':
@@ -219,7 +195,7 @@ def _label_files(
         with staged_file(target, force=arguments.force) as path:
             yield [path]
         return
-    names = [f'{scan.stem}.label' for scan in scans]
+    names = [f'{scan.name}.label' for scan in scans]
     with staged_files(target, names, force=arguments.force) as folder:
         yield [folder / name for name in names]
 
@@ -304,17 +280,17 @@ POSE_COLUMNS = (
 def run_pose(arguments: argparse.Namespace) -> int:
     """Print a line for each scan, and the medians."""
     poses, rows, notes = [], [], []
-    layout = options.scan_layout(arguments)
+    scans = list_inputs(arguments.input, options.scan_layout(arguments), arguments.topic)
     with closing(GroundSegmenter(options.read_config(arguments))) as segmenter:
-        for scan in find_scans(Path(arguments.input)):
+        for scan in scans:
             try:
-                pose = segmenter.estimate_pose(read_points(scan, layout))
+                pose = segmenter.estimate_pose(scan.read().xyz)
             except PointCloudError as error:
-                notes.append(f'{scan.name}: refused: {error}')
+                notes.append(f'{scan.title}: refused: {error}')
                 continue
             poses.append(pose)
-            rows.append(_pose_row(scan.name, pose))
-            notes += [f'{scan.name}: {line}' for line in pose.contradictions]
+            rows.append(_pose_row(scan.title, pose))
+            notes += [f'{scan.title}: {line}' for line in pose.contradictions]
     if poses:
         print(Table(POSE_COLUMNS, rows).text())
         notes.insert(0, _pose_summary(poses))

@@ -80,7 +80,12 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
 
 
 def read_points(path: str | Path, layout: ScanLayout = KITTI) -> npt.NDArray[np.float32]:
-    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4).
+    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4); raises as `read_scan`."""
+    return layout.points(read_scan(path, layout))
+
+
+def read_scan(path: str | Path, layout: ScanLayout) -> bytes:
+    """Bytes of a ``.bin`` file.
 
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
     points, or, where the layout asks for that, its numbers can be no scan.
@@ -94,7 +99,7 @@ def read_points(path: str | Path, layout: ScanLayout = KITTI) -> npt.NDArray[np.
         raise DataError(f'{path}: {doubt}; --force takes it as it is')
     if doubt:
         _LOGGER.warning('%s: %s', path, doubt)
-    return layout.points(data)
+    return data
 
 
 def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
