@@ -76,7 +76,7 @@ format: $(VENV)/.dev
 	$(BIN)/ruff format .
 
 generate: $(VENV)/.dev
-	$(BIN)/gp-ground-seg config generate .
+	$(BIN)/python docs/generate.py
 
 clean:
 	rm -rf $(VENV) build install log .mypy_cache .ruff_cache .pytest_cache .hypothesis

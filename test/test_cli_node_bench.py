@@ -35,11 +35,9 @@ def test_losses_are_reported_and_memory_is_seen(scans, tmp_path, capsys):
         '--memory-frames', '20', '--json', str(file), '--quiet',
         '--ros-args', '-p', 'learning.mode:=fixed',
     ]  # fmt: skip
-    code = cli.main(words)
+    assert cli.main(words) == 0
     document = json.loads(file.read_text())
     said = capsys.readouterr().out
-    sections = [*document['rates'], document['memory']]
-    assert code == (not all(met for one in sections for met in one['goals'].values()))
     slow, fast = document['rates']
     assert (slow['n_sent'], fast['n_sent']) == (30, 30)
     # Clouds that take some milliseconds, 1 ms apart: the oldest have to go.
@@ -58,7 +56,6 @@ def test_losses_are_reported_and_memory_is_seen(scans, tmp_path, capsys):
     assert 'Rate [Hz]' in said
     assert '1000' in said
     assert 'Memory over 20 clouds' in said
-    assert ('All goals met.' in said) == (code == 0)
 
 
 def test_a_node_that_cannot_start_is_an_error(scans, capsys):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, read_xyz
 from gp_ground_seg.data.scan_layout import ScanLayout
 from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
-from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
+from gp_ground_seg.errors import DataError, GroundSegError, require
 from gp_ground_seg.evaluation.evaluate import labelled_frames
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
 from gp_ground_seg.evaluation.report import Column
@@ -222,8 +221,7 @@ def result_text(
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
-    if importlib.util.find_spec('matplotlib') is None:
-        raise MissingDependencyError('the demo draws with matplotlib: pip install matplotlib')
+    require('matplotlib', 'plot')
     sequence = arguments.sequence
     if arguments.kitti is not None:
         sequence = sequence or list_sequences(arguments.kitti)[0]

@@ -15,7 +15,7 @@ from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Report, describe_environment, machine_line, written
 from gp_ground_seg.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
-from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
+from gp_ground_seg.experiments.variants import load_simulated, score_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
 from gp_ground_seg.simulation import DRIVES, SCENES, SENSORS
@@ -164,16 +164,16 @@ def _wrong_values(arguments: argparse.Namespace) -> Report:
 
 def _scenes(arguments: argparse.Namespace) -> Report:
     sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(DRIVES)
+    frames = simulated_frames(sensors, scenes, arguments.seeds or 3, variants.SCENE_PLACES)
     config, bar = options.read_config(arguments), options.progress('scenes')
-    seeds, peer = arguments.seeds or 3, _peer(arguments)
-    return variants.score_scenes(sensors, scenes, seeds, config, peer, bar)
+    return score_simulated(frames, variants.scene_tables, config, _peer(arguments), bar)
 
 
 def _objects(arguments: argparse.Namespace) -> Report:
-    scenes, seeds = arguments.scenes or lost.SCENES, arguments.seeds or 2
+    sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or lost.SCENES
+    frames = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
     config, bar = options.read_config(arguments), options.progress('objects')
-    sensors = arguments.sensors or list(SENSORS)
-    return lost.score_objects(sensors, scenes, seeds, config, _peer(arguments), bar)
+    return score_simulated(frames, lost.lost_tables, config, _peer(arguments), bar)
 
 
 def _coverage(arguments: argparse.Namespace) -> Report:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gp_ground_seg.data.semantic_kitti import Frame, read_labels, read_points
-from gp_ground_seg.errors import ConfigError, DataError, MissingDependencyError
+from gp_ground_seg.errors import ConfigError, DataError, require
 from gp_ground_seg.evaluation.evaluate import Progress
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confusion
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
@@ -97,12 +97,7 @@ def search(
     What is in the file `journal` is not done again. DataError if it is no journal, or that of
     another search: other parameters, or other `frames`.
     """
-    try:
-        import optuna
-        from optuna.storages import journal as journals
-    except ImportError as error:
-        text = "Optuna is not installed: pip install 'gp_ground_seg[tune]'"
-        raise MissingDependencyError(text) from error
+    optuna, journals = require('optuna', 'tune'), require('optuna.storages.journal', 'tune')
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     storage = None
     if journal is not None:
@@ -124,7 +119,7 @@ def search(
         raise DataError(f'{journal}: is of other parameters or frames; name another journal')
     study.set_user_attr('digest', digest)
 
-    def try_one(trial: optuna.Trial) -> float:
+    def try_one(trial: Any) -> float:
         choice = {spec.name: _suggest(trial, spec) for spec in specs}
         try:
             config = base.replace(**choice)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.errors import ConfigError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import report as results
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
@@ -141,30 +141,31 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
     return rows
 
 
-def score_scenes(
-    sensors: Sequence[str],
-    scenes: Sequence[str],
-    n_seeds: int,
+def score_simulated(
+    frames: Sequence[SimulatedFrame],
+    tables: Callable[[Sequence[MethodScore], Sequence[str]], dict[str, Table]],
     config: Config,
     peer: str | None,
     progress: Progress = iter,
 ) -> Report:
-    """Segment `n_seeds` simulated scenes of each name by each of the sensors.
+    """Segment simulated scans, all sensors with the parameters `config`.
 
-    The one of `PEERS` named runs on the same clouds, as `peer_of` makes it.
+    The one of `PEERS` named runs on the same clouds, as `peer_of` makes it. A sensor and scene of
+    which a scan is refused is left out; `tables` lays out the scores, with notes that say so.
     """
-    ours, theirs = [], []
-    for sensor in sensors:
-        frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
-        peers = [peer_of(sensor, peer)] if peer else []
-        own, *other = score_variants(
-            frames, load_simulated, {methods.OURS: config}, peers, progress=progress
-        )
-        ours.append(own)
-        theirs += other
-    pairs = [(methods.OURS, ours), (peer or '', theirs)]
-    scores = [methods.pool(name, own) for name, own in pairs if own]
-    return make_report({'scenes': scene_table(*scores)}, scores, config)
+    found: list[list[MethodScore]] = []
+    refused = []
+    groups = [list(own) for _, own in itertools.groupby(frames, lambda frame: frame.sequence)]
+    for own in progress(groups):
+        peers = [peer_of(own[0].sensor, peer)] if peer else []
+        try:
+            found.append(score_variants(own, load_simulated, {methods.OURS: config}, peers))
+        except PointCloudError as error:
+            refused.append(f'refused: {error}')
+    if not found:
+        raise PointCloudError('; '.join(refused))
+    scores = [methods.pool(parts[0].name, parts) for parts in zip(*found, strict=True)]
+    return make_report(tables(scores, refused), scores, config)
 
 
 def scene_parts(score: MethodScore) -> list[MethodScore]:
@@ -175,8 +176,9 @@ def scene_parts(score: MethodScore) -> list[MethodScore]:
     return [MethodScore(score.name, tuple(scans)) for scans in seeds.values()]
 
 
-def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
-    """One row for each sensor and scene; the note says where the peer is ahead in IoU."""
+def scene_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> dict[str, Table]:
+    """One row for each sensor and scene; a note says where the peer is ahead in IoU."""
+    ours, *peers = scores
     rows: list[Row] = []
     behind, ties = [], []
     for group in ours.sequences:
@@ -193,8 +195,7 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
                 (percent('no model', 'share_without_model'), share),
             ]
         )
-        if peer is not None:
-            its = peer.of(group)
+        for its in (peer.of(group) for peer in peers):
             median = its.height.median_absolute
             rows[-1] += [
                 (percent('its IoU', 'peer_iou'), its.iou),
@@ -213,15 +214,15 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
         f'{n_scans} simulated scans per row; IoU against exact labels [%], every point counts; '
         'height of the surface under true ground [cm]; share of it without a model [%]'
     )
-    notes = []
-    if peer is not None:
+    notes = [*refused]
+    if peers:
         title += (
-            f'; its: of {peer.title}, which has the true sensor height, and as surface its '
+            f'; its: of {peers[0].title}, which has the true sensor height, and as surface its '
             'nearest patch'
         )
         title += f'; {interval_note("scenes of each row")}'
         n_ahead = len(rows) - len(behind) - len(ties)
         where = f'; ties on {", ".join(ties)}' if ties else ''
         where += f'; behind on {", ".join(behind)}' if behind else ''
-        notes = [f'ahead of {peer.title} on {n_ahead} of {len(rows)} rows{where}']
-    return Table.of(rows, title=title, notes=notes)
+        notes.append(f'ahead of {peers[0].title} on {n_ahead} of {len(rows)} rows{where}')
+    return {'scenes': Table.of(rows, title=title, notes=notes)}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.errors import MissingDependencyError, PointCloudError
+from gp_ground_seg.errors import PointCloudError, require
 from gp_ground_seg.frame import FloatArray
 
 DPI = 120
@@ -32,13 +32,7 @@ _RAMP = np.array(
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Any:
     """Return an empty matplotlib figure [inch] outside pyplot's global state."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError(
-            "drawing needs matplotlib: pip install 'gp_ground_seg[plot]'"
-        ) from error
-    return Figure((width, height), dpi=dpi)
+    return require('matplotlib.figure', 'plot').Figure((width, height), dpi=dpi)
 
 
 def add_axes(figure: Any, left: float, bottom: float, size: tuple[float, float]) -> Any:

@@ -27,7 +27,6 @@ import numpy as np
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.point_cloud2 import CloudMessage, encode_cloud, stamp_of
 from gp_ground_seg.errors import GroundSegError
-from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.ros.lifecycle import (
     Session,
     large_cloud_transport,
@@ -39,8 +38,6 @@ from gp_ground_seg.ros.lifecycle import (
 INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'  # topics of the node
 START_TIMEOUT = 300.0  # time the node has to start, and to compile on a slow machine [s]
 SILENCE = 2.0  # time without a cloud after which what is still missing is lost [s]
-STEADY_FACTOR, STEADY_MARGIN = 1.5, 0.02
-"""How far latency may grow from the second quarter, which fills the queue, to the last [1, s]."""
 
 _RUN = """\
 from gp_ground_seg.ros.probe import run_node
@@ -333,29 +330,19 @@ class Probe:
 def rate_result(asked: float, trips: Sequence[Trip], n_dropped: int) -> dict[str, Any]:
     """Return the statistics of clouds sent at a rate of `asked` [Hz]; times in seconds."""
     latency = np.array([trip.latency for trip in trips])
-    quarter = len(trips) // 4
-    early = _percentile(latency[quarter : 2 * quarter], 50)
-    late = _percentile(latency[3 * quarter :], 50)
+    known = latency[np.isfinite(latency)]
     seconds = 1e-9 * (trips[-1].sent - trips[0].sent)
-    n_back = int(np.count_nonzero(np.isfinite(latency)))
-    percents = {'p50': 50, 'p95': 95, 'p99': 99, 'worst': 100}
+    percents = np.percentile(known, [50, 95, 99, 100]) if len(known) else np.full(4, np.nan)
     return {
         'asked': asked,
         'sent': (len(trips) - 1) / seconds if seconds > 0.0 else np.nan,
         'n_sent': len(trips),
-        'n_back': n_back,
-        'n_lost': len(trips) - n_back,
+        'n_back': len(known),
+        'n_lost': len(trips) - len(known),
         'n_dropped': n_dropped,
-        **{name: _percentile(latency, q) for name, q in percents.items()},
         'is_newest_back': trips[-1].back is not None,
-        'is_bounded': bool(late <= STEADY_FACTOR * early + STEADY_MARGIN),
-        'is_accounted': n_dropped == len(trips) - n_back,
+        **dict(zip(('p50', 'p95', 'p99', 'worst'), percents.tolist(), strict=True)),
     }
-
-
-def _percentile(latency: FloatArray, q: float) -> float:
-    known = latency[np.isfinite(latency)]
-    return float(np.percentile(known, q)) if len(known) else np.nan
 
 
 def memory_result(resident: Sequence[int], peak: int) -> dict[str, float]:
