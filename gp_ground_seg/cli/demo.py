@@ -239,7 +239,7 @@ def run(arguments: argparse.Namespace) -> int:
         probe_session('demo') as (session, words),
         # Right before the process that removes the folder if this one is killed.
         staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
-        NodeProcess(part / LOG, words, session.holding_back, part.parent) as node,
+        NodeProcess(part / LOG, words, part.parent) as node,
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)

@@ -184,9 +184,7 @@ def _measure(
         needing_ros('node-bench'),
         probing.probe_session('node_bench') as (session, own),
         tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
-        probing.NodeProcess(
-            Path(folder, 'log'), [*own, *words], session.holding_back, Path(folder)
-        ) as node,
+        probing.NodeProcess(Path(folder, 'log'), [*own, *words], Path(folder)) as node,
     ):
         probe = probing.Probe(session, lambda *_: None)
         if not quiet:

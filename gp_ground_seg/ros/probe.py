@@ -17,7 +17,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -77,21 +76,15 @@ class NodeProcess:
     """
 
     def __init__(
-        self,
-        log: Path,
-        ros_args: Sequence[str] = (),
-        uninterrupted: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
-        unfinished: Path | None = None,
+        self, log: Path, ros_args: Sequence[str] = (), unfinished: Path | None = None
     ) -> None:
         self._log = log
-        self._uninterrupted = uninterrupted
         words = [str(unfinished or ''), '--ros-args', *ros_args]
         self._command = [sys.executable, '-c', own_code(_RUN), *words]
 
     def __enter__(self) -> NodeProcess:
         """Start it."""
-        # An interrupt between the start and the assignment would leave it running.
-        with self._log.open('wb') as log, self._uninterrupted():
+        with self._log.open('wb') as log:
             self._process = subprocess.Popen(
                 self._command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT
             )
