@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label, simulation
-from gp_ground_seg.data.semantic_kitti import Frame
+from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
 from gp_ground_seg.errors import ConfigError, DataError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as runner
-from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore, labelled_frames
+from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore
 from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
 from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.experiments import (

@@ -6,13 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import report as results
-from gp_ground_seg.evaluation.evaluate import KnownScan, Progress
+from gp_ground_seg.evaluation.evaluate import KnownScan
 from gp_ground_seg.evaluation.metrics import (
     RING_EDGES,
     RING_TITLES,
@@ -24,7 +25,8 @@ from gp_ground_seg.evaluation.metrics import (
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.result import Segmentation
+from gp_ground_seg.result import FitReport, Segmentation
+from gp_ground_seg.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.segmenter import GroundSegmenter
 
 FINEST_STD = 1e-3
@@ -125,23 +127,36 @@ def compare_coverage(
     load: Callable[[Any], KnownScan],
     config: Config,
     kind: Kind,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> Report:
     """Segment each scan, without a past."""
     facts = {'config_changes': results.changed_parameters(config), 'config': config.nested()}
+    parts = runner.run(partial(_cover, load, config, kind.std), items)
+    rings = [one for own, _ in parts for one in own]
+    return Report(
+        {name: _table(rings, name, kind) for name in kind.keys},
+        [_row_of(one) for one in rings],
+        parts[-1][1],
+        {'std': kind.std, **facts},
+    )
+
+
+def _cover(
+    load: Callable[[Any], KnownScan],
+    config: Config,
+    std: str,
+    items: Sequence[Any],
+    progress: Progress,
+) -> tuple[list[RingCoverage], FitReport]:
+    """Coverage of some scans, and the fit of the last."""
     rings: list[RingCoverage] = []
     with closing(GroundSegmenter(config)) as segmenter:
         for item in progress(items):
             segmenter.reset()
             scan = load(item)
             found = segmenter.segment(scan.points)
-            rings += ring_coverages(scan, found, kind.std)
-    return Report(
-        {name: _table(rings, name, kind) for name in kind.keys},
-        [_row_of(one) for one in rings],
-        found.fit,
-        {'std': kind.std, **facts},
-    )
+            rings += ring_coverages(scan, found, std)
+    return rings, found.fit
 
 
 def ring_coverages(scan: KnownScan, found: Segmentation, std: str) -> list[RingCoverage]:

@@ -115,12 +115,17 @@ class CloudSubscription:
         node.create_timer(1.0, self._review_soon.trigger, clock=STEADY_CLOCK)
 
     @property
+    def qos(self) -> QoSProfile:
+        """Quality of service in use: of two, that of the reliable subscription."""
+        only_best_effort = self._n_best_effort == self.n_publishers
+        used = self._best_effort if self._best_effort and only_best_effort else self._subscription
+        return used.qos_profile
+
+    @property
     def qos_words(self) -> str:
-        """Quality of service in use, as in ``reliable, keep_last 5, volatile``."""
-        is_mixed = self._n_best_effort < self.n_publishers
-        used = self._subscription if is_mixed or not self._best_effort else self._best_effort
-        words = in_words(used.qos_profile)
-        if self._best_effort and is_mixed:
+        """`qos` as in ``reliable, keep_last 5, volatile``."""
+        words = in_words(self.qos)
+        if self._best_effort and self._n_best_effort < self.n_publishers:
             words += f'; best_effort from {self._n_best_effort} of {self.n_publishers} publishers'
         return words
 
