@@ -257,7 +257,7 @@ def test_scores_of_the_search_are_those_of_evaluate(frames):
 def test_scene_scores_follow_their_definitions():
     config = Config().replace(**{'grid.n_segments': 120})
     frames = variants.simulated_frames(['vlp-16'], ['kerb'], 2, (6.0,))
-    report = variants.score_simulated(frames, variants.scene_tables, config, with_peer=True)
+    report = variants.score_simulated(frames, variants.scene_tables, config, peer='patchworkpp')
     (row,) = report.tables['scenes'].json()
     total, its_total = Confusion(), Confusion()
     errors, its_errors = [], []
@@ -300,7 +300,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
 
     monkeypatch.setattr(variants, 'score_variants', refuse_hedges)
     frames = variants.simulated_frames([sensor], [scene, 'hedge'], 1, (0.0,))
-    report = variants.score_simulated(frames, lost.lost_tables, FIXED, with_peer=True)
+    report = variants.score_simulated(frames, lost.lost_tables, FIXED, peer='patchworkpp')
     (row,), (shares,) = (report.tables[name].json() for name in ('objects', 'vehicles'))
     made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
     x, y, z, _ = made.points.T.astype(float)
@@ -331,7 +331,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
     assert notes[0] == 'refused: hedge: z does not point up'
     assert notes[1].startswith(f'objects lost: {sensor} {scene} {row["lost_vehicles"]} of')
     with pytest.raises(PointCloudError, match='refused: hedge'):
-        variants.score_simulated(frames[1:], lost.lost_tables, FIXED, with_peer=False)
+        variants.score_simulated(frames[1:], lost.lost_tables, FIXED, peer=None)
 
 
 def test_behind_is_said():
@@ -399,7 +399,7 @@ def test_poses_of_simulated_scans(monkeypatch):
 def test_in_traffic_no_vehicle_is_lost(sensor):
     """Cars hide the ground near the sensor; docs/accuracy.md has the table."""
     frames = variants.simulated_frames([sensor], ['traffic_jam', 'car_park'], 1, (0.0,))
-    report = variants.score_simulated(frames, lost.lost_tables, Config(), with_peer=False)
+    report = variants.score_simulated(frames, lost.lost_tables, Config(), peer=None)
     for row in report.tables['objects'].json():
         assert row['vehicles'] > 20 and row['lost_vehicles'] == 0, row
     for row in report.tables['vehicles'].json():

@@ -8,7 +8,7 @@ import sys
 from gp_ground_seg.cli import options
 from gp_ground_seg.parameters import export
 from gp_ground_seg.parameters.config import Config, parameter_specs
-from gp_ground_seg.parameters.presets import PRESETS, find_preset
+from gp_ground_seg.parameters.presets import find_preset
 from gp_ground_seg.parameters.schema import read_parameters
 
 EXAMPLES = """\
@@ -84,12 +84,6 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 def run_diff(arguments: argparse.Namespace) -> int:
     """Print the parameters that differ."""
-    first, second = (
-        PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
-        for name in (arguments.a, arguments.b)
-    )
-    different = export.differences(first, second)
-    for spec, before, after in different:
-        unit = f' {spec.unit}' if spec.unit else ''
-        print(f'{spec.name}: {export.yaml_scalar(before)} -> {export.yaml_scalar(after)}{unit}')
+    different = options.changed_lines(*map(options.named_config, (arguments.a, arguments.b)))
+    print(*different, sep='\n', end='\n' * bool(different))
     return 1 if different else 0

@@ -24,7 +24,7 @@ from gp_ground_seg.evaluation import report as tables
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore
 from gp_ground_seg.evaluation.intervals import INTERVAL, Sums, interval_note, interval_text
 from gp_ground_seg.evaluation.object_table import object_table
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
@@ -44,8 +44,8 @@ instances of the labels (their upper 16 bits), or given as boxes, a file for eac
 
 Without labels only objects are counted, from the bottom of their boxes.
 
-Patchwork++ (--peer) has its published parameters; a height and a place of the sensor that are
-given (sensor.height, sensor.origin_x, ...) are given to it too.
+Patchwork++ or Patchwork (--peer) has its published parameters; a height and a place of the
+sensor that are given (sensor.height, sensor.origin_x, ...) are given to it too.
 """
 EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
@@ -76,7 +76,7 @@ RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
-    peers = {'choices': (methods.PATCHWORKPP,)}
+    peers = {'choices': PEERS}
     options.add(
         parser,
         ROOT,
@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
         items, load = _items_from_options(arguments)
         chosen: list[methods.Method] = [stack.enter_context(closing(methods.OurMethod(config)))]
         if arguments.peer is not None:
-            chosen.append(PatchworkppMethod.of_sensor(config.sensor))
+            chosen.append(PEERS[arguments.peer].of_sensor(config.sensor))
         runner = stack.enter_context(options.runner(arguments, 'evaluate'))
         scores = methods.score_methods(items, load, chosen, runner=runner)
         report = make_report(

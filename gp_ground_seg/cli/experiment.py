@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, staged_options
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.evaluate import load_kitti
+from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, load_kitti
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Report, describe_environment, machine_line, written
 from gp_ground_seg.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
@@ -42,7 +43,11 @@ CROWDED_LIST = _some_of('--scenes', SCENES, lost.SCENES)
 SENSOR_LIST = _some_of('--sensors', SENSORS, DEFAULT_SENSORS)
 EVERY_SENSOR = _some_of('--sensors', SENSORS, SURVEYED)
 EVERY_MOUNT = _some_of('--sensors', SENSORS, ['all'])
-NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
+NO_PEER = ('--no-peer', 'leave the peer out', options.FLAG)
+PEER = (
+    '--peer', 'the method beside ours (default: %(default)s)',
+    {'choices': PEERS, 'default': PATCHWORKPP},
+)  # fmt: skip
 SWITCH = (
     '--switch',
     'measure this departure instead, and the parameters that switch it off (may be repeated)',
@@ -115,6 +120,10 @@ def _name(option: Option) -> str:
     return option[0].lstrip('-').replace('-', '_')
 
 
+def _peer(arguments: argparse.Namespace) -> str | None:
+    return None if arguments.no_peer else arguments.peer
+
+
 def _check_source(arguments: argparse.Namespace) -> None:
     """Refuse options that contradict one another."""
     if arguments.simulated == (arguments.root is not None):
@@ -154,7 +163,7 @@ def _steps(arguments: argparse.Namespace, runner: Runner) -> Report:
     if options.read_config(arguments) != Config():
         raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
     frames = frames_from_options(arguments)
-    return stepwise.score_steps(frames, not arguments.no_peer, runner)
+    return stepwise.score_steps(frames, _peer(arguments), runner)
 
 
 def _wrong_values(arguments: argparse.Namespace, runner: Runner) -> Report:
@@ -166,14 +175,14 @@ def _scenes(arguments: argparse.Namespace, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(DRIVES)
     frames = simulated_frames(sensors, scenes, arguments.seeds or 3, variants.SCENE_PLACES)
     config = options.read_config(arguments)
-    return score_simulated(frames, variants.scene_tables, config, not arguments.no_peer, runner)
+    return score_simulated(frames, variants.scene_tables, config, _peer(arguments), runner)
 
 
 def _objects(arguments: argparse.Namespace, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or lost.SCENES
     frames = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
     config = options.read_config(arguments)
-    return score_simulated(frames, lost.lost_tables, config, not arguments.no_peer, runner)
+    return score_simulated(frames, lost.lost_tables, config, _peer(arguments), runner)
 
 
 def _coverage(arguments: argparse.Namespace, runner: Runner) -> Report:
@@ -264,7 +273,7 @@ and two, by sequence and range. On labelled frames that of the returns (return_s
 Go from the paper's method to the defaults, one step after the other, beside Patchwork++ and a
 surface that is interpolated, with our labels.
 """,
-        (ROOT, *OF_FRAMES, NO_PEER),
+        (ROOT, *OF_FRAMES, PEER, NO_PEER),
         _steps,
     ),
     'wrong-values': Experiment(
@@ -279,7 +288,7 @@ Give hyper-parameters that are wrong by factors of 3 and 10, with and without le
 Score simulated scans by exact labels and heights, beside Patchwork++ with its published
 parameters and the true height of the sensor. All sensors have one set of parameters.
 """,
-        (SENSOR_LIST, SCENE_LIST, SEEDS, NO_PEER),
+        (SENSOR_LIST, SCENE_LIST, SEEDS, PEER, NO_PEER),
         _scenes,
     ),
     'objects': Experiment(
@@ -288,7 +297,7 @@ Count vehicles, persons and cyclists of simulated scans that are called ground, 
 Patchwork++ with its published parameters and the true height and place of the sensor. All
 sensors have one set of parameters.
 """,
-        (EVERY_MOUNT, CROWDED_LIST, SEEDS, NO_PEER),
+        (EVERY_MOUNT, CROWDED_LIST, SEEDS, PEER, NO_PEER),
         _objects,
     ),
     'cross-validation': Experiment(

@@ -24,6 +24,8 @@ ROS_ARGS = '--ros-args'
 COMMANDS = {
     'segment': ('segment', 'label scans, or split the clouds of a bag'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
+    'compare': ('compare', 'two configurations on the same frames'),
+    'optimise': ('optimise', 'search parameters on your labelled frames'),
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
     'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),

@@ -19,6 +19,7 @@ from gp_ground_seg.data.atomic_output import leftovers
 from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.export import differences, yaml_scalar
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.parameters.schema import load_yaml
 from gp_ground_seg.scale.cluster import Runner, open_runner
@@ -153,6 +154,19 @@ def read_config(arguments: argparse.Namespace) -> Config:
     if arguments.config:
         config = Config.from_yaml(arguments.config, config)
     return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
+
+
+def named_config(name: str) -> Config:
+    """Return the parameters of a preset, or of a file."""
+    return PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
+
+
+def changed_lines(first: Config, second: Config) -> list[str]:
+    """Return a line for each parameter that differs, as in ``grid.n_bins: 80 -> 120``."""
+    return [
+        f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)} {spec.unit}'.rstrip()
+        for spec, before, after in differences(first, second)
+    ]
 
 
 def parse_setting(setting: str) -> tuple[str, Any]:

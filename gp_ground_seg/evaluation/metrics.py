@@ -306,6 +306,9 @@ class HeightError:
     sum_error: float  # [m]
     sum_squared_error: float  # [m^2]
     sum_squared_deviation: float  # of the truth from its mean in the frame [m^2]
+    n_with_std: int  # points whose standard deviation is known
+    n_within_1: int  # of these the ones with an error of at most one standard deviation
+    n_within_2: int
     median_absolute: float  # [m]; pooled the median over the frames
 
     @property
@@ -325,18 +328,27 @@ class HeightError:
 
 
 def height_error(
-    truth: npt.NDArray[np.floating], estimate: npt.NDArray[np.floating]
+    truth: npt.NDArray[np.floating],
+    estimate: npt.NDArray[np.floating],
+    std: npt.NDArray[np.floating] | None = None,
 ) -> HeightError:
-    """Compare true with estimated heights of the ground, (n,) [m]; NaN where there is no model."""
+    """Compare true with estimated heights of the ground, (n,) [m]; NaN where there is no model.
+
+    `std` are the standard deviations of the differences, (n,) [m], where they are told.
+    """
     known = np.isfinite(estimate)
     y = truth[known].astype(np.float64)
     error = estimate[known] - y
+    spread = np.full(len(y), np.nan) if std is None else std[known]
     return HeightError(
         n_points=len(y),
         n_without_model=len(truth) - len(y),
         sum_error=float(error.sum()),
         sum_squared_error=float(error @ error),
         sum_squared_deviation=float(np.sum((y - y.mean()) ** 2)) if len(y) else 0.0,
+        n_with_std=int(np.isfinite(spread).sum()),
+        n_within_1=int((np.abs(error) <= spread).sum()),
+        n_within_2=int((np.abs(error) <= 2.0 * spread).sum()),
         median_absolute=float(np.median(np.abs(error))) if len(y) else math.nan,
     )
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 from gp_ground_seg.evaluation.evaluate import MethodScore
 from gp_ground_seg.evaluation.objects import MIN_HEIGHT, MIN_RETURNS, ObjectCount
 from gp_ground_seg.evaluation.report import Column, Row, Table, percent
-from gp_ground_seg.experiments.variants import PEER
 from gp_ground_seg.simulation import PLACES
 
 SCENES = (*PLACES, 'urban')
@@ -60,9 +59,11 @@ def lost_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> d
     objects_notes = [*refused, f'objects lost: {", ".join(lost) or "none"}']
     returns_notes = []
     if len(scores) > 1:
-        of_objects += f'; its: of {PEER}, which has the true height and place of the sensor'
-        objects_notes.append(f'IoU behind {PEER}: {", ".join(behind) or "nowhere"}')
-        returns_notes = [f'more than {PEER}: {", ".join(more) or "nowhere"}']
+        of_objects += (
+            f'; its: of {scores[1].title}, which has the true height and place of the sensor'
+        )
+        objects_notes.append(f'IoU behind {scores[1].title}: {", ".join(behind) or "nowhere"}')
+        returns_notes = [f'more than {scores[1].title}: {", ".join(more) or "nowhere"}']
     return {
         'objects': Table.of(objects, title=of_objects, notes=objects_notes),
         'vehicles': Table.of(returns, title=of_returns, notes=returns_notes),

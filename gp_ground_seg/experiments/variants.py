@@ -18,7 +18,7 @@ from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
 from gp_ground_seg.evaluation.objects import BAND_TITLES, GROUPS, Objects
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS, PatchworkppMethod
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
@@ -33,7 +33,6 @@ SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
 OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
 """What rays hit of objects, by the classes of `GROUPS`; crates are boxes too, but no objects."""
-PEER = methods.TITLES[methods.PATCHWORKPP]
 
 
 class SimulatedFrame(NamedTuple):
@@ -73,10 +72,10 @@ def simulated_frames(
     return [SimulatedFrame(*case) for case in cases if not case[3] or case[1] not in PLACES]
 
 
-def peer_of(sensor: str) -> PatchworkppMethod:
-    """Return Patchwork++, told where a simulated sensor is in its cloud and above the ground."""
+def peer_of(sensor: str, peer: str = methods.PATCHWORKPP) -> PatchworkppMethod:
+    """Return one of `PEERS`, told where a simulated sensor is in its cloud and how high."""
     model = SENSORS[sensor]
-    return PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
+    return PEERS[peer](model.height, model.origin or (0.0, 0.0, 0.0))
 
 
 def refuse_changed(config: Config, names: Iterable[str]) -> None:
@@ -148,16 +147,16 @@ def score_simulated(
     frames: Sequence[SimulatedFrame],
     tables: Callable[[Sequence[MethodScore], Sequence[str]], dict[str, Table]],
     config: Config,
-    with_peer: bool,
+    peer: str | None,
     runner: Runner = HERE,
 ) -> Report:
     """Segment simulated scans, all sensors with the parameters `config`.
 
-    Patchwork++ runs on the same clouds, as `peer_of` makes it. A sensor and scene of which a scan
-    is refused is left out; `tables` lays out the scores, with notes that say so.
+    The one of `PEERS` named runs on the same clouds, as `peer_of` makes it. A sensor and scene of
+    which a scan is refused is left out; `tables` lays out the scores, with notes that say so.
     """
     groups = [list(own) for _, own in itertools.groupby(frames, lambda frame: frame.sequence)]
-    parts = runner.run(partial(_score_groups, config, with_peer), groups)
+    parts = runner.run(partial(_score_groups, config, peer), groups)
     outcomes = list(itertools.chain(*parts))
     refused = [one for one in outcomes if isinstance(one, str)]
     found = [one for one in outcomes if not isinstance(one, str)]
@@ -169,14 +168,14 @@ def score_simulated(
 
 def _score_groups(
     config: Config,
-    with_peer: bool,
+    peer: str | None,
     groups: Sequence[Sequence[SimulatedFrame]],
     progress: Progress,
 ) -> list[list[MethodScore] | str]:
     """Scores of each group of scans, of one sensor in one scene, or why one is refused."""
     outcomes: list[list[MethodScore] | str] = []
     for frames in progress(groups):
-        peers = [peer_of(frames[0].sensor)] if with_peer else []
+        peers = [peer_of(frames[0].sensor, peer)] if peer else []
         try:
             ours = {methods.OURS: config}
             outcomes.append(score_variants(frames, load_simulated, ours, peers))
@@ -234,11 +233,12 @@ def scene_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> 
     notes = [*refused]
     if peers:
         title += (
-            f'; its: of {PEER}, which has the true sensor height, and as surface its nearest patch'
+            f'; its: of {peers[0].title}, which has the true sensor height, and as surface its '
+            'nearest patch'
         )
         title += f'; {interval_note("scenes of each row")}'
         n_ahead = len(rows) - len(behind) - len(ties)
         where = f'; ties on {", ".join(ties)}' if ties else ''
         where += f'; behind on {", ".join(behind)}' if behind else ''
-        notes.append(f'ahead of {PEER} on {n_ahead} of {len(rows)} rows{where}')
+        notes.append(f'ahead of {peers[0].title} on {n_ahead} of {len(rows)} rows{where}')
     return {'scenes': Table.of(rows, title=title, notes=notes)}

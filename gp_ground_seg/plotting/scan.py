@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,9 @@ COLOURS_ABOVE = {
     'right': '#BCC2C8',
     'missed ground': style.BLUE,
     'false ground': style.VERMILION,
+    'same label': '#BCC2C8',
+    'ground in A only': style.BLUE,
+    'ground in B only': style.VERMILION,
 }
 EXTENT, RING_STEP = 50.0, 10.0
 """Half the side of the square seen from above, and the step between the rings in it [m]."""
@@ -167,10 +171,47 @@ def plot_birds_eye(
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=label, truth=truth)
-    xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
     panels = [_label_panel(label)]
     if truth is not None:
         panels.append(_error_panel(label, truth))
+    _draw_panels(xyz, panels, path, title)
+    return panels[-1][0]
+
+
+def plot_two_labels(
+    points: npt.ArrayLike,
+    labels: Sequence[Labels],
+    path: str | Path,
+    truth: Labels | None = None,
+    title: str = '',
+) -> None:
+    """Draw what two methods, A and B, say of points (N, >=3) [m] from above, as a PNG.
+
+    A panel for each, with its errors where the true labels are given, and one of where they
+    differ. The file `path` is replaced.
+    """
+    xyz = check_points(points)
+    one, other = labels
+    style.check_lengths(len(xyz), A=one, B=other, truth=truth)
+    own = [
+        _label_panel(label) if truth is None else _error_panel(label, truth) for label in labels
+    ]
+    panels = [(f'{name}: {text}', layers) for name, (text, layers) in zip('AB', own, strict=True)]
+    only_a, only_b = (
+        (a == Label.GROUND) & (b != Label.GROUND) for a, b in ((one, other), (other, one))
+    )
+    layers = {'same label': one == other, 'unknown': (one != other) & ~only_a & ~only_b}
+    layers |= {'ground in A only': only_a, 'ground in B only': only_b}
+    n_a, n_b = (_thousands(int(chosen.sum())) for chosen in (only_a, only_b))
+    panels.append((f'{n_a} ground in A only, {n_b} in B only', layers))
+    _draw_panels(xyz, panels, path, title)
+
+
+def _draw_panels(
+    xyz: FloatArray, panels: Sequence[tuple[str, Layers]], path: str | Path, title: str
+) -> None:
+    """Draw panels side by side."""
+    xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
     width = LEFT + SQUARE + RIGHT
     height = BELOW + SQUARE + ABOVE + (LINE if title else 0.0)
     figure = new_figure(width * len(panels), height)
@@ -182,7 +223,6 @@ def plot_birds_eye(
         axes.set_ylabel('x, forward [m]')
         _draw_panel(axes, xy, layers)
     save(figure, path)
-    return panels[-1][0]
 
 
 def _label_panel(label: Labels) -> tuple[str, Layers]:
@@ -222,7 +262,7 @@ def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None
         x, y = xy[chosen & inside].T
         if len(x):
             shown[name] = colour = COLOURS_ABOVE[name]
-            size = 3.0 if name in ('missed ground', 'false ground') else 1.0
+            size = 3.0 if COLOURS_ABOVE[name] in (style.BLUE, style.VERMILION) else 1.0
             axes.scatter(y, x, s=size, c=colour, linewidths=0.0, zorder=depth)
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
     for radius in np.arange(RING_STEP, EXTENT * math.sqrt(2.0), RING_STEP):
