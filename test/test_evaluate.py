@@ -14,10 +14,11 @@ from evaluation_samples import HeightRule, street, write_frame, write_streets
 from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation import metrics
-from gp_ground_seg.evaluation.evaluate import OurMethod, labelled_frames
+from gp_ground_seg.evaluation.evaluate import OurMethod
 from gp_ground_seg.evaluation.metrics import ClassCount, Confusion, height_error
 from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.experiments.variants import SimulatedFrame, load_simulated, peer_of

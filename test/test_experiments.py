@@ -12,11 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label, simulation
-from gp_ground_seg.data.semantic_kitti import Frame
+from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
 from gp_ground_seg.errors import ConfigError, DataError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as runner
-from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore, labelled_frames
-from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
+from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore
+from gp_ground_seg.evaluation.metrics import (
+    Confusion,
+    count_confusion,
+    height_error,
+    pool_height_errors,
+)
 from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.experiments import (
     ablation,
@@ -157,11 +162,11 @@ def test_coverage_of_normal_errors_is_what_the_normal_distribution_says(seed, fa
     rng = np.random.default_rng(seed)
     std = rng.uniform(0.02, 0.2, 5000)
     error = rng.normal(bias, std)
-    error[::10], std[1::10] = np.nan, np.nan
-    said, known = factor * std, np.isfinite(error) & np.isfinite(std)
-    parts = [coverage.count_coverage(*pair) for pair in ((error[:99], said[:99]),
-             (error[99:], said[99:]))]  # fmt: skip
-    found = sum(parts, coverage.Coverage())
+    error[::10], std[::10] = np.nan, np.nan
+    said, known = factor * std, np.isfinite(error)
+    truth = rng.normal(size=5000)
+    parts = [height_error(truth[k], (truth + error)[k], said[k]) for k in (np.s_[:99], np.s_[99:])]
+    found = pool_height_errors(parts)
     e, s = error[known], said[known]
     assert found.n_points == known.sum()
     assert found.within_1 == np.mean(np.abs(e) <= s)
@@ -169,7 +174,8 @@ def test_coverage_of_normal_errors_is_what_the_normal_distribution_says(seed, fa
     assert found.bias == pytest.approx(np.mean(e))
     assert found.rmse == pytest.approx(np.sqrt(np.mean(e**2)))
     assert found.nlpd == pytest.approx(-np.mean(scipy.stats.norm.logpdf(e, 0.0, s)))
-    assert np.isnan(coverage.Coverage().within_1) and np.isnan(coverage.Coverage().nlpd)
+    nothing = pool_height_errors([])
+    assert np.isnan(nothing.within_1) and np.isnan(nothing.nlpd)
 
 
 def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):

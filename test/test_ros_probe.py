@@ -1,4 +1,4 @@
-"""Losses, latency and growth, from times."""
+"""Losses and latency, from times."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.ros.probe import Trip, memory_result, rate_result
+from gp_ground_seg.ros.probe import Trip, rate_result
 
 
 def trips_of(latencies, period=0.1):
@@ -35,13 +35,3 @@ def test_counts_and_percentiles(latencies, n_dropped):
         np.testing.assert_allclose(found, expected, atol=1e-8)
     else:
         assert math.isnan(result['p50'])
-
-
-@given(st.integers(10, 3000), st.floats(-0.1, 0.5))
-def test_growth_is_that_after_the_start(n, growth):
-    share = n // 10
-    # Buffers are taken once.
-    resident = [100e6] * share + [300e6] * (n - 2 * share) + [300e6 * (1.0 + growth)] * share
-    result = memory_result(resident, peak=10**9)
-    assert result['growth'] == pytest.approx(growth, abs=1e-9)
-    assert (result['n_clouds'], result['peak']) == (n, 1e9)

@@ -21,6 +21,7 @@ from gp_ground_seg.evaluation.metrics import Labels
 from gp_ground_seg.evaluation.report import Column, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.scan import plot_two_labels
+from gp_ground_seg.scale.cluster import Runner
 
 DESCRIPTION = """\
 Run two configurations alternately on the same frames, and say in what they differ: IoU,
@@ -93,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
             for config, name in zip(configs, 'AB', strict=True)
         ]
         bar = options.progress('compare')
-        scores = score_methods(items, load, methods, progress=bar, watch=watch)
+        scores = score_methods(items, load, methods, runner=Runner(bar), watch=watch)
         paths = [folder / name for name in pictures] if folder else []
         for path, (row, scan, labels) in zip(paths, worst, strict=False):
             truth = next(iter(scan.truths.values()), None)

@@ -18,9 +18,13 @@ from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, read_xyz
 from gp_ground_seg.data.scan_layout import ScanLayout
-from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import (
+    labelled_frames,
+    list_sequences,
+    read_labels,
+    read_points,
+)
 from gp_ground_seg.errors import DataError, GroundSegError, require
-from gp_ground_seg.evaluation.evaluate import labelled_frames
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
 from gp_ground_seg.evaluation.report import Column
 from gp_ground_seg.frame import Label
@@ -239,7 +243,7 @@ def run(arguments: argparse.Namespace) -> int:
         probe_session('demo') as (session, words),
         # Right before the process that removes the folder if this one is killed.
         staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
-        NodeProcess(part / LOG, words, session.holding_back, part.parent) as node,
+        NodeProcess(part / LOG, words, part.parent) as node,
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)

@@ -18,6 +18,7 @@ from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import load_simulated, score_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
+from gp_ground_seg.scale.cluster import Runner
 from gp_ground_seg.simulation import DRIVES, SCENES, SENSORS
 
 Option = tuple[str, str, dict[str, Any]]
@@ -25,6 +26,7 @@ Option = tuple[str, str, dict[str, Any]]
 DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 SURVEYED = ('hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360')  # by `coverage`
 
+ONE_PROCESS = ('table1',)  # it measures times
 OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
 SEEDS = ('--seeds', 'simulated scenes of each kind', options.NUMBER)
@@ -66,7 +68,7 @@ class Experiment(NamedTuple):
 
     description: str
     options: tuple[Option, ...]
-    run: Callable[[argparse.Namespace], Report]
+    run: Callable[[argparse.Namespace, Runner], Report]
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -85,6 +87,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         options.add(own, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
+        if name in ONE_PROCESS:
+            own.set_defaults(workers=None, scheduler=None)
+        else:
+            options.add_cluster(own)
         options.add_config(own)
         own.set_defaults(run=run)
 
@@ -95,12 +101,15 @@ def run(arguments: argparse.Namespace) -> int:
     if SIMULATED in experiment.options:
         _check_source(arguments)
     with staged_options(arguments, 'json') as parts:
-        report = experiment.run(arguments)
+        with options.runner(arguments, arguments.experiment) as runner:
+            report = experiment.run(arguments, runner)
+            n_workers = runner.n_workers
         has_peer = not getattr(arguments, 'no_peer', True)
         environment = describe_environment(*(['pypatchworkpp'] if has_peer else []))
+        environment['n_workers'] = n_workers
         if 'json' in parts:
-            options = {name: getattr(arguments, name) for name in map(_name, experiment.options)}
-            report.facts.update(experiment=arguments.experiment, options=options)
+            given = {name: getattr(arguments, name) for name in map(_name, experiment.options)}
+            report.facts.update(experiment=arguments.experiment, options=given)
             report.write(parts['json'], environment)
     lines = [machine_line(environment, report.fit)]
     print(written(report.tables.values(), lines, markdown=arguments.markdown))
@@ -125,20 +134,20 @@ def _check_source(arguments: argparse.Namespace) -> None:
             raise DataError(f'{option[0]}: is for {kind} only')
 
 
-def _ablation(arguments: argparse.Namespace) -> Report:
-    config, bar = options.read_config(arguments), options.progress('ablation')
+def _ablation(arguments: argparse.Namespace, runner: Runner) -> Report:
+    config = options.read_config(arguments)
     if not arguments.simulated:
-        return ablation.compare_models(frames_from_options(arguments), load_kitti, config, bar)
+        return ablation.compare_models(frames_from_options(arguments), load_kitti, config, runner)
     seeds = arguments.seeds or 10
     frames = simulated_frames(['hdl-64e'], [ablation.SCENE], seeds, ablation.PLACES)
-    return ablation.compare_models(frames, load_simulated, config, bar)
+    return ablation.compare_models(frames, load_simulated, config, runner)
 
 
-def _departures(arguments: argparse.Namespace) -> Report:
+def _departures(arguments: argparse.Namespace, runner: Runner) -> Report:
     config = options.read_config(arguments)
     chosen = [parse_departure(text) for text in arguments.switch or []] or ablation.DEPARTURES
     frames = frames_from_options(arguments)
-    return ablation.compare_departures(frames, chosen, config, options.progress('departures'))
+    return ablation.compare_departures(frames, chosen, config, runner)
 
 
 def parse_departure(text: str) -> ablation.Departure:
@@ -150,47 +159,46 @@ def parse_departure(text: str) -> ablation.Departure:
     return ablation.Departure(title.strip(), dict(map(options.parse_setting, settings)))
 
 
-def _steps(arguments: argparse.Namespace) -> Report:
+def _steps(arguments: argparse.Namespace, runner: Runner) -> Report:
     if options.read_config(arguments) != Config():
         raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
-    frames, bar = frames_from_options(arguments), options.progress('steps')
-    return stepwise.score_steps(frames, _peer(arguments), bar)
+    frames = frames_from_options(arguments)
+    return stepwise.score_steps(frames, _peer(arguments), runner)
 
 
-def _wrong_values(arguments: argparse.Namespace) -> Report:
-    config, bar = options.read_config(arguments), options.progress('wrong-values')
-    return stepwise.score_wrong_values(frames_from_options(arguments), config, bar)
+def _wrong_values(arguments: argparse.Namespace, runner: Runner) -> Report:
+    config = options.read_config(arguments)
+    return stepwise.score_wrong_values(frames_from_options(arguments), config, runner)
 
 
-def _scenes(arguments: argparse.Namespace) -> Report:
+def _scenes(arguments: argparse.Namespace, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(DRIVES)
     frames = simulated_frames(sensors, scenes, arguments.seeds or 3, variants.SCENE_PLACES)
-    config, bar = options.read_config(arguments), options.progress('scenes')
-    return score_simulated(frames, variants.scene_tables, config, _peer(arguments), bar)
+    config = options.read_config(arguments)
+    return score_simulated(frames, variants.scene_tables, config, _peer(arguments), runner)
 
 
-def _objects(arguments: argparse.Namespace) -> Report:
+def _objects(arguments: argparse.Namespace, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or lost.SCENES
     frames = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
-    config, bar = options.read_config(arguments), options.progress('objects')
-    return score_simulated(frames, lost.lost_tables, config, _peer(arguments), bar)
+    config = options.read_config(arguments)
+    return score_simulated(frames, lost.lost_tables, config, _peer(arguments), runner)
 
 
-def _coverage(arguments: argparse.Namespace) -> Report:
-    config, bar = options.read_config(arguments), options.progress('coverage')
+def _coverage(arguments: argparse.Namespace, runner: Runner) -> Report:
+    config = options.read_config(arguments)
     if not arguments.simulated:
         frames = frames_from_options(arguments)
-        return coverage.compare_coverage(frames, load_kitti, config, coverage.LABELLED, bar)
+        return coverage.compare_coverage(frames, load_kitti, config, coverage.LABELLED, runner)
     sensors, scenes = arguments.sensors or list(SURVEYED), arguments.scenes or list(DRIVES)
     scans = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
-    return coverage.compare_coverage(scans, load_simulated, config, coverage.SIMULATED, bar)
+    return coverage.compare_coverage(scans, load_simulated, config, coverage.SIMULATED, runner)
 
 
-def _cross_validation(arguments: argparse.Namespace) -> Report:
+def _cross_validation(arguments: argparse.Namespace, runner: Runner) -> Report:
     grid, fixed = split_settings(arguments.settings)
     config = options.read_config(argparse.Namespace(**{**vars(arguments), 'settings': fixed}))
-    bar = options.progress('cross-validation')
-    return ablation.cross_validate(frames_from_options(arguments), config, grid, bar)
+    return ablation.cross_validate(frames_from_options(arguments), config, grid, runner)
 
 
 def split_settings(settings: Sequence[str]) -> tuple[dict[str, list[ParameterValue]], list[str]]:
@@ -214,17 +222,17 @@ def split_settings(settings: Sequence[str]) -> tuple[dict[str, list[ParameterVal
     return grid, fixed
 
 
-def _sensor_pose(arguments: argparse.Namespace) -> Report:
-    config, bar = options.read_config(arguments), options.progress('sensor-pose')
+def _sensor_pose(arguments: argparse.Namespace, runner: Runner) -> Report:
+    config = options.read_config(arguments)
     if not arguments.simulated:
         frames, mounts = frames_from_options(arguments), sensor_pose.MOUNTS
-        return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, bar)
+        return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, runner)
     scenes, mounts = arguments.scenes or list(DRIVES), sensor_pose.SIMULATED_MOUNTS
     scans = simulated_frames(DEFAULT_SENSORS, scenes, arguments.seeds or 1, (0.0,))
-    return sensor_pose.score_poses(scans, sensor_pose.load_mounted, mounts, config, bar)
+    return sensor_pose.score_poses(scans, sensor_pose.load_mounted, mounts, config, runner)
 
 
-def _table1(arguments: argparse.Namespace) -> Report:
+def _table1(arguments: argparse.Namespace, _: Runner) -> Report:
     config, bar = options.read_config(arguments), options.progress('table1')
     choices = [Choice.parse(word) for word in arguments.frames]
     layout = options.scan_layout(arguments)

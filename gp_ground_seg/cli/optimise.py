@@ -29,6 +29,7 @@ from gp_ground_seg.experiments.variants import make_report, score_variants
 from gp_ground_seg.parameters.config import Config, parameter_specs
 from gp_ground_seg.parameters.schema import ROS_NODE_KEY, ROS_PARAMETERS_KEY, ParameterValue
 from gp_ground_seg.plotting.charts import plot_search
+from gp_ground_seg.scale.cluster import Runner
 
 DESCRIPTION = f"""\
 Search parameters on your labelled frames (Optuna, TPE) by IoU in the GroundGrid convention, from
@@ -107,8 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
         best = max(known, key=lambda trial: trial.iou)
         config = base.replace(**best.choice)
         variants = {'given': base, 'best': config}
-        shown = options.progress('left out')
-        scores = score_variants(rest, load_kitti, variants, progress=shown)
+        runner = Runner(options.progress('left out'))
+        scores = score_variants(rest, load_kitti, variants, runner=runner)
         found = comparison.find_differences(*scores)
         ious = [f'{100.0 * trial.iou:.2f} %' for trial in (given, best)]
         verdict = (

@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.export import differences, yaml_scalar
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.parameters.schema import load_yaml
+from gp_ground_seg.scale.cluster import Runner, open_runner
 
 DEFAULT_PRESET = 'default'
 FLAG = {'action': 'store_true'}
@@ -84,6 +85,27 @@ def refuse_scan_layout(arguments: argparse.Namespace, source: object) -> None:
     for name in ('columns', 'dtype'):
         if getattr(arguments, name) is not None:
             raise DataError(f'--{name}: is for .bin scans, which {source} is not')
+
+
+def add_cluster(parser: argparse._ActionsContainer) -> None:
+    """Add ``--workers N`` and ``--scheduler ADDRESS``."""
+    add(
+        parser,
+        ('--workers', 'compute in N processes, with Dask', NUMBER),
+        ('--scheduler', 'compute on the Dask cluster of this scheduler, as in tcp://HOST:8786',
+         {'metavar': 'ADDRESS'}),
+    )  # fmt: skip
+
+
+def runner(
+    arguments: argparse.Namespace, title: str, unit: str = 'frame'
+) -> AbstractContextManager[Runner]:
+    """Return what computes blocks of frames by the options of `add_cluster`, with a bar."""
+    workers, scheduler = arguments.workers, arguments.scheduler
+    if workers and scheduler:
+        raise DataError('--workers: the cluster of --scheduler has its own, give one of the two')
+    bar = progress(title, quiet=getattr(arguments, 'quiet', False), unit=unit)
+    return open_runner(workers, scheduler, bar)
 
 
 def above_zero(text: str, or_zero: bool = False) -> float:

@@ -6,23 +6,28 @@ import argparse
 import math
 import re
 import statistics
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from gp_ground_seg.cli import options
+from gp_ground_seg.cli import dataset, options
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.files import AnyPath, as_path, write_file
 from gp_ground_seg.data.inputs import Inputs, holds_bag, list_inputs
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.frame import Label
+from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import Segmentation
+from gp_ground_seg.scale.cluster import Progress
+from gp_ground_seg.scale.dataset import Outcome, Scan, pool, segment_block
 from gp_ground_seg.segmenter import GroundSegmenter
 
 DESCRIPTION = """\
@@ -84,13 +89,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
     options.add(
         parser,
-        ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
+        ('input', 'scan, folder of scans, bag, or a root or URL', {'metavar': 'INPUT'}),
+        ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*'}),
         ('-o --output', 'for scans a folder, or a .label file for a single scan; for bags a '
          'folder, or a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),
+        ('--resume', 'go on with OUT, whose finished blocks are in its manifest', options.FLAG),
         options.FORCE,
         options.QUIET,
     )  # fmt: skip
+    options.add_cluster(parser)
     options.add_config(parser)
     raw = ('--raw', 'write 0 unknown, 1 ground, 2 obstacle as labels', options.FLAG)
     options.add(parser.add_argument_group('for scans'), *options.SCAN_LAYOUT, raw)
@@ -122,7 +130,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
     config = options.read_config(arguments)
     source = Path(arguments.input)
-    is_bag = holds_bag(source)
+    is_bag = '://' not in arguments.input and holds_bag(source)
     kind, foreign = ('scans', ['raw']) if is_bag else ('bags', FOR_BAGS)
     for name in foreign:
         if getattr(arguments, name):
@@ -130,26 +138,51 @@ def run(arguments: argparse.Namespace) -> int:
             raise DataError(f'--{option}: is for {kind}, which {source} is not')
     if is_bag:
         options.refuse_scan_layout(arguments, source)
+    if dataset.is_dataset(arguments):
+        _segment_dataset(arguments, config, is_bag)
+        return 0
     target = Path(arguments.output) if arguments.output else _default_output(source)
-    n_points = n_ground = 0
-    seconds = []
     with closing(GroundSegmenter(config)) as segmenter:
-        if is_bag:
-            results = _segment_bag(target, arguments, segmenter)
-        else:
-            results = _segment_scans(target, arguments, segmenter)
-        for result in results:
-            n_points += len(result.label)
-            n_ground += int((result.label == Label.GROUND).sum())
-            seconds.append(result.timings['total'])
-    share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
-    pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms'
-    pace += ' per frame (median' if len(seconds) > 1 else ' for the first frame (with loading code'
-    print(
-        f'{options.count(len(seconds), "frame")}, {options.count(n_points, "point")}, {share}, '
-        f'{pace}, segmentation only), written to {target}'
-    )
+        segment = _segment_bag if is_bag else _segment_scans
+        dataset.print_summary(Outcome.of(segment(target, arguments, segmenter)), target)
     return 0
+
+
+def _segment_dataset(arguments: argparse.Namespace, config: Config, is_bag: bool) -> None:
+    """Segment a whole data set, or several bags, into a folder."""
+    if arguments.output is None and '://' in arguments.input:
+        raise DataError(f'{arguments.input}: give the folder for the output, -o OUT')
+    target = as_path(arguments.output or _default_output(Path(arguments.input)))
+    if is_bag or arguments.more:
+        if not isinstance(target, Path):
+            raise DataError(f'{target}: bags are written to folders of this machine')
+        bags = dataset.list_bags(arguments, lambda path: _default_output(path).name)
+        dataset.run(arguments, config, target, bags, partial(_segment_bags, arguments, target))
+        return
+    scans, write = dataset.list_scans(arguments), partial(_write_labels, arguments.raw)
+    dataset.run(arguments, config, target, scans, partial(segment_block, write, target))
+
+
+def _segment_bags(
+    arguments: argparse.Namespace,
+    target: Path,
+    config: Config,
+    bags: Sequence[Scan],
+    progress: Progress,
+) -> Outcome:
+    """Segment bags, each into one in the folder `target`."""
+    outcomes = []
+    for bag in progress(bags):
+        given = {'input': str(bag.path), 'quiet': True, 'force': True}
+        own = argparse.Namespace(**{**vars(arguments), **given})
+        with closing(GroundSegmenter(config)) as segmenter:
+            outcomes.append(Outcome.of(_segment_bag(target / bag.name, own, segmenter)))
+    return pool(outcomes)
+
+
+def _write_labels(raw: bool, path: AnyPath, result: Segmentation) -> None:
+    codes = sorted(Label) if raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
+    write_file(path, np.array(codes, dtype='<u4')[result.label].tobytes())
 
 
 def _default_output(source: Path) -> Path:

@@ -28,6 +28,7 @@ class PatchworkppMethod:
     """
 
     name = PATCHWORKPP
+    depends_on_past = True
 
     def __init__(
         self, sensor_height: float | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
@@ -53,6 +54,10 @@ class PatchworkppMethod:
                 f'{sensor.height:g} set sensor.origin_z above {0.0 - sensor.height:g}'
             )
         return cls(height, origin)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send a worker what to make it of."""
+        return type(self), (self._sensor_height, self._origin)
 
     def reset(self) -> None:
         """Start anew with its default thresholds."""

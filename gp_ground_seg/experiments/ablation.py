@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation import report
-from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, load_kitti, pool
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, load_kitti, pool
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text, mse_sums
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.experiments.interpolation import interpolation_method
@@ -23,6 +23,7 @@ from gp_ground_seg.experiments.variants import (
 )
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
+from gp_ground_seg.scale.cluster import HERE, Runner
 
 _FIXED: Changes = {'learning.mode': 'fixed'}
 _WHOLE_FRAME: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'frame'}
@@ -87,13 +88,13 @@ def compare_models(
     items: Sequence[Any],
     load: Callable[[Any], KnownScan],
     config: Config,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> Report:
     """Score `MODELS` and an interpolation; ConfigError if `config` sets what they set."""
     refuse_changed(config, {name for changes in MODELS.values() for name in changes})
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     with closing(interpolation_method(config)) as plain:
-        scores = score_variants(items, load, variants, [plain], progress=progress)
+        scores = score_variants(items, load, variants, [plain], runner=runner)
     last = scores[len(MODELS) - 1]
     # Simulated scans are of one sequence, and of many scenes.
     parts = MethodScore.parts if len(last.sequences) > 1 else scene_parts
@@ -119,7 +120,7 @@ def compare_departures(
     frames: Sequence[Frame],
     departures: Sequence[Departure],
     config: Config,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> Report:
     """Switch one departure after the other, on the same frames in the same run."""
     variants = {'as given': config}
@@ -129,7 +130,7 @@ def compare_departures(
         variants[one.title] = config.replace(**one.changes)
         if variants[one.title] == config:
             raise ConfigError(f'departure {one.title!r}: its switch changes nothing')
-    scores = score_variants(frames, load_kitti, variants, progress=progress)
+    scores = score_variants(frames, load_kitti, variants, runner=runner)
     given, *switched = scores
 
     def row(
@@ -198,7 +199,7 @@ def coordinate_search(grid: Grid, start: Choice, worth: Callable[[Choice], float
 
 
 def cross_validate(
-    frames: Sequence[Frame], base: Config, grid: Grid, progress: Progress = iter
+    frames: Sequence[Frame], base: Config, grid: Grid, runner: Runner = HERE
 ) -> Report:
     """Choose values by pooled IoU, once on all sequences and once without each.
 
@@ -217,7 +218,7 @@ def cross_validate(
         key = tuple(choice[name] for name in grid)
         if key not in known:
             variant = {str(len(known)): base.replace(**choice)}
-            (known[key],) = score_variants(frames, load_kitti, variant, progress=progress)
+            (known[key],) = score_variants(frames, load_kitti, variant, runner=runner)
         return known[key]
 
     def choose(names: Sequence[str]) -> Choice:

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 from gp_ground_seg.data.semantic_kitti import Frame, read_labels, read_points
 from gp_ground_seg.errors import ConfigError, DataError, require
-from gp_ground_seg.evaluation.evaluate import Progress
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confusion
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue
+from gp_ground_seg.scale.cluster import Progress
 from gp_ground_seg.segmenter import GroundSegmenter
 
 GROUPS_OF_ROBOT = ('sensor', 'frame', 'input', 'runtime', 'diagnostics')

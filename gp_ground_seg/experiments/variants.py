@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from gp_ground_seg.errors import ConfigError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import report as results
-from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
 from gp_ground_seg.evaluation.objects import BAND_TITLES, GROUPS, Objects
@@ -22,6 +23,7 @@ from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
+from gp_ground_seg.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.simulation import PLACES, SCENES, SENSORS, Kind, simulate_scan
 
 Changes = Mapping[str, ParameterValue]
@@ -89,13 +91,13 @@ def score_variants(
     variants: Mapping[str, Config],
     peers: Sequence[methods.Method] = (),
     *,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> list[MethodScore]:
     """Run variants, then `peers`, once on every scan, alternately, each scan without a past."""
     with ExitStack() as stack:
         ours = [stack.enter_context(closing(OurMethod(c, name))) for name, c in variants.items()]
         every = [*ours, *peers]
-        return methods.score_methods(items, load, every, each_alone=True, progress=progress)
+        return methods.score_methods(items, load, every, each_alone=True, runner=runner)
 
 
 def make_report(
@@ -146,26 +148,40 @@ def score_simulated(
     tables: Callable[[Sequence[MethodScore], Sequence[str]], dict[str, Table]],
     config: Config,
     peer: str | None,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> Report:
     """Segment simulated scans, all sensors with the parameters `config`.
 
     The one of `PEERS` named runs on the same clouds, as `peer_of` makes it. A sensor and scene of
     which a scan is refused is left out; `tables` lays out the scores, with notes that say so.
     """
-    found: list[list[MethodScore]] = []
-    refused = []
     groups = [list(own) for _, own in itertools.groupby(frames, lambda frame: frame.sequence)]
-    for own in progress(groups):
-        peers = [peer_of(own[0].sensor, peer)] if peer else []
-        try:
-            found.append(score_variants(own, load_simulated, {methods.OURS: config}, peers))
-        except PointCloudError as error:
-            refused.append(f'refused: {error}')
+    parts = runner.run(partial(_score_groups, config, peer), groups)
+    outcomes = list(itertools.chain(*parts))
+    refused = [one for one in outcomes if isinstance(one, str)]
+    found = [one for one in outcomes if not isinstance(one, str)]
     if not found:
         raise PointCloudError('; '.join(refused))
-    scores = [methods.pool(parts[0].name, parts) for parts in zip(*found, strict=True)]
+    scores = [methods.pool(own[0].name, own) for own in zip(*found, strict=True)]
     return make_report(tables(scores, refused), scores, config)
+
+
+def _score_groups(
+    config: Config,
+    peer: str | None,
+    groups: Sequence[Sequence[SimulatedFrame]],
+    progress: Progress,
+) -> list[list[MethodScore] | str]:
+    """Scores of each group of scans, of one sensor in one scene, or why one is refused."""
+    outcomes: list[list[MethodScore] | str] = []
+    for frames in progress(groups):
+        peers = [peer_of(frames[0].sensor, peer)] if peer else []
+        try:
+            ours = {methods.OURS: config}
+            outcomes.append(score_variants(frames, load_simulated, ours, peers))
+        except PointCloudError as error:
+            outcomes.append(f'refused: {error}')
+    return outcomes
 
 
 def scene_parts(score: MethodScore) -> list[MethodScore]:
