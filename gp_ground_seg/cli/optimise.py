@@ -12,7 +12,7 @@ from functools import partial
 import yaml
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, staged_options
+from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
 from gp_ground_seg.evaluation import comparison
 from gp_ground_seg.evaluation.evaluate import load_kitti
 from gp_ground_seg.evaluation.report import (
@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.page:
         new_figure(1.0, 1.0)  # Raises at once where matplotlib is missing.
     with (
-        staged_options(arguments, 'json', 'output', 'page') as parts,
+        options.staged_options(arguments, 'json', 'output', 'page') as parts,
         options.runner(arguments, 'optimise') as runner,
     ):
         # Of values that are far off the library says much; their IoU says it too.
