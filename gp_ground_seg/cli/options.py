@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,12 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from gp_ground_seg.data.atomic_output import leftovers
+from gp_ground_seg.data.atomic_output import leftovers, staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.export import differences, yaml_scalar
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.parameters.schema import load_yaml
 from gp_ground_seg.scale.cluster import Runner, open_runner
@@ -176,6 +177,19 @@ def read_config(arguments: argparse.Namespace) -> Config:
     return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
 
 
+def named_config(name: str) -> Config:
+    """Return the parameters of a preset, or of a file."""
+    return PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
+
+
+def changed_lines(first: Config, second: Config) -> list[str]:
+    """Return a line for each parameter that differs, as in ``grid.n_bins: 80 -> 120``."""
+    return [
+        f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)} {spec.unit}'.rstrip()
+        for spec, before, after in differences(first, second)
+    ]
+
+
 def parse_setting(setting: str) -> tuple[str, Any]:
     """Split ``NAME=VALUE``; the parameter's own checks come with `Config.replace`."""
     name, separator, text = setting.partition('=')
@@ -209,6 +223,17 @@ def library_notes(level: int = logging.INFO) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.setLevel(before)
+
+
+@contextmanager
+def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
+    """Yield a path for each of the options given; the files appear when the block ends well."""
+    with ExitStack() as stack:
+        yield {
+            name: stack.enter_context(staged_file(path, force=arguments.force))
+            for name in names
+            if (path := getattr(arguments, name)) is not None
+        }
 
 
 def note_leftovers(target: Path) -> None:

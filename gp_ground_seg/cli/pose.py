@@ -9,7 +9,7 @@ from contextlib import closing
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
+from gp_ground_seg.evaluation.report import Cell, Column, Table, percent, write_json
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.segmenter import GroundSegmenter
 
@@ -36,6 +36,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         parser,
         ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
         *options.CLOUDS,
+        options.TO_JSON,
         options.FORCE,
     )
     options.add_config(parser)
@@ -43,14 +44,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 
 DEGREES = math.degrees(1.0)
-POSE_COLUMNS = (
+COLUMNS = (
     Column('scan'),
-    Column('height [m]', '.2f'),
-    Column('roll [deg]', '+.2f', scale=DEGREES),
-    Column('pitch [deg]', '+.2f', scale=DEGREES),
-    percent('support [%]', form='.0f'),
-    Column('residual [m]', '.3f'),
-    Column('used as'),
+    Column('height [m]', '.2f', 'height'),
+    Column('roll [deg]', '+.2f', 'roll', DEGREES),
+    Column('pitch [deg]', '+.2f', 'pitch', DEGREES),
+    percent('support [%]', 'support', '.0f'),
+    Column('residual [m]', '.3f', 'residual'),
+    Column('used as', key='used_as'),
 )
 
 
@@ -58,19 +59,24 @@ def run(arguments: argparse.Namespace) -> int:
     """Print a line for each scan, and the medians."""
     poses, rows, notes = [], [], []
     scans = options.list_clouds(arguments)
-    with closing(GroundSegmenter(options.read_config(arguments))) as segmenter:
-        for scan in scans:
-            try:
-                pose = segmenter.estimate_pose(scan.read().xyz)
-            except PointCloudError as error:
-                notes.append(f'{scan.title}: refused: {error}')
-                continue
-            poses.append(pose)
-            rows.append(_pose_row(scan.title, pose))
-            notes += [f'{scan.title}: {line}' for line in pose.contradictions]
-    if poses:
-        print(Table(POSE_COLUMNS, rows).text())
-        notes.insert(0, _pose_summary(poses))
+    config, bar = options.read_config(arguments), options.progress('pose')
+    with options.staged_options(arguments, 'json') as parts:
+        with closing(GroundSegmenter(config)) as segmenter:
+            for scan in bar(scans, total=len(scans)):
+                try:
+                    pose = segmenter.estimate_pose(scan.read().xyz)
+                except PointCloudError as error:
+                    notes.append(f'{scan.title}: refused: {error}')
+                    continue
+                poses.append(pose)
+                rows.append(_pose_row(scan.title, pose))
+                notes += [f'{scan.title}: {line}' for line in pose.contradictions]
+        table = Table(COLUMNS, rows)
+        if poses:
+            print(table.text())
+            notes.insert(0, _pose_summary(poses))
+        if 'json' in parts:
+            write_json({'scans': table.json(), 'notes': notes}, parts['json'])
     print('\n'.join(notes))
     return 0
 
