@@ -11,6 +11,7 @@ from conftest import REPOSITORY
 from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.cli import experiment
 from gp_ground_seg.cli.experiment import EXPERIMENTS, parse_departure, split_settings
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
@@ -104,12 +105,12 @@ def test_tables_as_markdown(capsys):
 def test_all_sensors_have_the_parameters_given(monkeypatch):
     found = []
 
-    def note(sensors, scenes, n_seeds, config, *_):
-        found.append((sensors, config))
-        assert scenes == list(DRIVES)  # those of the page
+    def note(frames, _tables, config, *_):
+        found.append(([*dict.fromkeys(frame.sensor for frame in frames)], config))
+        assert {frame.scene for frame in frames} == set(DRIVES)  # those of the page
         raise DataError('enough')
 
-    monkeypatch.setattr(variants, 'score_scenes', note)
+    monkeypatch.setattr(experiment, 'score_simulated', note)
     sensors = ['mid-360', 'hdl-64e']
     for extra, config in (([], Config()), (['--preset', 'paper'], PRESETS['paper'].config)):
         assert run('experiment', 'scenes', '--sensors', ','.join(sensors), *extra) == 2

@@ -33,9 +33,7 @@ def test_help_names_every_command_and_an_unknown_one_is_refused(capsys):
     assert "invalid choice: 'segmnet'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    'words', [['--help'], ['--version'], ['config', 'dump'], ['config', 'table'], ['node', '-h']]
-)
+@pytest.mark.parametrize('words', [['--help'], ['--version'], ['config', 'dump'], ['node', '-h']])
 def test_what_computes_nothing_imports_nothing_heavy(words):
     script = (
         'import atexit, sys\n'

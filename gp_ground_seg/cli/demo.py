@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -25,7 +24,7 @@ from gp_ground_seg.data.semantic_kitti import (
     read_labels,
     read_points,
 )
-from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
+from gp_ground_seg.errors import DataError, GroundSegError, require
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
 from gp_ground_seg.evaluation.report import Column
 from gp_ground_seg.frame import Label
@@ -226,8 +225,7 @@ def result_text(
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
-    if importlib.util.find_spec('matplotlib') is None:
-        raise MissingDependencyError('the demo draws with matplotlib: pip install matplotlib')
+    require('matplotlib', 'plot')
     sequence = arguments.sequence
     if arguments.kitti is not None:
         sequence = sequence or list_sequences(arguments.kitti)[0]
@@ -245,7 +243,7 @@ def run(arguments: argparse.Namespace) -> int:
         probe_session('demo') as (session, words),
         # Right before the process that removes the folder if this one is killed.
         staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
-        NodeProcess(part / LOG, words, session.holding_back, part.parent) as node,
+        NodeProcess(part / LOG, words, part.parent) as node,
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)

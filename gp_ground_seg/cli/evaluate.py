@@ -6,13 +6,12 @@ import argparse
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.boxes import find_boxes
 from gp_ground_seg.data.files import as_path
 from gp_ground_seg.data.inputs import list_inputs
@@ -24,7 +23,7 @@ from gp_ground_seg.evaluation import report as tables
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore
 from gp_ground_seg.evaluation.intervals import INTERVAL, Sums, interval_note, interval_text
 from gp_ground_seg.evaluation.object_table import object_table
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
@@ -44,8 +43,8 @@ instances of the labels (their upper 16 bits), or given as boxes, a file for eac
 
 Without labels only objects are counted, from the bottom of their boxes.
 
-Patchwork++ (--peer) has its published parameters; a height and a place of the sensor that are
-given (sensor.height, sensor.origin_x, ...) are given to it too.
+Patchwork++ or Patchwork (--peer) has its published parameters; a height and a place of the
+sensor that are given (sensor.height, sensor.origin_x, ...) are given to it too.
 """
 EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
@@ -76,7 +75,7 @@ RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
-    peers = {'choices': (methods.PATCHWORKPP,)}
+    peers = {'choices': PEERS}
     options.add(
         parser,
         ROOT,
@@ -104,11 +103,11 @@ def run(arguments: argparse.Namespace) -> int:
     }  # fmt: skip
     if arguments.per_frame is not None:
         tables.check_rows_file(arguments.per_frame)
-    with staged_options(arguments, *files) as parts, ExitStack() as stack:
+    with options.staged_options(arguments, *files) as parts, ExitStack() as stack:
         items, load = _items_from_options(arguments)
         chosen: list[methods.Method] = [stack.enter_context(closing(methods.OurMethod(config)))]
         if arguments.peer is not None:
-            chosen.append(PatchworkppMethod.of_sensor(config.sensor))
+            chosen.append(PEERS[arguments.peer].of_sensor(config.sensor))
         runner = stack.enter_context(options.runner(arguments, 'evaluate'))
         scores = methods.score_methods(items, load, chosen, runner=runner)
         report = make_report(
@@ -362,14 +361,3 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
         frames = boxed_frames(root, chosen, layout)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]
-
-
-@contextmanager
-def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
-    """Yield a path for each of the options given; the files appear when the block ends well."""
-    with ExitStack() as stack:
-        yield {
-            name: stack.enter_context(staged_file(path, force=arguments.force))
-            for name in names
-            if (path := getattr(arguments, name)) is not None
-        }

@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, staged_options
+from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.evaluate import load_kitti
+from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, load_kitti
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Report, describe_environment, machine_line, written
 from gp_ground_seg.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
-from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
+from gp_ground_seg.experiments.variants import load_simulated, score_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ParameterValue
 from gp_ground_seg.scale.cluster import Runner
@@ -26,6 +27,12 @@ DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 SURVEYED = ('hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360')  # by `coverage`
 
 ONE_PROCESS = ('table1',)  # it measures times
+EXAMPLES = """\
+  gp-ground-seg experiment ablation KITTI_ROOT
+  gp-ground-seg experiment scenes --sensors vlp-16 --scenes kerb
+  gp-ground-seg experiment NAME --help          describes one of them
+"""
+
 OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
 SEEDS = ('--seeds', 'simulated scenes of each kind', options.NUMBER)
@@ -42,7 +49,11 @@ CROWDED_LIST = _some_of('--scenes', SCENES, lost.SCENES)
 SENSOR_LIST = _some_of('--sensors', SENSORS, DEFAULT_SENSORS)
 EVERY_SENSOR = _some_of('--sensors', SENSORS, SURVEYED)
 EVERY_MOUNT = _some_of('--sensors', SENSORS, ['all'])
-NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
+NO_PEER = ('--no-peer', 'leave the peer out', options.FLAG)
+PEER = (
+    '--peer', 'the method beside ours (default: %(default)s)',
+    {'choices': PEERS, 'default': PATCHWORKPP},
+)  # fmt: skip
 SWITCH = (
     '--switch',
     'measure this departure instead, and the parameters that switch it off (may be repeated)',
@@ -68,19 +79,15 @@ class Experiment(NamedTuple):
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and a command below it for each of `EXPERIMENTS`."""
-    parser = subparsers.add_parser(
-        'experiment',
-        description='Repeat an experiment of docs/: configurations scored over frames.',
-        epilog='`gp-ground-seg experiment NAME --help` describes one of them.',
-    )
+    description = 'Repeat an experiment of docs/: configurations scored over frames.'
+    parser = options.new_parser(subparsers, 'experiment', description, EXAMPLES)
     names = parser.add_subparsers(metavar='NAME', required=True, dest='experiment')
     for name, experiment in EXPERIMENTS.items():
-        own = names.add_parser(
-            name,
-            help=re.split(r'\.(?:\s|$)', experiment.description)[0],
-            description=experiment.description,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
+        purpose = re.split(r'\.(?:\s|$)', experiment.description)[0]
+        source = ' KITTI_ROOT' if experiment.options[0][0] == 'root' else ' --sensors vlp-16'
+        source += ' --set label.ground_tolerance=0.05,0.1' * (name == 'cross-validation')
+        example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
+        own = options.new_parser(names, name, experiment.description, example, purpose)
         options.add(own, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
         if name in ONE_PROCESS:
             own.set_defaults(workers=None, scheduler=None)
@@ -95,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     experiment = EXPERIMENTS[arguments.experiment]
     if SIMULATED in experiment.options:
         _check_source(arguments)
-    with staged_options(arguments, 'json') as parts:
+    with options.staged_options(arguments, 'json') as parts:
         with options.runner(arguments, arguments.experiment) as runner:
             report = experiment.run(arguments, runner)
             n_workers = runner.n_workers
@@ -113,6 +120,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _name(option: Option) -> str:
     return option[0].lstrip('-').replace('-', '_')
+
+
+def _peer(arguments: argparse.Namespace) -> str | None:
+    return None if arguments.no_peer else arguments.peer
 
 
 def _check_source(arguments: argparse.Namespace) -> None:
@@ -154,7 +165,7 @@ def _steps(arguments: argparse.Namespace, runner: Runner) -> Report:
     if options.read_config(arguments) != Config():
         raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
     frames = frames_from_options(arguments)
-    return stepwise.score_steps(frames, not arguments.no_peer, runner)
+    return stepwise.score_steps(frames, _peer(arguments), runner)
 
 
 def _wrong_values(arguments: argparse.Namespace, runner: Runner) -> Report:
@@ -164,16 +175,16 @@ def _wrong_values(arguments: argparse.Namespace, runner: Runner) -> Report:
 
 def _scenes(arguments: argparse.Namespace, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(DRIVES)
+    frames = simulated_frames(sensors, scenes, arguments.seeds or 3, variants.SCENE_PLACES)
     config = options.read_config(arguments)
-    seeds, with_peer = arguments.seeds or 3, not arguments.no_peer
-    return variants.score_scenes(sensors, scenes, seeds, config, with_peer, runner)
+    return score_simulated(frames, variants.scene_tables, config, _peer(arguments), runner)
 
 
 def _objects(arguments: argparse.Namespace, runner: Runner) -> Report:
-    scenes, seeds = arguments.scenes or lost.SCENES, arguments.seeds or 2
+    sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or lost.SCENES
+    frames = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
     config = options.read_config(arguments)
-    sensors = arguments.sensors or list(SENSORS)
-    return lost.score_objects(sensors, scenes, seeds, config, not arguments.no_peer, runner)
+    return score_simulated(frames, lost.lost_tables, config, _peer(arguments), runner)
 
 
 def _coverage(arguments: argparse.Namespace, runner: Runner) -> Report:
@@ -264,7 +275,7 @@ and two, by sequence and range. On labelled frames that of the returns (return_s
 Go from the paper's method to the defaults, one step after the other, beside Patchwork++ and a
 surface that is interpolated, with our labels.
 """,
-        (ROOT, *OF_FRAMES, NO_PEER),
+        (ROOT, *OF_FRAMES, PEER, NO_PEER),
         _steps,
     ),
     'wrong-values': Experiment(
@@ -279,7 +290,7 @@ Give hyper-parameters that are wrong by factors of 3 and 10, with and without le
 Score simulated scans by exact labels and heights, beside Patchwork++ with its published
 parameters and the true height of the sensor. All sensors have one set of parameters.
 """,
-        (SENSOR_LIST, SCENE_LIST, SEEDS, NO_PEER),
+        (SENSOR_LIST, SCENE_LIST, SEEDS, PEER, NO_PEER),
         _scenes,
     ),
     'objects': Experiment(
@@ -288,7 +299,7 @@ Count vehicles, persons and cyclists of simulated scans that are called ground, 
 Patchwork++ with its published parameters and the true height and place of the sensor. All
 sensors have one set of parameters.
 """,
-        (EVERY_MOUNT, CROWDED_LIST, SEEDS, NO_PEER),
+        (EVERY_MOUNT, CROWDED_LIST, SEEDS, PEER, NO_PEER),
         _objects,
     ),
     'cross-validation': Experiment(

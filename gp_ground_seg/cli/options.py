@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,12 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from gp_ground_seg.data.atomic_output import leftovers
+from gp_ground_seg.data.atomic_output import leftovers, staged_file
+from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.export import differences, yaml_scalar
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.parameters.schema import load_yaml
 from gp_ground_seg.scale.cluster import Runner, open_runner
@@ -72,11 +74,31 @@ SCAN_LAYOUT: tuple[tuple[str, str, dict[str, Any]], ...] = (
 """Options of every command that reads ``.bin`` scans; it takes `FORCE` as well."""
 
 
+CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
+    ('--origin', 'place of the sensor in the coordinates of the input [m] (default: 0 0 0)',
+     {'metavar': ('X', 'Y', 'Z'), 'nargs': 3, 'type': float}),
+    *SCAN_LAYOUT,
+)  # fmt: skip
+"""Options of every command that reads clouds of any format; it takes `FORCE` as well."""
+
+
+def list_clouds(arguments: argparse.Namespace) -> Inputs:
+    """Return the clouds of the input."""
+    found = list_inputs(arguments.input, scan_layout(arguments), arguments.topic)
+    if found.topic is not None:
+        refuse_scan_layout(arguments, arguments.input)
+    return found
+
+
 def scan_layout(arguments: argparse.Namespace) -> ScanLayout:
-    """Return the layout of ``.bin`` scans; what can be no scan is refused, without ``--force``."""
+    """Return how scans are read; what can be no scan is refused, without ``--force``."""
     doubts = 'warn' if arguments.force else 'raise'
     columns, dtype = arguments.columns or KITTI.columns, arguments.dtype or KITTI.dtype
-    return ScanLayout(columns, dtype, doubts)
+    origin = getattr(arguments, 'origin', None)
+    if origin is not None and not all(map(math.isfinite, origin)):
+        raise DataError(f'--origin {" ".join(map(str, origin))}: must be three finite numbers')
+    return ScanLayout(columns, dtype, doubts, origin and tuple(origin))
 
 
 def refuse_scan_layout(arguments: argparse.Namespace, source: object) -> None:
@@ -155,6 +177,19 @@ def read_config(arguments: argparse.Namespace) -> Config:
     return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
 
 
+def named_config(name: str) -> Config:
+    """Return the parameters of a preset, or of a file."""
+    return PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
+
+
+def changed_lines(first: Config, second: Config) -> list[str]:
+    """Return a line for each parameter that differs, as in ``grid.n_bins: 80 -> 120``."""
+    return [
+        f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)} {spec.unit}'.rstrip()
+        for spec, before, after in differences(first, second)
+    ]
+
+
 def parse_setting(setting: str) -> tuple[str, Any]:
     """Split ``NAME=VALUE``; the parameter's own checks come with `Config.replace`."""
     name, separator, text = setting.partition('=')
@@ -188,6 +223,17 @@ def library_notes(level: int = logging.INFO) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.setLevel(before)
+
+
+@contextmanager
+def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
+    """Yield a path for each of the options given; the files appear when the block ends well."""
+    with ExitStack() as stack:
+        yield {
+            name: stack.enter_context(staged_file(path, force=arguments.force))
+            for name in names
+            if (path := getattr(arguments, name)) is not None
+        }
 
 
 def note_leftovers(target: Path) -> None:

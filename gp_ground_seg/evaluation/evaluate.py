@@ -39,8 +39,8 @@ from gp_ground_seg.segmenter import GroundSegmenter
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 OURS = 'gp_ground_seg'
-PATCHWORKPP = 'patchworkpp'
-TITLES = {PATCHWORKPP: 'Patchwork++'}
+PATCHWORKPP, PATCHWORK = 'patchworkpp', 'patchwork'
+TITLES = {PATCHWORKPP: 'Patchwork++', PATCHWORK: 'Patchwork'}
 """Names of methods in tables, where they differ from those in files."""
 ALL = 'all'
 Points = npt.NDArray[np.floating]
@@ -53,6 +53,7 @@ class MethodResult:
     label: Labels  # (N,)
     ground_z: FloatArray  # (N,) height of the ground under each point [m]; NaN = no model
     p_ground: npt.NDArray[np.floating] | None = None  # (N,), where it has probabilities
+    return_std: FloatArray | None = None  # (N,) of a ground return about `ground_z` [m]
     stages: dict[str, float] = field(default_factory=dict)  # seconds
     pose: SensorPose | None = None
     fit: FitReport | None = None
@@ -108,7 +109,9 @@ class OurMethod:
     def result(self) -> MethodResult:
         """Return all there is of the last scan."""
         own = self.last
-        return MethodResult(own.label, own.ground_z, own.p_ground, self.stages, own.pose, own.fit)
+        return MethodResult(
+            own.label, own.ground_z, own.p_ground, own.return_std, self.stages, own.pose, own.fit
+        )
 
     def close(self) -> None:
         """End the worker threads."""
@@ -150,7 +153,7 @@ class ScanScore:
     @property
     def confusion(self) -> Confusion:
         """Counts in the convention that counts."""
-        return next(iter(self.confusions.values()))
+        return next(iter(self.confusions.values()), Confusion())
 
 
 @dataclass(frozen=True)
@@ -289,14 +292,16 @@ def score_methods(
     each_alone: bool = False,
     clock: Callable[[], float] = time.perf_counter,
     runner: Runner = HERE,
+    watch: Callable[[KnownScan], None] | None = None,
 ) -> list[MethodScore]:
     """Run methods alternately on the same scans and score each run, in the order of `methods`.
 
     Which method goes first changes from scan to scan. Each runs once without counting:
     compilation and first allocations are not its speed. `items`, grouped by sequence, are loaded
     one by one. Methods are reset before each sequence, or with `each_alone` before each scan.
+    `watch` is called with each scan after all methods have run on it.
     """
-    score = partial(_score_block, load, methods, each_alone, clock)
+    score = partial(_score_block, load, methods, each_alone, clock, watch)
     has_past = not each_alone and any(method.depends_on_past for method in methods)
     parts = runner.run(score, items, _sequence_of if has_past else None)
     scans = [tuple(itertools.chain(*own)) for own in zip(*parts, strict=True)]
@@ -313,6 +318,7 @@ def _score_block(
     methods: Sequence[Method],
     each_alone: bool,
     clock: Callable[[], float],
+    watch: Callable[[KnownScan], None] | None,
     items: Sequence[Any],
     progress: Progress,
 ) -> list[list[ScanScore]]:
@@ -332,6 +338,8 @@ def _score_block(
             start = clock()
             _run(method, scan)
             scores[method.name].append(_score(scan, method, clock() - start))
+        if watch is not None:
+            watch(scan)
     return list(scores.values())
 
 
@@ -349,7 +357,8 @@ def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
     height = None
     if scan.ground_z is not None:
         own = scan.is_ground
-        height = metrics.height_error(scan.ground_z[own], result.ground_z[own])
+        std = None if result.return_std is None else result.return_std[own]
+        height = metrics.height_error(scan.ground_z[own], result.ground_z[own], std)
     return ScanScore(
         scan.sequence, scan.index, seconds, result.stages,
         {key: metrics.count_confusion(label, one) for key, one in scan.truths.items()},

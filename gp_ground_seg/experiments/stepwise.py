@@ -9,7 +9,7 @@ from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.evaluation import report as results
 from gp_ground_seg.evaluation.evaluate import Method, load_kitti
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, changed_parameters, percent
 from gp_ground_seg.experiments.interpolation import interpolation_method
 from gp_ground_seg.experiments.variants import make_report, refuse_changed, score_variants
@@ -46,11 +46,11 @@ def paper_steps() -> dict[str, Config]:
     return steps
 
 
-def score_steps(frames: Sequence[Frame], with_peer: bool, runner: Runner = HERE) -> Report:
-    """Score `paper_steps`, and beside them an interpolation and Patchwork++."""
+def score_steps(frames: Sequence[Frame], peer: str | None, runner: Runner = HERE) -> Report:
+    """Score `paper_steps`, and beside them an interpolation and one of `PEERS`."""
     steps = paper_steps()
     with closing(interpolation_method(Config())) as plain:
-        peers: list[Method] = [plain, *([PatchworkppMethod()] if with_peer else [])]
+        peers: list[Method] = [plain, *([PEERS[peer]()] if peer else [])]
         scores = score_variants(frames, load_kitti, steps, peers, runner=runner)
     rows: list[Row] = []
     for k, one in enumerate(scores):
