@@ -1,6 +1,7 @@
 """`segment`, `pose` and `plot` on clouds of every format: files, folders, data sets, bags."""
 
 import re
+import struct
 import sys
 
 import numpy as np
@@ -13,7 +14,6 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file, read_file
 from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.pcd import PcdHeader
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.ground_model import GroundModel
 
@@ -269,10 +269,10 @@ def test_refused(tmp_path, monkeypatch, capsys, words, message):
 )
 def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys, name, module):
     path = tmp_path / name
-    cloud = cloud_of(
-        name_columns(np.zeros((50, 3), np.float32)), PcdHeader(50, 1, is_compressed=True)
-    )
-    path.write_bytes(encode_file(path, cloud, np.zeros(50, np.uint8), {}))
+    cloud = cloud_of(name_columns(np.zeros((50, 3), np.float32)))
+    whole = encode_file(path, cloud, np.zeros(50, np.uint8), {})
+    compressed = b'DATA binary_compressed\n' + struct.pack('<II', 9, 50 * 13)
+    path.write_bytes(whole.replace(b'DATA binary\n', compressed))
     monkeypatch.setitem(sys.modules, module, None)
     assert run('segment', path, '-o', tmp_path / 'out.npy') == 2
     line = error_line(capsys)
