@@ -289,7 +289,7 @@ def test_behind_is_said():
 
     scores = score(90, 80, 70), score(89, 81, 70)
     (note,) = variants.scene_tables(scores)['scenes'].notes
-    assert note == 'ahead of Patchwork++ on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
+    assert note == 'ahead of x on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
 
 
 @pytest.fixture(scope='module')

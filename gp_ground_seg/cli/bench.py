@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.evaluate import staged_options
 from gp_ground_seg.data.inputs import holds_bag, list_inputs
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import list_sequences
@@ -76,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     given = arguments.record
     if given is not None:
         options.refuse_scan_layout(arguments, given)
-    with staged_options(arguments, 'json', 'plot') as parts:
+    with options.staged_options(arguments, 'json', 'plot') as parts:
         document = _measure(arguments) if given is None else read_record(given)
         if 'json' in parts:
             report.write_json(document, parts['json'])

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.evaluate import OF_FRAMES, frames_from_options, staged_options
+from gp_ground_seg.cli.evaluate import OF_FRAMES, frames_from_options
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.errors import ConfigError, DataError
@@ -88,7 +88,11 @@ def run(arguments: argparse.Namespace) -> int:
         del worst[n_drawn:]
 
     staged = staged_files(target, pictures, force=arguments.force) if target else nullcontext()
-    with staged_options(arguments, 'json') as parts, staged as folder, ExitStack() as stack:
+    with (
+        options.staged_options(arguments, 'json') as parts,
+        staged as folder,
+        ExitStack() as stack,
+    ):
         methods = [
             stack.enter_context(closing(OurMethod(config, name)))
             for config, name in zip(configs, 'AB', strict=True)

@@ -43,7 +43,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         (run_diff, 'compare two parameter files or presets', DIFF),
     ):
         name = run.__name__.removeprefix('run_')
-        added[name] = commands.add_parser(name, help=purpose, description=text or purpose)
+        examples = [line for line in EXAMPLES.splitlines() if f'config {name}' in line]
+        added[name] = options.new_parser(
+            commands, name, text or purpose, '\n'.join(examples), purpose
+        )
         added[name].set_defaults(run=run)
     options.add_config(added['dump'])
     added['check'].add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')

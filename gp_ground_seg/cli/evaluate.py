@@ -6,13 +6,12 @@ import argparse
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.boxes import find_boxes
 from gp_ground_seg.data.files import as_path
 from gp_ground_seg.data.inputs import list_inputs
@@ -104,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
     }  # fmt: skip
     if arguments.per_frame is not None:
         tables.check_rows_file(arguments.per_frame)
-    with staged_options(arguments, *files) as parts, ExitStack() as stack:
+    with options.staged_options(arguments, *files) as parts, ExitStack() as stack:
         items, load = _items_from_options(arguments)
         chosen: list[methods.Method] = [stack.enter_context(closing(methods.OurMethod(config)))]
         if arguments.peer is not None:
@@ -362,14 +361,3 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
         frames = boxed_frames(root, chosen, layout)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]
-
-
-@contextmanager
-def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
-    """Yield a path for each of the options given; the files appear when the block ends well."""
-    with ExitStack() as stack:
-        yield {
-            name: stack.enter_context(staged_file(path, force=arguments.force))
-            for name in names
-            if (path := getattr(arguments, name)) is not None
-        }

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, staged_options
+from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, load_kitti
 from gp_ground_seg.evaluation.patchworkpp import PEERS
@@ -26,6 +26,12 @@ DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 SURVEYED = ('hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360')  # by `coverage`
 
 ONE_PROCESS = ('table1',)  # it measures times
+EXAMPLES = """\
+  gp-ground-seg experiment ablation KITTI_ROOT
+  gp-ground-seg experiment scenes --sensors vlp-16 --scenes kerb
+  gp-ground-seg experiment NAME --help          describes one of them
+"""
+
 OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
 SEEDS = ('--seeds', 'simulated scenes of each kind', options.NUMBER)
@@ -72,19 +78,15 @@ class Experiment(NamedTuple):
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and a command below it for each of `EXPERIMENTS`."""
-    parser = subparsers.add_parser(
-        'experiment',
-        description='Repeat an experiment of docs/: configurations scored over frames.',
-        epilog='`gp-ground-seg experiment NAME --help` describes one of them.',
-    )
+    description = 'Repeat an experiment of docs/: configurations scored over frames.'
+    parser = options.new_parser(subparsers, 'experiment', description, EXAMPLES)
     names = parser.add_subparsers(metavar='NAME', required=True, dest='experiment')
     for name, experiment in EXPERIMENTS.items():
-        own = names.add_parser(
-            name,
-            help=re.split(r'\.(?:\s|$)', experiment.description)[0],
-            description=experiment.description,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
+        purpose = re.split(r'\.(?:\s|$)', experiment.description)[0]
+        source = ' KITTI_ROOT' if experiment.options[0][0] == 'root' else ' --sensors vlp-16'
+        source += ' --set label.ground_tolerance=0.05,0.1' * (name == 'cross-validation')
+        example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
+        own = options.new_parser(names, name, experiment.description, example, purpose)
         options.add(own, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
         if name in ONE_PROCESS:
             own.set_defaults(workers=None, scheduler=None)
@@ -99,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     experiment = EXPERIMENTS[arguments.experiment]
     if SIMULATED in experiment.options:
         _check_source(arguments)
-    with staged_options(arguments, 'json') as parts:
+    with options.staged_options(arguments, 'json') as parts:
         with options.runner(arguments, arguments.experiment) as runner:
             report = experiment.run(arguments, runner)
             n_workers = runner.n_workers

@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """Entry point of ``gp-ground-seg``: commands, and errors mapped to exit codes."""
 
 from __future__ import annotations
@@ -67,6 +68,15 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     return parser
 
 
+def _complete() -> None:
+    """Tell the shell what may follow its line, and end: argcomplete asks by the environment."""
+    import argcomplete
+
+    words = os.environ['COMP_LINE'].split()
+    command = next((word for word in words if word in COMMANDS), None)
+    argcomplete.autocomplete(build_parser(command))
+
+
 def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
     n_own = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
@@ -128,6 +138,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     It is that of the command, 2 after an error, which takes one line, or 130 when interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    if '_ARGCOMPLETE' in os.environ:
+        _complete()
     try:
         with _interruptible():
             arguments = _parse(words)

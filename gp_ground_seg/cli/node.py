@@ -124,11 +124,10 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
 
 def run_bench(arguments: argparse.Namespace) -> int:
     """Measure, print the table."""
-    from gp_ground_seg.cli.evaluate import staged_options
     from gp_ground_seg.evaluation.report import describe_environment, write_json
 
     clouds = _load_clouds(arguments)
-    with staged_options(arguments, 'json') as parts:
+    with options.staged_options(arguments, 'json') as parts:
         document = {
             'source': {
                 'data': arguments.data or 'simulated HDL-64E',

@@ -7,15 +7,12 @@ import base64
 import html
 import logging
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 
 import yaml
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, staged_options
-from gp_ground_seg.data.semantic_kitti import Frame
+from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
 from gp_ground_seg.evaluation import comparison
 from gp_ground_seg.evaluation.evaluate import load_kitti
 from gp_ground_seg.evaluation.report import (
@@ -29,7 +26,7 @@ from gp_ground_seg.experiments.variants import make_report, score_variants
 from gp_ground_seg.parameters.config import Config, parameter_specs
 from gp_ground_seg.parameters.schema import ROS_NODE_KEY, ROS_PARAMETERS_KEY, ParameterValue
 from gp_ground_seg.plotting.charts import plot_search
-from gp_ground_seg.scale.cluster import Runner
+from gp_ground_seg.plotting.style import new_figure
 
 DESCRIPTION = f"""\
 Search parameters on your labelled frames (Optuna, TPE) by IoU in the GroundGrid convention, from
@@ -77,6 +74,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         options.TO_JSON,
         options.FORCE,
     )  # fmt: skip
+    options.add_cluster(parser)
     options.add_config(parser)
     parser.set_defaults(run=run)
 
@@ -87,57 +85,45 @@ def run(arguments: argparse.Namespace) -> int:
     specs = optimise.searched_specs(arguments.parameters, base)
     left_out = arguments.left_out.split(',') if arguments.left_out else None
     searched, rest = optimise.split_frames(frames_from_options(arguments), left_out)
-    with staged_options(arguments, 'json', 'output', 'page') as parts:
-        total = arguments.trials * len(searched)
+    if arguments.page:
+        new_figure(1.0, 1.0)  # Raises at once where matplotlib is missing.
+    with (
+        options.staged_options(arguments, 'json', 'output', 'page') as parts,
+        options.runner(arguments, 'optimise') as runner,
+    ):
         # Of values that are far off the library says much; their IoU says it too.
-        with (
-            options.progress('optimise')(total=total) as bar,
-            options.library_notes(logging.ERROR),
-        ):
-
-            def counted(frames: Sequence[Frame]) -> Iterator[Frame]:
-                for frame in frames:
-                    yield frame
-                    bar.update()
-
-            trials = optimise.search(
-                base, specs, searched, partial(optimise.search_iou, progress=counted),
-                arguments.trials, arguments.seed, arguments.journal,
-            )  # fmt: skip
+        with options.library_notes(logging.ERROR):
+            n, seed, journal = arguments.trials, arguments.seed, arguments.journal
+            trials = optimise.search(base, specs, searched, runner, n, seed, journal)
         given, *_ = known = [trial for trial in trials if not math.isnan(trial.iou)]
         best = max(known, key=lambda trial: trial.iou)
         config = base.replace(**best.choice)
         variants = {'given': base, 'best': config}
-        runner = Runner(options.progress('left out'))
         scores = score_variants(rest, load_kitti, variants, runner=runner)
         found = comparison.find_differences(*scores)
-        ious = [f'{100.0 * trial.iou:.2f} %' for trial in (given, best)]
-        verdict = (
-            f'{_verdict(found[0])}; IoU on the {len(searched)} frames searched: '
-            f'given {ious[0]}, best of {len(trials)} trials {ious[1]}'
+        words = (
+            f'{_verdict(found[0])}. IoU on the {len(searched)} frames searched: given '
+            f'{100.0 * given.iou:.2f} %, best of {len(trials)} trials {100.0 * best.iou:.2f} %; '
+            f'{len(rest)} left out, of {", ".join(scores[0].sequences)}'
         )
         table = comparison.difference_table(scores[0], found, [*variants])
-        names = ', '.join(scores[0].sequences)
-        table = replace(table, title=f'{len(rest)} frames left out, of {names}; {table.title}')
-        report = make_report({}, scores, base)
+        report = make_report({}, scores, base, trials=[trial._asdict() for trial in trials])
         environment = describe_environment('optuna')
-        lines = [verdict, *options.changed_lines(base, config)]
+        lines = [words, *options.changed_lines(base, config)]
         lines.append(machine_line(environment, report.fit))
         text = written([table], lines, markdown=arguments.markdown)
         if 'json' in parts:
-            measures = [one._asdict() for one in found]
-            report.facts.update(trials=[trial._asdict() for trial in trials], measures=measures)
+            report.facts['measures'] = [one._asdict() for one in found]
             report.write(parts['json'], environment)
         if 'output' in parts:
-            parts['output'].write_text(f'# {verdict}\n{_parameter_file(config)}', encoding='utf-8')
+            values = yaml.safe_dump({ROS_NODE_KEY: {ROS_PARAMETERS_KEY: _changed(config)}})
+            parts['output'].write_text(f'# {words}\n{values}', encoding='utf-8')
         if 'page' in parts:
             picture = parts['page'].with_name('history.png')
             plot_search(known, [spec.name for spec in specs if optimise.is_log(spec)], picture)
             data = base64.b64encode(picture.read_bytes()).decode()
-            page = PAGE.format(
-                title=html.escape(arguments.root), text=html.escape(text), data=data
-            )
-            parts['page'].write_text(page, encoding='utf-8')
+            shown = {'title': html.escape(arguments.root), 'text': html.escape(text)}
+            parts['page'].write_text(PAGE.format(data=data, **shown), encoding='utf-8')
     print(text)
     return 0
 
@@ -145,16 +131,19 @@ def run(arguments: argparse.Namespace) -> int:
 def _verdict(iou: comparison.Difference) -> str:
     """Say by the frames left out whether there is something to win."""
     if math.isnan(iou.low):
-        return 'no verdict: too few frames left out for an interval'
-    if iou.low <= 0.0 <= iou.high:
-        return 'nothing to win: the interval of the IoU on frames left out holds 0'
-    return 'won on frames left out' if iou.low > 0.0 else 'lost on frames left out: keep the given'
+        return 'No verdict: too few frames left out for an interval'
+    if iou.low > 0.0:
+        return 'Won: the best is better on frames left out'
+    if iou.high < 0.0:
+        return 'Lost: the best is worse on frames left out, keep the given'
+    return 'Nothing to win: the interval of the IoU on frames left out holds 0'
 
 
-def _parameter_file(config: Config) -> str:
-    """Return what differs from the defaults, in the form of ROS, which commands read too."""
-    groups: dict[str, dict[str, ParameterValue]] = {}
-    for name, value in changed_parameters(config).items():
-        group, field = name.split('.')
-        groups.setdefault(group, {})[field] = value
-    return yaml.safe_dump({ROS_NODE_KEY: {ROS_PARAMETERS_KEY: groups}}, sort_keys=False)
+def _changed(config: Config) -> dict[str, dict[str, ParameterValue]]:
+    """Return what differs from the defaults, by group."""
+    names = changed_parameters(config)
+    groups = {
+        group: {field: value for field, value in own.items() if f'{group}.{field}' in names}
+        for group, own in config.nested().items()
+    }
+    return {group: own for group, own in groups.items() if own}

@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from gp_ground_seg.data.atomic_output import leftovers
+from gp_ground_seg.data.atomic_output import leftovers, staged_file
 from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.parameters.config import Config
@@ -202,6 +202,17 @@ def library_notes(level: int = logging.INFO) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.setLevel(before)
+
+
+@contextmanager
+def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
+    """Yield a path for each of the options given; the files appear when the block ends well."""
+    with ExitStack() as stack:
+        yield {
+            name: stack.enter_context(staged_file(path, force=arguments.force))
+            for name in names
+            if (path := getattr(arguments, name)) is not None
+        }
 
 
 def note_leftovers(target: Path) -> None:

@@ -21,7 +21,7 @@ from gp_ground_seg.data.files import AnyPath, as_path, write_file
 from gp_ground_seg.data.inputs import Inputs, holds_bag, list_inputs
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
+from gp_ground_seg.evaluation.report import Cell, Column, Table, percent, write_json
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
@@ -120,6 +120,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
         ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
         *options.SCAN_LAYOUT,
+        options.TO_JSON,
         options.FORCE,
     )
     options.add_config(parser)
@@ -301,12 +302,12 @@ def _check_output_topics(source: Path, topics: tuple[str, str], copied: list[str
 DEGREES = math.degrees(1.0)
 POSE_COLUMNS = (
     Column('scan'),
-    Column('height [m]', '.2f'),
-    Column('roll [deg]', '+.2f', scale=DEGREES),
-    Column('pitch [deg]', '+.2f', scale=DEGREES),
-    percent('support [%]', form='.0f'),
-    Column('residual [m]', '.3f'),
-    Column('used as'),
+    Column('height [m]', '.2f', 'height'),
+    Column('roll [deg]', '+.2f', 'roll', DEGREES),
+    Column('pitch [deg]', '+.2f', 'pitch', DEGREES),
+    percent('support [%]', 'support', '.0f'),
+    Column('residual [m]', '.3f', 'residual'),
+    Column('used as', key='used_as'),
 )
 
 
@@ -314,19 +315,24 @@ def run_pose(arguments: argparse.Namespace) -> int:
     """Print a line for each scan, and the medians."""
     poses, rows, notes = [], [], []
     scans = list_inputs(arguments.input, options.scan_layout(arguments), arguments.topic)
-    with closing(GroundSegmenter(options.read_config(arguments))) as segmenter:
-        for scan in scans:
-            try:
-                pose = segmenter.estimate_pose(scan.read().xyz)
-            except PointCloudError as error:
-                notes.append(f'{scan.title}: refused: {error}')
-                continue
-            poses.append(pose)
-            rows.append(_pose_row(scan.title, pose))
-            notes += [f'{scan.title}: {line}' for line in pose.contradictions]
-    if poses:
-        print(Table(POSE_COLUMNS, rows).text())
-        notes.insert(0, _pose_summary(poses))
+    config, bar = options.read_config(arguments), options.progress('pose')
+    with options.staged_options(arguments, 'json') as parts:
+        with closing(GroundSegmenter(config)) as segmenter:
+            for scan in bar(scans, total=len(scans)):
+                try:
+                    pose = segmenter.estimate_pose(scan.read().xyz)
+                except PointCloudError as error:
+                    notes.append(f'{scan.title}: refused: {error}')
+                    continue
+                poses.append(pose)
+                rows.append(_pose_row(scan.title, pose))
+                notes += [f'{scan.title}: {line}' for line in pose.contradictions]
+        table = Table(POSE_COLUMNS, rows)
+        if poses:
+            print(table.text())
+            notes.insert(0, _pose_summary(poses))
+        if 'json' in parts:
+            write_json({'scans': table.json(), 'notes': notes}, parts['json'])
     print('\n'.join(notes))
     return 0
 

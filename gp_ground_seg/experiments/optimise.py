@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,15 +16,14 @@ from gp_ground_seg.errors import ConfigError, DataError, require
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confusion
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue
-from gp_ground_seg.scale.cluster import Progress
+from gp_ground_seg.scale.cluster import Progress, Runner
 from gp_ground_seg.segmenter import GroundSegmenter
 
-GROUPS_OF_ROBOT = ('sensor', 'frame', 'input', 'runtime', 'diagnostics')
-DEFAULT_NAMES = tuple(
+DEFAULT_NAMES = [
     spec.name
     for spec in parameter_specs()
-    if spec.basic and spec.type in (int, float) and spec.name.split('.')[0] not in GROUPS_OF_ROBOT
-)
+    if spec.basic and spec.type in (int, float) and not spec.name.startswith(('sensor', 'runtime'))
+]
 """Basic numbers that bear on labels and are no facts of a robot."""
 LOG_RATIO = 100.0
 """Highest over lowest number accepted, both above 0, from which on the scale is logarithmic."""
@@ -56,8 +56,8 @@ def split_frames(
     return searched, rest
 
 
-def search_iou(config: Config, frames: Sequence[Frame], progress: Progress = iter) -> float:
-    """Return the IoU over labelled frames, GroundGrid convention, each without a past."""
+def count_frames(config: Config, frames: Sequence[Frame], progress: Progress = iter) -> Confusion:
+    """Score labelled frames in the GroundGrid convention, each without a past."""
     total = Confusion()
     with closing(GroundSegmenter(config)) as segmenter:
         for frame in progress(frames):
@@ -66,7 +66,7 @@ def search_iou(config: Config, frames: Sequence[Frame], progress: Progress = ite
             truth = GROUNDGRID.truth(read_labels(frame.labels_path, len(points)), points[:, 2])
             segmenter.reset()
             total += count_confusion(segmenter.segment(points).label, truth)
-    return total.iou
+    return total
 
 
 def searched_specs(names: Sequence[str], base: Config) -> list[ParameterSpec]:
@@ -87,7 +87,7 @@ def search(
     base: Config,
     specs: Sequence[ParameterSpec],
     frames: Sequence[Frame],
-    objective: Callable[[Config, Sequence[Frame]], float],
+    runner: Runner,
     n_trials: int,
     seed: int,
     journal: str | Path | None = None,
@@ -125,7 +125,10 @@ def search(
             config = base.replace(**choice)
         except ConfigError as error:  # values that do not go along
             raise optuna.TrialPruned from error
-        return objective(config, frames)
+        total = sum(runner.run(partial(count_frames, config), frames), Confusion())
+        if not total.tp + total.fn:
+            raise DataError('no return in the frames searched is labelled ground')
+        return total.iou
 
     states = optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.PRUNED
     n_done = len(study.get_trials(states=states))
