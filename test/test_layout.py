@@ -48,6 +48,11 @@ ONLY_IN = {
     'rosbags': ('data/bags.py',),
     'matplotlib': ('plotting/',),
     'numba': ('jit.py', 'compiled/'),
+    'optuna': ('experiments/optimise.py',),
+    'imageio': ('plotting/',),
+    'imageio_ffmpeg': ('plotting/',),
+    'argcomplete': ('cli/main.py',),
+    'pypatchworkpp': ('evaluation/patchworkpp.py',),
 }
 PRIVATE = ('numba.core', 'numba.np', 'llvmlite')
 
@@ -76,6 +81,8 @@ def imports(tree):
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, 'imports are absolute'
             yield from (f'{node.module}.{alias.name}' for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == 'require':
+            yield ast.literal_eval(node.args[0])
 
 
 def find_layer_violations(trees):
@@ -181,6 +188,7 @@ def test_files_are_of_a_size_worth_opening(trees):
         (find_foreign_violations, 'cli/a.py', 'from rclpy.node import Node'),
         (find_foreign_violations, 'data/a.py', 'import rosbags.highlevel'),
         (find_foreign_violations, 'cli/a.py', 'import matplotlib'),
+        (find_foreign_violations, 'cli/a.py', "require('optuna', 'tune')"),
         (find_foreign_violations, 'gp/a.py', 'from numba import njit'),
         (find_foreign_violations, 'compiled/a.py', 'from numba.core import types'),
         (find_foreign_violations, 'compiled/a.py', 'import llvmlite'),

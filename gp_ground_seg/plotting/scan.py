@@ -127,7 +127,7 @@ def write_movie(
     imageio = require('imageio.v2', 'plot')
     how: dict[str, Any] = {'duration': 1e3 / fps, 'loop': 0}
     if Path(path).suffix.lower() == '.mp4':
-        require('imageio_ffmpeg', 'plot')
+        require('imageio_ffmpeg', 'movie')
         how = {'fps': fps}
     with staged_file(path, force=True) as part, imageio.get_writer(part, **how) as writer:
         for scene in scenes:
