@@ -15,6 +15,7 @@ version = re.search(
 ).group(1)
 
 BAGS = ['rosbags>=0.11.9']
+FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
 PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
 MOVIE = ['imageio-ffmpeg>=0.4.8']  # for MP4; 165 MB, of which GIF needs none
 TUNE = ['optuna>=4.0']
@@ -74,6 +75,7 @@ setup(
     ],
     extras_require={
         'bags': BAGS,
+        'formats': FORMATS,
         'plot': PLOT,
         'movie': PLOT + MOVIE,
         'tune': PLOT + TUNE,

@@ -30,7 +30,7 @@ COMMANDS = {
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
     'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
-    'pose': ('segment', 'estimate height and tilt of the sensor from scans'),
+    'pose': ('pose', 'estimate height and tilt of the sensor from scans'),
     'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),
     'play': ('bags', "publish a bag's clouds as they were recorded"),
     'demo': ('demo', 'see it work, no data needed'),

@@ -16,6 +16,7 @@ import yaml
 from tqdm import tqdm
 
 from gp_ground_seg.data.atomic_output import leftovers, staged_file
+from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.parameters.config import Config
@@ -73,11 +74,31 @@ SCAN_LAYOUT: tuple[tuple[str, str, dict[str, Any]], ...] = (
 """Options of every command that reads ``.bin`` scans; it takes `FORCE` as well."""
 
 
+CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
+    ('--origin', 'place of the sensor in the coordinates of the input [m] (default: 0 0 0)',
+     {'metavar': ('X', 'Y', 'Z'), 'nargs': 3, 'type': float}),
+    *SCAN_LAYOUT,
+)  # fmt: skip
+"""Options of every command that reads clouds of any format; it takes `FORCE` as well."""
+
+
+def list_clouds(arguments: argparse.Namespace) -> Inputs:
+    """Return the clouds of the input."""
+    found = list_inputs(arguments.input, scan_layout(arguments), arguments.topic)
+    if found.topic is not None:
+        refuse_scan_layout(arguments, arguments.input)
+    return found
+
+
 def scan_layout(arguments: argparse.Namespace) -> ScanLayout:
-    """Return the layout of ``.bin`` scans; what can be no scan is refused, without ``--force``."""
+    """Return how scans are read; what can be no scan is refused, without ``--force``."""
     doubts = 'warn' if arguments.force else 'raise'
     columns, dtype = arguments.columns or KITTI.columns, arguments.dtype or KITTI.dtype
-    return ScanLayout(columns, dtype, doubts)
+    origin = getattr(arguments, 'origin', None)
+    if origin is not None and not all(map(math.isfinite, origin)):
+        raise DataError(f'--origin {" ".join(map(str, origin))}: must be three finite numbers')
+    return ScanLayout(columns, dtype, doubts, origin and tuple(origin))
 
 
 def refuse_scan_layout(arguments: argparse.Namespace, source: object) -> None:

@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.semantic_kitti import read_labels, read_points
+from gp_ground_seg.data.semantic_kitti import read_labels
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation.metrics import GROUNDGRID
 from gp_ground_seg.parameters.config import Config
@@ -38,6 +37,7 @@ model, with profiles of twice its standard deviation, coloured by length-scale.
 """
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
+  gp-ground-seg plot scan drive.mcap --frame 20 -o scan.png
   gp-ground-seg plot scan --simulate road_then_rubble -o scan.png
   gp-ground-seg plot scan --simulate urban --sensor vlp-16 --colour height -o scan.svg
   gp-ground-seg plot scan 000000.bin --camera 90,30,40 -o from_the_left.pdf
@@ -81,7 +81,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = options.new_parser(subparsers, 'plot', description, examples)
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
     number: dict[str, Any] = {'metavar': 'N', 'type': int}
-    scan = ('input', 'KITTI scan (.bin)', {'metavar': 'INPUT'})
+    scan = ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'})
     labels = ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'})
 
     view = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
@@ -101,7 +101,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add(
         drive,
         ('input', 'bag, sequence, or folder of scans', {'metavar': 'INPUT'}),
-        ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
         ('--frames', 'the first N clouds only', options.NUMBER),
         ('--fps', 'clouds per second (default: %(default)s)', {**options.NUMBER, 'default': 10}),
         options.QUIET,
@@ -132,7 +131,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for picture in (view, drive, above, segment):
         endings = ('.gif', '.mp4') if picture is drive else ('.png', '.pdf', '.svg')
         output = (f'{" or ".join(endings)} file', {'metavar': 'OUT', 'required': True})
-        options.add(picture, ('-o --output', *output), *options.SCAN_LAYOUT, options.FORCE)
+        if picture is not drive:
+            which = {**number, 'default': 0}
+            options.add(picture, ('--frame', 'which of several, from 0 (default: 0)', which))
+        options.add(picture, ('-o --output', *output), *options.CLOUDS, options.FORCE)
         options.add_config(picture)
         picture.set_defaults(run=run, endings=endings)
 
@@ -181,7 +183,7 @@ def _draw_scenes(arguments: argparse.Namespace, config: Config, segmenter: Groun
         scenes = (Scene(name, points, segmenter.segment(points)) for name, points in clouds)
         plot_sheet(scenes, len(SCENES), config, path, view)
         return f'{len(SCENES)} scenes'
-    inputs = list_inputs(arguments.input, options.scan_layout(arguments), arguments.topic)
+    inputs = options.list_clouds(arguments)
     n_clouds = min(len(inputs), arguments.frames or len(inputs))
     chosen = bar(islice(inputs, n_clouds), total=n_clouds)
     clouds = ((one.title, one.read().xyz) for one in chosen)
@@ -202,15 +204,22 @@ def _camera(text: str) -> View:
     return View.around(azimuth, elevation, distance)
 
 
-def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.float32], str]:
-    """Points of a file, and its name as in ``00/000005``."""
-    scan = Path(arguments.input)
-    folder = scan.resolve().parent
-    title = f'{folder.parent.name}/{scan.stem}' if folder.name == 'velodyne' else scan.name
-    return read_points(scan, options.scan_layout(arguments)), title
+def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]:
+    """Points of a scan, and its name as in ``00/000005``."""
+    scans = options.list_clouds(arguments)
+    try:
+        scan = scans[arguments.frame]
+    except IndexError as error:
+        most, n = len(scans) - 1, options.count(len(scans), 'scan')
+        raise DataError(
+            f'--frame {arguments.frame}: must be in [0, {most}]; {n} in {arguments.input}'
+        ) from error
+    folder = Path(str(scan.path)).resolve().parent
+    title = f'{folder.parent.name}/{scan.name}' if folder.name == 'velodyne' else scan.title
+    return scan.read().xyz, title
 
 
-def _simulate(arguments: argparse.Namespace, name: str) -> tuple[npt.NDArray[np.float32], str]:
+def _simulate(arguments: argparse.Namespace, name: str) -> tuple[npt.NDArray[np.floating], str]:
     options.refuse_scan_layout(arguments, 'a simulated one')
     if arguments.seed < 0:
         raise DataError(f'--seed {arguments.seed}: must not be negative')

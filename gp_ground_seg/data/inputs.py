@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
 
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.data.clouds import Cloud, name_columns
+from gp_ground_seg.data.cloud_files import NUSCENES_SUFFIX, SUFFIXES, read_file
+from gp_ground_seg.data.clouds import Cloud
 from gp_ground_seg.data.files import AnyPath, as_path
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
-from gp_ground_seg.data.semantic_kitti import read_scan
 from gp_ground_seg.errors import DataError, PointCloudError
 
-NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
-SUFFIXES = ('.bin',)
 # Where the scans of a data set are, in a folder of one of its drives, and these in its root.
 _SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')
 _DRIVES = ('sequences/*/velodyne', 'data_3d_raw/*/velodyne_points', '*/velodyne_points')
@@ -57,11 +55,17 @@ class Inputs:
     """
 
     def __init__(
-        self, path: AnyPath, items: Sequence[Input], topic: str | None = None, n_messages: int = 0
+        self,
+        path: AnyPath,
+        items: Sequence[Input],
+        topic: str | None = None,
+        n_messages: int = 0,
+        layout: ScanLayout = KITTI,
     ) -> None:
         self.path = path
         self.topic = topic  # of a bag, else None
         self._items = items
+        self._origin = layout.origin
         self._length = n_messages or len(items)
 
     def __len__(self) -> int:
@@ -76,7 +80,7 @@ class Inputs:
         with BagReader(str(self.path)) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
-                read = partial(_decode, raw, f'{self.path}: {place}')
+                read = partial(_decode, raw, f'{self.path}: {place}', self._origin)
                 yield Input(f'{k:06d}', f'{self.path.name}[{k}]', self.path, read, 1e-9 * time)
 
     def __getitem__(self, index: int) -> Input:
@@ -106,7 +110,7 @@ def list_inputs(
     if isinstance(path, Path) and holds_bag(path):
         with BagReader(path) as bag:
             name = bag.pick_point_cloud_topic(topic)
-            return Inputs(path, (), name, bag.n_messages(name))
+            return Inputs(path, (), name, bag.n_messages(name), layout)
     if topic is not None:
         raise DataError(f'--topic: is for bags, which {source} is not')
     files = _find_files(path)
@@ -158,17 +162,9 @@ def _stem(path: AnyPath) -> str:
     return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
 
 
-def read_file(path: AnyPath, layout: ScanLayout = KITTI) -> Cloud:
-    """Read a file of any format, known by its suffix."""
-    if path.name.endswith(NUSCENES_SUFFIX) and layout.columns == KITTI.columns:
-        layout = replace(layout, columns=NUSCENES_COLUMNS)
-    data = read_scan(path, layout)
-    return Cloud(name_columns(layout.view(data)), layout.points(data))
-
-
-def _decode(raw: bytes, place: str) -> Cloud:
+def _decode(raw: bytes, place: str, origin: tuple[float, float, float] | None) -> Cloud:
     try:
         message = decode_cloud(raw)
-        return Cloud(read_fields(message), read_xyz(message), message)
+        return Cloud(read_fields(message), read_xyz(message)).about(origin)
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error
