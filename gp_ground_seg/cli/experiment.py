@@ -84,7 +84,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for name, experiment in EXPERIMENTS.items():
         purpose = re.split(r'\.(?:\s|$)', experiment.description)[0]
         source = ' KITTI_ROOT' if experiment.options[0][0] == 'root' else ' --sensors vlp-16'
-        source += ' --set label.ground_tolerance=0.05,0.1' * (name == 'cross-validation')
         example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
         own = options.new_parser(names, name, experiment.description, example, purpose)
         options.add(own, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
