@@ -14,7 +14,7 @@ VALUES = {'errors', 'jit', 'log', 'frame'}
 STAGES = VALUES | {'parameters', 'pipeline', 'gp'}
 RESULT = STAGES | {'result', 'ground_model'}
 LIBRARY = RESULT | {'compiled', 'backend', 'segmenter'}
-TOOLS = LIBRARY | {'data', 'plotting', 'simulation', 'evaluation'}
+TOOLS = LIBRARY | {'data', 'plotting', 'simulation', 'scale', 'evaluation'}
 LAYERS = {
     'errors': set(),
     'jit': {'errors'},
@@ -31,7 +31,8 @@ LAYERS = {
     'backend': STAGES | {'compiled'},
     'segmenter': RESULT | {'backend'},
     'plotting': RESULT | {'data'},
-    'evaluation': LIBRARY | {'data', 'simulation'},
+    'scale': LIBRARY | {'data'},
+    'evaluation': LIBRARY | {'data', 'simulation', 'scale'},
     'ros': LIBRARY | {'data', 'plotting', 'simulation'},
     'experiments': TOOLS,
     'cli': TOOLS | {'experiments', 'ros'},
@@ -47,6 +48,9 @@ ROS = (
 ONLY_IN = {
     **dict.fromkeys(ROS.split(), ('ros/',)),
     'rosbags': ('data/bags.py',),
+    **dict.fromkeys(('dask', 'distributed'), ('scale/cluster.py',)),
+    'fsspec': ('data/files.py',),
+    'pyarrow': ('evaluation/report.py',),
     'matplotlib': ('plotting/',),
     'numba': ('jit.py', 'compiled/'),
     'optuna': ('experiments/optimise.py',),

@@ -76,6 +76,8 @@ def run(
     """
     if target.suffix == '.label':
         raise DataError(f'{target}: must be a folder')
+    if isinstance(target, Path) and not target.resolve().parent.is_dir():
+        raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')
     is_bag = items[0].read is list
     manifest = Manifest(target, digest(config, options.scan_layout(arguments), arguments.raw))
     names = [item.name for item in items]
@@ -83,9 +85,6 @@ def run(
     if done is None:
         done = set()
         manifest.begin(names, force=arguments.force)
-    if isinstance(target, Path):
-        for folder in {(target / name).parent for name in names}:
-            folder.mkdir(parents=True, exist_ok=True)
     left, n_workers = [item for item in items if item.name not in done], 0
     found = []
     if left:

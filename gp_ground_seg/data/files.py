@@ -33,7 +33,7 @@ class UrlPath:
         return self.url
 
     def __truediv__(self, name: str) -> UrlPath:
-        return UrlPath(f'{self.url.rstrip("/")}/{name}')
+        return self if name == '.' else UrlPath(f'{self.url.rstrip("/")}/{name}')
 
     @property
     def name(self) -> str:
@@ -125,6 +125,7 @@ def write_file(path: AnyPath, data: bytes) -> None:
     try:
         # Of that name only this one is written, should two workers compute the same.
         partial = path.with_name(f'.{path.name}{PARTIAL_MARK}{uuid.uuid4().hex}')
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             partial.write_bytes(data)
             os.replace(partial, path)

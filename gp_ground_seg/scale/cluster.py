@@ -9,7 +9,10 @@ import importlib.metadata
 import importlib.util
 import itertools
 import logging
+import multiprocessing
 import platform
+import signal
+import threading
 import uuid
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -208,6 +211,29 @@ def _compute(
 
 
 @contextmanager
+def _interrupt_kept() -> Iterator[None]:
+    """Keep Ctrl-C, which all processes of a terminal get, from those that are started.
+
+    They inherit the mask of signals. Here it takes effect when they are started.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    # Starts a process of multiprocessing's own, after which the mask of its thread is another.
+    multiprocessing.get_context('spawn').Lock()
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.signal(signal.SIGINT, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
 def open_runner(
     workers: int | None, scheduler: str | None, bar: Callable[..., tqdm[Any]]
 ) -> Iterator[Runner]:
@@ -218,32 +244,47 @@ def open_runner(
     if workers is None and scheduler is None:
         yield Runner(bar)
         return
+    with ExitStack() as stack:
+        with _interrupt_kept():
+            cluster = scheduler if workers is None else stack.enter_context(_start(workers))
+            client = stack.enter_context(_connect(cluster))
+        if scheduler is not None or importlib.util.find_spec('bokeh'):
+            _LOGGER.info('dashboard: %s', client.dashboard_link)
+        yield Runner(bar, client)
+
+
+def _start(n_workers: int) -> Any:
+    """Start workers of one thread on this machine."""
+    dashboard = 'localhost:0' if importlib.util.find_spec('bokeh') else None
+    return _distributed().LocalCluster(
+        n_workers=n_workers, threads_per_worker=1, dashboard_address=dashboard,
+        silence_logs=logging.CRITICAL,
+    )  # fmt: skip
+
+
+def _connect(cluster: Any) -> Any:
+    if isinstance(cluster, str) and not cluster.startswith(('tcp://', 'tls://')):
+        raise DataError(f'--scheduler {cluster}: must be tcp://HOST:PORT, or tls://')
+    distributed = _distributed()
+    with warnings.catch_warnings():
+        # Versions are compared by `_compute`, which says in one line what differs.
+        warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
+        try:
+            return distributed.Client(cluster, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise DataError(f'--scheduler {cluster}: does not answer ({error})') from error
+
+
+def _distributed() -> Any:
+    """Import distributed; it says nothing but by way of what we do."""
     try:
         import dask
-        from distributed import Client, LocalCluster
-        from distributed.versions import VersionMismatchWarning
+        import distributed
     except ImportError as error:
         raise MissingDependencyError(
             "Dask is not installed: pip install 'gp_ground_seg[scale]'"
         ) from error
+    dask.config.set(_CONFIG)
     for name in ('distributed', 'distributed.client'):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    with ExitStack() as stack, warnings.catch_warnings():
-        # Versions are compared by `_compute`, which says in one line what differs.
-        warnings.simplefilter('ignore', VersionMismatchWarning)
-        stack.enter_context(dask.config.set(_CONFIG))
-        address: Any = scheduler
-        dashboard = 'localhost:0' if importlib.util.find_spec('bokeh') else None
-        if scheduler is None:
-            address = LocalCluster(
-                n_workers=workers, threads_per_worker=1, dashboard_address=dashboard,
-                silence_logs=logging.CRITICAL,
-            )  # fmt: skip
-            stack.enter_context(address)
-        try:
-            client = stack.enter_context(Client(address, set_as_default=False))
-        except (OSError, ValueError) as error:
-            raise DataError(f'--scheduler {scheduler}: does not answer ({error})') from error
-        if scheduler is not None or dashboard:
-            _LOGGER.info('dashboard: %s', client.dashboard_link)
-        yield Runner(bar, client)
+    return distributed
