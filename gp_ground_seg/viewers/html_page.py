@@ -95,7 +95,7 @@ def legend(colourings: Iterable[str], config: Config) -> str:
     lines = []
     for name in colourings:
         swatches = ' '.join(
-            f'<span style="background:{colour}">&emsp;</span>&nbsp;{word}'
+            f'<nobr><span style="background:{colour}">&emsp;</span> {word}</nobr>'
             for word, colour in known.get(name, {}).items()
             if word != 'unknown'
         )

@@ -29,6 +29,10 @@ HOST = '127.0.0.1'
 START_TIMEOUT = 20.0  # of the web viewer [s]
 HIDDEN = ('height', 'p_ground', 'errors', 'band', 'faces', 'candidates')
 """Entities below ``scan`` that are not shown at first."""
+SERIES = {
+    'IoU': 'IoU [%]', 'lost': 'objects lost', 'theta': 'theta', 'latency': 'latency [ms]',
+}  # fmt: skip
+"""What is drawn over the frames, and its titles."""
 ABOUT = f"""\
 The eyes in the tree on the left show and hide:
 
@@ -68,11 +72,11 @@ class Recording:
         log('scan/faces', rr.LineStrips3D(scene.faces, colors=(122, 79, 163)))
         colours = palette(CANDIDATES)[1 - scene.is_inlier]
         log('scan/candidates', rr.Points3D(scene.candidates, radii=0.06, colors=colours))
-        seconds = {name: 1e3 * value for name, value in result.timings.items()}
-        groups = {'score': scores, 'theta': result.fit.theta, 'latency': seconds}
-        for group, values in groups.items():
-            for name, value in values.items():
-                log(f'{group}/{name.replace(" ", "_")}', rr.Scalars([value]))
+        numbers = {f'theta/{name}': value for name, value in result.fit.theta.items()}
+        numbers |= {name: value for name, value in scores.items() if name in SERIES}
+        numbers['latency'] = 1e3 * result.timings['total']
+        for name, value in numbers.items():
+            log(name, rr.Scalars([value]))
 
     def _mesh(self, mesh: Mesh, alpha: int) -> Any:
         return self._rr.Mesh3D(
@@ -88,11 +92,11 @@ def _blueprint(rrb: Any) -> Any:
     hidden = {f'scan/{name}': rrb.EntityBehavior(visible=False) for name in HIDDEN}
     eye = rrb.EyeControls3D(position=CAMERA, look_target=TARGET, eye_up=(0.0, 0.0, 1.0))
     scan = rrb.Spatial3DView(origin='scan', name='scan', overrides=hidden, eye_controls=eye)
-    titles = {'score': 'score', 'theta': 'theta', 'latency': 'latency [ms]'}
-    series = [rrb.TimeSeriesView(origin=name, name=title) for name, title in titles.items()]
+    series = [rrb.TimeSeriesView(origin=name, name=title) for name, title in SERIES.items()]
     about = rrb.TextDocumentView(origin='about', name='what is what')
+    left, right = rrb.Tabs(scan, about), rrb.Vertical(*series)
     return rrb.Blueprint(
-        rrb.Horizontal(scan, rrb.Vertical(*series, about), column_shares=[2.5, 1.0]),
+        rrb.Horizontal(left, right, column_shares=[2.5, 1.0]),
         rrb.BlueprintPanel(state='expanded'),
         rrb.SelectionPanel(state='collapsed'),
         rrb.TimePanel(state='collapsed'),

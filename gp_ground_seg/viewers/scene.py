@@ -52,14 +52,14 @@ class View(NamedTuple):
     objects: Objects | None = None
 
     def scores(self, result: Segmentation) -> dict[str, float]:
-        """Return how good a result is; nothing where the truth is not known."""
+        """IoU [%], objects lost, and objects; nothing where the truth is not known."""
         if self.truth is None or self.objects is None:
             return {}
         counts = count_objects(self.points, result.label, self.objects)
         found = [one for bands in counts.values() for one in bands]
         return {
-            'IoU [%]': 100.0 * count_confusion(result.label, self.truth).iou,
-            'objects lost': sum(one.n_lost for one in found),
+            'IoU': 100.0 * count_confusion(result.label, self.truth).iou,
+            'lost': sum(one.n_lost for one in found),
             'objects': sum(one.n_objects for one in found),
         }
 
