@@ -79,29 +79,30 @@ def draw_points(
     return server.scene.add_point_cloud(f'/{name}', points, colours, **look)
 
 
-def draw_surface(server: Any, mesh: Mesh, visible: bool) -> None:
+def draw_surface(server: Any, mesh: Mesh, visible: bool = True) -> Any:
     """Add the surface, with its colours; viser takes them by way of trimesh."""
     # The format in between, glTF, has linear colours.
     linear = (255.0 * (mesh.colours / 255.0) ** 2.2).astype(np.uint8)
     solid = require('trimesh', 'tune').Trimesh(
         mesh.vertices, mesh.triangles, vertex_colors=linear, process=False
     )
-    server.scene.add_mesh_trimesh('/surface', solid, visible=visible, cast_shadow=False)
+    return server.scene.add_mesh_trimesh('/surface', solid, visible=visible, cast_shadow=False)
 
 
-def legend(colourings: Iterable[str], config: Config) -> str:
-    """Return what the colours mean, as HTML, of `scene.point_colours` and of the surface."""
+def legend(names: Iterable[str], config: Config) -> str:
+    """Return what the colours mean, as HTML: those of points, and of the ``surface``."""
     known = {'class': CLASSES, 'errors': ERRORS, 'changes': CHANGES}
+    limits = config.length_scale
+    ramps = {**RAMPS, 'surface': (limits.min, limits.max)}
+    units = {'height': ' [m]', 'surface': ', length-scale [m]'}
     lines = []
-    for name in colourings:
+    for name in names:
         swatches = ' '.join(
             f'<nobr><span style="background:{colour}">&emsp;</span> {word}</nobr>'
             for word, colour in known.get(name, {}).items()
             if word != 'unknown'
         )
-        lines.append(f'{name}: {swatches or _bar(*RAMPS[name])}')
-    limits = config.length_scale
-    lines.append(f'surface, length-scale [m]: {_bar(limits.min, limits.max)}')
+        lines.append(f'{name}{units.get(name, "")}: {swatches or _bar(*ramps[name])}')
     return '<br>'.join(lines)
 
 
@@ -123,7 +124,7 @@ def write_page(path: str | Path, scene: Scene, title: str, config: Config, force
     with staged_file(path, force=force) as part, open_server(0, 'view') as server:
         draw(server, scene)
         page = server.get_scene_serializer().as_html()
-        words = f'<b>{html.escape(title)}</b><br>{legend(scene.colours, config)}'
+        words = f'<b>{html.escape(title)}</b><br>{legend([*scene.colours, "surface"], config)}'
         words += '<br>The button at the top right shows and hides: points by '
         words += f'{", ".join(scene.colours)}, surface, band, faces, candidates'
         head, body, rest = page.rpartition('</body>')

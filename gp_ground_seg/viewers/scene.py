@@ -102,16 +102,16 @@ def make_scene(view: View, result: Segmentation, config: Config, backend: Backen
     """Draw a segmented scan; `backend` finds the vertical faces again."""
     finite = result.label != Label.UNKNOWN
     level = result.pose.level(view.points[:, :3])
-    model = dataclasses.replace(GroundModel.of(result), roll=0.0, pitch=0.0)
-    azimuth, own = model.azimuth[result.candidates.segment], result.candidates
+    own = result.candidates
+    azimuth = _level_model(result).azimuth[own.segment]
     candidates = np.stack([own.r * np.cos(azimuth), own.r * np.sin(azimuth), own.z], axis=1)
     colours = point_colours(result, view.truth)
     return Scene(
         level[finite].astype(np.float32),
         result.label[finite],
         {name: values[finite] for name, values in colours.items()},
-        _sheets(model, config, 0.0),
-        _sheets(model, config, -N_STD, N_STD),
+        surface_mesh(result, config, 0.0),
+        surface_mesh(result, config, -N_STD, N_STD),
         _face_boxes(level, config, backend).astype(np.float32),
         candidates.astype(np.float32),
         result.surface.inlier,
@@ -132,6 +132,14 @@ def point_colours(result: Segmentation, truth: Labels | None = None) -> dict[str
     return colours
 
 
+def change_colours(label: Labels, before: Labels) -> Colours:
+    """Colours of all points, (N, 3), by class; those of `CHANGES` where the class has changed."""
+    colours = palette(CLASSES)[label]
+    changed = label != before
+    colours[changed] = palette(CHANGES)[(label[changed] != Label.GROUND).astype(int)]
+    return colours
+
+
 def palette(colours: dict[str, str]) -> Colours:
     """Return the colours of a legend, (n, 3), from 0 to 255."""
     return np.array([[*bytes.fromhex(colour[1:])] for colour in colours.values()], np.uint8)
@@ -149,8 +157,13 @@ def _bytes(colours: FloatArray) -> Colours:
     return (255.0 * colours).round().astype(np.uint8)
 
 
-def _sheets(model: GroundModel, config: Config, *n_std: float) -> Mesh:
+def _level_model(result: Segmentation) -> GroundModel:
+    return dataclasses.replace(GroundModel.of(result), roll=0.0, pitch=0.0)
+
+
+def surface_mesh(result: Segmentation, config: Config, *n_std: float) -> Mesh:
     """Surfaces so many standard deviations above the ground, where it is known as in `plot`."""
+    model = _level_model(result)
     n_segments, n_knots = model.height.shape
     known = np.isfinite(model.height) & (model.std <= config.label.ground_tolerance)
     quad = known & np.roll(known, -1, axis=0)
