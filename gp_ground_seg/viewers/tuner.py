@@ -88,7 +88,7 @@ class Tuner:
         gui, last = server.gui, len(inputs) - 1
         # Sharing would send the scan through a server of viser's makers.
         gui.configure_theme(control_width='large', show_share_button=False, show_logo=False)
-        gui.set_panel_label(str(inputs.path))
+        gui.set_panel_label(inputs.path.name)
         self._summary, self._legend = gui.add_markdown('segmenting ...'), gui.add_html('')
         self._frame = gui.add_slider('frame', 0, max(last, 1), 1, frame, visible=last > 0)
         colourings = ('changes', 'class', 'height', 'p_ground', 'errors')
