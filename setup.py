@@ -16,6 +16,7 @@ version = re.search(
 
 BAGS = ['rosbags>=0.11.9']
 PLOT = ['matplotlib>=3.6']
+VISER = ['viser>=1.1']
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
     'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
@@ -72,6 +73,8 @@ setup(
         'plot': PLOT,
         'ros': ROS + BAGS + PLOT,
         'test': TEST,
+        'tune': VISER,
+        'view': ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER],
         'dev': DEV,
     },
     zip_safe=False,

@@ -17,9 +17,9 @@ PATIENCE = 120.0
 """Time to wait for what has to happen [s]; only a failure takes that long."""
 # WebGL by SwiftShader, on the CPU: there is no GPU, and no sandbox for root.
 FLAGS = (
-    '--headless=new --no-sandbox --remote-debugging-port=0 --window-size=1400,1000 '
-    '--use-angle=swiftshader --enable-unsafe-swiftshader about:blank'
-).split()
+    '--headless=new', '--no-sandbox', '--remote-debugging-port=0', '--window-size=1400,1000',
+    '--use-angle=swiftshader', '--enable-unsafe-swiftshader', 'about:blank',
+)  # fmt: skip
 
 
 class Page:
@@ -94,7 +94,9 @@ class Page:
 
     def place(self, selector, number=0):
         """Middle of an element, in pixels."""
-        box = f'document.querySelectorAll({json.dumps(selector)})[{number}].getBoundingClientRect()'
+        box = (
+            f'document.querySelectorAll({json.dumps(selector)})[{number}].getBoundingClientRect()'
+        )
         rect = self.run(f'(() => {{ const b = {box}; return [b.x, b.y, b.width, b.height] }})()')
         return rect[0] + 0.5 * rect[2], rect[1] + 0.5 * rect[3]
 
@@ -106,7 +108,6 @@ class Page:
                 'Input.dispatchMouseEvent', type=kind, x=x, y=y, button='left',
                 buttons=0 if kind == 'mouseReleased' else 1, clickCount=1,
             )  # fmt: skip
-
 
     def click(self, words):
         """Click the button with these words on it."""

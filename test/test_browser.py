@@ -13,7 +13,7 @@ from cli_runner import INTERRUPTED, run, start  # noqa: E402
 
 from gp_ground_seg.parameters.config import Config  # noqa: E402
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan  # noqa: E402
-from gp_ground_seg.viewers.scene import CHANGES, CLASSES, palette  # noqa: E402
+from gp_ground_seg.viewers.scene import LEGENDS, palette  # noqa: E402
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
 ROAD, OBJECT = 40, 99  # classes of SemanticKITTI
@@ -39,19 +39,20 @@ def page(tmp_path_factory):
         yield page
 
 
-def count(picture, colours):
-    """Pixels of a picture that have a colour of a legend, by its name."""
+def count(picture):
+    """Pixels of a picture that have a colour of the legends of class and changes, by its name."""
     return {
         name: int((np.abs(picture - colour).max(axis=-1) <= 2).sum())
-        for name, colour in zip(colours, palette(colours).astype(float), strict=True)
+        for legend in ('class', 'changes')
+        for name, colour in zip(LEGENDS[legend], palette(legend).astype(float), strict=True)
     }
 
 
 def wait_for_colours(page, name, condition):
-    """Numbers of pixels by class and change once they fulfil a condition, which drawing takes."""
+    """Numbers of pixels by colour once they fulfil a condition: drawing takes a while."""
 
     def look():
-        found = count(page.screenshot(name), {**CLASSES, **CHANGES})
+        found = count(page.screenshot(name))
         return found if condition(found) else None
 
     return page.wait_for(look, f'{name} as it should be')
@@ -99,7 +100,5 @@ def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page
 
     page.click('tuned.yaml')
     page.wait_for(lambda: f'written to {output}' in page.text, 'file')
-    assert Config.from_yaml(output) == Config().replace(
-        **{'label.ground_tolerance': float(value)}
-    )
+    assert Config.from_yaml(output) == Config().replace(**{'label.ground_tolerance': float(value)})
     assert page.errors == []

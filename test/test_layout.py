@@ -33,7 +33,8 @@ LAYERS = {
     'evaluation': LIBRARY | {'data', 'simulation'},
     'ros': LIBRARY | {'data', 'plotting', 'simulation'},
     'experiments': TOOLS,
-    'cli': TOOLS | {'experiments', 'ros'},
+    'viewers': TOOLS,
+    'cli': TOOLS | {'experiments', 'ros', 'viewers'},
     '__init__': RESULT | {'segmenter'},
     '__main__': {'cli'},
 }
@@ -48,6 +49,8 @@ ONLY_IN = {
     'rosbags': ('data/bags.py',),
     'matplotlib': ('plotting/',),
     'numba': ('jit.py', 'compiled/'),
+    'rerun': ('viewers/rerun_view.py',),
+    **dict.fromkeys(('viser', 'trimesh'), ('viewers/html_page.py',)),
 }
 PRIVATE = ('numba.core', 'numba.np', 'llvmlite')
 
@@ -76,6 +79,8 @@ def imports(tree):
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, 'imports are absolute'
             yield from (f'{node.module}.{alias.name}' for alias in node.names)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == 'require':
+            yield ast.literal_eval(node.args[0])
 
 
 def find_layer_violations(trees):
@@ -181,6 +186,7 @@ def test_files_are_of_a_size_worth_opening(trees):
         (find_foreign_violations, 'cli/a.py', 'from rclpy.node import Node'),
         (find_foreign_violations, 'data/a.py', 'import rosbags.highlevel'),
         (find_foreign_violations, 'cli/a.py', 'import matplotlib'),
+        (find_foreign_violations, 'cli/a.py', "rr = require('rerun.blueprint', 'view')"),
         (find_foreign_violations, 'gp/a.py', 'from numba import njit'),
         (find_foreign_violations, 'compiled/a.py', 'from numba.core import types'),
         (find_foreign_violations, 'compiled/a.py', 'import llvmlite'),

@@ -27,7 +27,7 @@ COMMANDS = {
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
     'view': ('view', 'look at scans in Rerun, a browser or a page'),
-    'tune': ('tune', 'set parameters by sliders, and see the labels change'),
+    'tune': ('view', 'set parameters by sliders, and see the labels change'),
     'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
     'pose': ('segment', 'estimate height and tilt of the sensor from scans'),
     'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),

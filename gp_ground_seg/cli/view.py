@@ -1,170 +1,209 @@
-"""``view``: segmented scans to turn and scrub through, in Rerun or as a page."""
+"""``view``: segmented scans to turn and scrub through; ``tune``: parameters by sliders."""
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from itertools import islice
 from pathlib import Path
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.data.inputs import Input, Inputs, list_inputs
+from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.export import to_yaml
+from gp_ground_seg.parameters.schema import NODE_NAME
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
-from gp_ground_seg.viewers.html_page import write_page
+from gp_ground_seg.viewers.html_page import open_server, write_page
 from gp_ground_seg.viewers.rerun_view import Recording, web_viewer
-from gp_ground_seg.viewers.scene import Scene, View, make_scene, read_view
+from gp_ground_seg.viewers.scene import View, make_scene, read_view
+from gp_ground_seg.viewers.tuner import Tuner, tunable
 
-DESCRIPTION = """\
-Look at segmented scans: points by class, height over the ground or probability, the
-surface with its 2-sigma band and its length-scales, vertical faces, candidates and
-inliers; over the frames IoU and objects lost (where labels are at hand), theta and latency.
+VIEW = """\
+Look at segmented scans in Rerun: points by class, height or probability, the surface with
+its 2-sigma band and length-scales, vertical faces, candidates and inliers; over the frames
+IoU and objects lost (with labels, as SemanticKITTI has them), theta and latency.
 
-INPUT is whatever `segment` takes: a scan, a folder of scans, a sequence, a bag. Labels of
-SemanticKITTI are found beside its scans.
-
-Without --save, --web or --html it opens Rerun's own viewer. --web listens on this
-machine only, until Ctrl-C; from another: ssh -L.
+INPUT is what `segment` takes. --web serves to this machine only, until Ctrl-C.
 """
-EXAMPLES = """\
+VIEW_EXAMPLES = """\
   gp-ground-seg view KITTI_ROOT/sequences/00          scrub through a sequence
-  gp-ground-seg view drive.mcap --frame-step 5        every fifth cloud of a bag
-  gp-ground-seg view 000000.bin --labels 000000.label
-  gp-ground-seg view drive.mcap --web                 in the browser
-  gp-ground-seg view drive.mcap --save drive.rrd      later: rerun drive.rrd
-  gp-ground-seg view drive.mcap --frame 40 --html scan.html
+  gp-ground-seg view drive.mcap --frame-step 5 --web  every fifth cloud, in the browser
+  gp-ground-seg view drive.mcap --save drive.rrd      for later: rerun drive.rrd
+  gp-ground-seg view 000000.bin --labels 000000.label --html scan.html
 
 needs: pip install 'gp_ground_seg[view]'
+"""
+TUNE = """\
+A scan in the browser with sliders for its parameters: labels follow at once, those that
+change in colour; with labels IoU and objects lost too. Buttons write the parameters as
+YAML, and, where ROS runs, set them in a running node. For this machine only, until Ctrl-C.
+"""
+TUNE_EXAMPLES = """\
+  gp-ground-seg tune 000000.bin
+  gp-ground-seg tune KITTI_ROOT/sequences/00 --frame 5 -o kitti.yaml
+  gp-ground-seg tune drive.mcap --parameters label.ground_tolerance,faces.cell_size
+  gp-ground-seg tune drive.mcap --node /front/ground_segmentation_node
+
+needs: pip install 'gp_ground_seg[tune]'
 """
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the command."""
-    parser = options.new_parser(subparsers, 'view', DESCRIPTION, EXAMPLES)
-    add_input(parser)
-    number = {'metavar': 'N', 'type': options.positive}
+    """Declare the commands."""
+    view = options.new_parser(subparsers, 'view', VIEW, VIEW_EXAMPLES)
+    tune = options.new_parser(subparsers, 'tune', TUNE, TUNE_EXAMPLES)
+    number, file = options.NUMBER, {'metavar': 'FILE'}
+    for parser, run in ((view, run_view), (tune, run_tune)):
+        options.add(
+            parser,
+            ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
+            ('--labels', 'SemanticKITTI labels of a scan (default: those beside it)', file),
+            ('--frame', 'number of one frame, from 0', {'metavar': 'N', 'type': int}),
+            ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
+            ('--port', 'of the page (default: %(default)s)', {**number, 'default': 9090}),
+            *options.SCAN_LAYOUT,
+            options.FORCE,
+            options.QUIET,
+        )
+        options.add_config(parser)
+        parser.set_defaults(run=run)
     options.add(
-        parser,
-        ('--frame-step', 'only every N-th frame (default: 1)', {**number, 'default': 1}),
-        ('--port', 'of --web (default: a free one)', {**number, 'default': 0}),
-        options.QUIET,
+        view, ('--frame-step', 'only every N-th frame (default: 1)', {**number, 'default': 1})
     )
     options.add(
-        parser.add_mutually_exclusive_group(),
-        ('--save', 'write a recording for Rerun (.rrd)', {'metavar': 'FILE'}),
+        view.add_mutually_exclusive_group(),
+        ('--save', 'write a recording (.rrd)', file),
         ('--web', 'serve the web viewer, and print its address', options.FLAG),
-        ('--html', 'write one frame as a page that opens from disk', {'metavar': 'FILE'}),
+        ('--html', 'write one frame as a page (.html) that opens from disk', file),
     )
-    parser.set_defaults(run=run)
-
-
-def add_input(parser: argparse.ArgumentParser) -> None:
-    """Add what the scans are, and the parameters."""
-    frame = {'metavar': 'N', 'type': int}
+    specs = tunable()
+    basic = [spec.name for spec in specs if spec.basic]
+    names = options.some_of(spec.name for spec in specs)
     options.add(
-        parser,
-        ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
-        ('--labels', 'SemanticKITTI labels of the points, or their folder', {'metavar': 'PATH'}),
-        ('--frame', 'number of one frame, from 0', frame),
-        ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
-        *options.SCAN_LAYOUT,
-        options.FORCE,
-    )
-    options.add_config(parser)
+        tune,
+        ('--parameters', 'those to show (default: the basic ones)',
+         {'metavar': 'NAME,NAME', 'type': names, 'default': basic}),
+        ('-o --output', 'file to write (default: %(default)s)', {**file, 'default': 'tuned.yaml'}),
+        ('--node', 'node to set (default: %(default)s)',
+         {'metavar': 'NAME', 'default': f'/{NODE_NAME}'}),
+    )  # fmt: skip
 
 
-def open_input(arguments: argparse.Namespace) -> Inputs:
+def _open_inputs(arguments: argparse.Namespace) -> Inputs:
     """Return the frames; DataError if there are none, or not the one asked for."""
-    layout = options.scan_layout(arguments)
-    inputs = list_inputs(arguments.input, layout, arguments.topic)
+    inputs = list_inputs(arguments.input, options.scan_layout(arguments), arguments.topic)
     if inputs.topic is not None:
         options.refuse_scan_layout(arguments, arguments.input)
     if arguments.frame is not None and not 0 <= arguments.frame < len(inputs):
-        last = len(inputs) - 1
-        raise DataError(f'--frame {arguments.frame}: {arguments.input} has frames 0 to {last}')
+        raise DataError(f'--frame {arguments.frame}: must be 0 to {len(inputs) - 1} here')
     return inputs
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run_view(arguments: argparse.Namespace) -> int:
     """Segment the frames, and show them."""
-    inputs, config = open_input(arguments), options.read_config(arguments)
+    inputs, config = _open_inputs(arguments), options.read_config(arguments)
+    target = arguments.html or arguments.save
+    suffix = '.html' if arguments.html else '.rrd'
+    if target and Path(target).suffix.lower() != suffix:
+        raise DataError(f'{target}: must end in {suffix}')
     with closing(GroundSegmenter(config)) as segmenter:
-        frames = _frames(inputs, arguments, segmenter)
         if arguments.html:
-            _check_suffix(arguments.html, '.html')
             arguments.frame = arguments.frame or 0
-            _, view, scene, _ = next(frames)
-            write_page(arguments.html, scene, view.name, config, arguments.force)
-            print(f'{view.name}, written to {arguments.html}')
+            ((_, view, result),) = _frames(inputs, arguments, segmenter)
+            scene = make_scene(view, result, config, segmenter.backend)
+            write_page(target, scene, view.title, config, arguments.force)
         elif arguments.save:
-            _check_suffix(arguments.save, '.rrd')
-            with staged_file(arguments.save, force=arguments.force) as part:
-                recording = Recording(Path(arguments.input).name)
+            with staged_file(target, force=arguments.force) as part:
+                recording = Recording(inputs.path.name)
                 recording.stream.save(part)
-                n_frames = _send(recording, frames)
-                recording.stream.disconnect()
-            print(f'{options.count(n_frames, "frame")}, written to {arguments.save}')
+                _record(recording, inputs, arguments, segmenter)
         elif arguments.web:
             with web_viewer(arguments.port) as (server, address, sink):
-                recording = Recording(Path(arguments.input).name)
+                recording = Recording(inputs.path.name)
                 recording.stream.connect_grpc(sink)
                 print(f'{address}\nCtrl-C ends it.', flush=True)
-                try:
-                    _send(recording, frames)
-                    server.wait()
-                finally:
-                    # First, or rerun says that the server has gone.
-                    recording.stream.disconnect()
-                raise DataError('the web viewer ended')
+                _record(recording, inputs, arguments, segmenter)
+                server.wait()
+            ports = f'{arguments.port} or {arguments.port + 1}'
+            raise DataError(f'the web viewer has ended: is port {ports} in use? (--port)')
+        elif sys.platform == 'linux' and not {'DISPLAY', 'WAYLAND_DISPLAY'} & os.environ.keys():
+            raise DataError('no display here: --web, --save FILE and --html FILE need none')
         else:
-            if sys.platform == 'linux' and not {'DISPLAY', 'WAYLAND_DISPLAY'} & os.environ.keys():
-                raise DataError('no display here: --web, --save or --html need none')
-            recording = Recording(Path(arguments.input).name)
+            recording = Recording(inputs.path.name)
             recording.stream.spawn()
-            _send(recording, frames)
-            recording.stream.disconnect()
+            _record(recording, inputs, arguments, segmenter)
+    if target:
+        print(f'written to {target}')
     return 0
 
 
-def _check_suffix(path: str, suffix: str) -> None:
-    if Path(path).suffix.lower() != suffix:
-        raise DataError(f'{path}: must end in {suffix}')
-
-
-_Frame = tuple[int, View, Scene, Segmentation]
+def _record(
+    recording: Recording, inputs: Inputs, arguments: argparse.Namespace, segmenter: GroundSegmenter
+) -> None:
+    try:
+        for k, view, result in _frames(inputs, arguments, segmenter):
+            scene = make_scene(view, result, segmenter.config, segmenter.backend)
+            recording.log(k, scene, result, view.scores(result.label))
+    finally:
+        # All is sent, before a file gets its name or a server ends.
+        recording.stream.disconnect()
 
 
 def _frames(
     inputs: Inputs, arguments: argparse.Namespace, segmenter: GroundSegmenter
-) -> Iterator[_Frame]:
+) -> Iterator[tuple[int, View, Segmentation]]:
     """Segment the frames asked for, each with its number."""
-    step, one = arguments.frame_step, arguments.frame
-    n_frames = len(range(0, len(inputs), step)) if one is None else 1
-    with options.progress('view', quiet=arguments.quiet)(total=n_frames) as bar:
-        pairs = enumerate(inputs) if one is None else [(one, inputs[one])]
-        for k, item in pairs:
-            if one is None and k % step:
-                continue
+    first, step = arguments.frame or 0, arguments.frame_step
+    numbers = range(first, len(inputs) if arguments.frame is None else first + 1, step)
+    bar = options.progress('view', quiet=arguments.quiet)(total=len(numbers))
+    with bar:
+        chosen = islice(inputs, numbers.start, numbers.stop, step)
+        for k, item in zip(numbers, chosen, strict=True):
             view = read_view(item, arguments.labels)
             try:
-                if k == (one or 0):
-                    # Once without counting: code is loaded, or even compiled.
+                if k == first:
+                    # Once without counting its time, in which code is loaded.
                     segmenter.segment(view.points)
                     segmenter.reset()
-                result = segmenter.segment(view.points)
+                yield k, view, segmenter.segment(view.points)
             except PointCloudError as error:
                 raise DataError(f'{item.title}: {error}') from error
-            yield k, view, make_scene(view, result, segmenter.config, segmenter.backend), result
             bar.update()
 
 
-def _send(recording: Recording, frames: Iterator[_Frame]) -> int:
-    """Log the frames, and return their number."""
-    n_frames = 0
-    for n_frames, (k, view, scene, result) in enumerate(frames, 1):
-        recording.log(k, scene, result, view.scores(result))
-    return n_frames
+def run_tune(arguments: argparse.Namespace) -> int:
+    """Serve the page."""
+    inputs, config = _open_inputs(arguments), options.read_config(arguments)
+    output, is_ours = Path(arguments.output), arguments.force
+    if output.exists() and not is_ours:
+        raise DataError(f'{output}: exists already; --force replaces it')
+
+    def write(values: Config) -> str:
+        nonlocal is_ours
+        with staged_file(output, force=is_ours) as part:
+            part.write_text(to_yaml(values, 'Found with gp-ground-seg tune.'), encoding='utf-8')
+        is_ours = True
+        return f'written to {output}'
+
+    def apply(values: Config) -> str:
+        from gp_ground_seg.ros.parameters import set_remotely
+
+        set_remotely(arguments.node, {name: values[name] for name in arguments.parameters})
+        return f'{arguments.node} uses them'
+
+    with open_server(arguments.port, 'tune') as server:
+        shown = arguments.parameters, arguments.labels, arguments.frame or 0
+        tuner = Tuner(server, inputs, config, *shown)
+        tuner.add_button(f'write {output.name}', write)
+        if importlib.util.find_spec('rclpy'):
+            tuner.add_button(f'apply to {arguments.node}', apply)
+        print(f'http://{server.get_host()}:{server.get_port()}\nCtrl-C ends it.', flush=True)
+        tuner.run()
+    return 0

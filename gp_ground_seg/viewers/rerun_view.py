@@ -4,34 +4,20 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from gp_ground_seg.errors import DataError, require
+from gp_ground_seg.errors import require
 from gp_ground_seg.result import Segmentation
-from gp_ground_seg.viewers.scene import (
-    CAMERA,
-    CANDIDATES,
-    CLASSES,
-    RAMPS,
-    TARGET,
-    Mesh,
-    Scene,
-    palette,
-)
+from gp_ground_seg.viewers.scene import CAMERA, RAMPS, TARGET, Mesh, Scene
 
 HOST = '127.0.0.1'
-START_TIMEOUT = 20.0  # of the web viewer [s]
-HIDDEN = ('height', 'p_ground', 'errors', 'band', 'faces', 'candidates')
-"""Entities below ``scan`` that are not shown at first."""
-SERIES = {
-    'IoU': 'IoU [%]', 'lost': 'objects lost', 'theta': 'theta', 'latency': 'latency [ms]',
-}  # fmt: skip
+HIDDEN = ('height', 'p_ground', 'errors', 'faces', 'candidates', 'band')
+"""What is not shown at first."""
+SERIES = {'IoU': 'IoU [%]', 'lost': 'objects lost', 'theta': 'theta', 'latency': 'latency [ms]'}
 """What is drawn over the frames, and its titles."""
 ABOUT = f"""\
 The eyes in the tree on the left show and hide:
@@ -42,49 +28,42 @@ The eyes in the tree on the left show and hide:
 - **errors**, with labels: missed ground blue, false ground vermilion
 - **surface** of the ground: rough dark blue, smooth yellow (length-scale)
 - **band**: two standard deviations below it and above
-- **faces**: tiles with a vertical face
+- **faces**: returns in tiles with a vertical face
 - **candidates** of the ground: inliers blue, outliers black
 """
 
 
 class Recording:
-    """Frames on their way to a viewer or a file; see rerun's ``RecordingStream`` in `stream`."""
+    """Frames on their way to a viewer or a file, which rerun's ``RecordingStream`` knows."""
 
     def __init__(self, title: str) -> None:
         self._rr = rr = require('rerun', 'view')
-        self.stream = stream = rr.RecordingStream('gp_ground_seg')
-        stream.send_recording_name(title)
-        stream.send_blueprint(_blueprint(require('rerun.blueprint', 'view')))
-        stream.log('about', rr.TextDocument(ABOUT, media_type='text/markdown'), static=True)
-        known = zip(CLASSES, palette(CLASSES).tolist(), strict=True)
-        classes = [(k, name, tuple(rgb)) for k, (name, rgb) in enumerate(known)]
-        stream.log('scan', rr.ViewCoordinates.FLU, rr.AnnotationContext(classes), static=True)
+        self.stream = rr.RecordingStream('gp_ground_seg')
+        self.stream.send_recording_name(title)
+        self.stream.send_blueprint(_blueprint(require('rerun.blueprint', 'view')))
+        about = rr.TextDocument(ABOUT, media_type='text/markdown')
+        self.stream.log('about', about, static=True)
 
     def log(self, k: int, scene: Scene, result: Segmentation, scores: dict[str, float]) -> None:
         """Add frame `k`."""
-        rr, log, size = self._rr, self.stream.log, self._rr.Radius.ui_points(1.5)
+        rr, log = self._rr, self.stream.log
         self.stream.set_time('frame', sequence=k)
-        for name, colours in scene.colours.items():
-            look = {'class_ids': scene.label} if name == 'class' else {'colors': colours}
-            log(f'scan/{name}', rr.Points3D(scene.points, radii=size, **look))
+        for name, (points, colours) in scene.clouds.items():
+            size = rr.Radius.ui_points(3.0 if name == 'candidates' else 1.5)
+            log(f'scan/{name}', rr.Points3D(points, radii=size, colors=colours))
         log('scan/surface', self._mesh(scene.surface, 255))
         log('scan/band', self._mesh(scene.band, 90))
-        log('scan/faces', rr.LineStrips3D(scene.faces, colors=(122, 79, 163)))
-        colours = palette(CANDIDATES)[1 - scene.is_inlier]
-        log('scan/candidates', rr.Points3D(scene.candidates, radii=0.06, colors=colours))
-        numbers = {f'theta/{name}': value for name, value in result.fit.theta.items()}
-        numbers |= {name: value for name, value in scores.items() if name in SERIES}
-        numbers['latency'] = 1e3 * result.timings['total']
-        for name, value in numbers.items():
+        numbers = {name: value for name, value in scores.items() if name in SERIES}
+        numbers |= {f'theta/{name}': value for name, value in result.fit.theta.items()}
+        for name, value in {**numbers, 'latency': 1e3 * result.timings['total']}.items():
             log(name, rr.Scalars([value]))
 
     def _mesh(self, mesh: Mesh, alpha: int) -> Any:
+        vertices, triangles, colours = mesh
         return self._rr.Mesh3D(
-            vertex_positions=mesh.vertices,
-            triangle_indices=mesh.triangles,
-            vertex_colors=mesh.colours,
+            vertex_positions=vertices, triangle_indices=triangles, vertex_colors=colours,
             albedo_factor=(255, 255, 255, alpha),
-        )
+        )  # fmt: skip
 
 
 def _blueprint(rrb: Any) -> Any:
@@ -92,12 +71,10 @@ def _blueprint(rrb: Any) -> Any:
     hidden = {f'scan/{name}': rrb.EntityBehavior(visible=False) for name in HIDDEN}
     eye = rrb.EyeControls3D(position=CAMERA, look_target=TARGET, eye_up=(0.0, 0.0, 1.0))
     scan = rrb.Spatial3DView(origin='scan', name='scan', overrides=hidden, eye_controls=eye)
-    series = [rrb.TimeSeriesView(origin=name, name=title) for name, title in SERIES.items()]
     about = rrb.TextDocumentView(origin='about', name='what is what')
-    left, right = rrb.Tabs(scan, about), rrb.Vertical(*series)
+    series = [rrb.TimeSeriesView(origin=name, name=title) for name, title in SERIES.items()]
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[2.5, 1.0]),
-        rrb.BlueprintPanel(state='expanded'),
+        rrb.Horizontal(rrb.Tabs(scan, about), rrb.Vertical(*series), column_shares=[2.5, 1.0]),
         rrb.SelectionPanel(state='collapsed'),
         rrb.TimePanel(state='collapsed'),
     )
@@ -107,42 +84,22 @@ def _blueprint(rrb: Any) -> Any:
 def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
     """Serve Rerun's web viewer; yield its process, the page's address, and where to send frames.
 
-    rerun's own ``serve_web_viewer`` would listen on every network of the machine.
+    They arrive at the next port. rerun's own function would listen on every network.
     """
     require('rerun', 'view')
-    web, grpc = _free_port(port), _free_port(0)
+    words = f'--serve-web --bind {HOST} --web-viewer-port {port} --port {port + 1}'
     server = subprocess.Popen(
-        [sys.executable, '-m', 'rerun', '--serve-web', '--bind', HOST, '--port', str(grpc),
-         '--web-viewer-port', str(web)],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        [sys.executable, '-m', 'rerun', *words.split()], start_new_session=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        _wait_for(server, grpc)
-        sink = f'rerun+http://{HOST}:{grpc}/proxy'
-        source = sink.replace('+', '%2B').replace(':', '%3A').replace('/', '%2F')
-        yield server, f'http://{HOST}:{web}/?url={source}', sink
+        source = f'rerun%2Bhttp%3A%2F%2F{HOST}%3A{port + 1}%2Fproxy'
+        yield (
+            server,
+            f'http://{HOST}:{port}/?url={source}',
+            f'rerun+http://{HOST}:{port + 1}/proxy',
+        )
     finally:
         # The process is a wrapper of the one that serves.
         os.killpg(server.pid, signal.SIGTERM)
         server.wait()
-
-
-def _wait_for(server: subprocess.Popen[bytes], port: int) -> None:
-    deadline = time.monotonic() + START_TIMEOUT
-    while time.monotonic() < deadline and server.poll() is None:
-        with socket.socket() as connection:
-            if connection.connect_ex((HOST, port)) == 0:
-                return
-        time.sleep(0.1)
-    raise DataError("Rerun's web viewer did not start; --save FILE.rrd needs none")
-
-
-def _free_port(wanted: int) -> int:
-    """Return `wanted` if it is free, any that is for 0."""
-    with socket.socket() as trial:
-        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            trial.bind((HOST, wanted))
-        except OSError as error:
-            raise DataError(f'--port {wanted}: {error.strerror}') from error
-        return int(trial.getsockname()[1])
