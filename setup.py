@@ -17,6 +17,7 @@ version = re.search(
 BAGS = ['rosbags>=0.11.9']
 PLOT = ['matplotlib>=3.6']
 VISER = ['viser>=1.1']
+VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
     'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
@@ -27,6 +28,7 @@ ROS = [
 TEST = ['hypothesis>=6.100', 'pytest>=7.4']
 DEV = [
     *TEST,
+    *VIEW,
     'colcon-common-extensions',
     'flake8>=6',
     'flake8-builtins',
@@ -74,7 +76,7 @@ setup(
         'ros': ROS + BAGS + PLOT,
         'test': TEST,
         'tune': VISER,
-        'view': ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER],
+        'view': VIEW,
         'dev': DEV,
     },
     zip_safe=False,
