@@ -10,7 +10,7 @@ from conftest import REPOSITORY
 PACKAGE = 'gp_ground_seg'
 
 # Each layer and those it may import besides itself; a layer is a folder, or a file at the root.
-VALUES = {'errors', 'jit', 'frame'}
+VALUES = {'errors', 'jit', 'log', 'frame'}
 STAGES = VALUES | {'parameters', 'pipeline', 'gp'}
 RESULT = STAGES | {'result', 'ground_model'}
 LIBRARY = RESULT | {'compiled', 'backend', 'segmenter'}
@@ -18,6 +18,7 @@ TOOLS = LIBRARY | {'data', 'plotting', 'simulation', 'scale', 'evaluation'}
 LAYERS = {
     'errors': set(),
     'jit': {'errors'},
+    'log': set(),
     'frame': {'errors'},
     'parameters': VALUES,
     'data': VALUES | {'parameters'},

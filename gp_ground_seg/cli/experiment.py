@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
@@ -17,7 +17,6 @@ from gp_ground_seg.experiments import ablation, coverage, lost, sensor_pose, ste
 from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
 from gp_ground_seg.experiments.variants import load_simulated, score_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.schema import ParameterValue
 from gp_ground_seg.scale.cluster import Runner
 from gp_ground_seg.simulation import DRIVES, SCENES, SENSORS
 
@@ -85,7 +84,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for name, experiment in EXPERIMENTS.items():
         purpose = re.split(r'\.(?:\s|$)', experiment.description)[0]
         source = ' KITTI_ROOT' if experiment.options[0][0] == 'root' else ' --sensors vlp-16'
-        source += ' --set label.ground_tolerance=0.05,0.1' * (name == 'cross-validation')
         example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
         own = options.new_parser(names, name, experiment.description, example, purpose)
         options.add(own, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
@@ -197,33 +195,6 @@ def _coverage(arguments: argparse.Namespace, runner: Runner) -> Report:
     return coverage.compare_coverage(scans, load_simulated, config, coverage.SIMULATED, runner)
 
 
-def _cross_validation(arguments: argparse.Namespace, runner: Runner) -> Report:
-    grid, fixed = split_settings(arguments.settings)
-    config = options.read_config(argparse.Namespace(**{**vars(arguments), 'settings': fixed}))
-    return ablation.cross_validate(frames_from_options(arguments), config, grid, runner)
-
-
-def split_settings(settings: Sequence[str]) -> tuple[dict[str, list[ParameterValue]], list[str]]:
-    """Parameters to search with their values, and the settings of one value.
-
-    Raises ConfigError if nothing is to be searched, or something twice.
-    """
-    grid: dict[str, list[ParameterValue]] = {}
-    fixed = []
-    for setting in settings:
-        name, _, text = setting.partition('=')
-        if ',' not in text:
-            fixed.append(setting)
-            continue
-        if name.strip() in grid:
-            raise ConfigError(f'--set {setting}: {name.strip()} is searched twice')
-        words = [word for word in text.split(',') if word]
-        grid[name.strip()] = [options.parse_setting(f'{name}={word}')[1] for word in words]
-    if not grid:
-        raise ConfigError('cross-validation: nothing to choose, give --set NAME=VALUE,VALUE,...')
-    return grid, fixed
-
-
 def _sensor_pose(arguments: argparse.Namespace, runner: Runner) -> Report:
     config = options.read_config(arguments)
     if not arguments.simulated:
@@ -301,15 +272,6 @@ sensors have one set of parameters.
 """,
         (EVERY_MOUNT, CROWDED_LIST, SEEDS, PEER, NO_PEER),
         _objects,
-    ),
-    'cross-validation': Experiment(
-        """\
-Choose parameters on all sequences but one, and score them on that one. Parameters with
-several values are searched by pooled IoU, one after the other until no change of one is
-better: --set label.ground_tolerance=0.05,0.1
-""",
-        (ROOT, *OF_FRAMES),
-        _cross_validation,
     ),
     'sensor-pose': Experiment(
         """\
