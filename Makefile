@@ -16,7 +16,7 @@ help:
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.json and its picture'
 	@echo 'make figures   every table and picture of README and docs anew (needs KITTI=PATH; ONLY=word for some)'
-	@echo 'make node-bench  latency, losses and memory of the node over DDS'
+	@echo 'make node-bench  latency and losses of the node over DDS'
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make lint      ruff and mypy'
 	@echo 'make format    format the code'
@@ -82,7 +82,7 @@ format: $(VENV)/.dev
 	$(BIN)/ruff format .
 
 generate: $(VENV)/.dev
-	$(BIN)/gp-ground-seg config generate .
+	$(BIN)/python docs/generate.py
 
 clean:
 	rm -rf $(VENV) build install log .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -15,7 +15,10 @@ version = re.search(
 ).group(1)
 
 BAGS = ['rosbags>=0.11.9']
-PLOT = ['matplotlib>=3.6']
+FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
+PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
+MOVIE = ['imageio-ffmpeg>=0.4.8']  # for MP4; 165 MB, of which GIF needs none
+TUNE = ['optuna>=4.0']
 VISER = ['viser>=1.1']
 VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
@@ -28,7 +31,10 @@ ROS = [
 TEST = ['hypothesis>=6.100', 'pytest>=7.4']
 DEV = [
     *TEST,
+    *MOVIE,
+    *TUNE,
     *VIEW,
+    'argcomplete>=3.1',
     'colcon-common-extensions',
     'flake8>=6',
     'flake8-builtins',
@@ -72,10 +78,13 @@ setup(
     ],
     extras_require={
         'bags': BAGS,
+        'formats': FORMATS,
         'plot': PLOT,
+        'movie': PLOT + MOVIE,
+        'tune': PLOT + TUNE + VISER,
+        'complete': ['argcomplete>=3.1'],
         'ros': ROS + BAGS + PLOT,
         'test': TEST,
-        'tune': VISER,
         'view': VIEW,
         'dev': DEV,
     },

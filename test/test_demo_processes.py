@@ -36,6 +36,31 @@ def test_a_kill_ends_the_node_and_removes_the_folder(tmp_path, monkeypatch, comm
     assert list(tmp_path.iterdir()) == []
 
 
+INTERRUPTED = """
+import pathlib, subprocess, sys
+from gp_ground_seg.ros.probe import NodeProcess
+
+class Interrupted(subprocess.Popen):
+    def __init__(self, *words, **options):
+        super().__init__(*words, **options)
+        print(self.pid, flush=True)
+        raise KeyboardInterrupt
+
+subprocess.Popen = Interrupted
+folder = pathlib.Path(sys.argv[1])
+NodeProcess(folder / 'log', unfinished=folder).__enter__()
+"""
+
+
+def test_an_interrupt_right_after_the_start_of_the_node_ends_it(tmp_path):
+    (tmp_path / 'unfinished').mkdir()
+    words = [sys.executable, '-c', INTERRUPTED, str(tmp_path / 'unfinished')]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert 'KeyboardInterrupt' in done.stderr
+    wait_until(lambda: not is_running(int(done.stdout)))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_node_that_an_earlier_run_left_does_not_answer(tmp_path):
     """One on the same ROS domain and the topics that a node has by default."""
     with (

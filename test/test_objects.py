@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.data.boxes import COLUMNS, Boxes, read_boxes
-from gp_ground_seg.data.semantic_kitti import read_points
+from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
 from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.evaluation.evaluate import labelled_frames, load_kitti, score_methods
+from gp_ground_seg.evaluation.evaluate import load_kitti, score_methods
 from gp_ground_seg.evaluation.metrics import GROUND_CLASSES
 from gp_ground_seg.evaluation.objects import (
     BAND_EDGES,

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.evaluate import staged_options
 from gp_ground_seg.data.inputs import holds_bag, list_inputs
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import list_sequences
@@ -18,7 +17,7 @@ from gp_ground_seg.errors import DataError, MissingDependencyError
 from gp_ground_seg.evaluation import report
 from gp_ground_seg.evaluation.benchmark import BenchFrame, bench_cases, bench_document, run_cases
 from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, TITLES
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Cell, Column, Table
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config
@@ -26,8 +25,8 @@ from gp_ground_seg.plotting.charts import plot_stage_bars
 
 DESCRIPTION = """\
 Time the segmentation on your data: theta fixed and learned in every frame, on one
-thread and on all, by stage; with pypatchworkpp installed beside Patchwork++ on the same
-frames. Each time is taken right before or after that of Patchwork++ on that frame, so that
+thread and on all, by stage; with pypatchworkpp installed beside Patchwork++ (or --peer) on the
+same frames. Each time is taken right before or after that of the peer on that frame, so that
 the ratio of the two holds where the speed of the machine drifts. Reading is left out.
 Let nothing else run meanwhile.
 
@@ -57,6 +56,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
         ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
+        ('--peer', 'the method beside ours (default: %(default)s)',
+         {'choices': PEERS, 'default': PATCHWORKPP}),
         ('--plot', 'draw the stages as a PNG', file),
         ('--numpy', 'time learning without compiled code as well', options.FLAG),
         *options.SCAN_LAYOUT,
@@ -74,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     given = arguments.record
     if given is not None:
         options.refuse_scan_layout(arguments, given)
-    with staged_options(arguments, 'json', 'plot') as parts:
+    with options.staged_options(arguments, 'json', 'plot') as parts:
         document = _measure(arguments) if given is None else read_record(given)
         if 'json' in parts:
             report.write_json(document, parts['json'])
@@ -111,15 +112,15 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     environment = report.describe_environment('pypatchworkpp')
     threads = _threads(arguments.threads, config, environment['n_cores'])
     try:
-        PatchworkppMethod()
-        baseline = PATCHWORKPP
+        PEERS[arguments.peer]()
+        baseline = arguments.peer
     except MissingDependencyError:
         options.note('no ratios without the baseline: pip install pypatchworkpp')
         baseline = None
     measured = run_cases(
         frames_from_options(arguments, arguments.frames),
         bench_cases(config, threads, with_numpy=arguments.numpy),
-        PatchworkppMethod if baseline else None,
+        PEERS[baseline] if baseline else None,
         arguments.passes,
         progress=options.progress('bench'),
     )

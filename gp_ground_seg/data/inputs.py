@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
 
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.data.clouds import Cloud, name_columns
+from gp_ground_seg.data.cloud_files import NUSCENES_SUFFIX, SUFFIXES, read_file
+from gp_ground_seg.data.clouds import Cloud
+from gp_ground_seg.data.files import AnyPath, as_path
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
-from gp_ground_seg.data.semantic_kitti import read_scan
 from gp_ground_seg.errors import DataError, PointCloudError
 
-NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
-SUFFIXES = ('.bin',)
 # Where the scans of a data set are, in a folder of one of its drives, and these in its root.
 _SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')
 _DRIVES = ('sequences/*/velodyne', 'data_3d_raw/*/velodyne_points', '*/velodyne_points')
@@ -44,7 +43,7 @@ class Input:
 
     name: str
     title: str
-    path: Path
+    path: AnyPath
     read: Callable[[], Cloud]
     time: float | None = None
 
@@ -56,11 +55,17 @@ class Inputs:
     """
 
     def __init__(
-        self, path: Path, items: Sequence[Input], topic: str | None = None, n_messages: int = 0
+        self,
+        path: AnyPath,
+        items: Sequence[Input],
+        topic: str | None = None,
+        n_messages: int = 0,
+        layout: ScanLayout = KITTI,
     ) -> None:
         self.path = path
         self.topic = topic  # of a bag, else None
         self._items = items
+        self._origin = layout.origin
         self._length = n_messages or len(items)
 
     def __len__(self) -> int:
@@ -72,10 +77,10 @@ class Inputs:
         if self.topic is None:
             yield from self._items
             return
-        with BagReader(self.path) as bag:
+        with BagReader(str(self.path)) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
-                read = partial(_decode, raw, f'{self.path}: {place}')
+                read = partial(_decode, raw, f'{self.path}: {place}', self._origin)
                 yield Input(f'{k:06d}', f'{self.path.name}[{k}]', self.path, read, 1e-9 * time)
 
     def __getitem__(self, index: int) -> Input:
@@ -86,7 +91,7 @@ class Inputs:
 
 
 def list_inputs(
-    source: str | Path, layout: ScanLayout = KITTI, topic: str | None = None
+    source: str | AnyPath, layout: ScanLayout = KITTI, topic: str | None = None
 ) -> Inputs:
     """Return the clouds of `source`; DataError if there are none.
 
@@ -101,11 +106,11 @@ def list_inputs(
     topic : str or None
         PointCloud2 topic of a bag, by default the only one.
     """
-    path = Path(source)
-    if holds_bag(path):
+    path = as_path(source)
+    if isinstance(path, Path) and holds_bag(path):
         with BagReader(path) as bag:
             name = bag.pick_point_cloud_topic(topic)
-            return Inputs(path, (), name, bag.n_messages(name))
+            return Inputs(path, (), name, bag.n_messages(name), layout)
     if topic is not None:
         raise DataError(f'--topic: is for bags, which {source} is not')
     files = _find_files(path)
@@ -124,12 +129,12 @@ def holds_bag(path: Path) -> bool:
     return is_bag(path)
 
 
-def is_cloud_file(path: Path) -> bool:
+def is_cloud_file(path: AnyPath) -> bool:
     """Whether the name is that of a point cloud."""
     return path.suffix.lower() in SUFFIXES
 
 
-def _find_files(source: Path) -> list[Path]:
+def _find_files(source: AnyPath) -> Sequence[AnyPath]:
     accepted = ', '.join(SUFFIXES)
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
@@ -142,32 +147,24 @@ def _find_files(source: Path) -> list[Path]:
         return [source]
     for name in _SCAN_FOLDERS:
         folder = source / name
-        if files := sorted(file for file in folder.glob('*') if is_cloud_file(file)):
+        if files := sorted((file for file in folder.glob('*') if is_cloud_file(file)), key=str):
             return files
-    drives = sorted(path.parent for pattern in _DRIVES for path in source.glob(pattern))
+    drives = sorted({str(one.parent) for pattern in _DRIVES for one in source.glob(pattern)})
     hint = ''
     if drives:
-        names = ', '.join(path.name for path in drives)
+        names = ', '.join(Path(drive).name for drive in drives)
         hint = f'; give one of its sequences ({names}), as in {drives[0]}'
     raise DataError(f'{source}: no {accepted} file in it, and not a rosbag2 folder{hint}')
 
 
-def _stem(path: Path) -> str:
+def _stem(path: AnyPath) -> str:
     name = path.name
     return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
 
 
-def read_file(path: Path, layout: ScanLayout = KITTI) -> Cloud:
-    """Read a file of any format, known by its suffix."""
-    if path.name.endswith(NUSCENES_SUFFIX) and layout.columns == KITTI.columns:
-        layout = replace(layout, columns=NUSCENES_COLUMNS)
-    data = read_scan(path, layout)
-    return Cloud(name_columns(layout.view(data)), layout.points(data))
-
-
-def _decode(raw: bytes, place: str) -> Cloud:
+def _decode(raw: bytes, place: str, origin: tuple[float, float, float] | None) -> Cloud:
     try:
         message = decode_cloud(raw)
-        return Cloud(read_fields(message), read_xyz(message), message)
+        return Cloud(read_fields(message), read_xyz(message)).about(origin)
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error

@@ -14,13 +14,14 @@ import numpy as np
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.evaluate import Progress, load_kitti
+from gp_ground_seg.evaluation.evaluate import load_kitti
 from gp_ground_seg.evaluation.metrics import height_error
 from gp_ground_seg.evaluation.report import Column, Report, Table, changed_parameters
 from gp_ground_seg.experiments.variants import refuse_changed
 from gp_ground_seg.frame import OUTSIDE
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.result import Segmentation
+from gp_ground_seg.scale.cluster import Progress
 from gp_ground_seg.segmenter import GroundSegmenter
 
 MODELS = {'Z-L': 'latent', 'Z': 'line_gradient'}

@@ -26,7 +26,7 @@ README_BEGIN, README_END = '<!-- parameters:begin -->', '<!-- parameters:end -->
 _PAGE_HEAD = """\
 # All parameters
 
-Written by `gp-ground-seg config generate` from gp_ground_seg/parameters/config.py. The basic
+Written by `make generate` from gp_ground_seg/parameters/config.py. The basic
 ones, that are set for a robot, are in [README.md](../README.md); the others rarely need another
 value. `gp-ground-seg config dump` prints all with their values and ranges as a parameter file.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -99,4 +99,42 @@ def plot_reliability(sequences: Mapping[str, Any], path: str | Path, title: str)
     lower.set_ylim(min(0.1, 0.7 * percent[percent > 0].min()), 100.0)
     lower.set_ylabel('points [%]')
     lower.set_xlabel('probability of ground, p_ground')
+    save(figure, path)
+
+
+def plot_search(trials: Sequence[Any], logarithmic: Collection[str], path: str | Path) -> None:
+    """Draw IoU by trial, and over each parameter, as a PNG, replacing the file `path`.
+
+    `trials` have a `choice` of values by name, and an `iou`; the axes of parameters whose names
+    are in `logarithmic` are so.
+    """
+    iou = 100.0 * np.array([trial.iou for trial in trials])
+    best = int(iou.argmax())
+    values: dict[str, list[Any]] = {'trial': list(range(len(iou)))}
+    values |= {name: [trial.choice[name] for trial in trials] for name in trials[0].choice}
+    n_columns = min(len(values), 3)
+    n_rows = -(-len(values) // n_columns)
+    figure = new_figure(4.4 * n_columns, 3.6 * n_rows)
+    panels = list(figure.subplots(n_rows, n_columns, sharey=True, squeeze=False).flat)
+    for axes, (name, own) in zip(panels, values.items(), strict=False):
+        if isinstance(own[0], str | bool):
+            own = [str(value).lower() for value in own]
+        axes.scatter(
+            own, iou, s=18, c=values['trial'], cmap='Blues', edgecolors='#6B7178', linewidths=0.4
+        )
+        axes.plot(own[best], iou[best], 'o', ms=9, mfc='none', mec=style.VERMILION, mew=2)
+        if name in logarithmic:
+            axes.set_xscale('log')
+        axes.set_xlabel(name)
+        axes.grid(color='#E3E6E9', linewidth=0.8)
+    panels[0].plot(values['trial'], np.maximum.accumulate(iou), color=style.VERMILION)
+    panels[0].set_xlabel('trial (line: best so far; dark: late)')
+    # Values that fail altogether would leave no room for the others.
+    low, high = np.quantile(iou, 0.25), iou.max()
+    panels[0].set_ylim(low - 0.1 * (high - low) - 0.01, high + 0.1 * (high - low) + 0.01)
+    for axes in panels[::n_columns]:
+        axes.set_ylabel('IoU on the frames searched [%]')
+    for axes in panels[len(values) :]:
+        axes.set_axis_off()
+    figure.tight_layout()
     save(figure, path)

@@ -1,0 +1,145 @@
+"""What `segment` writes for a cloud: labels, the points with their results, the ground."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.data.cloud_files import WRITABLE, encode_file
+from gp_ground_seg.data.clouds import Cloud, Columns
+from gp_ground_seg.data.files import AnyPath
+from gp_ground_seg.data.inputs import Input
+from gp_ground_seg.data.numpy_files import encode_arrays
+from gp_ground_seg.errors import PointCloudError, require
+from gp_ground_seg.frame import Label
+from gp_ground_seg.ground_model import GroundModel
+from gp_ground_seg.result import Segmentation
+from gp_ground_seg.segmenter import GroundSegmenter
+
+LABELS = 'label'
+FORMATS = (LABELS, *(suffix[1:] for suffix in WRITABLE))
+SURFACES = ('npz', 'tif')
+CELL = 0.5
+"""Side of the cells of a written surface [m]."""
+# Unlabelled, road and other-object.
+SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
+PARTS = {'_ground': Label.GROUND, '_obstacles': Label.OBSTACLE}
+
+
+@dataclass(frozen=True)
+class CloudOutput:
+    """Files to write for each cloud.
+
+    Attributes
+    ----------
+    form : one of `FORMATS`, or None: labels of a ``.bin`` scan, else the input's format
+    raw : whether ``.label`` files hold `Label` rather than SemanticKITTI's codes
+    split : whether ground and obstacles are files of their own
+    surface : ``'npz'``, ``'tif'``, or None for no file of the ground
+    """
+
+    form: str | None = None
+    raw: bool = False
+    split: bool = False
+    surface: str | None = None
+
+    def names(self, one: Input, stem: str | None = None) -> list[str]:
+        """Names of the files of a cloud, which begin with `stem`, by default its name."""
+        stem, form = stem or one.name, self._form(one)
+        parts = PARTS if self.split and form != LABELS else ['']
+        surface = [f'{stem}_surface.{self.surface}'] if self.surface else []
+        return [*(f'{stem}{part}.{form}' for part in parts), *surface]
+
+    def _form(self, one: Input) -> str:
+        own = one.path.suffix.lower()[1:]
+        return self.form or (own if own in FORMATS else LABELS)
+
+    def write(
+        self, one: Input, segmenter: GroundSegmenter, paths: Sequence[AnyPath]
+    ) -> Segmentation:
+        """Segment a cloud and write its files, to `paths` in the order of `names`."""
+        cloud = one.read()
+        try:
+            result = segmenter.segment(cloud.xyz)
+        except PointCloudError as error:
+            raise PointCloudError(f'{one.path}: {error}') from error
+        if self._form(one) == LABELS:
+            paths[0].write_bytes(encode_labels(result, self.raw))
+        else:
+            values = _results(result, cloud)
+            for path, part in zip(paths, PARTS.values() if self.split else [None], strict=False):
+                mask = (result.label == part) | (part is None)
+                own = {name: column[mask] for name, column in values.items()}
+                path.write_bytes(encode_file(path, cloud.take(mask), result.label[mask], own))
+        if self.surface:
+            encode = _encode_npz if self.surface == 'npz' else _encode_tif
+            paths[-1].write_bytes(encode(result, cloud))
+        return result
+
+
+def encode_labels(result: Segmentation, raw: bool) -> bytes:
+    """File of a uint32 for each point: SemanticKITTI's code, or `Label`."""
+    codes = sorted(Label) if raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
+    return np.array(codes, dtype='<u4')[result.label].tobytes()
+
+
+def _results(result: Segmentation, cloud: Cloud) -> Columns:
+    """Values of each point beside its label, float32, in the coordinates of the file."""
+    values: Columns = {
+        'height': result.height,
+        'ground_z': result.ground_z + cloud.origin[2],
+        'ground_std': result.ground_std,
+        'p_ground': result.p_ground,
+    }
+    return {name: column.astype(np.float32) for name, column in values.items()}
+
+
+def _surface(result: Segmentation) -> tuple[npt.NDArray[Any], npt.NDArray[Any], float]:
+    """Ground and its standard deviation about the sensor in rows from south to north, and reach.
+
+    Both (n, n) float32 at the middles of cells, which reach so far to each side [m].
+    """
+    model = GroundModel.of(result)
+    n_cells = 2 * int(np.ceil(model.knots[-1] / CELL))
+    middle = CELL * (np.arange(n_cells) + 0.5 - n_cells / 2)
+    z, std = model.at(middle, middle[:, None])
+    return z.astype(np.float32), std.astype(np.float32), 0.5 * CELL * n_cells
+
+
+def _encode_npz(result: Segmentation, cloud: Cloud) -> bytes:
+    """File of x (W,), y (H,), ground_z and ground_std (H, W) [m]; NaN where there is no model."""
+    z, std, reach = _surface(result)
+    middle = np.arange(len(z)) * CELL + 0.5 * CELL - reach
+    x, y, height = cloud.origin
+    return encode_arrays(
+        {'x': middle + x, 'y': middle + y, 'ground_z': z + height, 'ground_std': std}
+    )
+
+
+def _encode_tif(result: Segmentation, cloud: Cloud) -> bytes:
+    """GeoTIFF of two pages, ground and standard deviation; in the coordinates of the file.
+
+    Tags as in OGC 19-008r4, GeoTIFF 1.1; the file of a cloud names no reference system.
+    """
+    require('PIL', 'plot')
+    from PIL import Image, TiffImagePlugin
+
+    z, std, reach = _surface(result)
+    x, y, height = cloud.origin
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    doubles, shorts = 12, 3
+    tags.tagtype.update({33550: doubles, 33922: doubles, 34735: shorts, 42113: 2})
+    tags[33550] = (CELL, CELL, 0.0)  # size of a cell
+    tags[33922] = (0.0, 0.0, 0.0, x - reach, y + reach, 0.0)  # its north-west corner
+    # Version 1.1; type of model: user-defined; of raster: values of areas.
+    tags[34735] = (1, 1, 1, 2, 1024, 0, 1, 32767, 1025, 0, 1, 1)
+    tags[42113] = 'nan'  # GDAL's mark of no data
+    pages = [Image.fromarray(np.flipud(grid).copy()) for grid in (z + np.float32(height), std)]
+    file = io.BytesIO()
+    pages[0].save(file, 'TIFF', save_all=True, append_images=pages[1:], tiffinfo=tags)
+    return file.getvalue()
