@@ -131,8 +131,7 @@ def run_view(arguments: argparse.Namespace) -> int:
                 print(f'{address}\nCtrl-C ends it.', flush=True)
                 _record(recording, inputs, arguments, segmenter)
                 server.wait()
-            ports = f'{arguments.port} or {arguments.port + 1}'
-            raise DataError(f'the web viewer has ended: is port {ports} in use? (--port)')
+            raise DataError('the web viewer has ended')
         elif sys.platform == 'linux' and not {'DISPLAY', 'WAYLAND_DISPLAY'} & os.environ.keys():
             raise DataError('no display here: --web, --save FILE and --html FILE need none')
         else:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
-from gp_ground_seg.errors import require
+from gp_ground_seg.errors import DataError, require
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.viewers.scene import CAMERA, RAMPS, TARGET, Mesh, Scene
 
@@ -87,12 +89,20 @@ def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
     They arrive at the next port. rerun's own function would listen on every network.
     """
     require('rerun', 'view')
+    ports = port, port + 1
+    if any(map(_is_listening, ports)):
+        raise DataError(f'--port {port}: it or the next one is in use; choose another')
     words = f'--serve-web --bind {HOST} --web-viewer-port {port} --port {port + 1}'
     server = subprocess.Popen(
         [sys.executable, '-m', 'rerun', *words.split()], start_new_session=True,
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
+        # A stream that finds nobody gives up after a while.
+        while not all(map(_is_listening, ports)):
+            if server.poll() is not None:
+                raise DataError("Rerun's web viewer does not start: try `rerun --serve-web`")
+            time.sleep(0.1)
         source = f'rerun%2Bhttp%3A%2F%2F{HOST}%3A{port + 1}%2Fproxy'
         yield (
             server,
@@ -101,5 +111,11 @@ def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
         )
     finally:
         # The process is a wrapper of the one that serves.
-        os.killpg(server.pid, signal.SIGTERM)
+        with suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGTERM)
         server.wait()
+
+
+def _is_listening(port: int) -> bool:
+    with socket.socket() as trial:
+        return trial.connect_ex((HOST, port)) == 0

@@ -61,8 +61,8 @@ class View(NamedTuple):
 def read_view(item: Input, labels: str | None = None) -> View:
     """Read a scan, and its labels: a file, or what SemanticKITTI has beside the scan."""
     points, path = item.read().xyz, labels
-    beside = item.path.parent.with_name('labels') / f'{item.name}.label'
-    if path is None and item.path.parent.name == 'velodyne' and beside.is_file():
+    beside = item.path.parent.parent / 'labels' / f'{item.name}.label'
+    if path is None and item.path.parent.name == 'velodyne' and beside.exists():
         path = str(beside)
     if path is None:
         return View(item.title, points)
@@ -148,11 +148,13 @@ def point_colours(name: str, result: Segmentation, other: Labels | None = None) 
 
 def palette(name: str) -> Colours:
     """Return the colours of a legend, (n, 3)."""
-    return np.array([[*bytes.fromhex(colour[1:])] for colour in LEGENDS[name].values()], np.uint8)
+    colours = [[*bytes.fromhex(colour[1:])] for colour in LEGENDS[name].values()]
+    return np.array(colours, dtype=np.uint8)
 
 
 def _bytes(colours: FloatArray) -> Colours:
-    return (255.0 * colours).round().astype(np.uint8)
+    result: Colours = (255.0 * colours).round().astype(np.uint8)
+    return result
 
 
 def _mesh(model: GroundModel, config: Config, *n_std: float) -> Mesh:
