@@ -35,7 +35,8 @@ LAYERS = {
     'evaluation': LIBRARY | {'data', 'simulation', 'scale'},
     'ros': LIBRARY | {'data', 'plotting', 'simulation'},
     'experiments': TOOLS,
-    'cli': TOOLS | {'experiments', 'ros'},
+    'viewers': TOOLS,
+    'cli': TOOLS | {'experiments', 'ros', 'viewers'},
     '__init__': RESULT | {'segmenter'},
     '__main__': {'cli'},
 }
@@ -53,6 +54,8 @@ ONLY_IN = {
     'pyarrow': ('evaluation/report.py',),
     'matplotlib': ('plotting/',),
     'numba': ('jit.py', 'compiled/'),
+    'rerun': ('viewers/rerun_view.py',),
+    **dict.fromkeys(('viser', 'trimesh'), ('viewers/html_page.py',)),
     'optuna': ('experiments/optimise.py',),
     'imageio': ('plotting/',),
     'imageio_ffmpeg': ('plotting/',),
