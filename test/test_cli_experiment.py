@@ -12,7 +12,7 @@ from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.cli import experiment
-from gp_ground_seg.cli.experiment import EXPERIMENTS, parse_departure, split_settings
+from gp_ground_seg.cli.experiment import EXPERIMENTS, parse_departure
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
@@ -59,7 +59,6 @@ CASES = {
     'objects': (
         ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
     ),
-    'cross-validation': (['ROOT', '--set', 'grid.r_max=5,20.0,60', *SMALL], 'scores', 3 * 4),
     'sensor-pose': (
         ['ROOT', '--sequences', '08', '--set', 'learning.mode=fixed'], 'turns', 27,
     ),
@@ -156,13 +155,6 @@ def test_a_departure_in_words():
         (['steps', 'ROOT', '--preset', 'paper'], 'give no parameters'),
         (['ablation', '--simulated', '--set', 'length_scale.model=latent2'], 'length_scale.model'),
         (['departures', 'ROOT', '--switch', 'a: '], 'must be TITLE'),
-        (['cross-validation', 'ROOT', '--set', 'grid.r_max=50,0.001'], 'grid.r_max'),
-        (['cross-validation', 'ROOT', '--set', 'grid.rmax=50,60'], 'grid.rmax'),
-        (['cross-validation', 'ROOT', '--set', 'grid.r_max=50'], 'nothing to choose'),
-        (
-            ['cross-validation', 'ROOT', '--set', 'grid.r_max=50,60', '--set', 'grid.r_max=5,6'],
-            'searched twice',
-        ),
         (['sensor-pose', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
         (['coverage', 'ROOT', '--sensors', 'vlp-16'], '--sensors: is for --simulated only'),
         (['coverage'], 'coverage: give either ROOT or --simulated'),
@@ -170,7 +162,7 @@ def test_a_departure_in_words():
         (['sensor-pose', 'ROOT', '--set', 'sensor.roll=1.0'], 'sensor.roll = 1.0: the exp'),
         (['scenes', '--preset', 'papr'], 'did you mean paper?'),
         *(([name, '--json', 'MINE', *(['ROOT'] if name not in ('scenes', 'objects') else [])],
-           '--force') for name in EXPERIMENTS if name != 'cross-validation'),
+           '--force') for name in EXPERIMENTS),
     ],
 )  # fmt: skip
 def test_errors_are_said_before_any_frame_is_read(
@@ -216,11 +208,6 @@ def test_commands_of_the_docs_are_accepted():
             if 'experiment' not in vars(arguments):
                 continue
             names.add(arguments.experiment)
-            if arguments.experiment == 'cross-validation':
-                grid, arguments.settings = split_settings(arguments.settings)
-                for name, values in grid.items():
-                    for value in values:
-                        Config().replace(**{name: value})
             read_config(arguments)
     assert names == set(EXPERIMENTS)
 

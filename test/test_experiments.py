@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label, simulation
-from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
-from gp_ground_seg.errors import ConfigError, DataError, PointCloudError
+from gp_ground_seg.data.semantic_kitti import labelled_frames
+from gp_ground_seg.errors import ConfigError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore
 from gp_ground_seg.evaluation.metrics import (
@@ -196,68 +196,6 @@ def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):
     assert row['ece'] == pytest.approx(sum(p[1:], p[0]).ece)
     assert [one['range'] for one in report.tables['range'].json()][:2] == ['0-10 m', '10-20 m']
     assert sum(one['n_points'] for one in report.rows) == row['points']
-
-
-GRID = {'a': [0, 1, 2], 'b': [0, 1, 2]}
-
-
-@given(st.lists(st.integers(0, 9), min_size=9, max_size=9))
-def test_no_single_change_betters_the_choice(heights):
-    worth = dict(zip(itertools.product(range(3), range(3)), heights, strict=True))
-
-    def of(choice):
-        return worth[choice['a'], choice['b']]
-
-    best = ablation.coordinate_search(GRID, {'a': 0, 'b': 0}, of)
-    for name, value in itertools.product(GRID, range(3)):
-        assert of({**best, name: value}) <= of(best)
-    assert of(best) >= worth[0, 0]
-    # Ties keep the given value.
-    assert ablation.coordinate_search(GRID, best, lambda _: 0.0) == best
-
-
-def test_each_sequence_is_scored_with_values_chosen_without_it(monkeypatch):
-    name = 'label.ground_tolerance'
-    hits = {0.1: (50, 50, 50), 0.2: (90, 60, 40), 0.3: (60, 70, 80)}
-    fit = GroundSegmenter().segment(np.empty((0, 3))).fit
-    runs = []
-
-    def score(_frames, _load, variants, **_):
-        ((title, config),) = variants.items()
-        runs.append(config[name])
-        scans = [
-            ScanScore(s, '0', 0.1, confusions={'g': Confusion(tp=tp, fn=100 - tp)}, fit=fit)
-            for s, tp in zip(('00', '05', '08'), hits[config[name]], strict=True)
-        ]
-        return [MethodScore(title, tuple(scans))]
-
-    monkeypatch.setattr(ablation, 'score_variants', score)
-    places = [Frame(s, '0', None, None, None) for s in ('00', '05', '08')]
-    report = ablation.cross_validate(places, Config().replace(**{name: 0.1}), {name: [0.2, 0.3]})
-    # By hand: on all 150, 190, 210; without 00 100, 100, 150; without 05 100, 130, 140;
-    # without 08 100, 150, 130.
-    (choices,) = report.tables['choices'].json()
-    assert list(choices.values()) == [name, '0.1', '0.3', '0.3', '0.3', '0.2']
-    rows = {row.pop('sequence'): row for row in report.tables['scores'].json()}
-    assert [rows[s]['iou left out'] for s in ('00', '05', '08')] == [0.6, 0.7, 0.4]
-    pooled = [rows['all'][f'iou {way}'] for way in ('given', 'tuned', 'left out')]
-    assert pooled == pytest.approx([150 / 300, 210 / 300, 170 / 300])
-    assert sorted(runs) == [0.1, 0.2, 0.3]  # each configuration once
-    assert report.facts['n_configurations'] == 3
-
-
-def test_scores_of_the_search_are_those_of_evaluate(frames):
-    name = 'grid.r_max'
-    report = ablation.cross_validate(frames, FAR, {name: [15.0, 120]})
-    assert report.facts['n_configurations'] == 2  # 120 is the given value
-    ours = runner.OurMethod(FAR)
-    (score,) = runner.score_methods(frames, runner.load_kitti, [ours])
-    ours.close()
-    row, *_, pooled = report.tables['scores'].json()
-    assert row['iou given'] == score.of('00').iou
-    assert (pooled['iou given'], pooled['ECE given']) == (score.iou, score.ece)
-    with pytest.raises(DataError, match='at least two sequences'):
-        ablation.cross_validate(frames[:2], FAR, {name: [15.0]})
 
 
 def test_scene_scores_follow_their_definitions():

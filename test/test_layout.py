@@ -10,7 +10,7 @@ from conftest import REPOSITORY
 PACKAGE = 'gp_ground_seg'
 
 # Each layer and those it may import besides itself; a layer is a folder, or a file at the root.
-VALUES = {'errors', 'jit', 'frame'}
+VALUES = {'errors', 'jit', 'log', 'frame'}
 STAGES = VALUES | {'parameters', 'pipeline', 'gp'}
 RESULT = STAGES | {'result', 'ground_model'}
 LIBRARY = RESULT | {'compiled', 'backend', 'segmenter'}
@@ -18,6 +18,7 @@ TOOLS = LIBRARY | {'data', 'plotting', 'simulation', 'scale', 'evaluation'}
 LAYERS = {
     'errors': set(),
     'jit': {'errors'},
+    'log': set(),
     'frame': {'errors'},
     'parameters': VALUES,
     'data': VALUES | {'parameters'},
@@ -34,7 +35,8 @@ LAYERS = {
     'evaluation': LIBRARY | {'data', 'simulation', 'scale'},
     'ros': LIBRARY | {'data', 'plotting', 'simulation'},
     'experiments': TOOLS,
-    'cli': TOOLS | {'experiments', 'ros'},
+    'viewers': TOOLS,
+    'cli': TOOLS | {'experiments', 'ros', 'viewers'},
     '__init__': RESULT | {'segmenter'},
     '__main__': {'cli'},
 }
@@ -55,6 +57,8 @@ ONLY_IN = {
     'pyarrow': ('evaluation/report.py',),
     'matplotlib': ('plotting/',),
     'numba': ('jit.py', 'compiled/'),
+    'rerun': ('viewers/rerun_view.py',),
+    **dict.fromkeys(('viser', 'trimesh'), ('viewers/html_page.py',)),
     'optuna': ('experiments/optimise.py',),
     'imageio': ('plotting/',),
     'imageio_ffmpeg': ('plotting/',),

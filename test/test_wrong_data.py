@@ -178,7 +178,6 @@ COMMANDS = {
     'evaluate': 'evaluate ROOT --json OUT.json',
     'ablation': 'experiment ablation ROOT --json OUT.json',
     'departures': 'experiment departures ROOT --json OUT.json',
-    'cross-validation': 'experiment cross-validation ROOT --set grid.n_bins=60,80 --json OUT.json',
     'sensor-pose': 'experiment sensor-pose ROOT --json OUT.json',
     'coverage': 'experiment coverage ROOT --json OUT.json',
     'table1': 'experiment table1 ROOT --frames 00/000000:1 --json OUT.json',

@@ -24,11 +24,12 @@ from gp_ground_seg.data.semantic_kitti import (
     read_labels,
     read_points,
 )
-from gp_ground_seg.errors import DataError, GroundSegError, require
+from gp_ground_seg.errors import DataError, GroundSegError
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
 from gp_ground_seg.evaluation.report import Column
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.scan import plot_birds_eye
+from gp_ground_seg.plotting.style import new_figure
 from gp_ground_seg.ros.lifecycle import needing_ros
 from gp_ground_seg.ros.probe import (
     GROUND,
@@ -146,26 +147,20 @@ def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> tuple[bo
     Returns whether each finite point came back once, with every byte, and nothing else did; and
     the `Label` (N,) by the cloud a point came back in.
     """
-    points, clouds = _records(sent), (results[GROUND], results[OBSTACLES])
+    points, clouds = point_cloud2.read_fields(sent), (results[GROUND], results[OBSTACLES])
     label = np.full(len(points), Label.UNKNOWN, dtype=np.uint8)
     for cloud in clouds:
         names = ('header', 'fields', 'point_step', 'is_bigendian')
         is_whole = len(cloud.data) == cloud.height * cloud.width * cloud.point_step
         if not is_whole or any(getattr(sent, name) != getattr(cloud, name) for name in names):
             return False, label
-    ground, obstacles = map(_records, clouds)
+    ground, obstacles = map(point_cloud2.read_fields, clouds)
     for value, part in ((Label.GROUND, ground), (Label.OBSTACLE, obstacles)):
         label[part['index'][part['index'] < len(points)]] = value
     back = np.concatenate([ground, obstacles])
     back = back[np.argsort(back['index'], kind='stable')]
     finite = np.isfinite(read_xyz(sent)).all(axis=1)
     return back.tobytes() == points[finite].tobytes(), label
-
-
-def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
-    """Return the points of a `numbered_cloud` as a structured array, (N,)."""
-    names = ('x', 'y', 'z', 'intensity', 'label', 'index')
-    return np.frombuffer(cloud.data, [(n, '<f4' if k < 4 else '<u4') for k, n in enumerate(names)])
 
 
 class Tally:
@@ -185,7 +180,7 @@ class Tally:
             return
         is_exact, label = check_scan(sent, results)
         xyz = read_xyz(sent)
-        truth = GROUNDGRID.truth(_records(sent)['label'], xyz[:, 2])
+        truth = GROUNDGRID.truth(point_cloud2.read_fields(sent)['label'], xyz[:, 2])
         self.n_points += int(np.isfinite(xyz).all(axis=1).sum())
         self.n_faulty += not is_exact
         self.confusion += count_confusion(label, truth)
@@ -225,7 +220,7 @@ def result_text(
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
-    require('matplotlib', 'plot')
+    new_figure(1.0, 1.0)  # where it cannot draw, it says so before the drive
     sequence = arguments.sequence
     if arguments.kitti is not None:
         sequence = sequence or list_sequences(arguments.kitti)[0]

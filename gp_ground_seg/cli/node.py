@@ -191,25 +191,21 @@ def _measure(
 
 
 def _text(document: dict[str, Any]) -> str:
-    from gp_ground_seg.evaluation.report import Column, Table
+    from gp_ground_seg.evaluation.report import Column, Table, milliseconds
 
-    columns = {
-        'asked': Column('Rate [Hz]', 'g'),
-        'sent': Column('sent [Hz]', '.2f'),
-        'n_sent': Column('sent', 'd'),
-        'n_back': Column('back', 'd'),
-        'n_lost': Column('lost', 'd'),
-        'n_dropped': Column('reported', 'd'),
-        'p50': Column('p50 [ms]', '.1f', scale=1e3),
-        'p95': Column('p95', '.1f', scale=1e3),
-        'p99': Column('p99', '.1f', scale=1e3),
-        'worst': Column('worst', '.1f', scale=1e3),
-    }
-    rows = [[rate[key] for key in columns] for rate in document['rates']]
+    counts = {'sent': 'n_sent', 'back': 'n_back', 'lost': 'n_lost', 'reported': 'n_dropped'}
+    percentiles = {'p50 [ms]': 'p50', 'p95': 'p95', 'p99': 'p99', 'worst': 'worst'}
+    columns = [
+        Column('Rate [Hz]', 'g', 'asked'),
+        Column('sent [Hz]', '.2f', 'sent'),
+        *(Column(title, 'd', key) for title, key in counts.items()),
+        *(milliseconds(title, key) for title, key in percentiles.items()),
+    ]
+    rows = [[rate[column.key] for column in columns] for rate in document['rates']]
     source, environment = document['source'], document['environment']
     return (
         f'{source["data"]}: {options.count(source["n_clouds"], "cloud")} of '
         f'{source["mean_points"]:.0f} points, {source["mean_bytes"] / 1e6:.2f} MB, on average\n'
         f'{environment["cpu"]}, {environment["n_cores"]} cores\n\n'
-        f'{Table(list(columns.values()), rows).text()}'
+        f'{Table(columns, rows).text()}'
     )

@@ -15,6 +15,7 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
+from gp_ground_seg import log
 from gp_ground_seg.data.atomic_output import leftovers, staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
@@ -206,23 +207,9 @@ def note(message: str) -> None:
     print(f'gp-ground-seg: note: {message}', file=sys.stderr)
 
 
-class _NoteHandler(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        note(record.getMessage())
-
-
-@contextmanager
-def library_notes(level: int = logging.INFO) -> Iterator[None]:
+def library_notes(level: int = logging.INFO) -> AbstractContextManager[None]:
     """Print what the library logs, such as that it compiles, as notes within the block."""
-    logger = logging.getLogger('gp_ground_seg')
-    handler, before = _NoteHandler(), logger.level
-    logger.addHandler(handler)
-    logger.setLevel(level)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(before)
+    return log.told(lambda _, text: note(text), level)
 
 
 @contextmanager

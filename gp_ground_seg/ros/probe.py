@@ -56,9 +56,8 @@ _NETWORK = (
 def private_network() -> Iterator[None]:
     """Keep this process and its children to this machine, on a ROS domain of their own."""
     kept = {name: os.environ.pop(name) for name in _NETWORK if name in os.environ}
-    domain = 1 + os.getpid() % _HIGHEST_DOMAIN
-    if str(domain) == kept.get('ROS_DOMAIN_ID'):
-        domain = 1 + domain % _HIGHEST_DOMAIN
+    own = kept.get('ROS_DOMAIN_ID')
+    domain = secrets.choice([k for k in range(1, _HIGHEST_DOMAIN + 1) if str(k) != own])
     os.environ['ROS_DOMAIN_ID'] = str(domain)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     try:

@@ -24,6 +24,7 @@ from typing import Any
 from tqdm import tqdm
 
 import gp_ground_seg
+from gp_ground_seg import log
 from gp_ground_seg.errors import DataError, MissingDependencyError
 from gp_ground_seg.parameters.config import Config
 
@@ -192,22 +193,11 @@ def _versions() -> dict[str, str | None]:
     return {**found, 'Python': platform.python_version()}
 
 
-class _Notes(logging.Handler):
-    """Keeps what is logged."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.kept: list[tuple[int, str]] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.kept.append((record.levelno, record.getMessage()))
-
-
 def _compute(
     expected: dict[str, str | None], function: Function, block: Sequence[Any]
 ) -> tuple[Any, list[tuple[int, str]]]:
     """Compute a block in a worker; return the result and what the library logged meanwhile."""
-    here, notes = _versions(), _Notes()
+    here, notes = _versions(), list[tuple[int, str]]()
     other = [
         f'{name} {v}, not {expected[name]}' for name, v in here.items() if v != expected[name]
     ]
@@ -215,13 +205,9 @@ def _compute(
         raise DataError(f'a worker on {platform.node()} has {"; ".join(other)}')
     if other:
         line = f'a worker on {platform.node()} has {"; ".join(other)}: last digits may differ'
-        notes.kept.append((logging.WARNING, line))
-    _LOGGER.addHandler(notes)
-    _LOGGER.setLevel(logging.INFO)
-    try:
-        return function(block, iter), notes.kept
-    finally:
-        _LOGGER.removeHandler(notes)
+        notes.append((logging.WARNING, line))
+    with log.told(lambda *message: notes.append(message)):
+        return function(block, iter), notes
 
 
 @contextmanager
