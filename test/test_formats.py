@@ -378,7 +378,11 @@ def test_a_lie_in_a_laz_file_is_found_before_memory_is_asked_for(tmp_path):
         paths[-1].write_bytes(data)
     # In a process of its own: lazrs ends it where memory cannot be had.
     done = subprocess.run(
-        [sys.executable, '-c', READ_ALL, *paths], capture_output=True, text=True, check=True
+        [sys.executable, '-c', READ_ALL, *paths],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
     )
     for line, (*_, message) in zip(done.stdout.splitlines(), LAZ_LIES, strict=True):
         assert re.match(f'DataError: .*{message}', line)
