@@ -19,6 +19,8 @@ FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
 PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
 MOVIE = ['imageio-ffmpeg>=0.4.8']  # for MP4; 165 MB, of which GIF needs none
 TUNE = ['optuna>=4.0']
+VISER = ['viser>=1.1']
+VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
     'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
@@ -31,6 +33,7 @@ DEV = [
     *TEST,
     *MOVIE,
     *TUNE,
+    *VIEW,
     'argcomplete>=3.1',
     'colcon-common-extensions',
     'flake8>=6',
@@ -78,10 +81,11 @@ setup(
         'formats': FORMATS,
         'plot': PLOT,
         'movie': PLOT + MOVIE,
-        'tune': PLOT + TUNE,
+        'tune': PLOT + TUNE + VISER,
         'complete': ['argcomplete>=3.1'],
         'ros': ROS + BAGS + PLOT,
         'test': TEST,
+        'view': VIEW,
         'dev': DEV,
     },
     zip_safe=False,

@@ -8,8 +8,6 @@ from contextlib import ExitStack, closing, nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, frames_from_options
 from gp_ground_seg.data.atomic_output import staged_files
@@ -108,17 +106,15 @@ def run(arguments: argparse.Namespace) -> int:
         environment = report.describe_environment()
         if 'json' in parts:
             document = {
-                'configs': [
-                    {'given': g, **c.nested()} for g, c in zip(given, configs, strict=True)
-                ],
+                'configs': {'A': given[0], 'B': given[1], 'changed': changed},
                 'environment': environment,
                 'measures': [one._asdict() for one in differences],
                 'scans': Table(COLUMNS, rows).json(),
             }
             report.write_json(document, parts['json'])
-    shares = np.average([row[3:] for row in rows], axis=0, weights=[row[2] for row in rows])
     n_points = sum(row[2] for row in rows)
-    last = ['all', options.count(len(rows), 'frame'), n_points, *shares.tolist()]
+    shares = [sum(row[2] * row[k] for row in rows) / max(n_points, 1) for k in (3, 4, 5)]
+    last = ['all', options.count(len(rows), 'frame'), n_points, *shares]
     title = 'Points with two labels, in the frames with most and in all  [%]'
     tables = [
         comparison.difference_table(scores[0], differences, ['A', 'B']),
