@@ -64,7 +64,12 @@ def encode_ply(cloud: Cloud) -> bytes:
     """File of a cloud as vertices, binary, with the comments it was read with."""
     fields = in_types(cloud.fields, _NAMES, 'PLY', flat=True)
     header = cloud.header if isinstance(cloud.header, PlyHeader) else PlyHeader()
-    lines = ['ply', 'format binary_little_endian 1.0', *header.remarks, f'element vertex {len(fields)}']
+    lines = [
+        'ply',
+        'format binary_little_endian 1.0',
+        *header.remarks,
+        f'element vertex {len(fields)}',
+    ]
     for name in fields.dtype.names or ():
         lines.append(f'property {_NAMES[fields.dtype[name].str[1:]]} {name}')
     return '\n'.join([*lines, 'end_header', '']).encode() + fields.tobytes()
