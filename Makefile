@@ -1,4 +1,4 @@
-# make demo | make test | make bench | make node-bench | make colcon | make lint: each creates the environment it needs.
+# make demo | make test | make browser-test | make bench | make node-bench | make colcon | make lint: each creates the environment it needs.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -6,11 +6,12 @@ KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test torture bench bench-docs figures node-bench colcon lint format generate clean
+.PHONY: help demo test browser-test torture bench bench-docs figures node-bench colcon lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
 	@echo 'make test      the whole test suite (KITTI=PATH adds labelled frames)'
+	@echo 'make browser-test  pages of view and tune in a headless Chromium, which root gets by apt'
 	@echo 'make torture   adversarial clouds, files and uses (TORTURE_SCALE=100 for a night)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.json and its picture'
@@ -41,6 +42,11 @@ demo: $(VENV)/.ros
 
 test: $(VENV)/.dev
 	$(WITH_KITTI) $(BIN)/python -m pytest
+
+browser-test: $(VENV)/.dev
+	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && apt-get install -y chromium; } \
+		|| { echo 'Chromium is not installed: sudo apt-get install chromium'; exit 1; }
+	$(BIN)/python -m pytest test/test_browser.py
 
 torture: $(VENV)/.dev
 	$(BIN)/python test/torture.py

@@ -20,6 +20,8 @@ PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
 MOVIE = ['imageio-ffmpeg>=0.4.8']  # for MP4; 165 MB, of which GIF needs none
 TUNE = ['optuna>=4.0']
 SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']  # 21 MB; s3fs, for s3://, is 36 MB more
+VISER = ['viser>=1.1']
+VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
     'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
@@ -33,6 +35,7 @@ DEV = [
     *MOVIE,
     *TUNE,
     *SCALE,
+    *VIEW,
     'argcomplete>=3.1',
     'colcon-common-extensions',
     'flake8>=6',
@@ -83,11 +86,12 @@ setup(
         'formats': FORMATS,
         'plot': PLOT,
         'movie': PLOT + MOVIE,
-        'tune': PLOT + TUNE,
+        'tune': PLOT + TUNE + VISER,
         'scale': SCALE,
         'complete': ['argcomplete>=3.1'],
         'ros': ROS + BAGS + PLOT,
         'test': TEST,
+        'view': VIEW,
         'dev': DEV,
     },
     zip_safe=False,

@@ -15,7 +15,7 @@ from gp_ground_seg.data.clouds import Cloud, Columns
 from gp_ground_seg.data.files import AnyPath
 from gp_ground_seg.data.inputs import Input
 from gp_ground_seg.data.numpy_files import encode_arrays
-from gp_ground_seg.errors import PointCloudError, require
+from gp_ground_seg.errors import DataError, PointCloudError, require
 from gp_ground_seg.frame import Label
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.result import Segmentation
@@ -51,7 +51,9 @@ class CloudOutput:
     def names(self, one: Input, stem: str | None = None) -> list[str]:
         """Names of the files of a cloud, which begin with `stem`, by default its name."""
         stem, form = stem or one.name, self._form(one)
-        parts = PARTS if self.split and form != LABELS else ['']
+        if self.split and form == LABELS:
+            raise DataError('--split: is for clouds, a .label file has both; see --format')
+        parts = PARTS if self.split else ['']
         surface = [f'{stem}_surface.{self.surface}'] if self.surface else []
         return [*(f'{stem}{part}.{form}' for part in parts), *surface]
 

@@ -29,6 +29,8 @@ COMMANDS = {
     'optimise': ('optimise', 'search parameters on your labelled frames'),
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
+    'view': ('view', 'look at scans in Rerun, a browser or a page'),
+    'tune': ('view', 'set parameters by sliders, and see the labels change'),
     'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
     'pose': ('pose', 'estimate height and tilt of the sensor from scans'),
     'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),

@@ -77,7 +77,7 @@ SCAN_LAYOUT: tuple[tuple[str, str, dict[str, Any]], ...] = (
 
 CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
-    ('--origin', 'place of the sensor in the coordinates of the input [m] (default: 0 0 0)',
+    ('--origin', 'place of the sensor in clouds in the coordinates of a map [m]',
      {'metavar': ('X', 'Y', 'Z'), 'nargs': 3, 'type': float}),
     *SCAN_LAYOUT,
 )  # fmt: skip
