@@ -197,6 +197,12 @@ def test_lines_that_are_short_or_steep_or_of_two_candidates_start_at_no_break(ba
     assert breaks(backend, r, z, offsets=[0, 6, 9])[1] == [False, False]
 
 
+def test_a_candidate_far_below_moves_no_slope_break_of_other_segments(backend):
+    r, z = slope_at_16_m(0.05, step=1.5)
+    start, at_break = breaks(backend, np.append(5.0, r), np.append(-3e30, z), offsets=[0, 1, 10])
+    assert (start, at_break) == ([0, 1, 7, 10], [False, False, False])
+
+
 def test_a_ramp_seen_by_few_rings_is_ground():
     missed = []
     for changes in ({}, {'growth.min_bend_extent': 1000.0}):

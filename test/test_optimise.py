@@ -5,6 +5,7 @@ import re
 import sys
 from functools import partial
 
+import optuna
 import pytest
 from cli_runner import error_line, run
 from evaluation_samples import write_streets
@@ -54,6 +55,10 @@ def test_parameters_searched_are_in_the_ranges_declared(frames):
     scales = {'grid.n_segments': True, 'grid.bin_growth': False, 'sensor.origin_z': False,
               'grid.r_min': False, TOLERANCE: True, 'surface.look_aside': False}  # fmt: skip
     assert {name: optimise.is_log(find_spec(name)) for name in scales} == scales
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(0))
+    drawn = [optimise._suggest(study.ask(), find_spec('grid.n_segments')) for _ in range(100)]
+    # On a linear scale half of them would be above 1026.
+    assert 60 < sorted(drawn)[50] < 140 and min(drawn) >= 4 and max(drawn) <= 2048
     for name, base in (('sensor.height', Config()), ('frame.base', Config())):
         with pytest.raises(ConfigError, match=f'{name} = '):
             optimise.searched_specs([name], base)

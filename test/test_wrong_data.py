@@ -150,8 +150,8 @@ def test_a_bag_is_no_scan(tmp_path, capsys, kind):
     (write_ros1_bag if kind == 'drive.bag' else write_ros2_bag)(tmp_path / kind)
     # Whatever its size: cut to whole points here, which the size alone would not tell.
     content = (tmp_path / kind).read_bytes()
-    (tmp_path / kind).write_bytes(content[: len(content) // 16 * 16])
-    assert run('plot', 'scan', tmp_path / kind, '-o', tmp_path / 'a.png') == 2
+    (tmp_path / 'drive.bin').write_bytes(content[: len(content) // 16 * 16])
+    assert run('plot', 'scan', tmp_path / 'drive.bin', '-o', tmp_path / 'a.png') == 2
     assert 'begins as a bag does' in error_line(capsys)
     assert not (tmp_path / 'a.png').exists()
 

@@ -24,11 +24,12 @@ from gp_ground_seg.data.semantic_kitti import (
     read_labels,
     read_points,
 )
-from gp_ground_seg.errors import DataError, GroundSegError, require
+from gp_ground_seg.errors import DataError, GroundSegError
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
 from gp_ground_seg.evaluation.report import Column
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.scan import plot_birds_eye
+from gp_ground_seg.plotting.style import new_figure
 from gp_ground_seg.ros.lifecycle import needing_ros
 from gp_ground_seg.ros.probe import (
     GROUND,
@@ -219,7 +220,7 @@ def result_text(
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
-    require('matplotlib', 'plot')
+    new_figure(1.0, 1.0)  # where it cannot draw, it says so before the drive
     sequence = arguments.sequence
     if arguments.kitti is not None:
         sequence = sequence or list_sequences(arguments.kitti)[0]

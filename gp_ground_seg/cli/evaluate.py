@@ -356,7 +356,10 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
         frames = labelled_frames(root, chosen, layout)
     elif chosen is None and not any(root.glob('sequences/*/velodyne')):
         name = Path(arguments.root).resolve().stem
-        frames = [Frame(name, one.name, one.path, None, 0.0, layout) for one in list_inputs(root)]
+        scans = [one for one in list_inputs(root) if one.path.suffix == '.bin']
+        if not scans:
+            raise DataError(f'{root}: objects are counted in .bin scans, none here')
+        frames = [Frame(name, one.name, one.path, None, 0.0, layout) for one in scans]
     else:
         frames = boxed_frames(root, chosen, layout)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)

@@ -73,7 +73,7 @@ class Experiment(NamedTuple):
 
     description: str
     options: tuple[Option, ...]
-    run: Callable[[argparse.Namespace, Runner], Report]
+    run: Callable[[argparse.Namespace, Config, Runner], Report]
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -100,9 +100,10 @@ def run(arguments: argparse.Namespace) -> int:
     experiment = EXPERIMENTS[arguments.experiment]
     if SIMULATED in experiment.options:
         _check_source(arguments)
+    config = options.read_config(arguments)
     with options.staged_options(arguments, 'json') as parts:
         with options.runner(arguments, arguments.experiment) as runner:
-            report = experiment.run(arguments, runner)
+            report = experiment.run(arguments, config, runner)
             n_workers = runner.n_workers
         has_peer = not getattr(arguments, 'no_peer', True)
         environment = describe_environment(*(['pypatchworkpp'] if has_peer else []))
@@ -134,8 +135,7 @@ def _check_source(arguments: argparse.Namespace) -> None:
             raise DataError(f'{option[0]}: is for {kind} only')
 
 
-def _ablation(arguments: argparse.Namespace, runner: Runner) -> Report:
-    config = options.read_config(arguments)
+def _ablation(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     if not arguments.simulated:
         return ablation.compare_models(frames_from_options(arguments), load_kitti, config, runner)
     seeds = arguments.seeds or 10
@@ -143,8 +143,7 @@ def _ablation(arguments: argparse.Namespace, runner: Runner) -> Report:
     return ablation.compare_models(frames, load_simulated, config, runner)
 
 
-def _departures(arguments: argparse.Namespace, runner: Runner) -> Report:
-    config = options.read_config(arguments)
+def _departures(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     chosen = [parse_departure(text) for text in arguments.switch or []] or ablation.DEPARTURES
     frames = frames_from_options(arguments)
     return ablation.compare_departures(frames, chosen, config, runner)
@@ -159,34 +158,30 @@ def parse_departure(text: str) -> ablation.Departure:
     return ablation.Departure(title.strip(), dict(map(options.parse_setting, settings)))
 
 
-def _steps(arguments: argparse.Namespace, runner: Runner) -> Report:
-    if options.read_config(arguments) != Config():
+def _steps(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
+    if config != Config():
         raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
     frames = frames_from_options(arguments)
     return stepwise.score_steps(frames, _peer(arguments), runner)
 
 
-def _wrong_values(arguments: argparse.Namespace, runner: Runner) -> Report:
-    config = options.read_config(arguments)
+def _wrong_values(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     return stepwise.score_wrong_values(frames_from_options(arguments), config, runner)
 
 
-def _scenes(arguments: argparse.Namespace, runner: Runner) -> Report:
+def _scenes(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(DRIVES)
     frames = simulated_frames(sensors, scenes, arguments.seeds or 3, variants.SCENE_PLACES)
-    config = options.read_config(arguments)
     return score_simulated(frames, variants.scene_tables, config, _peer(arguments), runner)
 
 
-def _objects(arguments: argparse.Namespace, runner: Runner) -> Report:
+def _objects(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or lost.SCENES
     frames = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
-    config = options.read_config(arguments)
     return score_simulated(frames, lost.lost_tables, config, _peer(arguments), runner)
 
 
-def _coverage(arguments: argparse.Namespace, runner: Runner) -> Report:
-    config = options.read_config(arguments)
+def _coverage(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     if not arguments.simulated:
         frames = frames_from_options(arguments)
         return coverage.compare_coverage(frames, load_kitti, config, coverage.LABELLED, runner)
@@ -195,8 +190,7 @@ def _coverage(arguments: argparse.Namespace, runner: Runner) -> Report:
     return coverage.compare_coverage(scans, load_simulated, config, coverage.SIMULATED, runner)
 
 
-def _sensor_pose(arguments: argparse.Namespace, runner: Runner) -> Report:
-    config = options.read_config(arguments)
+def _sensor_pose(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     if not arguments.simulated:
         frames, mounts = frames_from_options(arguments), sensor_pose.MOUNTS
         return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, runner)
@@ -205,8 +199,8 @@ def _sensor_pose(arguments: argparse.Namespace, runner: Runner) -> Report:
     return sensor_pose.score_poses(scans, sensor_pose.load_mounted, mounts, config, runner)
 
 
-def _table1(arguments: argparse.Namespace, _: Runner) -> Report:
-    config, bar = options.read_config(arguments), options.progress('table1')
+def _table1(arguments: argparse.Namespace, config: Config, _: Runner) -> Report:
+    bar = options.progress('table1')
     choices = [Choice.parse(word) for word in arguments.frames]
     layout = options.scan_layout(arguments)
     return table1(arguments.root, choices, config, arguments.repeats, layout, bar)

@@ -30,14 +30,19 @@ Split scans into ground and obstacles.
 
 INPUT is one of:
   scan.bin             a scan as KITTI's: float32 x, y, z, intensity; --columns, --dtype: another
-  folder               of .bin files, or a sequence with velodyne/ in it
+  .pcd .ply .las .laz .npy .npz, and .pcd.bin of nuScenes
+  folder               of such files, or a sequence with velodyne/ in it
   drive.bag            a ROS 1 bag
   drive.mcap, .db3     a single-file rosbag2
   folder               of a rosbag2 (with metadata.yaml)
 
-Scans give .label files in SemanticKITTI's form, one uint32 per point in input
+Scans .bin give .label files in SemanticKITTI's form, one uint32 per point in input
 order: 40 (road) = ground, 99 (other-object) = obstacle, 0 (unlabelled) = unknown,
 which are the points that are not finite. With --raw: 1, 2 and 0.
+
+Other formats give their own, the name of OUT or --format another: every field of the
+input, and label (0 unknown, 1 ground, 2 obstacle; LAS: classification 2 ground),
+height, ground_z, ground_std [m], p_ground (docs/datasets.md).
 
 A bag gives a rosbag2 with all messages of the input as they are, and after each
 point cloud its ground and its obstacles: every field of every point bit for bit,
@@ -53,7 +58,8 @@ Nothing is overwritten without --force. Output is written under a hidden name
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
-  gp-ground-seg segment nuscenes/samples/LIDAR_TOP -o labels --columns 5
+  gp-ground-seg segment scan.pcd -o scan.laz --surface tif
+  gp-ground-seg segment drive.mcap --format ply --split     files for each cloud
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
 """
@@ -71,8 +77,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         parser,
         ('input', 'scan, folder of scans, bag, or a root or URL', {'metavar': 'INPUT'}),
         ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*'}),
-        ('-o --output', 'for scans a folder, or a .label file for a single scan; for bags a '
-         'folder, or a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
+        ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
+         'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),
         ('--resume', 'go on with OUT, whose finished blocks are in its manifest', options.FLAG),
         options.FORCE,
@@ -136,9 +142,9 @@ def _segment_dataset(arguments: argparse.Namespace, config: Config, is_bag: bool
     if arguments.output is None and '://' in arguments.input:
         raise DataError(f'{arguments.input}: give the folder for the output, -o OUT')
     target = as_path(arguments.output or _default_output(Path(arguments.input)))
-    for name in ('format', 'split', 'surface', 'origin'):
-        if getattr(arguments, name) and not (is_bag and name == 'format'):
-            raise DataError(f'--{name}: whole data sets give .label files')
+    for name in ('format', 'split', 'surface'):
+        if getattr(arguments, name) not in (None, False, *SUFFIX_OF_STORAGE):
+            raise DataError(f'--{name}: whole data sets give .label files and bags')
     if is_bag or arguments.more:
         if not isinstance(target, Path):
             raise DataError(f'{target}: bags are written to folders of this machine')

@@ -14,7 +14,7 @@ from gp_ground_seg.data.bag_files import in_one_line
 from gp_ground_seg.data.clouds import Cloud, Columns, name_columns
 from gp_ground_seg.data.files import AnyPath
 from gp_ground_seg.data.las import encode_las, read_las
-from gp_ground_seg.data.numpy_files import encode_npy, encode_npz, read_npy, read_npz
+from gp_ground_seg.data.numpy_files import encode_npy, encode_npz, read_numpy
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
 from gp_ground_seg.data.scan_layout import KITTI, MAX_SCAN_BYTES, ScanLayout, find_objection
@@ -28,8 +28,8 @@ _READERS: dict[str, Callable[[bytes], Cloud]] = {
     '.ply': read_ply,
     '.las': read_las,
     '.laz': read_las,
-    '.npy': read_npy,
-    '.npz': read_npz,
+    '.npy': read_numpy,
+    '.npz': read_numpy,
 }
 _ENCODERS = {'.pcd': encode_pcd, '.ply': encode_ply, '.npy': encode_npy, '.npz': encode_npz}
 SUFFIXES = ('.bin', *_READERS)
@@ -81,7 +81,7 @@ def _named(path: AnyPath, what: str) -> Iterator[None]:
         yield
     except PointCloudError as error:
         raise DataError(f'{path}: {error}') from error
-    except (GroundSegError, MemoryError, OSError):
+    except GroundSegError:
         raise
     except Exception as error:  # Of many types: ValueError, LaspyException, struct, zlib, ...
         said = f'{type(error).__name__}: {in_one_line(error)}'

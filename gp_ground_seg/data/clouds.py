@@ -111,7 +111,7 @@ def in_types(
             raise PointCloudError(f'field {name}: {format_name} has no type {values.dtype}')
         values = values.astype(f'<{code}')
         if flat and values.ndim > 1:
-            table = values.reshape(len(values), -1)
+            table = values.reshape(len(values), int(np.prod(values.shape[1:])))
             columns.update({f'{name}_{k}': table[:, k] for k in range(table.shape[1])})
         else:
             columns[name] = values

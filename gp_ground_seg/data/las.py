@@ -37,44 +37,43 @@ def _laspy() -> Any:
 def read_las(data: bytes) -> Cloud:
     """Read a file; PointCloudError if its header cannot be right."""
     laspy = _laspy()
-    _check_header(data)
+    n_chunks = _check_sizes(data)
+    # The reader on one thread takes no size in a damaged file for granted.
     with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs) as reader:
         header = reader.header
         size = header.point_count * header.point_format.size
-        room = MAX_SCAN_BYTES if header.are_points_compressed else len(data)
+        room = len(data)
+        if header.are_points_compressed:
+            (chunk_size,) = struct.unpack_from(
+                '<I', header.vlrs.get('LasZipVlr')[0].record_data, 12
+            )
+            room = min(MAX_SCAN_BYTES, n_chunks * chunk_size * header.point_format.size)
         if size > room:
             raise PointCloudError(f'{header.point_count} points ({size} bytes), of {room} bytes')
-        if header.are_points_compressed:
-            _check_chunks(data, header)
         las = reader.read()
     if len(las) != header.point_count:
         raise PointCloudError(f'{len(las)} points, its header says {header.point_count}')
     names = [name for name in las.point_format.dimension_names if name not in 'XYZ']
-    columns = {name: np.array(las[name]) for name in ('x', 'y', 'z', *names)}
-    return cloud_of(gather(columns), header)
+    return cloud_of(gather({name: np.array(las[name]) for name in (*'xyz', *names)}), header)
 
 
-def _check_header(data: bytes) -> None:
-    """Raise PointCloudError for more records than there is room for; laspy reads on and on."""
-    (n_records,) = struct.unpack_from('<I', data, 100)
-    if data[24:26] >= b'\x01\x04':
+def _check_sizes(data: bytes) -> int:
+    """Return the number of chunks; PointCloudError if there is no room for these or the records.
+
+    laspy would read records on and on, lazrs end the process where it gets no memory for chunks.
+    """
+    (start, n_records, point_format) = struct.unpack_from('<IIB', data, 96)
+    n_chunks = 0
+    if data[25] >= 4:  # version 1.4
         n_records += struct.unpack_from('<I', data, 243)[0]
-    if n_records * 54 > len(data):
-        raise PointCloudError(f'{n_records} variable length records in {len(data)} bytes')
-
-
-def _check_chunks(data: bytes, header: Any) -> None:
-    """Raise PointCloudError for a table of chunks that cannot be; lazrs would end the process."""
-    (start,) = struct.unpack_from('<q', data, header.offset_to_point_data)
-    if start == -1:  # of a writer that could not go back
-        (start,) = struct.unpack_from('<q', data, len(data) - 8)
-    if not header.offset_to_point_data < start <= len(data) - 8:
-        raise PointCloudError(f'table of chunks at byte {start} of {len(data)}; truncated?')
-    version, n_chunks = struct.unpack_from('<II', data, start)
-    (chunk_size,) = struct.unpack_from('<I', header.vlrs.get('LasZipVlr')[0].record_data, 12)
-    least, most = n_chunks, n_chunks * chunk_size
-    if version or n_chunks > len(data) or not least <= header.point_count <= most:
-        raise PointCloudError(f'{header.point_count} points in {n_chunks} chunks of {chunk_size}')
+    if point_format & 0x80:  # compressed
+        (table,) = struct.unpack_from('<q', data, start)
+        if table == -1:  # of a writer that could not go back
+            (table,) = struct.unpack_from('<q', data, len(data) - 8)
+        (n_chunks,) = struct.unpack_from('<I', data, table + 4)
+    if n_records > len(data) // 54 or n_chunks > len(data):
+        raise PointCloudError(f'{n_records} records and {n_chunks} chunks in {len(data)} bytes')
+    return int(n_chunks)
 
 
 def encode_las(cloud: Cloud, label: npt.NDArray[np.uint8], compressed: bool) -> bytes:

@@ -8,6 +8,7 @@ Source: http://paulbourke.net/dataformats/ply/.
 from __future__ import annotations
 
 import re
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,12 @@ _CODES = {
 _SAME = {np.dtype(code).name: code for code in _CODES.values()}  # int8, ..., of newer writers
 _NAMES = {code: name for name, code in _CODES.items()}
 _ORDERS = {'ascii': '<', 'binary_little_endian': '<', 'binary_big_endian': '>'}
+
+
+class PlyHeader(NamedTuple):
+    """What a file says besides its vertices."""
+
+    remarks: tuple[str, ...] = ()
 
 
 def read_ply(data: bytes) -> Cloud:
@@ -50,14 +57,19 @@ def read_ply(data: bytes) -> Cloud:
     if elements[:1] != ['vertex'] or n_points < 0:
         raise PointCloudError(f'elements {elements}: must begin with the vertices')
     fields = read_table(data[end.end() :], np.dtype(types), n_points, kind == 'ascii')
-    return cloud_of(fields.astype(fields.dtype.newbyteorder('=')), tuple(remarks))
+    return cloud_of(fields.astype(fields.dtype.newbyteorder('=')), PlyHeader(tuple(remarks)))
 
 
 def encode_ply(cloud: Cloud) -> bytes:
     """File of a cloud as vertices, binary, with the comments it was read with."""
     fields = in_types(cloud.fields, _NAMES, 'PLY', flat=True)
-    remarks = cloud.header if isinstance(cloud.header, tuple) else ()
-    lines = ['ply', 'format binary_little_endian 1.0', *remarks, f'element vertex {len(fields)}']
+    header = cloud.header if isinstance(cloud.header, PlyHeader) else PlyHeader()
+    lines = [
+        'ply',
+        'format binary_little_endian 1.0',
+        *header.remarks,
+        f'element vertex {len(fields)}',
+    ]
     for name in fields.dtype.names or ():
         lines.append(f'property {_NAMES[fields.dtype[name].str[1:]]} {name}')
     return '\n'.join([*lines, 'end_header', '']).encode() + fields.tobytes()

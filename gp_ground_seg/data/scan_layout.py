@@ -128,7 +128,7 @@ def find_objection(xyz: _Numbers) -> str:
         centre = np.median(near, axis=0) if len(near) else np.zeros(3)
         if problem and np.hypot(*centre[:2]) > MAX_RANGE > _middle(near - centre):
             place = ', '.join(f'{number:.1f}' for number in centre)
-            return f'{problem}, about {place}; --origin X,Y,Z says where the sensor was'
+            return f'{problem}, about {place}; --origin X Y Z says where the sensor was'
         return '; '.join(part for part in (problem, problem and _guess(xyz)) if part)
 
 

@@ -45,24 +45,11 @@ class Kind(NamedTuple):
 
     std: str  # attribute of `Segmentation`
     against: str
-    keys: dict[str, Callable[[RingCoverage], str]]  # what the rows of each table are
+    groups: tuple[str, ...]  # words of `RingCoverage.sequence`, by which there are tables
 
 
-_BY_RANGE: dict[str, Callable[[RingCoverage], str]] = {'range': lambda one: one.ring}
-LABELLED = Kind(
-    'return_std',
-    'labelled ground returns',
-    {'sequence': lambda one: one.sequence, **_BY_RANGE},
-)
-SIMULATED = Kind(
-    'ground_std',
-    'exact heights under ground returns',
-    {
-        'sensor': lambda one: one.sequence.split()[0],
-        'scene': lambda one: one.sequence.split()[1],
-        **_BY_RANGE,
-    },
-)
+LABELLED = Kind('return_std', 'labelled ground returns', ('sequence',))
+SIMULATED = Kind('ground_std', 'exact heights under ground returns', ('sensor', 'scene'))
 
 
 def compare_coverage(
@@ -77,7 +64,7 @@ def compare_coverage(
     parts = runner.run(partial(_cover, load, config, kind.std), items)
     rings = [one for own, _ in parts for one in own]
     return Report(
-        {name: _table(rings, name, kind) for name in kind.keys},
+        {name: _table(rings, name, kind) for name in (*kind.groups, 'range')},
         [_row_of(one) for one in rings],
         parts[-1][1],
         {'std': kind.std, **facts},
@@ -120,10 +107,12 @@ def ring_coverages(scan: KnownScan, found: Segmentation, std: str) -> list[RingC
 
 
 def _table(rings: Sequence[RingCoverage], name: str, kind: Kind) -> Table:
-    """Table of `Kind.keys`, and the sum of all."""
+    """Table by one of `Kind.groups` or by range, and the sum of all."""
     groups: dict[str, list[RingCoverage]] = {}
     for one in rings:
-        groups.setdefault(kind.keys[name](one), []).append(one)
+        words = one.sequence.split(maxsplit=len(kind.groups) - 1)
+        own_names = dict(zip((*kind.groups, 'range'), (*words, one.ring), strict=True))
+        groups.setdefault(own_names[name], []).append(one)
     rows: list[Row] = []
     for group, own in {**groups, methods.ALL: list(rings)}.items():
         pooled = pool_height_errors([one.height for one in own])

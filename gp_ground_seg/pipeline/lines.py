@@ -185,12 +185,11 @@ def starts_at_slope_break(lines: Lines, candidates: Candidates, config: Config) 
     chosen = np.flatnonzero(possible)
     segment = candidates.segment
     chosen = chosen[segment[first[chosen]] == segment[first[chosen] - 1]]
-    start, stop, number = first[chosen], behind[chosen], size[chosen]
+    start, number = first[chosen], size[chosen]
     last = start - 1
     r, z = candidates.r, candidates.z
-    sum_r, sum_z = np.cumsum(r), np.cumsum(z)
-    mean_r = (sum_r[stop - 1] - sum_r[last]) / number
-    mean_z = (sum_z[stop - 1] - sum_z[last]) / number
+    mean_r = np.add.reduceat(r, first)[chosen] / number
+    mean_z = np.add.reduceat(z, first)[chosen] / number
     over_last = mean_z + lines.slope[chosen] * (r[last] - mean_r) - z[last]
     slope_before = lines.slope[lines.line[last]]
     # A single candidate, or one above the other, has no usable slope: level.
