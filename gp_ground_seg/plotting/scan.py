@@ -24,7 +24,7 @@ Labels = npt.NDArray[np.uint8]
 
 COLOURS = {'ground': '#B9BFC6', 'obstacles': style.VERMILION}
 VALUES = {
-    'height': ('height over the ground [m]', -0.5, 2.5),
+    'height': ('height over the ground [m]', -0.5, 3.0),
     'p_ground': ('probability of ground', 0.0, 1.0),
 }
 """What points are coloured by instead of their class: attributes of `Segmentation`."""
