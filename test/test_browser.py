@@ -17,6 +17,7 @@ from gp_ground_seg.viewers.scene import LEGENDS, palette  # noqa: E402
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
 ROAD, OBJECT = 40, 99  # classes of SemanticKITTI
+SHADED = 40  # difference of a shaded colour, from 0 to 255
 
 
 @pytest.fixture(scope='module')
@@ -39,10 +40,10 @@ def page(tmp_path_factory):
         yield page
 
 
-def count(picture):
+def count(picture, tolerance=2):
     """Pixels of a picture that have a colour of the legends of class and changes, by its name."""
     return {
-        name: int((np.abs(picture - colour).max(axis=-1) <= 2).sum())
+        name: int((np.abs(picture - colour).max(axis=-1) <= tolerance).sum())
         for legend in ('class', 'changes')
         for name, colour in zip(LEGENDS[legend], palette(legend).astype(float), strict=True)
     }
@@ -66,6 +67,22 @@ def test_page_of_a_scan_opens_from_disk_and_draws_its_points(sequence, page, tmp
     text = page.text
     assert '000001.bin' in text and 'p_ground' in text and 'errors' in text
     assert page.errors == []
+
+
+def test_the_web_viewer_draws_the_scan(sequence, page):
+    pytest.importorskip('rerun', reason='rerun is not installed')
+    page.messages.clear()
+    with start('view', sequence, '--web', '--port', 9590) as process:
+        page.open(f'{process.stdout.readline().strip()}&renderer=webgl')
+        # Rerun shades its points: the middle of an obstacle is darker than in the legend.
+        page.wait_for(
+            lambda: count(page.screenshot('web.png'), SHADED)['obstacle'] > 1000, 'obstacles'
+        )
+        process.send_signal(signal.SIGINT)
+        assert process.wait() in INTERRUPTED
+    # It asks for fonts and news, which there may be no network for.
+    ours = [text for text in page.errors if 'fetch' not in text and 'load resource' not in text]
+    assert ours == []
 
 
 @pytest.fixture(scope='module')
