@@ -20,7 +20,6 @@ from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.scale.cluster import Progress, cut, depends_on_past
 from gp_ground_seg.scale.dataset import Manifest, Outcome, Scan, digest, pool, sweep
 
-
 # What the output depends on, beside the parameters and the layout of scans.
 _OPTIONS = ('raw', 'topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
 
