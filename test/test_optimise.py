@@ -117,7 +117,7 @@ def test_a_journal_goes_on_after_an_interrupt_and_is_of_one_search(frames, tmp_p
         partial(search, [TOLERANCE], frames, base=Config()),
         partial(search, [TOLERANCE], frames, seed=1),
     ):
-        with pytest.raises(DataError, match='of other parameters or frames'):
+        with pytest.raises(DataError, match='of other parameters, frames or seed'):
             other(n=5, journal=path)
     assert path.read_bytes().startswith(before)
     assert search([TOLERANCE], frames, 5, path) == trials and len(calls) == 6
