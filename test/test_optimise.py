@@ -202,6 +202,7 @@ def test_a_worse_choice_is_said_to_be_lost(root, tmp_path, capsys, monkeypatch):
     ('words', 'message'),
     [
         (['--parameters', 'sensor.height'], 'sensor.height = auto: is no number or choice'),
+        (['--parameters', 'label.tolerance'], 'did you mean label.ground_tolerance?'),
         (['--left-out', '99'], 'no frames to search on or to leave out'),
         (['--journal', '/no/such/a.log'], '/no/such/a.log: cannot be read as a journal'),
     ],

@@ -70,7 +70,7 @@ def count_frames(config: Config, frames: Sequence[Frame], progress: Progress = i
 
 def searched_specs(names: Sequence[str], base: Config) -> list[ParameterSpec]:
     """Return the parameters to search; ConfigError for one that has no values to begin with."""
-    specs = [find_spec(name) for name in names]
+    specs = [find_spec(name) for name in dict.fromkeys(names)]
     for spec in specs:
         if base[spec.name] == AUTO or (spec.type is str and not spec.choices):
             raise ConfigError(f'{spec.name} = {base[spec.name]}: is no number or choice to search')
