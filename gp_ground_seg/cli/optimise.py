@@ -34,9 +34,9 @@ those given on, and compare what is best with those given on frames that the sea
 every second sequence, or the second half of a single one. Where the interval of the difference
 holds 0 there is nothing to win, and the parameters given are as good.
 
-Searched by default: {', '.join(optimise.DEFAULT_NAMES)};
-in the whole range that is accepted of each. A search with --journal that was interrupted goes
-on when it is started again in the same way.
+Each parameter is searched in the whole range that is accepted; by default
+{', '.join(optimise.DEFAULT_NAMES)}.
+A search with --journal that was interrupted goes on when it is started again in the same way.
 """
 EXAMPLES = """\
   gp-ground-seg optimise ROOT --trials 100 -o best.yaml --page search.html
