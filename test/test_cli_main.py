@@ -43,8 +43,8 @@ def test_every_help_has_examples_that_can_be_run(name, capsys):
         examples = re.findall(r'^  (gp-ground-seg .*)$', re.sub(r'\\\n *', '', text), re.MULTILINE)
         assert mark and any(one.startswith(leaf.prog) for one in examples), leaf.prog
         for example in examples:
-            # Behind three spaces is what it does, behind > and --ros-args what others read.
-            words = shlex.split(re.split(r'   +| > | &$| --ros-args', example)[0])[1:]
+            # Behind two spaces is what it does, behind > and --ros-args what others read.
+            words = shlex.split(re.split(r'  +| > | &$| --ros-args', example)[0])[1:]
             cli.build_parser(words[0]).parse_args(words)
     assert capsys.readouterr().err == ''
 

@@ -117,7 +117,7 @@ def test_a_journal_goes_on_after_an_interrupt_and_is_of_one_search(frames, tmp_p
         partial(search, [TOLERANCE], frames, base=Config()),
         partial(search, [TOLERANCE], frames, seed=1),
     ):
-        with pytest.raises(DataError, match='of other parameters or frames'):
+        with pytest.raises(DataError, match='of other parameters, frames or seed'):
             other(n=5, journal=path)
     assert path.read_bytes().startswith(before)
     assert search([TOLERANCE], frames, 5, path) == trials and len(calls) == 6
@@ -202,6 +202,7 @@ def test_a_worse_choice_is_said_to_be_lost(root, tmp_path, capsys, monkeypatch):
     ('words', 'message'),
     [
         (['--parameters', 'sensor.height'], 'sensor.height = auto: is no number or choice'),
+        (['--parameters', 'label.tolerance'], 'did you mean label.ground_tolerance?'),
         (['--left-out', '99'], 'no frames to search on or to leave out'),
         (['--journal', '/no/such/a.log'], '/no/such/a.log: cannot be read as a journal'),
     ],

@@ -222,12 +222,12 @@ def drawn(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ('colour', 'of_wall', 'of_ground'),
-    [('height', (0.3, 0.5, 0.75), 1 / 6), ('p_ground', (0,), 1)],
+    [('height', (0.3, 0.5, 0.65), 1 / 7), ('p_ground', (0,), 1)],
 )
 def test_points_are_coloured_by_height_and_probability(
     drawn, tmp_path, colour, of_wall, of_ground
 ):
-    """The wall is 2 m high; heights are from -0.5 to 2.5 m."""
+    """The wall is 2 m high; heights are from -0.5 to 3 m."""
     assert run('plot', 'scan', drawn, '--colour', colour, '-o', tmp_path / 'a.png') == 0
     pixels = imread(tmp_path / 'a.png')[60:700, ..., :3]
     assert close_to(pixels, style.VERMILION).sum() == 0

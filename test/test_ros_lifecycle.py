@@ -66,9 +66,9 @@ WORDS = {
     'namespace': ('-r __ns:=front', '__ns:=front'),
     'argument': ('--nonsense', "UnknownROSArgsError: ['--nonsense']"),
     'log level': ('--log-level loud', 'does not use a valid severity level'),
-    'reliability': (f'-p {QOS}.reliability:=maybe', "= 'maybe': must be one of reliable"),
+    'reliability': (f'-p {QOS}.reliability:=maybe', 'policy `reliability`: `maybe`'),
     'depth': (f'-p {QOS}.depth:=-3', 'depth = -3: must be an integer in [1, 10000]'),
-    'depth type': (f'-p {QOS}.depth:=many', "depth = 'many': must be"),
+    'depth type': (f'-p {QOS}.depth:=many', "expecting type 'INTEGER'"),
 }
 
 

@@ -23,7 +23,7 @@ from gp_ground_seg.evaluation.report import (
 )
 from gp_ground_seg.experiments import optimise
 from gp_ground_seg.experiments.variants import make_report, score_variants
-from gp_ground_seg.parameters.config import Config, parameter_specs
+from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import ROS_NODE_KEY, ROS_PARAMETERS_KEY, ParameterValue
 from gp_ground_seg.plotting.charts import plot_search
 from gp_ground_seg.plotting.style import new_figure
@@ -34,9 +34,9 @@ those given on, and compare what is best with those given on frames that the sea
 every second sequence, or the second half of a single one. Where the interval of the difference
 holds 0 there is nothing to win, and the parameters given are as good.
 
-Searched by default: {', '.join(optimise.DEFAULT_NAMES)};
-in the whole range that is accepted of each. A search with --journal that was interrupted goes
-on when it is started again in the same way.
+Each parameter is searched in the whole range that is accepted; by default
+{', '.join(optimise.DEFAULT_NAMES)}.
+A search with --journal that was interrupted goes on when it is started again in the same way.
 """
 EXAMPLES = """\
   gp-ground-seg optimise ROOT --trials 100 -o best.yaml --page search.html
@@ -54,7 +54,6 @@ PAGE = """\
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'optimise', DESCRIPTION, EXAMPLES)
-    names = options.some_of(spec.name for spec in parameter_specs())
     file = {'metavar': 'FILE'}
     options.add(
         parser,
@@ -62,7 +61,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         *OF_FRAMES,
         ('--left-out', 'sequences to score on (default: every second)', {'metavar': 'LIST'}),
         ('--parameters', 'parameters to search, as in grid.n_bins,label.ground_tolerance',
-         {'metavar': 'LIST', 'type': names, 'default': optimise.DEFAULT_NAMES}),
+         {'metavar': 'LIST', 'default': ','.join(optimise.DEFAULT_NAMES)}),
         ('--trials', 'try so many sets of values (default: %(default)s)',
          {**options.NUMBER, 'default': 50}),
         ('--seed', 'of what is tried (default: %(default)s)',
@@ -82,7 +81,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Search, score on the frames left out, write the files, print what came out."""
     base = options.read_config(arguments)
-    specs = optimise.searched_specs(arguments.parameters, base)
+    specs = optimise.searched_specs(arguments.parameters.split(','), base)
     left_out = arguments.left_out.split(',') if arguments.left_out else None
     searched, rest = optimise.split_frames(frames_from_options(arguments), left_out)
     if arguments.page:

@@ -33,9 +33,9 @@ IoU and objects lost (with labels, as SemanticKITTI has them), theta and latency
 INPUT is what `segment` takes. --web serves to this machine only, until Ctrl-C.
 """
 VIEW_EXAMPLES = """\
-  gp-ground-seg view KITTI_ROOT/sequences/00          scrub through a sequence
-  gp-ground-seg view drive.mcap --frame-step 5 --web  every fifth cloud, in the browser
-  gp-ground-seg view drive.mcap --save drive.rrd      for later: rerun drive.rrd
+  gp-ground-seg view KITTI_ROOT/sequences/00           scrub through a sequence
+  gp-ground-seg view drive.mcap --frame-step 5 --web   every fifth cloud, in the browser
+  gp-ground-seg view drive.mcap --save drive.rrd       for later: rerun drive.rrd
   gp-ground-seg view 000000.bin --labels 000000.label --html scan.html
 
 needs: pip install 'gp_ground_seg[view]'

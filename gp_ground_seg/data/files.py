@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
-from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
+from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError, require
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,9 @@ class UrlPath:
     @contextmanager
     def _open(self) -> Iterator[tuple[Any, str]]:
         """File system, and the path in it; what goes wrong becomes a DataError."""
+        core = require('fsspec.core', 'scale')
         try:
-            import fsspec
-        except ImportError as error:
-            raise MissingDependencyError(
-                "fsspec is not installed: pip install 'gp_ground_seg[scale]'"
-            ) from error
-        try:
-            yield fsspec.core.url_to_fs(self.url, use_listings_cache=False)
+            yield core.url_to_fs(self.url, use_listings_cache=False)
         except GroundSegError:
             raise
         except ImportError as error:  # of the package for this kind of URL, which fsspec names

@@ -367,7 +367,8 @@ def height_error(
         n_points=len(y),
         n_without_model=len(truth) - len(y),
         sum_error=float(error.sum()),
-        sum_squared_error=float(error @ error),
+        # Of a product of vectors the last digits depend on the number of threads.
+        sum_squared_error=float(np.square(error).sum()),
         sum_squared_deviation=float(np.sum((y - y.mean()) ** 2)) if len(y) else 0.0,
         n_with_std=int(np.isfinite(spread).sum()),
         n_within_1=int((np.abs(error) <= spread).sum()),

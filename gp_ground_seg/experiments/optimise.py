@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,6 +15,7 @@ from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confus
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue
 from gp_ground_seg.scale.cluster import Progress, Runner
+from gp_ground_seg.scale.dataset import digest
 from gp_ground_seg.segmenter import GroundSegmenter
 
 DEFAULT_NAMES = [
@@ -71,7 +70,7 @@ def count_frames(config: Config, frames: Sequence[Frame], progress: Progress = i
 
 def searched_specs(names: Sequence[str], base: Config) -> list[ParameterSpec]:
     """Return the parameters to search; ConfigError for one that has no values to begin with."""
-    specs = [find_spec(name) for name in names]
+    specs = [find_spec(name) for name in dict.fromkeys(names)]
     for spec in specs:
         if base[spec.name] == AUTO or (spec.type is str and not spec.choices):
             raise ConfigError(f'{spec.name} = {base[spec.name]}: is no number or choice to search')
@@ -112,12 +111,14 @@ def search(
     study = optuna.create_study(
         storage=storage, study_name='gp_ground_seg', direction='maximize', load_if_exists=True
     )
-    what = [base.flat(), [spec.name for spec in specs], seed]
-    what += [[frame.sequence, frame.index] for frame in frames]
-    digest = hashlib.sha256(json.dumps(what).encode()).hexdigest()[:12]
-    if study.user_attrs.setdefault('digest', digest) != digest:
-        raise DataError(f'{journal}: is of other parameters or frames; name another journal')
-    study.set_user_attr('digest', digest)
+    names = [f'{frame.sequence}/{frame.index}' for frame in frames]
+    mark = digest(base, seed, [spec.name for spec in specs], names)
+    if (found := study.user_attrs.get('digest', mark)) != mark:
+        raise DataError(
+            f'{journal}: is of other parameters, frames or seed (digest {found}, here {mark}); '
+            'name another journal'
+        )
+    study.set_user_attr('digest', mark)
 
     def try_one(trial: Any) -> float:
         choice = {spec.name: _suggest(trial, spec) for spec in specs}

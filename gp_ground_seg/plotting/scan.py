@@ -24,7 +24,7 @@ Labels = npt.NDArray[np.uint8]
 
 COLOURS = {'ground': '#B9BFC6', 'obstacles': style.VERMILION}
 VALUES = {
-    'height': ('height over the ground [m]', -0.5, 2.5),
+    'height': ('height over the ground [m]', -0.5, 3.0),
     'p_ground': ('probability of ground', 0.0, 1.0),
 }
 """What points are coloured by instead of their class: attributes of `Segmentation`."""
@@ -175,9 +175,8 @@ def _draw_points(axes: Any, xyz: FloatArray, segmentation: Segmentation, view: V
     """Draw far points first, and the ground below all obstacles."""
     place, depth = project(xyz, view.camera)
     size = _scale(axes) ** 2
-    for colour, value, layer in zip(
-        COLOURS.values(), (Label.GROUND, Label.OBSTACLE), (1, 4), strict=True
-    ):
+    labels_and_layers = ((Label.GROUND, 1), (Label.OBSTACLE, 4))
+    for colour, (value, layer) in zip(COLOURS.values(), labels_and_layers, strict=True):
         chosen = np.flatnonzero((segmentation.label == value) & (depth > CLOSEST))
         chosen = chosen[np.argsort(-depth[chosen])]
         look: dict[str, Any] = {'c': colour, 'zorder': layer}

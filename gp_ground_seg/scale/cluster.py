@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 import gp_ground_seg
 from gp_ground_seg import log
-from gp_ground_seg.errors import DataError, MissingDependencyError
+from gp_ground_seg.errors import DataError, require
 from gp_ground_seg.parameters.config import Config
 
 _LOGGER = logging.getLogger('gp_ground_seg')
@@ -255,9 +255,8 @@ def open_runner(
 
 def _start(n_workers: int) -> Any:
     """Start workers of one thread on this machine."""
-    dashboard = 'localhost:0' if importlib.util.find_spec('bokeh') else None
     return _distributed().LocalCluster(
-        n_workers=n_workers, threads_per_worker=1, dashboard_address=dashboard,
+        n_workers=n_workers, threads_per_worker=1, dashboard_address='127.0.0.1:0',
         silence_logs=logging.CRITICAL,
     )  # fmt: skip
 
@@ -277,14 +276,8 @@ def _connect(cluster: Any) -> Any:
 
 def _distributed() -> Any:
     """Import distributed; it says nothing but by way of what we do."""
-    try:
-        import dask
-        import distributed
-    except ImportError as error:
-        raise MissingDependencyError(
-            "Dask is not installed: pip install 'gp_ground_seg[scale]'"
-        ) from error
-    dask.config.set(_CONFIG)
+    distributed = require('distributed', 'scale')
+    require('dask.config', 'scale').set(_CONFIG)
     for name in ('distributed', 'distributed.client'):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     return distributed
