@@ -46,7 +46,7 @@ test: $(VENV)/.dev
 browser-test: $(VENV)/.dev
 	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && apt-get install -y chromium; } \
 		|| { echo 'Chromium is not installed: sudo apt-get install chromium'; exit 1; }
-	$(BIN)/python -m pytest test/test_browser.py
+	GP_GROUND_SEG_WEB_VIEWER=1 $(BIN)/python -m pytest test/test_browser.py
 
 torture: $(VENV)/.dev
 	$(BIN)/python test/torture.py

@@ -1,7 +1,7 @@
 """Pages in a real browser: they draw, sliders move labels, the console has no error."""
 
+import os
 import re
-import signal
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ import pytest
 viser = pytest.importorskip('viser', reason='viser is not installed')
 
 from browser import CHROMIUM, open_browser  # noqa: E402
-from cli_runner import INTERRUPTED, run, start  # noqa: E402
+from cli_runner import run, until_ctrl_c  # noqa: E402
 
 from gp_ground_seg.parameters.config import Config  # noqa: E402
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan  # noqa: E402
@@ -17,6 +17,7 @@ from gp_ground_seg.viewers.scene import LEGENDS, palette  # noqa: E402
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
 ROAD, OBJECT = 40, 99  # classes of SemanticKITTI
+SHADED = 40  # difference of a shaded colour, from 0 to 255
 
 
 @pytest.fixture(scope='module')
@@ -39,10 +40,10 @@ def page(tmp_path_factory):
         yield page
 
 
-def count(picture):
+def count(picture, tolerance=2):
     """Pixels of a picture that have a colour of the legends of class and changes, by its name."""
     return {
-        name: int((np.abs(picture - colour).max(axis=-1) <= 2).sum())
+        name: int((np.abs(picture - colour).max(axis=-1) <= tolerance).sum())
         for legend in ('class', 'changes')
         for name, colour in zip(LEGENDS[legend], palette(legend).astype(float), strict=True)
     }
@@ -68,15 +69,30 @@ def test_page_of_a_scan_opens_from_disk_and_draws_its_points(sequence, page, tmp
     assert page.errors == []
 
 
+@pytest.mark.skipif(
+    'GP_GROUND_SEG_WEB_VIEWER' not in os.environ,
+    reason='takes minutes without a GPU: make browser-test',
+)
+def test_the_web_viewer_draws_the_scan(sequence, page):
+    pytest.importorskip('rerun', reason='rerun is not installed')
+    page.messages.clear()
+    with until_ctrl_c('view', sequence, '--web', '--port', 9590) as process:
+        page.open(f'{process.stdout.readline().strip()}&renderer=webgl')
+        # Rerun shades its points: the middle of an obstacle is darker than in the legend.
+        page.wait_for(
+            lambda: count(page.screenshot('web.png'), SHADED)['obstacle'] > 1000, 'obstacles'
+        )
+    # It asks for fonts and news, which there may be no network for.
+    ours = [text for text in page.errors if 'fetch' not in text and 'load resource' not in text]
+    assert ours == []
+
+
 @pytest.fixture(scope='module')
 def tune(sequence, tmp_path_factory):
     """Address of the page, and the file that it writes."""
     output = tmp_path_factory.mktemp('output') / 'tuned.yaml'
-    with start('tune', sequence, '--output', output) as process:
+    with until_ctrl_c('tune', sequence, '--output', output) as process:
         yield process.stdout.readline().strip(), output
-        process.send_signal(signal.SIGINT)
-        assert process.wait() in INTERRUPTED
-        assert process.stderr.read().splitlines()[-1] == 'gp-ground-seg: interrupted'
 
 
 def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page):

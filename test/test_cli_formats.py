@@ -222,7 +222,7 @@ def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
     assert out.read_bytes() != first
     capsys.readouterr()
     assert run('plot', 'above', bag, '--frame', '3', '-o', tmp_path / 'b.png') == 2
-    assert '--frame 3: must be in [0, 2]; 3 scans in' in error_line(capsys)
+    assert '--frame 3: must be 0 to 2 here' in error_line(capsys)
 
 
 @pytest.mark.parametrize(
@@ -235,6 +235,7 @@ def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
         (['a.npy', '-o', 'x.pcd', '--format', 'ply'], 'x.pcd: ends in .pcd, which is not ply'),
         (['a.npy', '--topic', '/a'], '--topic: is for bags'),
         (['a.npy', '--drop', '/a'], '--drop: is for bags'),
+        (['a.npy', '--columns', '5'], '--columns: is for .bin scans, which a.npy is not'),
         (['a.npy', '-o', 'x.label', '--split'], '--split: is for clouds'),
         (['a.npy', '-o', 'x.pcd', '--origin', 'nan', '0', '0'], 'must be three finite numbers'),
         (['drive.mcap', '--split'], '--split: is for scans'),

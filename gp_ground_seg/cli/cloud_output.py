@@ -5,10 +5,8 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file
 from gp_ground_seg.data.clouds import Cloud, Columns
@@ -79,8 +77,7 @@ class CloudOutput:
                 own = {name: column[mask] for name, column in values.items()}
                 path.write_bytes(encode_file(path, cloud.take(mask), result.label[mask], own))
         if self.surface:
-            encode = _encode_npz if self.surface == 'npz' else _encode_tif
-            paths[-1].write_bytes(encode(result, cloud))
+            paths[-1].write_bytes(_encode_surface(result, cloud, self.surface))
         return result
 
 
@@ -101,47 +98,32 @@ def _results(result: Segmentation, cloud: Cloud) -> Columns:
     return {name: column.astype(np.float32) for name, column in values.items()}
 
 
-def _surface(result: Segmentation) -> tuple[npt.NDArray[Any], npt.NDArray[Any], float]:
-    """Ground and its standard deviation about the sensor in rows from south to north, and reach.
+def _encode_surface(result: Segmentation, cloud: Cloud, kind: str) -> bytes:
+    """File of the ground about the sensor as a grid, float32, in the coordinates of the file [m].
 
-    Both (n, n) float32 at the middles of cells, which reach so far to each side [m].
+    .npz: x (W,), y (H,), ground_z and ground_std (H, W), NaN where there is no model. GeoTIFF:
+    pages of the two, from north to south, without a name of the coordinates (OGC 19-008r4).
     """
     model = GroundModel.of(result)
-    n_cells = 2 * int(np.ceil(model.knots[-1] / CELL))
-    middle = CELL * (np.arange(n_cells) + 0.5 - n_cells / 2)
+    reach = CELL * np.ceil(model.knots[-1] / CELL)
+    middle = np.arange(0.5 * CELL - reach, reach, CELL)
     z, std = model.at(middle, middle[:, None])
-    return z.astype(np.float32), std.astype(np.float32), 0.5 * CELL * n_cells
-
-
-def _encode_npz(result: Segmentation, cloud: Cloud) -> bytes:
-    """File of x (W,), y (H,), ground_z and ground_std (H, W) [m]; NaN where there is no model."""
-    z, std, reach = _surface(result)
-    middle = np.arange(len(z)) * CELL + 0.5 * CELL - reach
     x, y, height = cloud.origin
-    return encode_arrays(
-        {'x': middle + x, 'y': middle + y, 'ground_z': z + height, 'ground_std': std}
-    )
-
-
-def _encode_tif(result: Segmentation, cloud: Cloud) -> bytes:
-    """GeoTIFF of two pages, ground and standard deviation; in the coordinates of the file.
-
-    Tags as in OGC 19-008r4, GeoTIFF 1.1; the file of a cloud names no reference system.
-    """
+    grids = {'ground_z': (z + height).astype(np.float32), 'ground_std': std.astype(np.float32)}
+    if kind == 'npz':
+        return encode_arrays({'x': middle + x, 'y': middle + y, **grids})
     require('PIL', 'plot')
     from PIL import Image, TiffImagePlugin
 
-    z, std, reach = _surface(result)
-    x, y, height = cloud.origin
     tags = TiffImagePlugin.ImageFileDirectory_v2()
     doubles, shorts = 12, 3
-    tags.tagtype.update({33550: doubles, 33922: doubles, 34735: shorts, 42113: 2})
-    tags[33550] = (CELL, CELL, 0.0)  # size of a cell
-    tags[33922] = (0.0, 0.0, 0.0, x - reach, y + reach, 0.0)  # its north-west corner
+    tags.tagtype.update({33550: doubles, 33922: doubles, 34735: shorts})
+    tags[33550] = (CELL, CELL, 0.0)
+    tags[33922] = (0.0, 0.0, 0.0, x - reach, y + reach, 0.0)  # the north-west corner
     # Version 1.1; type of model: user-defined; of raster: values of areas.
     tags[34735] = (1, 1, 1, 2, 1024, 0, 1, 32767, 1025, 0, 1, 1)
     tags[42113] = 'nan'  # GDAL's mark of no data
-    pages = [Image.fromarray(np.flipud(grid).copy()) for grid in (z + np.float32(height), std)]
+    first, second = (Image.fromarray(np.flipud(grid).copy()) for grid in grids.values())
     file = io.BytesIO()
-    pages[0].save(file, 'TIFF', save_all=True, append_images=pages[1:], tiffinfo=tags)
+    first.save(file, 'TIFF', save_all=True, append_images=[second], tiffinfo=tags)
     return file.getvalue()

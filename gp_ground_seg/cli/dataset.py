@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
+from gp_ground_seg.cli.cloud_output import FORMATS
 from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
@@ -74,7 +75,7 @@ def run(
 
     `function` computes a block, and writes below `target`.
     """
-    if target.suffix == '.label':
+    if target.suffix[1:] in FORMATS:
         raise DataError(f'{target}: must be a folder')
     if isinstance(target, Path) and not target.resolve().parent.is_dir():
         raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')

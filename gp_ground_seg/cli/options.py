@@ -85,10 +85,13 @@ CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 
 
 def list_clouds(arguments: argparse.Namespace) -> Inputs:
-    """Return the clouds of the input."""
+    """Return the clouds of the input; DataError if ``--frame`` is none of them."""
     found = list_inputs(arguments.input, scan_layout(arguments), arguments.topic)
-    if found.topic is not None:
+    if found.topic is not None or not any(one.path.suffix == '.bin' for one in found):
         refuse_scan_layout(arguments, arguments.input)
+    frame = getattr(arguments, 'frame', None)
+    if frame is not None and not 0 <= frame < len(found):
+        raise DataError(f'--frame {frame}: must be 0 to {len(found) - 1} here')
     return found
 
 

@@ -206,14 +206,7 @@ def _camera(text: str) -> View:
 
 def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]:
     """Points of a scan, and its name as in ``00/000005``."""
-    scans = options.list_clouds(arguments)
-    try:
-        scan = scans[arguments.frame]
-    except IndexError as error:
-        most, n = len(scans) - 1, options.count(len(scans), 'scan')
-        raise DataError(
-            f'--frame {arguments.frame}: must be in [0, {most}]; {n} in {arguments.input}'
-        ) from error
+    scan = options.list_clouds(arguments)[arguments.frame]
     folder = Path(str(scan.path)).resolve().parent
     title = f'{folder.parent.name}/{scan.name}' if folder.name == 'velodyne' else scan.title
     return scan.read().xyz, title

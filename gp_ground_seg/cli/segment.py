@@ -142,9 +142,9 @@ def _segment_dataset(arguments: argparse.Namespace, config: Config, is_bag: bool
     if arguments.output is None and '://' in arguments.input:
         raise DataError(f'{arguments.input}: give the folder for the output, -o OUT')
     target = as_path(arguments.output or _default_output(Path(arguments.input)))
-    for name in ('format', 'split', 'surface', 'origin'):
-        if getattr(arguments, name) and not (is_bag and name == 'format'):
-            raise DataError(f'--{name}: whole data sets give .label files')
+    for name in ('format', 'split', 'surface'):
+        if getattr(arguments, name) not in (None, False, *SUFFIX_OF_STORAGE):
+            raise DataError(f'--{name}: whole data sets give .label files and bags')
     if is_bag or arguments.more:
         if not isinstance(target, Path):
             raise DataError(f'{target}: bags are written to folders of this machine')

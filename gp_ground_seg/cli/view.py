@@ -13,7 +13,7 @@ from pathlib import Path
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.data.inputs import Inputs, list_inputs
+from gp_ground_seg.data.inputs import Inputs
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.export import to_yaml
@@ -33,9 +33,9 @@ IoU and objects lost (with labels, as SemanticKITTI has them), theta and latency
 INPUT is what `segment` takes. --web serves to this machine only, until Ctrl-C.
 """
 VIEW_EXAMPLES = """\
-  gp-ground-seg view KITTI_ROOT/sequences/00          scrub through a sequence
-  gp-ground-seg view drive.mcap --frame-step 5 --web  every fifth cloud, in the browser
-  gp-ground-seg view drive.mcap --save drive.rrd      for later: rerun drive.rrd
+  gp-ground-seg view KITTI_ROOT/sequences/00           scrub through a sequence
+  gp-ground-seg view drive.mcap --frame-step 5 --web   every fifth cloud, in the browser
+  gp-ground-seg view drive.mcap --save drive.rrd       for later: rerun drive.rrd
   gp-ground-seg view 000000.bin --labels 000000.label --html scan.html
 
 needs: pip install 'gp_ground_seg[view]'
@@ -66,9 +66,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
             ('--labels', 'SemanticKITTI labels of a scan (default: those beside it)', file),
             ('--frame', 'number of one frame, from 0', {'metavar': 'N', 'type': int}),
-            ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
             ('--port', 'of the page (default: %(default)s)', {**number, 'default': 9090}),
-            *options.SCAN_LAYOUT,
+            *options.CLOUDS,
             options.FORCE,
             options.QUIET,
         )
@@ -96,19 +95,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )  # fmt: skip
 
 
-def _open_inputs(arguments: argparse.Namespace) -> Inputs:
-    """Return the frames; DataError if there are none, or not the one asked for."""
-    inputs = list_inputs(arguments.input, options.scan_layout(arguments), arguments.topic)
-    if inputs.topic is not None:
-        options.refuse_scan_layout(arguments, arguments.input)
-    if arguments.frame is not None and not 0 <= arguments.frame < len(inputs):
-        raise DataError(f'--frame {arguments.frame}: must be 0 to {len(inputs) - 1} here')
-    return inputs
-
-
 def run_view(arguments: argparse.Namespace) -> int:
     """Segment the frames, and show them."""
-    inputs, config = _open_inputs(arguments), options.read_config(arguments)
+    inputs, config = options.list_clouds(arguments), options.read_config(arguments)
     target = arguments.html or arguments.save
     suffix = '.html' if arguments.html else '.rrd'
     if target and Path(target).suffix.lower() != suffix:
@@ -179,7 +168,7 @@ def _frames(
 
 def run_tune(arguments: argparse.Namespace) -> int:
     """Serve the page."""
-    inputs, config = _open_inputs(arguments), options.read_config(arguments)
+    inputs, config = options.list_clouds(arguments), options.read_config(arguments)
     output, is_ours = Path(arguments.output), arguments.force
     if output.exists() and not is_ours:
         raise DataError(f'{output}: exists already; --force replaces it')

@@ -18,7 +18,7 @@ from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
 from gp_ground_seg.viewers.html_page import draw_points, legend
-from gp_ground_seg.viewers.scene import Cloud, View, point_colours, read_view
+from gp_ground_seg.viewers.scene import Cloud, point_colours, read_view
 
 N_STEPS = 400  # of a slider
 LOG_RANGE = 100.0
@@ -60,7 +60,7 @@ class Tuner:
         self._cloud: Any = None
         self._drawn: object = None
         self._view = lru_cache(maxsize=1)(lambda number: read_view(inputs[number], labels))
-        self._before = lru_cache(maxsize=1)(self._segment)
+        self._before = lru_cache(maxsize=1)(self._labels_and_scores)
 
         gui, last = server.gui, len(inputs) - 1
         # Sharing would send the scan through a server of viser's makers.
@@ -141,8 +141,12 @@ class Tuner:
         self._segmenter.reset()
         return self._segmenter.segment(self._view(number).points)
 
+    def _labels_and_scores(self, number: int, config: Config) -> tuple[Labels, dict[str, float]]:
+        label = self._segment(number, config).label
+        return label, self._view(number).scores(label)
+
     def _show(self, number: int, name: str, config: Config) -> None:
-        before = self._before(number, self._reference).label
+        before, old_scores = self._before(number, self._reference)
         result, view = self._segment(number, config), self._view(number)
         if name == 'errors' and view.truth is None:
             name = 'changes'
@@ -158,13 +162,13 @@ class Tuner:
                 self._drawn = drawn
             words = legend(['class', name] if name == 'changes' else [name], config)
             self._legend.content = f'<div style="font-size:12px;padding:4px 12px">{words}</div>'
-            self._table.content = _table(view, result, before)
+            scores = view.scores(result.label), old_scores
+            self._table.content = _table(result, before, scores)
 
 
-def _table(view: View, result: Segmentation, before: Labels) -> str:
+def _table(result: Segmentation, before: Labels, scores: Sequence[dict[str, float]]) -> str:
     """Numbers of a result and of labels before, and how many labels have changed."""
     both = result.label, before
-    scores = [view.scores(label) for label in both]
     rows = {
         word: [f'{np.count_nonzero(label == value):,}' for label in both]
         for word, value in (('ground', Label.GROUND), ('obstacle', Label.OBSTACLE))
