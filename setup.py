@@ -19,6 +19,7 @@ FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
 PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
 MOVIE = ['imageio-ffmpeg>=0.4.8']  # for MP4; 165 MB, of which GIF needs none
 TUNE = ['optuna>=4.0']
+SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']  # 21 MB; s3fs, for s3://, is 36 MB more
 VISER = ['viser>=1.1']
 VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
@@ -33,6 +34,7 @@ DEV = [
     *TEST,
     *MOVIE,
     *TUNE,
+    *SCALE,
     *VIEW,
     'argcomplete>=3.1',
     'colcon-common-extensions',
@@ -41,9 +43,12 @@ DEV = [
     'flake8-comprehensions',
     'flake8-docstrings',  # and pydocstyle, which ament_pep257 runs
     'flake8-quotes',
+    'moto[server]>=5.0',
     'mypy>=1.10,<2.5',
+    'pyarrow>=14',
     'pypatchworkpp>=1.4',
     'ruff>=0.6,<0.18',
+    's3fs>=2024.2',
     'scikit-learn>=1.4',
     'setuptools<80',  # colcon's ament_python build needs `setup.py develop` and `install`
     'types-PyYAML',
@@ -82,6 +87,7 @@ setup(
         'plot': PLOT,
         'movie': PLOT + MOVIE,
         'tune': PLOT + TUNE + VISER,
+        'scale': SCALE,
         'complete': ['argcomplete>=3.1'],
         'ros': ROS + BAGS + PLOT,
         'test': TEST,

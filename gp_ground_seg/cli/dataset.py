@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import statistics
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,9 @@ from gp_ground_seg.errors import DataError
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.scale.cluster import Progress, cut, depends_on_past
 from gp_ground_seg.scale.dataset import Manifest, Outcome, Scan, digest, pool, sweep
+
+# What the output depends on, beside the parameters and the layout of scans.
+_OPTIONS = ('raw', 'topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
 
 
 def is_dataset(arguments: argparse.Namespace) -> bool:
@@ -80,7 +84,9 @@ def run(
     if isinstance(target, Path) and not target.resolve().parent.is_dir():
         raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')
     is_bag = items[0].read is list
-    manifest = Manifest(target, digest(config, options.scan_layout(arguments), arguments.raw))
+    layout = replace(options.scan_layout(arguments), doubts='ignore')
+    given = [getattr(arguments, name) for name in _OPTIONS]
+    manifest = Manifest(target, digest(config, layout, given))
     names = [item.name for item in items]
     done = manifest.resume() if arguments.resume else None
     if done is None:

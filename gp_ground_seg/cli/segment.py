@@ -35,6 +35,7 @@ INPUT is one of:
   drive.bag            a ROS 1 bag
   drive.mcap, .db3     a single-file rosbag2
   folder               of a rosbag2 (with metadata.yaml)
+  KITTI_ROOT           with sequences/00/velodyne/ and so on in it; several bags; s3://...
 
 Scans .bin give .label files in SemanticKITTI's form, one uint32 per point in input
 order: 40 (road) = ground, 99 (other-object) = obstacle, 0 (unlabelled) = unknown,
@@ -54,6 +55,10 @@ with what they look like; with --force they are taken.
 
 Nothing is overwritten without --force. Output is written under a hidden name
 (.NAME.partial-...) and takes its name when it is complete.
+
+Of a KITTI_ROOT, several bags, a URL, and with --workers or --resume each file appears
+when it is complete, and OUT/manifest.jsonl has a line for each block of files; --resume
+leaves out what is in it. Labels are the same (docs/datasets.md).
 """
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
@@ -62,6 +67,8 @@ EXAMPLES = """\
   gp-ground-seg segment drive.mcap --format ply --split     files for each cloud
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
+  gp-ground-seg segment KITTI_ROOT -o OUT --workers 8 --resume
+  gp-ground-seg segment s3://bucket/kitti -o s3://bucket/labels --scheduler tcp://host:8786
 """
 
 GROUND_TOPIC, OBSTACLES_TOPIC = '/ground', '/obstacles'

@@ -159,7 +159,7 @@ class Manifest:
 def digest(config: Config, *more: object) -> str:
     """Digest of what labels depend on: parameters but for the number of threads, and `more`."""
     nested = config.replace(**{'runtime.n_threads': 1}).nested()
-    text = json.dumps([nested, *map(str, more)], sort_keys=True)
+    text = json.dumps([nested, *map(repr, more)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
