@@ -37,7 +37,9 @@ def until_ctrl_c(*words, **options):
             process.send_signal(signal.SIGINT)
             said = process.communicate()[1]
     assert process.returncode in INTERRUPTED
-    assert said.splitlines()[-1:] == ['gp-ground-seg: interrupted']
+    *notes, last = said.splitlines()
+    assert last == 'gp-ground-seg: interrupted'
+    assert all(line.startswith('gp-ground-seg: note: ') for line in notes), said
 
 
 def stat_words(pid):

@@ -81,7 +81,8 @@ def test_a_tilted_scan_is_drawn_level_and_the_mesh_lies_under_its_ground():
     tilt = 0.3
     cosine, sine = np.cos(tilt), np.sin(tilt)
     turned = scan_of(0, 'flat').points[:, :3] @ [[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]
-    result, segmenter = segment(turned.astype(np.float32))
+    turned = turned.astype(np.float32)
+    result, segmenter = segment(turned)
     assert not result.pose.is_level
     scene = make_scene(View('a', turned), result, segmenter.config, segmenter.backend)
     ground = scene.clouds['class'].points[result.label == Label.GROUND]
