@@ -278,6 +278,7 @@ def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
     [
         ('missing.bin', [], r'missing\.bin: no such file or folder'),
         ('empty', [], r'empty: no \.bin, \.pcd.* file in it, and not a rosbag2 folder$'),
+        ('root', ['--format', 'ply'], r'--format: whole data sets give \.label files and bags'),
         ('unfinished', [], r'no metadata\.yaml in it\); bag files in it.*: x_0\.mcap'),
         ('notes.txt', [], r'not a scan or bag; accepted are \.bin'),
         ('good', ['--topic', '/a'], r'--topic: is for bags'),
@@ -289,6 +290,8 @@ def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
 def test_refused_for_scans(tmp_path, capsys, monkeypatch, given, words, message):
     monkeypatch.chdir(tmp_path)
     write_scans(Path('good'), n_scans=1)
+    for name in ('00', '08'):
+        write_scans(Path('root/sequences', name, 'velodyne'), n_scans=1)
     for folder in ('empty', 'unfinished'):
         Path(folder).mkdir()
     Path('unfinished/x_0.mcap').write_bytes(b'')

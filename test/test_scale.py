@@ -30,6 +30,7 @@ distributed = pytest.importorskip('distributed')
 pytestmark = pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
 
 PAST = ['--set', 'learning.mode=first_frame']
+N_FRAMES = 600  # of the long sequence
 
 
 @pytest.fixture(scope='module')
@@ -254,10 +255,10 @@ def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, 
 
 @pytest.fixture(scope='module')
 def long_root(tmp_path_factory):
-    """A sequence of a thousand frames, of few files."""
+    """A sequence of many frames, of few files."""
     folder = write_streets(tmp_path_factory.mktemp('long'), s00=2)
     scans = folder / 'sequences/00/velodyne'
-    for k in range(2, 1000):
+    for k in range(2, N_FRAMES):
         (scans / f'{k:06d}.bin').hardlink_to(scans / f'{k % 2:06d}.bin')
     return folder
 
@@ -291,19 +292,19 @@ def test_killed_worker_and_client_lose_nothing_and_nothing_is_done_twice(
     assert 'died; computed again: block' in err and 'Traceback' not in err
     assert_gone(workers)
     before = finished(out)
-    assert 0 < len(before) < 1000
+    assert 0 < len(before) < N_FRAMES
     times = {name: (out / name).stat().st_mtime_ns for name in before}
     with (out / 'manifest.jsonl').open('a') as file:
         file.write('{"block": 7, "na')  # as a line that was being written
     (out / 'sequences/00/predictions/.000999.label.partial-0').touch()
     assert run(*command, '--resume') == 0
-    assert f'{len(before)} of 1000 were finished before' in capsys.readouterr().out
+    assert f'{len(before)} of {N_FRAMES} were finished before' in capsys.readouterr().out
     assert sorted(finished(out)) == [
-        f'sequences/00/predictions/{k:06d}.label' for k in range(1000)
+        f'sequences/00/predictions/{k:06d}.label' for k in range(N_FRAMES)
     ]
     assert {name: (out / name).stat().st_mtime_ns for name in before} == times
     found = labels(out)
-    assert len(found) == 1000 == len(list((out / 'sequences/00/predictions').iterdir()))
+    assert len(found) == N_FRAMES == len(list((out / 'sequences/00/predictions').iterdir()))
     assert len(set(found.values())) == 2
 
 
