@@ -191,8 +191,12 @@ def test_only_the_frames_that_were_asked_for(sequence, tmp_path):
     rerun()
     from rerun.chunk import RrdReader
 
-    for words, expected in ((('--frame', 1), [1]), (('--frame-step', 2), [0])):
-        path = tmp_path / f'{expected}.rrd'
+    for words, expected in (
+        (('--frame', 0), [0]),
+        (('--frame', 1), [1]),
+        (('--frame-step', 2), [0]),
+    ):
+        path = tmp_path / f'{"".join(map(str, words))}.rrd'
         assert run('view', sequence, '--save', path, '--quiet', *words) == 0
         chunks = [c for c in RrdReader(path).stream() if c.entity_path == '/scan/class']
         frames = [chunk.to_record_batch()['frame'].to_pylist() for chunk in chunks]
