@@ -21,9 +21,17 @@ from typing import NamedTuple
 
 TEST = Path(__file__).parent
 SEGMENTATION = ['test/torture_clouds.py', 'test/torture_cases.py']
-for own in ('compiled', 'gp', 'parameters', 'pipeline'):
+for own in ('compiled', 'gp', 'pipeline'):
     SEGMENTATION.append(f'gp_ground_seg/{own}')
-for own in ('backend', 'frame', 'jit', 'result', 'segmenter'):
+for own in (
+    'backend',
+    'frame',
+    'jit',
+    'parameters/config',
+    'parameters/schema',
+    'result',
+    'segmenter',
+):
     SEGMENTATION.append(f'gp_ground_seg/{own}.py')
 
 
