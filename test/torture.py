@@ -21,18 +21,19 @@ from typing import NamedTuple
 
 TEST = Path(__file__).parent
 SEGMENTATION = ['test/torture_clouds.py', 'test/torture_cases.py']
-for own in ('compiled', 'gp', 'pipeline'):
-    SEGMENTATION.append(f'gp_ground_seg/{own}')
 for own in (
-    'backend',
-    'frame',
-    'jit',
-    'parameters/config',
-    'parameters/schema',
-    'result',
-    'segmenter',
+    'backend.py',
+    'compiled',
+    'frame.py',
+    'gp',
+    'jit.py',
+    'parameters/config.py',
+    'parameters/schema.py',
+    'pipeline',
+    'result.py',
+    'segmenter.py',
 ):
-    SEGMENTATION.append(f'gp_ground_seg/{own}.py')
+    SEGMENTATION.append(f'gp_ground_seg/{own}')
 
 
 class Part(NamedTuple):
