@@ -37,6 +37,10 @@ _CONFIG = {
     'distributed.comm.timeouts.connect': '10s',
     # A worker that died and takes its time to start anew is not given up.
     'distributed.deploy.lost-worker-timeout': '1h',
+    # Dask's workers return freed memory to the system at once, and fetch it anew for each frame:
+    # a quarter of a frame's time.
+    'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': None,
+    'distributed.worker.profile.enabled': False,  # samples the stack 100 times a second
 }
 
 _NO_BAR = partial(tqdm, disable=True)
