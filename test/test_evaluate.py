@@ -11,7 +11,6 @@ import pypatchworkpp
 import pytest
 from cli_runner import error_line, run
 from evaluation_samples import HeightRule, street, write_frame, write_streets
-from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.data.semantic_kitti import labelled_frames
@@ -290,8 +289,7 @@ def root(tmp_path_factory):
 def evaluated(root, tmp_path_factory):
     """Files of a run beside Patchwork++."""
     folder = tmp_path_factory.mktemp('evaluated')
-    options = ('--json', 'a.json'), ('--reliability', 'a.png')
-    words = [word for option, name in options for word in (option, folder / name)]
+    words = ['--json', folder / 'a.json']
     assert run('evaluate', root, *words, '--worst', 2, '--peer', 'patchworkpp') == 0
     return folder
 
@@ -354,7 +352,6 @@ def test_classes_rings_and_probabilities(evaluated):
     )  # fmt: skip
     assert [row['iou'] for row in document['worst']] == ious[:2]
     assert {row['most errors on'] for row in document['worst']} <= {'road', 'building'}
-    assert imread(evaluated / 'a.png').shape[2] == 4
     rings = {row['range']: row for row in document['rings']}
     assert rings['> 50 m']['iou'] is rings['> 50 m']['patchworkpp_iou'] is None
     assert sum(row['share_of_errors'] for row in rings.values()) == pytest.approx(1.0)
@@ -394,9 +391,9 @@ def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
     assert max(len(line) for line in output.splitlines() if 'every number' not in line) <= 100
 
 
-@pytest.mark.parametrize('option', ['--json', '--reliability'])
+@pytest.mark.parametrize('option', ['--json', '--per-frame'])
 def test_files_are_not_overwritten_without_force(root, tmp_path, option, monkeypatch, capsys):
-    target = tmp_path / 'mine'
+    target = tmp_path / 'mine.csv'
     target.write_text('mine')
     with monkeypatch.context() as patched:
         patched.setattr(runner, 'read_points', None)  # refused before any frame is read
@@ -444,6 +441,6 @@ def test_frames_without_a_scored_point_and_a_root_without_sequences(tmp_path, ca
     assert run('evaluate', root, '--worst', 2) == 0
     capsys.readouterr()
     for wrong, message in ((root, 'no scored point'), (tmp_path, 'SemanticKITTI layout')):
-        assert run('evaluate', wrong, '--reliability', tmp_path / 'a.png') == 2
+        assert run('evaluate', wrong, '--json', tmp_path / 'a.json') == 2
         assert message in error_line(capsys)
-    assert not (tmp_path / 'a.png').exists()
+    assert not (tmp_path / 'a.json').exists()

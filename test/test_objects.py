@@ -523,7 +523,6 @@ def test_boxes_beside_labels_take_the_ground_from_these(tmp_path, capsys):
             'other.csv: boxes of one scan, other; give those of 00',
         ),
         ('SCAN --boxes BOXES/00/000000.csv --worst 3', '--worst: needs labels of the ground'),
-        ('SCAN --boxes BOXES/00/000000.csv --reliability a.png', '--reliability: needs labels'),
         ('BOXES --boxes BOXES', 'no .bin file in it'),
         ('SCAN', 'no sequences/*/velodyne folder below it'),
         ('SCAN --boxes BOXES/00/000000.csv --sequences 00', 'no sequences/*/velodyne folder'),

@@ -17,7 +17,6 @@ from matplotlib.image import imread
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.cli import plot
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
-from gp_ground_seg.evaluation.metrics import Calibration
 from gp_ground_seg.plotting import charts, scan, style
 from gp_ground_seg.plotting.scan import (
     CAMERA,
@@ -351,24 +350,6 @@ def test_bars_are_as_long_as_the_stages(tmp_path):
     charts.plot_stage_bars(cases, path, 'title', baseline=('other', 80.0))
     column = close_to(imread(path), charts.REFERENCE_COLOUR, 0.02).sum(axis=0)
     assert column.max() > 50  # A dashed line from top to bottom.
-
-
-def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
-    """By the pixels of the pooled line: the mean of right minus up in the square."""
-    p = np.linspace(0.0, 1.0, 21)[:-1] + 0.025
-    for power, low, high in ((1.0, -0.02, 0.02), (3.0, 0.15, 0.35)):  # p - p^3: 0.25 on average
-        found = Calibration(np.full(20, 1000), 1000 * p**power, 1000 * p, 0.2)
-        sequences = dict.fromkeys(('00', '08', 'all'), found)
-        charts.plot_reliability(sequences, tmp_path / 'a.png', 'title')
-        top, left, side = inches(charts.TITLE, charts.LEFT, charts.SQUARE)
-        square = imread(tmp_path / 'a.png')[top : top + side, left : left + side]
-        line = close_to(square, charts.POOLED_COLOUR, 0.02)
-        line[3 * side // 4 :, 3 * side // 5 :] = False  # the legend
-        rows, columns = np.nonzero(line)
-        assert low < np.mean(rows - (side - columns)) / side < high
-    found.n_points[:] = 0
-    with pytest.raises(PointCloudError, match='no scored point'):
-        charts.plot_reliability({'all': found}, tmp_path / 'b.png', '')
 
 
 DEFICIENCIES = {

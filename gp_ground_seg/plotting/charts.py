@@ -1,4 +1,4 @@
-"""Charts: time by stage, and how reliable the probability of ground is."""
+"""Charts: time by stage, and a search of parameters."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.errors import PointCloudError
 from gp_ground_seg.plotting import style
 from gp_ground_seg.plotting.style import add_axes, new_figure, save, write_line
 
@@ -18,14 +17,9 @@ STAGE_COLOURS = (
     style.VIOLET,
 )  # fmt: skip
 REFERENCE_COLOUR = '#3B4046'
-POOLED_COLOUR = style.BLUE
 
 # Inches: the bar chart, a bar, and what is above and below all bars.
 BARS_WIDTH, BAR, AROUND = 10.0, 0.55, 1.9
-# Inches: the square of the diagram, the counts and the gap below it, and the space about them.
-SQUARE, COUNTS, GAP, LEFT, RIGHT, BOTTOM, TITLE = 5.4, 1.4, 0.15, 0.8, 0.2, 0.6, 0.5
-MIN_POINTS = 20
-"""The share of ground is not drawn for bins with fewer points."""
 
 
 def plot_stage_bars(
@@ -59,46 +53,6 @@ def plot_stage_bars(
         bbox_to_anchor=(0.5, 1.0 - 0.55 / height), handlelength=1.2, columnspacing=1.2,
     )  # fmt: skip
     write_line(figure, title, 0.5, 0.3, fontsize=11)
-    save(figure, path)
-
-
-def plot_reliability(sequences: Mapping[str, Any], path: str | Path, title: str) -> None:
-    """Draw the share of ground over probability, and points per bin below, as a PNG.
-
-    `sequences` are an `evaluation.metrics.Calibration` each, the last one that of all frames.
-    """
-    *parts, pooled = sequences.values()
-    if not pooled.n_total:
-        raise PointCloudError('reliability diagram: no scored point has a probability')
-    figure = new_figure(LEFT + SQUARE + RIGHT, TITLE + SQUARE + GAP + COUNTS + BOTTOM)
-    upper = add_axes(figure, LEFT, BOTTOM + COUNTS + GAP, (SQUARE, SQUARE))
-    lower = add_axes(figure, LEFT, BOTTOM, (SQUARE, COUNTS))
-    lower.sharex(upper)
-    upper.tick_params(labelbottom=False)
-    upper.plot([0, 1], [0, 1], color=REFERENCE_COLOUR, linestyle='--', linewidth=1, label='ideal')
-    thin = {'color': '#9AA1A9', 'linewidth': 1, 'marker': '.'}
-    thick = {'color': POOLED_COLOUR, 'linewidth': 2, 'marker': 'o', 'label': 'all'}
-    for one, look in (*((part, thin) for part in parts), (pooled, thick)):
-        enough = one.n_points >= MIN_POINTS
-        mean, share = (one.by_bin(sums)[enough] for sums in (one.sum_p, one.n_ground))
-        upper.plot(mean, share, markersize=6, clip_on=False, **look)
-    upper.set_xlim(0.0, 1.0)
-    upper.set_ylim(0.0, 1.0)
-    upper.set_ylabel('share that is ground')
-    upper.set_title(title, fontsize=12, fontweight='bold', parse_math=False)
-    upper.grid(color='#E3E6E9', linewidth=0.8)
-    text = f'ECE {pooled.ece:.4f}\nBrier {pooled.brier:.4f}'
-    upper.text(0.97, 0.03, text, ha='right', va='bottom', fontsize=11)
-    upper.legend(loc='lower right', bbox_to_anchor=(1.0, 0.1), frameon=False)
-    percent = 100.0 * pooled.n_points / pooled.n_total
-    edges = np.linspace(0.0, 1.0, len(percent) + 1)
-    lower.bar(
-        edges[:-1], percent, np.diff(edges), align='edge', color='#BFD7EA', edgecolor='white'
-    )
-    lower.set_yscale('log')
-    lower.set_ylim(min(0.1, 0.7 * percent[percent > 0].min()), 100.0)
-    lower.set_ylabel('points [%]')
-    lower.set_xlabel('probability of ground, p_ground')
     save(figure, path)
 
 
