@@ -87,8 +87,9 @@ def test_scans_without_labels_have_no_label_field(tmp_path, capsys):
 
 def test_all_by_force_at_ten_hertz(tmp_path, capsys):
     folder = write_sequence(tmp_path)
-    (tmp_path / 'out').mkdir()
+    assert convert(tmp_path, '--sequence', '04', tmp_path / 'out') == 0
     (folder / 'times.txt').unlink()
+    capsys.readouterr()
     assert convert(tmp_path, '--sequence', '04', tmp_path / 'out') == 2
     assert 'out: exists already; --force replaces it' in cli_runner.error_line(capsys)
     assert convert(tmp_path, '--sequence', '04', tmp_path / 'out', '--force') == 0

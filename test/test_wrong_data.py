@@ -180,7 +180,7 @@ COMMANDS = {
     'departures': 'experiment departures ROOT --json OUT.json',
     'sensor-pose': 'experiment sensor-pose ROOT --json OUT.json',
     'coverage': 'experiment coverage ROOT --json OUT.json',
-    'table1': 'experiment table1 ROOT --frames 00/000000:1 --json OUT.json',
+    'table1': 'experiment table1 ROOT --json OUT.json',
     'node-bench': 'node-bench ROOT --json OUT.json',
     'demo': 'demo --kitti ROOT --output OUT',
 }
