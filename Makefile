@@ -62,7 +62,7 @@ figures: $(VENV)/.dev
 	$(BIN)/python docs/figures.py $(KITTI) $(ONLY)
 
 node-bench: $(VENV)/.ros
-	$(BIN)/gp-ground-seg node-bench $(KITTI)
+	$(BIN)/python test/node_bench.py $(KITTI)
 
 # The interpreter of colcon is that of the node; ROS wheels lie below its prefix.
 colcon: export AMENT_PREFIX_PATH := $(abspath $(VENV))
