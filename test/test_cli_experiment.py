@@ -36,7 +36,7 @@ def root(tmp_path_factory):
 def few_places(monkeypatch):
     monkeypatch.setattr(variants, 'SCENE_PLACES', (0.0,))
     monkeypatch.setattr(ablation, 'PLACES', (12.0,))
-    some = ablation.Departure('near', {'grid.r_max': 15.0}), ablation.DEPARTURES[0]
+    some = ablation.Departure('near', {'grid.r_max': 15.0}), ablation.DEPARTURES[3]
     monkeypatch.setattr(ablation, 'DEPARTURES', some)
     chosen = Choice('00', '000000', (3, 4)), Choice('00', '000001', (5,))
     monkeypatch.setattr(paper_table, 'CHOICES', chosen)
