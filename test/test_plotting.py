@@ -17,7 +17,7 @@ from matplotlib.image import imread
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.cli import plot
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
-from gp_ground_seg.plotting import charts, scan, style
+from gp_ground_seg.plotting import scan, style
 from gp_ground_seg.plotting.scan import (
     CAMERA,
     TARGET,
@@ -140,7 +140,7 @@ def test_bad_input_is_said(tmp_path, keywords, error, message):
 def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeypatch):
     script = (
         'import sys, numpy as np\n'
-        'from gp_ground_seg.plotting import charts, scan, segment\n'
+        'from gp_ground_seg.plotting import scan, segment\n'
         'assert "matplotlib" not in sys.modules\n'
         'scan.plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
         'assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules\n'
@@ -330,26 +330,6 @@ def test_command_draws_a_scan_from_above(tmp_path, capsys):
     assert re.match(said, capsys.readouterr().out.splitlines()[-1])
     missed = where(tmp_path / 'a.png', COLOURS['missed ground'], left=LEFT + PANEL)
     assert missed[1] > 500
-
-
-def test_bars_are_as_long_as_the_stages(tmp_path):
-    cases = {f'case {k}': {'first': 10.0 * k, 'second': 30.0} for k in range(1, 5)}
-    path = tmp_path / 'bars.png'
-    charts.plot_stage_bars(cases, path, 'title')
-    image = imread(path)
-
-    def lengths(colour):
-        # The legend's patches are above the bars.
-        return close_to(image[len(image) // 3 :], colour, 0.02).sum(axis=1)
-
-    first, second = (lengths(colour) for colour in charts.STAGE_COLOURS[:2])
-    found = np.unique(first[first > 20])
-    np.testing.assert_allclose(found / found[0], [1, 2, 3, 4], rtol=0.05)
-    assert second.max() == pytest.approx(3 * found[0], rel=0.05)
-    assert lengths(charts.REFERENCE_COLOUR).max() < 3
-    charts.plot_stage_bars(cases, path, 'title', baseline=('other', 80.0))
-    column = close_to(imread(path), charts.REFERENCE_COLOUR, 0.02).sum(axis=0)
-    assert column.max() > 50  # A dashed line from top to bottom.
 
 
 DEFICIENCIES = {
