@@ -1,12 +1,11 @@
 """The pages hold: samples of their tables and the numbers of their pictures, computed again."""
 
-import importlib.util
 import json
 import re
 
 import pytest
 from cli_runner import run
-from conftest import REPOSITORY, find_kitti
+from conftest import REPOSITORY, find_kitti, load_script
 
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.cli import demo
@@ -14,9 +13,7 @@ from gp_ground_seg.evaluation.metrics import GROUNDGRID
 from gp_ground_seg.jit import JIT_ENABLED
 from gp_ground_seg.plotting.scan import plot_birds_eye
 
-SPEC = importlib.util.spec_from_file_location('figures', REPOSITORY / 'docs' / 'figures.py')
-figures = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(figures)
+figures = load_script('docs/figures.py')
 
 FIGURES = [
     figure
