@@ -180,7 +180,6 @@ COMMANDS = {
     'departures': 'experiment departures ROOT --json OUT.json',
     'sensor-pose': 'experiment sensor-pose ROOT --json OUT.json',
     'coverage': 'experiment coverage ROOT --json OUT.json',
-    'table1': 'experiment table1 ROOT --json OUT.json',
     'demo': 'demo --kitti ROOT --output OUT',
 }
 

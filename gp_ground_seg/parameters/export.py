@@ -69,7 +69,7 @@ def yaml_scalar(value: ParameterValue) -> str:
 
 
 def accepted_values(spec: ParameterSpec) -> str:
-    """Accepted values in words, without their unit."""
+    """Say which values are accepted, without their unit."""
     if spec.choices:
         return ' or '.join(spec.choices)
     if spec.type is bool:
