@@ -254,7 +254,6 @@ def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
         (('--from', 'nowhere.json'), 'nowhere.json'),
         (('--from', 'OTHER'), 'not a record'),
         (('DATA', '--json', 'OTHER'), 'exists already'),
-        (('DATA', '--json', 'OTHER'), 'exists already'),
         (('EMPTY',), 'no point'),
     ],
 )

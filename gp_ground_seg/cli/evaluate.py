@@ -35,8 +35,6 @@ and cyclists: the share of their returns from 0.3 m above the local ground that 
 ground, and the objects of which more than half of these returns are. Objects are the
 instances of the labels (their upper 16 bits), or given as boxes, a file for each scan:
 
-  000007.csv   class,x,y,z,length,width,height,yaw   as first line; centre and size [m] in
-               the frame of the cloud, yaw about z, from x towards y [rad]
   000007.npz   box_class (K,), box_center (K, 3), box_size (K, 3), box_rotation (K, 3, 3):
                rows of the matrix are the axes of the box in the frame of the cloud
 
@@ -52,8 +50,8 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
   gp-ground-seg evaluate KITTI_ROOT --worst 9 --per-frame frames.csv
   gp-ground-seg evaluate s3://bucket/kitti --workers 8
-  gp-ground-seg evaluate KITTI_ROOT --boxes boxes --peer patchworkpp      boxes/00/000000.csv, ...
-  gp-ground-seg evaluate scans --boxes boxes                scans/a.bin with boxes/a.csv, ...
+  gp-ground-seg evaluate KITTI_ROOT --boxes boxes --peer patchworkpp      boxes/00/000000.npz, ...
+  gp-ground-seg evaluate scans --boxes boxes                scans/a.bin with boxes/a.npz, ...
   gp-ground-seg evaluate a.bin --boxes a.npz
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). With --workers
@@ -350,7 +348,12 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
         scans = [one for one in list_inputs(root) if one.path.suffix == '.bin']
         if not scans:
             raise DataError(f'{root}: objects are counted in .bin scans, none here')
-        frames = [Frame(name, one.name, one.path, None, 0.0, layout) for one in scans]
+        # Boxes beside a scan, of the same stem, make its whole file name the name of the input.
+        names = [one.name.removesuffix('.bin') for one in scans]
+        frames = [
+            Frame(name, own, one.path, None, 0.0, layout)
+            for own, one in zip(names, scans, strict=True)
+        ]
     else:
         frames = boxed_frames(root, chosen, layout)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
