@@ -511,14 +511,14 @@ def test_boxes_beside_labels_take_the_ground_from_these(tmp_path, capsys):
     ('words', 'message'),
     [
         ('ROOT --boxes BOXES/none', 'BOXES/none: no such file or folder'),
-        ('ROOT --boxes BOXES', 'BOXES/08: 000001.npz and 000001.npz are not there'),
+        ('ROOT --boxes BOXES', 'BOXES/08/000001.npz: no such file'),
         ('ROOT --boxes BOXES/00/000000.npz', 'boxes of one scan, 000000; give a folder with a fi'),
         (
             'SCAN --boxes BOXES/other.npz',
             'other.npz: boxes of one scan, other; give those of 00',
         ),
         ('SCAN --boxes BOXES/00/000000.npz --worst 3', '--worst: needs labels of the ground'),
-        ('BOXES --boxes BOXES', 'no .bin file in it'),
+        ('BOXES --boxes BOXES', 'objects are counted in .bin scans, none here'),
         ('SCAN', 'no sequences/*/velodyne folder below it'),
         ('SCAN --boxes BOXES/00/000000.npz --sequences 00', 'no sequences/*/velodyne folder'),
     ],
