@@ -33,7 +33,9 @@ def plot_search(trials: Sequence[Any], logarithmic: Collection[str], path: str |
             values = [str(value).lower() for value in values]
         axes.scatter(values, iou, c=order, cmap='Blues', edgecolors='#6B7178', linewidths=0.4)
         axes.plot(values[best], iou[best], 'o', ms=9, mfc='none', mec=VERMILION, mew=2)
-        axes.set_xscale('log' if name in logarithmic else axes.get_xscale())
+        if name in logarithmic:
+            axes.set_xscale('log')
+            axes.tick_params(axis='x', which='minor', labelbottom=False)
         axes.set(xlabel=name, ylabel='IoU on the frames searched [%]')
     panels[0].set_xlabel('trial (line: best so far; dark: late)')
     panels[0].plot(order, np.maximum.accumulate(iou), color=VERMILION)
