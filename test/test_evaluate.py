@@ -439,7 +439,6 @@ def test_frames_without_a_scored_point_and_a_root_without_sequences(tmp_path, ca
     label.write_bytes(bytes(len(label.read_bytes())))  # all unlabelled
     assert run('evaluate', root, '--worst', 2) == 0
     capsys.readouterr()
-    for wrong, message in ((root, 'no scored point'), (tmp_path, 'SemanticKITTI layout')):
-        assert run('evaluate', wrong, '--json', tmp_path / 'a.json') == 2
-        assert message in error_line(capsys)
+    assert run('evaluate', tmp_path, '--json', tmp_path / 'a.json') == 2
+    assert 'SemanticKITTI layout' in error_line(capsys)
     assert not (tmp_path / 'a.json').exists()
