@@ -1,4 +1,4 @@
-# make demo | make test | make bench | make node-bench | make colcon | make lint: each creates the environment it needs.
+# make demo | make test | make browser-test | make bench | make node-bench | make colcon | make lint: each creates the environment it needs.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -6,16 +6,17 @@ KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test torture bench bench-docs figures node-bench colcon lint format generate clean
+.PHONY: help demo test browser-test torture bench bench-docs figures node-bench colcon lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
 	@echo 'make test      the whole test suite (KITTI=PATH adds labelled frames)'
+	@echo 'make browser-test  pages of view and tune in a headless Chromium, which root gets by apt'
 	@echo 'make torture   adversarial clouds, files and uses (TORTURE_SCALE=100 for a night)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.json and its picture'
 	@echo 'make figures   every table and picture of README and docs anew (needs KITTI=PATH; ONLY=word for some)'
-	@echo 'make node-bench  latency, losses and memory of the node over DDS'
+	@echo 'make node-bench  latency and losses of the node over DDS'
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make lint      ruff and mypy'
 	@echo 'make format    format the code'
@@ -42,6 +43,12 @@ demo: $(VENV)/.ros
 test: $(VENV)/.dev
 	$(WITH_KITTI) $(BIN)/python -m pytest
 
+browser-test: $(VENV)/.dev
+	@command -v chromium >/dev/null \
+		|| { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -qq -y chromium; } \
+		|| { echo 'Chromium is not installed: sudo apt-get install chromium'; exit 1; }
+	GP_GROUND_SEG_WEB_VIEWER=1 $(BIN)/python -m pytest test/test_browser.py
+
 torture: $(VENV)/.dev
 	$(BIN)/python test/torture.py
 
@@ -50,13 +57,14 @@ bench: $(VENV)/.dev
 
 bench-docs: $(VENV)/.dev
 	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy --force \
-		--json docs/performance.json --plot docs/images/performance.png
+		--json docs/performance.json
+	$(BIN)/python docs/stages.py
 
 figures: $(VENV)/.dev
 	$(BIN)/python docs/figures.py $(KITTI) $(ONLY)
 
 node-bench: $(VENV)/.ros
-	$(BIN)/gp-ground-seg node-bench $(KITTI)
+	$(BIN)/python test/node_bench.py $(KITTI)
 
 # The interpreter of colcon is that of the node; ROS wheels lie below its prefix.
 colcon: export AMENT_PREFIX_PATH := $(abspath $(VENV))
@@ -76,7 +84,7 @@ format: $(VENV)/.dev
 	$(BIN)/ruff format .
 
 generate: $(VENV)/.dev
-	$(BIN)/gp-ground-seg config generate .
+	$(BIN)/python docs/generate.py
 
 clean:
 	rm -rf $(VENV) build install log .mypy_cache .ruff_cache .pytest_cache .hypothesis

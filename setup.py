@@ -15,7 +15,12 @@ version = re.search(
 ).group(1)
 
 BAGS = ['rosbags>=0.11.9']
-PLOT = ['matplotlib>=3.6']
+FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
+PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
+TUNE = ['optuna>=4.0']
+SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']  # 21 MB; s3fs, for s3://, is 36 MB more
+VISER = ['viser>=1.1']
+VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
     'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
@@ -26,15 +31,22 @@ ROS = [
 TEST = ['hypothesis>=6.100', 'pytest>=7.4']
 DEV = [
     *TEST,
+    *TUNE,
+    *SCALE,
+    *VIEW,
+    'argcomplete>=3.1',
     'colcon-common-extensions',
     'flake8>=6',
     'flake8-builtins',
     'flake8-comprehensions',
     'flake8-docstrings',  # and pydocstyle, which ament_pep257 runs
     'flake8-quotes',
+    'moto[server]>=5.0',
     'mypy>=1.10,<2.5',
+    'pyarrow>=14',
     'pypatchworkpp>=1.4',
     'ruff>=0.6,<0.18',
+    's3fs>=2024.2',
     'scikit-learn>=1.4',
     'setuptools<80',  # colcon's ament_python build needs `setup.py develop` and `install`
     'types-PyYAML',
@@ -69,9 +81,14 @@ setup(
     ],
     extras_require={
         'bags': BAGS,
+        'formats': FORMATS,
         'plot': PLOT,
+        'tune': PLOT + TUNE + VISER,
+        'scale': SCALE,
+        'complete': ['argcomplete>=3.1'],
         'ros': ROS + BAGS + PLOT,
         'test': TEST,
+        'view': VIEW,
         'dev': DEV,
     },
     zip_safe=False,

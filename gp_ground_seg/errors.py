@@ -1,5 +1,8 @@
 """Exceptions that carry one clear line for the user."""
 
+import importlib
+from typing import Any
+
 
 class GroundSegError(Exception):
     """Root of every error raised on purpose by this package."""
@@ -19,3 +22,17 @@ class DataError(GroundSegError):
 
 class MissingDependencyError(GroundSegError, ImportError):
     """An optional package that this command needs is not installed."""
+
+
+def require(module: str, extra: str) -> Any:
+    """Import a module of an optional package.
+
+    Raises a MissingDependencyError, with the `extra` of ours that installs it, if that fails.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingDependencyError(
+            f'{module.split(".")[0]} is not installed, or does not work here ({error}): '
+            f"pip install 'gp_ground_seg[{extra}]'"
+        ) from error

@@ -1,5 +1,6 @@
 """Runs the commands under test, in this process or in one of their own."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -24,6 +25,21 @@ def start(*words, **options):
         [sys.executable, '-m', 'gp_ground_seg', *(str(word) for word in words)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
     )  # fmt: skip
+
+
+@contextlib.contextmanager
+def until_ctrl_c(*words, **options):
+    """Command as a process of its own, which Ctrl-C ends, with one line, behind the block."""
+    with start(*words, **options) as process:
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGINT)
+            said = process.communicate()[1]
+    assert process.returncode in INTERRUPTED
+    *notes, last = said.splitlines()
+    assert last == 'gp-ground-seg: interrupted'
+    assert all(line.startswith('gp-ground-seg: note: ') for line in notes), said
 
 
 def stat_words(pid):

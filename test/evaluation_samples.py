@@ -53,6 +53,8 @@ class HeightRule:
     The journal gets its name for each run and an R before it for each reset.
     """
 
+    depends_on_past = False
+
     def __init__(self, name: str, height: float, journal: list | None = None) -> None:
         self.name = name
         self.height = height

@@ -11,14 +11,16 @@ from conftest import REPOSITORY
 from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.cli.experiment import EXPERIMENTS, parse_departure, split_settings
+from gp_ground_seg.cli import experiment
+from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
-from gp_ground_seg.errors import ConfigError, DataError
+from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.experiments import ablation, sensor_pose, variants
-from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, VARIANCES, Choice, table1
+from gp_ground_seg.experiments import table1 as paper_table
+from gp_ground_seg.experiments.table1 import CHOICES, VARIANCES, Choice, table1
 from gp_ground_seg.parameters.presets import PRESETS
 from gp_ground_seg.simulation import DRIVES, HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
 
@@ -34,6 +36,11 @@ def root(tmp_path_factory):
 def few_places(monkeypatch):
     monkeypatch.setattr(variants, 'SCENE_PLACES', (0.0,))
     monkeypatch.setattr(ablation, 'PLACES', (12.0,))
+    some = ablation.Departure('near', {'grid.r_max': 15.0}), ablation.DEPARTURES[3]
+    monkeypatch.setattr(ablation, 'DEPARTURES', some)
+    chosen = Choice('00', '000000', (3, 4)), Choice('00', '000001', (5,))
+    monkeypatch.setattr(paper_table, 'CHOICES', chosen)
+    monkeypatch.setattr(paper_table, 'N_REPEATS', 1)
 
 
 CASES = {
@@ -41,11 +48,7 @@ CASES = {
     'ablation --simulated': (['--seeds', '1', *SMALL], 'models', 7),
     'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
     'wrong-values': (['ROOT', '--frame-step', '3', *SMALL], 'values', 26 * 2),
-    'departures': (
-        ['ROOT', '--switch', 'small: grid.n_bins=79', '--switch',
-         'near: grid.r_max=15', *SMALL],
-        'departures', 3 * 4,
-    ),
+    'departures': (['ROOT', *SMALL], 'departures', 3 * 4),
     'coverage': (['ROOT', *SMALL], 'sequence', 4 * 6),
     'coverage --simulated': (
         ['--sensors', 'vlp-16,mid-360', '--scenes', 'kerb', '--seeds', '1'], 'sensor', 2 * 6,
@@ -58,13 +61,10 @@ CASES = {
     'objects': (
         ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
     ),
-    'cross-validation': (['ROOT', '--set', 'grid.r_max=5,20.0,60', *SMALL], 'scores', 3 * 4),
     'sensor-pose': (
         ['ROOT', '--sequences', '08', '--set', 'learning.mode=fixed'], 'turns', 27,
     ),
-    'table1': (
-        ['ROOT', '--frames', '00/000000:3,4', '00/000001:5', '--repeats', '1'], 'errors', 3,
-    ),
+    'table1': (['ROOT'], 'errors', 3),
 }  # fmt: skip
 
 
@@ -104,12 +104,12 @@ def test_tables_as_markdown(capsys):
 def test_all_sensors_have_the_parameters_given(monkeypatch):
     found = []
 
-    def note(sensors, scenes, n_seeds, config, *_):
-        found.append((sensors, config))
-        assert scenes == list(DRIVES)  # those of the page
+    def note(frames, _tables, config, *_):
+        found.append(([*dict.fromkeys(frame.sensor for frame in frames)], config))
+        assert {frame.scene for frame in frames} == set(DRIVES)  # those of the page
         raise DataError('enough')
 
-    monkeypatch.setattr(variants, 'score_scenes', note)
+    monkeypatch.setattr(experiment, 'score_simulated', note)
     sensors = ['mid-360', 'hdl-64e']
     for extra, config in (([], Config()), (['--preset', 'paper'], PRESETS['paper'].config)):
         assert run('experiment', 'scenes', '--sensors', ','.join(sensors), *extra) == 2
@@ -131,15 +131,6 @@ def test_simulated_poses_have_their_own_options(monkeypatch, capsys):
     assert found == [(2 * 2 * 3, {'flat', 'kerb'}, 40)]
 
 
-def test_a_departure_in_words():
-    found = parse_departure('gate: at all: growth.max_std=1 learning.mode=fixed')
-    assert found.title == 'gate: at all'
-    assert found.changes == {'growth.max_std': 1, 'learning.mode': 'fixed'}
-    for text in ('growth.max_std=1', 'title: ', ': growth.max_std=1', 'title: x'):
-        with pytest.raises(ConfigError):
-            parse_departure(text)
-
-
 @pytest.mark.parametrize(
     ('words', 'message'),
     [
@@ -154,14 +145,6 @@ def test_a_departure_in_words():
         (['steps', 'ROOT', '--set', 'grid.n_bins=40'], 'give no parameters'),
         (['steps', 'ROOT', '--preset', 'paper'], 'give no parameters'),
         (['ablation', '--simulated', '--set', 'length_scale.model=latent2'], 'length_scale.model'),
-        (['departures', 'ROOT', '--switch', 'a: '], 'must be TITLE'),
-        (['cross-validation', 'ROOT', '--set', 'grid.r_max=50,0.001'], 'grid.r_max'),
-        (['cross-validation', 'ROOT', '--set', 'grid.rmax=50,60'], 'grid.rmax'),
-        (['cross-validation', 'ROOT', '--set', 'grid.r_max=50'], 'nothing to choose'),
-        (
-            ['cross-validation', 'ROOT', '--set', 'grid.r_max=50,60', '--set', 'grid.r_max=5,6'],
-            'searched twice',
-        ),
         (['sensor-pose', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
         (['coverage', 'ROOT', '--sensors', 'vlp-16'], '--sensors: is for --simulated only'),
         (['coverage'], 'coverage: give either ROOT or --simulated'),
@@ -169,7 +152,7 @@ def test_a_departure_in_words():
         (['sensor-pose', 'ROOT', '--set', 'sensor.roll=1.0'], 'sensor.roll = 1.0: the exp'),
         (['scenes', '--preset', 'papr'], 'did you mean paper?'),
         *(([name, '--json', 'MINE', *(['ROOT'] if name not in ('scenes', 'objects') else [])],
-           '--force') for name in EXPERIMENTS if name != 'cross-validation'),
+           '--force') for name in EXPERIMENTS),
     ],
 )  # fmt: skip
 def test_errors_are_said_before_any_frame_is_read(
@@ -215,11 +198,6 @@ def test_commands_of_the_docs_are_accepted():
             if 'experiment' not in vars(arguments):
                 continue
             names.add(arguments.experiment)
-            if arguments.experiment == 'cross-validation':
-                grid, arguments.settings = split_settings(arguments.settings)
-                for name, values in grid.items():
-                    for value in values:
-                        Config().replace(**{name: value})
             read_config(arguments)
     assert names == set(EXPERIMENTS)
 
@@ -245,13 +223,12 @@ def frame(rubble):
     return points, read_labels(rubble / 'sequences/00/labels/000000.label', len(points))
 
 
-def rows_of(root, *choices):
-    return table1(root, choices, Config(), n_repeats=1).rows
-
-
 @pytest.fixture(scope='module')
 def measured(rubble):
-    return rows_of(rubble, Choice('00', '000000', SEGMENTS))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_table, 'CHOICES', [Choice('00', '000000', SEGMENTS)])
+        patch.setattr(paper_table, 'N_REPEATS', 1)
+        return table1(rubble, Config()).rows
 
 
 @pytest.mark.parametrize(
@@ -307,11 +284,8 @@ def test_theta_is_of_the_whole_frame_and_learned(measured):
 @pytest.mark.parametrize(
     ('words', 'message'),
     [
-        (['--frames', '00/000007:3'], 'no frame 000007 in sequence 00; there are 000000'),
-        (['--frames', '07/000000:3'], 'sequences here: 00'),
-        (['--frames', '00/000000:180'], 'segment 180: must be in [0, 179]'),
-        (['--frames', '000000'], "'000000': must be as in 08/000005:151"),
-        (['--frames', '00/1:a'], 'must be as in'),
+        ([], 'no frame 000001 in sequence 00; there are 000000'),
+        (['--set', 'grid.n_segments=4'], 'segment 4: must be in [0, 3]'),
         (['--set', 'length_scale.model=constant'], 'leave it out'),
         (['--set', 'learning.mode=fixed'], 'leave it out'),
     ],
@@ -322,15 +296,16 @@ def test_errors_of_the_table_are_said(rubble, words, message, capsys):
 
 
 def test_frames_without_labels(tmp_path, capsys):
-    root = write_streets(tmp_path, s00=1)
+    root = write_streets(tmp_path, s00=2)
     (root / 'sequences/00/labels/000000.label').unlink()
-    assert run('experiment', 'table1', root, '--repeats', 1, '--frames', '00/000000:3') == 2
+    assert run('experiment', 'table1', root) == 2
     assert 'has no labels' in error_line(capsys)
 
 
-def test_default_segments_of_real_frames(kitti):
+def test_default_segments_of_real_frames(kitti, monkeypatch):
     """A pair on a slope and one on uneven ground, both predicted better than by their mean."""
-    rows = rows_of(kitti, *map(Choice.parse, DEFAULT_CHOICES))
+    monkeypatch.setattr(paper_table, 'CHOICES', CHOICES)
+    rows = table1(kitti, Config()).rows
     assert [row['segment'][-3:] for row in rows] == ['157', '158', '147', '148']
     for row in rows:
         assert row['held out'] > 200

@@ -1,13 +1,18 @@
 """The entry point: every command is there, and none costs what another imports."""
 
+import importlib
+import inspect
 import logging
+import os
 import re
+import shlex
 import subprocess
 import sys
 
 import pytest
 
 from gp_ground_seg.cli import main as cli
+from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.options import library_notes
 
 HEAVY = {'numba', 'scipy', 'matplotlib', 'rosbags', 'rclpy'}
@@ -22,6 +27,76 @@ def test_every_command_has_a_parser_and_explains_itself(name, capsys):
     assert f'gp-ground-seg {name}' in text.partition('options:')[2]
 
 
+def parsers_below(parser):
+    """Parsers of a command that have none below them, as words of the command line."""
+    below = [one.choices for one in parser._actions if isinstance(one.choices, dict)]
+    names = [leaf for one in below for leaf in one.values() if isinstance(leaf, type(parser))]
+    return [leaf for one in names for leaf in parsers_below(one)] or [parser]
+
+
+@pytest.mark.parametrize('name', cli.COMMANDS)
+def test_every_help_has_examples_that_can_be_run(name, capsys):
+    """Also of what is below a command; an example is taken by the parser as it stands."""
+    parser = cli.build_parser(name)
+    for leaf in parsers_below(parser):
+        _, mark, text = leaf.epilog.partition('examples:\n')
+        examples = re.findall(r'^  (gp-ground-seg .*)$', re.sub(r'\\\n *', '', text), re.MULTILINE)
+        assert mark and any(one.startswith(leaf.prog) for one in examples), leaf.prog
+        for example in examples:
+            # Behind two spaces is what it does, behind > and --ros-args what others read.
+            words = shlex.split(re.split(r'  +| > | &$| --ros-args', example)[0])[1:]
+            cli.build_parser(words[0]).parse_args(words)
+    assert capsys.readouterr().err == ''
+
+
+def test_whatever_prints_a_table_has_json():
+    leaves = [leaf for name in cli.COMMANDS for leaf in parsers_below(cli.build_parser(name))]
+    found = {leaf.prog.split(' ', 1)[1] for leaf in leaves if '--json' in leaf.format_usage()}
+    experiments = {f'experiment {name}' for name in EXPERIMENTS}
+    tables = {'evaluate', 'compare', 'optimise', 'bench', 'pose'}
+    assert found == tables | experiments
+    printing = set()
+    for leaf in leaves:
+        source = inspect.getsource(inspect.getmodule(leaf.get_default('run')))
+        if re.search(r'\.text\(\)|\bwritten\(', source):
+            printing.add(leaf.get_default('run').__module__)
+    assert printing == {
+        leaf.get_default('run').__module__ for leaf in leaves if '--json' in leaf.format_usage()
+    }
+
+
+@pytest.mark.parametrize('module', sorted({module for module, _ in cli.COMMANDS.values()}))
+def test_whatever_goes_over_frames_shows_how_far_it_is(module):
+    source = inspect.getsource(importlib.import_module(f'gp_ground_seg.cli.{module}'))
+    assert ('options.progress(' in source or 'options.runner(' in source) == (
+        module not in ('config', 'node')
+    )
+
+
+def completions(line, tmp_path):
+    """What argcomplete tells bash for a line, the cursor at its end."""
+    path = tmp_path / 'said'
+    environment = {
+        **os.environ, '_ARGCOMPLETE': '1', '_ARGCOMPLETE_IFS': '\n', '_ARGCOMPLETE_SHELL': 'bash',
+        '_ARGCOMPLETE_STDOUT_FILENAME': str(path), 'COMP_LINE': line, 'COMP_POINT': str(len(line)),
+    }  # fmt: skip
+    words = [sys.executable, '-m', 'gp_ground_seg']
+    subprocess.run(words, env=environment, check=True, timeout=60)
+    return path.read_text().split()
+
+
+def test_a_shell_completes_commands_options_and_their_values(tmp_path):
+    commands = completions('gp-ground-seg ', tmp_path)
+    assert set(cli.COMMANDS) <= set(commands)
+    assert completions('gp-ground-seg eva', tmp_path) == ['evaluate']
+    assert completions('gp-ground-seg evaluate ROOT --peer patchworkp', tmp_path) == [
+        'patchworkpp'
+    ]
+    assert completions('gp-ground-seg plot scan --colour p', tmp_path) == ['p_ground']
+    source = inspect.getsource(cli)
+    assert '# PYTHON_ARGCOMPLETE_OK' in source[:1024]  # looked for by its global completion
+
+
 def test_help_names_every_command_and_an_unknown_one_is_refused(capsys):
     with pytest.raises(SystemExit, match='0'):
         cli.main(['--help'])
@@ -33,9 +108,7 @@ def test_help_names_every_command_and_an_unknown_one_is_refused(capsys):
     assert "invalid choice: 'segmnet'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    'words', [['--help'], ['--version'], ['config', 'dump'], ['config', 'table'], ['node', '-h']]
-)
+@pytest.mark.parametrize('words', [['--help'], ['--version'], ['config', 'dump'], ['node', '-h']])
 def test_what_computes_nothing_imports_nothing_heavy(words):
     script = (
         'import atexit, sys\n'

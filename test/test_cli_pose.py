@@ -1,6 +1,7 @@
 """The command `pose`."""
 
 import dataclasses
+import json
 import math
 import re
 
@@ -37,6 +38,24 @@ def test_height_and_tilt_of_scans_and_their_medians(tmp_path, capsys):
     assert 'sensor.roll to -1.57' in refused
     (summary,) = (line for line in lines if line.startswith('median of 2: sensor.height=1.2'))
     assert 'sensor.roll=' in summary
+
+
+def test_json_has_every_number_unscaled_and_what_was_refused(tmp_path, capsys):
+    write_scan(tmp_path / 'b.bin', 1.2, roll=math.radians(5.0), pitch=math.radians(-4.0))
+    write_scan(tmp_path / 'c.bin', 1.2, turn=(-math.pi / 2, 0.0))
+    words = ['pose', tmp_path, '--json', tmp_path / 'a.json']
+    assert run(*words) == 0
+    document = json.loads((tmp_path / 'a.json').read_text())
+    (row,) = document['scans']
+    assert (row['scan'], row['roll'], row['pitch']) == (
+        'b.bin', pytest.approx(math.radians(5.0), abs=0.003),
+        pytest.approx(math.radians(-4.0), abs=0.003),
+    )  # fmt: skip
+    assert 0.0 < row['support'] <= 1.0 and row['height'] == pytest.approx(1.2, abs=0.03)
+    assert [note.partition(':')[0] for note in document['notes']] == ['median of 1', 'c.bin']
+    capsys.readouterr()
+    assert run(*words) == 2
+    assert 'a.json: exists already; --force replaces it' in error_line(capsys)
 
 
 def test_a_height_given_is_contradicted(tmp_path, capsys):

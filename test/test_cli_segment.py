@@ -277,8 +277,8 @@ def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
     ('given', 'words', 'message'),
     [
         ('missing.bin', [], r'missing\.bin: no such file or folder'),
-        ('empty', [], r'empty: no \.bin file in it, and not a rosbag2 folder$'),
-        ('root', [], r'give one of its sequences \(00, 08\), as in root/sequences/00'),
+        ('empty', [], r'empty: no \.bin, \.pcd.* file in it, and not a rosbag2 folder$'),
+        ('root', ['--format', 'ply'], r'--format: whole data sets give \.label files and bags'),
         ('unfinished', [], r'no metadata\.yaml in it\); bag files in it.*: x_0\.mcap'),
         ('notes.txt', [], r'not a scan or bag; accepted are \.bin'),
         ('good', ['--topic', '/a'], r'--topic: is for bags'),

@@ -11,15 +11,15 @@ import pypatchworkpp
 import pytest
 from cli_runner import error_line, run
 from evaluation_samples import HeightRule, street, write_frame, write_streets
-from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.evaluation import metrics
-from gp_ground_seg.evaluation.evaluate import OurMethod, labelled_frames
+from gp_ground_seg.evaluation.evaluate import OurMethod
 from gp_ground_seg.evaluation.metrics import ClassCount, Confusion, height_error
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PatchworkMethod, PatchworkppMethod
 from gp_ground_seg.experiments.variants import SimulatedFrame, load_simulated, peer_of
 from gp_ground_seg.parameters.config import SensorConfig
 
@@ -132,13 +132,12 @@ def test_errors_of_classes_and_of_rings_are_all_errors_and_sequences_are_pooled(
         assert sum(one.missed for one in found) == score.confusion.fn
         assert sum(one.false for one in found) == score.confusion.fp
         assert sum(score.rings, Confusion()) == score.confusion
-    assert misses.calibration is None and math.isnan(misses.ece)
+    assert misses.calibration is None
     parts, pooled = [invents.of(s).calibration for s in ('00', '08')], invents.calibration
     n_scored = sum(ring.points for ring in invents.rings)
     assert pooled.n_total == sum(part.n_total for part in parts) == n_scored
     mean = sum(part.brier * part.n_total for part in parts) / n_scored
     assert pooled.brier == pytest.approx(mean)
-    assert invents.ece == pooled.ece
 
 
 def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path):
@@ -201,6 +200,47 @@ def test_the_peer_has_the_height_of_its_sensor():
     assert labels[0] == labels[1] != labels[2]
 
 
+def test_patchwork_is_that_of_its_package_and_has_the_height_of_its_sensor():
+    scan = load_simulated(SimulatedFrame('hdl-64e', 'urban', 0, 0.0))
+    parameters = pypatchworkpp.PatchworkParams()
+    labels = {}
+    for height in (None, 1.73, 0.9):
+        if height is not None:
+            parameters.sensor_height, parameters.ATAT_ON = height, False
+        alone = pypatchworkpp.patchwork(parameters)
+        alone.estimateGround(scan.points)
+        method = PatchworkMethod(height)
+        method.run(scan.points)
+        found = method.result()
+        assert np.isnan(found.ground_z).all() and found.ground_z.shape == (len(scan.points),)
+        np.testing.assert_array_equal(
+            np.flatnonzero(found.label == Label.GROUND), np.sort(alone.getGroundIndices())
+        )
+        labels[height] = found.label
+    assert np.mean((labels[1.73] == Label.GROUND) == scan.is_ground) > 0.5
+    assert (labels[1.73] != labels[0.9]).any()
+    of_scenes = peer_of('hdl-64e-vehicle', 'patchwork')
+    vehicle = load_simulated(SimulatedFrame('hdl-64e-vehicle', 'urban', 0, 0.0))
+    of_scenes.run(vehicle.points)
+    assert np.mean(of_scenes.result().label == labels[1.73]) > 0.99
+
+
+def test_patchwork_is_a_peer_of_commands(root, tmp_path, capfd):
+    path = tmp_path / 'a.json'
+    assert run('evaluate', root, '--peer', 'patchwork', '--json', path) == 0
+    said = capfd.readouterr().out
+    assert 'Patchwork IoU' in said and 'Patchwork++' not in said
+    document = json.loads(path.read_text())
+    assert 0.0 < document['groundgrid'][-1]['patchwork_iou'] < 1.0
+    assert document['heights'][-1]['patchwork_rmse'] is None  # It has no surface.
+    words = ['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', 1, '--peer', 'patchwork']
+    assert run('experiment', 'scenes', *words) == 0
+    assert 'its: of Patchwork, which' in capfd.readouterr().out.replace('\n  ', ' ')
+    words = ['--frames', 2, '--threads', 1, '--peer', 'patchwork']
+    assert run('bench', root, *words) == 0
+    assert '/ Patchwork ' in capfd.readouterr().out
+
+
 def test_the_peer_is_told_where_the_sensor_is():
     """It takes the origin of a cloud to be the sensor, which that of a vehicle's frame is not."""
     scan, own = run_peer('flat', 'hdl-64e', sensor_height=1.73)
@@ -248,8 +288,7 @@ def root(tmp_path_factory):
 def evaluated(root, tmp_path_factory):
     """Files of a run beside Patchwork++."""
     folder = tmp_path_factory.mktemp('evaluated')
-    options = ('--json', 'a.json'), ('--reliability', 'a.png')
-    words = [word for option, name in options for word in (option, folder / name)]
+    words = ['--json', folder / 'a.json']
     assert run('evaluate', root, *words, '--worst', 2, '--peer', 'patchworkpp') == 0
     return folder
 
@@ -312,7 +351,6 @@ def test_classes_rings_and_probabilities(evaluated):
     )  # fmt: skip
     assert [row['iou'] for row in document['worst']] == ious[:2]
     assert {row['most errors on'] for row in document['worst']} <= {'road', 'building'}
-    assert imread(evaluated / 'a.png').shape[2] == 4
     rings = {row['range']: row for row in document['rings']}
     assert rings['> 50 m']['iou'] is rings['> 50 m']['patchworkpp_iou'] is None
     assert sum(row['share_of_errors'] for row in rings.values()) == pytest.approx(1.0)
@@ -352,9 +390,9 @@ def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
     assert max(len(line) for line in output.splitlines() if 'every number' not in line) <= 100
 
 
-@pytest.mark.parametrize('option', ['--json', '--reliability'])
+@pytest.mark.parametrize('option', ['--json', '--per-frame'])
 def test_files_are_not_overwritten_without_force(root, tmp_path, option, monkeypatch, capsys):
-    target = tmp_path / 'mine'
+    target = tmp_path / 'mine.csv'
     target.write_text('mine')
     with monkeypatch.context() as patched:
         patched.setattr(runner, 'read_points', None)  # refused before any frame is read
@@ -401,7 +439,6 @@ def test_frames_without_a_scored_point_and_a_root_without_sequences(tmp_path, ca
     label.write_bytes(bytes(len(label.read_bytes())))  # all unlabelled
     assert run('evaluate', root, '--worst', 2) == 0
     capsys.readouterr()
-    for wrong, message in ((root, 'no scored point'), (tmp_path, 'SemanticKITTI layout')):
-        assert run('evaluate', wrong, '--reliability', tmp_path / 'a.png') == 2
-        assert message in error_line(capsys)
-    assert not (tmp_path / 'a.png').exists()
+    assert run('evaluate', tmp_path, '--json', tmp_path / 'a.json') == 2
+    assert 'SemanticKITTI layout' in error_line(capsys)
+    assert not (tmp_path / 'a.json').exists()

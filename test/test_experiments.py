@@ -12,11 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label, simulation
-from gp_ground_seg.data.semantic_kitti import Frame
-from gp_ground_seg.errors import ConfigError, DataError, PointCloudError
+from gp_ground_seg.data.semantic_kitti import labelled_frames
+from gp_ground_seg.errors import ConfigError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as runner
-from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore, labelled_frames
-from gp_ground_seg.evaluation.metrics import Confusion, count_confusion, height_error
+from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore
+from gp_ground_seg.evaluation.metrics import (
+    Confusion,
+    count_confusion,
+    height_error,
+    pool_height_errors,
+)
 from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
 from gp_ground_seg.experiments import (
     ablation,
@@ -117,9 +122,10 @@ def test_every_switch_of_the_list_is_accepted_and_turns_something(departure):
         assert switched[name] != Config()[name], name
 
 
-def test_worth_is_what_having_it_adds(frames):
+def test_worth_is_what_having_it_adds(frames, monkeypatch):
     departures = [Departure('far grid', NEAR), Departure('near grid', NEAR, kept=False)]
-    report = ablation.compare_departures(frames, departures, FAR)
+    monkeypatch.setattr(ablation, 'DEPARTURES', departures)
+    report = ablation.compare_departures(frames, FAR)
     rows = {row['departure']: row for row in report.tables['departures'].json()}
     given, near = variants.score_variants(
         frames, runner.load_kitti, {'given': FAR, 'near': FAR.replace(**NEAR)}
@@ -138,18 +144,10 @@ def test_worth_is_what_having_it_adds(frames):
     assert rows['as given']['time_ratio'] == 1.0
 
 
-@pytest.mark.parametrize(
-    ('departures', 'message'),
-    [
-        ([Departure('a', {'grid.n_bins': 80})], "'a': its switch changes nothing"),
-        ([Departure('a', {'grid.n_bins': 40})] * 2, "'a': there is one"),
-        ([Departure('a', {'grid.bins': 40})], 'grid.bins'),
-        ([Departure('as given', {'grid.n_bins': 40})], "'as given': there is one"),
-    ],
-)
-def test_lists_that_cannot_be(departures, message):
-    with pytest.raises(ConfigError, match=message):
-        ablation.compare_departures([], departures, Config())
+def test_a_switch_that_changes_nothing_is_refused(monkeypatch):
+    monkeypatch.setattr(ablation, 'DEPARTURES', [Departure('far grid', NEAR)])
+    with pytest.raises(ConfigError, match="'far grid': its switch changes nothing"):
+        ablation.compare_departures([], Config().replace(**NEAR))
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.5, 2.0), st.floats(-0.1, 0.1))
@@ -157,11 +155,11 @@ def test_coverage_of_normal_errors_is_what_the_normal_distribution_says(seed, fa
     rng = np.random.default_rng(seed)
     std = rng.uniform(0.02, 0.2, 5000)
     error = rng.normal(bias, std)
-    error[::10], std[1::10] = np.nan, np.nan
-    said, known = factor * std, np.isfinite(error) & np.isfinite(std)
-    parts = [coverage.count_coverage(*pair) for pair in ((error[:99], said[:99]),
-             (error[99:], said[99:]))]  # fmt: skip
-    found = sum(parts, coverage.Coverage())
+    error[::10], std[::10] = np.nan, np.nan
+    said, known = factor * std, np.isfinite(error)
+    truth = rng.normal(size=5000)
+    parts = [height_error(truth[k], (truth + error)[k], said[k]) for k in (np.s_[:99], np.s_[99:])]
+    found = pool_height_errors(parts)
     e, s = error[known], said[known]
     assert found.n_points == known.sum()
     assert found.within_1 == np.mean(np.abs(e) <= s)
@@ -169,7 +167,8 @@ def test_coverage_of_normal_errors_is_what_the_normal_distribution_says(seed, fa
     assert found.bias == pytest.approx(np.mean(e))
     assert found.rmse == pytest.approx(np.sqrt(np.mean(e**2)))
     assert found.nlpd == pytest.approx(-np.mean(scipy.stats.norm.logpdf(e, 0.0, s)))
-    assert np.isnan(coverage.Coverage().within_1) and np.isnan(coverage.Coverage().nlpd)
+    nothing = pool_height_errors([])
+    assert np.isnan(nothing.within_1) and np.isnan(nothing.nlpd)
 
 
 def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):
@@ -192,72 +191,10 @@ def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):
     assert sum(one['n_points'] for one in report.rows) == row['points']
 
 
-GRID = {'a': [0, 1, 2], 'b': [0, 1, 2]}
-
-
-@given(st.lists(st.integers(0, 9), min_size=9, max_size=9))
-def test_no_single_change_betters_the_choice(heights):
-    worth = dict(zip(itertools.product(range(3), range(3)), heights, strict=True))
-
-    def of(choice):
-        return worth[choice['a'], choice['b']]
-
-    best = ablation.coordinate_search(GRID, {'a': 0, 'b': 0}, of)
-    for name, value in itertools.product(GRID, range(3)):
-        assert of({**best, name: value}) <= of(best)
-    assert of(best) >= worth[0, 0]
-    # Ties keep the given value.
-    assert ablation.coordinate_search(GRID, best, lambda _: 0.0) == best
-
-
-def test_each_sequence_is_scored_with_values_chosen_without_it(monkeypatch):
-    name = 'label.ground_tolerance'
-    hits = {0.1: (50, 50, 50), 0.2: (90, 60, 40), 0.3: (60, 70, 80)}
-    fit = GroundSegmenter().segment(np.empty((0, 3))).fit
-    runs = []
-
-    def score(_frames, _load, variants, **_):
-        ((title, config),) = variants.items()
-        runs.append(config[name])
-        scans = [
-            ScanScore(s, '0', 0.1, confusions={'g': Confusion(tp=tp, fn=100 - tp)}, fit=fit)
-            for s, tp in zip(('00', '05', '08'), hits[config[name]], strict=True)
-        ]
-        return [MethodScore(title, tuple(scans))]
-
-    monkeypatch.setattr(ablation, 'score_variants', score)
-    places = [Frame(s, '0', None, None, None) for s in ('00', '05', '08')]
-    report = ablation.cross_validate(places, Config().replace(**{name: 0.1}), {name: [0.2, 0.3]})
-    # By hand: on all 150, 190, 210; without 00 100, 100, 150; without 05 100, 130, 140;
-    # without 08 100, 150, 130.
-    (choices,) = report.tables['choices'].json()
-    assert list(choices.values()) == [name, '0.1', '0.3', '0.3', '0.3', '0.2']
-    rows = {row.pop('sequence'): row for row in report.tables['scores'].json()}
-    assert [rows[s]['iou left out'] for s in ('00', '05', '08')] == [0.6, 0.7, 0.4]
-    pooled = [rows['all'][f'iou {way}'] for way in ('given', 'tuned', 'left out')]
-    assert pooled == pytest.approx([150 / 300, 210 / 300, 170 / 300])
-    assert sorted(runs) == [0.1, 0.2, 0.3]  # each configuration once
-    assert report.facts['n_configurations'] == 3
-
-
-def test_scores_of_the_search_are_those_of_evaluate(frames):
-    name = 'grid.r_max'
-    report = ablation.cross_validate(frames, FAR, {name: [15.0, 120]})
-    assert report.facts['n_configurations'] == 2  # 120 is the given value
-    ours = runner.OurMethod(FAR)
-    (score,) = runner.score_methods(frames, runner.load_kitti, [ours])
-    ours.close()
-    row, *_, pooled = report.tables['scores'].json()
-    assert row['iou given'] == score.of('00').iou
-    assert (pooled['iou given'], pooled['ECE given']) == (score.iou, score.ece)
-    with pytest.raises(DataError, match='at least two sequences'):
-        ablation.cross_validate(frames[:2], FAR, {name: [15.0]})
-
-
-def test_scene_scores_follow_their_definitions(monkeypatch):
-    monkeypatch.setattr(variants, 'SCENE_PLACES', (6.0,))
+def test_scene_scores_follow_their_definitions():
     config = Config().replace(**{'grid.n_segments': 120})
-    report = variants.score_scenes(['vlp-16'], ['kerb'], 2, config, with_peer=True)
+    frames = variants.simulated_frames(['vlp-16'], ['kerb'], 2, (6.0,))
+    report = variants.score_simulated(frames, variants.scene_tables, config, peer='patchworkpp')
     (row,) = report.tables['scenes'].json()
     total, its_total = Confusion(), Confusion()
     errors, its_errors = [], []
@@ -291,15 +228,16 @@ def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
 
 def test_lost_objects_follow_their_definitions(monkeypatch):
     sensor, scene = 'vlp-16-low', 'traffic_jam'
-    score = lost.score_variants
+    score = variants.score_variants
 
     def refuse_hedges(frames, *rest):
         if frames[0].scene == 'hedge':
             raise PointCloudError('hedge: z does not point up')
         return score(frames, *rest)
 
-    monkeypatch.setattr(lost, 'score_variants', refuse_hedges)
-    report = lost.score_objects([sensor], [scene, 'hedge'], 1, FIXED, with_peer=True)
+    monkeypatch.setattr(variants, 'score_variants', refuse_hedges)
+    frames = variants.simulated_frames([sensor], [scene, 'hedge'], 1, (0.0,))
+    report = variants.score_simulated(frames, lost.lost_tables, FIXED, peer='patchworkpp')
     (row,), (shares,) = (report.tables[name].json() for name in ('objects', 'vehicles'))
     made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
     x, y, z, _ = made.points.T.astype(float)
@@ -330,7 +268,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
     assert notes[0] == 'refused: hedge: z does not point up'
     assert notes[1].startswith(f'objects lost: {sensor} {scene} {row["lost_vehicles"]} of')
     with pytest.raises(PointCloudError, match='refused: hedge'):
-        lost.score_objects([sensor], ['hedge'], 1, FIXED, with_peer=False)
+        variants.score_simulated(frames[1:], lost.lost_tables, FIXED, peer=None)
 
 
 def test_behind_is_said():
@@ -342,8 +280,9 @@ def test_behind_is_said():
             for name, iou in zip(('flat', 'ramp', 'kerb'), ious, strict=True)
         ))  # fmt: skip
 
-    (note,) = variants.scene_table(score(90, 80, 70), score(89, 81, 70)).notes
-    assert note == 'ahead of Patchwork++ on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
+    scores = score(90, 80, 70), score(89, 81, 70)
+    (note,) = variants.scene_tables(scores)['scenes'].notes
+    assert note == 'ahead of x on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
 
 
 @pytest.fixture(scope='module')
@@ -396,8 +335,8 @@ def test_poses_of_simulated_scans(monkeypatch):
 @pytest.mark.parametrize('sensor', ['hdl-64e', 'os1-128', 'vlp-32c-pair'])
 def test_in_traffic_no_vehicle_is_lost(sensor):
     """Cars hide the ground near the sensor; docs/accuracy.md has the table."""
-    scenes = ['traffic_jam', 'car_park']
-    report = lost.score_objects([sensor], scenes, 1, Config(), with_peer=False)
+    frames = variants.simulated_frames([sensor], ['traffic_jam', 'car_park'], 1, (0.0,))
+    report = variants.score_simulated(frames, lost.lost_tables, Config(), peer=None)
     for row in report.tables['objects'].json():
         assert row['vehicles'] > 20 and row['lost_vehicles'] == 0, row
     for row in report.tables['vehicles'].json():

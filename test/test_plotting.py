@@ -1,24 +1,28 @@
 """The pictures of scans and scores, by their pixels."""
 
+import itertools
 import re
 import subprocess
 import sys
 
+import imageio.v3 as imageio
 import numpy as np
 import pytest
 from cli_runner import error_line, run
 from conftest import hilly_scan
+from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.cli import plot
 from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
-from gp_ground_seg.evaluation.metrics import Calibration
-from gp_ground_seg.plotting import charts, scan, style
+from gp_ground_seg.plotting import scan, style
 from gp_ground_seg.plotting.scan import (
     CAMERA,
     TARGET,
     ZOOM,
+    View,
     plot_birds_eye,
     plot_scan_view,
     project,
@@ -136,7 +140,7 @@ def test_bad_input_is_said(tmp_path, keywords, error, message):
 def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeypatch):
     script = (
         'import sys, numpy as np\n'
-        'from gp_ground_seg.plotting import charts, scan, segment\n'
+        'from gp_ground_seg.plotting import scan, segment\n'
         'assert "matplotlib" not in sys.modules\n'
         'scan.plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
         'assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules\n'
@@ -169,17 +173,130 @@ def test_picture_shows_ground_obstacles_and_model(tmp_path):
     points[:10] = np.nan
     config = Config()
     found = GroundSegmenter(config).segment(points)
-    for title, height in (('title with $ and _', 768), ('', 720)):
+    for title, height in (('title with $ and _', 840), ('', 792)):
         plot_scan_view(points, found, config, tmp_path / 'scan.png', title)
         picture = imread(tmp_path / 'scan.png')
         assert picture.shape[:2] == (height, 1440)
         colours = (picture[60:650, ..., :3] * 255).round().astype(int).reshape(-1, 3)
+        assert (colours == (213, 94, 0)).all(axis=1).sum() > 400
+        # The legend is below the scene, not in it.
+        foot = (picture[-72:, :720, :3] * 255).round().astype(int).reshape(-1, 3)
         for wanted in ((185, 191, 198), (213, 94, 0)):
-            assert (colours == wanted).all(axis=1).sum() > 400
+            assert (foot == wanted).all(axis=1).sum() > 50
         # Bluish or yellowish lines: neither grey nor orange.
         assert (colours[:, 2] - colours[:, 0] > 60).sum() > 300
     with pytest.raises(PointCloudError, match=r'label of shape \(8000,\) for 7999 points'):
         plot_scan_view(points[1:], found, config, tmp_path / 'scan.png')
+
+
+def on_screen(camera, *points):
+    return project(np.array(points, dtype=float), camera)[0]
+
+
+def test_a_camera_stands_where_it_is_told():
+    turn = np.degrees(np.arctan2(*np.subtract(CAMERA, TARGET)[1::-1]))
+    distance = np.linalg.norm(np.subtract(CAMERA, TARGET))
+    up = np.degrees(np.arcsin((CAMERA[2] - TARGET[2]) / distance))
+    assert (turn + 360, up, distance) == pytest.approx((196, 24, 32), abs=0.2)  # as --help says
+    np.testing.assert_allclose(View.around(turn, up, distance).camera, CAMERA, atol=1e-9)
+    ahead, left = np.add(TARGET, (5, 0, 0)), np.add(TARGET, (0, 5, 0))
+    # From the left what is ahead is to the left; from ahead what is left is to the right.
+    (x, _), (_, y) = on_screen(View.around(90, 0, 20).camera, ahead, np.add(TARGET, (0, 0, 1)))
+    assert x == pytest.approx(-0.25 * ZOOM) and y > 0
+    assert on_screen(View.around(0, 10, 20).camera, left)[0, 0] > 0.2 * ZOOM
+    assert on_screen(View.around(0, 10, 40).camera, left)[0, 0] < 0.2 * ZOOM
+
+
+@pytest.fixture(scope='module')
+def drawn(tmp_path_factory):
+    """Scan of level ground with a wall, and its file."""
+    rng = np.random.default_rng(0)
+    ground = rng.uniform((-20, -20, -1.75), (30, 20, -1.71), (20000, 3))
+    wall = rng.uniform((20, -10, -1.7), (20.1, 10, 0.3), (4000, 3))
+    points = np.column_stack([np.concatenate([ground, wall]), np.zeros(24000)]).astype('<f4')
+    path = tmp_path_factory.mktemp('scans') / 'a.bin'
+    points.tofile(path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ('colour', 'of_wall', 'of_ground'),
+    [('height', (0.3, 0.5, 0.65), 1 / 7), ('p_ground', (0,), 1)],
+)
+def test_points_are_coloured_by_height_and_probability(
+    drawn, tmp_path, colour, of_wall, of_ground
+):
+    """The wall is 2 m high; heights are from -0.5 to 3 m."""
+    assert run('plot', 'scan', drawn, '--colour', colour, '-o', tmp_path / 'a.png') == 0
+    pixels = imread(tmp_path / 'a.png')[60:700, ..., :3]
+    assert close_to(pixels, style.VERMILION).sum() == 0
+    shades = colormaps['viridis']
+    assert close_to(pixels, shades(float(of_ground))[:3], 0.05).sum() > 2000
+    for share in of_wall:
+        assert close_to(pixels, shades(float(share))[:3], 0.05).sum() > 20
+
+
+def test_pdf_and_svg_hold_points_as_pixels_and_are_the_same_each_time(drawn, tmp_path):
+    for name, begin in (('a.pdf', b'%PDF'), ('a.svg', b'<?xml')):
+        found = []
+        for _ in range(2):
+            assert run('plot', 'scan', drawn, '-o', tmp_path / name, '--force') == 0
+            found.append((tmp_path / name).read_bytes())
+        assert found[0] == found[1]
+        assert found[0].startswith(begin) and len(found[0]) < 2_000_000
+    assert found[0].count(b'<image') >= 1 and found[0].count(b'<use') < 100
+    assert run('plot', 'above', drawn, '-o', tmp_path / 'b.svg') == 0
+    assert (tmp_path / 'b.svg').read_bytes().count(b'<use') < 200
+
+
+def test_a_sheet_has_a_panel_for_each_scene(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(plot, 'SCENES', dict(itertools.islice(plot.SCENES.items(), 4)))
+    path = tmp_path / 'sheet.png'
+    assert run('plot', 'scan', '--sheet', '--sensor', 'vlp-16', '-o', path) == 0
+    assert capsys.readouterr().out == f'4 scenes, written to {path}\n'
+    picture = imread(path)[..., :3]
+    width, height = inches(scan.PANEL + scan.GAP, scan.PANEL / 2 + scan.TITLE)
+    assert picture.shape[1] == 3 * width
+    for k in range(6):
+        row, column = divmod(k, 3)
+        panel = picture[row * height + 60 : (row + 1) * height - 5, column * width :][:, :width]
+        assert (panel.min(axis=-1) < 0.9).any() == (k < 4)
+
+
+def test_a_drive_is_a_movie_of_its_clouds(drawn, tmp_path, capsys):
+    points = np.fromfile(drawn, '<f4').reshape(-1, 4)
+    (tmp_path / 'scans').mkdir()
+    for k, n in enumerate((20000, 24000, 20000)):  # the wall is at the end
+        points[:n].tofile(tmp_path / 'scans' / f'{k}.bin')
+    path = tmp_path / 'drive.gif'
+    words = ['plot', 'drive', tmp_path / 'scans', '-o', path]
+    assert run(*words) == 0
+    assert capsys.readouterr().out == f'3 clouds, written to {path}\n'
+    movie = imageio.imread(path)
+    assert movie.shape == (3, 560, 960, 3)
+    orange = [
+        (np.abs(one[50:480].astype(int) - (213, 94, 0)).max(axis=-1) < 60).sum() for one in movie
+    ]
+    assert max(orange[0], orange[2]) < 100 < orange[1]
+    assert run(*words, '--frames', 1) == 2
+    assert '--force replaces it' in error_line(capsys)
+    assert run(*words, '--frames', 2, '--force', '--fps', 5) == 0
+    assert len(imageio.imread(path)) == 2
+    assert [one.name for one in tmp_path.iterdir() if one.name != 'scans'] == [path.name]
+
+
+def test_what_movies_need_is_optional(drawn, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'imageio.v2', None)
+    assert run('plot', 'drive', drawn, '-o', tmp_path / 'a.gif') == 2
+    assert "pip install 'gp_ground_seg[plot]'" in error_line(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('camera', ['90', '90,30', 'a,b,c', '0,90,20', '0,20,0.5', '0,20,nan'])
+def test_a_camera_that_sees_nothing_is_refused(tmp_path, capsys, camera):
+    with pytest.raises(SystemExit, match='2'):
+        run('plot', 'scan', '--simulate', 'flat', f'--camera={camera}', '-o', tmp_path / 'a.png')
+    assert 'as in 90,30,40' in capsys.readouterr().err
 
 
 def test_command_draws_a_scan_and_keeps_what_is_there(tmp_path, capsys):
@@ -213,44 +330,6 @@ def test_command_draws_a_scan_from_above(tmp_path, capsys):
     assert re.match(said, capsys.readouterr().out.splitlines()[-1])
     missed = where(tmp_path / 'a.png', COLOURS['missed ground'], left=LEFT + PANEL)
     assert missed[1] > 500
-
-
-def test_bars_are_as_long_as_the_stages(tmp_path):
-    cases = {f'case {k}': {'first': 10.0 * k, 'second': 30.0} for k in range(1, 5)}
-    path = tmp_path / 'bars.png'
-    charts.plot_stage_bars(cases, path, 'title')
-    image = imread(path)
-
-    def lengths(colour):
-        # The legend's patches are above the bars.
-        return close_to(image[len(image) // 3 :], colour, 0.02).sum(axis=1)
-
-    first, second = (lengths(colour) for colour in charts.STAGE_COLOURS[:2])
-    found = np.unique(first[first > 20])
-    np.testing.assert_allclose(found / found[0], [1, 2, 3, 4], rtol=0.05)
-    assert second.max() == pytest.approx(3 * found[0], rel=0.05)
-    assert lengths(charts.REFERENCE_COLOUR).max() < 3
-    charts.plot_stage_bars(cases, path, 'title', baseline=('other', 80.0))
-    column = close_to(imread(path), charts.REFERENCE_COLOUR, 0.02).sum(axis=0)
-    assert column.max() > 50  # A dashed line from top to bottom.
-
-
-def test_the_line_is_on_the_diagonal_only_if_calibrated(tmp_path):
-    """By the pixels of the pooled line: the mean of right minus up in the square."""
-    p = np.linspace(0.0, 1.0, 21)[:-1] + 0.025
-    for power, low, high in ((1.0, -0.02, 0.02), (3.0, 0.15, 0.35)):  # p - p^3: 0.25 on average
-        found = Calibration(np.full(20, 1000), 1000 * p**power, 1000 * p, 0.2)
-        sequences = dict.fromkeys(('00', '08', 'all'), found)
-        charts.plot_reliability(sequences, tmp_path / 'a.png', 'title')
-        top, left, side = inches(charts.TITLE, charts.LEFT, charts.SQUARE)
-        square = imread(tmp_path / 'a.png')[top : top + side, left : left + side]
-        line = close_to(square, charts.POOLED_COLOUR, 0.02)
-        line[3 * side // 4 :, 3 * side // 5 :] = False  # the legend
-        rows, columns = np.nonzero(line)
-        assert low < np.mean(rows - (side - columns)) / side < high
-    found.n_points[:] = 0
-    with pytest.raises(PointCloudError, match='no scored point'):
-        charts.plot_reliability({'all': found}, tmp_path / 'b.png', '')
 
 
 DEFICIENCIES = {

@@ -1,7 +1,5 @@
 """The optional topics: what is in them, and that nobody pays for them unasked."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -165,7 +163,7 @@ def test_nothing_is_built_that_nobody_subscribes_to(b, monkeypatch):
 
 
 def test_quality_of_service_of_every_output_can_be_overridden():
-    topics = [o.topic for o in (*outputs.CLOUD_OUTPUTS, *outputs.marker_outputs())]
+    topics = [o.topic for o in outputs.OUTPUTS]
     assert set(topics) == {'ground', 'obstacles', *OPTIONAL}
     values = {}
     for topic in topics:
@@ -176,17 +174,3 @@ def test_quality_of_service_of_every_output_can_be_overridden():
         for _, publisher in node._outputs._publishers:
             assert publisher.qos_profile.depth == 3
             assert publisher.qos_profile.reliability.name == 'BEST_EFFORT'
-
-
-def test_without_visualization_msgs_the_node_says_so_and_works(monkeypatch, capfd):
-    for name in list(sys.modules):
-        if name.split('.')[0] == 'visualization_msgs':
-            monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, 'visualization_msgs', None)
-    with ros.started_node('-r', '__ns:=/bare') as node:
-        topics = [publisher.topic_name for _, publisher in node._outputs._publishers]
-    own = f'/bare/{NODE_NAME}'
-    assert topics == ['/bare/ground', '/bare/obstacles', f'{own}/labeled', f'{own}/ground_model']
-    said = capfd.readouterr().err
-    assert 'no topic ~/markers: visualization_msgs' in said
-    assert 'ros-jazzy-visualization-msgs' in said

@@ -18,9 +18,12 @@ from rclpy.qos import qos_profile_parameters
 from ros_helpers import bench, street, to_message
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
+from gp_ground_seg.errors import DataError
 from gp_ground_seg.parameters.config import find_spec, parameter_specs
 from gp_ground_seg.parameters.export import file_problems
 from gp_ground_seg.parameters.presets import PRESETS
+from gp_ground_seg.ros import parameters
+from gp_ground_seg.ros.parameters import set_remotely
 
 TYPES = {
     bool: ParameterType.PARAMETER_BOOL,
@@ -341,3 +344,18 @@ def test_unknown_names_are_reported_and_not_declared(capfd):
     assert log.count('is not used') == 2
     assert '  sensor.height: 2.5 m  (default auto)' in log
     assert '  sensor.roll: auto\n' in log
+
+
+def test_parameters_are_set_from_another_process(b, monkeypatch):
+    """What the button of ``tune`` does."""
+    name = b.node.get_fully_qualified_name()
+    with ros.isolated():
+        set_remotely(name, {'label.ground_tolerance': 0.2, 'sensor.height': 1.2})
+        expected = Config().replace(**{'label.ground_tolerance': 0.2, 'sensor.height': 1.2})
+        assert b.node.config == expected
+        with pytest.raises(DataError, match=r'label\.ground_tolerance = 9\.0: must be a number'):
+            set_remotely(name, {'label.ground_tolerance': 9.0})
+        assert b.node.config == expected
+        monkeypatch.setattr(parameters, 'REMOTE_TIMEOUT', 0.5)
+        with pytest.raises(DataError, match=f'/nobody: no such node.*{name}'):
+            set_remotely('/nobody', {'label.ground_tolerance': 0.2})

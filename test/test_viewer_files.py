@@ -14,7 +14,7 @@ TOPICS = {'/ground', '/obstacles', *OPTIONAL}
 
 def test_topics_are_those_of_the_node():
     outputs = pytest.importorskip('gp_ground_seg.ros.outputs', reason='ROS is not installed')
-    names = [output.topic for output in (*outputs.CLOUD_OUTPUTS, *outputs.marker_outputs())]
+    names = [output.topic for output in outputs.OUTPUTS]
     found = {name.replace('~', NODE) if name[0] == '~' else f'/{name}' for name in names}
     assert found == TOPICS
 

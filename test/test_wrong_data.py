@@ -150,8 +150,8 @@ def test_a_bag_is_no_scan(tmp_path, capsys, kind):
     (write_ros1_bag if kind == 'drive.bag' else write_ros2_bag)(tmp_path / kind)
     # Whatever its size: cut to whole points here, which the size alone would not tell.
     content = (tmp_path / kind).read_bytes()
-    (tmp_path / kind).write_bytes(content[: len(content) // 16 * 16])
-    assert run('plot', 'scan', tmp_path / kind, '-o', tmp_path / 'a.png') == 2
+    (tmp_path / 'drive.bin').write_bytes(content[: len(content) // 16 * 16])
+    assert run('plot', 'scan', tmp_path / 'drive.bin', '-o', tmp_path / 'a.png') == 2
     assert 'begins as a bag does' in error_line(capsys)
     assert not (tmp_path / 'a.png').exists()
 
@@ -178,11 +178,8 @@ COMMANDS = {
     'evaluate': 'evaluate ROOT --json OUT.json',
     'ablation': 'experiment ablation ROOT --json OUT.json',
     'departures': 'experiment departures ROOT --json OUT.json',
-    'cross-validation': 'experiment cross-validation ROOT --set grid.n_bins=60,80 --json OUT.json',
     'sensor-pose': 'experiment sensor-pose ROOT --json OUT.json',
     'coverage': 'experiment coverage ROOT --json OUT.json',
-    'table1': 'experiment table1 ROOT --frames 00/000000:1 --json OUT.json',
-    'node-bench': 'node-bench ROOT --json OUT.json',
     'demo': 'demo --kitti ROOT --output OUT',
 }
 
@@ -231,7 +228,6 @@ def test_the_option_helps_and_force_takes_it_with_a_note(command, root, capsys):
         ('bench --from OLD.json', 'OLD.json'),
         ('plot scan --simulate flat -o OUT.png', 'a simulated one'),
         ('demo --output OUT', 'a simulated one'),
-        ('node-bench', 'a simulated one'),
     ],
 )
 def test_a_layout_is_for_files_of_scans(tmp_path, monkeypatch, capsys, words, what):

@@ -10,27 +10,22 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.evaluate import staged_options
-from gp_ground_seg.cli.segment import find_scans
-from gp_ground_seg.data.bag_files import is_bag
-from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.data.point_cloud2 import decode_cloud, read_xyz
+from gp_ground_seg.data.inputs import holds_bag, list_inputs
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
-from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
-from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.data.semantic_kitti import list_sequences
+from gp_ground_seg.errors import DataError, MissingDependencyError
 from gp_ground_seg.evaluation import report
 from gp_ground_seg.evaluation.benchmark import BenchFrame, bench_cases, bench_document, run_cases
 from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, TITLES
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Cell, Column, Table
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.charts import plot_stage_bars
 
 DESCRIPTION = """\
 Time the segmentation on your data: theta fixed and learned in every frame, on one
-thread and on all, by stage; with pypatchworkpp installed beside Patchwork++ on the same
-frames. Each time is taken right before or after that of Patchwork++ on that frame, so that
+thread and on all, by stage; with pypatchworkpp installed beside Patchwork++ (or --peer) on the
+same frames. Each time is taken right before or after that of the peer on that frame, so that
 the ratio of the two holds where the speed of the machine drifts. Reading is left out.
 Let nothing else run meanwhile.
 
@@ -40,7 +35,7 @@ EXAMPLES = """\
   gp-ground-seg bench KITTI_ROOT
   gp-ground-seg bench drive.mcap --frames 20 --threads 1
   gp-ground-seg bench KITTI_ROOT --set grid.n_segments=120 --json mine.json
-  gp-ground-seg bench --from mine.json --plot stages.png
+  gp-ground-seg bench --from mine.json
 """
 
 RUN_LENGTH = 10
@@ -60,7 +55,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
         ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
-        ('--plot', 'draw the stages as a PNG', file),
+        ('--peer', 'the method beside ours (default: %(default)s)',
+         {'choices': PEERS, 'default': PATCHWORKPP}),
         ('--numpy', 'time learning without compiled code as well', options.FLAG),
         *options.SCAN_LAYOUT,
         options.TO_JSON,
@@ -77,25 +73,12 @@ def run(arguments: argparse.Namespace) -> int:
     given = arguments.record
     if given is not None:
         options.refuse_scan_layout(arguments, given)
-    with staged_options(arguments, 'json', 'plot') as parts:
+    with options.staged_options(arguments, 'json') as parts:
         document = _measure(arguments) if given is None else read_record(given)
         if 'json' in parts:
             report.write_json(document, parts['json'])
-        if 'plot' in parts:
-            _plot(document, parts['plot'])
     print(bench_text(document))
     return 0
-
-
-def _plot(document: dict[str, Any], path: Path) -> None:
-    # Without compiled code a frame takes so long that the others would be but slivers.
-    cases = [case for case in document['cases'] if case['backend'] == 'numba']
-    cpu = document['environment']['cpu']
-    title = f'{document["n_frames"]} frames of {document["data"]}, {cpu}'
-    bars = {case['name']: case['stages_ms'] for case in cases or document['cases']}
-    peer = document['baseline_ms']
-    line = (TITLES[document['baseline']], peer['median']) if peer else None
-    plot_stage_bars(bars, path, title, line)
 
 
 def read_record(path: str | Path) -> dict[str, Any]:
@@ -114,15 +97,15 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     environment = report.describe_environment('pypatchworkpp')
     threads = _threads(arguments.threads, config, environment['n_cores'])
     try:
-        PatchworkppMethod()
-        baseline = PATCHWORKPP
+        PEERS[arguments.peer]()
+        baseline = arguments.peer
     except MissingDependencyError:
         options.note('no ratios without the baseline: pip install pypatchworkpp')
         baseline = None
     measured = run_cases(
         frames_from_options(arguments, arguments.frames),
         bench_cases(config, threads, with_numpy=arguments.numpy),
-        PatchworkppMethod if baseline else None,
+        PEERS[baseline] if baseline else None,
         arguments.passes,
         progress=options.progress('bench'),
     )
@@ -144,7 +127,7 @@ def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
 def frames_from_options(arguments: argparse.Namespace, n_frames: int) -> list[BenchFrame]:
     """Read about `n_frames` frames of the options."""
     source = Path(arguments.data)
-    if is_bag(source):
+    if holds_bag(source):
         options.refuse_scan_layout(arguments, source)
     return load_frames(source, n_frames, arguments.topic, options.scan_layout(arguments))
 
@@ -153,46 +136,25 @@ def load_frames(
     source: Path, n_frames: int, topic: str | None = None, layout: ScanLayout = KITTI
 ) -> list[BenchFrame]:
     """Read about `n_frames` frames of DATA; DataError if there is no point in any."""
-    if not source.exists():
-        raise DataError(f'{source}: no such file or folder')
-    if is_bag(source):
-        frames = _bag_frames(source, n_frames, topic)
-    elif topic is not None:
-        raise DataError(f'--topic: is for bags, which {source} is not')
+    if topic is None and any(source.glob('sequences/*/velodyne')):
+        folders = {name: source / 'sequences' / name for name in list_sequences(source)}
     else:
-        if any(source.glob('sequences/*/velodyne')):
-            frames_of = {name: list_frames(source, name) for name in list_sequences(source)}
-            paths = {name: [one.points_path for one in own] for name, own in frames_of.items()}
-        else:
-            paths = {source.stem: find_scans(source)}
-        frames = []
-        for j, (name, own) in enumerate(paths.items()):
-            # Shares of whole frames that add up to those wanted.
-            share = n_frames * (j + 1) // len(paths) - n_frames * j // len(paths)
-            frames += [
-                BenchFrame(run_name, own[k].stem, read_points(own[k], layout))
-                for run_name, k in runs(name, len(own), share)
-            ]
-    if not any(len(frame.points) for frame in frames):
-        raise DataError(f'{source}: no point in any of {len(frames)} frames')
-    return frames
-
-
-def _bag_frames(source: Path, n_frames: int, topic: str | None) -> list[BenchFrame]:
+        folders = {source.stem: source}
     frames = []
-    with BagReader(source) as bag:
-        name = bag.pick_point_cloud_topic(topic)
-        wanted = {k: run_name for run_name, k in runs(name, bag.n_messages(name), n_frames)}
-        for k, (_, time, raw) in enumerate(bag.messages([name])):
+    for j, (name, folder) in enumerate(folders.items()):
+        inputs = list_inputs(folder, layout, topic)
+        # Shares of whole frames that add up to those wanted.
+        share = n_frames * (j + 1) // len(folders) - n_frames * j // len(folders)
+        wanted = {k: run_name for run_name, k in runs(inputs.topic or name, len(inputs), share)}
+        for k, one in enumerate(inputs):
             if k in wanted:
-                try:
-                    xyz = read_xyz(decode_cloud(raw))
-                except PointCloudError as error:
-                    raise DataError(f'{source}: message {k} of topic {name}: {error}') from error
+                xyz = one.read().xyz
                 # With full intensity Patchwork++ drops no point as noise.
                 points = np.ones((len(xyz), 4), dtype=np.float32)
-                points[:, :3] = xyz
-                frames.append(BenchFrame(wanted[k], str(time), points))
+                points[:, : xyz.shape[1]] = xyz
+                frames.append(BenchFrame(wanted[k], one.name, points))
+    if not any(len(frame.points) for frame in frames):
+        raise DataError(f'{source}: no point in any of {len(frames)} frames')
     return frames
 
 

@@ -1,17 +1,14 @@
-"""``config``: the parameters as a file, as a table; checks and comparison of parameter files."""
+"""``config``: the parameters as a file; checks and comparison of parameter files."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.errors import DataError
 from gp_ground_seg.parameters import export
 from gp_ground_seg.parameters.config import Config, parameter_specs
-from gp_ground_seg.parameters.presets import PRESETS, find_preset
+from gp_ground_seg.parameters.presets import find_preset
 from gp_ground_seg.parameters.schema import read_parameters
 
 EXAMPLES = """\
@@ -20,7 +17,6 @@ EXAMPLES = """\
   gp-ground-seg config dump --preset paper       those of the paper, with the reasons
   gp-ground-seg config check my.yaml             unknown names, types, ranges
   gp-ground-seg config diff default my.yaml      what a file, or a preset, changes
-  gp-ground-seg config table                     every parameter as a Markdown table
 """
 
 CHECK = """\
@@ -45,19 +41,17 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         (run_dump, 'print the effective parameters as a ROS parameter file', ''),
         (run_check, 'say everything that is wrong with a parameter file', CHECK),
         (run_diff, 'compare two parameter files or presets', DIFF),
-        (run_presets, 'list the presets and what they are for', ''),
-        (run_table, 'print every parameter as a Markdown table', ''),
-        (run_generate, 'rewrite config/*.yaml and the tables of README.md and docs/', ''),
     ):
         name = run.__name__.removeprefix('run_')
-        added[name] = commands.add_parser(name, help=purpose, description=text or purpose)
+        examples = [line for line in EXAMPLES.splitlines() if f'config {name}' in line]
+        added[name] = options.new_parser(
+            commands, name, text or purpose, '\n'.join(examples), purpose
+        )
         added[name].set_defaults(run=run)
     options.add_config(added['dump'])
     added['check'].add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
     for side in 'ab':
         added['diff'].add_argument(side, metavar=side.upper(), help='parameter file or preset')
-    root = {'metavar': 'REPO_ROOT', 'nargs': '?', 'default': '.'}
-    options.add(added['generate'], ('root', 'the checkout (default: here)', root))
 
 
 def run_dump(arguments: argparse.Namespace) -> int:
@@ -93,47 +87,6 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 def run_diff(arguments: argparse.Namespace) -> int:
     """Print the parameters that differ."""
-    first, second = (
-        PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
-        for name in (arguments.a, arguments.b)
-    )
-    different = export.differences(first, second)
-    for spec, before, after in different:
-        unit = f' {spec.unit}' if spec.unit else ''
-        print(f'{spec.name}: {export.yaml_scalar(before)} -> {export.yaml_scalar(after)}{unit}')
+    different = options.changed_lines(*map(options.named_config, (arguments.a, arguments.b)))
+    print(*different, sep='\n', end='\n' * bool(different))
     return 1 if different else 0
-
-
-def run_presets(_arguments: argparse.Namespace) -> int:
-    """Print name and purpose of each preset."""
-    width = max(map(len, PRESETS))
-    for preset in PRESETS.values():
-        print(f'{preset.name:<{width}}  {preset.purpose}')
-    return 0
-
-
-def run_table(_arguments: argparse.Namespace) -> int:
-    """Print the Markdown table."""
-    print(export.to_markdown_table(), end='')
-    return 0
-
-
-def run_generate(arguments: argparse.Namespace) -> int:
-    """Rewrite the generated files that have changed, and name all of them."""
-    root = Path(arguments.root)
-    readme = root / export.README_PATH
-    if not readme.is_file():
-        raise DataError(f'{readme}: no such file; name the root of a checkout')
-    try:
-        files = export.generated_files(readme.read_bytes().decode('utf-8'))
-    except DataError as error:
-        raise DataError(f'{readme}: {error}') from error
-    for name, text in files.items():
-        path, data = root / name, text.encode('utf-8')
-        changed = not path.exists() or path.read_bytes() != data
-        if changed:
-            path.parent.mkdir(exist_ok=True)
-            with staged_file(path, force=True) as part:
-                part.write_bytes(data)
-        print(f'{path}: {"rewritten" if changed else "unchanged"}')
-    return 0

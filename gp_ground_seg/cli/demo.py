@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,13 +18,18 @@ from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, decode_cloud, encode_cloud, read_xyz
 from gp_ground_seg.data.scan_layout import ScanLayout
-from gp_ground_seg.data.semantic_kitti import list_sequences, read_labels, read_points
-from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
-from gp_ground_seg.evaluation.evaluate import labelled_frames
+from gp_ground_seg.data.semantic_kitti import (
+    labelled_frames,
+    list_sequences,
+    read_labels,
+    read_points,
+)
+from gp_ground_seg.errors import DataError, GroundSegError
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
 from gp_ground_seg.evaluation.report import Column
 from gp_ground_seg.frame import Label
 from gp_ground_seg.plotting.scan import plot_birds_eye
+from gp_ground_seg.plotting.style import new_figure
 from gp_ground_seg.ros.lifecycle import needing_ros
 from gp_ground_seg.ros.probe import (
     GROUND,
@@ -143,26 +147,20 @@ def check_scan(sent: CloudMessage, results: dict[str, CloudMessage]) -> tuple[bo
     Returns whether each finite point came back once, with every byte, and nothing else did; and
     the `Label` (N,) by the cloud a point came back in.
     """
-    points, clouds = _records(sent), (results[GROUND], results[OBSTACLES])
+    points, clouds = point_cloud2.read_fields(sent), (results[GROUND], results[OBSTACLES])
     label = np.full(len(points), Label.UNKNOWN, dtype=np.uint8)
     for cloud in clouds:
         names = ('header', 'fields', 'point_step', 'is_bigendian')
         is_whole = len(cloud.data) == cloud.height * cloud.width * cloud.point_step
         if not is_whole or any(getattr(sent, name) != getattr(cloud, name) for name in names):
             return False, label
-    ground, obstacles = map(_records, clouds)
+    ground, obstacles = map(point_cloud2.read_fields, clouds)
     for value, part in ((Label.GROUND, ground), (Label.OBSTACLE, obstacles)):
         label[part['index'][part['index'] < len(points)]] = value
     back = np.concatenate([ground, obstacles])
     back = back[np.argsort(back['index'], kind='stable')]
     finite = np.isfinite(read_xyz(sent)).all(axis=1)
     return back.tobytes() == points[finite].tobytes(), label
-
-
-def _records(cloud: CloudMessage) -> npt.NDArray[Any]:
-    """Return the points of a `numbered_cloud` as a structured array, (N,)."""
-    names = ('x', 'y', 'z', 'intensity', 'label', 'index')
-    return np.frombuffer(cloud.data, [(n, '<f4' if k < 4 else '<u4') for k, n in enumerate(names)])
 
 
 class Tally:
@@ -182,7 +180,7 @@ class Tally:
             return
         is_exact, label = check_scan(sent, results)
         xyz = read_xyz(sent)
-        truth = GROUNDGRID.truth(_records(sent)['label'], xyz[:, 2])
+        truth = GROUNDGRID.truth(point_cloud2.read_fields(sent)['label'], xyz[:, 2])
         self.n_points += int(np.isfinite(xyz).all(axis=1).sum())
         self.n_faulty += not is_exact
         self.confusion += count_confusion(label, truth)
@@ -222,8 +220,7 @@ def result_text(
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the demo."""
-    if importlib.util.find_spec('matplotlib') is None:
-        raise MissingDependencyError('the demo draws with matplotlib: pip install matplotlib')
+    new_figure(1.0, 1.0)  # where it cannot draw, it says so before the drive
     sequence = arguments.sequence
     if arguments.kitti is not None:
         sequence = sequence or list_sequences(arguments.kitti)[0]
@@ -241,7 +238,7 @@ def run(arguments: argparse.Namespace) -> int:
         probe_session('demo') as (session, words),
         # Right before the process that removes the folder if this one is killed.
         staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
-        NodeProcess(part / LOG, words, session.holding_back, part.parent) as node,
+        NodeProcess(part / LOG, words, part.parent) as node,
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)
@@ -287,7 +284,7 @@ def _play(path: Path, n_frames: int, wanted: float | None, probe: Probe) -> dict
         print(f'[3/3] {what}, and receiving both clouds', flush=True)
         with options.progress('scans')(total=n_frames) as bar:
             clouds = (decode_cloud(raw) for _, _, raw in bag.messages([INPUT]))
-            return rate_result(rate, probe.paced(clouds, rate, bar.update), 0)
+            return rate_result(rate, probe.paced(clouds, rate, bar.update))
 
 
 def sustainable_rate(cloud: CloudMessage, probe: Probe) -> float:

@@ -6,16 +6,16 @@ import argparse
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.segment import find_scans
-from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.boxes import find_boxes
-from gp_ground_seg.data.semantic_kitti import Frame
+from gp_ground_seg.data.files import as_path
+from gp_ground_seg.data.inputs import list_inputs
+from gp_ground_seg.data.semantic_kitti import Frame, boxed_frames, labelled_frames
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import metrics
@@ -23,11 +23,10 @@ from gp_ground_seg.evaluation import report as tables
 from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore
 from gp_ground_seg.evaluation.intervals import INTERVAL, Sums, interval_note, interval_text
 from gp_ground_seg.evaluation.object_table import object_table
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
-from gp_ground_seg.plotting.charts import plot_reliability
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in both conventions of the field: precision,
@@ -36,28 +35,27 @@ and cyclists: the share of their returns from 0.3 m above the local ground that 
 ground, and the objects of which more than half of these returns are. Objects are the
 instances of the labels (their upper 16 bits), or given as boxes, a file for each scan:
 
-  000007.csv   class,x,y,z,length,width,height,yaw   as first line; centre and size [m] in
-               the frame of the cloud, yaw about z, from x towards y [rad]
   000007.npz   box_class (K,), box_center (K, 3), box_size (K, 3), box_rotation (K, 3, 3):
                rows of the matrix are the axes of the box in the frame of the cloud
 
 Without labels only objects are counted, from the bottom of their boxes.
 
-Patchwork++ (--peer) has its published parameters; a height and a place of the sensor that are
-given (sensor.height, sensor.origin_x, ...) are given to it too.
+Patchwork++ or Patchwork (--peer) has its published parameters; a height and a place of the
+sensor that are given (sensor.height, sensor.origin_x, ...) are given to it too.
 """
 EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08 --json scores.json
   gp-ground-seg evaluate KITTI_ROOT --set label.ground_tolerance=0.15
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
-  gp-ground-seg evaluate KITTI_ROOT --worst 9
-  gp-ground-seg evaluate KITTI_ROOT --reliability reliability.png
-  gp-ground-seg evaluate KITTI_ROOT --boxes boxes --peer patchworkpp      boxes/00/000000.csv, ...
-  gp-ground-seg evaluate scans --boxes boxes                scans/a.bin with boxes/a.csv, ...
+  gp-ground-seg evaluate KITTI_ROOT --worst 9 --per-frame frames.csv
+  gp-ground-seg evaluate s3://bucket/kitti --workers 8
+  gp-ground-seg evaluate KITTI_ROOT --boxes boxes --peer patchworkpp      boxes/00/000000.npz, ...
+  gp-ground-seg evaluate scans --boxes boxes                scans/a.bin with boxes/a.npz, ...
   gp-ground-seg evaluate a.bin --boxes a.npz
 
-KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI).
+KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). With --workers
+the tables are the same, but for the times: frames are computed beside one another.
 """
 
 ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
@@ -73,13 +71,13 @@ RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
-    peers = {'choices': (methods.PATCHWORKPP,)}
+    peers = {'choices': PEERS}
     options.add(
         parser,
         ROOT,
         *OF_FRAMES,
+        ('--per-frame', 'write the numbers of each frame (.csv, .parquet)', {'metavar': 'FILE'}),
         ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
-        ('--reliability', 'draw share of ground over p_ground (PNG)', {'metavar': 'FILE'}),
         ('--boxes', 'objects: a file, or a folder of files; ROOT may be .bin scans without labels',
          {'metavar': 'PATH'}),
         ('--peer', 'run this one on the same frames, alternately', peers),
@@ -87,6 +85,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         options.TO_JSON,
         options.FORCE,
     )  # fmt: skip
+    options.add_cluster(parser)
     options.add_config(parser)
     parser.set_defaults(run=run)
 
@@ -94,25 +93,27 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate, write the files, print the tables."""
     config = options.read_config(arguments)
-    files = {'json': 'every number', 'reliability': 'reliability diagram'}
-    with staged_options(arguments, *files) as parts, ExitStack() as stack:
+    files = {'json': 'every number', 'per_frame': 'each frame'}
+    if arguments.per_frame is not None:
+        tables.check_rows_file(arguments.per_frame)
+    with options.staged_options(arguments, *files) as parts, ExitStack() as stack:
         items, load = _items_from_options(arguments)
         chosen: list[methods.Method] = [stack.enter_context(closing(methods.OurMethod(config)))]
         if arguments.peer is not None:
-            chosen.append(PatchworkppMethod.of_sensor(config.sensor))
-        bar = options.progress('evaluate')
-        scores = methods.score_methods(items, load, chosen, progress=bar)
+            chosen.append(PEERS[arguments.peer].of_sensor(config.sensor))
+        runner = stack.enter_context(options.runner(arguments, 'evaluate'))
+        scores = methods.score_methods(items, load, chosen, runner=runner)
         report = make_report(
-            score_tables(scores, arguments.worst), scores, config,
+            score_tables(scores, arguments.worst, runner.n_workers), scores, config,
             data=arguments.root, reliability=reliability_rows(scores[0]),
             stages={score.name: score.median_stages for score in scores},
         )  # fmt: skip
         environment = tables.describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
+        environment['n_workers'] = runner.n_workers
         if 'json' in parts:
             report.write(parts['json'], environment)
-        if 'reliability' in parts:
-            title = f'Reliability, {len(items)} frames'
-            plot_reliability(_calibrations(scores[0]), parts['reliability'], title)
+        if 'per_frame' in parts:
+            tables.write_rows(report.rows, parts['per_frame'])
     print(f'{_headline(scores)}\n')
     lines = [tables.parameters_line(report.facts['config_changes'])]
     lines.append(tables.machine_line(environment, report.fit))
@@ -129,9 +130,8 @@ def _items_from_options(
     frames = frames_from_options(arguments)
     if arguments.boxes is None:
         return frames, methods.load_kitti
-    for name in ('worst', 'reliability'):
-        if getattr(arguments, name) is not None and frames[0].labels_path is None:
-            raise DataError(f'--{name}: needs labels of the ground, which {arguments.root} lacks')
+    if arguments.worst is not None and frames[0].labels_path is None:
+        raise DataError(f'--worst: needs labels of the ground, which {arguments.root} lacks')
     return [*zip(frames, find_boxes(arguments.boxes, frames), strict=True)], methods.load_boxed
 
 
@@ -147,11 +147,13 @@ def _headline(scores: Sequence[MethodScore]) -> str:
     return f'{first}\n{seconds} per frame  (median)'
 
 
-def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str, Table]:
+def score_tables(
+    scores: Sequence[MethodScore], n_worst: int | None, n_workers: int = 0
+) -> dict[str, Table]:
     """Tables of an evaluation by name, ours first in `scores`."""
     objects = object_table(scores, options.count(len(scores[0].sequences), 'sequence'))
     if not scores[0].has_labels:
-        return {'objects': objects, 'times': _time_table(scores)}
+        return {'objects': objects, 'times': _time_table(scores, n_workers)}
     return {
         **{one.key: _convention_table(scores, one) for one in metrics.CONVENTIONS},
         **({'differences': _difference_table(*scores)} if len(scores) > 1 else {}),
@@ -161,7 +163,7 @@ def score_tables(scores: Sequence[MethodScore], n_worst: int | None) -> dict[str
         'probabilities': _calibration_table(scores[0]),
         'heights': _height_table(scores),
         **({'worst': _worst_table(scores[0], n_worst)} if n_worst else {}),
-        'times': _time_table(scores),
+        'times': _time_table(scores, n_workers),
     }
 
 
@@ -308,7 +310,7 @@ def _worst_table(score: MethodScore, n_worst: int) -> Table:
     return Table([*columns, percent('of errors', 'share_of_errors')], rows, title)
 
 
-def _time_table(scores: Sequence[MethodScore]) -> Table:
+def _time_table(scores: Sequence[MethodScore], n_workers: int) -> Table:
     ours = scores[0].seconds()
     rows: list[list[Cell]] = [
         [one.title, one.seconds(), one.seconds(statistics.fmean), ours / one.seconds()]
@@ -317,7 +319,9 @@ def _time_table(scores: Sequence[MethodScore]) -> Table:
     columns = [Column('method'), tables.milliseconds('median'), tables.milliseconds('mean')]
     columns.append(Column('ours / this', '.2f', 'ratio'))
     stages = ', '.join(f'{name} {1e3 * s:.1f}' for name, s in scores[0].median_stages.items())
-    return Table(columns, rows, 'Time per frame, reading left out  [ms]', [f'stages: {stages}'])
+    beside = f', {options.count(n_workers, "worker")} beside one another' if n_workers else ''
+    title = f'Time per frame, reading left out{beside}  [ms]'
+    return Table(columns, rows, title, [f'stages: {stages}'])
 
 
 def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
@@ -336,24 +340,21 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
     """Frames of the options, grouped by sequence; labelled, unless objects are given as boxes."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
-    root, layout = Path(arguments.root), options.scan_layout(arguments)
+    root, layout = as_path(arguments.root), options.scan_layout(arguments)
     if getattr(arguments, 'boxes', None) is None:
-        frames = methods.labelled_frames(root, chosen, layout)
+        frames = labelled_frames(root, chosen, layout)
     elif chosen is None and not any(root.glob('sequences/*/velodyne')):
-        name = root.resolve().stem
-        frames = [Frame(name, path.stem, path, None, 0.0, layout) for path in find_scans(root)]
+        name = Path(arguments.root).resolve().stem
+        scans = [one for one in list_inputs(root) if one.path.suffix == '.bin']
+        if not scans:
+            raise DataError(f'{root}: objects are counted in .bin scans, none here')
+        # Boxes beside a scan, of the same stem, make its whole file name the name of the input.
+        names = [one.name.removesuffix('.bin') for one in scans]
+        frames = [
+            Frame(name, own, one.path, None, 0.0, layout)
+            for own, one in zip(names, scans, strict=True)
+        ]
     else:
-        frames = methods.boxed_frames(root, chosen, layout)
+        frames = boxed_frames(root, chosen, layout)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]
-
-
-@contextmanager
-def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
-    """Yield a path for each of the options given; the files appear when the block ends well."""
-    with ExitStack() as stack:
-        yield {
-            name: stack.enter_context(staged_file(path, force=arguments.force))
-            for name in names
-            if (path := getattr(arguments, name)) is not None
-        }

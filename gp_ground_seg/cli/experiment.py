@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options, staged_options
+from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
 from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.evaluate import load_kitti
+from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, load_kitti
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Report, describe_environment, machine_line, written
 from gp_ground_seg.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
-from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
-from gp_ground_seg.experiments.variants import load_simulated, simulated_frames
+from gp_ground_seg.experiments.table1 import table1
+from gp_ground_seg.experiments.variants import load_simulated, score_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.schema import ParameterValue
+from gp_ground_seg.scale.cluster import Runner
 from gp_ground_seg.simulation import DRIVES, SCENES, SENSORS
 
 Option = tuple[str, str, dict[str, Any]]
 
 DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
 SURVEYED = ('hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360')  # by `coverage`
+
+ONE_PROCESS = ('table1',)  # it measures times
+EXAMPLES = """\
+  gp-ground-seg experiment ablation KITTI_ROOT
+  gp-ground-seg experiment scenes --sensors vlp-16 --scenes kerb
+  gp-ground-seg experiment NAME --help          describes one of them
+"""
 
 OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
@@ -40,19 +48,10 @@ CROWDED_LIST = _some_of('--scenes', SCENES, lost.SCENES)
 SENSOR_LIST = _some_of('--sensors', SENSORS, DEFAULT_SENSORS)
 EVERY_SENSOR = _some_of('--sensors', SENSORS, SURVEYED)
 EVERY_MOUNT = _some_of('--sensors', SENSORS, ['all'])
-NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
-SWITCH = (
-    '--switch',
-    'measure this departure instead, and the parameters that switch it off (may be repeated)',
-    {'metavar': 'TITLE: NAME=VALUE ...', 'action': 'append'},
-)
-SEGMENTS = (
-    '--frames', f'frames and segments (default: {" ".join(DEFAULT_CHOICES)})',
-    {'metavar': 'SEQ/IDX:SEG,SEG', 'nargs': '+', 'default': DEFAULT_CHOICES},
-)  # fmt: skip
-REPEATS = (
-    '--repeats', 'timed runs of each method (default: %(default)s)',
-    {**options.NUMBER, 'default': 9},
+NO_PEER = ('--no-peer', 'leave the peer out', options.FLAG)
+PEER = (
+    '--peer', 'the method beside ours (default: %(default)s)',
+    {'choices': PEERS, 'default': PATCHWORKPP},
 )  # fmt: skip
 
 
@@ -61,25 +60,24 @@ class Experiment(NamedTuple):
 
     description: str
     options: tuple[Option, ...]
-    run: Callable[[argparse.Namespace], Report]
+    run: Callable[[argparse.Namespace, Config, Runner], Report]
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and a command below it for each of `EXPERIMENTS`."""
-    parser = subparsers.add_parser(
-        'experiment',
-        description='Repeat an experiment of docs/: configurations scored over frames.',
-        epilog='`gp-ground-seg experiment NAME --help` describes one of them.',
-    )
+    description = 'Repeat an experiment of docs/: configurations scored over frames.'
+    parser = options.new_parser(subparsers, 'experiment', description, EXAMPLES)
     names = parser.add_subparsers(metavar='NAME', required=True, dest='experiment')
     for name, experiment in EXPERIMENTS.items():
-        own = names.add_parser(
-            name,
-            help=re.split(r'\.(?:\s|$)', experiment.description)[0],
-            description=experiment.description,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
+        purpose = re.split(r'\.(?:\s|$)', experiment.description)[0]
+        source = ' KITTI_ROOT' if experiment.options[0][0] == 'root' else ' --sensors vlp-16'
+        example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
+        own = options.new_parser(names, name, experiment.description, example, purpose)
         options.add(own, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
+        if name in ONE_PROCESS:
+            own.set_defaults(workers=None, scheduler=None)
+        else:
+            options.add_cluster(own)
         options.add_config(own)
         own.set_defaults(run=run)
 
@@ -89,13 +87,17 @@ def run(arguments: argparse.Namespace) -> int:
     experiment = EXPERIMENTS[arguments.experiment]
     if SIMULATED in experiment.options:
         _check_source(arguments)
-    with staged_options(arguments, 'json') as parts:
-        report = experiment.run(arguments)
+    config = options.read_config(arguments)
+    with options.staged_options(arguments, 'json') as parts:
+        with options.runner(arguments, arguments.experiment) as runner:
+            report = experiment.run(arguments, config, runner)
+            n_workers = runner.n_workers
         has_peer = not getattr(arguments, 'no_peer', True)
         environment = describe_environment(*(['pypatchworkpp'] if has_peer else []))
+        environment['n_workers'] = n_workers
         if 'json' in parts:
-            options = {name: getattr(arguments, name) for name in map(_name, experiment.options)}
-            report.facts.update(experiment=arguments.experiment, options=options)
+            given = {name: getattr(arguments, name) for name in map(_name, experiment.options)}
+            report.facts.update(experiment=arguments.experiment, options=given)
             report.write(parts['json'], environment)
     lines = [machine_line(environment, report.fit)]
     print(written(report.tables.values(), lines, markdown=arguments.markdown))
@@ -104,6 +106,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _name(option: Option) -> str:
     return option[0].lstrip('-').replace('-', '_')
+
+
+def _peer(arguments: argparse.Namespace) -> str | None:
+    return None if arguments.no_peer else arguments.peer
 
 
 def _check_source(arguments: argparse.Namespace) -> None:
@@ -116,110 +122,62 @@ def _check_source(arguments: argparse.Namespace) -> None:
             raise DataError(f'{option[0]}: is for {kind} only')
 
 
-def _ablation(arguments: argparse.Namespace) -> Report:
-    config, bar = options.read_config(arguments), options.progress('ablation')
+def _ablation(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     if not arguments.simulated:
-        return ablation.compare_models(frames_from_options(arguments), load_kitti, config, bar)
+        return ablation.compare_models(frames_from_options(arguments), load_kitti, config, runner)
     seeds = arguments.seeds or 10
     frames = simulated_frames(['hdl-64e'], [ablation.SCENE], seeds, ablation.PLACES)
-    return ablation.compare_models(frames, load_simulated, config, bar)
+    return ablation.compare_models(frames, load_simulated, config, runner)
 
 
-def _departures(arguments: argparse.Namespace) -> Report:
-    config = options.read_config(arguments)
-    chosen = [parse_departure(text) for text in arguments.switch or []] or ablation.DEPARTURES
-    frames = frames_from_options(arguments)
-    return ablation.compare_departures(frames, chosen, config, options.progress('departures'))
+def _departures(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
+    return ablation.compare_departures(frames_from_options(arguments), config, runner)
 
 
-def parse_departure(text: str) -> ablation.Departure:
-    """Read ``TITLE: NAME=VALUE NAME=VALUE``; ConfigError if it is not of that form."""
-    title, _, switch = text.rpartition(': ')
-    settings = switch.split()
-    if not title.strip() or not settings:
-        raise ConfigError(f'--switch {text!r}: must be TITLE: NAME=VALUE ...')
-    return ablation.Departure(title.strip(), dict(map(options.parse_setting, settings)))
-
-
-def _steps(arguments: argparse.Namespace) -> Report:
-    if options.read_config(arguments) != Config():
+def _steps(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
+    if config != Config():
         raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
-    frames, bar = frames_from_options(arguments), options.progress('steps')
-    return stepwise.score_steps(frames, not arguments.no_peer, bar)
+    frames = frames_from_options(arguments)
+    return stepwise.score_steps(frames, _peer(arguments), runner)
 
 
-def _wrong_values(arguments: argparse.Namespace) -> Report:
-    config, bar = options.read_config(arguments), options.progress('wrong-values')
-    return stepwise.score_wrong_values(frames_from_options(arguments), config, bar)
+def _wrong_values(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
+    return stepwise.score_wrong_values(frames_from_options(arguments), config, runner)
 
 
-def _scenes(arguments: argparse.Namespace) -> Report:
+def _scenes(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(DRIVES)
-    config, bar = options.read_config(arguments), options.progress('scenes')
-    seeds, with_peer = arguments.seeds or 3, not arguments.no_peer
-    return variants.score_scenes(sensors, scenes, seeds, config, with_peer, bar)
+    frames = simulated_frames(sensors, scenes, arguments.seeds or 3, variants.SCENE_PLACES)
+    return score_simulated(frames, variants.scene_tables, config, _peer(arguments), runner)
 
 
-def _objects(arguments: argparse.Namespace) -> Report:
-    scenes, seeds = arguments.scenes or lost.SCENES, arguments.seeds or 2
-    config, bar = options.read_config(arguments), options.progress('objects')
-    sensors = arguments.sensors or list(SENSORS)
-    return lost.score_objects(sensors, scenes, seeds, config, not arguments.no_peer, bar)
+def _objects(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
+    sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or lost.SCENES
+    frames = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
+    return score_simulated(frames, lost.lost_tables, config, _peer(arguments), runner)
 
 
-def _coverage(arguments: argparse.Namespace) -> Report:
-    config, bar = options.read_config(arguments), options.progress('coverage')
+def _coverage(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     if not arguments.simulated:
         frames = frames_from_options(arguments)
-        return coverage.compare_coverage(frames, load_kitti, config, coverage.LABELLED, bar)
+        return coverage.compare_coverage(frames, load_kitti, config, coverage.LABELLED, runner)
     sensors, scenes = arguments.sensors or list(SURVEYED), arguments.scenes or list(DRIVES)
     scans = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
-    return coverage.compare_coverage(scans, load_simulated, config, coverage.SIMULATED, bar)
+    return coverage.compare_coverage(scans, load_simulated, config, coverage.SIMULATED, runner)
 
 
-def _cross_validation(arguments: argparse.Namespace) -> Report:
-    grid, fixed = split_settings(arguments.settings)
-    config = options.read_config(argparse.Namespace(**{**vars(arguments), 'settings': fixed}))
-    bar = options.progress('cross-validation')
-    return ablation.cross_validate(frames_from_options(arguments), config, grid, bar)
-
-
-def split_settings(settings: Sequence[str]) -> tuple[dict[str, list[ParameterValue]], list[str]]:
-    """Parameters to search with their values, and the settings of one value.
-
-    Raises ConfigError if nothing is to be searched, or something twice.
-    """
-    grid: dict[str, list[ParameterValue]] = {}
-    fixed = []
-    for setting in settings:
-        name, _, text = setting.partition('=')
-        if ',' not in text:
-            fixed.append(setting)
-            continue
-        if name.strip() in grid:
-            raise ConfigError(f'--set {setting}: {name.strip()} is searched twice')
-        words = [word for word in text.split(',') if word]
-        grid[name.strip()] = [options.parse_setting(f'{name}={word}')[1] for word in words]
-    if not grid:
-        raise ConfigError('cross-validation: nothing to choose, give --set NAME=VALUE,VALUE,...')
-    return grid, fixed
-
-
-def _sensor_pose(arguments: argparse.Namespace) -> Report:
-    config, bar = options.read_config(arguments), options.progress('sensor-pose')
+def _sensor_pose(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     if not arguments.simulated:
         frames, mounts = frames_from_options(arguments), sensor_pose.MOUNTS
-        return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, bar)
+        return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, runner)
     scenes, mounts = arguments.scenes or list(DRIVES), sensor_pose.SIMULATED_MOUNTS
     scans = simulated_frames(DEFAULT_SENSORS, scenes, arguments.seeds or 1, (0.0,))
-    return sensor_pose.score_poses(scans, sensor_pose.load_mounted, mounts, config, bar)
+    return sensor_pose.score_poses(scans, sensor_pose.load_mounted, mounts, config, runner)
 
 
-def _table1(arguments: argparse.Namespace) -> Report:
-    config, bar = options.read_config(arguments), options.progress('table1')
-    choices = [Choice.parse(word) for word in arguments.frames]
-    layout = options.scan_layout(arguments)
-    return table1(arguments.root, choices, config, arguments.repeats, layout, bar)
+def _table1(arguments: argparse.Namespace, config: Config, _: Runner) -> Report:
+    bar = options.progress('table1')
+    return table1(arguments.root, config, options.scan_layout(arguments), bar)
 
 
 EXPERIMENTS = {
@@ -236,10 +194,9 @@ rubble, by exact labels and heights.
     'departures': Experiment(
         """\
 Undo one departure from the paper after the other. They are the rows of
-gp_ground_seg/experiments/ablation.py; --switch measures another without touching it:
-  --switch 'tight gate: growth.max_std=1'
+gp_ground_seg/experiments/ablation.py; `compare` measures any other change.
 """,
-        (ROOT, *OF_FRAMES, SWITCH),
+        (ROOT, *OF_FRAMES),
         _departures,
     ),
     'coverage': Experiment(
@@ -256,7 +213,7 @@ and two, by sequence and range. On labelled frames that of the returns (return_s
 Go from the paper's method to the defaults, one step after the other, beside Patchwork++ and a
 surface that is interpolated, with our labels.
 """,
-        (ROOT, *OF_FRAMES, NO_PEER),
+        (ROOT, *OF_FRAMES, PEER, NO_PEER),
         _steps,
     ),
     'wrong-values': Experiment(
@@ -271,7 +228,7 @@ Give hyper-parameters that are wrong by factors of 3 and 10, with and without le
 Score simulated scans by exact labels and heights, beside Patchwork++ with its published
 parameters and the true height of the sensor. All sensors have one set of parameters.
 """,
-        (SENSOR_LIST, SCENE_LIST, SEEDS, NO_PEER),
+        (SENSOR_LIST, SCENE_LIST, SEEDS, PEER, NO_PEER),
         _scenes,
     ),
     'objects': Experiment(
@@ -280,17 +237,8 @@ Count vehicles, persons and cyclists of simulated scans that are called ground, 
 Patchwork++ with its published parameters and the true height and place of the sensor. All
 sensors have one set of parameters.
 """,
-        (EVERY_MOUNT, CROWDED_LIST, SEEDS, NO_PEER),
+        (EVERY_MOUNT, CROWDED_LIST, SEEDS, PEER, NO_PEER),
         _objects,
-    ),
-    'cross-validation': Experiment(
-        """\
-Choose parameters on all sequences but one, and score them on that one. Parameters with
-several values are searched by pooled IoU, one after the other until no change of one is
-better: --set label.ground_tolerance=0.05,0.1
-""",
-        (ROOT, *OF_FRAMES),
-        _cross_validation,
     ),
     'sensor-pose': Experiment(
         """\
@@ -305,7 +253,7 @@ sensors at four heights.
         """\
 Measure the paper's Table I on segments of labelled frames.
 """,
-        (ROOT, SEGMENTS, REPEATS, *options.SCAN_LAYOUT),
+        (ROOT, *options.SCAN_LAYOUT),
         _table1,
     ),
 }

@@ -1,3 +1,4 @@
+# PYTHON_ARGCOMPLETE_OK
 """Entry point of ``gp-ground-seg``: commands, and errors mapped to exit codes."""
 
 from __future__ import annotations
@@ -24,16 +25,19 @@ ROS_ARGS = '--ros-args'
 COMMANDS = {
     'segment': ('segment', 'label scans, or split the clouds of a bag'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
+    'compare': ('compare', 'two configurations on the same frames'),
+    'optimise': ('optimise', 'search parameters on your labelled frames'),
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
+    'view': ('view', 'look at scans in Rerun, a browser or a page'),
+    'tune': ('view', 'set parameters by sliders, and see the labels change'),
     'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
-    'pose': ('segment', 'estimate height and tilt of the sensor from scans'),
+    'pose': ('pose', 'estimate height and tilt of the sensor from scans'),
     'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),
     'play': ('bags', "publish a bag's clouds as they were recorded"),
     'demo': ('demo', 'see it work, no data needed'),
     'config': ('config', 'write, check and compare parameter files'),
     'node': ('node', 'run the ROS 2 node'),
-    'node-bench': ('node', 'latency, losses and memory of the node'),
     'warm-up': ('node', 'compile beforehand what the first start would compile'),
 }
 
@@ -63,6 +67,15 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         for name, (_, purpose) in COMMANDS.items():
             subparsers.add_parser(name, help=purpose)
     return parser
+
+
+def _complete() -> None:
+    """Tell the shell what may follow its line, and end: argcomplete asks by the environment."""
+    import argcomplete
+
+    words = os.environ['COMP_LINE'].split()
+    command = next((word for word in words if word in COMMANDS), None)
+    argcomplete.autocomplete(build_parser(command))
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
@@ -126,6 +139,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     It is that of the command, 2 after an error, which takes one line, or 130 when interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    if '_ARGCOMPLETE' in os.environ:
+        _complete()
     try:
         with _interruptible():
             arguments = _parse(words)

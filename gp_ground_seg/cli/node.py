@@ -1,54 +1,20 @@
-"""``node``: the ROS 2 node; ``node-bench``: its latency, losses, memory; ``warm-up``."""
+"""``node``: the ROS 2 node; ``warm-up``: compile its code beforehand."""
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
+from gp_ground_seg.errors import GroundSegError, MissingDependencyError
 from gp_ground_seg.ros.lifecycle import needing_ros, stop_on_signals
-
-if TYPE_CHECKING:
-    from gp_ground_seg.data.point_cloud2 import CloudMessage
-    from gp_ground_seg.ros.probe import Trip
-
-N_SIMULATED = 10
-FEWEST = 10
-
-# Goals: up to which rates nothing is lost and latency is limited [Hz], that limit [s], most memory
-# [bytes], and its largest growth [1].
-LOSSLESS_RATE, PUNCTUAL_RATE = 20.0, 10.0
-MAX_P99, MAX_PEAK, MAX_GROWTH = 0.1, 350e6, 0.02
 
 NODE_EXAMPLES = """\
   gp-ground-seg node
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud
   gp-ground-seg node --ros-args -p label.ground_tolerance:=0.15 --params-file my.yaml
-"""
-BENCH_DESCRIPTION = """\
-Start the node in a second process and send it clouds through ROS: at several rates, to
-see what is lost and how late the results are back, then one by one, to see what memory it
-takes and whether that grows. Both processes have a ROS domain of their own. Let nothing
-else run meanwhile: sender and receiver share the machine with the node.
-
-DATA is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag;
-without it, simulated scans of an HDL-64E. What follows --ros-args goes to the node.
-"""
-BENCH_EXAMPLES = """\
-  gp-ground-seg node-bench
-  gp-ground-seg node-bench KITTI_ROOT --json node.json
-  gp-ground-seg node-bench drive.mcap --rates 10 --frames 100 --memory-frames 0
-  gp-ground-seg node-bench KITTI_ROOT --ros-args -p learning.mode:=fixed
-
-exit code: 0, 1 if a goal of the table is missed, 2 for an error, 130 when interrupted
 """
 WARM_UP_DESCRIPTION = """\
 Compile beforehand what a robot, or an image for one, would compile at its first start: the
@@ -70,31 +36,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     parser = options.new_parser(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES)
     parser.set_defaults(run=run_warm_up)
-
-    parser = options.new_parser(subparsers, 'node-bench', BENCH_DESCRIPTION, BENCH_EXAMPLES)
-    number: dict[str, Any] = {'metavar': 'N', 'type': partial(options.positive, least=FEWEST)}
-    options.add(
-        parser,
-        ('data', 'scans or a bag', {'metavar': 'DATA', 'nargs': '?'}),
-        ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
-        ('--clouds', 'different clouds, sent over and over (default: %(default)s)',
-         {**number, 'default': 30}),
-        ('--rates', 'clouds per second, one after the other (default: %(default)s)',
-         {'metavar': 'LIST', 'type': _rates, 'default': '10,20,50'}),
-        ('--frames', 'clouds sent at each rate (default: %(default)s)',
-         {**number, 'default': 600}),
-        ('--memory-frames', 'clouds sent one by one; 0 = leave memory out (default: %(default)s)',
-         {'metavar': 'N', 'type': int, 'default': 2000}),
-        *options.SCAN_LAYOUT,
-        options.TO_JSON,
-        options.FORCE,
-        options.QUIET,
-    )  # fmt: skip
-    parser.set_defaults(run=run_bench, accepts_ros_args=True)
-
-
-def _rates(text: str) -> list[float]:
-    return [options.above_zero(word) for word in text.split(',')]
 
 
 def start(words: Sequence[str]) -> int:
@@ -131,147 +72,3 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
         raise GroundSegError('compiled code is not kept on disk, see the note above')
     print(f'compiled code is kept in {folder}; it was there after {seconds:.1f} s')
     return 0
-
-
-def run_bench(arguments: argparse.Namespace) -> int:
-    """Measure, print the table."""
-    from gp_ground_seg.cli.evaluate import staged_options
-    from gp_ground_seg.evaluation.report import describe_environment, write_json
-
-    n_memory = arguments.memory_frames
-    if n_memory and n_memory < FEWEST:
-        raise DataError(f'--memory-frames {n_memory}: must be 0 or at least {FEWEST}')
-    clouds = _load_clouds(arguments)
-    with staged_options(arguments, 'json') as parts:
-        rates, memory = _measure(arguments, clouds)
-        document = {
-            'source': {
-                'data': arguments.data or 'simulated HDL-64E',
-                'n_clouds': len(clouds),
-                'mean_points': sum(cloud.width for cloud in clouds) / len(clouds),
-                'mean_bytes': sum(len(cloud.data) for cloud in clouds) / len(clouds),
-                'node_arguments': arguments.ros_args[1:],
-            },
-            'rates': rates,
-            'memory': memory or None,
-            'environment': describe_environment(),
-        }
-        if 'json' in parts:
-            write_json(document, parts['json'])
-    goals = {f'{rate["asked"]:g} Hz': rate['goals'] for rate in rates}
-    goals['memory'] = memory.get('goals', {})
-    missed = [f'{where}: {goal}' for where, own in goals.items() for goal in own if not own[goal]]
-    print(_text(document, missed))
-    return 1 if missed else 0
-
-
-def _load_clouds(arguments: argparse.Namespace) -> list[CloudMessage]:
-    """Return the clouds to send, x, y, z and intensity as float32."""
-    from gp_ground_seg.cli.bags import scan_cloud
-    from gp_ground_seg.cli.bench import frames_from_options
-    from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
-
-    if arguments.data is not None:
-        points = [frame.points for frame in frames_from_options(arguments, arguments.clouds)]
-    elif arguments.topic is not None:
-        raise DataError(f'--topic {arguments.topic}: goes with a bag')
-    else:
-        options.refuse_scan_layout(arguments, 'a simulated one')
-        points = [scan for scan, _, _ in simulated_drive(min(arguments.clouds, N_SIMULATED)).scans]
-    return [scan_cloud(scan, 0, FRAME_ID) for scan in points]
-
-
-def _measure(
-    arguments: argparse.Namespace, different: Sequence[CloudMessage]
-) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return the results at each rate, and those of memory, if wanted."""
-    from gp_ground_seg.ros import probe as probing
-
-    quiet, words = arguments.quiet, arguments.ros_args[1:]
-    n, n_memory = arguments.frames, arguments.memory_frames
-    stamped = probing.restamped(different, 1_700_000_000)
-    with (
-        needing_ros('node-bench'),
-        probing.probe_session('node_bench') as (session, own),
-        tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
-        probing.NodeProcess(
-            Path(folder, 'log'), [*own, *words], session.holding_back, Path(folder)
-        ) as node,
-    ):
-        probe = probing.Probe(session, lambda *_: None)
-        if not quiet:
-            options.note('waiting for the node; it compiles when it runs the first time')
-        probe.connect(node)
-        rates = []
-        for rate in arguments.rates:
-            _, dropped_before = probe.counters()
-            with options.progress(f'{rate:g} Hz', quiet=quiet)(total=n) as bar:
-                trips = probe.paced(itertools.islice(stamped, n), rate, bar.update)
-            _, dropped = probe.counters()
-            found = probing.rate_result(rate, trips, dropped - dropped_before)
-            rates.append({**found, 'goals': _rate_goals(found)})
-        node.check()
-        resident: list[int] = []
-
-        def watch(trip: Trip) -> None:
-            if trip.back is None:
-                node.check()
-                raise GroundSegError(f'no answer to a cloud; the node said:\n{node.log_tail()}')
-            resident.append(probing.memory(node.pid)[0])
-
-        clouds = itertools.islice(stamped, n_memory)
-        probe.one_by_one(options.progress('memory', quiet=quiet)(clouds, total=n_memory), watch)
-        if not n_memory:
-            return rates, {}
-        memory = probing.memory_result(resident, probing.memory(node.pid)[1])
-        goals = {
-            f'peak below {MAX_PEAK / 1e6:.0f} MB': memory['peak'] < MAX_PEAK,
-            f'growth at most {MAX_GROWTH:.0%}': memory['growth'] <= MAX_GROWTH,
-        }
-        return rates, {**memory, 'goals': goals}
-
-
-def _rate_goals(rate: dict[str, Any]) -> dict[str, bool]:
-    goals = {
-        'newest cloud back': rate['is_newest_back'],
-        'losses reported': rate['is_accounted'],
-        'latency bounded': rate['is_bounded'],
-    }
-    if rate['asked'] <= LOSSLESS_RATE:
-        goals['nothing lost'] = rate['n_lost'] == 0
-    if rate['asked'] <= PUNCTUAL_RATE:
-        goals[f'p99 at most {1e3 * MAX_P99:.0f} ms'] = rate['p99'] <= MAX_P99
-    return goals
-
-
-def _text(document: dict[str, Any], missed: Sequence[str]) -> str:
-    from gp_ground_seg.evaluation.report import Column, Table
-
-    columns = {
-        'asked': Column('Rate [Hz]', 'g'),
-        'sent': Column('sent [Hz]', '.2f'),
-        'n_sent': Column('sent', 'd'),
-        'n_back': Column('back', 'd'),
-        'n_lost': Column('lost', 'd'),
-        'n_dropped': Column('reported', 'd'),
-        'p50': Column('p50 [ms]', '.1f', scale=1e3),
-        'p95': Column('p95', '.1f', scale=1e3),
-        'p99': Column('p99', '.1f', scale=1e3),
-        'worst': Column('worst', '.1f', scale=1e3),
-    }
-    rows = [[rate[key] for key in columns] for rate in document['rates']]
-    source, environment, memory = (document[k] for k in ('source', 'environment', 'memory'))
-    parts = [
-        f'{source["data"]}: {options.count(source["n_clouds"], "cloud")} of '
-        f'{source["mean_points"]:.0f} points, {source["mean_bytes"] / 1e6:.2f} MB, on average\n'
-        f'{environment["cpu"]}, {environment["n_cores"]} cores',
-        Table(list(columns.values()), rows).text(),
-    ]
-    if memory:
-        parts.append(
-            f'Memory over {memory["n_clouds"]} clouds: {memory["start"] / 1e6:.1f} MB near the '
-            f'start, {memory["end"] / 1e6:.1f} MB at the end ({memory["growth"]:+.2%}); '
-            f'peak {memory["peak"] / 1e6:.1f} MB'
-        )
-    parts.append('Goals missed: ' + '; '.join(missed) if missed else 'All goals met.')
-    return '\n\n'.join(parts)

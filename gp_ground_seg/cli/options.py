@@ -7,7 +7,7 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,16 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from gp_ground_seg.data.atomic_output import leftovers
+from gp_ground_seg import log
+from gp_ground_seg.data.atomic_output import leftovers, staged_file
+from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
 from gp_ground_seg.errors import ConfigError, DataError
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.export import differences, yaml_scalar
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.parameters.schema import load_yaml
+from gp_ground_seg.scale.cluster import Runner, open_runner
 
 DEFAULT_PRESET = 'default'
 FLAG = {'action': 'store_true'}
@@ -71,11 +75,34 @@ SCAN_LAYOUT: tuple[tuple[str, str, dict[str, Any]], ...] = (
 """Options of every command that reads ``.bin`` scans; it takes `FORCE` as well."""
 
 
+CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ('--topic', 'PointCloud2 topic of a bag (default: the only one)', {'metavar': 'T'}),
+    ('--origin', 'place of the sensor in clouds in the coordinates of a map [m]',
+     {'metavar': ('X', 'Y', 'Z'), 'nargs': 3, 'type': float}),
+    *SCAN_LAYOUT,
+)  # fmt: skip
+"""Options of every command that reads clouds of any format; it takes `FORCE` as well."""
+
+
+def list_clouds(arguments: argparse.Namespace) -> Inputs:
+    """Return the clouds of the input; DataError if ``--frame`` is none of them."""
+    found = list_inputs(arguments.input, scan_layout(arguments), arguments.topic)
+    if found.topic is not None or not any(one.path.suffix == '.bin' for one in found):
+        refuse_scan_layout(arguments, arguments.input)
+    frame = getattr(arguments, 'frame', None)
+    if frame is not None and not 0 <= frame < len(found):
+        raise DataError(f'--frame {frame}: must be 0 to {len(found) - 1} here')
+    return found
+
+
 def scan_layout(arguments: argparse.Namespace) -> ScanLayout:
-    """Return the layout of ``.bin`` scans; what can be no scan is refused, without ``--force``."""
+    """Return how scans are read; what can be no scan is refused, without ``--force``."""
     doubts = 'warn' if arguments.force else 'raise'
     columns, dtype = arguments.columns or KITTI.columns, arguments.dtype or KITTI.dtype
-    return ScanLayout(columns, dtype, doubts)
+    origin = getattr(arguments, 'origin', None)
+    if origin is not None and not all(map(math.isfinite, origin)):
+        raise DataError(f'--origin {" ".join(map(str, origin))}: must be three finite numbers')
+    return ScanLayout(columns, dtype, doubts, origin and tuple(origin))
 
 
 def refuse_scan_layout(arguments: argparse.Namespace, source: object) -> None:
@@ -85,15 +112,35 @@ def refuse_scan_layout(arguments: argparse.Namespace, source: object) -> None:
             raise DataError(f'--{name}: is for .bin scans, which {source} is not')
 
 
-def above_zero(text: str, or_zero: bool = False) -> float:
+def add_cluster(parser: argparse._ActionsContainer) -> None:
+    """Add ``--workers N`` and ``--scheduler ADDRESS``."""
+    add(
+        parser,
+        ('--workers', 'compute in N processes, with Dask', NUMBER),
+        ('--scheduler', 'compute on the Dask cluster of this scheduler, as in tcp://HOST:8786',
+         {'metavar': 'ADDRESS'}),
+    )  # fmt: skip
+
+
+def runner(
+    arguments: argparse.Namespace, title: str, unit: str = 'frame'
+) -> AbstractContextManager[Runner]:
+    """Return what computes blocks of frames by the options of `add_cluster`, with a bar."""
+    workers, scheduler = arguments.workers, arguments.scheduler
+    if workers and scheduler:
+        raise DataError('--workers: the cluster of --scheduler has its own, give one of the two')
+    bar = progress(title, quiet=getattr(arguments, 'quiet', False), unit=unit)
+    return open_runner(workers, scheduler, bar)
+
+
+def above_zero(text: str) -> float:
     """Read a number above 0."""
     try:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not (math.isfinite(number) and (number > 0.0 or (or_zero and number == 0.0))):
-        wanted = 'at least' if or_zero else 'above'
-        raise argparse.ArgumentTypeError(f'{text!r}: must be a number, {wanted} 0')
+    if not (math.isfinite(number) and number > 0.0):
+        raise argparse.ArgumentTypeError(f'{text!r}: must be a number, above 0')
     return number
 
 
@@ -133,6 +180,19 @@ def read_config(arguments: argparse.Namespace) -> Config:
     return config.replace(**dict(parse_setting(setting) for setting in arguments.settings))
 
 
+def named_config(name: str) -> Config:
+    """Return the parameters of a preset, or of a file."""
+    return PRESETS[name].config if name in PRESETS else Config.from_yaml(name)
+
+
+def changed_lines(first: Config, second: Config) -> list[str]:
+    """Return a line for each parameter that differs, as in ``grid.n_bins: 80 -> 120``."""
+    return [
+        f'{spec.name}: {yaml_scalar(before)} -> {yaml_scalar(after)} {spec.unit}'.rstrip()
+        for spec, before, after in differences(first, second)
+    ]
+
+
 def parse_setting(setting: str) -> tuple[str, Any]:
     """Split ``NAME=VALUE``; the parameter's own checks come with `Config.replace`."""
     name, separator, text = setting.partition('=')
@@ -149,23 +209,20 @@ def note(message: str) -> None:
     print(f'gp-ground-seg: note: {message}', file=sys.stderr)
 
 
-class _NoteHandler(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        note(record.getMessage())
+def library_notes(level: int = logging.INFO) -> AbstractContextManager[None]:
+    """Print what the library logs, such as that it compiles, as notes within the block."""
+    return log.told(lambda _, text: note(text), level)
 
 
 @contextmanager
-def library_notes(level: int = logging.INFO) -> Iterator[None]:
-    """Print what the library logs, such as that it compiles, as notes within the block."""
-    logger = logging.getLogger('gp_ground_seg')
-    handler, before = _NoteHandler(), logger.level
-    logger.addHandler(handler)
-    logger.setLevel(level)
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(before)
+def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[str, Path]]:
+    """Yield a path for each of the options given; the files appear when the block ends well."""
+    with ExitStack() as stack:
+        yield {
+            name: stack.enter_context(staged_file(path, force=arguments.force))
+            for name in names
+            if (path := getattr(arguments, name)) is not None
+        }
 
 
 def note_leftovers(target: Path) -> None:

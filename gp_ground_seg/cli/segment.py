@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
-import statistics
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from gp_ground_seg.cli import options
+from gp_ground_seg.cli import dataset, options
+from gp_ground_seg.cli.cloud_output import FORMATS, CloudOutput, encode_labels
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
-from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE, is_bag
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.files import AnyPath, as_path, write_file
+from gp_ground_seg.data.inputs import Input, Inputs, holds_bag
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
-from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.frame import Label
-from gp_ground_seg.pipeline.sensor_pose import SensorPose
+from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.result import Segmentation
+from gp_ground_seg.scale.cluster import Progress
+from gp_ground_seg.scale.dataset import Outcome, Scan, pool, segment_block
 from gp_ground_seg.segmenter import GroundSegmenter
 
 DESCRIPTION = """\
@@ -30,14 +30,20 @@ Split scans into ground and obstacles.
 
 INPUT is one of:
   scan.bin             a scan as KITTI's: float32 x, y, z, intensity; --columns, --dtype: another
-  folder               of .bin files, or a sequence with velodyne/ in it
+  .pcd .ply .las .laz .npy .npz, and .pcd.bin of nuScenes
+  folder               of such files, or a sequence with velodyne/ in it
   drive.bag            a ROS 1 bag
   drive.mcap, .db3     a single-file rosbag2
   folder               of a rosbag2 (with metadata.yaml)
+  KITTI_ROOT           with sequences/00/velodyne/ and so on in it; several bags; s3://...
 
-Scans give .label files in SemanticKITTI's form, one uint32 per point in input
+Scans .bin give .label files in SemanticKITTI's form, one uint32 per point in input
 order: 40 (road) = ground, 99 (other-object) = obstacle, 0 (unlabelled) = unknown,
 which are the points that are not finite. With --raw: 1, 2 and 0.
+
+Other formats give their own, the name of OUT or --format another: every field of the
+input, and label (0 unknown, 1 ground, 2 obstacle; LAS: classification 2 ground),
+height, ground_z, ground_std [m], p_ground (docs/datasets.md).
 
 A bag gives a rosbag2 with all messages of the input as they are, and after each
 point cloud its ground and its obstacles: every field of every point bit for bit,
@@ -49,33 +55,25 @@ with what they look like; with --force they are taken.
 
 Nothing is overwritten without --force. Output is written under a hidden name
 (.NAME.partial-...) and takes its name when it is complete.
+
+Of a KITTI_ROOT, several bags, a URL, and with --workers or --resume each file appears
+when it is complete, and OUT/manifest.jsonl has a line for each block of files; --resume
+leaves out what is in it. Labels are the same (docs/datasets.md).
 """
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
-  gp-ground-seg segment nuscenes/samples/LIDAR_TOP -o labels --columns 5
+  gp-ground-seg segment scan.pcd -o scan.laz --surface
+  gp-ground-seg segment drive.mcap --format ply --split     files for each cloud
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
-"""
-
-POSE_DESCRIPTION = """\
-Estimate from scans how high the sensor is and how it is tilted.
-
-INPUT is a .bin scan (float32 x, y, z, intensity; else --columns, --dtype), a folder of
-them, or a sequence with velodyne/ in it. Each scan is judged by itself. Support is the
-share of the low points on the plane that was found, residual their distance to it.
-With enough scans of level ground the medians are values to set: docs/pose.md.
-"""
-POSE_EXAMPLES = """\
-  gp-ground-seg pose 000000.bin
-  gp-ground-seg pose KITTI_ROOT/sequences/00
-  gp-ground-seg pose scans --set sensor.height=1.2      does it agree?
+  gp-ground-seg segment KITTI_ROOT -o OUT --workers 8 --resume
+  gp-ground-seg segment s3://bucket/kitti -o s3://bucket/labels --scheduler tcp://host:8786
 """
 
 GROUND_TOPIC, OBSTACLES_TOPIC = '/ground', '/obstacles'
-FOR_BAGS = ('topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
-# Unlabelled, road and other-object.
-SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
+FOR_BAGS = ('ground_topic', 'obstacles_topic', 'drop')
+FOR_SCANS = ('raw', 'split', 'surface', 'origin')
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
@@ -84,144 +82,161 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
     options.add(
         parser,
-        ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
-        ('-o --output', 'for scans a folder, or a .label file for a single scan; for bags a '
-         'folder, or a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
+        ('input', 'scan, folder of scans, bag, or a root or URL', {'metavar': 'INPUT'}),
+        ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*'}),
+        ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
+         'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
          {'metavar': 'OUT'}),
+        ('--resume', 'go on with OUT, whose finished blocks are in its manifest', options.FLAG),
         options.FORCE,
         options.QUIET,
     )  # fmt: skip
+    options.add_cluster(parser)
     options.add_config(parser)
-    raw = ('--raw', 'write 0 unknown, 1 ground, 2 obstacle as labels', options.FLAG)
-    options.add(parser.add_argument_group('for scans'), *options.SCAN_LAYOUT, raw)
+    options.add(
+        parser.add_argument_group('for scans'),
+        ('--raw', 'write 0 unknown, 1 ground, 2 obstacle as labels', options.FLAG),
+        ('--split', 'write ground and obstacles apart, as OUT_ground and OUT_obstacles',
+         options.FLAG),
+        ('--surface', 'write the ground as a grid as well, as OUT_surface.npz', options.FLAG),
+    )  # fmt: skip
     topic, several = {'metavar': 'T'}, {'metavar': 'T', 'action': 'append', 'default': []}
+    formats = (*FORMATS, *SUFFIX_OF_STORAGE)
+    options.add(
+        parser,
+        ('--format', 'of the output (default: by the name of OUT, else labels of .bin scans, and '
+         f'as the input; mcap for ROS 1): {", ".join(formats)}',
+         {'choices': formats, 'metavar': 'FORMAT'}),
+        *options.CLOUDS,
+    )  # fmt: skip
     options.add(
         parser.add_argument_group('for bags'),
-        ('--topic', 'PointCloud2 topic (default: the only one there is)', topic),
         ('--ground-topic', f'topic of the ground (default: {GROUND_TOPIC})', topic),
         ('--obstacles-topic', f'topic of the obstacles (default: {OBSTACLES_TOPIC})', topic),
         ('--drop', 'leave this topic out of the output (may be repeated)', several),
-        ('--format', 'storage of the output (default: by its name, else as the input; mcap for '
-         'ROS 1)', {'choices': SUFFIX_OF_STORAGE}),
-    )  # fmt: skip
-    parser.set_defaults(run=run)
-
-    parser = options.new_parser(subparsers, 'pose', POSE_DESCRIPTION, POSE_EXAMPLES)
-    options.add(
-        parser,
-        ('input', 'scan, or folder of scans', {'metavar': 'INPUT'}),
-        *options.SCAN_LAYOUT,
-        options.FORCE,
     )
-    options.add_config(parser)
-    parser.set_defaults(run=run_pose)
+    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
     config = options.read_config(arguments)
     source = Path(arguments.input)
-    holds_bag = is_bag(source)
-    if source.is_dir() and not any(source.glob('*.bin')):
-        # A folder of bag files and no scans: `BagReader` says what is missing there.
-        holds_bag |= any(child.suffix in BAG_SUFFIXES for child in source.iterdir())
-    scans = [] if holds_bag else find_scans(source)
-    kind, foreign = ('scans', ['raw']) if holds_bag else ('bags', FOR_BAGS)
+    is_bag = '://' not in arguments.input and holds_bag(source)
+    gives_bag = is_bag and arguments.format not in FORMATS
+    kind, foreign = ('scans', FOR_SCANS) if gives_bag else ('bags', FOR_BAGS)
+    if not (is_bag or arguments.format in FORMATS):
+        foreign = (*foreign, 'topic', 'format')
     for name in foreign:
         if getattr(arguments, name):
             option = name.replace('_', '-')
             raise DataError(f'--{option}: is for {kind}, which {source} is not')
-    if holds_bag:
+    if is_bag:
         options.refuse_scan_layout(arguments, source)
-    target = Path(arguments.output) if arguments.output else _default_output(source)
-    n_points = n_ground = 0
-    seconds = []
+    if dataset.is_dataset(arguments):
+        _segment_dataset(arguments, config, is_bag)
+        return 0
+    target = Path(arguments.output or _default_output(source, arguments.format))
     with closing(GroundSegmenter(config)) as segmenter:
-        if holds_bag:
-            results = _segment_bag(target, arguments, segmenter)
-        else:
-            results = _segment_scans(scans, target, arguments, segmenter)
-        for result in results:
-            n_points += len(result.label)
-            n_ground += int((result.label == Label.GROUND).sum())
-            seconds.append(result.timings['total'])
-    share = f'{n_ground / n_points:.1%} ground' if n_points else 'no ground'
-    pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms'
-    pace += ' per frame (median' if len(seconds) > 1 else ' for the first frame (with loading code'
-    print(
-        f'{options.count(len(seconds), "frame")}, {options.count(n_points, "point")}, {share}, '
-        f'{pace}, segmentation only), written to {target}'
-    )
+        segment = _segment_bag if gives_bag else _segment_scans
+        dataset.print_summary(Outcome.of(segment(target, arguments, segmenter)), target)
     return 0
 
 
-def _default_output(source: Path) -> Path:
+def _segment_dataset(arguments: argparse.Namespace, config: Config, is_bag: bool) -> None:
+    """Segment a whole data set, or several bags, into a folder."""
+    if arguments.output is None and '://' in arguments.input:
+        raise DataError(f'{arguments.input}: give the folder for the output, -o OUT')
+    target = as_path(arguments.output or _default_output(Path(arguments.input)))
+    for name in ('format', 'split', 'surface'):
+        if getattr(arguments, name) not in (None, False, *SUFFIX_OF_STORAGE):
+            raise DataError(f'--{name}: whole data sets give .label files and bags')
+    if is_bag or arguments.more:
+        if not isinstance(target, Path):
+            raise DataError(f'{target}: bags are written to folders of this machine')
+        bags = dataset.list_bags(arguments, lambda path: _default_output(path).name)
+        dataset.run(arguments, config, target, bags, partial(_segment_bags, arguments, target))
+        return
+    scans, write = dataset.list_scans(arguments), partial(_write_labels, arguments.raw)
+    dataset.run(arguments, config, target, scans, partial(segment_block, write, target))
+
+
+def _segment_bags(
+    arguments: argparse.Namespace,
+    target: Path,
+    config: Config,
+    bags: Sequence[Scan],
+    progress: Progress,
+) -> Outcome:
+    """Segment bags, each into one in the folder `target`."""
+    outcomes = []
+    for bag in progress(bags):
+        given = {'input': str(bag.path), 'quiet': True, 'force': True}
+        own = argparse.Namespace(**{**vars(arguments), **given})
+        with closing(GroundSegmenter(config)) as segmenter:
+            outcomes.append(Outcome.of(_segment_bag(target / bag.name, own, segmenter)))
+    return pool(outcomes)
+
+
+def _write_labels(raw: bool, path: AnyPath, result: Segmentation) -> None:
+    write_file(path, encode_labels(result, raw))
+
+
+def _default_output(source: Path, form: str | None = None) -> Path:
     """Beside the input: a file for a single-file rosbag2, else a folder."""
     named = source if source.name not in ('', '..') else source.resolve()
     if named.is_dir():
         return named.with_name(f'{named.name}_ground')
     suffix = '' if named.suffix in ('.bag', '.bin') else named.suffix
+    if form in FORMATS:
+        suffix = '' if named.suffix in BAG_SUFFIXES else f'.{form}'
     return named.with_name(f'{named.stem}_ground{suffix}')
 
 
-def find_scans(source: Path) -> list[Path]:
-    """Return the .bin files of a file, folder, sequence or KITTI raw drive, or raise DataError."""
-    if not source.exists():
-        raise DataError(f'{source}: no such file or folder')
-    if source.is_file():
-        if source.suffix != '.bin':
-            raise DataError(
-                f'{source}: not a scan or bag; accepted are .bin, .bag, .mcap and .db3 files, '
-                'folders of .bin files and rosbag2 folders'
-            )
-        return [source]
-    for name in ('.', 'velodyne', 'velodyne_points/data'):
-        if scans := sorted((source / name).glob('*.bin')):
-            return scans
-    sequences = sorted(path.parent for path in source.glob('sequences/*/velodyne'))
-    hint = ''
-    if sequences:
-        names = ', '.join(path.name for path in sequences)
-        hint = f'; give one of its sequences ({names}), as in {sequences[0]}'
-    raise DataError(f'{source}: no .bin file in it, and not a rosbag2 folder{hint}')
-
-
 def _segment_scans(
-    scans: Sequence[Path], target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
+    target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
 ) -> Iterator[Segmentation]:
-    """Write one label file per scan; yield what each holds."""
-    codes = sorted(Label) if arguments.raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
-    code, layout = np.array(codes, dtype='<u4'), options.scan_layout(arguments)
+    """Write the files of each scan; yield what each holds."""
+    scans = options.list_clouds(arguments)
+    is_file = target.suffix[1:] in FORMATS
+    has_several = scans.topic or Path(arguments.input).is_dir()
+    if is_file and has_several:
+        raise DataError(f'{target}: must be a folder, {arguments.input} has several scans')
+    if target.suffix and not (is_file or has_several or target.is_dir()):
+        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
+    form = target.suffix[1:] if is_file else arguments.format
+    if arguments.format not in (None, form):
+        raise DataError(f'{target}: ends in {target.suffix}, which is not {arguments.format}')
+    output = CloudOutput(form, arguments.raw, arguments.split, arguments.surface)
     if not arguments.quiet:
         options.note_leftovers(target)
     with (
-        _label_files(scans, target, arguments) as label_paths,
+        _staged(scans, output, target, is_file, arguments.force) as paths,
         options.progress('segment', quiet=arguments.quiet)(total=len(scans)) as bar,
     ):
-        for scan, label_path in zip(scans, label_paths, strict=True):
-            try:
-                result = segmenter.segment(read_points(scan, layout))
-            except PointCloudError as error:
-                raise PointCloudError(f'{scan}: {error}') from error
-            label_path.write_bytes(code[result.label].tobytes())
-            yield result
+        for scan in scans:
+            yield output.write(scan, segmenter, paths(scan))
             bar.update()
 
 
 @contextmanager
-def _label_files(
-    scans: Sequence[Path], target: Path, arguments: argparse.Namespace
-) -> Iterator[list[Path]]:
-    """Yield where to write the labels of each scan; all take their names at the end."""
-    if target.suffix == '.label':
-        if Path(arguments.input).is_dir():
-            raise DataError(f'{target}: must be a folder, {arguments.input} is one')
-        with staged_file(target, force=arguments.force) as path:
-            yield [path]
-        return
-    names = [f'{scan.stem}.label' for scan in scans]
-    with staged_files(target, names, force=arguments.force) as folder:
-        yield [folder / name for name in names]
+def _staged(
+    scans: Inputs, output: CloudOutput, target: Path, is_file: bool, force: bool
+) -> Iterator[Callable[[Input], list[Path]]]:
+    """Yield what returns where to write the files of a scan; all take their names at the end."""
+    folder, stem = (target.parent, target.stem) if is_file else (target, None)
+    names = [name for scan in scans for name in output.names(scan, stem)]
+    inputs = {Path(str(scan.path)).resolve() for scan in scans}
+    for name in names:
+        if (folder / name).resolve() in inputs:
+            raise DataError(f'{folder / name}: is the input; name another output')
+    with ExitStack() as stack:
+        if is_file:
+            paths = [stack.enter_context(staged_file(folder / n, force=force)) for n in names]
+            yield lambda _: paths
+        else:
+            hidden = stack.enter_context(staged_files(folder, names, force=force))
+            yield lambda scan: [hidden / name for name in output.names(scan)]
 
 
 def _segment_bag(
@@ -287,64 +302,3 @@ def _check_output_topics(source: Path, topics: tuple[str, str], copied: list[str
             raise DataError(f'{source}: has a topic {name} already; {choices}')
     if topics[0] == topics[1]:
         raise DataError(f'--obstacles-topic {topics[1]}: is the topic of the ground as well')
-
-
-DEGREES = math.degrees(1.0)
-POSE_COLUMNS = (
-    Column('scan'),
-    Column('height [m]', '.2f'),
-    Column('roll [deg]', '+.2f', scale=DEGREES),
-    Column('pitch [deg]', '+.2f', scale=DEGREES),
-    percent('support [%]', form='.0f'),
-    Column('residual [m]', '.3f'),
-    Column('used as'),
-)
-
-
-def run_pose(arguments: argparse.Namespace) -> int:
-    """Print a line for each scan, and the medians."""
-    poses, rows, notes = [], [], []
-    layout = options.scan_layout(arguments)
-    with closing(GroundSegmenter(options.read_config(arguments))) as segmenter:
-        for scan in find_scans(Path(arguments.input)):
-            try:
-                pose = segmenter.estimate_pose(read_points(scan, layout))
-            except PointCloudError as error:
-                notes.append(f'{scan.name}: refused: {error}')
-                continue
-            poses.append(pose)
-            rows.append(_pose_row(scan.name, pose))
-            notes += [f'{scan.name}: {line}' for line in pose.contradictions]
-    if poses:
-        print(Table(POSE_COLUMNS, rows).text())
-        notes.insert(0, _pose_summary(poses))
-    print('\n'.join(notes))
-    return 0
-
-
-def _pose_row(name: str, pose: SensorPose) -> list[Cell]:
-    """Return what was measured, where the scan tells it, and the values used."""
-    used = f'height {pose.height:.2f}'
-    if not pose.height_estimated:
-        used = f'height {pose.height:g} (not measured)'
-    if not pose.is_level:
-        used += f', roll {math.degrees(pose.roll):.1f} pitch {math.degrees(pose.pitch):.1f}'
-    found = pose.measured
-    if found is None or not found.tells_height:
-        return [name, *5 * [None], used]
-    tilt = (found.roll, found.pitch) if found.tells_tilt else (None, None)
-    return [name, found.height, *tilt, found.plane.support, found.plane.residual, used]
-
-
-def _pose_summary(poses: list[SensorPose]) -> str:
-    """Return the medians over the scans that tell, as parameters."""
-    found = [pose.measured for pose in poses if pose.measured is not None]
-    heights = [one.height for one in found if one.tells_height]
-    tilts = [(one.roll, one.pitch) for one in found if one.tells_tilt]
-    if not heights:
-        return 'no scan shows enough ground to tell the height: set sensor.height'
-    words = f'median of {len(heights)}: sensor.height={statistics.median(heights):.2f}'
-    if tilts:
-        roll, pitch = map(statistics.median, zip(*tilts, strict=True))
-        words += f' sensor.roll={roll:.3f} sensor.pitch={pitch:.3f} [m, rad]'
-    return words

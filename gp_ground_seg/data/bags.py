@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -30,26 +29,16 @@ from gp_ground_seg.data.bag_files import (
     storage_of,
     writing,
 )
-from gp_ground_seg.errors import DataError, MissingDependencyError
+from gp_ground_seg.errors import DataError, require
 
 _HEADER = 'std_msgs/msg/Header'
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 
 
-def require_rosbags() -> None:
-    """Raise `MissingDependencyError`, with how to install it, unless rosbags can be imported."""
-    try:
-        importlib.import_module('rosbags.highlevel')
-    except ImportError as error:
-        raise MissingDependencyError(
-            f"bags need the package rosbags ({error}): pip install 'gp_ground_seg[bags]'"
-        ) from error
-
-
 @functools.cache
 def jazzy_types() -> Any:
     """Message types of ROS 2 Jazzy (``rosbags.typesys.store.Typestore``)."""
-    require_rosbags()
+    require('rosbags.highlevel', 'bags')
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -142,7 +131,7 @@ class BagReader(AbstractContextManager['BagReader']):
     """
 
     def __init__(self, path: str | Path) -> None:
-        require_rosbags()
+        require('rosbags.highlevel', 'bags')
         from rosbags import rosbag1, rosbag2
 
         self.path = Path(path)
@@ -287,7 +276,7 @@ class BagWriter:
     def __init__(
         self, path: str | Path, *, storage: str | None = None, force: bool = False
     ) -> None:
-        require_rosbags()
+        require('rosbags.highlevel', 'bags')
         self.path = Path(path)
         self.storage = resolve_storage(path, storage)
         self._force = force

@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.recfunctions import repack_fields
 
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, in_one_line
 from gp_ground_seg.data.bags import jazzy_types
@@ -66,6 +67,27 @@ def read_columns(cloud: CloudMessage, names: Sequence[str]) -> dict[str, npt.NDA
     """Values of the fields `names`, each (height, width), a copy in native byte order."""
     views = _views(cloud, names, _CODES).items()
     return {name: view.astype(view.dtype.newbyteorder('=')) for name, view in views}
+
+
+def read_fields(cloud: CloudMessage) -> npt.NDArray[np.void]:
+    """Every field of every point under its name, row by row, native byte order, (N,) structured.
+
+    A field of several numbers is a sub-array. Raises PointCloudError as `read_xyz`, and if any
+    field cannot be as it is described.
+    """
+    layout: Any = {'names': [], 'formats': [], 'offsets': [], 'itemsize': cloud.point_step}
+    try:
+        for field in cloud.fields:
+            layout['names'].append(field.name)
+            # Some old writers leave count at 0 and mean 1.
+            shape = () if field.count < 2 else (field.count,)
+            layout['formats'].append((_code(cloud, field.datatype), shape))
+            layout['offsets'].append(field.offset)
+        dtype = np.dtype(layout)
+    except (KeyError, ValueError) as error:
+        raise PointCloudError(f'point cloud: fields: {in_one_line(error)}') from error
+    points = _view(cloud, dtype).reshape(-1)
+    return points.astype(repack_fields(dtype.newbyteorder('=')))
 
 
 def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
@@ -158,7 +180,7 @@ def _check_field(field: Any, accepted: Collection[int], point_step: int) -> None
         raise PointCloudError(f'point cloud: field {field.name} {problem}')
 
 
-def _view(cloud: CloudMessage, code: str, offset: int = 0) -> npt.NDArray[Any]:
+def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDArray[Any]:
     """Type `code` at an offset within each point, (height, width); checks that all points fit."""
     height, width = cloud.height, cloud.width
     point_step, row_step, row_bytes = cloud.point_step, cloud.row_step, width * cloud.point_step

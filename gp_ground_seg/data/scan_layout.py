@@ -15,6 +15,7 @@ from gp_ground_seg.parameters.config import find_spec
 
 DTYPES = ('float32', 'float64')
 MIN_COLUMNS = 3
+MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dense scan
 MAX_RANGE = find_spec('grid.r_max').maximum or 0.0  # what lies beyond is never segmented [m]
 
 _Numbers = npt.NDArray[np.floating]
@@ -40,11 +41,13 @@ class ScanLayout:
     dtype : ``'float32'`` or ``'float64'``, little-endian
     doubts : what to do where the numbers cannot be points so read: ``'ignore'``, ``'warn'`` or
         ``'raise'``
+    origin : place of the sensor in the coordinates of the file [m], by default their origin
     """
 
     columns: int = 4
     dtype: str = 'float32'
     doubts: str = 'ignore'
+    origin: tuple[float, float, float] | None = None
 
     @property
     def bytes_per_point(self) -> int:
@@ -79,7 +82,7 @@ def find_doubt(data: bytes, layout: ScanLayout) -> str:
         return 'begins as a bag does; `segment` and `bench` read bags'
     points = layout.view(data)
     with np.errstate(all='ignore'):
-        problem = _objection(points) or _column_objection(points)
+        problem = _objection(points) or _double_objection(points) or _column_objection(points)
         if not problem and len(data) % layout.bytes_per_point == 0:
             return ''
         other = _likely_layout(data, layout)
@@ -114,8 +117,24 @@ def _objection(points: _Numbers) -> str:
     middle = _middle(size)
     if middle > MAX_RANGE:
         return f'half of the points are farther than {middle:.0f} m'
+    return ''
+
+
+def find_objection(xyz: _Numbers) -> str:
+    """Return why points of known type (N, 3) can be no scan, and what they look like, or ''."""
+    with np.errstate(all='ignore'):
+        problem = _objection(xyz)
+        near = _sample(xyz)
+        centre = np.median(near, axis=0) if len(near) else np.zeros(3)
+        if problem and np.hypot(*centre[:2]) > MAX_RANGE > _middle(near - centre):
+            place = ', '.join(f'{number:.1f}' for number in centre)
+            return f'{problem}, about {place}; --origin X Y Z says where the sensor was'
+        return '; '.join(part for part in (problem, problem and _guess(xyz)) if part)
+
+
+def _double_objection(points: _Numbers) -> str:
     # The lower halves of doubles are no float32 that can be measured.
-    if points.dtype.itemsize == 8 and not _objection(points.view('<f4')):
+    if points.itemsize == 8 and len(points) >= _MIN_POINTS and not _objection(points.view('<f4')):
         return 'halves of its numbers are coordinates by themselves'
     return ''
 
@@ -180,7 +199,8 @@ def _likely_layout(data: bytes, layout: ScanLayout) -> ScanLayout | None:
         other = ScanLayout(_fewest(spreads) if spreads else layout.columns, dtype)
         is_whole = len(data) % other.bytes_per_point == 0
         is_other = str(other) != str(layout)
-        if is_other and is_whole and not _objection(other.view(data)):
+        points = other.view(data)
+        if is_other and is_whole and not (_objection(points) or _double_objection(points)):
             return other
     return None
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 import logging
 import math
 import os
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, find_doubt
+from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
+from gp_ground_seg.data.scan_layout import KITTI, MAX_SCAN_BYTES, ScanLayout, find_doubt
 from gp_ground_seg.errors import DataError
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
-MAX_SCAN_BYTES = 1 << 30  # of a .bin file: 67 million points, a hundred times a dense scan
 _MAX_TIMES_BYTES = 1 << 24
 
 
@@ -26,39 +26,95 @@ class Frame:
 
     sequence: str  # name of the sequence folder
     index: str  # name of the file without its ending
-    points_path: Path  # the ``.bin`` file
-    labels_path: Path | None  # the ``.label`` file, if there is one
+    points_path: AnyPath  # the ``.bin`` file
+    labels_path: AnyPath | None  # the ``.label`` file, if there is one
     time: float  # since the start of the sequence [s]
     layout: ScanLayout = KITTI  # of the ``.bin`` file
 
+    def __str__(self) -> str:
+        """Sequence and index."""
+        return f'{self.sequence}/{self.index}'
 
-def list_sequences(root: str | Path) -> list[str]:
+
+def list_sequences(root: str | AnyPath) -> list[str]:
     """Names of the sequences below ``root/sequences``; raises DataError if there is none."""
-    folder = Path(root) / 'sequences'
+    place = as_path(root)
+    if isinstance(place, UrlPath) and not place.exists():
+        raise DataError(f'{root}: no such file or folder')
+    folder = place / 'sequences'
     names = sorted(path.parent.name for path in folder.glob('*/velodyne') if path.is_dir())
     if not names:
         raise DataError(f'{root}: no sequences/*/velodyne folder below it (SemanticKITTI layout)')
     return names
 
 
-def list_frames(root: str | Path, sequence: str, layout: ScanLayout = KITTI) -> list[Frame]:
+def list_frames(root: str | AnyPath, sequence: str, layout: ScanLayout = KITTI) -> list[Frame]:
     """Frames of one sequence, in order; DataError if there are none, or times.txt does not fit."""
-    folder = Path(root) / 'sequences' / sequence
+    folder = as_path(root) / 'sequences' / sequence
     if not (folder / 'velodyne').is_dir():
         known = ', '.join(list_sequences(root))
         raise DataError(f'{folder}: no velodyne folder in it; sequences here: {known}')
-    paths = sorted((folder / 'velodyne').glob('*.bin'))
+    paths: list[AnyPath] = sorted((folder / 'velodyne').glob('*.bin'), key=str)
     if not paths:
         raise DataError(f'{folder / "velodyne"}: no .bin file in it')
+    # One listing, as each question takes a store of objects 20 ms.
+    labels = {path.stem: path for path in (folder / 'labels').glob('*.label')}
     frames = []
     for path, time in zip(paths, _read_times(folder / 'times.txt', paths), strict=True):
-        labels = folder / 'labels' / f'{path.stem}.label'
-        own = labels if labels.exists() else None
-        frames.append(Frame(sequence, path.stem, path, own, time, layout))
+        frames.append(Frame(sequence, path.stem, path, labels.get(path.stem), time, layout))
     return frames
 
 
-def _read_times(path: Path, frames: list[Path]) -> list[float]:
+def labelled_frames(
+    root: str | AnyPath, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
+) -> list[Frame]:
+    """Frames of the named sequences, or of all that have labels, in order.
+
+    Sequences of SemanticKITTI's test set have none; a note says which are left out. Raises
+    DataError if a sequence is not there, a named one or a single frame has no labels, or all.
+    """
+    known = list_sequences(root)
+    frames, left_out = [], []
+    for name in _chosen(root, sequences):
+        own = list_frames(root, name, layout)
+        bare = [frame.index for frame in own if frame.labels_path is None]
+        if sequences is None and len(bare) == len(own):
+            left_out.append(name)
+            continue
+        if bare:
+            raise DataError(f'{root}: frames of sequence {name} have no labels, as {bare[0]}')
+        frames += own
+    if not frames:
+        raise DataError(f'{root}: no sequence has labels, of {", ".join(known)}')
+    if left_out:
+        _LOGGER.info('sequences without labels left out: %s', ', '.join(left_out))
+    return frames
+
+
+def _chosen(root: str | AnyPath, sequences: Sequence[str] | None) -> list[str]:
+    """Sequences below `root` that are named, or all; raises DataError if one is not there."""
+    known = list_sequences(root)
+    chosen = list(dict.fromkeys(known if sequences is None else sequences))
+    unknown = [name for name in chosen if name not in known]
+    if unknown or not chosen:
+        problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
+        raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
+    return chosen
+
+
+def boxed_frames(
+    root: str | AnyPath, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
+) -> list[Frame]:
+    """Frames of the named sequences, or of all; labels count where each frame has some."""
+    found = [one for name in _chosen(root, sequences) for one in list_frames(root, name, layout)]
+    n_bare = sum(frame.labels_path is None for frame in found)
+    if 0 < n_bare < len(found):
+        _LOGGER.info('labels left out: %d of %d frames have none', n_bare, len(found))
+        return [replace(frame, labels_path=None) for frame in found]
+    return found
+
+
+def _read_times(path: AnyPath, frames: Sequence[AnyPath]) -> list[float]:
     """Time of each frame: line k of times.txt belongs to the file numbered k."""
     if not path.exists():
         return [FRAME_PERIOD * k for k in range(len(frames))]
@@ -79,8 +135,13 @@ def _read_times(path: Path, frames: list[Path]) -> list[float]:
     return times
 
 
-def read_points(path: str | Path, layout: ScanLayout = KITTI) -> npt.NDArray[np.float32]:
-    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4).
+def read_points(path: str | AnyPath, layout: ScanLayout = KITTI) -> npt.NDArray[np.float32]:
+    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4); raises as `read_scan`."""
+    return layout.points(read_scan(path, layout))
+
+
+def read_scan(path: str | AnyPath, layout: ScanLayout) -> bytes:
+    """Bytes of a ``.bin`` file.
 
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
     points, or, where the layout asks for that, its numbers can be no scan.
@@ -94,15 +155,15 @@ def read_points(path: str | Path, layout: ScanLayout = KITTI) -> npt.NDArray[np.
         raise DataError(f'{path}: {doubt}; --force takes it as it is')
     if doubt:
         _LOGGER.warning('%s: %s', path, doubt)
-    return layout.points(data)
+    return data
 
 
-def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
+def read_labels(path: str | AnyPath, n_points: int) -> npt.NDArray[np.uint16]:
     """Semantic classes of a ``.label`` file, (n_points,); DataError if it has another number."""
     return (read_entries(path, n_points) & 0xFFFF).astype(np.uint16)
 
 
-def read_entries(path: str | Path, n_points: int) -> npt.NDArray[np.uint32]:
+def read_entries(path: str | AnyPath, n_points: int) -> npt.NDArray[np.uint32]:
     """Entries of a ``.label`` file, (n_points,): class below, instance in the upper 16 bits."""
     expected = f'expected {4 * n_points} for {n_points} points'
     data = read_bytes(path, 4 * n_points, expected)
@@ -111,13 +172,17 @@ def read_entries(path: str | Path, n_points: int) -> npt.NDArray[np.uint32]:
     return np.frombuffer(data, dtype='<u4').astype(np.uint32)
 
 
-def read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:
+def read_bytes(path: str | AnyPath, most: int, expected: str = '') -> bytes:
     """Read a file; DataError if it cannot be read or has more than `most` bytes."""
     try:
-        with open(path, 'rb') as file:
-            size = os.fstat(file.fileno()).st_size
-            # A pipe or a device has the size 0, and may have no end.
-            data = b'' if size > most else file.read(size or most + 1)
+        place = as_path(path)
+        if isinstance(place, UrlPath):
+            data, size = place.read(most)
+        else:
+            with open(place, 'rb') as file:
+                size = os.fstat(file.fileno()).st_size
+                # A pipe or a device has the size 0, and may have no end.
+                data = b'' if size > most else file.read(size or most + 1)
     except OSError as error:
         raise DataError(f'{path}: {error.strerror or error}') from error
     if max(size, len(data)) > most:

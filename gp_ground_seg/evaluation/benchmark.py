@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.evaluation.evaluate import Method, OurMethod, Progress
+from gp_ground_seg.evaluation.evaluate import Method, OurMethod
 from gp_ground_seg.evaluation.report import changed_parameters
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.result import FitReport
+from gp_ground_seg.scale.cluster import Progress
 
 MODES = {'fixed': 'theta fixed', 'every_frame': 'learning'}
 """Values of ``learning.mode`` that are timed, and their titles."""

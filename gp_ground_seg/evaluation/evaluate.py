@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.backend import Backend
+from gp_ground_seg.backend import Backend, make_backend
 from gp_ground_seg.data.boxes import read_boxes
-from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
-from gp_ground_seg.data.semantic_kitti import (
-    Frame,
-    list_frames,
-    list_sequences,
-    read_entries,
-    read_points,
-)
+from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation import metrics
 from gp_ground_seg.evaluation.metrics import CONVENTIONS, GROUNDGRID, Confusion, Labels
@@ -36,19 +31,18 @@ from gp_ground_seg.evaluation.objects import (
     pool_objects,
 )
 from gp_ground_seg.frame import BoolArray, FloatArray, Label
-from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.config import Config, RuntimeConfig
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.result import FitReport
+from gp_ground_seg.scale.cluster import HERE, Progress, Runner, depends_on_past
 from gp_ground_seg.segmenter import GroundSegmenter
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 OURS = 'gp_ground_seg'
-PATCHWORKPP = 'patchworkpp'
-TITLES = {PATCHWORKPP: 'Patchwork++'}
+PATCHWORKPP, PATCHWORK = 'patchworkpp', 'patchwork'
+TITLES = {PATCHWORKPP: 'Patchwork++', PATCHWORK: 'Patchwork'}
 """Names of methods in tables, where they differ from those in files."""
 ALL = 'all'
-Progress = Callable[[Sequence[Any]], Iterable[Any]]
-"""Wraps items to show how far the work is, as tqdm does."""
 Points = npt.NDArray[np.floating]
 
 
@@ -59,6 +53,7 @@ class MethodResult:
     label: Labels  # (N,)
     ground_z: FloatArray  # (N,) height of the ground under each point [m]; NaN = no model
     p_ground: npt.NDArray[np.floating] | None = None  # (N,), where it has probabilities
+    return_std: FloatArray | None = None  # (N,) of a ground return about `ground_z` [m]
     stages: dict[str, float] = field(default_factory=dict)  # seconds
     pose: SensorPose | None = None
     fit: FitReport | None = None
@@ -68,6 +63,7 @@ class Method(Protocol):
     """Something that labels scans, one sequence after the other."""
 
     name: str
+    depends_on_past: bool  # whether the labels of a scan depend on the scans before it
 
     def reset(self) -> None:
         """Forget what was learned from earlier scans."""
@@ -82,9 +78,19 @@ class Method(Protocol):
 class OurMethod:
     """`GroundSegmenter` as a method; `last` is its last result."""
 
-    def __init__(self, config: Config, name: str = OURS, backend: Backend | None = None) -> None:
-        self.name = name
-        self._segmenter = GroundSegmenter(config, backend=backend)
+    def __init__(
+        self,
+        config: Config,
+        name: str = OURS,
+        make: Callable[[RuntimeConfig], Backend] = make_backend,
+    ) -> None:
+        self.name, self.depends_on_past, self._make = name, depends_on_past(config), make
+        self._segmenter = GroundSegmenter(config, backend=make(config.runtime))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send a worker what to make it of; it has one thread there, as there are many."""
+        config = self._segmenter.config.replace(**{'runtime.n_threads': 1})
+        return type(self), (config, self.name, self._make)
 
     def reset(self) -> None:
         """Forget what was learned."""
@@ -103,7 +109,9 @@ class OurMethod:
     def result(self) -> MethodResult:
         """Return all there is of the last scan."""
         own = self.last
-        return MethodResult(own.label, own.ground_z, own.p_ground, self.stages, own.pose, own.fit)
+        return MethodResult(
+            own.label, own.ground_z, own.p_ground, own.return_std, self.stages, own.pose, own.fit
+        )
 
     def close(self) -> None:
         """End the worker threads."""
@@ -145,7 +153,7 @@ class ScanScore:
     @property
     def confusion(self) -> Confusion:
         """Counts in the convention that counts."""
-        return next(iter(self.confusions.values()))
+        return next(iter(self.confusions.values()), Confusion())
 
 
 @dataclass(frozen=True)
@@ -197,11 +205,6 @@ class MethodScore:
         return self.confusion.iou
 
     @property
-    def ece(self) -> float:
-        """Expected calibration error; NaN without probabilities."""
-        return math.nan if self.calibration is None else self.calibration.ece
-
-    @property
     def classes(self) -> dict[int, metrics.ClassCount]:
         """Sum of the counts by class, by ascending class number."""
         numbers = sorted({number for scan in self.scans for number in scan.classes})
@@ -250,55 +253,6 @@ def pool(name: str, scores: Iterable[MethodScore]) -> MethodScore:
     return MethodScore(name, tuple(scan for one in scores for scan in one.scans))
 
 
-def labelled_frames(
-    root: str | Path, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
-) -> list[Frame]:
-    """Frames of the named sequences, or of all that have labels, in order.
-
-    Sequences of SemanticKITTI's test set have none; a note says which are left out. Raises
-    DataError if a sequence is not there, a named one or a single frame has no labels, or all.
-    """
-    known = list_sequences(root)
-    frames, left_out = [], []
-    for name in _chosen(root, sequences):
-        own = list_frames(root, name, layout)
-        bare = [frame.index for frame in own if frame.labels_path is None]
-        if sequences is None and len(bare) == len(own):
-            left_out.append(name)
-            continue
-        if bare:
-            raise DataError(f'{root}: frames of sequence {name} have no labels, as {bare[0]}')
-        frames += own
-    if not frames:
-        raise DataError(f'{root}: no sequence has labels, of {", ".join(known)}')
-    if left_out:
-        _LOGGER.info('sequences without labels left out: %s', ', '.join(left_out))
-    return frames
-
-
-def _chosen(root: str | Path, sequences: Sequence[str] | None) -> list[str]:
-    """Sequences below `root` that are named, or all; raises DataError if one is not there."""
-    known = list_sequences(root)
-    chosen = list(dict.fromkeys(known if sequences is None else sequences))
-    unknown = [name for name in chosen if name not in known]
-    if unknown or not chosen:
-        problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
-        raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
-    return chosen
-
-
-def boxed_frames(
-    root: str | Path, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
-) -> list[Frame]:
-    """Frames of the named sequences, or of all; labels count where each frame has some."""
-    found = [one for name in _chosen(root, sequences) for one in list_frames(root, name, layout)]
-    n_bare = sum(frame.labels_path is None for frame in found)
-    if 0 < n_bare < len(found):
-        _LOGGER.info('labels left out: %d of %d frames have none', n_bare, len(found))
-        return [replace(frame, labels_path=None) for frame in found]
-    return found
-
-
 def load_kitti(frame: Frame) -> KnownScan:
     """Read a labelled frame; the ground whose height counts is what is labelled ground."""
     if frame.labels_path is None:
@@ -332,14 +286,38 @@ def score_methods(
     *,
     each_alone: bool = False,
     clock: Callable[[], float] = time.perf_counter,
-    progress: Progress = iter,
+    runner: Runner = HERE,
+    watch: Callable[[KnownScan], None] | None = None,
 ) -> list[MethodScore]:
     """Run methods alternately on the same scans and score each run, in the order of `methods`.
 
     Which method goes first changes from scan to scan. Each runs once without counting:
     compilation and first allocations are not its speed. `items`, grouped by sequence, are loaded
     one by one. Methods are reset before each sequence, or with `each_alone` before each scan.
+    `watch` is called with each scan after all methods have run on it.
     """
+    score = partial(_score_block, load, methods, each_alone, clock, watch)
+    has_past = not each_alone and any(method.depends_on_past for method in methods)
+    parts = runner.run(score, items, _sequence_of if has_past else None)
+    scans = [tuple(itertools.chain(*own)) for own in zip(*parts, strict=True)]
+    return [MethodScore(one.name, own) for one, own in zip(methods, scans, strict=True)]
+
+
+def _sequence_of(item: Any) -> str:
+    name: str = (item if isinstance(item, Frame) else item[0]).sequence
+    return name
+
+
+def _score_block(
+    load: Callable[[Any], KnownScan],
+    methods: Sequence[Method],
+    each_alone: bool,
+    clock: Callable[[], float],
+    watch: Callable[[KnownScan], None] | None,
+    items: Sequence[Any],
+    progress: Progress,
+) -> list[list[ScanScore]]:
+    """Scores of some scans, by method."""
     scores: dict[str, list[ScanScore]] = {method.name: [] for method in methods}
     sequence = None
     for k, item in enumerate(progress(items)):
@@ -355,7 +333,9 @@ def score_methods(
             start = clock()
             _run(method, scan)
             scores[method.name].append(_score(scan, method, clock() - start))
-    return [MethodScore(name, tuple(found)) for name, found in scores.items()]
+        if watch is not None:
+            watch(scan)
+    return list(scores.values())
 
 
 def _run(method: Method, scan: KnownScan) -> None:
@@ -372,7 +352,8 @@ def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
     height = None
     if scan.ground_z is not None:
         own = scan.is_ground
-        height = metrics.height_error(scan.ground_z[own], result.ground_z[own])
+        std = None if result.return_std is None else result.return_std[own]
+        height = metrics.height_error(scan.ground_z[own], result.ground_z[own], std)
     return ScanScore(
         scan.sequence, scan.index, seconds, result.stages,
         {key: metrics.count_confusion(label, one) for key, one in scan.truths.items()},

@@ -7,6 +7,7 @@ sequences an interval is rough, and rather too narrow than too wide.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -17,6 +18,8 @@ from gp_ground_seg.evaluation.report import Column
 from gp_ground_seg.frame import FloatArray
 
 CONFIDENCE, N_DRAWS, SEED = 0.95, 10_000, 0
+N_BLOCKS, MIN_BLOCK = 10, 5
+"""Most blocks of a single sequence, and the least number of frames in each."""
 INTERVAL = Column('95 % interval', key='interval')
 """Column of `interval_text`."""
 
@@ -34,6 +37,16 @@ class Interval(NamedTuple):
     def is_tie(self) -> bool:
         """Whether it holds 0."""
         return self.low <= 0.0 <= self.high
+
+
+def clusters(score: MethodScore) -> list[MethodScore]:
+    """Return what is drawn: the sequences, or of a single one blocks of successive frames."""
+    parts, n = score.parts(), len(score.scans)
+    if len(parts) > 1:
+        return parts
+    n_blocks = max(min(N_BLOCKS, n // MIN_BLOCK), 1)
+    edges = [n * k // n_blocks for k in range(n_blocks + 1)]
+    return [MethodScore(score.name, score.scans[a:b]) for a, b in itertools.pairwise(edges)]
 
 
 def iou_sums(score: MethodScore) -> tuple[float, float]:

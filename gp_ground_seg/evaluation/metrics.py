@@ -294,6 +294,11 @@ def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Cali
     )
 
 
+FINEST_STD = 1e-3
+"""Least standard deviation in the predictive density [m]: no sensor resolves a millimetre, and the
+density of a handful of returns that happen to agree would outweigh all others."""
+
+
 @dataclass(frozen=True)
 class HeightError:
     """Errors of the surface under points whose ground height is known; over no points NaN.
@@ -306,6 +311,10 @@ class HeightError:
     sum_error: float  # [m]
     sum_squared_error: float  # [m^2]
     sum_squared_deviation: float  # of the truth from its mean in the frame [m^2]
+    n_with_std: int  # points whose standard deviation is known
+    n_within_1: int  # of these the ones with an error of at most one standard deviation
+    n_within_2: int
+    sum_nlpd: float  # of these, negative logs of the predictive density, of a density per metre
     median_absolute: float  # [m]; pooled the median over the frames
 
     @property
@@ -323,20 +332,48 @@ class HeightError:
         """Standardised mean squared error, mean((y - mu)^2) / var(y) (paper, section IV)."""
         return ratio(self.sum_squared_error, self.sum_squared_deviation)
 
+    @property
+    def within_1(self) -> float:
+        """Share within one standard deviation; 0.683 of a normal distribution."""
+        return ratio(self.n_within_1, self.n_with_std)
+
+    @property
+    def within_2(self) -> float:
+        """Share within two standard deviations; 0.954 of a normal distribution."""
+        return ratio(self.n_within_2, self.n_with_std)
+
+    @property
+    def nlpd(self) -> float:
+        """Mean negative log predictive density (Rasmussen and Williams, 2006, section 2.5)."""
+        return ratio(self.sum_nlpd, self.n_with_std)
+
 
 def height_error(
-    truth: npt.NDArray[np.floating], estimate: npt.NDArray[np.floating]
+    truth: npt.NDArray[np.floating],
+    estimate: npt.NDArray[np.floating],
+    std: npt.NDArray[np.floating] | None = None,
 ) -> HeightError:
-    """Compare true with estimated heights of the ground, (n,) [m]; NaN where there is no model."""
+    """Compare true with estimated heights of the ground, (n,) [m]; NaN where there is no model.
+
+    `std` are the standard deviations of the differences, (n,) [m], where they are told.
+    """
     known = np.isfinite(estimate)
     y = truth[known].astype(np.float64)
     error = estimate[known] - y
+    spread = np.full(len(y), np.nan) if std is None else std[known]
+    fine = np.maximum(spread, FINEST_STD)
+    nlpd = 0.5 * np.log(2.0 * np.pi * fine**2) + 0.5 * (error / fine) ** 2
     return HeightError(
         n_points=len(y),
         n_without_model=len(truth) - len(y),
         sum_error=float(error.sum()),
-        sum_squared_error=float(error @ error),
+        # Of a product of vectors the last digits depend on the number of threads.
+        sum_squared_error=float(np.square(error).sum()),
         sum_squared_deviation=float(np.sum((y - y.mean()) ** 2)) if len(y) else 0.0,
+        n_with_std=int(np.isfinite(spread).sum()),
+        n_within_1=int((np.abs(error) <= spread).sum()),
+        n_within_2=int((np.abs(error) <= 2.0 * spread).sum()),
+        sum_nlpd=float(nlpd[np.isfinite(spread)].sum()),
         median_absolute=float(np.median(np.abs(error))) if len(y) else math.nan,
     )
 

@@ -1,4 +1,4 @@
-"""Patchwork++ as a method, to compare with."""
+"""Patchwork++, and Patchwork before it, as methods to compare with."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from gp_ground_seg.errors import ConfigError, MissingDependencyError
-from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, MethodResult, Points
+from gp_ground_seg.evaluation.evaluate import PATCHWORK, PATCHWORKPP, MethodResult, Points
+from gp_ground_seg.evaluation.metrics import Labels
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import SensorConfig
 from gp_ground_seg.parameters.schema import AUTO
@@ -26,6 +28,7 @@ class PatchworkppMethod:
     """
 
     name = PATCHWORKPP
+    depends_on_past = True
 
     def __init__(
         self, sensor_height: float | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
@@ -47,19 +50,26 @@ class PatchworkppMethod:
         height = sensor.height + sensor.origin_z
         if height <= 0.0:
             raise ConfigError(
-                f'patchworkpp: takes the sensor to be above the ground; with sensor.height = '
+                f'{cls.name}: takes the sensor to be above the ground; with sensor.height = '
                 f'{sensor.height:g} set sensor.origin_z above {0.0 - sensor.height:g}'
             )
         return cls(height, origin)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send a worker what to make it of."""
+        return type(self), (self._sensor_height, self._origin)
+
     def reset(self) -> None:
         """Start anew with its default thresholds."""
         with _c_stdout_silenced():  # it greets on standard output, which is for tables
-            parameters = self._module.Parameters()
-            if self._sensor_height is not None:
-                parameters.sensor_height = self._sensor_height
-            self._uprightness = float(parameters.uprightness_thr)
-            self._estimator = self._module.patchworkpp(parameters)
+            self._estimator = self._make_estimator()
+
+    def _make_estimator(self) -> Any:
+        parameters = self._module.Parameters()
+        if self._sensor_height is not None:
+            parameters.sensor_height = self._sensor_height
+        self._uprightness = float(parameters.uprightness_thr)
+        return self._module.patchworkpp(parameters)
 
     def run(self, points: Points) -> None:
         """Segment a scan."""
@@ -71,8 +81,7 @@ class PatchworkppMethod:
 
     def result(self) -> MethodResult:
         """Labels, and the plane of the nearest upright patch: it has no surface of its own."""
-        label = np.full(len(self._points), Label.OBSTACLE, dtype=np.uint8)
-        label[self._estimator.getGroundIndices()] = Label.GROUND
+        label = self._label()
         centre = np.asarray(self._estimator.getCenters(), dtype=np.float64).reshape(-1, 3)
         normal = np.asarray(self._estimator.getNormals(), dtype=np.float64).reshape(-1, 3)
         upright = np.abs(normal[:, 2]) > self._uprightness
@@ -84,6 +93,34 @@ class PatchworkppMethod:
         centre, normal = centre[nearest], normal[nearest]
         fall = np.sum((xy - centre[:, :2]) * normal[:, :2], axis=1) / normal[:, 2]
         return MethodResult(label, np.asarray(centre[:, 2] - fall + self._origin[2]))
+
+    def _label(self) -> Labels:
+        label = np.full(len(self._points), Label.OBSTACLE, dtype=np.uint8)
+        label[self._estimator.getGroundIndices()] = Label.GROUND
+        return label
+
+
+class PatchworkMethod(PatchworkppMethod):
+    """Patchwork (Lim, Oh, Myung, RA-L 2021) from the same package; it gives labels only.
+
+    It estimates the height of the sensor from its first scan where none is given.
+    """
+
+    name = PATCHWORK
+
+    def _make_estimator(self) -> Any:
+        parameters = self._module.PatchworkParams()
+        if self._sensor_height is not None:
+            parameters.sensor_height, parameters.ATAT_ON = self._sensor_height, False
+        return self._module.patchwork(parameters)
+
+    def result(self) -> MethodResult:
+        """Labels; it does not tell its planes."""
+        return MethodResult(self._label(), np.full(len(self._points), np.nan))
+
+
+PEERS = {peer.name: peer for peer in (PatchworkppMethod, PatchworkMethod)}
+"""What to compare with, by name."""
 
 
 @contextlib.contextmanager

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import csv
 import importlib.metadata
+import importlib.util
+import itertools
 import json
 import math
 import os
 import platform
 import subprocess
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gp_ground_seg
+from gp_ground_seg.errors import DataError, MissingDependencyError
 from gp_ground_seg.parameters.config import Config, parameter_specs
 from gp_ground_seg.parameters.schema import ParameterValue
 from gp_ground_seg.result import FitReport
@@ -150,6 +154,39 @@ def write_json(document: Any, path: str | Path) -> None:
     Path(path).write_text(text, encoding='utf-8')
 
 
+def check_rows_file(name: str) -> None:
+    """Raise an error if `write_rows` could not write a file of this name."""
+    if not name.endswith(('.csv', '.parquet')):
+        raise DataError(f'{name}: must end in .csv or .parquet')
+    if name.endswith('.parquet') and importlib.util.find_spec('pyarrow') is None:
+        raise MissingDependencyError('pyarrow is not installed: pip install pyarrow')
+
+
+def write_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write rows as CSV or Parquet; a cell within a cell gets a column, as ``objects_vehicle``."""
+    flat = [dict(_flat(row)) for row in rows]
+    names = list(dict.fromkeys(itertools.chain(*flat)))
+    if path.suffix == '.parquet':
+        from pyarrow import Table as ArrowTable
+        from pyarrow.parquet import write_table
+
+        whole = [{name: row.get(name) for name in names} for row in flat]
+        write_table(ArrowTable.from_pylist(whole), path)
+        return
+    with path.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(flat)
+
+
+def _flat(row: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    for key, value in row.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f'{prefix}{key}_')
+        else:
+            yield prefix + key, _plain(value)
+
+
 def describe_environment(*packages: str) -> dict[str, Any]:
     """Describe machine and software of a run, with the versions of further `packages`.
 
@@ -175,6 +212,8 @@ def machine_line(environment: Mapping[str, Any], fit: FitReport | None = None) -
     cores = '1 core' if environment['n_cores'] == 1 else f'{environment["n_cores"]} cores'
     if fit is not None:
         threads = '1 thread' if fit.n_threads == 1 else f'{fit.n_threads} threads'
+        if n_workers := environment.get('n_workers'):
+            threads = f'workers with {n_workers} threads in all'
         cores = f'{threads} on {cores}, {fit.backend}'
     versions = ', '.join(f'{name} {v or "absent"}' for name, v in environment['versions'].items())
     commit, _, dirty = (environment['commit'] or 'unknown').partition('-')

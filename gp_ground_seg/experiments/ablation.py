@@ -1,16 +1,16 @@
-"""What settings are worth: length-scale models, departures from the paper, cross-validation."""
+"""What settings are worth: length-scale models, departures from the paper."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from typing import Any, NamedTuple
 
 from gp_ground_seg.data.semantic_kitti import Frame
-from gp_ground_seg.errors import ConfigError, DataError
+from gp_ground_seg.errors import ConfigError
 from gp_ground_seg.evaluation import report
-from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, load_kitti, pool
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, load_kitti
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text, mse_sums
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.experiments.interpolation import interpolation_method
@@ -22,7 +22,7 @@ from gp_ground_seg.experiments.variants import (
     score_variants,
 )
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.schema import ParameterValue
+from gp_ground_seg.scale.cluster import HERE, Runner
 
 _FIXED: Changes = {'learning.mode': 'fixed'}
 _WHOLE_FRAME: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'frame'}
@@ -78,22 +78,18 @@ DEPARTURES: tuple[Departure, ...] = (
 )
 """What `departures` measures. A new row here is all that a further one takes."""
 
-Choice = dict[str, ParameterValue]
-"""A value for each parameter that is searched, by dotted name."""
-Grid = Mapping[str, Sequence[ParameterValue]]
-
 
 def compare_models(
     items: Sequence[Any],
     load: Callable[[Any], KnownScan],
     config: Config,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> Report:
     """Score `MODELS` and an interpolation; ConfigError if `config` sets what they set."""
     refuse_changed(config, {name for changes in MODELS.values() for name in changes})
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     with closing(interpolation_method(config)) as plain:
-        scores = score_variants(items, load, variants, [plain], progress=progress)
+        scores = score_variants(items, load, variants, [plain], runner=runner)
     last = scores[len(MODELS) - 1]
     # Simulated scans are of one sequence, and of many scenes.
     parts = MethodScore.parts if len(last.sequences) > 1 else scene_parts
@@ -115,21 +111,14 @@ def compare_models(
     return make_report({'models': Table.of(rows, title=title)}, scores, config, changes=MODELS)
 
 
-def compare_departures(
-    frames: Sequence[Frame],
-    departures: Sequence[Departure],
-    config: Config,
-    progress: Progress = iter,
-) -> Report:
+def compare_departures(frames: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
     """Switch one departure after the other, on the same frames in the same run."""
     variants = {'as given': config}
-    for one in departures:
-        if one.title in variants:
-            raise ConfigError(f'departure {one.title!r}: there is one of that title already')
+    for one in DEPARTURES:
         variants[one.title] = config.replace(**one.changes)
         if variants[one.title] == config:
             raise ConfigError(f'departure {one.title!r}: its switch changes nothing')
-    scores = score_variants(frames, load_kitti, variants, progress=progress)
+    scores = score_variants(frames, load_kitti, variants, runner=runner)
     given, *switched = scores
 
     def row(
@@ -151,7 +140,7 @@ def compare_departures(
         ]
 
     switches = []
-    for one, score in zip(departures, switched, strict=True):
+    for one, score in zip(DEPARTURES, switched, strict=True):
         having, without = (given, score) if one.kept else (score, given)
         interval = interval_text(having.parts(), without.parts())
         switch = 'off' if one.kept else 'on'
@@ -163,7 +152,7 @@ def compare_departures(
         'time: over that as given, median of the frames'
     )
     tables = {'departures': Table.of(rows, title=title)}
-    changes = {one.title: one.changes for one in departures}
+    changes = {one.title: one.changes for one in DEPARTURES}
     return make_report(tables, scores, config, changes=changes)
 
 
@@ -181,72 +170,3 @@ def _counted(score: MethodScore) -> str:
     is_exact = 'exact' in score.scans[0].confusions
     rule = 'by exact labels' if is_exact else 'in the GroundGrid convention'
     return f'{len(score.scans)} scans of {", ".join(score.sequences)}; IoU {rule}'
-
-
-def coordinate_search(grid: Grid, start: Choice, worth: Callable[[Choice], float]) -> Choice:
-    """Maximise `worth` one parameter after the other; of equal choices the earlier one stays."""
-    best, highest = dict(start), worth(start)
-    better = True
-    while better:
-        better = False
-        for name, values in grid.items():
-            for value in values:
-                trial = {**best, name: value}
-                if (found := worth(trial)) > highest:
-                    best, highest, better = trial, found, True
-    return best
-
-
-def cross_validate(
-    frames: Sequence[Frame], base: Config, grid: Grid, progress: Progress = iter
-) -> Report:
-    """Choose values by pooled IoU, once on all sequences and once without each.
-
-    Each configuration segments every frame once, however many searches need it. `grid` has the
-    values to try beside those of `base`, where each search starts.
-    """
-    sequences = list(dict.fromkeys(frame.sequence for frame in frames))
-    if len(sequences) < 2:
-        raise DataError('cross-validation: needs at least two sequences')
-    # As the configuration holds them: 1 and 1.0 are one value.
-    tried = {name: [base.replace(**{name: v})[name] for v in grid[name]] for name in grid}
-    start: Choice = {name: base[name] for name in grid}
-    known: dict[tuple[ParameterValue, ...], MethodScore] = {}
-
-    def score(choice: Choice) -> MethodScore:
-        key = tuple(choice[name] for name in grid)
-        if key not in known:
-            variant = {str(len(known)): base.replace(**choice)}
-            (known[key],) = score_variants(frames, load_kitti, variant, progress=progress)
-        return known[key]
-
-    def choose(names: Sequence[str]) -> Choice:
-        return coordinate_search(tried, start, lambda choice: score(choice).of(*names).iou)
-
-    choices = {'given': start, 'tuned': choose(sequences)}
-    for left_out in sequences:
-        choices[f'- {left_out}'] = choose([name for name in sequences if name != left_out])
-    scores = [pool(name, [score(choices[name])]) for name in ('given', 'tuned')]
-    own = (score(choices[f'- {name}']).of(name) for name in sequences)
-    scores.append(pool('left out', own))
-    rows: list[Row] = []
-    for parts in zip(*(one.by_sequence() for one in scores), strict=True):
-        rows.append([(Column('sequence'), parts[0][0])])
-        rows[-1] += [(percent(f'IoU {o.name} [%]', f'iou {o.name}'), o.iou) for _, o in parts]
-        rows[-1] += [(Column(f'ECE {o.name}', '.4f'), o.ece) for _, o in parts]
-    title = (
-        'IoU and expected calibration error, GroundGrid convention: as given; with the values '
-        f'best on all {len(sequences)} sequences (tuned); each sequence with the values best on '
-        f'the others (left out). {len(known)} configurations scored.'
-    )
-    columns = [Column('parameter'), *(Column(way, 's') for way in choices)]
-    chosen = [[name, *(_shown(own[name]) for own in choices.values())] for name in grid]
-    tables = {
-        'scores': Table.of(rows, title=title, n_sums=1),
-        'choices': Table(columns, chosen, 'Values chosen; - 00: without sequence 00'),
-    }
-    return make_report(tables, scores, base, n_configurations=len(known), tried=tried)
-
-
-def _shown(value: ParameterValue) -> str:
-    return f'{value:g}' if isinstance(value, float) else str(value).lower()

@@ -2,86 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import report as results
-from gp_ground_seg.evaluation.evaluate import KnownScan, Progress
+from gp_ground_seg.evaluation.evaluate import KnownScan
 from gp_ground_seg.evaluation.metrics import (
     RING_EDGES,
     RING_TITLES,
     Calibration,
-    Sums,
+    HeightError,
     count_calibration,
-    ratio,
+    height_error,
+    pool_height_errors,
 )
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
-from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.result import Segmentation
+from gp_ground_seg.result import FitReport, Segmentation
+from gp_ground_seg.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.segmenter import GroundSegmenter
-
-FINEST_STD = 1e-3
-"""Least standard deviation in the predictive density [m]: no sensor resolves a millimetre, and the
-density of a handful of returns that happen to agree would outweigh all others."""
-
-
-@dataclass(frozen=True)
-class Coverage(Sums):
-    """Errors of the ground's height against their standard deviations, as sums.
-
-    Ratios over nothing are NaN. The error is estimate minus truth.
-    """
-
-    n_points: int = 0
-    n_within_1: int = 0  # of points whose error is at most one standard deviation
-    n_within_2: int = 0
-    sum_error: float = 0.0  # [m]
-    sum_squared_error: float = 0.0  # [m^2]
-    sum_nlpd: float = 0.0  # negative logs of the predictive density, [nat] of a density per metre
-
-    @property
-    def within_1(self) -> float:
-        """Share within one standard deviation; 0.683 of a normal distribution."""
-        return ratio(self.n_within_1, self.n_points)
-
-    @property
-    def within_2(self) -> float:
-        """Share within two standard deviations; 0.954 of a normal distribution."""
-        return ratio(self.n_within_2, self.n_points)
-
-    @property
-    def bias(self) -> float:
-        """Mean error [m]."""
-        return ratio(self.sum_error, self.n_points)
-
-    @property
-    def rmse(self) -> float:
-        """Root mean squared error [m]."""
-        return math.sqrt(ratio(self.sum_squared_error, self.n_points))
-
-    @property
-    def nlpd(self) -> float:
-        """Mean negative log predictive density (Rasmussen and Williams, 2006, section 2.5)."""
-        return ratio(self.sum_nlpd, self.n_points)
-
-
-def count_coverage(error: FloatArray, std: FloatArray) -> Coverage:
-    """Compare errors with their standard deviations, (n,) each [m]; NaN does not count."""
-    known = np.isfinite(error) & np.isfinite(std)
-    e, s = np.abs(error[known]), std[known]
-    fine = np.maximum(s, FINEST_STD)
-    nlpd = 0.5 * np.log(2.0 * np.pi * fine**2) + 0.5 * (e / fine) ** 2
-    return Coverage(
-        len(e), int((e <= s).sum()), int((e <= 2.0 * s).sum()), float(error[known].sum()),
-        float(e @ e), float(nlpd.sum()),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -91,7 +36,7 @@ class RingCoverage:
     sequence: str
     index: str
     ring: str  # of `RING_TITLES`
-    coverage: Coverage
+    height: HeightError
     calibration: Calibration  # of p_ground
 
 
@@ -100,24 +45,11 @@ class Kind(NamedTuple):
 
     std: str  # attribute of `Segmentation`
     against: str
-    keys: dict[str, Callable[[RingCoverage], str]]  # what the rows of each table are
+    groups: tuple[str, ...]  # words of `RingCoverage.sequence`, by which there are tables
 
 
-_BY_RANGE: dict[str, Callable[[RingCoverage], str]] = {'range': lambda one: one.ring}
-LABELLED = Kind(
-    'return_std',
-    'labelled ground returns',
-    {'sequence': lambda one: one.sequence, **_BY_RANGE},
-)
-SIMULATED = Kind(
-    'ground_std',
-    'exact heights under ground returns',
-    {
-        'sensor': lambda one: one.sequence.split()[0],
-        'scene': lambda one: one.sequence.split()[1],
-        **_BY_RANGE,
-    },
-)
+LABELLED = Kind('return_std', 'labelled ground returns', ('sequence',))
+SIMULATED = Kind('ground_std', 'exact heights under ground returns', ('sensor', 'scene'))
 
 
 def compare_coverage(
@@ -125,50 +57,65 @@ def compare_coverage(
     load: Callable[[Any], KnownScan],
     config: Config,
     kind: Kind,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> Report:
     """Segment each scan, without a past."""
     facts = {'config_changes': results.changed_parameters(config), 'config': config.nested()}
+    parts = runner.run(partial(_cover, load, config, kind.std), items)
+    rings = [one for own, _ in parts for one in own]
+    return Report(
+        {name: _table(rings, name, kind) for name in (*kind.groups, 'range')},
+        [_row_of(one) for one in rings],
+        parts[-1][1],
+        {'std': kind.std, **facts},
+    )
+
+
+def _cover(
+    load: Callable[[Any], KnownScan],
+    config: Config,
+    std: str,
+    items: Sequence[Any],
+    progress: Progress,
+) -> tuple[list[RingCoverage], FitReport]:
+    """Coverage of some scans, and the fit of the last."""
     rings: list[RingCoverage] = []
     with closing(GroundSegmenter(config)) as segmenter:
         for item in progress(items):
             segmenter.reset()
             scan = load(item)
             found = segmenter.segment(scan.points)
-            rings += ring_coverages(scan, found, kind.std)
-    return Report(
-        {name: _table(rings, name, kind) for name in kind.keys},
-        [_row_of(one) for one in rings],
-        found.fit,
-        {'std': kind.std, **facts},
-    )
+            rings += ring_coverages(scan, found, std)
+    return rings, found.fit
 
 
 def ring_coverages(scan: KnownScan, found: Segmentation, std: str) -> list[RingCoverage]:
     """Compare a segmented scan with the truth in each ring; `std` as in `Kind`."""
     assert scan.ground_z is not None and scan.is_ground is not None
     truth = next(iter(scan.truths.values()))
-    error, spread = found.ground_z - scan.ground_z, getattr(found, std)
+    heights = scan.ground_z, found.ground_z, getattr(found, std)
     x, y = scan.points[:, :2].astype(np.float64).T
     ring = np.digitize(np.hypot(x, y), RING_EDGES[1:-1])
     result = []
     for k, title in enumerate(RING_TITLES):
         own = ring == k
         ground = own & scan.is_ground
-        height = count_coverage(error[ground], spread[ground])
+        height = height_error(*(values[ground] for values in heights))
         probabilities = count_calibration(found.p_ground[own], truth[own])
         result.append(RingCoverage(scan.sequence, scan.index, title, height, probabilities))
     return result
 
 
 def _table(rings: Sequence[RingCoverage], name: str, kind: Kind) -> Table:
-    """Table of `Kind.keys`, and the sum of all."""
+    """Table by one of `Kind.groups` or by range, and the sum of all."""
     groups: dict[str, list[RingCoverage]] = {}
     for one in rings:
-        groups.setdefault(kind.keys[name](one), []).append(one)
+        words = one.sequence.split(maxsplit=len(kind.groups) - 1)
+        own_names = dict(zip((*kind.groups, 'range'), (*words, one.ring), strict=True))
+        groups.setdefault(own_names[name], []).append(one)
     rows: list[Row] = []
     for group, own in {**groups, methods.ALL: list(rings)}.items():
-        pooled = sum((one.coverage for one in own), Coverage())
+        pooled = pool_height_errors([one.height for one in own])
         probabilities = [one.calibration for one in own]
         ece = sum(probabilities[1:], probabilities[0]).ece
         rows.append(
@@ -195,5 +142,5 @@ def _row_of(one: RingCoverage) -> dict[str, Any]:
     """Every number of a scan in a ring; lengths in metres."""
     names = ('n_points', 'within_1', 'within_2', 'nlpd', 'bias', 'rmse')
     row: dict[str, Any] = {'sequence': one.sequence, 'index': one.index, 'ring': one.ring}
-    row |= {name: getattr(one.coverage, name) for name in names}
+    row |= {name: getattr(one.height, name) for name in names}
     return row | {'ece': one.calibration.ece, 'n_probabilities': one.calibration.n_total}

@@ -9,7 +9,7 @@ import numpy as np
 from gp_ground_seg.backend import Backend, make_backend
 from gp_ground_seg.evaluation.evaluate import OurMethod
 from gp_ground_seg.frame import FloatArray, Frame, GroundSurface
-from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.config import Config, RuntimeConfig
 
 TITLE = 'interpolation, our labels'
 MAX_SLOPE, TOLERANCE = 0.15, 0.1
@@ -20,8 +20,12 @@ of six pairs on a third of the labelled frames."""
 def interpolation_method(config: Config) -> OurMethod:
     """Return our method with this surface in place of the model's, and nothing learned."""
     fixed = config.replace(**{'learning.mode': 'fixed'})
-    backend: Any = InterpolatingBackend(make_backend(fixed.runtime))
-    return OurMethod(fixed, TITLE, backend)
+    return OurMethod(fixed, TITLE, interpolating_backend)
+
+
+def interpolating_backend(runtime: RuntimeConfig) -> Any:
+    """Make the backend of the parameters, with this surface."""
+    return InterpolatingBackend(make_backend(runtime))
 
 
 class InterpolatingBackend:

@@ -6,20 +6,9 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation import evaluate as methods
-from gp_ground_seg.evaluation.evaluate import MethodScore, Progress
+from gp_ground_seg.evaluation.evaluate import MethodScore
 from gp_ground_seg.evaluation.objects import MIN_HEIGHT, MIN_RETURNS, ObjectCount
-from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
-from gp_ground_seg.experiments.variants import (
-    PEER,
-    load_simulated,
-    make_report,
-    peer_of,
-    score_variants,
-    simulated_frames,
-)
-from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.evaluation.report import Column, Row, Table, percent
 from gp_ground_seg.simulation import PLACES
 
 SCENES = (*PLACES, 'urban')
@@ -29,37 +18,6 @@ BANDS = {'0-10 m': slice(0, 1), '10-20 m': slice(1, 2), '> 20 m': slice(2, None)
 
 COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
 """Classes of `evaluation.objects.GROUPS` by column."""
-
-
-def score_objects(
-    sensors: Sequence[str],
-    scenes: Sequence[str],
-    n_seeds: int,
-    config: Config,
-    with_peer: bool,
-    progress: Progress = iter,
-) -> Report:
-    """Segment `n_seeds` simulated scenes of each name by each sensor, and count lost objects.
-
-    All sensors have the parameters `config`. A sensor and scene of which a scan is refused is left
-    out, and a note says why.
-    """
-    found: list[list[MethodScore]] = []
-    refused = []
-    cases = [(sensor, scene) for sensor in sensors for scene in scenes]
-    for sensor, scene in progress(cases):
-        frames = simulated_frames([sensor], [scene], n_seeds, (0.0,))
-        peers = [peer_of(sensor)] if with_peer else []
-        try:
-            scores = score_variants(frames, load_simulated, {methods.OURS: config}, peers)
-        except PointCloudError as error:
-            refused.append(f'refused: {error}')
-        else:
-            found.append(scores)
-    if not found:
-        raise PointCloudError('; '.join(refused))
-    pooled = [methods.pool(own[0].name, own) for own in zip(*found, strict=True)]
-    return make_report(lost_tables(pooled, refused), pooled, config)
 
 
 def lost_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> dict[str, Table]:
@@ -101,9 +59,11 @@ def lost_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> d
     objects_notes = [*refused, f'objects lost: {", ".join(lost) or "none"}']
     returns_notes = []
     if len(scores) > 1:
-        of_objects += f'; its: of {PEER}, which has the true height and place of the sensor'
-        objects_notes.append(f'IoU behind {PEER}: {", ".join(behind) or "nowhere"}')
-        returns_notes = [f'more than {PEER}: {", ".join(more) or "nowhere"}']
+        of_objects += (
+            f'; its: of {scores[1].title}, which has the true height and place of the sensor'
+        )
+        objects_notes.append(f'IoU behind {scores[1].title}: {", ".join(behind) or "nowhere"}')
+        returns_notes = [f'more than {scores[1].title}: {", ".join(more) or "nowhere"}']
     return {
         'objects': Table.of(objects, title=of_objects, notes=objects_notes),
         'vehicles': Table.of(returns, title=of_returns, notes=returns_notes),

@@ -13,7 +13,7 @@ import numpy as np
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.evaluation import evaluate as methods
-from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, Progress, pool
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, pool
 from gp_ground_seg.evaluation.intervals import interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, SENSOR_HEIGHT
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
@@ -22,6 +22,7 @@ from gp_ground_seg.experiments.variants import SimulatedFrame
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.parameters.schema import AUTO
 from gp_ground_seg.pipeline.sensor_pose import SensorPose
+from gp_ground_seg.scale.cluster import HERE, Runner
 from gp_ground_seg.simulation import SCENES, SENSORS, semantic_kitti_labels, simulate_scan
 
 Turn = tuple[float, float]
@@ -59,7 +60,7 @@ def score_poses(
     load: Callable[[Mount, Any], KnownScan],
     mounts: Sequence[Mount],
     config: Config,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> Report:
     """Run scans under each mount; ConfigError if `config` sets the pose itself."""
     names = ('sensor.height', 'sensor.roll', 'sensor.pitch')
@@ -76,7 +77,7 @@ def score_poses(
             way: config.replace(**dict(zip(names, pose, strict=True)))
             for way, pose in poses.items()
         }
-        found = engine.score_variants(items, partial(load, mount), variants, progress=progress)
+        found = engine.score_variants(items, partial(load, mount), variants, runner=runner)
         for group in found[0].sequences:
             trials.append(Trial(group, mount, *(score.of(group) for score in found)))
         scores += [pool(f'{one.name} {height:g} m {turn_text(turn)}', [one]) for one in found]

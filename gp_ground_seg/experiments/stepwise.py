@@ -7,14 +7,15 @@ from contextlib import closing
 
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.evaluation import report as results
-from gp_ground_seg.evaluation.evaluate import Method, Progress, load_kitti
+from gp_ground_seg.evaluation.evaluate import Method, load_kitti
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, changed_parameters, percent
 from gp_ground_seg.experiments.interpolation import interpolation_method
 from gp_ground_seg.experiments.variants import make_report, refuse_changed, score_variants
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.presets import find_preset
+from gp_ground_seg.scale.cluster import HERE, Runner
 
 STEPS = {
     'vertical faces': ('faces.',),
@@ -45,12 +46,12 @@ def paper_steps() -> dict[str, Config]:
     return steps
 
 
-def score_steps(frames: Sequence[Frame], with_peer: bool, progress: Progress = iter) -> Report:
-    """Score `paper_steps`, and beside them an interpolation and Patchwork++."""
+def score_steps(frames: Sequence[Frame], peer: str | None, runner: Runner = HERE) -> Report:
+    """Score `paper_steps`, and beside them an interpolation and one of `PEERS`."""
     steps = paper_steps()
     with closing(interpolation_method(Config())) as plain:
-        peers: list[Method] = [plain, *([PatchworkppMethod()] if with_peer else [])]
-        scores = score_variants(frames, load_kitti, steps, peers, progress=progress)
+        peers: list[Method] = [plain, *([PEERS[peer]()] if peer else [])]
+        scores = score_variants(frames, load_kitti, steps, peers, runner=runner)
     rows: list[Row] = []
     for k, one in enumerate(scores):
         other = scores[min(max(k, 1), len(steps)) - 1]
@@ -72,9 +73,7 @@ def score_steps(frames: Sequence[Frame], with_peer: bool, progress: Progress = i
     return make_report({'steps': Table.of(rows, title=title)}, scores, Config())
 
 
-def score_wrong_values(
-    frames: Sequence[Frame], config: Config, progress: Progress = iter
-) -> Report:
+def score_wrong_values(frames: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
     """Give hyper-parameters wrong, with and without learning."""
     refuse_changed(config, [*GIVEN['both'], 'learning.mode'])
     wrong = {
@@ -86,7 +85,7 @@ def score_wrong_values(
     for title, changes in {'the defaults': {}, **wrong}.items():
         variants[title] = config.replace(**changes)
         variants[f'{title}, fixed'] = config.replace(**changes, **{'learning.mode': 'fixed'})
-    scores = score_variants(frames, load_kitti, variants, progress=progress)
+    scores = score_variants(frames, load_kitti, variants, runner=runner)
     rows: list[Row] = [
         [
             (Column('given'), learned.name),

@@ -6,22 +6,24 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.errors import ConfigError
+from gp_ground_seg.errors import ConfigError, PointCloudError
 from gp_ground_seg.evaluation import evaluate as methods
 from gp_ground_seg.evaluation import report as results
-from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod, Progress
+from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore, OurMethod
 from gp_ground_seg.evaluation.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.evaluation.metrics import RATIOS, class_errors, class_name, ratio
 from gp_ground_seg.evaluation.objects import BAND_TITLES, GROUPS, Objects
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
+from gp_ground_seg.evaluation.patchworkpp import PEERS, PatchworkppMethod
 from gp_ground_seg.evaluation.report import Column, Report, Row, Table, percent
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec
 from gp_ground_seg.parameters.schema import ParameterValue
+from gp_ground_seg.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.simulation import PLACES, SCENES, SENSORS, Kind, simulate_scan
 
 Changes = Mapping[str, ParameterValue]
@@ -31,7 +33,6 @@ SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
 OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
 """What rays hit of objects, by the classes of `GROUPS`; crates are boxes too, but no objects."""
-PEER = methods.TITLES[methods.PATCHWORKPP]
 
 
 class SimulatedFrame(NamedTuple):
@@ -71,10 +72,10 @@ def simulated_frames(
     return [SimulatedFrame(*case) for case in cases if not case[3] or case[1] not in PLACES]
 
 
-def peer_of(sensor: str) -> PatchworkppMethod:
-    """Return Patchwork++, told where a simulated sensor is in its cloud and above the ground."""
+def peer_of(sensor: str, peer: str = methods.PATCHWORKPP) -> PatchworkppMethod:
+    """Return one of `PEERS`, told where a simulated sensor is in its cloud and how high."""
     model = SENSORS[sensor]
-    return PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
+    return PEERS[peer](model.height, model.origin or (0.0, 0.0, 0.0))
 
 
 def refuse_changed(config: Config, names: Iterable[str]) -> None:
@@ -90,13 +91,13 @@ def score_variants(
     variants: Mapping[str, Config],
     peers: Sequence[methods.Method] = (),
     *,
-    progress: Progress = iter,
+    runner: Runner = HERE,
 ) -> list[MethodScore]:
     """Run variants, then `peers`, once on every scan, alternately, each scan without a past."""
     with ExitStack() as stack:
         ours = [stack.enter_context(closing(OurMethod(c, name))) for name, c in variants.items()]
         every = [*ours, *peers]
-        return methods.score_methods(items, load, every, each_alone=True, progress=progress)
+        return methods.score_methods(items, load, every, each_alone=True, runner=runner)
 
 
 def make_report(
@@ -142,30 +143,45 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
     return rows
 
 
-def score_scenes(
-    sensors: Sequence[str],
-    scenes: Sequence[str],
-    n_seeds: int,
+def score_simulated(
+    frames: Sequence[SimulatedFrame],
+    tables: Callable[[Sequence[MethodScore], Sequence[str]], dict[str, Table]],
     config: Config,
-    with_peer: bool,
-    progress: Progress = iter,
+    peer: str | None,
+    runner: Runner = HERE,
 ) -> Report:
-    """Segment `n_seeds` simulated scenes of each name by each of the sensors.
+    """Segment simulated scans, all sensors with the parameters `config`.
 
-    Patchwork++ runs on the same clouds, as `peer_of` makes it.
+    The one of `PEERS` named runs on the same clouds, as `peer_of` makes it. A sensor and scene of
+    which a scan is refused is left out; `tables` lays out the scores, with notes that say so.
     """
-    ours, theirs = [], []
-    for sensor in sensors:
-        frames = simulated_frames([sensor], scenes, n_seeds, SCENE_PLACES)
-        peers = [peer_of(sensor)] if with_peer else []
-        own, *other = score_variants(
-            frames, load_simulated, {methods.OURS: config}, peers, progress=progress
-        )
-        ours.append(own)
-        theirs += other
-    pairs = [(methods.OURS, ours), (methods.PATCHWORKPP, theirs)]
-    scores = [methods.pool(name, own) for name, own in pairs if own]
-    return make_report({'scenes': scene_table(*scores)}, scores, config)
+    groups = [list(own) for _, own in itertools.groupby(frames, lambda frame: frame.sequence)]
+    parts = runner.run(partial(_score_groups, config, peer), groups)
+    outcomes = list(itertools.chain(*parts))
+    refused = [one for one in outcomes if isinstance(one, str)]
+    found = [one for one in outcomes if not isinstance(one, str)]
+    if not found:
+        raise PointCloudError('; '.join(refused))
+    scores = [methods.pool(own[0].name, own) for own in zip(*found, strict=True)]
+    return make_report(tables(scores, refused), scores, config)
+
+
+def _score_groups(
+    config: Config,
+    peer: str | None,
+    groups: Sequence[Sequence[SimulatedFrame]],
+    progress: Progress,
+) -> list[list[MethodScore] | str]:
+    """Scores of each group of scans, of one sensor in one scene, or why one is refused."""
+    outcomes: list[list[MethodScore] | str] = []
+    for frames in progress(groups):
+        peers = [peer_of(frames[0].sensor, peer)] if peer else []
+        try:
+            ours = {methods.OURS: config}
+            outcomes.append(score_variants(frames, load_simulated, ours, peers))
+        except PointCloudError as error:
+            outcomes.append(f'refused: {error}')
+    return outcomes
 
 
 def scene_parts(score: MethodScore) -> list[MethodScore]:
@@ -176,8 +192,9 @@ def scene_parts(score: MethodScore) -> list[MethodScore]:
     return [MethodScore(score.name, tuple(scans)) for scans in seeds.values()]
 
 
-def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
-    """One row for each sensor and scene; the note says where the peer is ahead in IoU."""
+def scene_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> dict[str, Table]:
+    """One row for each sensor and scene; a note says where the peer is ahead in IoU."""
+    ours, *peers = scores
     rows: list[Row] = []
     behind, ties = [], []
     for group in ours.sequences:
@@ -194,8 +211,7 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
                 (percent('no model', 'share_without_model'), share),
             ]
         )
-        if peer is not None:
-            its = peer.of(group)
+        for its in (peer.of(group) for peer in peers):
             median = its.height.median_absolute
             rows[-1] += [
                 (percent('its IoU', 'peer_iou'), its.iou),
@@ -214,14 +230,15 @@ def scene_table(ours: MethodScore, peer: MethodScore | None = None) -> Table:
         f'{n_scans} simulated scans per row; IoU against exact labels [%], every point counts; '
         'height of the surface under true ground [cm]; share of it without a model [%]'
     )
-    notes = []
-    if peer is not None:
+    notes = [*refused]
+    if peers:
         title += (
-            f'; its: of {PEER}, which has the true sensor height, and as surface its nearest patch'
+            f'; its: of {peers[0].title}, which has the true sensor height, and as surface its '
+            'nearest patch'
         )
         title += f'; {interval_note("scenes of each row")}'
         n_ahead = len(rows) - len(behind) - len(ties)
         where = f'; ties on {", ".join(ties)}' if ties else ''
         where += f'; behind on {", ".join(behind)}' if behind else ''
-        notes = [f'ahead of {PEER} on {n_ahead} of {len(rows)} rows{where}']
-    return Table.of(rows, title=title, notes=notes)
+        notes.append(f'ahead of {peers[0].title} on {n_ahead} of {len(rows)} rows{where}')
+    return {'scenes': Table.of(rows, title=title, notes=notes)}

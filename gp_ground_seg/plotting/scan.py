@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.data.atomic_output import staged_file
+from gp_ground_seg.errors import require
 from gp_ground_seg.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.parameters.config import Config
@@ -20,8 +23,16 @@ from gp_ground_seg.result import Segmentation
 Labels = npt.NDArray[np.uint8]
 
 COLOURS = {'ground': '#B9BFC6', 'obstacles': style.VERMILION}
-WIDTH, HEIGHT, TITLE = 12.0, 6.0, 0.4
-"""Size of the picture, and of the line above it [inch]."""
+VALUES = {
+    'height': ('height over the ground [m]', -0.5, 3.0),
+    'p_ground': ('probability of ground', 0.0, 1.0),
+}
+"""What points are coloured by instead of their class: attributes of `Segmentation`."""
+WIDTH, HEIGHT, TITLE, FOOT = 12.0, 6.0, 0.4, 0.6
+"""Size of the scene, and of the line above and the legend below it [inch]."""
+PANEL, GAP, N_COLUMNS = 4.8, 0.15, 3
+"""Width of a scene of a sheet and of the gap beside it [inch], and how many are in a row."""
+MOVIE_DPI = 80  # 960 by 560: whole blocks of a video
 N_STD = 2.0
 N_PROFILES = 60
 CLOSEST = 1.0
@@ -31,6 +42,30 @@ CAMERA, TARGET = (-16.0, -7.0, 10.0), (12.0, 1.0, -3.0)
 ZOOM = 0.75
 """Focal length over the width of the picture."""
 
+
+class View(NamedTuple):
+    """Where a scene is seen from, sensor frame [m], and what its colours are: of `VALUES`."""
+
+    camera: tuple[float, float, float] = CAMERA
+    colour: str = 'class'
+
+    @classmethod
+    def around(cls, azimuth: float, elevation: float, distance: float) -> View:
+        """Look at the middle of the scene from a direction [degrees] and a distance [m]."""
+        turn, up = math.radians(azimuth), math.radians(elevation)
+        across = math.cos(turn) * math.cos(up), math.sin(turn) * math.cos(up), math.sin(up)
+        x, y, z = np.add(TARGET, np.multiply(distance, across)).tolist()
+        return cls((x, y, z))
+
+
+class Scene(NamedTuple):
+    """A segmented scan to draw."""
+
+    title: str
+    points: npt.ArrayLike  # (N, >=3) [m]
+    segmentation: Segmentation
+
+
 COLOURS_ABOVE = {
     'ground': '#E3B968',
     'obstacle': '#1B4F72',
@@ -39,6 +74,9 @@ COLOURS_ABOVE = {
     'right': '#BCC2C8',
     'missed ground': style.BLUE,
     'false ground': style.VERMILION,
+    'same label': '#BCC2C8',
+    'ground in A only': style.BLUE,
+    'ground in B only': style.VERMILION,
 }
 EXTENT, RING_STEP = 50.0, 10.0
 """Half the side of the square seen from above, and the step between the rings in it [m]."""
@@ -52,98 +90,167 @@ def plot_scan_view(
     config: Config,
     path: str | Path,
     title: str = '',
+    view: View | None = None,
 ) -> str:
-    """Draw a scan in perspective as a PNG, replacing the file `path`; return numbers of points.
+    """Draw a scan in perspective, replacing the file `path`; return numbers of points.
 
-    Ground and obstacles of `points`, (N, >=3) [m], and on them profiles of the ground model with
-    two standard deviations, coloured by length-scale: what the node's topics show in RViz.
-    Ground less certain than ``label.ground_tolerance`` is not drawn.
+    Ground and obstacles of `points`, (N, >=3) [m], and the ground model coloured by length-scale,
+    with profiles of two standard deviations: what the node's topics show in RViz. Ground less
+    certain than ``label.ground_tolerance`` is not drawn. In a PDF or SVG points are pixels.
     """
-    xyz = check_points(points)
-    style.check_lengths(len(xyz), label=segmentation.label)
-    finite = finite_points(xyz)
-    figure = new_figure(WIDTH, HEIGHT + (TITLE if title else 0.0))
-    axes = add_axes(figure, 0.0, 0.0, (WIDTH, HEIGHT))
-    write_line(figure, title, 0.5, 0.5 * TITLE, fontsize=14)
-    _draw_points(axes, xyz[finite], segmentation.label[finite])
-    _draw_profiles(axes, GroundModel.of(segmentation), config)
-    _draw_legend(figure, axes, config)
-    axes.set_axis_off()
-    axes.set_aspect('equal')
-    axes.set_xlim(-0.5, 0.5)
-    axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
+    figure = _scene_figure(Scene(title, points, segmentation), config, view or View())
     save(figure, path)
     return _label_panel(segmentation.label)[0]
 
 
-def project(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+def plot_sheet(
+    scenes: Iterable[Scene], n_scenes: int, config: Config, path: str | Path, view: View
+) -> None:
+    """Draw scenes side by side as `plot_scan_view` draws one, replacing the file `path`."""
+    height, n_rows = PANEL * HEIGHT / WIDTH, -(-n_scenes // N_COLUMNS)
+    full = FOOT + n_rows * (height + TITLE)
+    figure = new_figure((PANEL + GAP) * N_COLUMNS, full)
+    for k, scene in enumerate(scenes):
+        row, column = divmod(k, N_COLUMNS)
+        bottom = full - (row + 1) * (height + TITLE)
+        axes = add_axes(figure, column * (PANEL + GAP), bottom, (PANEL, height))
+        axes.set_title(scene.title, fontsize=12, parse_math=False)
+        _draw_scene(axes, scene, config, view)
+    _draw_legend(figure, config, view.colour)
+    save(figure, path)
+
+
+def write_movie(
+    scenes: Iterable[Scene], config: Config, path: str | Path, view: View, fps: float
+) -> None:
+    """Write a GIF of scenes, replacing the file."""
+    imageio = require('imageio.v2', 'plot')
+    with (
+        staged_file(path, force=True) as part,
+        imageio.get_writer(part, duration=1e3 / fps, loop=0) as writer,
+    ):
+        for scene in scenes:
+            writer.append_data(style.pixels(_scene_figure(scene, config, view, MOVIE_DPI)))
+
+
+def _scene_figure(scene: Scene, config: Config, view: View, dpi: int = style.DPI) -> Any:
+    figure = new_figure(WIDTH, FOOT + HEIGHT + (TITLE if scene.title else 0.0), dpi)
+    write_line(figure, scene.title, 0.5, 0.5 * TITLE, fontsize=14)
+    _draw_scene(add_axes(figure, 0.0, FOOT, (WIDTH, HEIGHT)), scene, config, view)
+    _draw_legend(figure, config, view.colour)
+    return figure
+
+
+def _draw_scene(axes: Any, scene: Scene, config: Config, view: View) -> None:
+    xyz = check_points(scene.points)
+    style.check_lengths(len(xyz), label=scene.segmentation.label)
+    _draw_points(axes, xyz, scene.segmentation, view)
+    _draw_surface(axes, GroundModel.of(scene.segmentation), config, view)
+    axes.set_axis_off()
+    axes.set_aspect('equal')
+    axes.set_xlim(-0.5, 0.5)
+    axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
+
+
+def project(
+    points: FloatArray, camera: tuple[float, float, float] = CAMERA
+) -> tuple[FloatArray, FloatArray]:
     """Return places in the picture and depths [m] of points, (..., 2) and (...).
 
     A place is in widths of the picture, right and up of its middle; NaN nearer than `CLOSEST`.
     """
-    forward = np.subtract(TARGET, CAMERA)
+    forward = np.subtract(TARGET, camera)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
-    seen = (points - CAMERA) @ np.stack([right, np.cross(right, forward), forward]).T
+    seen = (points - camera) @ np.stack([right, np.cross(right, forward), forward]).T
     depth: FloatArray = seen[..., 2]
     safe = np.where(depth > CLOSEST, depth, np.nan)
     place: FloatArray = ZOOM * seen[..., :2] / safe[..., None]
     return place, depth
 
 
-def _draw_points(axes: Any, xyz: FloatArray, label: npt.NDArray[np.uint8]) -> None:
+def _draw_points(axes: Any, xyz: FloatArray, segmentation: Segmentation, view: View) -> None:
     """Draw far points first, and the ground below all obstacles."""
-    place, depth = project(xyz)
+    place, depth = project(xyz, view.camera)
+    size = _scale(axes) ** 2
     labels_and_layers = ((Label.GROUND, 1), (Label.OBSTACLE, 4))
     for colour, (value, layer) in zip(COLOURS.values(), labels_and_layers, strict=True):
-        chosen = np.flatnonzero((label == value) & (depth > CLOSEST))
+        chosen = np.flatnonzero((segmentation.label == value) & (depth > CLOSEST))
         chosen = chosen[np.argsort(-depth[chosen])]
+        look: dict[str, Any] = {'c': colour, 'zorder': layer}
+        if view.colour in VALUES:
+            _, low, high = VALUES[view.colour]
+            look = {'c': getattr(segmentation, view.colour)[chosen], 'vmin': low, 'vmax': high}
+            look |= {'cmap': style.value_colours(), 'plotnonfinite': True, 'zorder': 4}
         axes.scatter(
-            *place[chosen].T, s=np.clip(40.0 / depth[chosen], 0.4, 4.0), c=colour,
-            linewidths=0.0, zorder=layer,
+            *place[chosen].T, s=size * np.clip(40.0 / depth[chosen], 0.4, 4.0), linewidths=0.0,
+            rasterized=True, **look,
         )  # fmt: skip
 
 
-def _draw_profiles(axes: Any, model: GroundModel, config: Config) -> None:
+def _scale(axes: Any) -> float:
+    """Return the width of a scene over that of a picture of its own."""
+    width: float = axes.bbox.width / axes.figure.dpi
+    return width / WIDTH
+
+
+def _draw_surface(axes: Any, model: GroundModel, config: Config, view: View) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
 
-    last = len(model.height) - 1
-    rows = np.unique(np.linspace(0, last, min(last + 1, N_PROFILES)).round()).astype(int)
     middle, lower, upper = (
-        project(model.knot_points(n_std)[rows])[0] for n_std in (0.0, -N_STD, N_STD)
+        project(model.knot_points(n_std), view.camera)[0] for n_std in (0.0, -N_STD, N_STD)
     )
-    certain = model.std[rows] <= config.label.ground_tolerance
+    certain = model.std <= config.label.ground_tolerance
     shown = certain & np.isfinite(upper + lower + middle).all(axis=-1)
     piece = shown[:, :-1] & shown[:, 1:]
     limits = config.length_scale
-    colours = style.length_scale_colours(model.length_scale[rows], limits.min, limits.max)
-    colours = colours[:, :-1][piece]
-    corners = [lower[:, :-1], lower[:, 1:], upper[:, 1:], upper[:, :-1]]
-    quads = np.stack([corner[piece] for corner in corners], axis=1)
-    ends = np.stack([middle[:, :-1][piece], middle[:, 1:][piece]], axis=1)
-    axes.add_collection(
-        PolyCollection(list(quads), facecolors=colours, alpha=0.35, linewidths=0.0, zorder=2)
+    colours = style.length_scale_colours(model.length_scale, limits.min, limits.max)
+    if view.colour in VALUES:
+        colours = np.full_like(colours, 0.6)
+
+    def add(drawn: BoolArray, corners: Sequence[FloatArray], kind: Any, **look: Any) -> None:
+        shapes = np.stack([corner[drawn] for corner in corners], axis=1)
+        collection = kind(list(shapes), rasterized=True, **look)
+        collection.set_color(colours[:, :-1][drawn])
+        axes.add_collection(collection)
+
+    aside = [np.roll(middle, -1, axis=0)[:, ends] for ends in (slice(1, None), slice(-1))]
+    filled = piece & np.roll(piece, -1, axis=0)
+    flat = {'alpha': 0.45, 'linewidths': 0.0, 'antialiaseds': False, 'zorder': 2}
+    add(filled, [middle[:, :-1], middle[:, 1:], *aside], PolyCollection, **flat)
+    piece[np.arange(len(piece)) % -(-len(piece) // N_PROFILES) > 0] = False
+    band = [lower[:, :-1], lower[:, 1:], upper[:, 1:], upper[:, :-1]]
+    add(piece, band, PolyCollection, alpha=0.35, linewidths=0.0, zorder=2)
+    add(
+        piece,
+        [middle[:, :-1], middle[:, 1:]],
+        LineCollection,
+        linewidths=1.3 * _scale(axes),
+        zorder=3,
     )
-    axes.add_collection(LineCollection(list(ends), colors=colours, linewidths=1.3, zorder=3))
 
 
-def _draw_legend(figure: Any, axes: Any, config: Config) -> None:
-    from matplotlib.patches import Rectangle
-
+def _draw_legend(figure: Any, config: Config, colour: str) -> None:
+    """Draw what the colours are below all else."""
+    width = figure.get_size_inches()[0]
+    bar = add_axes(figure, 0.66 * width, 0.26, (0.3 * width, 0.14))
+    bar.set_yticks([])
+    if colour in VALUES:
+        title, low, high = VALUES[colour]
+        ramp, extent = np.linspace(0.0, 1.0, 200)[None], (low, high, 0.0, 1.0)
+        bar.imshow(ramp, extent=extent, aspect='auto', cmap=style.value_colours())
+        bar.set_title(f'{title}; grey points: no model', fontsize=9.5, loc='left', pad=3.0)
+        return
     dots = style.legend_dots(COLOURS, 7)
-    legend = axes.legend(handles=dots, loc='upper left', fontsize=11, framealpha=0.85)
-    legend.set_zorder(5)
-    plate = Rectangle((0.205, -0.5 * HEIGHT / WIDTH + 0.008), 0.285, 0.068)
-    plate.set(facecolor='white', edgecolor='#CCCCCC', alpha=0.85, zorder=5)
-    axes.add_patch(plate)
-    bar = add_axes(figure, 0.72 * WIDTH, 0.40, (0.255 * WIDTH, 0.16))
+    figure.legend(handles=dots, loc='lower left', fontsize=11, frameon=False, ncols=2)
     low, high = config.length_scale.min, config.length_scale.max
     colours = style.length_scale_colours(np.geomspace(low, high, 200), low, high)
     bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], colours[None])
     bar.set_xscale('log')
-    bar.set_yticks([])
-    bar.set_title('length-scale of the ground [m]; ribbons: 2 sigma', fontsize=9.5)
+    bar.set_title(
+        'length-scale of the ground [m]; ribbons: 2 sigma', fontsize=9.5, loc='left', pad=3.0
+    )
     ticks = [tick for tick in (0.1, 0.3, 1, 3, 10, 30, 100, 300) if low <= tick <= high]
     bar.set_xticks(ticks, labels=[f'{tick:g}' for tick in ticks])
     bar.minorticks_off()
@@ -167,10 +274,47 @@ def plot_birds_eye(
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=label, truth=truth)
-    xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
     panels = [_label_panel(label)]
     if truth is not None:
         panels.append(_error_panel(label, truth))
+    _draw_panels(xyz, panels, path, title)
+    return panels[-1][0]
+
+
+def plot_two_labels(
+    points: npt.ArrayLike,
+    labels: Sequence[Labels],
+    path: str | Path,
+    truth: Labels | None = None,
+    title: str = '',
+) -> None:
+    """Draw what two methods, A and B, say of points (N, >=3) [m] from above, as a PNG.
+
+    A panel for each, with its errors where the true labels are given, and one of where they
+    differ. The file `path` is replaced.
+    """
+    xyz = check_points(points)
+    one, other = labels
+    style.check_lengths(len(xyz), A=one, B=other, truth=truth)
+    own = [
+        _label_panel(label) if truth is None else _error_panel(label, truth) for label in labels
+    ]
+    panels = [(f'{name}: {text}', layers) for name, (text, layers) in zip('AB', own, strict=True)]
+    only_a, only_b = (
+        (a == Label.GROUND) & (b != Label.GROUND) for a, b in ((one, other), (other, one))
+    )
+    layers = {'same label': one == other, 'unknown': (one != other) & ~only_a & ~only_b}
+    layers |= {'ground in A only': only_a, 'ground in B only': only_b}
+    n_a, n_b = (_thousands(int(chosen.sum())) for chosen in (only_a, only_b))
+    panels.append((f'{n_a} ground in A only, {n_b} in B only', layers))
+    _draw_panels(xyz, panels, path, title)
+
+
+def _draw_panels(
+    xyz: FloatArray, panels: Sequence[tuple[str, Layers]], path: str | Path, title: str
+) -> None:
+    """Draw panels side by side."""
+    xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
     width = LEFT + SQUARE + RIGHT
     height = BELOW + SQUARE + ABOVE + (LINE if title else 0.0)
     figure = new_figure(width * len(panels), height)
@@ -182,7 +326,6 @@ def plot_birds_eye(
         axes.set_ylabel('x, forward [m]')
         _draw_panel(axes, xy, layers)
     save(figure, path)
-    return panels[-1][0]
 
 
 def _label_panel(label: Labels) -> tuple[str, Layers]:
@@ -222,8 +365,8 @@ def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None
         x, y = xy[chosen & inside].T
         if len(x):
             shown[name] = colour = COLOURS_ABOVE[name]
-            size = 3.0 if name in ('missed ground', 'false ground') else 1.0
-            axes.scatter(y, x, s=size, c=colour, linewidths=0.0, zorder=depth)
+            size = 3.0 if COLOURS_ABOVE[name] in (style.BLUE, style.VERMILION) else 1.0
+            axes.scatter(y, x, s=size, c=colour, linewidths=0.0, zorder=depth, rasterized=True)
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
     for radius in np.arange(RING_STEP, EXTENT * math.sqrt(2.0), RING_STEP):
         axes.plot(

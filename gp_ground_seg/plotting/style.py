@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.errors import MissingDependencyError, PointCloudError
+from gp_ground_seg.errors import PointCloudError, require
 from gp_ground_seg.frame import FloatArray
 
 DPI = 120
@@ -32,13 +33,7 @@ _RAMP = np.array(
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Any:
     """Return an empty matplotlib figure [inch] outside pyplot's global state."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingDependencyError(
-            "drawing needs matplotlib: pip install 'gp_ground_seg[plot]'"
-        ) from error
-    return Figure((width, height), dpi=dpi)
+    return require('matplotlib.figure', 'plot').Figure((width, height), dpi=dpi)
 
 
 def add_axes(figure: Any, left: float, bottom: float, size: tuple[float, float]) -> Any:
@@ -67,12 +62,30 @@ def legend_dots(colours: Mapping[str, str], size: float) -> list[Any]:
 
 
 def save(figure: Any, path: str | Path) -> None:
-    """Write a figure as PDF where `path` ends so, else as PNG, replacing the file."""
-    kind = 'pdf' if Path(path).suffix.lower() == '.pdf' else 'png'
-    # With its date no PDF would equal another.
-    metadata = {'CreationDate': None} if kind == 'pdf' else {}
-    with staged_file(path, force=True) as part:
+    """Write a figure as PDF or SVG where `path` ends so, else as PNG, replacing the file."""
+    from matplotlib import rc_context
+
+    kind = {'.pdf': 'pdf', '.svg': 'svg'}.get(Path(path).suffix.lower(), 'png')
+    # With their dates, and names by chance, no two files would be equal.
+    metadata = {'pdf': {'CreationDate': None}, 'svg': {'Date': None}}.get(kind, {})
+    with staged_file(path, force=True) as part, rc_context({'svg.hashsalt': 'gp_ground_seg'}):
         figure.savefig(part, format=kind, metadata=metadata)
+
+
+def pixels(figure: Any) -> npt.NDArray[np.uint8]:
+    """Return a figure as an image, (height, width, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3]
+
+
+def value_colours() -> Any:
+    """Return the colours of a range of values; NaN has that of `UNKNOWN`."""
+    from matplotlib import colormaps
+
+    return colormaps['viridis'].with_extremes(bad=UNKNOWN)
 
 
 def check_lengths(n_points: int, **values: Any) -> None:

@@ -224,7 +224,6 @@ class Session:
     """The node of a command, without services and /rosout, and the time it spends waiting."""
 
     _is_interrupted = False
-    _is_held_back = False
 
     def __init__(self, node: Any) -> None:
         from rclpy.executors import SingleThreadedExecutor
@@ -246,17 +245,7 @@ class Session:
     def interrupt(self, _number: int, _frame: FrameType | None) -> None:
         """Raise KeyboardInterrupt, now and at the next wait."""
         self._is_interrupted = True
-        if not self._is_held_back:
-            raise KeyboardInterrupt
-
-    @contextmanager
-    def holding_back(self) -> Iterator[None]:
-        """Let a signal within the block be raised at the next `check` only."""
-        self._is_held_back = True
-        try:
-            yield
-        finally:
-            self._is_held_back = False
+        raise KeyboardInterrupt
 
     def close(self) -> None:
         """Destroy the node."""

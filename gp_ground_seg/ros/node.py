@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2
 
+from gp_ground_seg import log
 from gp_ground_seg.backend import NumpyBackend, choose_backend
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.errors import GroundSegError, PointCloudError
@@ -24,7 +27,7 @@ from gp_ground_seg.ros.input import THROTTLED, TfListener, TimeJumps, is_tf_used
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.subscription import CloudSubscription
-from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader, LibraryLog
+from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader
 from gp_ground_seg.segmenter import GroundSegmenter
 
 
@@ -40,7 +43,8 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
-        self._library_log = LibraryLog(self.get_logger())
+        self._library_log = ExitStack()
+        self._library_log.enter_context(log.told(self._pass_on))
         self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
         self._is_compiled = False
         self._tf: TfListener | None = None
@@ -79,6 +83,13 @@ class GroundSegmentationNode(ConfiguredNode):
         self._segmenter.configure(dataclasses.replace(config, runtime=runtime))
         self._follow_tf(config)
         self._diagnostics.configure(config.diagnostics)
+
+    def _pass_on(self, level: int, message: str) -> None:
+        # rclpy wants a line of code for each severity.
+        if level >= logging.WARNING:
+            self.get_logger().warning(message)
+        else:
+            self.get_logger().info(message)
 
     def _load_backend(self, config: Config) -> None:
         if not self._loader.is_started and choose_backend(config.runtime.backend) == 'numba':

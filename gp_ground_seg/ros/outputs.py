@@ -7,9 +7,12 @@ from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
+from geometry_msgs.msg import Point
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
 
 from gp_ground_seg.data.point_cloud2 import append_columns, read_xyz
 from gp_ground_seg.frame import FloatArray, IntArray, Label
@@ -76,15 +79,13 @@ def labelled_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointCloud
     return message
 
 
-def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> Any:
+def markers(cloud: PointCloud2, segmentation: Segmentation, config: Config) -> MarkerArray:
     """Return the ground model as a MarkerArray in the frame of `cloud`.
 
     ``profiles``: ground height over range, coloured by length-scale from ``length_scale.min``
     to ``length_scale.max``. ``band``: two standard deviations about it, vertical. Neither is
     drawn where the standard deviation is above ``label.ground_tolerance``.
     """
-    from visualization_msgs.msg import Marker, MarkerArray
-
     model = GroundModel.of(segmentation)
     grid = np.ix_(_thin(len(model.height), MAX_PROFILES), _thin(len(model.knots), MAX_KNOTS))
     points, std = model.knot_points()[grid], model.std[grid]
@@ -116,10 +117,7 @@ def _thin(count: int, most: int) -> IntArray:
 
 def _marker(
     cloud: PointCloud2, name: str, kind: int, vertices: FloatArray, index: IntArray
-) -> Any:
-    from geometry_msgs.msg import Point
-    from visualization_msgs.msg import Marker
-
+) -> Marker:
     # Viewers warn of a marker without vertices: it is deleted.
     action = Marker.ADD if len(index) else Marker.DELETE
     marker = Marker(header=cloud.header, ns=name, id=0, type=kind, action=action)
@@ -133,10 +131,8 @@ def _marker(
     return marker
 
 
-def _colours(rgb: FloatArray) -> list[Any]:
+def _colours(rgb: FloatArray) -> list[ColorRGBA]:
     """Return the message of each colour (N, 3); similar ones share one."""
-    from std_msgs.msg import ColorRGBA
-
     keys = [tuple(row) for row in (np.rint(rgb * 50.0) / 50.0).tolist()]
     shared = {(r, g, b): ColorRGBA(r=r, g=g, b=b, a=1.0) for r, g, b in set(keys)}
     return [shared[key] for key in keys]
@@ -147,20 +143,13 @@ def _points_with(label: Label) -> Callable[[PointCloud2, Segmentation, Config], 
 
 
 LABELLED = Output('~/labeled', PointCloud2, lambda c, s, _: labelled_cloud(c, s), True)
-CLOUD_OUTPUTS = (
+OUTPUTS = (
     Output('ground', PointCloud2, _points_with(Label.GROUND), False),
     Output('obstacles', PointCloud2, _points_with(Label.OBSTACLE), False),
     LABELLED,
     Output('~/ground_model', PointCloud2, lambda c, s, _: ground_model_cloud(c, s), True),
+    Output('~/markers', MarkerArray, markers, True),
 )
-
-
-def marker_outputs() -> tuple[Output, ...]:
-    """Return the output of ``~/markers``; raise an ImportError without visualization_msgs."""
-    import geometry_msgs.msg  # noqa: F401
-    from visualization_msgs.msg import MarkerArray
-
-    return (Output('~/markers', MarkerArray, markers, True),)
 
 
 class OutputPublishers:
@@ -168,19 +157,11 @@ class OutputPublishers:
 
     def __init__(self, node: Node) -> None:
         self._logger = node.get_logger()
-        outputs: tuple[Output, ...] = CLOUD_OUTPUTS
-        try:
-            outputs += marker_outputs()
-        except ImportError as error:
-            self._logger.warning(
-                f'no topic ~/markers: {error.name} is not installed '
-                '(sudo apt install ros-jazzy-visualization-msgs)'
-            )
         self._renamed: dict[str, str] = {}
         options = {'qos_overriding_options': QoSOverridingOptions.with_default_policies()}
         self._publishers = [
             (o, node.create_publisher(o.message_type, o.topic, cloud_profile(), **options))
-            for o in outputs
+            for o in OUTPUTS
         ]
 
     def n_subscribers(self) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""A node in a second process, clouds sent to it, and what comes back: losses, latency, memory.
+"""A node in a second process, clouds sent to it, and what comes back: losses and latency.
 
 ROS is imported by what needs it: commands import this module where there is no ROS.
 """
@@ -17,7 +17,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,6 @@ import numpy as np
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.point_cloud2 import CloudMessage, encode_cloud, stamp_of
 from gp_ground_seg.errors import GroundSegError
-from gp_ground_seg.frame import FloatArray
 from gp_ground_seg.ros.lifecycle import (
     Session,
     large_cloud_transport,
@@ -39,17 +37,13 @@ from gp_ground_seg.ros.lifecycle import (
 INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'  # topics of the node
 START_TIMEOUT = 300.0  # time the node has to start, and to compile on a slow machine [s]
 SILENCE = 2.0  # time without a cloud after which what is still missing is lost [s]
-STEADY_FACTOR, STEADY_MARGIN = 1.5, 0.02
-"""How far latency may grow from the second quarter, which fills the queue, to the last [1, s]."""
 
 _RUN = """\
 from gp_ground_seg.ros.probe import run_node
 sys.exit(run_node(*sys.argv[1:]))
 """
-_DIAGNOSTICS = '/diagnostics'
 _PROBE_FRAME = 'gp_ground_seg_probe'
 _PROBE_PERIOD = 0.2
-_COUNTERS = ('Clouds since startup', 'Dropped since startup')
 _HIGHEST_DOMAIN = 101  # ports above meet those that Linux hands out
 _NETWORK = (
     'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -60,9 +54,8 @@ _NETWORK = (
 def private_network() -> Iterator[None]:
     """Keep this process and its children to this machine, on a ROS domain of their own."""
     kept = {name: os.environ.pop(name) for name in _NETWORK if name in os.environ}
-    domain = 1 + os.getpid() % _HIGHEST_DOMAIN
-    if str(domain) == kept.get('ROS_DOMAIN_ID'):
-        domain = 1 + domain % _HIGHEST_DOMAIN
+    own = kept.get('ROS_DOMAIN_ID')
+    domain = secrets.choice([k for k in range(1, _HIGHEST_DOMAIN + 1) if str(k) != own])
     os.environ['ROS_DOMAIN_ID'] = str(domain)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     try:
@@ -80,21 +73,15 @@ class NodeProcess:
     """
 
     def __init__(
-        self,
-        log: Path,
-        ros_args: Sequence[str] = (),
-        uninterrupted: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
-        unfinished: Path | None = None,
+        self, log: Path, ros_args: Sequence[str] = (), unfinished: Path | None = None
     ) -> None:
         self._log = log
-        self._uninterrupted = uninterrupted
         words = [str(unfinished or ''), '--ros-args', *ros_args]
         self._command = [sys.executable, '-c', own_code(_RUN), *words]
 
     def __enter__(self) -> NodeProcess:
         """Start it."""
-        # An interrupt between the start and the assignment would leave it running.
-        with self._log.open('wb') as log, self._uninterrupted():
+        with self._log.open('wb') as log:
             self._process = subprocess.Popen(
                 self._command, stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT
             )
@@ -159,7 +146,7 @@ def probe_session(name: str) -> Iterator[tuple[Session, list[str]]]:
     taken the same ROS domain.
     """
     token = secrets.token_hex(8)
-    topics = (INPUT, GROUND, OBSTACLES, _DIAGNOSTICS)
+    topics = (INPUT, GROUND, OBSTACLES, '/diagnostics')
     own = [word for topic in topics for word in ('-r', f'{topic}:=/probe_{token}{topic}')]
     with (
         private_network(),
@@ -167,19 +154,6 @@ def probe_session(name: str) -> Iterator[tuple[Session, list[str]]]:
         ros_session(name, ['--ros-args', *own]) as session,
     ):
         yield session, own
-
-
-def memory(pid: int) -> tuple[int, int]:
-    """Return the memory that a process holds now, and the most it ever held [bytes]."""
-    path = Path('/proc', str(pid), 'status')
-    try:
-        status = path.read_text(encoding='ascii', errors='replace')
-    except OSError as error:
-        reason = f'{error.strerror}; memory is measured on Linux only'
-        raise GroundSegError(f'{path}: {reason}') from None
-    values = dict(line.partition(':')[::2] for line in status.splitlines())
-    now, peak = (1024 * int(values[key].split()[0]) for key in ('VmRSS', 'VmHWM'))
-    return now, peak
 
 
 @dataclasses.dataclass
@@ -214,7 +188,6 @@ class Probe:
     def __init__(
         self, session: Session, on_back: Callable[[CloudMessage, Results], object]
     ) -> None:
-        from diagnostic_msgs.msg import DiagnosticArray
         from sensor_msgs.msg import PointCloud2
 
         from gp_ground_seg.ros.input import cloud_profile
@@ -223,13 +196,11 @@ class Probe:
         self._session = session
         self._on_back = on_back
         self._waiting: dict[tuple[int, int], tuple[Trip, CloudMessage, Results]] = {}
-        self._counts: dict[str, int] = {}
         self._publisher = session.node.create_publisher(PointCloud2, INPUT, cloud_profile(10))
         for topic in (GROUND, OBSTACLES):
             session.node.create_subscription(
                 PointCloud2, topic, partial(self._receive, topic), cloud_profile(50), raw=True
             )
-        session.node.create_subscription(DiagnosticArray, _DIAGNOSTICS, self._diagnosed, 10)
 
     def connect(self, node: NodeProcess) -> None:
         """Send empty clouds until both topics have answered and the node is settled."""
@@ -239,7 +210,7 @@ class Probe:
             while time.monotonic() < next_time:
                 self._session.spin(0.02)
             node.check()
-            if trip.back is not None and self._counts and node.is_settled():
+            if trip.back is not None and node.is_settled():
                 break
             if time.monotonic() > end:
                 raise GroundSegError(
@@ -267,28 +238,13 @@ class Probe:
         self._wait(SILENCE)
         return trips
 
-    def one_by_one(
-        self,
-        clouds: Iterable[CloudMessage],
-        on_trip: Callable[[Trip], object] = lambda _: None,
-        silence: float = SILENCE,
-    ) -> list[Trip]:
+    def one_by_one(self, clouds: Iterable[CloudMessage], silence: float = SILENCE) -> list[Trip]:
         """Send each cloud when the one before is back, or lost; return their trips."""
         trips = []
         for cloud in clouds:
             trips.append(self._send(cloud, encode_cloud(cloud)))
             self._wait(silence)
-            on_trip(trips[-1])
         return trips
-
-    def counters(self) -> tuple[int, int]:
-        """Return the clouds that the node has processed and dropped, by its next report."""
-        self._counts.clear()
-        end = time.monotonic() + 5.0
-        while not self._counts and time.monotonic() < end:
-            self._session.spin(0.05)
-        processed, dropped = (self._counts.get(name, -1) for name in _COUNTERS)
-        return processed, dropped
 
     def _send(self, cloud: CloudMessage, raw: bytes) -> Trip:
         trip = Trip(time.time_ns())
@@ -323,45 +279,18 @@ class Probe:
             if is_data:
                 self._on_back(sent, results)
 
-    def _diagnosed(self, array: Any) -> None:
-        for status in array.status:
-            if status.name.endswith(': processing'):
-                values = {entry.key: entry.value for entry in status.values}
-                self._counts.update({name: int(values[name]) for name in _COUNTERS})
 
-
-def rate_result(asked: float, trips: Sequence[Trip], n_dropped: int) -> dict[str, Any]:
+def rate_result(asked: float, trips: Sequence[Trip]) -> dict[str, Any]:
     """Return the statistics of clouds sent at a rate of `asked` [Hz]; times in seconds."""
     latency = np.array([trip.latency for trip in trips])
-    quarter = len(trips) // 4
-    early = _percentile(latency[quarter : 2 * quarter], 50)
-    late = _percentile(latency[3 * quarter :], 50)
+    known = latency[np.isfinite(latency)]
     seconds = 1e-9 * (trips[-1].sent - trips[0].sent)
-    n_back = int(np.count_nonzero(np.isfinite(latency)))
-    percents = {'p50': 50, 'p95': 95, 'p99': 99, 'worst': 100}
+    percents = np.percentile(known, [50, 95, 99, 100]) if len(known) else np.full(4, np.nan)
     return {
         'asked': asked,
         'sent': (len(trips) - 1) / seconds if seconds > 0.0 else np.nan,
         'n_sent': len(trips),
-        'n_back': n_back,
-        'n_lost': len(trips) - n_back,
-        'n_dropped': n_dropped,
-        **{name: _percentile(latency, q) for name, q in percents.items()},
-        'is_newest_back': trips[-1].back is not None,
-        'is_bounded': bool(late <= STEADY_FACTOR * early + STEADY_MARGIN),
-        'is_accounted': n_dropped == len(trips) - n_back,
+        'n_back': len(known),
+        'n_lost': len(trips) - len(known),
+        **dict(zip(('p50', 'p95', 'p99', 'worst'), percents.tolist(), strict=True)),
     }
-
-
-def _percentile(latency: FloatArray, q: float) -> float:
-    known = latency[np.isfinite(latency)]
-    return float(np.percentile(known, q)) if len(known) else np.nan
-
-
-def memory_result(resident: Sequence[int], peak: int) -> dict[str, float]:
-    """Return memory near the start and at the end of ten values or more [bytes]; its growth."""
-    n_clouds, share = len(resident), len(resident) // 10
-    start = float(np.median(resident[share : 2 * share]))
-    end = float(np.median(resident[-share:]))
-    growth = end / start - 1.0
-    return {'n_clouds': n_clouds, 'start': start, 'end': end, 'peak': peak, 'growth': growth}

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import logging
 import os
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
 
 from gp_ground_seg.backend import Backend
 from gp_ground_seg.jit import code_folder, is_code_kept
@@ -21,7 +19,6 @@ from gp_ground_seg.segmenter import warm_up
 FOLLOWS = 'segmenting with numpy until the compiled code is there; to compile takes a minute'
 CHANGED = 'segmenting with numba now'
 STAYS = 'segmenting with numpy from now on'
-_LIBRARY = logging.getLogger('gp_ground_seg')
 
 _COMPILE = """\
 import os, threading
@@ -114,25 +111,3 @@ class BackendLoader:
         if code and not self._is_stopped:
             reason = said.splitlines()[-1] if said else f'exit code {code}'
             raise RuntimeError(f'the compiling process failed: {reason}')
-
-
-class LibraryLog(logging.Handler):
-    """Passes the library's messages on to the logger of a node, until `close`."""
-
-    def __init__(self, logger: Any) -> None:
-        super().__init__()
-        self._logger = logger
-        _LIBRARY.setLevel(logging.INFO)
-        _LIBRARY.addHandler(self)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Log one message; rclpy wants a line of code for each severity."""
-        if record.levelno >= logging.WARNING:
-            self._logger.warning(record.getMessage())
-        else:
-            self._logger.info(record.getMessage())
-
-    def close(self) -> None:
-        """Pass no more messages on."""
-        _LIBRARY.removeHandler(self)
-        super().close()

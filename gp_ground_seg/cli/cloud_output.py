@@ -1,0 +1,110 @@
+"""What `segment` writes for a cloud: labels, the points with their results, the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gp_ground_seg.data.cloud_files import WRITABLE, encode_file
+from gp_ground_seg.data.clouds import Cloud, Columns
+from gp_ground_seg.data.files import AnyPath
+from gp_ground_seg.data.inputs import Input
+from gp_ground_seg.data.numpy_files import encode_arrays
+from gp_ground_seg.errors import DataError, PointCloudError
+from gp_ground_seg.frame import Label
+from gp_ground_seg.ground_model import GroundModel
+from gp_ground_seg.result import Segmentation
+from gp_ground_seg.segmenter import GroundSegmenter
+
+LABELS = 'label'
+FORMATS = (LABELS, *(suffix[1:] for suffix in WRITABLE))
+CELL = 0.5
+"""Side of the cells of a written surface [m]."""
+# Unlabelled, road and other-object.
+SEMANTIC_KITTI_CODE = {Label.UNKNOWN: 0, Label.GROUND: 40, Label.OBSTACLE: 99}
+PARTS = {'_ground': Label.GROUND, '_obstacles': Label.OBSTACLE}
+
+
+@dataclass(frozen=True)
+class CloudOutput:
+    """Files to write for each cloud.
+
+    Attributes
+    ----------
+    form : one of `FORMATS`, or None: labels of a ``.bin`` scan, else the input's format
+    raw : whether ``.label`` files hold `Label` rather than SemanticKITTI's codes
+    split : whether ground and obstacles are files of their own
+    surface : whether the ground is written as a grid, in a file of its own
+    """
+
+    form: str | None = None
+    raw: bool = False
+    split: bool = False
+    surface: bool = False
+
+    def names(self, one: Input, stem: str | None = None) -> list[str]:
+        """Names of the files of a cloud, which begin with `stem`, by default its name."""
+        stem, form = stem or one.name, self._form(one)
+        if self.split and form == LABELS:
+            raise DataError('--split: is for clouds, a .label file has both; see --format')
+        parts = PARTS if self.split else ['']
+        surface = [f'{stem}_surface.npz'] if self.surface else []
+        return [*(f'{stem}{part}.{form}' for part in parts), *surface]
+
+    def _form(self, one: Input) -> str:
+        own = one.path.suffix.lower()[1:]
+        return self.form or (own if own in FORMATS else LABELS)
+
+    def write(
+        self, one: Input, segmenter: GroundSegmenter, paths: Sequence[AnyPath]
+    ) -> Segmentation:
+        """Segment a cloud and write its files, to `paths` in the order of `names`."""
+        cloud = one.read()
+        try:
+            result = segmenter.segment(cloud.xyz)
+        except PointCloudError as error:
+            raise PointCloudError(f'{one.path}: {error}') from error
+        if self._form(one) == LABELS:
+            paths[0].write_bytes(encode_labels(result, self.raw))
+        else:
+            values = _results(result, cloud)
+            for path, part in zip(paths, PARTS.values() if self.split else [None], strict=False):
+                mask = (result.label == part) | (part is None)
+                own = {name: column[mask] for name, column in values.items()}
+                path.write_bytes(encode_file(path, cloud.take(mask), result.label[mask], own))
+        if self.surface:
+            paths[-1].write_bytes(_encode_surface(result, cloud))
+        return result
+
+
+def encode_labels(result: Segmentation, raw: bool) -> bytes:
+    """File of a uint32 for each point: SemanticKITTI's code, or `Label`."""
+    codes = sorted(Label) if raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
+    return np.array(codes, dtype='<u4')[result.label].tobytes()
+
+
+def _results(result: Segmentation, cloud: Cloud) -> Columns:
+    """Values of each point beside its label, float32, in the coordinates of the file."""
+    values: Columns = {
+        'height': result.height,
+        'ground_z': result.ground_z + cloud.origin[2],
+        'ground_std': result.ground_std,
+        'p_ground': result.p_ground,
+    }
+    return {name: column.astype(np.float32) for name, column in values.items()}
+
+
+def _encode_surface(result: Segmentation, cloud: Cloud) -> bytes:
+    """File of the ground about the sensor as a grid, float32, in the coordinates of the file [m].
+
+    Arrays x (W,), y (H,), ground_z and ground_std (H, W), NaN where there is no model.
+    """
+    model = GroundModel.of(result)
+    reach = CELL * np.ceil(model.knots[-1] / CELL)
+    middle = np.arange(0.5 * CELL - reach, reach, CELL)
+    z, std = model.at(middle, middle[:, None])
+    x, y, height = cloud.origin
+    grids = {'ground_z': (z + height).astype(np.float32), 'ground_std': std.astype(np.float32)}
+    return encode_arrays({'x': middle + x, 'y': middle + y, **grids})

@@ -1,0 +1,130 @@
+"""``segment`` of whole data sets: scans or bags in blocks, with a record from which to go on."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from gp_ground_seg.cli import options
+from gp_ground_seg.cli.cloud_output import FORMATS
+from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
+from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
+from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
+from gp_ground_seg.errors import DataError
+from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.scale.cluster import Progress, cut, depends_on_past
+from gp_ground_seg.scale.dataset import Manifest, Outcome, Scan, digest, pool, sweep
+
+# What the output depends on, beside the parameters and the layout of scans.
+_OPTIONS = ('raw', 'topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
+
+
+def is_dataset(arguments: argparse.Namespace) -> bool:
+    """Whether output is to appear block by block, rather than all of it at the end."""
+    asked = (arguments.workers, arguments.scheduler, arguments.resume, arguments.more)
+    return any(asked) or isinstance(as_path(arguments.input), UrlPath) or _is_root(arguments.input)
+
+
+def _is_root(source: str) -> bool:
+    return any(True for _ in as_path(source).glob('sequences/*/velodyne'))
+
+
+def list_scans(arguments: argparse.Namespace) -> list[Scan]:
+    """List the scans of the input; of a SemanticKITTI root, output goes into the same folders."""
+    layout = options.scan_layout(arguments)
+    if not _is_root(arguments.input):
+        found = list_inputs(as_path(arguments.input), layout)
+        return [Scan(one.path, f'{one.name}.label', '', partial(_read, one)) for one in found]
+    names = list_sequences(arguments.input)
+    frames = [frame for name in names for frame in list_frames(arguments.input, name, layout)]
+    return [
+        Scan(
+            one.points_path, f'sequences/{one.sequence}/predictions/{one.index}.label',
+            one.sequence, partial(read_points, one.points_path, layout),
+        )
+        for one in frames
+    ]  # fmt: skip
+
+
+def _read(one: Input) -> Any:
+    return one.read().xyz
+
+
+def list_bags(arguments: argparse.Namespace, name_of: Callable[[Path], str]) -> list[Scan]:
+    """List the bags of the input, each a sequence of its own."""
+    paths = [Path(source) for source in (arguments.input, *arguments.more)]
+    for path in paths:
+        if not holds_bag(path):
+            raise DataError(f'{path}: is no bag, of several inputs each must be one')
+    names = [name_of(path) for path in paths]
+    for name in names:
+        if names.count(name) > 1:
+            raise DataError(f'two of the bags would become {name}')
+    return [Scan(path, name, name, list) for path, name in zip(paths, names, strict=True)]
+
+
+def run(
+    arguments: argparse.Namespace,
+    config: Config,
+    target: AnyPath,
+    items: Sequence[Scan],
+    function: Callable[[Config, Sequence[Scan], Progress], Outcome],
+) -> None:
+    """Compute the blocks that are not finished, and say what they were.
+
+    `function` computes a block, and writes below `target`.
+    """
+    if target.suffix[1:] in FORMATS:
+        raise DataError(f'{target}: must be a folder')
+    if isinstance(target, Path) and not target.resolve().parent.is_dir():
+        raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')
+    is_bag = items[0].read is list
+    layout = replace(options.scan_layout(arguments), doubts='ignore')
+    given = [getattr(arguments, name) for name in _OPTIONS]
+    manifest = Manifest(target, digest(config, layout, given))
+    names = [item.name for item in items]
+    done = manifest.resume() if arguments.resume else None
+    if done is None:
+        done = set()
+        manifest.begin(names, force=arguments.force)
+    left, n_workers = [item for item in items if item.name not in done], 0
+    found = []
+    if left:
+        with options.runner(arguments, 'segment', 'bag' if is_bag else 'frame') as runner:
+            n_workers = runner.n_workers
+            if n_workers:
+                config = config.replace(**{'runtime.n_threads': 1})
+            if is_bag or depends_on_past(config):
+                # A sequence that is not finished is computed again from its first scan.
+                behind = {item.sequence for item in left}
+                again = [item for item in items if item.sequence in behind]
+                blocks = cut(again, lambda item: item.sequence)
+            else:
+                blocks = cut(left, None, n_workers)
+            for k, outcome in runner.map_blocks(partial(function, config), blocks):
+                manifest.add([item.name for item in blocks[k]])
+                found.append(outcome)
+    if isinstance(target, Path):
+        sweep(target, names)
+    if done:
+        print(f'{len(items) - len(left)} of {len(items)} were finished before')
+    if left:
+        print_summary(pool(found), target, n_workers)
+
+
+def print_summary(found: Outcome, target: AnyPath, n_workers: int = 0) -> None:
+    """Print a line on what was segmented."""
+    seconds = found.seconds
+    share = f'{found.n_ground / found.n_points:.1%} ground' if found.n_points else 'no ground'
+    pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms'
+    pace += ' per frame (median' if len(seconds) > 1 else ' for the first frame (with loading code'
+    beside = f' in each of {options.count(n_workers, "worker")}' if n_workers else ''
+    print(
+        f'{options.count(len(seconds), "frame")}, {options.count(found.n_points, "point")}, '
+        f'{share}, {pace}, segmentation only){beside}, written to {target}'
+    )

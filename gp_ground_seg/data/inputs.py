@@ -1,0 +1,170 @@
+"""The clouds of whatever the user has: files of any format, folders of them, data sets, bags."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
+from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.data.cloud_files import NUSCENES_SUFFIX, SUFFIXES, read_file
+from gp_ground_seg.data.clouds import Cloud
+from gp_ground_seg.data.files import AnyPath, as_path
+from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
+from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
+from gp_ground_seg.errors import DataError, PointCloudError
+
+# Where the scans of a data set are, in a folder of one of its drives, and these in its root.
+_SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')
+_DRIVES = ('sequences/*/velodyne', 'data_3d_raw/*/velodyne_points', '*/velodyne_points')
+
+
+@dataclass(frozen=True)
+class Input:
+    """One cloud, not read yet.
+
+    Attributes
+    ----------
+    name : str
+        Unique among its `Inputs`; output is named after it.
+    title : str
+        Name to show: that of the file, or of the bag with the number of the message.
+    path : Path
+        The file, or the bag.
+    read : callable
+        Returns the `Cloud`; raises DataError if it cannot be read, or can be no scan.
+    time : float or None
+        When it was recorded [s]; None if the format does not tell.
+    """
+
+    name: str
+    title: str
+    path: AnyPath
+    read: Callable[[], Cloud]
+    time: float | None = None
+
+
+class Inputs:
+    """Clouds in their order: ``len()``, iteration and indices; read one at a time.
+
+    A bag is read from its beginning each time; its clouds are best iterated over.
+    """
+
+    def __init__(
+        self,
+        path: AnyPath,
+        items: Sequence[Input],
+        topic: str | None = None,
+        n_messages: int = 0,
+        layout: ScanLayout = KITTI,
+    ) -> None:
+        self.path = path
+        self.topic = topic  # of a bag, else None
+        self._items = items
+        self._origin = layout.origin
+        self._length = n_messages or len(items)
+
+    def __len__(self) -> int:
+        """Count the clouds."""
+        return self._length
+
+    def __iter__(self) -> Iterator[Input]:
+        """Yield each cloud, not read yet."""
+        if self.topic is None:
+            yield from self._items
+            return
+        with BagReader(str(self.path)) as bag:
+            for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
+                place = f'message {k} of topic {self.topic}, recorded at {time} ns'
+                read = partial(_decode, raw, f'{self.path}: {place}', self._origin)
+                yield Input(f'{k:06d}', f'{self.path.name}[{k}]', self.path, read, 1e-9 * time)
+
+    def __getitem__(self, index: int) -> Input:
+        """Return one cloud, not read yet; IndexError beyond the last."""
+        if not 0 <= index < len(self):
+            raise IndexError(f'{self.path}: {index} of {len(self)} clouds')
+        return next(islice(iter(self), index, None))
+
+
+def list_inputs(
+    source: str | AnyPath, layout: ScanLayout = KITTI, topic: str | None = None
+) -> Inputs:
+    """Return the clouds of `source`; DataError if there are none.
+
+    Parameters
+    ----------
+    source : str or Path
+        A file of a known format; a folder of such files, of one or several formats; a sequence
+        of SemanticKITTI, a raw drive of KITTI or KITTI-360; a bag.
+    layout : ScanLayout
+        Of ``.bin`` files, and what to do with clouds that can be no scan. nuScenes'
+        ``.pcd.bin``, which has five columns, is known by its name.
+    topic : str or None
+        PointCloud2 topic of a bag, by default the only one.
+    """
+    path = as_path(source)
+    if isinstance(path, Path) and holds_bag(path):
+        with BagReader(path) as bag:
+            name = bag.pick_point_cloud_topic(topic)
+            return Inputs(path, (), name, bag.n_messages(name), layout)
+    if topic is not None:
+        raise DataError(f'--topic: is for bags, which {source} is not')
+    files = _find_files(path)
+    stems = [_stem(file) for file in files]
+    clashing = {stem for stem, n in Counter(stems).items() if n > 1}
+    names = [f.name if stem in clashing else stem for f, stem in zip(files, stems, strict=True)]
+    pairs = zip(names, files, strict=True)
+    return Inputs(path, [Input(n, f.name, f, partial(read_file, f, layout)) for n, f in pairs])
+
+
+def holds_bag(path: Path) -> bool:
+    """Whether `path` is a bag, or a folder that has bag files and no scans in it."""
+    if path.is_dir() and not any(is_cloud_file(child) for child in path.iterdir()):
+        # `BagReader` says what is missing there.
+        return is_bag(path) or any(child.suffix in BAG_SUFFIXES for child in path.iterdir())
+    return is_bag(path)
+
+
+def is_cloud_file(path: AnyPath) -> bool:
+    """Whether the name is that of a point cloud."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def _find_files(source: AnyPath) -> Sequence[AnyPath]:
+    accepted = ', '.join(SUFFIXES)
+    if not source.exists():
+        raise DataError(f'{source}: no such file or folder')
+    if not source.is_dir():
+        if not is_cloud_file(source):
+            raise DataError(
+                f'{source}: not a scan or bag; accepted are {accepted}, .bag, .mcap and .db3 '
+                'files, folders of scans and rosbag2 folders'
+            )
+        return [source]
+    for name in _SCAN_FOLDERS:
+        folder = source / name
+        if files := sorted((file for file in folder.glob('*') if is_cloud_file(file)), key=str):
+            return files
+    drives = sorted({str(one.parent) for pattern in _DRIVES for one in source.glob(pattern)})
+    hint = ''
+    if drives:
+        names = ', '.join(Path(drive).name for drive in drives)
+        hint = f'; give one of its sequences ({names}), as in {drives[0]}'
+    raise DataError(f'{source}: no {accepted} file in it, and not a rosbag2 folder{hint}')
+
+
+def _stem(path: AnyPath) -> str:
+    name = path.name
+    return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
+
+
+def _decode(raw: bytes, place: str, origin: tuple[float, float, float] | None) -> Cloud:
+    try:
+        message = decode_cloud(raw)
+        return Cloud(read_fields(message), read_xyz(message)).about(origin)
+    except PointCloudError as error:
+        raise DataError(f'{place}: {error}') from error

@@ -1,0 +1,1 @@
+"""Scans to turn, scrub and tune: Rerun, a page, a browser with sliders."""

@@ -1,0 +1,267 @@
+"""`segment`, `pose` and `plot` on clouds of every format: files, folders, data sets, bags."""
+
+import re
+import struct
+import sys
+
+import numpy as np
+import pytest
+from bag_samples import scan, write_ros2_bag
+from cli_runner import error_line, run
+
+from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.data.cloud_files import WRITABLE, encode_file, read_file
+from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
+from gp_ground_seg.data.inputs import list_inputs
+from gp_ground_seg.errors import DataError
+from gp_ground_seg.ground_model import GroundModel
+
+laspy = pytest.importorskip('laspy', reason='needs the extra formats')
+
+POINTS = scan()
+NAMES = ('x', 'y', 'z', 'intensity')
+MAP = (448_250.5, 5_411_900.25, 312.0)  # of a sensor, UTM [m]
+
+
+@pytest.fixture(scope='module')
+def expected():
+    """Result for `POINTS`; compiled for both precisions, or a command would say that it does."""
+    segmenter = GroundSegmenter(Config())
+    segmenter.segment(POINTS.astype(np.float64))
+    return segmenter.segment(POINTS)
+
+
+@pytest.fixture
+def source(tmp_path):
+    POINTS.tofile(tmp_path / 'a.bin')
+    return tmp_path / 'a.bin'
+
+
+def values(result):
+    return {
+        name: getattr(result, name) for name in ('height', 'ground_z', 'ground_std', 'p_ground')
+    }
+
+
+@pytest.mark.parametrize('suffix', WRITABLE)
+def test_every_format_holds_the_results_of_each_point(source, suffix, expected):
+    out = source.with_suffix(suffix)
+    assert run('segment', source, '-o', out) == 0
+    found = read_file(out).fields
+    kept = np.ones(len(POINTS), bool)
+    if suffix in ('.las', '.laz'):
+        kept = np.isfinite(POINTS).all(axis=1)
+        label, intensity = np.array([0, 2, 1])[expected.label], 'original_intensity'
+        np.testing.assert_array_equal(found['classification'], label[kept])
+        for name in 'xyz':
+            assert np.abs(found[name] - POINTS[kept, 'xyz'.index(name)]).max() < 0.51e-4
+    else:
+        np.testing.assert_array_equal(found['label'], expected.label)
+        intensity = 'intensity'
+        for k, name in enumerate('xyz'):
+            np.testing.assert_array_equal(found[name], POINTS[:, k])
+    np.testing.assert_array_equal(found[intensity], POINTS[kept, 3])
+    for name, column in values(expected).items():
+        assert found[name].dtype == np.float32
+        np.testing.assert_array_equal(found[name], column[kept].astype(np.float32))
+
+
+@pytest.mark.parametrize('suffix', WRITABLE)
+def test_a_cloud_of_any_format_is_segmented_to_its_own(source, suffix, expected):
+    again = source.with_name(f'b{suffix}')
+    assert run('segment', source, '-o', again, '--quiet') == 0
+    assert run('segment', again, '--quiet') == 0
+    found = read_file(source.with_name(f'b_ground{suffix}')).fields
+    kept = np.isfinite(POINTS).all(axis=1) if suffix in ('.las', '.laz') else slice(None)
+    name, classes = 'gp_label', np.arange(3)
+    if suffix in ('.las', '.laz'):
+        name, classes = 'classification', np.array([0, 2, 1])
+        np.testing.assert_array_equal(
+            found['original_classification'], classes[expected.label][kept]
+        )
+    # Of coordinates that were rounded, few points are on the edge of a band.
+    assert np.mean(found[name] != classes[expected.label][kept]) < 0.005
+    assert {'gp_height', 'gp_ground_z'} < set(found.dtype.names)
+    np.testing.assert_allclose(found['gp_height'], expected.height[kept], atol=2e-3)
+
+
+def test_ground_and_obstacles_apart(source, expected):
+    assert run('segment', source, '-o', source.with_name('out.ply'), '--split') == 0
+    for part, label in (('ground', Label.GROUND), ('obstacles', Label.OBSTACLE)):
+        found = read_file(source.with_name(f'out_{part}.ply')).fields
+        np.testing.assert_array_equal(found['x'], POINTS[expected.label == label, 0])
+        assert (found['label'] == label).all()
+
+
+def test_the_ground_as_a_grid(tmp_path, expected):
+    cloud = cloud_of(
+        gather({name: POINTS[:, k].astype(float) + MAP[k] for k, name in enumerate('xyz')})
+    )
+    path = tmp_path / 'a.npy'
+    path.write_bytes(encode_file(path, cloud, expected.label, {}))
+    words = ('--origin', *MAP, '--surface')
+    assert run('segment', path, '-o', tmp_path / 'out.pcd', *words, '--quiet') == 0
+    with np.load(tmp_path / 'out_surface.npz') as found:
+        x, y = found['x'] - MAP[0], found['y'] - MAP[1]
+        z, std = found['ground_z'], found['ground_std']
+    expected_z, expected_std = GroundModel.of(expected).at(x, y[:, None])
+    assert np.isfinite(expected_z).sum() > 1000
+    np.testing.assert_allclose(z - MAP[2], expected_z, atol=1e-3)
+    np.testing.assert_allclose(std, expected_std, atol=1e-4)
+
+
+def test_clouds_of_a_map_need_the_place_of_the_sensor(tmp_path, expected, capsys):
+    header = laspy.LasHeader(version='1.4', point_format=6)
+    header.offsets, header.scales = np.array([448000.0, 5411000.0, 0.0]), np.full(3, 1e-3)
+    kept = np.isfinite(POINTS).all(axis=1)
+    las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(int(kept.sum()), header=header))
+    for k, name in enumerate('xyz'):
+        las[name] = POINTS[kept, k].astype(np.float64) + MAP[k]
+    las.write(str(tmp_path / 'map.laz'))
+    out = tmp_path / 'out.laz'
+    assert run('segment', tmp_path / 'map.laz', '-o', out) == 2
+    line = error_line(capsys)
+    assert 'half of the points are farther than' in line
+    assert re.search(r'about 4482\d\d\.\d, 5411\d\d\d\.\d, .*; --origin X Y Z says where', line)
+    assert run('segment', tmp_path / 'map.laz', '-o', out, '--origin', *MAP) == 0
+    found = laspy.read(out)
+    for name in 'XYZ':
+        np.testing.assert_array_equal(found[name], las[name])
+    label = np.array([0, 2, 1])[expected.label[kept]]
+    assert np.mean(found.classification != label) < 0.005
+    ground_z = expected.ground_z[kept]
+    np.testing.assert_allclose(found['ground_z'] - MAP[2], ground_z, atol=0.01)
+
+
+def test_a_folder_of_several_formats(tmp_path, expected, capsys):
+    folder = tmp_path / 'in'
+    folder.mkdir()
+    POINTS.tofile(folder / 'a.bin')
+    np.hstack([POINTS, POINTS[:, :1]]).tofile(folder / 'b.pcd.bin')
+    np.save(folder / 'a.npy', POINTS)
+    assert [one.name for one in list_inputs(folder)] == ['a.bin', 'a.npy', 'b']
+    assert run('segment', folder, '-o', tmp_path / 'own', '--quiet') == 0
+    own = sorted(path.name for path in (tmp_path / 'own').iterdir())
+    assert own == ['a.bin.label', 'a.npy.npy', 'b.label']
+    assert run('segment', folder, '-o', tmp_path / 'pcd', '--format', 'pcd', '--surface') == 0
+    for name in ('a.bin', 'a.npy', 'b'):
+        found = read_file(tmp_path / 'pcd' / f'{name}.pcd').fields
+        np.testing.assert_array_equal(found['label'], expected.label)
+        assert (tmp_path / 'pcd' / f'{name}_surface.npz').is_file()
+    # nuScenes' fifth column, known by the name of the file.
+    np.testing.assert_array_equal(found['column_5'], POINTS[:, 0])
+
+
+def test_clouds_of_a_bag(tmp_path, capsys):
+    bag = write_bag(tmp_path)
+    inputs = list_inputs(bag)
+    assert (len(inputs), inputs.topic, inputs[2].name) == (3, '/points', '000002')
+    np.testing.assert_array_equal(inputs[2].read().xyz, scan(2)[:, :3])
+    assert [one.title for one in inputs] == [f'drive.mcap[{k}]' for k in range(3)]
+    with pytest.raises(IndexError):
+        inputs[3]
+    assert run('segment', bag, '--format', 'npz', '--quiet') == 0
+    for k in range(3):
+        with np.load(tmp_path / 'drive_ground' / f'{k:06d}.npz') as found:
+            np.testing.assert_array_equal(found['i'], scan(k)[:, 3])
+            assert found['ring'].dtype == np.uint16 and len(found['label']) == len(scan(k))
+    capsys.readouterr()
+    assert run('pose', bag, '--topic', '/points') == 0
+    assert 'drive.mcap[1]' in capsys.readouterr().out
+
+
+def write_bag(folder):
+    write_ros2_bag(folder / 'drive.mcap')
+    return folder / 'drive.mcap'
+
+
+@pytest.mark.parametrize(
+    ('drive', 'hint'),
+    [
+        ('data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/data', 'data_3d_raw/2013_05_28'),
+        ('sequences/00/velodyne', 'sequences/00'),
+        ('2011_09_26_drive_0001_sync/velodyne_points/data', '2011_09_26_drive'),
+        ('samples/LIDAR_TOP', ''),
+    ],
+)
+def test_data_sets_are_known_by_their_folders(tmp_path, drive, hint):
+    (tmp_path / drive).mkdir(parents=True)
+    POINTS.tofile(tmp_path / drive / '000007.bin')
+    if hint:
+        with pytest.raises(DataError, match=f'give one of its sequences .*{hint}'):
+            list_inputs(tmp_path)
+        folder = (tmp_path / drive).parents[drive.count('_points')]
+    else:
+        folder = tmp_path
+    (one,) = list_inputs(folder)
+    assert one.name == '000007'
+    np.testing.assert_array_equal(one.read().xyz, POINTS)
+
+
+def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
+    pytest.importorskip('matplotlib')
+    bag, out = write_bag(tmp_path), tmp_path / 'a.png'
+    assert run('plot', 'above', bag, '--frame', '1', '-o', out) == 0
+    first = out.read_bytes()
+    assert run('plot', 'above', bag, '--frame', '2', '-o', out, '--force') == 0
+    assert out.read_bytes() != first
+    capsys.readouterr()
+    assert run('plot', 'above', bag, '--frame', '3', '-o', tmp_path / 'b.png') == 2
+    assert '--frame 3: must be 0 to 2 here' in error_line(capsys)
+
+
+@pytest.mark.parametrize(
+    ('words', 'message'),
+    [
+        (['a.npy', '-o', 'a.npy', '--force'], 'a.npy: is the input'),
+        (['folder', '-o', 'folder', '--force'], 'is the input'),
+        (['a.npy', '-o', 'a.xyz'], 'a.xyz: must be a folder, or end in .label, .pcd'),
+        (['a.npy', '-o', 'taken.pcd'], 'taken.pcd: exists already'),
+        (['folder', '-o', 'x.pcd'], 'x.pcd: must be a folder'),
+        (['a.npy', '-o', 'x.pcd', '--format', 'ply'], 'x.pcd: ends in .pcd, which is not ply'),
+        (['a.npy', '--topic', '/a'], '--topic: is for bags'),
+        (['a.npy', '--drop', '/a'], '--drop: is for bags'),
+        (['a.npy', '--columns', '5'], '--columns: is for .bin scans, which a.npy is not'),
+        (['a.npy', '-o', 'x.label', '--split'], '--split: is for clouds'),
+        (['a.npy', '-o', 'x.pcd', '--origin', 'nan', '0', '0'], 'must be three finite numbers'),
+        (['drive.mcap', '--split'], '--split: is for scans'),
+        (['drive.mcap', '--origin', '1', '2', '3'], '--origin: is for scans'),
+        (['drive.mcap', '--format', 'pcd', '--columns', '5'], '--columns: is for .bin scans'),
+        (['wide.npy', '-o', 'x.ply'], 'field t: PLY has no type uint64'),
+        (['far.npy', '-o', 'x.pcd'], 'looks like millimetres'),
+        (['none.npy', '-o', 'x.pcd'], 'none of 200 points is finite; --force'),
+    ],
+)  # fmt: skip
+def test_refused(tmp_path, monkeypatch, capsys, words, message):
+    monkeypatch.chdir(tmp_path)
+    np.save('a.npy', POINTS)
+    (tmp_path / 'folder').mkdir()
+    np.save('folder/b.npy', POINTS)
+    (tmp_path / 'taken.pcd').write_text('mine')
+    fields = name_columns(POINTS)
+    np.save(
+        'wide.npy', gather({**{n: fields[n] for n in 'xyz'}, 't': np.zeros(len(fields), 'u8')})
+    )
+    np.save('far.npy', 1000.0 * POINTS)
+    np.save('none.npy', np.full((200, 3), np.nan))
+    write_bag(tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
+    assert run('segment', *words) == 2
+    assert message in error_line(capsys)
+    assert {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ('name', 'module'), [('a.laz', 'lazrs'), ('a.las', 'laspy'), ('a.pcd', 'lzf')]
+)
+def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys, name, module):
+    path = tmp_path / name
+    cloud = cloud_of(name_columns(np.zeros((50, 3), np.float32)))
+    whole = encode_file(path, cloud, np.zeros(50, np.uint8), {})
+    compressed = b'DATA binary_compressed\n' + struct.pack('<II', 9, 50 * 13)
+    path.write_bytes(whole.replace(b'DATA binary\n', compressed))
+    monkeypatch.setitem(sys.modules, module, None)
+    assert run('segment', path, '-o', tmp_path / 'out.npy') == 2
+    line = error_line(capsys)
+    assert line.startswith(f'{module} is not installed')
+    assert line.endswith("pip install 'gp_ground_seg[formats]'")

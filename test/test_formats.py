@@ -1,0 +1,442 @@
+"""Point clouds in files of every format: read, written, foreign, damaged."""
+
+import io
+import re
+import struct
+import subprocess
+import sys
+import zipfile
+
+import lzf
+import numpy as np
+import pytest
+from bag_samples import scan
+from cli_runner import error_line, run
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.data.cloud_files import WRITABLE, encode_file, read_file
+from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
+from gp_ground_seg.data.pcd import PcdHeader
+from gp_ground_seg.data.ply import PlyHeader
+from gp_ground_seg.data.scan_layout import ScanLayout
+from gp_ground_seg.errors import DataError
+
+laspy = pytest.importorskip('laspy', reason='needs the extra formats')
+
+RESULTS = ('height', 'ground_z', 'ground_std', 'p_ground')
+EXACT = [suffix for suffix in WRITABLE if suffix not in ('.las', '.laz')]
+CODES = ['i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8']
+rng = np.random.default_rng(0)
+
+
+@pytest.fixture(scope='module')
+def segmenter():
+    """Compiled for both precisions, or the first command would say that it does."""
+    found = GroundSegmenter(Config())
+    for dtype in (np.float32, np.float64):
+        found.segment(scan().astype(dtype))
+    return found
+
+
+def sample(n=500, seed=0):
+    """A cloud with fields of several types, one of several numbers."""
+    rng = np.random.default_rng(seed)
+    return gather(
+        {
+            **{name: rng.normal(0.0, 20.0, n).astype('f4') for name in 'xyz'},
+            'intensity': rng.random(n).astype('f4'),
+            'ring': rng.integers(0, 64, n).astype('u2'),
+            'time': np.arange(n) // 50 * 0.25,  # which can be compressed
+            'normal': rng.normal(size=(n, 3)).astype('f4'),
+        }
+    )
+
+
+def encode(name, fields, header=None, label=None, **results):
+    label = np.zeros(len(fields), np.uint8) if label is None else label
+    cloud = cloud_of(fields, header)
+    return encode_file(name, cloud, label, results)
+
+
+def reread(path, data, layout=None):
+    path.write_bytes(data)
+    return read_file(path, layout or ScanLayout())
+
+
+def assert_fields(found, expected):
+    """Every field of `expected`, in its type, bit for bit."""
+    for name in expected.dtype.names:
+        assert found[name].dtype == expected[name].dtype, name
+        assert found[name].tobytes() == expected[name].tobytes(), name
+
+
+# Round trips.
+
+
+@st.composite
+def clouds(draw, codes):
+    n = draw(st.integers(0, 20))
+    columns = {}
+    names = draw(st.lists(st.from_regex(r'[A-Za-w][a-z0-9]{0,5}', fullmatch=True), unique=True))
+    for name in ('x', 'y', 'z', *dict.fromkeys(names)):
+        own = draw(st.sampled_from(['f4', 'f8'] if name in 'xyz' else codes))
+        shape = (n,) if name in 'xyz' else draw(st.sampled_from([(n,), (n,), (n, 3)]))
+        size = int(np.prod(shape)) * np.dtype(own).itemsize
+        columns[name] = np.frombuffer(draw(st.binary(min_size=size, max_size=size)), own)
+        columns[name] = columns[name].reshape(shape)
+    return gather(columns)
+
+
+@pytest.mark.parametrize('suffix', EXACT)
+@settings(max_examples=25)
+@given(data=st.data())
+def test_what_is_written_is_read_back_bit_for_bit(tmp_path_factory, suffix, data):
+    wide = [] if suffix == '.ply' else ['i8', 'u8']
+    fields = data.draw(clouds([*CODES, *wide]))
+    path = tmp_path_factory.mktemp('trip') / f'a{suffix}'
+    found = reread(path, encode(path, fields)).fields
+    if suffix == '.ply':  # which has no fields of several numbers
+        for name in [name for name in fields.dtype.names if fields[name].ndim > 1]:
+            parts = np.stack([found[f'{name}_{k}'] for k in range(3)], axis=-1)
+            assert parts.tobytes() == fields[name].tobytes()
+            fields = fields[[other for other in fields.dtype.names if other != name]]
+    assert_fields(found, fields)
+    taken = 'gp_label' if 'label' in fields.dtype.names else 'label'
+    assert found[taken].dtype == np.uint8
+
+
+@pytest.mark.parametrize('suffix', ['.las', '.laz'])
+@settings(max_examples=25)
+@given(data=st.data())
+def test_las_keeps_integers_scale_and_records(tmp_path_factory, suffix, data):
+    version, kind = data.draw(st.sampled_from([('1.2', 0), ('1.2', 3), ('1.4', 6), ('1.4', 7)]))
+    n = data.draw(st.integers(0, 20))
+    header = laspy.LasHeader(version=version, point_format=kind)
+    header.scales = np.array([data.draw(st.sampled_from([1e-4, 1e-3, 0.01, 0.25])) for _ in 'xyz'])
+    header.offsets = np.array([data.draw(st.sampled_from([0.0, 5e5, -12.75])) for _ in 'xyz'])
+    header.vlrs.append(laspy.VLR('user', 7, 'mine', b'1234'))
+    header.add_extra_dims([laspy.ExtraBytesParams('range', 'f8')])
+    las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(n, header=header))
+    numbers = np.random.default_rng(data.draw(st.integers(0, 999)))
+    for name in 'XYZ':
+        las[name] = numbers.integers(-(2**31), 2**31, n)
+    las.intensity, las['range'] = numbers.integers(0, 2**16, n), numbers.random(n)
+    las.classification, las.return_number = numbers.integers(0, 18, n), numbers.integers(0, 5, n)
+    path = tmp_path_factory.mktemp('trip') / f'a{suffix}'
+    las.write(str(path))
+    cloud = read_file(path)
+    label = numbers.integers(0, 3, n).astype(np.uint8)
+    path.write_bytes(encode_file(path, cloud, label, {'height': np.ones(n, np.float32)}))
+    found = laspy.read(path)
+    for name in ('X', 'Y', 'Z', 'intensity', 'range', 'return_number'):
+        np.testing.assert_array_equal(found[name], las[name])
+    np.testing.assert_array_equal(found.classification, np.array([0, 2, 1])[label])
+    if np.any(las.classification):
+        np.testing.assert_array_equal(found.original_classification, las.classification)
+    assert (found.header.point_format.id, str(found.header.version)) == (kind, version)
+    np.testing.assert_array_equal(found.header.scales, header.scales)
+    np.testing.assert_array_equal(found.header.offsets, header.offsets)
+    (own,) = [vlr for vlr in found.vlrs if getattr(vlr, 'user_id', '') == 'user']
+    assert own.record_data == b'1234'
+
+
+def test_other_formats_become_las_within_its_resolution(tmp_path, caplog):
+    fields = sample()
+    fields['x'][7] = np.nan
+    path = tmp_path / 'a.las'
+    label = rng.integers(0, 3, len(fields)).astype(np.uint8)
+    path.write_bytes(encode(path, fields, label=label, height=fields['x']))
+    found, kept = laspy.read(path), np.arange(len(fields)) != 7
+    assert '1 left out' in caplog.text
+    for name in 'xyz':
+        assert np.abs(found[name] - fields[name][kept]).max() <= 0.5001e-4
+    np.testing.assert_array_equal(found['original_intensity'], fields['intensity'][kept])
+    np.testing.assert_array_equal(found['ring'], fields['ring'][kept])
+    np.testing.assert_array_equal(found['normal_2'], fields['normal'][kept, 2])
+    np.testing.assert_array_equal(found.classification, np.array([0, 2, 1])[label[kept]])
+    assert found.header.global_encoding.wkt and np.all(found.return_number == 1)
+
+
+def test_what_a_format_beside_its_points_says_is_kept(tmp_path):
+    fields = sample(60)
+    header = PcdHeader(20, 3, '1 2 3 0 1 0 0')
+    path = tmp_path / 'a.pcd'
+    again = reread(path, encode(path, fields, header))
+    assert again.header == header
+    part = again.take(np.arange(60) < 10)
+    assert reread(path, encode(path, part.fields, part.header)).header[:3] == (10, 1, header[2])
+    path = tmp_path / 'a.ply'
+    remarks = PlyHeader(('comment mine',))
+    assert reread(path, encode(path, fields, remarks)).header == remarks
+    path = tmp_path / 'a.npz'
+    np.savez(path, pose=np.eye(4), **{name: fields[name] for name in fields.dtype.names})
+    path.write_bytes(encode_file(path, read_file(path), np.zeros(60, np.uint8), {}))
+    with np.load(path) as found:
+        np.testing.assert_array_equal(found['pose'], np.eye(4))
+
+
+# Files of other writers.
+
+
+def test_files_of_pypcd4(tmp_path):
+    pypcd4 = pytest.importorskip('pypcd4')
+    fields = sample()
+    flat = fields[['x', 'y', 'z', 'intensity', 'ring', 'time']]
+    types = [flat.dtype[name].type for name in flat.dtype.names]
+    columns = [flat[name] for name in flat.dtype.names]
+    theirs = pypcd4.PointCloud.from_points(columns, flat.dtype.names, types)
+    for kind in ('BINARY', 'BINARY_COMPRESSED'):
+        theirs.save(tmp_path / 'a.pcd', encoding=getattr(pypcd4.Encoding, kind))
+        assert_fields(read_file(tmp_path / 'a.pcd').fields, flat)
+    theirs.save(tmp_path / 'a.pcd', encoding=pypcd4.Encoding.ASCII)
+    np.testing.assert_allclose(read_file(tmp_path / 'a.pcd').fields['x'], flat['x'], rtol=1e-5)
+    (tmp_path / 'b.pcd').write_bytes(encode(tmp_path / 'b.pcd', flat))
+    assert_fields(pypcd4.PointCloud.from_path(tmp_path / 'b.pcd').pc_data, flat)
+
+
+def test_ply_is_read_by_plyfile(tmp_path):
+    plyfile = pytest.importorskip('plyfile')
+    fields = sample()[['x', 'y', 'z', 'ring', 'time']]
+    fields = gather({name: fields[name] for name in fields.dtype.names})
+    (tmp_path / 'b.ply').write_bytes(encode(tmp_path / 'b.ply', fields))
+    assert_fields(plyfile.PlyData.read(tmp_path / 'b.ply')['vertex'].data, fields)
+    for order, text in (('<', False), ('>', False), ('=', True)):
+        element = plyfile.PlyElement.describe(fields, 'vertex', comments=['theirs'])
+        plyfile.PlyData([element], text=text, byte_order=order).write(tmp_path / 'a.ply')
+        found = read_file(tmp_path / 'a.ply').fields
+        np.testing.assert_allclose(found['x'], fields['x'], rtol=1e-6)
+        np.testing.assert_array_equal(found['ring'], fields['ring'])
+
+
+def pcd(rows, body):
+    return b''.join(f'{row}\n'.encode() for row in rows) + body
+
+
+XYZ = np.arange(12, dtype='f4').reshape(4, 3)
+
+
+def padded_pcd():
+    """As PCL saves a Velodyne cloud: padding of several bytes, organised."""
+    dtype = np.dtype([('xyz', '<f4', 3), ('a', 'V4'), ('intensity', '<f4'), ('ring', '<u2'),
+                      ('b', 'V10')])  # fmt: skip
+    points = np.zeros(4, dtype)
+    points['xyz'], points['intensity'], points['ring'] = XYZ, [1, 2, 3, 4], [5, 6, 7, 8]
+    return pcd(
+        ['# .PCD v0.7 - Point Cloud Data file format', 'VERSION 0.7',
+         'FIELDS x y z _ intensity ring _',
+         'SIZE 4 4 4 1 4 2 1', 'TYPE F F F U F U U', 'COUNT 1 1 1 4 1 1 10', 'WIDTH 2', 'HEIGHT 2',
+         'VIEWPOINT 0 0 1.7 1 0 0 0', 'POINTS 4', 'DATA binary'], points.tobytes(),
+    )  # fmt: skip
+
+
+def descriptor_pcd():
+    """As PCL compresses fields of several numbers: those of a point beside each other."""
+    signature = np.arange(20, dtype='<f4').reshape(4, 5)
+    columns = XYZ.T.astype('<f4').tobytes() + signature.tobytes()
+    packed = lzf.compress(columns)
+    return pcd(
+        ['VERSION 0.7', 'FIELDS x y z fpfh', 'SIZE 4 4 4 4', 'TYPE F F F F', 'COUNT 1 1 1 5',
+         'WIDTH 4', 'HEIGHT 1', 'VIEWPOINT 0 0 0 1 0 0 0', 'POINTS 4', 'DATA binary_compressed'],
+        struct.pack('<II', len(packed), len(columns)) + packed,
+    )  # fmt: skip
+
+
+def ply(lines, body):
+    return '\n'.join(['ply', *lines, 'end_header', '']).encode() + body
+
+
+def lines_of(table):
+    return '\n'.join(' '.join(map(str, row)) for row in table).encode() + b'\n'
+
+
+FOREIGN = {
+    'pcl_padded.pcd': (padded_pcd(), ('x', 'y', 'z', 'intensity', 'ring')),
+    'pcl_descriptors.pcd': (descriptor_pcd(), ('x', 'y', 'z', 'fpfh')),
+    # Without COUNT and VIEWPOINT; lines that end as Windows ends them.
+    'old.pcd': (
+        pcd(['VERSION .5\r', 'FIELDS x y z\r', 'SIZE 4 4 4\r', 'TYPE F F F\r', 'WIDTH 4\r',
+             'HEIGHT 1\r', 'POINTS 4\r', 'DATA ascii\r'], lines_of(XYZ).replace(b'\n', b'\r\n')),
+        ('x', 'y', 'z'),
+    ),
+    'pcl.ply': (
+        ply(['format binary_little_endian 1.0', 'comment PCL generated', 'element vertex 4',
+             'property float x', 'property float y', 'property float z', 'element camera 1',
+             'property float view_px', 'property int viewportx'],
+            XYZ.astype('<f4').tobytes() + bytes(8)),
+        ('x', 'y', 'z'),
+    ),
+    'open3d.ply': (
+        ply(['format ascii 1.0', 'comment Created by Open3D', 'element vertex 4',
+             'property double x', 'property double y', 'property double z', 'property uchar red',
+             'element face 1', 'property list uchar uint vertex_indices'],
+            lines_of([[*row, 255] for row in XYZ]) + b'3 0 1 2\n'),
+        ('x', 'y', 'z', 'red'),
+    ),
+    'cloudcompare.ply': (
+        ply(['format binary_big_endian 1.0', 'comment Created by CloudCompare v2.13',
+             'obj_info Generated by CloudCompare!', 'element vertex 4', 'property float x',
+             'property float y', 'property float z', 'property float scalar_Intensity'],
+            np.hstack([XYZ, XYZ[:, :1]]).astype('>f4').tobytes()),
+        ('x', 'y', 'z', 'scalar_Intensity'),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', FOREIGN)
+def test_what_other_programs_write_is_read(tmp_path, name):
+    data, names = FOREIGN[name]
+    cloud = reread(tmp_path / name, data)
+    assert cloud.fields.dtype.names == names
+    np.testing.assert_array_equal(cloud.xyz, XYZ)
+    if name == 'pcl_descriptors.pcd':
+        np.testing.assert_array_equal(cloud.fields['fpfh'], np.arange(20).reshape(4, 5))
+    if name == 'pcl_padded.pcd':
+        assert cloud.header[:3] == (2, 2, '0 0 1.7 1 0 0 0')
+        np.testing.assert_array_equal(cloud.fields['ring'], [5, 6, 7, 8])
+
+
+def test_arrays_of_every_kind(tmp_path):
+    table = np.random.default_rng(1).normal(size=(9, 5))
+    np.save(tmp_path / 'table.npy', np.asfortranarray(table))
+    np.savez_compressed(tmp_path / 'table.npz', points=table, ring=np.arange(9))
+    fields = name_columns(table)
+    assert_fields(read_file(tmp_path / 'table.npy').fields, fields)
+    found = read_file(tmp_path / 'table.npz').fields
+    assert_fields(found, fields)
+    assert found.dtype.names == ('x', 'y', 'z', 'intensity', 'column_5', 'ring')
+
+
+# Files that are damaged, or lie.
+
+
+def refused(path, data):
+    """The line that a file is refused with; None if it is read."""
+    try:
+        reread(path, bytes(data))
+    except DataError as error:
+        said = str(error)
+    else:
+        return None
+    assert said.startswith(f'{path}: ')
+    assert '\n' not in said
+    return said
+
+
+@pytest.mark.parametrize('suffix', WRITABLE)
+def test_damaged_files_are_refused_in_one_line(tmp_path, suffix):
+    path = tmp_path / f'a{suffix}'
+    whole = encode(path, sample(200))
+    numbers = np.random.default_rng(5)
+    n_times = 40 if suffix == '.laz' else 200  # each is decoded
+    for cut in numbers.integers(len(whole), size=n_times // 4):
+        assert refused(path, whole[:cut])
+    n_refused = 0
+    for _ in range(n_times):
+        data = bytearray(whole)
+        for place in numbers.integers(min(len(whole), 2000), size=numbers.integers(1, 5)):
+            data[place] = numbers.integers(256)
+        n_refused += refused(path, data) is not None
+    assert n_refused >= n_times // 20
+
+
+def test_text_that_ends_early_is_refused(tmp_path):
+    data, _ = FOREIGN['old.pcd']
+    assert 'truncated?' in refused(tmp_path / 'a.pcd', data[:-30])
+
+
+LAZ_LIES = [
+    (247, 1 << 40, '<Q', r'1099511627776 points \(\d+ bytes\)'),
+    (247, 10_000_000, '<Q', '10000000 points'),
+    (100, 4_000_000_000, '<I', r'400000000\d records'),
+    (243, 4_000_000_000, '<I', r'400000000\d records'),
+    ('points', 1200, '<q', r'(cannot be read as|\d+ chunks in)'),
+    ('table', 77 << 40, '<Q', '19712 chunks in'),
+]
+READ_ALL = """
+import sys
+from pathlib import Path
+from gp_ground_seg.data.cloud_files import read_file
+for path in sys.argv[1:]:
+    try:
+        read_file(Path(path))
+    except Exception as error:
+        print(f'{type(error).__name__}: {error}')
+"""
+
+
+def test_a_lie_in_a_laz_file_is_found_before_memory_is_asked_for(tmp_path):
+    whole = encode(tmp_path / 'a.laz', sample(200))
+    (points,) = struct.unpack_from('<I', whole, 96)
+    (table,) = struct.unpack_from('<q', whole, points)
+    paths = []
+    for k, (place, value, code, _) in enumerate(LAZ_LIES):
+        data = bytearray(whole)
+        struct.pack_into(code, data, {'points': points, 'table': table}.get(place, place), value)
+        paths.append(tmp_path / f'{k}.laz')
+        paths[-1].write_bytes(data)
+    # In a process of its own: lazrs ends it where memory cannot be had.
+    done = subprocess.run(
+        [sys.executable, '-c', READ_ALL, *paths],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    for line, (*_, message) in zip(done.stdout.splitlines(), LAZ_LIES, strict=True):
+        assert re.match(f'DataError: .*{message}', line)
+
+
+def zip_of(**members):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(f'{name}.npy', data)
+    return file.getvalue()
+
+
+def npy_bytes(array, **options):
+    file = io.BytesIO()
+    np.save(file, array, **options)
+    return file.getvalue()
+
+
+LIES = {
+    'objects.npy': (npy_bytes(np.array([{}, 1]), allow_pickle=True), 'Object arrays cannot be'),
+    'shape.npy': (
+        npy_bytes(XYZ).replace(b'(4, 3)', b'(9999999999, 3)'), r'cannot be read as \.npy \('
+    ),
+    'flat.npy': (npy_bytes(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
+    'names.npz': (zip_of(a=npy_bytes(XYZ)), 'no field x of one number per point'),
+    'sizes.pcd': (padded_pcd().replace(b'WIDTH 2', b'WIDTH 9'), '4 points, which is not width 9'),
+    'many.pcd': (
+        padded_pcd().replace(b'WIDTH 2', b'WIDTH 4000000').replace(b'POINTS 4', b'POINTS 8000000'),
+        '8000000 points',
+    ),
+    'lzf.pcd': (
+        descriptor_pcd().replace(b'POINTS 4', b'POINTS 400000000')
+        .replace(b'WIDTH 4', b'WIDTH 400000000'),
+        'its header says 12800000000',
+    ),
+    'type.pcd': (padded_pcd().replace(b'TYPE F', b'TYPE X'), 'field x: no type X of 4 bytes'),
+    'data.pcd': (padded_pcd().replace(b'DATA binary', b'DATA other'), 'DATA other: must be'),
+    'none.pcd': (b'no header', 'no DATA line'),
+    'list.ply': (
+        ply(['format ascii 1.0', 'element vertex 1', 'property list uchar int x'], b'1 1\n'),
+        'property x of the vertices: is a list',
+    ),
+    'many.ply': (FOREIGN['pcl.ply'][0].replace(b'vertex 4', b'vertex 4000000'), '4000000 points'),
+    'faces.ply': (ply(['format ascii 1.0', 'element face 0'], b''), 'must begin with the vert'),
+    'empty.las': (b'', 'cannot be read as .las'),
+    'no.las': (b'LASF' + bytes(400), 'cannot be read as .las'),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', LIES)
+def test_files_that_cannot_be_are_refused_with_the_reason(tmp_path, name, capsys):
+    data, message = LIES[name]
+    (tmp_path / name).write_bytes(data)
+    assert run('segment', tmp_path / name, '-o', tmp_path / 'out.pcd') == 2
+    assert re.search(message, error_line(capsys))
+    assert not (tmp_path / 'out.pcd').exists()
