@@ -1,6 +1,8 @@
 """The package as a whole: versions, layers, dependencies."""
 
+import ast
 import re
+import shlex
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -10,6 +12,7 @@ from conftest import REPOSITORY
 from test_layout import PACKAGE, ROS, imports, parse
 
 import gp_ground_seg
+from gp_ground_seg.ros.lifecycle import ROS_WHEELS
 
 
 @pytest.fixture
@@ -90,3 +93,51 @@ def test_no_path_of_one_machine_and_no_data_is_tracked():
         pytest.skip('not a git checkout')
     files = listed.stdout.split()
     assert not [name for name in files if name.endswith(('.bin', '.label', '.mcap', '.db3'))]
+
+
+HINTS = ('require', 'install_hint')
+
+
+def required_packages():
+    """The second arguments of `require` and the arguments of `install_hint`, where literal."""
+    for tree in parse(REPOSITORY / PACKAGE).values():
+        for node in ast.walk(tree):
+            is_hint = isinstance(node, ast.Call) and ast.unparse(node.func) in HINTS
+            if is_hint and isinstance(node.args[-1], ast.Constant):
+                yield from shlex.split(node.args[-1].value)
+
+
+def test_what_hints_name_is_what_our_extras_install():
+    """Names of other packages on PyPI, so that a hint works wherever ours comes from."""
+    named = {*required_packages(), *shlex.split(ROS_WHEELS)}
+    assert {'rosbags', 'numba', 'ros-jazzy-rclpy[fastrtps]'} <= named
+    setup = (REPOSITORY / 'setup.py').read_text(encoding='utf-8')
+    missing = {name for name in named if not re.search(rf"'{re.escape(name)}\W", setup)}
+    assert missing <= {'lazrs', 'pillow'}  # of laspy[lazrs] and of matplotlib
+
+
+HINT = """if True:
+    import sys, sysconfig
+    sys.prefix, folder = {prefix!r}, {folder!r}
+    sysconfig.get_path = lambda name: folder
+    from gp_ground_seg.errors import install_hint
+    print(install_hint('rosbags'))
+"""
+
+
+def test_a_hint_says_where_pip_works(tmp_path):
+    """Debian and Ubuntu mark their Python as theirs (PEP 668); a virtual environment is not."""
+
+    def hint(prefix):
+        code = HINT.format(prefix=prefix, folder=str(tmp_path))
+        done = subprocess.run(
+            [sys.executable, '-c', code], capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    here = f'{sys.executable} -m pip install rosbags'
+    assert hint(sys.base_prefix) == here
+    (tmp_path / 'EXTERNALLY-MANAGED').touch()
+    there = 'pip install rosbags, in a virtual environment: see docs/install.md'
+    assert hint(sys.base_prefix) == there
+    assert hint('/elsewhere') == here

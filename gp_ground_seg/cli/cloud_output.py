@@ -112,7 +112,7 @@ def _encode_surface(result: Segmentation, cloud: Cloud, kind: str) -> bytes:
     grids = {'ground_z': (z + height).astype(np.float32), 'ground_std': std.astype(np.float32)}
     if kind == 'npz':
         return encode_arrays({'x': middle + x, 'y': middle + y, **grids})
-    require('PIL', 'plot')
+    require('PIL', 'pillow')
     from PIL import Image, TiffImagePlugin
 
     tags = TiffImagePlugin.ImageFileDirectory_v2()

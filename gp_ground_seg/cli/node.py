@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError
+from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError, install_hint
 from gp_ground_seg.ros.lifecycle import needing_ros, stop_on_signals
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
 
     if not HAVE_NUMBA:
         raise MissingDependencyError(
-            'numba is not installed, nothing to compile: pip install numba'
+            f'numba is not installed, nothing to compile: {install_hint("numba")}'
         )
     begin = time.monotonic()
     warm_up().close()

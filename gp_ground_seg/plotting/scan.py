@@ -124,10 +124,10 @@ def write_movie(
     scenes: Iterable[Scene], config: Config, path: str | Path, view: View, fps: float
 ) -> None:
     """Write a GIF, or an MP4 where `path` ends so, of scenes, replacing the file."""
-    imageio = require('imageio.v2', 'plot')
+    imageio = require('imageio.v2', 'imageio matplotlib')
     how: dict[str, Any] = {'duration': 1e3 / fps, 'loop': 0}
     if Path(path).suffix.lower() == '.mp4':
-        require('imageio_ffmpeg', 'movie')
+        require('imageio_ffmpeg', 'imageio-ffmpeg')
         how = {'fps': fps}
     with staged_file(path, force=True) as part, imageio.get_writer(part, **how) as writer:
         for scene in scenes:

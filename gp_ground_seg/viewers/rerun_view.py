@@ -39,10 +39,10 @@ class Recording:
     """Frames on their way to a viewer or a file, which rerun's ``RecordingStream`` knows."""
 
     def __init__(self, title: str) -> None:
-        self._rr = rr = require('rerun', 'view')
+        self._rr = rr = require('rerun', 'rerun-sdk')
         self.stream = rr.RecordingStream('gp_ground_seg')
         self.stream.send_recording_name(title)
-        self.stream.send_blueprint(_blueprint(require('rerun.blueprint', 'view')))
+        self.stream.send_blueprint(_blueprint(require('rerun.blueprint', 'rerun-sdk')))
         about = rr.TextDocument(ABOUT, media_type='text/markdown')
         self.stream.log('about', about, static=True)
 
@@ -88,7 +88,7 @@ def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
 
     They arrive at the next port. rerun's own function would listen on every network.
     """
-    require('rerun', 'view')
+    require('rerun', 'rerun-sdk')
     ports = port, port + 1
     if any(map(_is_listening, ports)):
         raise DataError(f'--port {port}: it or the next one is in use; choose another')
