@@ -72,6 +72,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/config', sorted(glob('config/*'))),
+        (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.py'))),
     ],
     install_requires=[
         'numpy>=1.26',
