@@ -247,7 +247,9 @@ def _draw_legend(figure: Any, config: Config, colour: str) -> None:
     figure.legend(handles=dots, loc='lower left', fontsize=11, frameon=False, ncols=2)
     low, high = config.length_scale.min, config.length_scale.max
     colours = style.length_scale_colours(np.geomspace(low, high, 200), low, high)
-    bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], colours[None])
+    # matplotlib takes an array of colours since 3.7, Ubuntu 24.04 has 3.6.
+    listed = require('matplotlib.colors', 'matplotlib').ListedColormap(colours)
+    bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], np.arange(200)[None], cmap=listed)
     bar.set_xscale('log')
     bar.set_title(
         'length-scale of the ground [m]; ribbons: 2 sigma', fontsize=9.5, loc='left', pad=3.0
