@@ -3,6 +3,7 @@
 import ast
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -21,15 +22,16 @@ def package():
 
 
 def test_package_xml_is_that_of_this_package(package):
-    assert package.findtext('version') == gp_ground_seg.__version__
-    changelog = (REPOSITORY / 'CHANGELOG.rst').read_text(encoding='utf-8')
-    assert re.search(r'^(\d+\.\d+\.\d+|Forthcoming)\b', changelog, re.MULTILINE)
     assert package.get('format') == '3'
     assert package.findtext('export/build_type') == 'ament_python'
     depends = {element.text for element in package.iter('exec_depend')}
     trees = parse(REPOSITORY / PACKAGE).values()
     imported = {name.split('.')[0] for tree in trees for name in imports(tree)}
     assert imported & set(ROS.split()) <= depends
+    files = [ast.parse(path.read_text()) for path in REPOSITORY.glob('launch/*.launch.py')]
+    launched = {name.split('.')[0] for tree in files for name in imports(tree)}
+    assert {'launch', 'launch_ros'} <= launched & depends
+    assert launched <= depends | {'pathlib', 'yaml'}
 
 
 # The order that the schema of format 3 (REP 149) asks for.
@@ -48,6 +50,36 @@ def test_package_xml_follows_its_schema(package):
             assert element.text == ' '.join(element.text.split())
     names = [element.text for element in package if 'depend' in element.tag]
     assert len(set(names)) == len(names)
+
+
+def test_one_version(package):
+    """Of the newest section of the changelog as well, unless that is of the next release."""
+    version = gp_ground_seg.__version__
+    assert package.findtext('version') == version
+    setup = (REPOSITORY / 'setup.py').read_text(encoding='utf-8')
+    assert re.findall(r"version='(.*)',", setup) == [version]
+    changelog = (REPOSITORY / 'CHANGELOG.rst').read_text(encoding='utf-8')
+    newest, rule = re.search(r'^(.+)\n(-+)$', changelog, re.MULTILINE).groups()
+    assert len(newest) == len(rule)
+    assert newest == 'Forthcoming' or re.fullmatch(rf'{version} \(\d{{4}}-\d\d-\d\d\)', newest)
+
+
+@pytest.mark.filterwarnings('ignore::DeprecationWarning')  # of docutils, which catkin_pkg calls
+def test_the_tools_of_a_release_read_the_changelog_and_set_the_version(tmp_path):
+    """Those of catkin, which bloom uses as well."""
+    changelogs = pytest.importorskip('catkin_pkg.changelog', reason='catkin_pkg is not installed')
+    packages = pytest.importorskip('catkin_pkg.package')
+    versions = pytest.importorskip('catkin_pkg.package_version')
+    changelog = changelogs.get_changelog_from_path(str(REPOSITORY / 'CHANGELOG.rst'))
+    assert changelog.package_name == PACKAGE
+    newest, _, entries = next(iter(changelog.foreach_version()))
+    assert newest in (gp_ground_seg.__version__, 'forthcoming') and len(entries) > 0
+    for name in ('package.xml', 'setup.py'):
+        shutil.copy(REPOSITORY / name, tmp_path)
+    found = packages.parse_package(str(tmp_path / 'package.xml'))
+    versions.update_versions({str(tmp_path): found}, '9.8.7')
+    assert packages.parse_package(str(tmp_path / 'package.xml')).version == '9.8.7'
+    assert "version='9.8.7'," in (tmp_path / 'setup.py').read_text()
 
 
 def test_package_xml_is_accepted_by_the_tools_of_ros():
