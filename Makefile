@@ -44,7 +44,8 @@ test: $(VENV)/.dev
 	$(WITH_KITTI) $(BIN)/python -m pytest
 
 browser-test: $(VENV)/.dev
-	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && apt-get install -y chromium; } \
+	@command -v chromium >/dev/null \
+		|| { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -qq -y chromium; } \
 		|| { echo 'Chromium is not installed: sudo apt-get install chromium'; exit 1; }
 	GP_GROUND_SEG_WEB_VIEWER=1 $(BIN)/python -m pytest test/test_browser.py
 
@@ -56,13 +57,14 @@ bench: $(VENV)/.dev
 
 bench-docs: $(VENV)/.dev
 	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy --force \
-		--json docs/performance.json --plot docs/images/performance.png
+		--json docs/performance.json
+	$(BIN)/python docs/stages.py
 
 figures: $(VENV)/.dev
 	$(BIN)/python docs/figures.py $(KITTI) $(ONLY)
 
 node-bench: $(VENV)/.ros
-	$(BIN)/gp-ground-seg node-bench $(KITTI)
+	$(BIN)/python test/node_bench.py $(KITTI)
 
 # The interpreter of colcon is that of the node; ROS wheels lie below its prefix.
 colcon: export AMENT_PREFIX_PATH := $(abspath $(VENV))

@@ -10,7 +10,6 @@ PACKAGE = 'gp_ground_seg'
 BAGS = ['rosbags>=0.11.9']
 FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
 PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
-MOVIE = ['imageio-ffmpeg>=0.4.8']  # for MP4; 165 MB, of which GIF needs none
 TUNE = ['optuna>=4.0']
 SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']  # 21 MB; s3fs, for s3://, is 36 MB more
 VISER = ['viser>=1.1']
@@ -25,7 +24,6 @@ ROS = [
 TEST = ['hypothesis>=6.100', 'pytest>=7.4']
 DEV = [
     *TEST,
-    *MOVIE,
     *TUNE,
     *SCALE,
     *VIEW,
@@ -80,7 +78,6 @@ setup(
         'bags': BAGS,
         'formats': FORMATS,
         'plot': PLOT,
-        'movie': PLOT + MOVIE,
         'tune': PLOT + TUNE + VISER,
         'scale': SCALE,
         'complete': ['argcomplete>=3.1'],
