@@ -1,18 +1,11 @@
 """Package description for pip and colcon."""
 
-import re
 from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
 
 PACKAGE = 'gp_ground_seg'
-
-version = re.search(
-    r"^__version__ = '([^']+)'$",
-    Path(PACKAGE, '__init__.py').read_text(encoding='utf-8'),
-    re.MULTILINE,
-).group(1)
 
 BAGS = ['rosbags>=0.11.9']
 FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
@@ -55,11 +48,12 @@ DEV = [
 
 setup(
     name=PACKAGE,
-    version=version,
+    version='0.2.0',  # a literal: catkin_prepare_release writes it here and into package.xml
     description='Ground segmentation of LiDAR scans with two coupled Gaussian processes',
     long_description=Path('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     license='Apache-2.0',
+    url='https://arxiv.org/abs/2112.05847',
     author='gp_ground_seg maintainers',
     maintainer='gp_ground_seg maintainers',
     maintainer_email='maintainers@users.noreply.h-seed-aac284b4.example',
@@ -70,6 +64,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/config', sorted(glob('config/*'))),
+        (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.py'))),
     ],
     install_requires=[
         'numpy>=1.26',

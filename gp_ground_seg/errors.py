@@ -1,6 +1,10 @@
 """Exceptions that carry one clear line for the user."""
 
 import importlib
+import shlex
+import sys
+import sysconfig
+from pathlib import Path
 from typing import Any
 
 
@@ -24,15 +28,26 @@ class MissingDependencyError(GroundSegError, ImportError):
     """An optional package that this command needs is not installed."""
 
 
-def require(module: str, extra: str) -> Any:
+def install_hint(packages: str) -> str:
+    """Return a command that installs `packages` of PyPI for this interpreter, or where they go.
+
+    The Python of a distribution takes them in a virtual environment only (PEP 668).
+    """
+    marker = Path(sysconfig.get_path('stdlib'), 'EXTERNALLY-MANAGED')
+    if sys.prefix == sys.base_prefix and marker.exists():
+        return f'pip install {packages}, in a virtual environment: see docs/install.md'
+    return f'{shlex.quote(sys.executable)} -m pip install {packages}'
+
+
+def require(module: str, packages: str) -> Any:
     """Import a module of an optional package.
 
-    Raises a MissingDependencyError, with the `extra` of ours that installs it, if that fails.
+    Raises a MissingDependencyError, with the `packages` of PyPI that it needs, if that fails.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise MissingDependencyError(
             f'{module.split(".")[0]} is not installed, or does not work here ({error}): '
-            f"pip install 'gp_ground_seg[{extra}]'"
+            f'{install_hint(packages)}'
         ) from error

@@ -324,7 +324,7 @@ def test_without_ros(tmp_path, capsys, monkeypatch):
     assert play(tmp_path / 'drive.mcap') == 2
     line = error_line(capsys)
     assert line.startswith('play needs ROS 2, which cannot be imported')
-    assert "pip install 'gp_ground_seg[ros]'" in line
+    assert "pip install 'ros-jazzy-rclpy[fastrtps]' " in line
 
 
 @pytest.mark.parametrize(

@@ -252,9 +252,14 @@ def test_refused(tmp_path, monkeypatch, capsys, words, message):
 
 
 @pytest.mark.parametrize(
-    ('name', 'module'), [('a.laz', 'lazrs'), ('a.las', 'laspy'), ('a.pcd', 'lzf')]
+    ('name', 'module', 'packages'),
+    [
+        ('a.laz', 'lazrs', 'laspy lazrs'),
+        ('a.las', 'laspy', 'laspy lazrs'),
+        ('a.pcd', 'lzf', 'python-neo-lzf'),
+    ],
 )
-def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys, name, module):
+def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys, name, module, packages):
     path = tmp_path / name
     cloud = cloud_of(name_columns(np.zeros((50, 3), np.float32)))
     whole = encode_file(path, cloud, np.zeros(50, np.uint8), {})
@@ -264,4 +269,4 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys, name, module)
     assert run('segment', path, '-o', tmp_path / 'out.npy') == 2
     line = error_line(capsys)
     assert line.startswith(f'{module} is not installed')
-    assert line.endswith("pip install 'gp_ground_seg[formats]'")
+    assert line.endswith(f'pip install {packages}')

@@ -75,9 +75,10 @@ def test_the_package_is_in_the_index_and_imported_from_the_workspace(workspace):
     assert Path(prefix) in Path(module).parents
     installed = Path(prefix, 'share', PACKAGE)
     assert (installed / 'package.xml').read_bytes() == (REPOSITORY / 'package.xml').read_bytes()
-    for file in (REPOSITORY / 'config').iterdir():
-        if file.is_file():
-            assert (installed / 'config' / file.name).read_bytes() == file.read_bytes()
+    shared = [*REPOSITORY.glob('config/*'), *REPOSITORY.glob('launch/*.launch.py')]
+    assert len(shared) >= 6
+    for file in shared:
+        assert (installed / file.parent.name / file.name).read_bytes() == file.read_bytes()
 
 
 def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):

@@ -1,6 +1,9 @@
 """The package as a whole: versions, layers, dependencies."""
 
+import ast
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -10,6 +13,7 @@ from conftest import REPOSITORY
 from test_layout import PACKAGE, ROS, imports, parse
 
 import gp_ground_seg
+from gp_ground_seg.ros.lifecycle import ROS_WHEELS
 
 
 @pytest.fixture
@@ -18,15 +22,16 @@ def package():
 
 
 def test_package_xml_is_that_of_this_package(package):
-    assert package.findtext('version') == gp_ground_seg.__version__
-    changelog = (REPOSITORY / 'CHANGELOG.rst').read_text(encoding='utf-8')
-    assert re.search(r'^(\d+\.\d+\.\d+|Forthcoming)\b', changelog, re.MULTILINE)
     assert package.get('format') == '3'
     assert package.findtext('export/build_type') == 'ament_python'
     depends = {element.text for element in package.iter('exec_depend')}
     trees = parse(REPOSITORY / PACKAGE).values()
     imported = {name.split('.')[0] for tree in trees for name in imports(tree)}
     assert imported & set(ROS.split()) <= depends
+    files = [ast.parse(path.read_text()) for path in REPOSITORY.glob('launch/*.launch.py')]
+    launched = {name.split('.')[0] for tree in files for name in imports(tree)}
+    assert {'launch', 'launch_ros'} <= launched & depends
+    assert launched <= depends | {'pathlib', 'yaml'}
 
 
 # The order that the schema of format 3 (REP 149) asks for.
@@ -45,6 +50,35 @@ def test_package_xml_follows_its_schema(package):
             assert element.text == ' '.join(element.text.split())
     names = [element.text for element in package if 'depend' in element.tag]
     assert len(set(names)) == len(names)
+
+
+def test_one_version(package):
+    """Of the newest section of the changelog as well, unless that is of the next release."""
+    version = gp_ground_seg.__version__
+    assert package.findtext('version') == version
+    setup = (REPOSITORY / 'setup.py').read_text(encoding='utf-8')
+    assert re.findall(r"version='(.*)',", setup) == [version]
+    changelog = (REPOSITORY / 'CHANGELOG.rst').read_text(encoding='utf-8')
+    newest, rule = re.search(r'^(.+)\n(-+)$', changelog, re.MULTILINE).groups()
+    assert len(newest) == len(rule)
+    assert newest == 'Forthcoming' or re.fullmatch(rf'{version} \(\d{{4}}-\d\d-\d\d\)', newest)
+
+
+@pytest.mark.filterwarnings('ignore::DeprecationWarning')  # of docutils, which catkin_pkg calls
+def test_the_tools_of_a_release_read_the_changelog_and_set_the_version(tmp_path):
+    """Those of catkin, which bloom uses as well."""
+    changelogs = pytest.importorskip('catkin_pkg.changelog', reason='catkin_pkg is not installed')
+    packages = pytest.importorskip('catkin_pkg.package')
+    versions = pytest.importorskip('catkin_pkg.package_version')
+    changelog = changelogs.get_changelog_from_path(str(REPOSITORY / 'CHANGELOG.rst'))
+    newest, _, entries = next(iter(changelog.foreach_version()))
+    assert newest in (gp_ground_seg.__version__, 'forthcoming') and len(entries) > 0
+    for name in ('package.xml', 'setup.py'):
+        shutil.copy(REPOSITORY / name, tmp_path)
+    found = packages.parse_package(str(tmp_path / 'package.xml'))
+    versions.update_versions({str(tmp_path): found}, '9.8.7')
+    assert packages.parse_package(str(tmp_path / 'package.xml')).version == '9.8.7'
+    assert "version='9.8.7'," in (tmp_path / 'setup.py').read_text()
 
 
 def test_package_xml_is_accepted_by_the_tools_of_ros():
@@ -90,3 +124,51 @@ def test_no_path_of_one_machine_and_no_data_is_tracked():
         pytest.skip('not a git checkout')
     files = listed.stdout.split()
     assert not [name for name in files if name.endswith(('.bin', '.label', '.mcap', '.db3'))]
+
+
+HINTS = ('require', 'install_hint')
+
+
+def required_packages():
+    """The second arguments of `require` and the arguments of `install_hint`, where literal."""
+    for tree in parse(REPOSITORY / PACKAGE).values():
+        for node in ast.walk(tree):
+            is_hint = isinstance(node, ast.Call) and ast.unparse(node.func) in HINTS
+            if is_hint and isinstance(node.args[-1], ast.Constant):
+                yield from shlex.split(node.args[-1].value)
+
+
+def test_what_hints_name_is_what_our_extras_install():
+    """Names of other packages on PyPI, so that a hint works wherever ours comes from."""
+    named = {*required_packages(), *shlex.split(ROS_WHEELS)}
+    assert {'rosbags', 'numba', 'ros-jazzy-rclpy[fastrtps]'} <= named
+    setup = (REPOSITORY / 'setup.py').read_text(encoding='utf-8')
+    missing = {name for name in named if not re.search(rf"'{re.escape(name)}[<>=[;']", setup)}
+    assert missing <= {'lazrs'}  # of laspy[lazrs]
+
+
+HINT = """if True:
+    import sys, sysconfig
+    sys.prefix, folder = {prefix!r}, {folder!r}
+    sysconfig.get_path = lambda name: folder
+    from gp_ground_seg.errors import install_hint
+    print(install_hint('rosbags'))
+"""
+
+
+def test_a_hint_says_where_pip_works(tmp_path):
+    """Debian and Ubuntu mark their Python as theirs (PEP 668); a virtual environment is not."""
+
+    def hint(prefix):
+        code = HINT.format(prefix=prefix, folder=str(tmp_path))
+        done = subprocess.run(
+            [sys.executable, '-c', code], capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    here = f'{sys.executable} -m pip install rosbags'
+    assert hint(sys.base_prefix) == here
+    (tmp_path / 'EXTERNALLY-MANAGED').touch()
+    there = 'pip install rosbags, in a virtual environment: see docs/install.md'
+    assert hint(sys.base_prefix) == there
+    assert hint('/elsewhere') == here

@@ -20,7 +20,7 @@ from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.jit import HAVE_NUMBA
-from gp_ground_seg.ros.lifecycle import ros_session
+from gp_ground_seg.ros.lifecycle import ROS_WHEELS, ros_session
 
 FIXED = (*IN_NAMESPACE, '-p', 'learning.mode:=fixed')
 SOON = 4.0
@@ -113,7 +113,7 @@ def test_missing_ros_is_said_in_one_line():
     done = run_python('-c', f"import sys; sys.modules['rclpy'] = None; {ros.ENTRY_POINT[1]}")
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
-    assert "pip install 'gp_ground_seg[ros]'" in line
+    assert f'pip install {ROS_WHEELS}' in line
 
 
 def test_two_nodes_side_by_side_read_their_parts_of_one_file(tmp_path):

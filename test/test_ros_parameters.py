@@ -342,8 +342,26 @@ def test_unknown_names_are_reported_and_not_declared(capfd):
         assert not node.has_parameter('lable.ground_tolerance')
         log = ros.said_by(capfd, 'did you mean label.ground_tolerance?', '/nowhere')
     assert log.count('is not used') == 2
-    assert '  sensor.height: 2.5 m  (default auto)' in log
-    assert '  sensor.roll: auto\n' in log
+    shown = [line for line in log.splitlines() if '  (default ' in line]
+    assert '  sensor.height: 2.5 m  (default auto)' in shown
+    assert len(shown) == len(changes)  # a line for each that differs, and no other
+    assert 'ros2 param dump /ground_segmentation_node' in log
+
+
+def test_a_start_with_the_defaults_is_one_line_about_them(capfd):
+    with ros.started_node():
+        log = ros.said_by(capfd, 'listening to')
+    assert 'parameters: all defaults (all values by ros2 param dump' in log
+    assert '(default' not in log
+    assert len(log.splitlines()) <= 4
+
+
+def test_a_given_height_is_not_doubted_before_the_first_cloud(capfd):
+    with ros.bench(*ros.given({'sensor.height': 4.5})):
+        pass
+    log = capfd.readouterr().err
+    assert 'sensor.height: 4.5 m' in log
+    assert 'is sensor.height right' not in log
 
 
 def test_parameters_are_set_from_another_process(b, monkeypatch):

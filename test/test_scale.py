@@ -201,7 +201,7 @@ def test_without_the_extra(package, words, root, tmp_path, monkeypatch, capsys):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.chdir(tmp_path)
     assert run('segment', root, *words) == 2
-    assert "pip install 'gp_ground_seg[scale]'" in error_line(capsys)
+    assert f'pip install {package}' in error_line(capsys)
 
 
 def test_local_paths_need_neither_dask_nor_fsspec(root, tmp_path):

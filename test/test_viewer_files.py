@@ -7,6 +7,10 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.backend import NumpyBackend
+from gp_ground_seg.parameters.schema import NODE_NAME
+
 NODE = '/ground_segmentation_node'
 OPTIONAL = {f'{NODE}/{name}' for name in ('labeled', 'ground_model', 'markers')}
 TOPICS = {'/ground', '/obstacles', *OPTIONAL}
@@ -21,6 +25,7 @@ def test_topics_are_those_of_the_node():
 
 def test_rviz_shows_every_topic():
     text = (REPOSITORY / 'config' / 'ground_segmentation.rviz').read_text(encoding='utf-8')
+    assert '<<:' not in text  # RViz reads it with yaml-cpp, which has no merge keys
     manager = yaml.safe_load(text)['Visualization Manager']
     shown = [display for display in manager['Displays'] if 'Topic' in display]
     assert {display['Topic']['Value'] for display in shown} == TOPICS
@@ -42,12 +47,60 @@ def test_foxglove_shows_every_topic():
     assert sorted(panels) == sorted(layout['configById'])
 
 
-def test_nav2_snippet_is_yaml_and_fits_the_command_above_it():
-    text = (REPOSITORY / 'docs' / 'nav2.md').read_text(encoding='utf-8')
-    (snippet,) = re.findall(r'```yaml\n(.*?)```', text, re.DOTALL)
-    costmap = yaml.safe_load(snippet)['local_costmap']['local_costmap']['ros__parameters']
-    layer = costmap['obstacle_layer']
-    for source in layer['observation_sources'].split():
-        assert f'-r {source}:={layer[source]["topic"]}' in text
-    marking = {name for name in ('obstacles', 'ground') if layer[name]['marking']}
-    assert marking == {'obstacles'}
+def colour_fields():
+    """Topic and field of each display that colours points by a field."""
+    text = (REPOSITORY / 'config' / 'ground_segmentation.rviz').read_text(encoding='utf-8')
+    for display in yaml.safe_load(text)['Visualization Manager']['Displays']:
+        if 'Channel Name' in display:
+            yield display['Topic']['Value'], display['Channel Name']
+    text = (REPOSITORY / 'config' / 'foxglove_layout.json').read_text(encoding='utf-8')
+    for topic, settings in json.loads(text)['configById']['3D!ground']['topics'].items():
+        if 'colorField' in settings:
+            yield topic, settings['colorField']
+
+
+def test_fields_and_namespaces_are_those_of_the_messages():
+    ros = pytest.importorskip('ros_helpers', reason='ROS is not installed')
+    outputs = pytest.importorskip('gp_ground_seg.ros.outputs')
+    points = ros.street(3000)
+    cloud = ros.to_message(points)
+    result = GroundSegmenter(backend=NumpyBackend()).segment(ros.xyz_of(points))
+    made = {o.topic: o.build(cloud, result, Config()) for o in outputs.OUTPUTS}
+    shown = set(colour_fields())
+    assert (f'{NODE}/labeled', 'label') in shown and len(shown) >= 3
+    for topic, field in shown:
+        assert field in {one.name for one in made[topic.replace(NODE, '~')].fields}
+    text = (REPOSITORY / 'config' / 'ground_segmentation.rviz').read_text(encoding='utf-8')
+    displays = yaml.safe_load(text)['Visualization Manager']['Displays']
+    (namespaces,) = (one['Namespaces'] for one in displays if 'Namespaces' in one)
+    assert set(namespaces) == {marker.ns for marker in made['~/markers'].markers if marker.ns}
+
+
+def snippets(page):
+    text = (REPOSITORY / 'docs' / page).read_text(encoding='utf-8')
+    return text, [yaml.safe_load(one) for one in re.findall(r'```yaml\n(.*?)```', text, re.DOTALL)]
+
+
+def test_nav2_snippets_are_yaml_and_fit_the_command_above_them():
+    text, found = snippets('nav2.md')
+    costmaps = [one['local_costmap']['local_costmap']['ros__parameters'] for one in found]
+    assert len(costmaps) == 2
+    for costmap in costmaps:
+        assert set(costmap['plugins']) <= set(costmap)
+        layer = costmap['obstacle_layer']
+        for source in layer['observation_sources'].split():
+            assert f'-r {source}:={layer[source]["topic"]}' in text
+        marking = {name for name in ('obstacles', 'ground') if layer[name]['marking']}
+        assert marking == {'obstacles'}
+    consistency = costmaps[1]['ground_consistency_layer']
+    assert f'-r ground:={consistency["ground_points_topic"]}' in text
+    assert f'-r obstacles:={consistency["nonground_points_topic"]}' in text
+
+
+def test_the_aggregator_of_the_diagnostics_finds_our_statuses():
+    _, (found,) = snippets('diagnostics.md')
+    group = found['analyzers']['ros__parameters']['ground_segmentation']
+    (part,) = group['contains']
+    tasks = ('input', 'processing', 'model', 'output')
+    assert all(part in f'front/{NODE_NAME}: {task}' for task in tasks)
+    assert group['num_items'] == len(tasks)

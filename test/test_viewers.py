@@ -291,16 +291,16 @@ def test_what_is_refused(sequence, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ('words', 'module', 'extra'),
+    ('words', 'module', 'package'),
     [
-        (('view', '--save', 'a.rrd'), 'rerun', 'view'),
-        (('view', '--web'), 'rerun', 'view'),
-        (('view', '--html', 'a.html'), 'viser', 'view'),
-        (('tune', '-o', 'a.yaml'), 'viser', 'tune'),
+        (('view', '--save', 'a.rrd'), 'rerun', 'rerun-sdk'),
+        (('view', '--web'), 'rerun', 'rerun-sdk'),
+        (('view', '--html', 'a.html'), 'viser', 'viser'),
+        (('tune', '-o', 'a.yaml'), 'viser', 'viser'),
     ],
 )
 def test_a_missing_library_is_one_line(
-    words, module, extra, sequence, tmp_path, monkeypatch, capsys
+    words, module, package, sequence, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, module, None)
@@ -308,5 +308,5 @@ def test_a_missing_library_is_one_line(
     assert run(command, sequence, '--quiet', *more) == 2
     line = error_line(capsys)
     assert line.startswith(f'{module} is not installed')
-    assert line.endswith(f"pip install 'gp_ground_seg[{extra}]'")
+    assert line.endswith(f'pip install {package}')
     assert not list(tmp_path.iterdir())

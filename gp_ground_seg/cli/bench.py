@@ -99,8 +99,8 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     try:
         PEERS[arguments.peer]()
         baseline = arguments.peer
-    except MissingDependencyError:
-        options.note('no ratios without the baseline: pip install pypatchworkpp')
+    except MissingDependencyError as error:
+        options.note(f'no ratios without the baseline: {error}')
         baseline = None
     measured = run_cases(
         frames_from_options(arguments, arguments.frames),

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.errors import GroundSegError, MissingDependencyError
+from gp_ground_seg.errors import GroundSegError, MissingDependencyError, install_hint
 from gp_ground_seg.ros.lifecycle import needing_ros, stop_on_signals
 
 NODE_EXAMPLES = """\
@@ -63,7 +63,7 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
 
     if not HAVE_NUMBA:
         raise MissingDependencyError(
-            'numba is not installed, nothing to compile: pip install numba'
+            f'numba is not installed, nothing to compile: {install_hint("numba")}'
         )
     begin = time.monotonic()
     warm_up().close()

@@ -38,7 +38,7 @@ VIEW_EXAMPLES = """\
   gp-ground-seg view drive.mcap --save drive.rrd       for later: rerun drive.rrd
   gp-ground-seg view 000000.bin --labels 000000.label --html scan.html
 
-needs: pip install 'gp_ground_seg[view]'
+needs the packages rerun-sdk, and viser for --html (docs/install.md)
 """
 TUNE = """\
 A scan in the browser with sliders for its parameters: labels follow at once, those that
@@ -51,7 +51,7 @@ TUNE_EXAMPLES = """\
   gp-ground-seg tune drive.mcap --parameters label.ground_tolerance,faces.cell_size
   gp-ground-seg tune drive.mcap --node /front/ground_segmentation_node
 
-needs: pip install 'gp_ground_seg[tune]'
+needs the package viser (docs/install.md)
 """
 
 
@@ -186,7 +186,7 @@ def run_tune(arguments: argparse.Namespace) -> int:
         set_remotely(arguments.node, {name: values[name] for name in arguments.parameters})
         return f'{arguments.node} uses them'
 
-    with open_server(arguments.port, 'tune') as server:
+    with open_server(arguments.port) as server:
         shown = arguments.parameters, arguments.labels, arguments.frame or 0
         tuner = Tuner(server, inputs, config, *shown)
         tuner.add_button(f'write {output.name}', write)

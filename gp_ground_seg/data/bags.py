@@ -38,7 +38,7 @@ _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
 @functools.cache
 def jazzy_types() -> Any:
     """Message types of ROS 2 Jazzy (``rosbags.typesys.store.Typestore``)."""
-    require('rosbags.highlevel', 'bags')
+    require('rosbags.highlevel', 'rosbags')
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -131,7 +131,7 @@ class BagReader(AbstractContextManager['BagReader']):
     """
 
     def __init__(self, path: str | Path) -> None:
-        require('rosbags.highlevel', 'bags')
+        require('rosbags.highlevel', 'rosbags')
         from rosbags import rosbag1, rosbag2
 
         self.path = Path(path)
@@ -276,7 +276,7 @@ class BagWriter:
     def __init__(
         self, path: str | Path, *, storage: str | None = None, force: bool = False
     ) -> None:
-        require('rosbags.highlevel', 'bags')
+        require('rosbags.highlevel', 'rosbags')
         self.path = Path(path)
         self.storage = resolve_storage(path, storage)
         self._force = force

@@ -88,7 +88,7 @@ class UrlPath:
     @contextmanager
     def _open(self) -> Iterator[tuple[Any, str]]:
         """File system, and the path in it; what goes wrong becomes a DataError."""
-        core = require('fsspec.core', 'scale')
+        core = require('fsspec.core', 'fsspec')
         try:
             yield core.url_to_fs(self.url, use_listings_cache=False)
         except GroundSegError:

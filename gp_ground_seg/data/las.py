@@ -30,8 +30,8 @@ _ORIGINAL = 'original_'  # of fields whose name is that of a dimension of anothe
 
 
 def _laspy() -> Any:
-    require('lazrs', 'formats')
-    return require('laspy', 'formats')
+    require('lazrs', 'laspy lazrs')
+    return require('laspy', 'laspy lazrs')
 
 
 def read_las(data: bytes) -> Cloud:

@@ -77,7 +77,7 @@ def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields
             f'body of {size} bytes, its header says {needed} (at most {MAX_SCAN_BYTES})'
         )
     # LZF knows no empty text.
-    body = require('lzf', 'formats').decompress(data[8 : 8 + packed], size) if size else b''
+    body = require('lzf', 'python-neo-lzf').decompress(data[8 : 8 + packed], size) if size else b''
     columns, start = {}, 0
     for name in dtype.names or ():
         column = np.frombuffer(body, np.dtype([(name, dtype[name])]), n_points, start)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from gp_ground_seg.errors import ConfigError, MissingDependencyError
+from gp_ground_seg.errors import ConfigError, require
 from gp_ground_seg.evaluation.evaluate import PATCHWORK, PATCHWORKPP, MethodResult, Points
 from gp_ground_seg.evaluation.metrics import Labels
 from gp_ground_seg.frame import Label
@@ -33,11 +33,7 @@ class PatchworkppMethod:
     def __init__(
         self, sensor_height: float | None = None, origin: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> None:
-        try:
-            import pypatchworkpp
-        except ImportError as error:
-            raise MissingDependencyError('patchworkpp: pip install pypatchworkpp') from error
-        self._module = pypatchworkpp
+        self._module = require('pypatchworkpp', 'pypatchworkpp')
         self._sensor_height, self._origin = sensor_height, np.array(origin)
         self.reset()
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gp_ground_seg
-from gp_ground_seg.errors import DataError, MissingDependencyError
+from gp_ground_seg.errors import DataError, MissingDependencyError, install_hint
 from gp_ground_seg.parameters.config import Config, parameter_specs
 from gp_ground_seg.parameters.schema import ParameterValue
 from gp_ground_seg.result import FitReport
@@ -159,7 +159,7 @@ def check_rows_file(name: str) -> None:
     if not name.endswith(('.csv', '.parquet')):
         raise DataError(f'{name}: must end in .csv or .parquet')
     if name.endswith('.parquet') and importlib.util.find_spec('pyarrow') is None:
-        raise MissingDependencyError('pyarrow is not installed: pip install pyarrow')
+        raise MissingDependencyError(f'pyarrow is not installed: {install_hint("pyarrow")}')
 
 
 def write_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:

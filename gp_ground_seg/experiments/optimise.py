@@ -90,7 +90,7 @@ def search(
     What is in the file `journal` is not done again. DataError if it is no journal, or that of
     another search: other parameters, or other `frames`.
     """
-    optuna, journals = require('optuna', 'tune'), require('optuna.storages.journal', 'tune')
+    optuna, journals = require('optuna', 'optuna'), require('optuna.storages.journal', 'optuna')
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     storage = None
     if journal is not None:

@@ -124,7 +124,7 @@ def write_movie(
     scenes: Iterable[Scene], config: Config, path: str | Path, view: View, fps: float
 ) -> None:
     """Write a GIF of scenes, replacing the file."""
-    imageio = require('imageio.v2', 'plot')
+    imageio = require('imageio.v2', 'imageio matplotlib')
     with (
         staged_file(path, force=True) as part,
         imageio.get_writer(part, duration=1e3 / fps, loop=0) as writer,
@@ -246,7 +246,9 @@ def _draw_legend(figure: Any, config: Config, colour: str) -> None:
     figure.legend(handles=dots, loc='lower left', fontsize=11, frameon=False, ncols=2)
     low, high = config.length_scale.min, config.length_scale.max
     colours = style.length_scale_colours(np.geomspace(low, high, 200), low, high)
-    bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], colours[None])
+    # matplotlib takes an array of colours since 3.7, Ubuntu 24.04 has 3.6.
+    listed = require('matplotlib.colors', 'matplotlib').ListedColormap(colours)
+    bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], np.arange(200)[None], cmap=listed)
     bar.set_xscale('log')
     bar.set_title(
         'length-scale of the ground [m]; ribbons: 2 sigma', fontsize=9.5, loc='left', pad=3.0

@@ -33,7 +33,7 @@ _RAMP = np.array(
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Any:
     """Return an empty matplotlib figure [inch] outside pyplot's global state."""
-    return require('matplotlib.figure', 'plot').Figure((width, height), dpi=dpi)
+    return require('matplotlib.figure', 'matplotlib').Figure((width, height), dpi=dpi)
 
 
 def add_axes(figure: Any, left: float, bottom: float, size: tuple[float, float]) -> Any:

@@ -22,10 +22,11 @@ from typing import Any
 
 import yaml
 
-from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyError
+from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyError, install_hint
 from gp_ground_seg.parameters.schema import read_yaml
 
 HIGHEST_DOMAIN = 232
+ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
 
 
 def initialize(words: Sequence[str]) -> None:
@@ -94,7 +95,7 @@ def needing_ros(command: str) -> Iterator[None]:
             raise
         raise MissingDependencyError(
             f'{command} needs ROS 2, which cannot be imported ({error}): source the setup '
-            "file of a ROS 2 installation, or pip install 'gp_ground_seg[ros]'"
+            f'file of a ROS 2 installation, or {install_hint(ROS_WHEELS)}'
         ) from error
 
 

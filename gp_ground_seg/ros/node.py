@@ -59,7 +59,7 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _start(self) -> None:
         logger = self.get_logger()
-        logger.info(f'effective configuration:\n{describe(self.config)}')
+        logger.info(describe(self.config, self.get_fully_qualified_name()))
         with lifecycle.start_errors():
             self._outputs = OutputPublishers(self)
             self._input = CloudSubscription(self, 'points', self.is_given, self._on_cloud)

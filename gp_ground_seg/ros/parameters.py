@@ -58,15 +58,16 @@ def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
     return config.replace(**values)
 
 
-def describe(config: Config) -> str:
-    """Return one line per parameter: name, value, unit, and the default if it differs."""
+def describe(config: Config, node_name: str) -> str:
+    """Return one line per parameter that is not at its default, and how to see all."""
     lines = []
     for spec in parameter_specs():
-        value = config[spec.name]
-        unit = f' {spec.unit}' if spec.unit and not isinstance(value, str) else ''
-        note = '' if value == spec.default else f'  (default {spec.default})'
-        lines.append(f'  {spec.name}: {value}{unit}{note}')
-    return '\n'.join(lines)
+        if (value := config[spec.name]) != spec.default:
+            unit = f' {spec.unit}' if spec.unit and not isinstance(value, str) else ''
+            lines.append(f'\n  {spec.name}: {value}{unit}  (default {spec.default})')
+    head = 'parameters that differ from the defaults' if lines else 'parameters: all defaults'
+    how = f'all values by ros2 param dump {node_name}, explained by gp-ground-seg config dump'
+    return f'{head} ({how}){":" if lines else ""}{"".join(lines)}'
 
 
 class ConfiguredNode(Node):  # type: ignore[misc]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import os
 import subprocess
@@ -84,7 +85,8 @@ class BackendLoader:
             if code_folder() is not None and not is_code_kept():
                 self._compile()
             if not self._is_stopped:
-                self._backend = warm_up(config)
+                # A given height is not that of the scan which is segmented for this.
+                self._backend = warm_up(dataclasses.replace(config, sensor=Config().sensor))
         except Exception as error:
             self.error = f'{type(error).__name__}: {error}'
         self.seconds = time.monotonic() - start

@@ -280,8 +280,8 @@ def _connect(cluster: Any) -> Any:
 
 def _distributed() -> Any:
     """Import distributed; it says nothing but by way of what we do."""
-    distributed = require('distributed', 'scale')
-    require('dask.config', 'scale').set(_CONFIG)
+    distributed = require('distributed', 'distributed')
+    require('dask.config', 'distributed').set(_CONFIG)
     for name in ('distributed', 'distributed.client'):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     return distributed

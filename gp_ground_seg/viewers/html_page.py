@@ -28,9 +28,9 @@ _BOX = (
 
 
 @contextmanager
-def open_server(port: int, extra: str) -> Iterator[Any]:
+def open_server(port: int) -> Iterator[Any]:
     """Viser server on this machine; 0 is any free port. It prints nothing."""
-    viser = require('viser', extra)
+    viser = require('viser', 'viser')
     try:
         with redirect_stdout(io.StringIO()):
             server = viser.ViserServer(host=HOST, port=port, verbose=False)
@@ -56,14 +56,14 @@ def draw_points(server: Any, name: str, cloud: Cloud, visible: bool = True) -> A
 def _draw_surface(server: Any, mesh: Mesh) -> None:
     # viser takes colours by way of trimesh and glTF, where they are linear.
     linear = (255.0 * (mesh.colours / 255.0) ** 2.2).astype(np.uint8)
-    trimesh = require('trimesh', 'view')
+    trimesh = require('trimesh', 'viser')
     solid = trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=linear, process=False)
     server.scene.add_mesh_trimesh('/surface', solid, cast_shadow=False)
 
 
 def write_page(path: str | Path, scene: Scene, title: str, config: Config, force: bool) -> None:
     """Write a page that holds everything, and opens from disk."""
-    with staged_file(path, force=force) as part, open_server(0, 'view') as server:
+    with staged_file(path, force=force) as part, open_server(0) as server:
         for name, cloud in scene.clouds.items():
             draw_points(server, name, cloud, visible=name in SHOWN)
         _draw_surface(server, scene.surface)

@@ -40,7 +40,7 @@ class Recording:
     """Frames on their way to a viewer or a file, which rerun's ``RecordingStream`` knows."""
 
     def __init__(self, title: str) -> None:
-        self._rr = rr = require('rerun', 'view')
+        self._rr = rr = require('rerun', 'rerun-sdk')
         self.stream = rr.RecordingStream('gp_ground_seg')
         self.stream.send_recording_name(title)
         self._has_blueprint = False
@@ -52,7 +52,7 @@ class Recording:
         rr, log = self._rr, self.stream.log
         if not self._has_blueprint:
             series = [name for name in SERIES if scores or name not in NEED_LABELS]
-            self.stream.send_blueprint(_blueprint(require('rerun.blueprint', 'view'), series))
+            self.stream.send_blueprint(_blueprint(require('rerun.blueprint', 'rerun-sdk'), series))
             self._has_blueprint = True
         self.stream.set_time('frame', sequence=k)
         for name, (points, colours) in scene.clouds.items():
@@ -93,7 +93,7 @@ def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
 
     They arrive at the next port. rerun's own function would listen on every network.
     """
-    require('rerun', 'view')
+    require('rerun', 'rerun-sdk')
     ports = port, port + 1
     if any(map(_is_listening, ports)):
         raise DataError(f'--port {port}: it or the next one is in use; choose another')
