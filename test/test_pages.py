@@ -166,7 +166,7 @@ def test_numbers_of_the_readme_are_those_of_the_pages():
     baseline = f'{record["baseline_ms"]["median"]:.1f} ms'
     for name in ('learning, 2 threads', 'theta fixed, 2 threads', 'learning, numpy'):
         time, ratio = cases[name]['ms']['median'], cases[name]['ratio']['median']
-        expected.append([f'{time:.3g} ms', baseline, f'{ratio:.2g} times'])
+        expected.append([f'{time:.3g} ms', baseline, f'{ratio:#.2g} times'])
     shown = table_below('README.md', '## How good, how fast')[2:]
     assert [row[1:] for row in shown] == expected
     assert shown[3][0] == f'vehicles lost, of {cars[0]}'
