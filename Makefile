@@ -49,7 +49,8 @@ test: $(VENV)/.dev
 	$(WITH_KITTI) $(BIN)/python -m pytest
 
 browser-test: $(VENV)/.dev
-	@command -v chromium >/dev/null || { [ "$$(id -u)" = 0 ] && apt-get install -y chromium; } \
+	@command -v chromium >/dev/null \
+		|| { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -qq -y chromium; } \
 		|| { echo 'Chromium is not installed: sudo apt-get install chromium'; exit 1; }
 	GP_GROUND_SEG_WEB_VIEWER=1 $(BIN)/python -m pytest test/test_browser.py
 

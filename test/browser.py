@@ -27,7 +27,7 @@ class Page:
 
     def __init__(self, connection):
         self._connection, self._numbers = connection, itertools.count(1)
-        self.messages = []
+        self.messages, self._is_loaded = [], False
         for domain in ('Page', 'Runtime', 'Log'):
             self.call(f'{domain}.enable')
 
@@ -51,6 +51,8 @@ class Page:
             self.messages.append(('error', json.dumps(own['exceptionDetails'])))
         elif event['method'] == 'Log.entryAdded':
             self.messages.append((own['entry']['level'], own['entry']['text']))
+        elif event['method'] == 'Page.loadEventFired':
+            self._is_loaded = True
 
     @property
     def errors(self):
@@ -69,13 +71,15 @@ class Page:
         return self.run('document.body ? document.body.innerText : ""')
 
     def open(self, address):
+        self._is_loaded = False
         self.call('Page.navigate', url=address)
+        self.wait_for(lambda: self._is_loaded, f'page {address}')
 
     def wait_for(self, condition, what):
         """Return the first value of `condition` that is true."""
         end = time.monotonic() + PATIENCE
         while not (value := condition()):
-            assert time.monotonic() < end, f'no {what}; page: {self.text!r}; {self.messages}'
+            assert time.monotonic() < end, f'no {what}; {self.messages}'
             with contextlib.suppress(TimeoutError):
                 self._keep(json.loads(self._connection.recv(timeout=0.1)))
         return value
@@ -122,10 +126,17 @@ def open_browser(folder):
     from websockets.sync.client import connect
 
     words = [CHROMIUM, f'--user-data-dir={folder}', *FLAGS]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+    port_file = folder / 'DevToolsActivePort'
+    with (
+        open(folder / 'stderr.txt', 'w') as log,
+        subprocess.Popen(words, stderr=log) as process,
+    ):
         try:
-            said = next(line for line in process.stderr if 'DevTools listening on' in line)
-            port = said.rpartition('/devtools')[0].rpartition(':')[2]
+            end = time.monotonic() + PATIENCE
+            while not (port_file.exists() and port_file.read_text().count('\n')):
+                assert process.poll() is None and time.monotonic() < end, 'Chromium does not start'
+                time.sleep(0.05)
+            port = port_file.read_text().split()[0]
             with urllib.request.urlopen(f'http://127.0.0.1:{port}/json') as answer:
                 pages = json.load(answer)
             (address,) = (p['webSocketDebuggerUrl'] for p in pages if p['type'] == 'page')

@@ -34,7 +34,7 @@ def sequence(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(scope='module')
+@pytest.fixture
 def page(tmp_path_factory):
     with open_browser(tmp_path_factory.mktemp('profile')) as page:
         yield page
@@ -75,7 +75,6 @@ def test_page_of_a_scan_opens_from_disk_and_draws_its_points(sequence, page, tmp
 )
 def test_the_web_viewer_draws_the_scan(sequence, page):
     pytest.importorskip('rerun', reason='rerun is not installed')
-    page.messages.clear()
     with until_ctrl_c('view', sequence, '--web', '--port', 9590) as process:
         page.open(f'{process.stdout.readline().strip()}&renderer=webgl')
         # Rerun shades its points: the middle of an obstacle is darker than in the legend.
@@ -97,7 +96,6 @@ def tune(sequence, tmp_path_factory):
 
 def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page):
     address, output = tune
-    page.messages.clear()
     page.open(address)
     page.wait_for(lambda: re.search(r'^0 changed', page.text, re.MULTILINE), 'first labels')
     before = wait_for_colours(page, 'tune.png', lambda n: min(n['ground'], n['obstacle']) > 1000)

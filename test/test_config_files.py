@@ -10,7 +10,7 @@ import yaml
 from cli_runner import run
 from config_samples import configs
 from conftest import REPOSITORY
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
@@ -45,7 +45,10 @@ def test_yaml_reads_back_in_the_types_that_ros_wants(tmp_path_factory, config):
 def test_any_yaml_writer_will_do(tmp_path_factory, config, flow, ros):
     path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
     tree = {'/**': {'ros__parameters': config.nested()}} if ros else config.nested()
-    path.write_text(yaml.safe_dump(tree, default_flow_style=flow))
+    text = yaml.safe_dump(tree, default_flow_style=flow)
+    # PyYAML writes a frame named 1e5 without quotes: a number, for us as for ROS.
+    assume(not re.search(r': \d+[eE][+-]?\d+[,}\n]', text))
+    path.write_text(text)
     assert Config.from_yaml(path) == config
 
 

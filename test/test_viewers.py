@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_samples import write_ros2_bag
 from cli_runner import error_line, run, until_ctrl_c
 
 from gp_ground_seg import GroundSegmenter, Label
@@ -201,6 +202,25 @@ def test_only_the_frames_that_were_asked_for(sequence, tmp_path):
         chunks = [c for c in RrdReader(path).stream() if c.entity_path == '/scan/class']
         frames = [chunk.to_record_batch()['frame'].to_pylist() for chunk in chunks]
         assert frames == [expected]
+
+
+def test_a_bag_has_no_series_that_need_labels(sequence, tmp_path):
+    rerun()
+    from rerun.chunk import RrdReader
+
+    write_ros2_bag(tmp_path / 'drive.mcap')
+    for words, expected in (
+        ((tmp_path / 'drive.mcap', '--frame-step', 2), {'theta', 'latency'}),
+        ((sequence,), {'theta', 'latency', 'IoU', 'lost'}),
+    ):
+        path = tmp_path / f'{len(words)}.rrd'
+        assert run('view', *words, '--save', path, '--quiet') == 0
+        reader = RrdReader(path)
+        (blueprint,) = reader.blueprints()
+        batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
+        origin = 'ViewBlueprint:space_origin'
+        views = [b[origin].to_pylist() for b in batches if origin in b.schema.names]
+        assert {name for ((name,),) in views} == {'scan', 'about', *expected}
 
 
 def free_ports():

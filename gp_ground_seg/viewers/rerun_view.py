@@ -21,6 +21,7 @@ HIDDEN = ('height', 'p_ground', 'errors', 'faces', 'candidates', 'band')
 """What is not shown at first."""
 SERIES = {'IoU': 'IoU [%]', 'lost': 'objects lost', 'theta': 'theta', 'latency': 'latency [ms]'}
 """What is drawn over the frames, and its titles."""
+NEED_LABELS = ('IoU', 'lost')
 ABOUT = f"""\
 The eyes in the tree on the left show and hide:
 
@@ -42,13 +43,17 @@ class Recording:
         self._rr = rr = require('rerun', 'view')
         self.stream = rr.RecordingStream('gp_ground_seg')
         self.stream.send_recording_name(title)
-        self.stream.send_blueprint(_blueprint(require('rerun.blueprint', 'view')))
+        self._has_blueprint = False
         about = rr.TextDocument(ABOUT, media_type='text/markdown')
         self.stream.log('about', about, static=True)
 
     def log(self, k: int, scene: Scene, result: Segmentation, scores: dict[str, float]) -> None:
         """Add frame `k`."""
         rr, log = self._rr, self.stream.log
+        if not self._has_blueprint:
+            series = [name for name in SERIES if scores or name not in NEED_LABELS]
+            self.stream.send_blueprint(_blueprint(require('rerun.blueprint', 'view'), series))
+            self._has_blueprint = True
         self.stream.set_time('frame', sequence=k)
         for name, (points, colours) in scene.clouds.items():
             size = rr.Radius.ui_points(3.0 if name == 'candidates' else 1.5)
@@ -68,13 +73,13 @@ class Recording:
         )  # fmt: skip
 
 
-def _blueprint(rrb: Any) -> Any:
-    """Scan on the left, what changes over the frames on the right."""
+def _blueprint(rrb: Any, names: list[str]) -> Any:
+    """Scan on the left, the series of these names on the right."""
     hidden = {f'scan/{name}': rrb.EntityBehavior(visible=False) for name in HIDDEN}
     eye = rrb.EyeControls3D(position=CAMERA, look_target=TARGET, eye_up=(0.0, 0.0, 1.0))
     scan = rrb.Spatial3DView(origin='scan', name='scan', overrides=hidden, eye_controls=eye)
     about = rrb.TextDocumentView(origin='about', name='what is what')
-    series = [rrb.TimeSeriesView(origin=name, name=title) for name, title in SERIES.items()]
+    series = [rrb.TimeSeriesView(origin=name, name=SERIES[name]) for name in names]
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Tabs(scan, about), rrb.Vertical(*series), column_shares=[2.5, 1.0]),
         rrb.SelectionPanel(state='collapsed'),

@@ -48,7 +48,7 @@ class View(NamedTuple):
     objects: Objects | None = None
 
     def scores(self, label: Labels) -> dict[str, float]:
-        """IoU [%], objects lost, and objects; nothing where the truth is not known."""
+        """Return IoU [%], objects lost and objects; nothing where the truth is not known."""
         if self.truth is None or self.objects is None:
             return {}
         bands = count_objects(self.points, label, self.objects).values()

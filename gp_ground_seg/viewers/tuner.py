@@ -97,7 +97,7 @@ class Tuner:
         while self._changed.wait():
             self._changed.clear()
             try:
-                self._show(int(self._frame.value), self._colours.value, self.config)
+                self.show(int(self._frame.value), self._colours.value, self.config)
             except GroundSegError as error:
                 self._table.content = f'**{error}**'
 
@@ -145,7 +145,8 @@ class Tuner:
         label = self._segment(number, config).label
         return label, self._view(number).scores(label)
 
-    def _show(self, number: int, name: str, config: Config) -> None:
+    def show(self, number: int, name: str, config: Config) -> None:
+        """Segment a frame, and draw it in the colours of that name."""
         before, old_scores = self._before(number, self._reference)
         result, view = self._segment(number, config), self._view(number)
         if name == 'errors' and view.truth is None:
