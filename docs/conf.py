@@ -19,6 +19,8 @@ version = release = __version__
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon']
 html_theme = 'sphinx_rtd_theme'
 html_theme_options = {'navigation_depth': 3, 'style_external_links': True}
+html_static_path = ['_static']
+html_css_files = ['wide.css']
 html_show_sourcelink = False
 exclude_patterns = ['_build', 'scans']
 myst_heading_anchors = 4
