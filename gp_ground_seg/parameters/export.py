@@ -26,9 +26,9 @@ README_BEGIN, README_END = '<!-- parameters:begin -->', '<!-- parameters:end -->
 _PAGE_HEAD = """\
 # Parameters
 
-`make generate` writes this page from gp_ground_seg/parameters/config.py. Most users set only the ones
-in the first table of the README. `gp-ground-seg config dump` writes all of them, with their values
-and ranges, as a parameter file. A symbol is that of the paper.
+`make generate` writes this page from gp_ground_seg/parameters/config.py. Most users set only those
+in the table of the README. `gp-ground-seg config dump` writes all of them, with their values and
+ranges, as a parameter file. A symbol is that of the paper.
 
 """
 _WIDTH = 99
