@@ -62,7 +62,8 @@ bench: $(VENV)/.dev
 
 bench-docs: $(VENV)/.dev
 	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy --force \
-		--json docs/performance.json --plot docs/images/performance.png
+		--json docs/performance.json
+	$(BIN)/python docs/stages.py
 
 figures: $(VENV)/.dev
 	$(BIN)/python docs/figures.py $(KITTI) $(ONLY)
@@ -72,7 +73,7 @@ docs: $(VENV)/.docs
 	@echo 'docs/_build/html/index.html is the first page'
 
 node-bench: $(VENV)/.ros
-	$(BIN)/gp-ground-seg node-bench $(KITTI)
+	$(BIN)/python test/node_bench.py $(KITTI)
 
 # The interpreter of colcon is that of the node; ROS wheels lie below its prefix.
 colcon: export AMENT_PREFIX_PATH := $(abspath $(VENV))

@@ -17,7 +17,6 @@ version = re.search(
 BAGS = ['rosbags>=0.11.9']
 FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
 PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
-MOVIE = ['imageio-ffmpeg>=0.4.8']  # for MP4; 165 MB, of which GIF needs none
 TUNE = ['optuna>=4.0']
 SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']  # 21 MB; s3fs, for s3://, is 36 MB more
 VISER = ['viser>=1.1']
@@ -34,7 +33,6 @@ TEST = ['hypothesis>=6.100', 'pytest>=7.4']
 DOCS = ['myst-parser>=3', 'sphinx>=7.2', 'sphinx-rtd-theme>=2']
 DEV = [
     *TEST,
-    *MOVIE,
     *TUNE,
     *SCALE,
     *VIEW,
@@ -88,7 +86,6 @@ setup(
         'bags': BAGS,
         'formats': FORMATS,
         'plot': PLOT,
-        'movie': PLOT + MOVIE,
         'tune': PLOT + TUNE + VISER,
         'scale': SCALE,
         'complete': ['argcomplete>=3.1'],

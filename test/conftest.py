@@ -1,5 +1,6 @@
 """Shared by test modules: labelled frames where they are at hand, small scans, both backends."""
 
+import importlib.util
 import os
 import signal
 from collections.abc import Iterator
@@ -21,6 +22,14 @@ settings.register_profile('default', deadline=None)
 settings.load_profile('default')
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def load_script(path):
+    """A script of the repository as a module."""
+    spec = importlib.util.spec_from_file_location(Path(path).stem, REPOSITORY / path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def find_kitti() -> Path | None:

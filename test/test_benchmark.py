@@ -13,10 +13,8 @@ from conftest import REPOSITORY, hilly_scan
 from evaluation_samples import HeightRule, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.image import imread
 
 from gp_ground_seg import Config
-from gp_ground_seg.cli import bench as command
 from gp_ground_seg.cli.bench import RUN_LENGTH, bench_text, load_frames, read_record, runs
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation import benchmark
@@ -256,7 +254,6 @@ def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
         (('--from', 'nowhere.json'), 'nowhere.json'),
         (('--from', 'OTHER'), 'not a record'),
         (('DATA', '--json', 'OTHER'), 'exists already'),
-        (('DATA', '--plot', 'OTHER'), 'exists already'),
         (('EMPTY',), 'no point'),
     ],
 )
@@ -287,16 +284,3 @@ def test_without_the_baseline_there_are_no_ratios(scans, monkeypatch, tmp_path, 
     document = json.loads((tmp_path / 'a.json').read_text())
     assert document['baseline'] is document['baseline_ms'] is None
     assert 'ratio' not in document['cases'][0]
-
-
-def test_the_picture_leaves_out_cases_without_compiled_code(record, tmp_path, monkeypatch):
-    assert run('bench', '--from', record, '--plot', tmp_path / 'a.png') == 0
-    assert imread(tmp_path / 'a.png').shape[2] == 4
-    drawn = []
-    monkeypatch.setattr(
-        command, 'plot_stage_bars', lambda cases, path, *_: drawn.append((cases, path.touch()))
-    )
-    assert run('bench', '--from', record, '--plot', tmp_path / 'bars.png') == 0
-    cases = json.loads(record.read_text())['cases']
-    compiled = {case['name']: case['stages_ms'] for case in cases if case['backend'] == 'numba'}
-    assert drawn == [(compiled, None)] and len(compiled) < len(cases)

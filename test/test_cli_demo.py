@@ -126,7 +126,7 @@ def test_counts_and_words():
     tally.add(clouds[0], split(clouds[0], perfect()))
     tally.add(clouds[3], split(clouds[3], ~perfect()))
     tally.add(sent_cloud(stamp=77), {})
-    result = rate_result(10.0, trips(0.05, None, None, 0.07, 0.02), 0)
+    result = rate_result(10.0, trips(0.05, None, None, 0.07, 0.02))
     text, is_good = result_text(tally, result, 0, 'the truth')
     assert not is_good
     assert '5 sent, 3 back, 2 lost' in text and 'median 50.0 ms' in text
@@ -155,7 +155,7 @@ def test_what_failed_is_said(rate, n_stray, is_good, words):
     tally = Tally([stamp_of(cloud)])
     tally.add(cloud, split(cloud, perfect()))
     latencies = (0.15, 0.15, 0.15) if rate == 10.0 else (0.15, 0.15, None)
-    result = rate_result(rate, trips(*latencies), 0)
+    result = rate_result(rate, trips(*latencies))
     text, found = result_text(tally, result, n_stray, 'the truth')
     assert (found, words in text) == (is_good, True)
 

@@ -12,14 +12,15 @@ from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.cli import experiment
-from gp_ground_seg.cli.experiment import EXPERIMENTS, parse_departure
+from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
-from gp_ground_seg.errors import ConfigError, DataError
+from gp_ground_seg.errors import DataError
 from gp_ground_seg.evaluation import evaluate as runner
 from gp_ground_seg.experiments import ablation, sensor_pose, variants
-from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, VARIANCES, Choice, table1
+from gp_ground_seg.experiments import table1 as paper_table
+from gp_ground_seg.experiments.table1 import CHOICES, VARIANCES, Choice, table1
 from gp_ground_seg.parameters.presets import PRESETS
 from gp_ground_seg.simulation import DRIVES, HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
 
@@ -35,6 +36,11 @@ def root(tmp_path_factory):
 def few_places(monkeypatch):
     monkeypatch.setattr(variants, 'SCENE_PLACES', (0.0,))
     monkeypatch.setattr(ablation, 'PLACES', (12.0,))
+    some = ablation.Departure('near', {'grid.r_max': 15.0}), ablation.DEPARTURES[3]
+    monkeypatch.setattr(ablation, 'DEPARTURES', some)
+    chosen = Choice('00', '000000', (3, 4)), Choice('00', '000001', (5,))
+    monkeypatch.setattr(paper_table, 'CHOICES', chosen)
+    monkeypatch.setattr(paper_table, 'N_REPEATS', 1)
 
 
 CASES = {
@@ -42,11 +48,7 @@ CASES = {
     'ablation --simulated': (['--seeds', '1', *SMALL], 'models', 7),
     'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
     'wrong-values': (['ROOT', '--frame-step', '3', *SMALL], 'values', 26 * 2),
-    'departures': (
-        ['ROOT', '--switch', 'small: grid.n_bins=79', '--switch',
-         'near: grid.r_max=15', *SMALL],
-        'departures', 3 * 4,
-    ),
+    'departures': (['ROOT', *SMALL], 'departures', 3 * 4),
     'coverage': (['ROOT', *SMALL], 'sequence', 4 * 6),
     'coverage --simulated': (
         ['--sensors', 'vlp-16,mid-360', '--scenes', 'kerb', '--seeds', '1'], 'sensor', 2 * 6,
@@ -62,9 +64,7 @@ CASES = {
     'sensor-pose': (
         ['ROOT', '--sequences', '08', '--set', 'learning.mode=fixed'], 'turns', 27,
     ),
-    'table1': (
-        ['ROOT', '--frames', '00/000000:3,4', '00/000001:5', '--repeats', '1'], 'errors', 3,
-    ),
+    'table1': (['ROOT'], 'errors', 3),
 }  # fmt: skip
 
 
@@ -131,15 +131,6 @@ def test_simulated_poses_have_their_own_options(monkeypatch, capsys):
     assert found == [(2 * 2 * 3, {'flat', 'kerb'}, 40)]
 
 
-def test_a_departure_in_words():
-    found = parse_departure('gate: at all: growth.max_std=1 learning.mode=fixed')
-    assert found.title == 'gate: at all'
-    assert found.changes == {'growth.max_std': 1, 'learning.mode': 'fixed'}
-    for text in ('growth.max_std=1', 'title: ', ': growth.max_std=1', 'title: x'):
-        with pytest.raises(ConfigError):
-            parse_departure(text)
-
-
 @pytest.mark.parametrize(
     ('words', 'message'),
     [
@@ -154,7 +145,6 @@ def test_a_departure_in_words():
         (['steps', 'ROOT', '--set', 'grid.n_bins=40'], 'give no parameters'),
         (['steps', 'ROOT', '--preset', 'paper'], 'give no parameters'),
         (['ablation', '--simulated', '--set', 'length_scale.model=latent2'], 'length_scale.model'),
-        (['departures', 'ROOT', '--switch', 'a: '], 'must be TITLE'),
         (['sensor-pose', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
         (['coverage', 'ROOT', '--sensors', 'vlp-16'], '--sensors: is for --simulated only'),
         (['coverage'], 'coverage: give either ROOT or --simulated'),
@@ -233,13 +223,12 @@ def frame(rubble):
     return points, read_labels(rubble / 'sequences/00/labels/000000.label', len(points))
 
 
-def rows_of(root, *choices):
-    return table1(root, choices, Config(), n_repeats=1).rows
-
-
 @pytest.fixture(scope='module')
 def measured(rubble):
-    return rows_of(rubble, Choice('00', '000000', SEGMENTS))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_table, 'CHOICES', [Choice('00', '000000', SEGMENTS)])
+        patch.setattr(paper_table, 'N_REPEATS', 1)
+        return table1(rubble, Config()).rows
 
 
 @pytest.mark.parametrize(
@@ -295,11 +284,8 @@ def test_theta_is_of_the_whole_frame_and_learned(measured):
 @pytest.mark.parametrize(
     ('words', 'message'),
     [
-        (['--frames', '00/000007:3'], 'no frame 000007 in sequence 00; there are 000000'),
-        (['--frames', '07/000000:3'], 'sequences here: 00'),
-        (['--frames', '00/000000:180'], 'segment 180: must be in [0, 179]'),
-        (['--frames', '000000'], "'000000': must be as in 08/000005:151"),
-        (['--frames', '00/1:a'], 'must be as in'),
+        ([], 'no frame 000001 in sequence 00; there are 000000'),
+        (['--set', 'grid.n_segments=4'], 'segment 4: must be in [0, 3]'),
         (['--set', 'length_scale.model=constant'], 'leave it out'),
         (['--set', 'learning.mode=fixed'], 'leave it out'),
     ],
@@ -310,15 +296,16 @@ def test_errors_of_the_table_are_said(rubble, words, message, capsys):
 
 
 def test_frames_without_labels(tmp_path, capsys):
-    root = write_streets(tmp_path, s00=1)
+    root = write_streets(tmp_path, s00=2)
     (root / 'sequences/00/labels/000000.label').unlink()
-    assert run('experiment', 'table1', root, '--repeats', 1, '--frames', '00/000000:3') == 2
+    assert run('experiment', 'table1', root) == 2
     assert 'has no labels' in error_line(capsys)
 
 
-def test_default_segments_of_real_frames(kitti):
+def test_default_segments_of_real_frames(kitti, monkeypatch):
     """A pair on a slope and one on uneven ground, both predicted better than by their mean."""
-    rows = rows_of(kitti, *map(Choice.parse, DEFAULT_CHOICES))
+    monkeypatch.setattr(paper_table, 'CHOICES', CHOICES)
+    rows = table1(kitti, Config()).rows
     assert [row['segment'][-3:] for row in rows] == ['157', '158', '147', '148']
     for row in rows:
         assert row['held out'] > 200

@@ -53,7 +53,7 @@ def test_whatever_prints_a_table_has_json():
     leaves = [leaf for name in cli.COMMANDS for leaf in parsers_below(cli.build_parser(name))]
     found = {leaf.prog.split(' ', 1)[1] for leaf in leaves if '--json' in leaf.format_usage()}
     experiments = {f'experiment {name}' for name in EXPERIMENTS}
-    tables = {'evaluate', 'compare', 'optimise', 'bench', 'pose', 'node-bench'}
+    tables = {'evaluate', 'compare', 'optimise', 'bench', 'pose'}
     assert found == tables | experiments
     printing = set()
     for leaf in leaves:
@@ -68,7 +68,9 @@ def test_whatever_prints_a_table_has_json():
 @pytest.mark.parametrize('module', sorted({module for module, _ in cli.COMMANDS.values()}))
 def test_whatever_goes_over_frames_shows_how_far_it_is(module):
     source = inspect.getsource(importlib.import_module(f'gp_ground_seg.cli.{module}'))
-    assert ('options.progress(' in source or 'options.runner(' in source) == (module != 'config')
+    assert ('options.progress(' in source or 'options.runner(' in source) == (
+        module not in ('config', 'node')
+    )
 
 
 def completions(line, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from cli_runner import run
 from config_samples import configs
-from conftest import REPOSITORY
+from conftest import REPOSITORY, load_script
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -17,11 +17,12 @@ from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
 from gp_ground_seg.errors import DataError
 from gp_ground_seg.parameters import export
 from gp_ground_seg.parameters.config import parameter_specs
-from gp_ground_seg.parameters.export import README_BEGIN, README_END, file_problems
+from gp_ground_seg.parameters.export import file_problems
 from gp_ground_seg.parameters.presets import PRESETS, find_preset
 from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
 
 GENERATE = 'run: make generate'
+generate = load_script('docs/generate.py')
 
 
 @settings(max_examples=40)
@@ -75,7 +76,7 @@ def test_every_parameter_is_explained_above_it():
 
 
 def test_generated_files_are_up_to_date():
-    files = export.generated_files((REPOSITORY / 'README.md').read_text(encoding='utf-8'))
+    files = generate.generated_files((REPOSITORY / 'README.md').read_text(encoding='utf-8'))
     assert set(files) == {
         'README.md', 'docs/parameters.md', *(f'config/{name}.yaml' for name in PRESETS)
     }  # fmt: skip
@@ -85,7 +86,7 @@ def test_generated_files_are_up_to_date():
 
 
 def test_tables_have_a_row_for_each_parameter():
-    table = export.to_markdown_table()
+    table = generate.to_markdown_table()
     header, rule, *rows = table.splitlines()
     assert set(rule) <= set('| -')
     assert len(rows) == len(parameter_specs())
@@ -98,7 +99,7 @@ def test_tables_have_a_row_for_each_parameter():
         symbol = f'`{spec.symbol}`' if spec.symbol else ''
         assert cells[3:] == [spec.unit, symbol, spec.description]
     # README.md has the basic ones, the page all of them.
-    files = export.generated_files(f'{README_BEGIN}{README_END}')
+    files = generate.generated_files(f'{generate.BEGIN}{generate.END}')
     assert files['docs/parameters.md'].endswith(table)
     is_basic = [spec.basic for spec in parameter_specs()]
     basic = [row for row, wanted in zip(rows, is_basic, strict=True) if wanted]
@@ -107,9 +108,9 @@ def test_tables_have_a_row_for_each_parameter():
 
 @pytest.mark.parametrize('marks', ['', 'b', 'e', 'eb', 'bbe', 'bee'])
 def test_the_readme_needs_its_markers(marks):
-    readme = '\n'.join({'b': README_BEGIN, 'e': README_END}[mark] for mark in marks)
-    with pytest.raises(DataError, match=f'{README_BEGIN} and {README_END} once each'):
-        export.generated_files(readme)
+    readme = '\n'.join({'b': generate.BEGIN, 'e': generate.END}[mark] for mark in marks)
+    with pytest.raises(DataError, match=f'{generate.BEGIN} and {generate.END} once each'):
+        generate.generated_files(readme)
 
 
 def test_the_presets_are_those_promised_and_another_is_refused():

@@ -6,7 +6,6 @@ import sys
 import time
 
 import numpy as np
-import pytest
 from bag_samples import cloud, write_ros2_bag
 from cli_runner import children, is_running, start
 from ros_helpers import PATIENCE
@@ -22,10 +21,8 @@ def wait_until(condition):
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize('command', ['demo', 'node-bench'])
-def test_a_kill_ends_the_node_and_removes_the_folder(tmp_path, monkeypatch, command):
-    monkeypatch.setenv('TMPDIR', str(tmp_path))  # of node-bench
-    with start(command, '--frames', 500, cwd=tmp_path) as process:
+def test_a_kill_ends_the_node_and_removes_the_folder(tmp_path):
+    with start('demo', '--frames', 500, cwd=tmp_path) as process:
         wait_until(lambda: children(process.pid))
         nodes = children(process.pid)
         wait_until(lambda: [*tmp_path.rglob('*log')])  # in the folder that is to go
@@ -81,8 +78,6 @@ def test_a_node_that_an_earlier_run_left_does_not_answer(tmp_path):
             session.spin(0.05)
         assert np.isfinite([trip.latency for trip in trips]).all()
         assert probe.n_stray == 0
-        # The empty clouds of `connect` count too.
-        assert probe.counters()[0] >= len(trips)
 
 
 def test_nothing_is_imported_from_the_current_folder(tmp_path, monkeypatch):

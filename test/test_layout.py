@@ -53,7 +53,6 @@ ONLY_IN = {
     'fsspec': ('data/files.py',),
     **dict.fromkeys(('laspy', 'lazrs'), ('data/las.py',)),
     'lzf': ('data/pcd.py',),
-    'PIL': ('cli/cloud_output.py',),
     'pyarrow': ('evaluation/report.py',),
     'matplotlib': ('plotting/',),
     'numba': ('jit.py', 'compiled/'),
@@ -61,7 +60,6 @@ ONLY_IN = {
     **dict.fromkeys(('viser', 'trimesh'), ('viewers/html_page.py',)),
     'optuna': ('experiments/optimise.py',),
     'imageio': ('plotting/',),
-    'imageio_ffmpeg': ('plotting/',),
     'argcomplete': ('cli/main.py',),
     'pypatchworkpp': ('evaluation/patchworkpp.py',),
 }

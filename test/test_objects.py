@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
-from gp_ground_seg.data.boxes import COLUMNS, Boxes, read_boxes
+from gp_ground_seg.data.boxes import Boxes, read_boxes
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
 from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.evaluation.evaluate import load_kitti, score_methods
@@ -278,8 +278,6 @@ def test_objects_of_boxes_are_what_is_in_them_over_their_bottom():
 
 # Files of boxes.
 
-CSV = f'{",".join(COLUMNS)}\ncar,10,5,1,4,2,1.6,{math.radians(30)}\n"dog, a",0,-2,0,1,1,1,0\n'
-
 
 def box_arrays(**changes):
     arrays = {
@@ -291,15 +289,14 @@ def box_arrays(**changes):
     return arrays | changes
 
 
-def test_both_kinds_of_files_hold_the_same_boxes(tmp_path):
-    (tmp_path / 'a.csv').write_text('\ufeff' + CSV.replace(',', ', ', 3))
+def test_a_file_holds_boxes_and_may_hold_its_scan(tmp_path):
     np.savez(tmp_path / 'a.npz', xyzi=np.zeros((5, 4)), **box_arrays())
-    a, b = read_boxes(tmp_path / 'a.csv'), read_boxes(tmp_path / 'a.npz')
-    assert a.names == b.names == ['car', 'dog, a']
-    for own, other in zip(a[1:], b[1:], strict=True):
-        np.testing.assert_allclose(own, other, atol=1e-12)
-    (tmp_path / 'none.csv').write_text(CSV.partition('\n')[0])
-    none = read_boxes(tmp_path / 'none.csv')
+    found = read_boxes(tmp_path / 'a.npz')
+    assert found.names == ['car', 'dog, a']
+    for own, other in zip(found[1:], list(box_arrays().values())[1:], strict=True):
+        np.testing.assert_array_equal(own, other)
+    np.savez(tmp_path / 'none.npz', **{name: own[:0] for name, own in box_arrays().items()})
+    none = read_boxes(tmp_path / 'none.npz')
     assert [len(part) for part in none] == [0] * 4 and none.rotation.shape == (0, 3, 3)
 
 
@@ -328,21 +325,14 @@ def test_arrays_that_are_no_boxes_are_refused(tmp_path, changes, message):
 @pytest.mark.parametrize(
     ('name', 'content', 'message'),
     [
-        ('a.csv', CSV.replace('yaw', 'heading'), 'no column yaw; the first line names class,x,'),
-        ('a.csv', '', 'no column class, x, y'),
-        ('a.csv', CSV.replace(',1.6,', ',tall,'), "line 2: could not convert string to float: 't"),
-        ('a.csv', CSV + 'car,1,2', 'line 4: '),
-        ('a.csv', CSV.replace(',1.6,', ',0,'), r'box 1 \(car\): size 4, 2, 0: must be above 0'),
-        ('a.csv', b'\xff\xfe\x00', "can't decode"),
         ('a.npz', b'PK\x03\x04nothing', r'a\.npz: '),
-        ('a.npz', CSV, 'not an .npz file'),
-        ('a.txt', CSV, r'boxes are read from \.npz and \.csv files'),
-        ('b.csv', None, 'No such file'),
+        ('a.csv', b'class,x,y', 'not an .npz file'),
+        ('b.npz', None, 'No such file'),
     ],
 )
 def test_files_that_hold_no_boxes_are_refused(tmp_path, name, content, message):
     if content is not None:
-        (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+        (tmp_path / name).write_bytes(content)
     with pytest.raises(DataError, match=message) as caught:
         read_boxes(tmp_path / name)
     assert '\n' not in str(caught.value)
@@ -392,8 +382,13 @@ def write_cars(root, *sequences, with_labels=True):
 def write_boxes(path, names=('Car', 'Van')):
     """Boxes of the two cars, down to the road."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [f'{n},{x},{y},-0.96,4.1,1.9,1.54,0' for n, (x, y) in zip(names, CARS, strict=True)]
-    path.write_text('\n'.join([','.join(COLUMNS), *rows]))
+    np.savez(
+        path,
+        box_class=names,
+        box_center=[(x, y, -0.96) for x, y in CARS],
+        box_size=[(4.1, 1.9, 1.54)] * len(CARS),
+        box_rotation=[np.eye(3)] * len(CARS),
+    )
 
 
 def evaluated(root, folder, *words):
@@ -471,7 +466,7 @@ def test_where_nothing_stands_or_nothing_has_a_number_it_is_said(tmp_path, capsy
 def test_boxes_count_without_labels_in_folders_and_files(tmp_path, capsys):
     root = write_cars(tmp_path / 'kitti', '00', '08', with_labels=False)
     for k, name in enumerate(('00', '08')):
-        write_boxes(tmp_path / 'boxes' / name / f'{k:06d}.csv')
+        write_boxes(tmp_path / 'boxes' / name / f'{k:06d}.npz')
     document = evaluated(root, tmp_path, '--boxes', tmp_path / 'boxes', '--peer', 'patchworkpp')
     assert capsys.readouterr().out.startswith('IoU not available, no labels of the ground  (2 fr')
     row = row_of(document, 'vehicle', 'all')
@@ -484,7 +479,7 @@ def test_boxes_count_without_labels_in_folders_and_files(tmp_path, capsys):
     shares = []
     for k, name in enumerate(('00', '08')):
         scan = root / 'sequences' / name / 'velodyne' / f'{k:06d}.bin'
-        boxes = tmp_path / 'boxes' / name / f'{k:06d}.csv'
+        boxes = tmp_path / 'boxes' / name / f'{k:06d}.npz'
         alone = evaluated(scan, tmp_path, '--boxes', boxes)
         shares.append(row_of(alone, 'vehicle', 'all'))
         (tmp_path / 'flat' / scan.name).write_bytes(scan.read_bytes())
@@ -496,8 +491,8 @@ def test_boxes_count_without_labels_in_folders_and_files(tmp_path, capsys):
 
 def test_boxes_beside_labels_take_the_ground_from_these(tmp_path, capsys):
     root = write_cars(tmp_path / 'kitti', '00')
-    write_boxes(tmp_path / '000000.csv', names=('robot', 'Van'))
-    document = evaluated(root, tmp_path, '--boxes', tmp_path / '000000.csv')
+    write_boxes(tmp_path / '000000.npz', names=('robot', 'Van'))
+    document = evaluated(root, tmp_path, '--boxes', tmp_path / '000000.npz')
     assert document['groundgrid'][-1]['iou'] > 0.9
     assert [row['class'] for row in document['objects'][::5]] == ['vehicle', 'robot']
     labelled = row_of(evaluated(root, tmp_path), 'vehicle', 'all')
@@ -505,8 +500,8 @@ def test_boxes_beside_labels_take_the_ground_from_these(tmp_path, capsys):
     assert sum(row['returns'] for row in both) == labelled['returns']
     # Frames without labels among them: none of the labels count.
     write_frame(root, '00', 1, street_with_cars(1)[0])
-    write_boxes(tmp_path / 'boxes' / '000000.csv')
-    write_boxes(tmp_path / 'boxes' / '000001.csv')
+    write_boxes(tmp_path / 'boxes' / '000000.npz')
+    write_boxes(tmp_path / 'boxes' / '000001.npz')
     capsys.readouterr()
     assert 'groundgrid' not in evaluated(root, tmp_path, '--boxes', tmp_path / 'boxes')
     assert 'note: labels left out: 1 of 2 frames have none' in capsys.readouterr().err
@@ -516,23 +511,22 @@ def test_boxes_beside_labels_take_the_ground_from_these(tmp_path, capsys):
     ('words', 'message'),
     [
         ('ROOT --boxes BOXES/none', 'BOXES/none: no such file or folder'),
-        ('ROOT --boxes BOXES', 'BOXES/08: 000001.npz and 000001.csv are not there'),
-        ('ROOT --boxes BOXES/00/000000.csv', 'boxes of one scan, 000000; give a folder with a fi'),
+        ('ROOT --boxes BOXES', 'BOXES/08/000001.npz: no such file'),
+        ('ROOT --boxes BOXES/00/000000.npz', 'boxes of one scan, 000000; give a folder with a fi'),
         (
-            'SCAN --boxes BOXES/other.csv',
-            'other.csv: boxes of one scan, other; give those of 00',
+            'SCAN --boxes BOXES/other.npz',
+            'other.npz: boxes of one scan, other; give those of 00',
         ),
-        ('SCAN --boxes BOXES/00/000000.csv --worst 3', '--worst: needs labels of the ground'),
-        ('SCAN --boxes BOXES/00/000000.csv --reliability a.png', '--reliability: needs labels'),
-        ('BOXES --boxes BOXES', 'no .bin file in it'),
+        ('SCAN --boxes BOXES/00/000000.npz --worst 3', '--worst: needs labels of the ground'),
+        ('BOXES --boxes BOXES', 'objects are counted in .bin scans, none here'),
         ('SCAN', 'no sequences/*/velodyne folder below it'),
-        ('SCAN --boxes BOXES/00/000000.csv --sequences 00', 'no sequences/*/velodyne folder'),
+        ('SCAN --boxes BOXES/00/000000.npz --sequences 00', 'no sequences/*/velodyne folder'),
     ],
 )
 def test_boxes_that_do_not_fit_are_one_line(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     root = write_cars(tmp_path / 'kitti', '00', '08', with_labels=False)
-    for name in ('00/000000.csv', 'other.csv'):
+    for name in ('00/000000.npz', 'other.npz'):
         write_boxes(tmp_path / 'boxes' / name)
     scan = root / 'sequences/00/velodyne/000000.bin'
     before = sorted(tmp_path.rglob('*'))
@@ -540,11 +534,6 @@ def test_boxes_that_do_not_fit_are_one_line(tmp_path, monkeypatch, capsys, words
     assert run('evaluate', *words.split(), '--json', tmp_path / 'a.json') == 2
     assert message.replace('BOXES', 'boxes') in error_line(capsys)
     assert sorted(tmp_path.rglob('*')) == before
-    both = tmp_path / 'boxes/00/000000.npz'
-    both.touch()
-    (tmp_path / 'boxes/other.csv').unlink()
-    assert run('evaluate', root, '--boxes', tmp_path / 'boxes') == 2
-    assert '000000.npz and 000000.csv are both there, delete one' in error_line(capsys)
 
 
 def test_objects_of_the_frames_at_hand(kitti):

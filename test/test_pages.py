@@ -1,12 +1,13 @@
 """The pages hold: samples of their tables and the numbers of their pictures, computed again."""
 
-import importlib.util
 import json
 import re
 
+import numpy as np
 import pytest
 from cli_runner import run
-from conftest import REPOSITORY, find_kitti
+from conftest import REPOSITORY, find_kitti, load_script
+from matplotlib.image import imread
 
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.cli import demo
@@ -15,9 +16,7 @@ from gp_ground_seg.evaluation.metrics import GROUNDGRID
 from gp_ground_seg.jit import JIT_ENABLED
 from gp_ground_seg.plotting.scan import plot_birds_eye
 
-SPEC = importlib.util.spec_from_file_location('figures', REPOSITORY / 'docs' / 'figures.py')
-figures = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(figures)
+figures = load_script('docs/figures.py')
 
 FIGURES = [
     figure
@@ -279,3 +278,20 @@ def test_a_figure_is_replaced_and_nothing_else():
 )
 def test_cells(shown, found, is_same):
     assert same(shown, found) is is_same
+
+
+def test_bars_of_the_stages_are_as_long_as_their_times(tmp_path):
+    stages = load_script('docs/stages.py')
+    cases = {f'case {k}': {'first': 10.0 * k, 'second': 30.0} for k in range(1, 5)}
+    stages.plot_stage_bars(cases, tmp_path / 'bars.png', 'title', baseline=('other', 80.0))
+    image = imread(tmp_path / 'bars.png')[..., :3]
+
+    def near(colour):
+        rgb = [int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
+        # The legend's patches are above the bars.
+        return (np.abs(image[len(image) // 3 :] - rgb) < 0.02).all(axis=-1)
+
+    lengths = near(stages.STAGE_COLOURS[0]).sum(axis=1)
+    found = np.unique(lengths[lengths > 20])
+    np.testing.assert_allclose(found / found[0], [1, 2, 3, 4], rtol=0.05)
+    assert near(stages.REFERENCE_COLOUR).sum(axis=0).max() > 50  # a dashed line

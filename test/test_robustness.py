@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import tracemalloc
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from gp_ground_seg.cli import main as cli
 from gp_ground_seg.compiled.backend import NumbaBackend
 from gp_ground_seg.data.atomic_output import staged_bag_folder
 from gp_ground_seg.data.bags import BagReader
+from gp_ground_seg.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.parameters.config import size_of_tables
 
 
@@ -180,3 +182,22 @@ def test_an_interrupted_replacement_leaves_a_whole_bag(interrupted, when, tmp_pa
     with BagReader(tmp_path / 'drive') as bag:
         assert list(bag.messages()) == (new if (interrupted, when) == (1, 'after') else old)
     assert [path.name for path in tmp_path.iterdir()] == ['drive']
+
+
+@pytest.mark.parametrize('backend', ['numba', 'numpy'])
+def test_a_latent_process_that_swings_far_overflows_nowhere(backend):
+    """A prior of 100 log m and hardly any noise: the mean reached 556 between pseudo-inputs."""
+    rng = np.random.default_rng(0)
+    azimuth, r = rng.uniform(-np.pi, np.pi, 9000), rng.gamma(2.0, 5.0, 9000)
+    z = rng.normal(-1.73, 0.5, 9000)
+    points = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z])
+    changes = {
+        'latent.sigma_f_bar': 100.0, 'latent.sigma_n_bar': 0.01, 'latent.sigma_l_bar': 3.0,
+        'latent.candidates_per_pseudo_input': 1.0, 'learning.fixed': 'latent',
+        'sensor.height': 1.73, 'runtime.backend': backend,
+    }  # fmt: skip
+    with closing(GroundSegmenter(Config().replace(**changes))) as segmenter:
+        result = segmenter.segment(points)  # warnings are errors
+    assert np.nanmax(np.abs(result.log_length_scale)) == MAX_ABS_LOG_LENGTH_SCALE
+    ground = result.label == Label.GROUND
+    assert ground.any() and np.isfinite(result.height[ground]).all()

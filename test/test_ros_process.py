@@ -178,7 +178,7 @@ def simulated_bag(folder):
 
 
 def kitti_bag(folder, kitti):
-    assert run('kitti-to-bag', kitti, '--sequence', '08', folder / 'drive', '--count', 6) == 0
+    assert run('kitti-to-bag', kitti, '--sequence', '08', folder / 'drive') == 0
     return folder / 'drive', '/kitti/velo/pointcloud'
 
 
@@ -196,7 +196,7 @@ def test_frames_to_bag_to_player_to_node_and_back(source, tmp_path, request):
     with BagReader(bag) as reader:
         sent = [decode_cloud(raw) for _, _, raw in reader.messages([topic])]
     with ros.linked(sends=None) as link, play(bag, topic=topic) as player:
-        back = link.ground.wait(6), link.obstacles.wait(6)
+        back = link.ground.wait(len(sent)), link.obstacles.wait(len(sent))
         assert player.popen.wait(60.0) == 0, player.log
         status = link.wait_for_status('processing', lambda *_: True)
         levels = {s.level for array in link.diagnostics.messages for s in array.status}

@@ -180,8 +180,6 @@ COMMANDS = {
     'departures': 'experiment departures ROOT --json OUT.json',
     'sensor-pose': 'experiment sensor-pose ROOT --json OUT.json',
     'coverage': 'experiment coverage ROOT --json OUT.json',
-    'table1': 'experiment table1 ROOT --frames 00/000000:1 --json OUT.json',
-    'node-bench': 'node-bench ROOT --json OUT.json',
     'demo': 'demo --kitti ROOT --output OUT',
 }
 
@@ -230,7 +228,6 @@ def test_the_option_helps_and_force_takes_it_with_a_note(command, root, capsys):
         ('bench --from OLD.json', 'OLD.json'),
         ('plot scan --simulate flat -o OUT.png', 'a simulated one'),
         ('demo --output OUT', 'a simulated one'),
-        ('node-bench', 'a simulated one'),
     ],
 )
 def test_a_layout_is_for_files_of_scans(tmp_path, monkeypatch, capsys, words, what):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +13,7 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
-from gp_ground_seg.errors import DataError, GroundSegError
+from gp_ground_seg.errors import DataError
 from gp_ground_seg.ros.lifecycle import large_cloud_transport, needing_ros, ros_session
 
 if TYPE_CHECKING:
@@ -43,7 +41,7 @@ that single file, which `ros2 bag play` and Foxglove open as well.
 """
 CONVERT_EXAMPLES = """\
   gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 00 drive
-  gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 08 drive.mcap --start 100 --count 50
+  gp-ground-seg kitti-to-bag KITTI_ROOT --sequence 08 drive.mcap
 """
 PLAY_DESCRIPTION = """\
 Publish the point clouds of a bag (ROS 1 .bag, rosbag2 folder, .mcap, .db3) on
@@ -61,7 +59,7 @@ In the end one line tells
 """
 PLAY_EXAMPLES = """\
   gp-ground-seg play drive.mcap
-  gp-ground-seg play drive.mcap --clock --rate 0.5 --start 10 --duration 5
+  gp-ground-seg play drive.mcap --clock --rate 0.5
   gp-ground-seg play drive.mcap --loop --ros-args -r /kitti/velo/pointcloud:=/points
 
 exit code: 0, 1 if clouds were not delivered (always 0 with --no-wait), 2 for an error,
@@ -72,15 +70,11 @@ exit code: 0, 1 if clouds were not delivered (always 0 with --no-wait), 2 for an
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
     parser = options.new_parser(subparsers, 'kitti-to-bag', CONVERT_DESCRIPTION, CONVERT_EXAMPLES)
-    storage, scans = {'choices': ('mcap', 'sqlite3')}, {'metavar': 'N', 'type': int}
     options.add(
         parser,
         ('root', 'folder with sequences/ in it', {'metavar': 'ROOT'}),
         ('output', 'folder, .mcap or .db3 file to write', {'metavar': 'OUT'}),
         ('--sequence', 'sequence, as in 00', {'metavar': 'S', 'required': True}),
-        ('--format', 'storage (default: by the name of OUT, else mcap)', storage),
-        ('--start', 'scans to skip (default: 0)', {**scans, 'default': 0}),
-        ('--count', 'scans to write (default: all)', scans),
         *options.SCAN_LAYOUT,
         options.FORCE,
         options.QUIET,
@@ -88,7 +82,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run_convert)
 
     parser = options.new_parser(subparsers, 'play', PLAY_DESCRIPTION, PLAY_EXAMPLES)
-    seconds = {'metavar': 'S', 'type': partial(options.above_zero, or_zero=True)}
     options.add(
         parser,
         ('bag', 'bag to play', {'metavar': 'BAG'}),
@@ -96,21 +89,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {'metavar': 'R', 'type': options.above_zero, 'default': 1.0}),
         ('--loop', 'begin again at the end, until Ctrl-C', options.FLAG),
         ('--clock', "publish the bag's time on /clock, 50 Hz (for use_sim_time)", options.FLAG),
-        ('--start', 'skip the first S seconds', {**seconds, 'default': 0.0}),
-        ('--duration', 'play S seconds only', {'metavar': 'S', 'type': options.above_zero}),
-        options.QUIET,
-    )  # fmt: skip
-    options.add(
-        parser.add_mutually_exclusive_group(),
         ('--topic', 'PointCloud2 topic to play (may be repeated; default: the only one)',
          {'metavar': 'T', 'action': 'append'}),
-        ('--all', 'play all PointCloud2 topics', options.FLAG),
-    )  # fmt: skip
-    options.add(
-        parser.add_mutually_exclusive_group(),
-        ('--wait', 'give up without a subscriber within S seconds (default: wait until there is '
-         'one)', seconds),
         ('--no-wait', 'start at once, with or without a subscriber', options.FLAG),
+        options.QUIET,
     )  # fmt: skip
     parser.set_defaults(run=run_play, accepts_ros_args=True)
 
@@ -126,14 +108,14 @@ def scan_cloud(
 def run_convert(arguments: argparse.Namespace) -> int:
     """Write the bag."""
     layout = options.scan_layout(arguments)
-    frames = _choose(list_frames(arguments.root, arguments.sequence, layout), arguments)
+    frames = list_frames(arguments.root, arguments.sequence, layout)
     stamps = [_nanoseconds(frame) for frame in frames]
     target = Path(arguments.output)
     if not arguments.quiet:
         options.note_leftovers(target)
     n_points = 0
     with (
-        BagWriter(target, storage=arguments.format, force=arguments.force) as bag,
+        BagWriter(target, force=arguments.force) as bag,
         options.progress('kitti-to-bag', quiet=arguments.quiet)(total=len(frames)) as bar,
     ):
         bag.add_topic(cloud_topic(TOPIC))
@@ -152,18 +134,6 @@ def run_convert(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _choose(frames: Sequence[Frame], arguments: argparse.Namespace) -> Sequence[Frame]:
-    start = arguments.start
-    where = f'sequence {arguments.sequence}: {options.count(len(frames), "scan")} there'
-    if not 0 <= start < len(frames):
-        raise DataError(f'--start {start}: must be in [0, {len(frames) - 1}]; {where}')
-    left = len(frames) - start
-    wanted = left if arguments.count is None else arguments.count
-    if not 1 <= wanted <= left:
-        raise DataError(f'--count {wanted}: must be in [1, {left}] from scan {start} on; {where}')
-    return frames[start : start + wanted]
-
-
 def _nanoseconds(frame: Frame) -> int:
     """Return the stamp of a frame [ns]."""
     last = 2**31 - 1 - EPOCH
@@ -180,10 +150,10 @@ def run_play(arguments: argparse.Namespace) -> int:
     with needing_ros('play'):
         from gp_ground_seg.ros.playback import Player, PlayOptions
 
-    names = ('rate', 'start', 'duration', 'loop', 'clock')
-    how = PlayOptions(*(getattr(arguments, name) for name in names))
+    how = PlayOptions(arguments.rate, arguments.loop, arguments.clock)
     with BagReader(arguments.bag) as bag:
-        topics = _choose_topics(bag, arguments)
+        chosen = dict.fromkeys(arguments.topic or [None])
+        topics = [bag.pick_point_cloud_topic(name) for name in chosen]
         others = [f'{name} ({kind})' for name, kind in bag.topics.items() if name not in topics]
         if others and not arguments.quiet:
             options.note(f'not played: {", ".join(others)}')
@@ -191,7 +161,7 @@ def run_play(arguments: argparse.Namespace) -> int:
         with large_cloud_transport(), ros_session('bag_player', arguments.ros_args) as session:
             player = Player(session.node, bag, topics, session.sleep, how)
             if not arguments.no_wait:
-                _wait_for_subscribers(player, arguments)
+                _wait_for_subscribers(player, quiet=arguments.quiet)
             try:
                 # With --loop there is no end to show progress towards, only a count.
                 total = 0 if arguments.loop else n_clouds
@@ -206,24 +176,9 @@ def run_play(arguments: argparse.Namespace) -> int:
     return 1 if player.n_undelivered and not arguments.no_wait else 0
 
 
-def _choose_topics(bag: BagReader, arguments: argparse.Namespace) -> list[str]:
-    if arguments.all:
-        topics = [name for name in bag.point_cloud_topics if bag.n_messages(name)]
-        return topics or [bag.pick_point_cloud_topic()]
-    chosen = dict.fromkeys(arguments.topic or [None])
-    return [bag.pick_point_cloud_topic(name) for name in chosen]
-
-
-def _wait_for_subscribers(player: Player, arguments: argparse.Namespace) -> None:
-    limit: float | None = arguments.wait
-    if player.wait_for_subscribers(SILENT_WAIT if limit is None else min(limit, SILENT_WAIT)):
-        return
-    lonely = ', '.join(player.topics_without_subscriber())
-    if limit is None or limit > SILENT_WAIT:
-        if not arguments.quiet:
-            options.note(f'waiting for a subscriber of {lonely}')
-        if player.wait_for_subscribers(None if limit is None else limit - SILENT_WAIT):
-            return
-    raise GroundSegError(
-        f'no subscriber of {lonely} within {limit:g} s; --no-wait plays without one'
-    )
+def _wait_for_subscribers(player: Player, *, quiet: bool) -> None:
+    if not (player.wait_for_subscribers(SILENT_WAIT) or quiet):
+        options.note(
+            f'waiting for a subscriber of {", ".join(player.topics_without_subscriber())}'
+        )
+    player.wait_for_subscribers()

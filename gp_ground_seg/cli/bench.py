@@ -21,7 +21,6 @@ from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Cell, Column, Table
 from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.charts import plot_stage_bars
 
 DESCRIPTION = """\
 Time the segmentation on your data: theta fixed and learned in every frame, on one
@@ -36,7 +35,7 @@ EXAMPLES = """\
   gp-ground-seg bench KITTI_ROOT
   gp-ground-seg bench drive.mcap --frames 20 --threads 1
   gp-ground-seg bench KITTI_ROOT --set grid.n_segments=120 --json mine.json
-  gp-ground-seg bench --from mine.json --plot stages.png
+  gp-ground-seg bench --from mine.json
 """
 
 RUN_LENGTH = 10
@@ -58,7 +57,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
         ('--peer', 'the method beside ours (default: %(default)s)',
          {'choices': PEERS, 'default': PATCHWORKPP}),
-        ('--plot', 'draw the stages as a PNG', file),
         ('--numpy', 'time learning without compiled code as well', options.FLAG),
         *options.SCAN_LAYOUT,
         options.TO_JSON,
@@ -75,25 +73,12 @@ def run(arguments: argparse.Namespace) -> int:
     given = arguments.record
     if given is not None:
         options.refuse_scan_layout(arguments, given)
-    with options.staged_options(arguments, 'json', 'plot') as parts:
+    with options.staged_options(arguments, 'json') as parts:
         document = _measure(arguments) if given is None else read_record(given)
         if 'json' in parts:
             report.write_json(document, parts['json'])
-        if 'plot' in parts:
-            _plot(document, parts['plot'])
     print(bench_text(document))
     return 0
-
-
-def _plot(document: dict[str, Any], path: Path) -> None:
-    # Without compiled code a frame takes so long that the others would be but slivers.
-    cases = [case for case in document['cases'] if case['backend'] == 'numba']
-    cpu = document['environment']['cpu']
-    title = f'{document["n_frames"]} frames of {document["data"]}, {cpu}'
-    bars = {case['name']: case['stages_ms'] for case in cases or document['cases']}
-    peer = document['baseline_ms']
-    line = (TITLES[document['baseline']], peer['median']) if peer else None
-    plot_stage_bars(bars, path, title, line)
 
 
 def read_record(path: str | Path) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ from gp_ground_seg.data.clouds import Cloud, Columns
 from gp_ground_seg.data.files import AnyPath
 from gp_ground_seg.data.inputs import Input
 from gp_ground_seg.data.numpy_files import encode_arrays
-from gp_ground_seg.errors import DataError, PointCloudError, require
+from gp_ground_seg.errors import DataError, PointCloudError
 from gp_ground_seg.frame import Label
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.result import Segmentation
@@ -21,7 +20,6 @@ from gp_ground_seg.segmenter import GroundSegmenter
 
 LABELS = 'label'
 FORMATS = (LABELS, *(suffix[1:] for suffix in WRITABLE))
-SURFACES = ('npz', 'tif')
 CELL = 0.5
 """Side of the cells of a written surface [m]."""
 # Unlabelled, road and other-object.
@@ -38,13 +36,13 @@ class CloudOutput:
     form : one of `FORMATS`, or None: labels of a ``.bin`` scan, else the input's format
     raw : whether ``.label`` files hold `Label` rather than SemanticKITTI's codes
     split : whether ground and obstacles are files of their own
-    surface : ``'npz'``, ``'tif'``, or None for no file of the ground
+    surface : whether the ground is written as a grid, in a file of its own
     """
 
     form: str | None = None
     raw: bool = False
     split: bool = False
-    surface: str | None = None
+    surface: bool = False
 
     def names(self, one: Input, stem: str | None = None) -> list[str]:
         """Names of the files of a cloud, which begin with `stem`, by default its name."""
@@ -52,7 +50,7 @@ class CloudOutput:
         if self.split and form == LABELS:
             raise DataError('--split: is for clouds, a .label file has both; see --format')
         parts = PARTS if self.split else ['']
-        surface = [f'{stem}_surface.{self.surface}'] if self.surface else []
+        surface = [f'{stem}_surface.npz'] if self.surface else []
         return [*(f'{stem}{part}.{form}' for part in parts), *surface]
 
     def _form(self, one: Input) -> str:
@@ -77,7 +75,7 @@ class CloudOutput:
                 own = {name: column[mask] for name, column in values.items()}
                 path.write_bytes(encode_file(path, cloud.take(mask), result.label[mask], own))
         if self.surface:
-            paths[-1].write_bytes(_encode_surface(result, cloud, self.surface))
+            paths[-1].write_bytes(_encode_surface(result, cloud))
         return result
 
 
@@ -98,11 +96,10 @@ def _results(result: Segmentation, cloud: Cloud) -> Columns:
     return {name: column.astype(np.float32) for name, column in values.items()}
 
 
-def _encode_surface(result: Segmentation, cloud: Cloud, kind: str) -> bytes:
+def _encode_surface(result: Segmentation, cloud: Cloud) -> bytes:
     """File of the ground about the sensor as a grid, float32, in the coordinates of the file [m].
 
-    .npz: x (W,), y (H,), ground_z and ground_std (H, W), NaN where there is no model. GeoTIFF:
-    pages of the two, from north to south, without a name of the coordinates (OGC 19-008r4).
+    Arrays x (W,), y (H,), ground_z and ground_std (H, W), NaN where there is no model.
     """
     model = GroundModel.of(result)
     reach = CELL * np.ceil(model.knots[-1] / CELL)
@@ -110,20 +107,4 @@ def _encode_surface(result: Segmentation, cloud: Cloud, kind: str) -> bytes:
     z, std = model.at(middle, middle[:, None])
     x, y, height = cloud.origin
     grids = {'ground_z': (z + height).astype(np.float32), 'ground_std': std.astype(np.float32)}
-    if kind == 'npz':
-        return encode_arrays({'x': middle + x, 'y': middle + y, **grids})
-    require('PIL', 'plot')
-    from PIL import Image, TiffImagePlugin
-
-    tags = TiffImagePlugin.ImageFileDirectory_v2()
-    doubles, shorts = 12, 3
-    tags.tagtype.update({33550: doubles, 33922: doubles, 34735: shorts})
-    tags[33550] = (CELL, CELL, 0.0)
-    tags[33922] = (0.0, 0.0, 0.0, x - reach, y + reach, 0.0)  # the north-west corner
-    # Version 1.1; type of model: user-defined; of raster: values of areas.
-    tags[34735] = (1, 1, 1, 2, 1024, 0, 1, 32767, 1025, 0, 1, 1)
-    tags[42113] = 'nan'  # GDAL's mark of no data
-    first, second = (Image.fromarray(np.flipud(grid).copy()) for grid in grids.values())
-    file = io.BytesIO()
-    first.save(file, 'TIFF', save_all=True, append_images=[second], tiffinfo=tags)
-    return file.getvalue()
+    return encode_arrays({'x': middle + x, 'y': middle + y, **grids})

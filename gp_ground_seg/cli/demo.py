@@ -284,7 +284,7 @@ def _play(path: Path, n_frames: int, wanted: float | None, probe: Probe) -> dict
         print(f'[3/3] {what}, and receiving both clouds', flush=True)
         with options.progress('scans')(total=n_frames) as bar:
             clouds = (decode_cloud(raw) for _, _, raw in bag.messages([INPUT]))
-            return rate_result(rate, probe.paced(clouds, rate, bar.update), 0)
+            return rate_result(rate, probe.paced(clouds, rate, bar.update))
 
 
 def sustainable_rate(cloud: CloudMessage, probe: Probe) -> float:

@@ -27,7 +27,6 @@ from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
 from gp_ground_seg.experiments.variants import make_report
 from gp_ground_seg.frame import Label
-from gp_ground_seg.plotting.charts import plot_reliability
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in both conventions of the field: precision,
@@ -36,8 +35,6 @@ and cyclists: the share of their returns from 0.3 m above the local ground that 
 ground, and the objects of which more than half of these returns are. Objects are the
 instances of the labels (their upper 16 bits), or given as boxes, a file for each scan:
 
-  000007.csv   class,x,y,z,length,width,height,yaw   as first line; centre and size [m] in
-               the frame of the cloud, yaw about z, from x towards y [rad]
   000007.npz   box_class (K,), box_center (K, 3), box_size (K, 3), box_rotation (K, 3, 3):
                rows of the matrix are the axes of the box in the frame of the cloud
 
@@ -53,9 +50,8 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
   gp-ground-seg evaluate KITTI_ROOT --worst 9 --per-frame frames.csv
   gp-ground-seg evaluate s3://bucket/kitti --workers 8
-  gp-ground-seg evaluate KITTI_ROOT --reliability reliability.png
-  gp-ground-seg evaluate KITTI_ROOT --boxes boxes --peer patchworkpp      boxes/00/000000.csv, ...
-  gp-ground-seg evaluate scans --boxes boxes                scans/a.bin with boxes/a.csv, ...
+  gp-ground-seg evaluate KITTI_ROOT --boxes boxes --peer patchworkpp      boxes/00/000000.npz, ...
+  gp-ground-seg evaluate scans --boxes boxes                scans/a.bin with boxes/a.npz, ...
   gp-ground-seg evaluate a.bin --boxes a.npz
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). With --workers
@@ -82,7 +78,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         *OF_FRAMES,
         ('--per-frame', 'write the numbers of each frame (.csv, .parquet)', {'metavar': 'FILE'}),
         ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
-        ('--reliability', 'draw share of ground over p_ground (PNG)', {'metavar': 'FILE'}),
         ('--boxes', 'objects: a file, or a folder of files; ROOT may be .bin scans without labels',
          {'metavar': 'PATH'}),
         ('--peer', 'run this one on the same frames, alternately', peers),
@@ -98,9 +93,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate, write the files, print the tables."""
     config = options.read_config(arguments)
-    files = {
-        'json': 'every number', 'reliability': 'reliability diagram', 'per_frame': 'each frame'
-    }  # fmt: skip
+    files = {'json': 'every number', 'per_frame': 'each frame'}
     if arguments.per_frame is not None:
         tables.check_rows_file(arguments.per_frame)
     with options.staged_options(arguments, *files) as parts, ExitStack() as stack:
@@ -121,9 +114,6 @@ def run(arguments: argparse.Namespace) -> int:
             report.write(parts['json'], environment)
         if 'per_frame' in parts:
             tables.write_rows(report.rows, parts['per_frame'])
-        if 'reliability' in parts:
-            title = f'Reliability, {len(items)} frames'
-            plot_reliability(_calibrations(scores[0]), parts['reliability'], title)
     print(f'{_headline(scores)}\n')
     lines = [tables.parameters_line(report.facts['config_changes'])]
     lines.append(tables.machine_line(environment, report.fit))
@@ -140,9 +130,8 @@ def _items_from_options(
     frames = frames_from_options(arguments)
     if arguments.boxes is None:
         return frames, methods.load_kitti
-    for name in ('worst', 'reliability'):
-        if getattr(arguments, name) is not None and frames[0].labels_path is None:
-            raise DataError(f'--{name}: needs labels of the ground, which {arguments.root} lacks')
+    if arguments.worst is not None and frames[0].labels_path is None:
+        raise DataError(f'--worst: needs labels of the ground, which {arguments.root} lacks')
     return [*zip(frames, find_boxes(arguments.boxes, frames), strict=True)], methods.load_boxed
 
 
@@ -359,7 +348,12 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
         scans = [one for one in list_inputs(root) if one.path.suffix == '.bin']
         if not scans:
             raise DataError(f'{root}: objects are counted in .bin scans, none here')
-        frames = [Frame(name, one.name, one.path, None, 0.0, layout) for one in scans]
+        # Boxes beside a scan, of the same stem, make its whole file name the name of the input.
+        names = [one.name.removesuffix('.bin') for one in scans]
+        frames = [
+            Frame(name, own, one.path, None, 0.0, layout)
+            for own, one in zip(names, scans, strict=True)
+        ]
     else:
         frames = boxed_frames(root, chosen, layout)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)

@@ -14,7 +14,7 @@ from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, load_kitti
 from gp_ground_seg.evaluation.patchworkpp import PEERS
 from gp_ground_seg.evaluation.report import Report, describe_environment, machine_line, written
 from gp_ground_seg.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
-from gp_ground_seg.experiments.table1 import DEFAULT_CHOICES, Choice, table1
+from gp_ground_seg.experiments.table1 import table1
 from gp_ground_seg.experiments.variants import load_simulated, score_simulated, simulated_frames
 from gp_ground_seg.parameters.config import Config
 from gp_ground_seg.scale.cluster import Runner
@@ -52,19 +52,6 @@ NO_PEER = ('--no-peer', 'leave the peer out', options.FLAG)
 PEER = (
     '--peer', 'the method beside ours (default: %(default)s)',
     {'choices': PEERS, 'default': PATCHWORKPP},
-)  # fmt: skip
-SWITCH = (
-    '--switch',
-    'measure this departure instead, and the parameters that switch it off (may be repeated)',
-    {'metavar': 'TITLE: NAME=VALUE ...', 'action': 'append'},
-)
-SEGMENTS = (
-    '--frames', f'frames and segments (default: {" ".join(DEFAULT_CHOICES)})',
-    {'metavar': 'SEQ/IDX:SEG,SEG', 'nargs': '+', 'default': DEFAULT_CHOICES},
-)  # fmt: skip
-REPEATS = (
-    '--repeats', 'timed runs of each method (default: %(default)s)',
-    {**options.NUMBER, 'default': 9},
 )  # fmt: skip
 
 
@@ -144,18 +131,7 @@ def _ablation(arguments: argparse.Namespace, config: Config, runner: Runner) -> 
 
 
 def _departures(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
-    chosen = [parse_departure(text) for text in arguments.switch or []] or ablation.DEPARTURES
-    frames = frames_from_options(arguments)
-    return ablation.compare_departures(frames, chosen, config, runner)
-
-
-def parse_departure(text: str) -> ablation.Departure:
-    """Read ``TITLE: NAME=VALUE NAME=VALUE``; ConfigError if it is not of that form."""
-    title, _, switch = text.rpartition(': ')
-    settings = switch.split()
-    if not title.strip() or not settings:
-        raise ConfigError(f'--switch {text!r}: must be TITLE: NAME=VALUE ...')
-    return ablation.Departure(title.strip(), dict(map(options.parse_setting, settings)))
+    return ablation.compare_departures(frames_from_options(arguments), config, runner)
 
 
 def _steps(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
@@ -201,9 +177,7 @@ def _sensor_pose(arguments: argparse.Namespace, config: Config, runner: Runner) 
 
 def _table1(arguments: argparse.Namespace, config: Config, _: Runner) -> Report:
     bar = options.progress('table1')
-    choices = [Choice.parse(word) for word in arguments.frames]
-    layout = options.scan_layout(arguments)
-    return table1(arguments.root, choices, config, arguments.repeats, layout, bar)
+    return table1(arguments.root, config, options.scan_layout(arguments), bar)
 
 
 EXPERIMENTS = {
@@ -220,10 +194,9 @@ rubble, by exact labels and heights.
     'departures': Experiment(
         """\
 Undo one departure from the paper after the other. They are the rows of
-gp_ground_seg/experiments/ablation.py; --switch measures another without touching it:
-  --switch 'tight gate: growth.max_std=1'
+gp_ground_seg/experiments/ablation.py; `compare` measures any other change.
 """,
-        (ROOT, *OF_FRAMES, SWITCH),
+        (ROOT, *OF_FRAMES),
         _departures,
     ),
     'coverage': Experiment(
@@ -280,7 +253,7 @@ sensors at four heights.
         """\
 Measure the paper's Table I on segments of labelled frames.
 """,
-        (ROOT, SEGMENTS, REPEATS, *options.SCAN_LAYOUT),
+        (ROOT, *options.SCAN_LAYOUT),
         _table1,
     ),
 }

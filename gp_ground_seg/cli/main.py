@@ -38,7 +38,6 @@ COMMANDS = {
     'demo': ('demo', 'see it work, no data needed'),
     'config': ('config', 'write, check and compare parameter files'),
     'node': ('node', 'run the ROS 2 node'),
-    'node-bench': ('node', 'latency, losses and memory of the node'),
     'warm-up': ('node', 'compile beforehand what the first start would compile'),
 }
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import base64
-import html
 import logging
 import math
 from functools import partial
@@ -24,8 +22,9 @@ from gp_ground_seg.evaluation.report import (
 from gp_ground_seg.experiments import optimise
 from gp_ground_seg.experiments.variants import make_report, score_variants
 from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.parameters.export import is_logarithmic
 from gp_ground_seg.parameters.schema import ROS_NODE_KEY, ROS_PARAMETERS_KEY, ParameterValue
-from gp_ground_seg.plotting.charts import plot_search
+from gp_ground_seg.plotting.search import plot_search
 from gp_ground_seg.plotting.style import new_figure
 
 DESCRIPTION = f"""\
@@ -39,15 +38,9 @@ Each parameter is searched in the whole range that is accepted; by default
 A search with --journal that was interrupted goes on when it is started again in the same way.
 """
 EXAMPLES = """\
-  gp-ground-seg optimise ROOT --trials 100 -o best.yaml --page search.html
+  gp-ground-seg optimise ROOT --trials 100 -o best.yaml --picture search.png
   gp-ground-seg optimise ROOT --journal search.log -o best.yaml      interrupt, start again
   gp-ground-seg optimise ROOT --parameters label.ground_tolerance,growth.max_std --left-out 08
-"""
-PAGE = """\
-<!doctype html><html lang="en"><meta charset="utf-8"><title>Search on {title}</title>
-<style>body {{font-family: sans-serif; margin: 2em}} img {{max-width: 100%}}</style>
-<h1>Search of parameters on {title}</h1><pre>{text}</pre>
-<img alt="IoU by trial, and over the values tried" src="data:image/png;base64,{data}"></html>
 """
 
 
@@ -68,7 +61,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {'metavar': 'N', 'type': partial(options.positive, least=0), 'default': 0}),
         ('--journal', 'keep every trial in this file, and go on with what is in it', file),
         ('-o --output', 'write the values that differ to this parameter file (YAML)', file),
-        ('--page', 'write a page with the history (HTML)', file),
+        ('--picture', 'draw the trials: IoU over each parameter (PNG)', file),
         options.MARKDOWN,
         options.TO_JSON,
         options.FORCE,
@@ -84,10 +77,10 @@ def run(arguments: argparse.Namespace) -> int:
     specs = optimise.searched_specs(arguments.parameters.split(','), base)
     left_out = arguments.left_out.split(',') if arguments.left_out else None
     searched, rest = optimise.split_frames(frames_from_options(arguments), left_out)
-    if arguments.page:
+    if arguments.picture:
         new_figure(1.0, 1.0)  # Raises at once where matplotlib is missing.
     with (
-        options.staged_options(arguments, 'json', 'output', 'page') as parts,
+        options.staged_options(arguments, 'json', 'output', 'picture') as parts,
         options.runner(arguments, 'optimise') as runner,
     ):
         # Of values that are far off the library says much; their IoU says it too.
@@ -117,12 +110,9 @@ def run(arguments: argparse.Namespace) -> int:
         if 'output' in parts:
             values = yaml.safe_dump({ROS_NODE_KEY: {ROS_PARAMETERS_KEY: _changed(config)}})
             parts['output'].write_text(f'# {words}\n{values}', encoding='utf-8')
-        if 'page' in parts:
-            picture = parts['page'].with_name('history.png')
-            plot_search(known, [spec.name for spec in specs if optimise.is_log(spec)], picture)
-            data = base64.b64encode(picture.read_bytes()).decode()
-            shown = {'title': html.escape(arguments.root), 'text': html.escape(text)}
-            parts['page'].write_text(PAGE.format(data=data, **shown), encoding='utf-8')
+        if 'picture' in parts:
+            logarithmic = [spec.name for spec in specs if is_logarithmic(spec)]
+            plot_search(known, logarithmic, parts['picture'])
     print(text)
     return 0
 

@@ -48,7 +48,7 @@ DRIVE = """\
 Draw clouds of a bag, sequence or folder as `plot scan` does, one after the other, as a movie.
 """
 DRIVE_EXAMPLES = """\
-  gp-ground-seg plot drive drive.mcap -o drive.mp4
+  gp-ground-seg plot drive drive.mcap -o drive.gif
   gp-ground-seg plot drive KITTI_ROOT/sequences/00 --frames 30 --colour p_ground -o drive.gif
 """
 
@@ -129,7 +129,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--azimuth', 'the one that looks there, 90 = left', degrees),
     )
     for picture in (view, drive, above, segment):
-        endings = ('.gif', '.mp4') if picture is drive else ('.png', '.pdf', '.svg')
+        endings = ('.gif',) if picture is drive else ('.png', '.pdf', '.svg')
         output = (f'{" or ".join(endings)} file', {'metavar': 'OUT', 'required': True})
         if picture is not drive:
             which = {**number, 'default': 0}

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from gp_ground_seg.cli import dataset, options
-from gp_ground_seg.cli.cloud_output import FORMATS, SURFACES, CloudOutput, encode_labels
+from gp_ground_seg.cli.cloud_output import FORMATS, CloudOutput, encode_labels
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
@@ -63,7 +63,7 @@ leaves out what is in it. Labels are the same (docs/datasets.md).
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
-  gp-ground-seg segment scan.pcd -o scan.laz --surface tif
+  gp-ground-seg segment scan.pcd -o scan.laz --surface
   gp-ground-seg segment drive.mcap --format ply --split     files for each cloud
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
@@ -98,8 +98,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--raw', 'write 0 unknown, 1 ground, 2 obstacle as labels', options.FLAG),
         ('--split', 'write ground and obstacles apart, as OUT_ground and OUT_obstacles',
          options.FLAG),
-        ('--surface', 'write the ground as a grid as well, as OUT_surface',
-         {'choices': SURFACES}),
+        ('--surface', 'write the ground as a grid as well, as OUT_surface.npz', options.FLAG),
     )  # fmt: skip
     topic, several = {'metavar': 'T'}, {'metavar': 'T', 'action': 'append', 'default': []}
     formats = (*FORMATS, *SUFFIX_OF_STORAGE)

@@ -9,6 +9,7 @@ import numpy as np
 from gp_ground_seg.compiled.numerics import LANES, exp_neg, solve_in_place
 from gp_ground_seg.compiled.threads import Part
 from gp_ground_seg.frame import FloatArray, Frame
+from gp_ground_seg.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.jit import jit
 
 
@@ -78,6 +79,8 @@ def latent_log_length_scales(
             for i in range(size):
                 d = wanted[i] - centre
                 value[i] += scaled * exp_neg(sharpness * d * d)
+        for i in range(size):
+            value[i] = min(max(value[i], -MAX_ABS_LOG_LENGTH_SCALE), MAX_ABS_LOG_LENGTH_SCALE)
         for i in range(n):
             at_candidates[own + i] = value[i]
         for i in range(n_wanted):

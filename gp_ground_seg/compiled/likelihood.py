@@ -9,6 +9,7 @@ import numpy as np
 from gp_ground_seg.compiled.numerics import exp_neg, factorise, invert, invert_triangle
 from gp_ground_seg.compiled.threads import Part
 from gp_ground_seg.frame import FloatArray, Inliers
+from gp_ground_seg.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.jit import jit
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -74,7 +75,7 @@ def log_likelihood(
                     covariance = sigma_f_bar**2 * exp_neg(sharpness * d * d)
                     k_star[i, j] = covariance
                     value += covariance * beta[j]
-                u[i] = value
+                u[i] = min(max(value, -MAX_ABS_LOG_LENGTH_SCALE), MAX_ABS_LOG_LENGTH_SCALE)
         else:
             for i in range(n):
                 u[i] = inliers.log_length_scale[first + i]

@@ -1,8 +1,7 @@
-"""Boxes about the objects of a scan, a file for each scan: ``.npz`` or ``.csv``."""
+"""Boxes about the objects of a scan, an ``.npz`` file for each scan."""
 
 from __future__ import annotations
 
-import csv
 import io
 import zipfile
 import zlib
@@ -17,13 +16,11 @@ from gp_ground_seg.errors import DataError
 from gp_ground_seg.frame import FloatArray
 
 ARRAYS = {'box_class': (), 'box_center': (3,), 'box_size': (3,), 'box_rotation': (3, 3)}
-"""Arrays of an ``.npz`` file, and what follows the number of boxes in the shape of each."""
-COLUMNS = ('class', 'x', 'y', 'z', 'length', 'width', 'height', 'yaw')
-"""Columns of a ``.csv`` file: centre and size [m], `yaw` about z, from x towards y [rad]."""
+"""Arrays of a file, and what follows the number of boxes in the shape of each."""
 _MAX_BYTES = 1 << 28  # a file may hold its scan too
-# What numpy, zipfile and csv raise; RuntimeError: encrypted, or of an unknown kind.
+# What numpy and zipfile raise; RuntimeError: encrypted, or of an unknown kind.
 _UNREADABLE = (
-    ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, csv.Error,
+    ValueError, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 _MAX_SKEW = 1e-3  # of the axes of a box, which are orthonormal
 
@@ -55,22 +52,17 @@ def find_boxes(where: str | Path, frames: Sequence[Frame]) -> list[Path]:
     for frame in frames:
         own = where / frame.sequence
         folder = own if own.is_dir() or len(sequences) > 1 else where
-        names = [f'{frame.index}{suffix}' for suffix in ('.npz', '.csv')]
-        found = [path for name in names if (path := folder / name).exists()]
-        if len(found) != 1:
-            both = 'both there, delete one' if found else 'not there, one must be'
-            raise DataError(f'{folder}: {" and ".join(names)} are {both}')
-        paths += found
+        paths.append(folder / f'{frame.index}.npz')
+        if not paths[-1].exists():
+            raise DataError(f'{paths[-1]}: no such file')
     return paths
 
 
 def read_boxes(path: str | Path) -> Boxes:
     """Read the boxes of a scan; DataError says what is wrong with a file."""
-    data, suffix = read_bytes(path, _MAX_BYTES), Path(path).suffix
-    if suffix not in ('.npz', '.csv'):
-        raise DataError(f'{path}: boxes are read from .npz and .csv files')
+    data = read_bytes(path, _MAX_BYTES)
     try:
-        boxes = _read_npz(data) if suffix == '.npz' else _read_csv(data)
+        boxes = _read_npz(data)
         _check(boxes)
     except _UNREADABLE as error:
         raise DataError(f'{path}: {" ".join(str(error).split())}') from error
@@ -90,29 +82,6 @@ def _read_npz(data: bytes) -> Boxes:
             raise ValueError(f'{name} of shape {arrays[name].shape}: must be {(n_boxes, *rest)}')
     numbers = [arrays[name].astype(np.float64) for name in ARRAYS if name != 'box_class']
     return Boxes([str(word) for word in arrays['box_class']], *numbers)
-
-
-def _read_csv(data: bytes) -> Boxes:
-    rows = csv.DictReader(io.StringIO(data.decode('utf-8-sig')), skipinitialspace=True)
-    given = rows.fieldnames or ()
-    if missing := [name for name in COLUMNS if name not in given]:
-        raise ValueError(
-            f'no column {", ".join(missing)}; the first line names {",".join(COLUMNS)}'
-        )
-    names, numbers = [], []
-    for row in rows:
-        names.append(row['class'])
-        try:
-            numbers.append([float(row[name]) for name in COLUMNS[1:]])
-        except (TypeError, ValueError) as error:
-            raise ValueError(f'line {rows.line_num}: {error}') from error
-    values = np.array(numbers, dtype=np.float64).reshape(-1, len(COLUMNS) - 1)
-    cos, sin = np.cos(values[:, 6]), np.sin(values[:, 6])
-    rotation = np.zeros((len(names), 3, 3))
-    rotation[:, 0, 0], rotation[:, 0, 1] = cos, sin
-    rotation[:, 1, 0], rotation[:, 1, 1] = -sin, cos
-    rotation[:, 2, 2] = 1.0
-    return Boxes(names, values[:, :3], values[:, 3:6], rotation)
 
 
 def _check(boxes: Boxes) -> None:

@@ -205,11 +205,6 @@ class MethodScore:
         return self.confusion.iou
 
     @property
-    def ece(self) -> float:
-        """Expected calibration error; NaN without probabilities."""
-        return math.nan if self.calibration is None else self.calibration.ece
-
-    @property
     def classes(self) -> dict[int, metrics.ClassCount]:
         """Sum of the counts by class, by ascending class number."""
         numbers = sorted({number for scan in self.scans for number in scan.classes})

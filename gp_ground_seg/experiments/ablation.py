@@ -111,17 +111,10 @@ def compare_models(
     return make_report({'models': Table.of(rows, title=title)}, scores, config, changes=MODELS)
 
 
-def compare_departures(
-    frames: Sequence[Frame],
-    departures: Sequence[Departure],
-    config: Config,
-    runner: Runner = HERE,
-) -> Report:
+def compare_departures(frames: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
     """Switch one departure after the other, on the same frames in the same run."""
     variants = {'as given': config}
-    for one in departures:
-        if one.title in variants:
-            raise ConfigError(f'departure {one.title!r}: there is one of that title already')
+    for one in DEPARTURES:
         variants[one.title] = config.replace(**one.changes)
         if variants[one.title] == config:
             raise ConfigError(f'departure {one.title!r}: its switch changes nothing')
@@ -147,7 +140,7 @@ def compare_departures(
         ]
 
     switches = []
-    for one, score in zip(departures, switched, strict=True):
+    for one, score in zip(DEPARTURES, switched, strict=True):
         having, without = (given, score) if one.kept else (score, given)
         interval = interval_text(having.parts(), without.parts())
         switch = 'off' if one.kept else 'on'
@@ -159,7 +152,7 @@ def compare_departures(
         'time: over that as given, median of the frames'
     )
     tables = {'departures': Table.of(rows, title=title)}
-    changes = {one.title: one.changes for one in departures}
+    changes = {one.title: one.changes for one in DEPARTURES}
     return make_report(tables, scores, config, changes=changes)
 
 

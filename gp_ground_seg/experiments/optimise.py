@@ -13,6 +13,7 @@ from gp_ground_seg.data.semantic_kitti import Frame, read_labels, read_points
 from gp_ground_seg.errors import ConfigError, DataError, require
 from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, count_confusion
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
+from gp_ground_seg.parameters.export import is_logarithmic
 from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue
 from gp_ground_seg.scale.cluster import Progress, Runner
 from gp_ground_seg.scale.dataset import digest
@@ -24,8 +25,6 @@ DEFAULT_NAMES = [
     if spec.basic and spec.type in (int, float) and not spec.name.startswith(('sensor', 'runtime'))
 ]
 """Basic numbers that bear on labels and are no facts of a robot."""
-LOG_RATIO = 100.0
-"""Highest over lowest number accepted, both above 0, from which on the scale is logarithmic."""
 
 
 class Trial(NamedTuple):
@@ -75,11 +74,6 @@ def searched_specs(names: Sequence[str], base: Config) -> list[ParameterSpec]:
         if base[spec.name] == AUTO or (spec.type is str and not spec.choices):
             raise ConfigError(f'{spec.name} = {base[spec.name]}: is no number or choice to search')
     return specs
-
-
-def is_log(spec: ParameterSpec) -> bool:
-    """Whether accepted numbers span decades, to be searched on a log scale."""
-    return (spec.maximum or 0.0) >= LOG_RATIO * (spec.minimum or math.inf) > 0.0
 
 
 def search(
@@ -148,4 +142,4 @@ def _suggest(trial: Any, spec: ParameterSpec) -> Any:
         return trial.suggest_categorical(spec.name, spec.choices or (False, True))
     draw = trial.suggest_int if spec.type is int else trial.suggest_float
     low, high = (spec.type(end) for end in (spec.minimum, spec.maximum))
-    return draw(spec.name, low, high, log=is_log(spec))
+    return draw(spec.name, low, high, log=is_logarithmic(spec))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import statistics
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
@@ -28,7 +27,6 @@ MODELS = {'Z-L': 'latent', 'Z': 'line_gradient'}
 """The paper's method and the one it is compared with, as values of ``length_scale.model``."""
 VARIANCES = ('sigma_f^2', 'sigma_n^2', 'sigma_f_bar^2', 'sigma_l_bar^2', 'sigma_n_bar^2')
 """Squares of the first entries of theta: in m^2; those of f_bar and n_bar without unit."""
-_CHOICE = re.compile(r'([^/:]+)/([^/:]+):(\d+(?:,\d+)*)')
 
 
 class Choice(NamedTuple):
@@ -38,41 +36,31 @@ class Choice(NamedTuple):
     frame: str
     segments: tuple[int, ...]
 
-    @classmethod
-    def parse(cls, word: str) -> Choice:
-        """Read ``08/000005:151,152``; DataError if it is of another form."""
-        match = _CHOICE.fullmatch(word)
-        if match is None:
-            raise DataError(f'--frames {word!r}: must be as in 08/000005:151,152')
-        sequence, frame, segments = match.groups()
-        return cls(sequence, frame, tuple(map(int, segments.split(','))))
 
-
-DEFAULT_CHOICES = ('10/000000:157,158', '03/000006:147,148')
+CHOICES = (Choice('10', '000000', (157, 158)), Choice('03', '000006', (147, 148)))
 """An adjacent pair that climbs a verge and a hill, 3 m over 30 m, and one on uneven ground."""
+N_REPEATS = 9
 
 
 def table1(
     root: str | Path,
-    choices: Sequence[Choice],
     config: Config,
-    n_repeats: int,
     layout: ScanLayout = KITTI,
     progress: Progress = iter,
 ) -> Report:
-    """Measure the table on the chosen segments, at least one choice.
+    """Measure the table on the segments of `CHOICES`.
 
-    Each method runs on each frame once without counting, then `n_repeats` times, alternately.
+    Each method runs on each frame once without counting, then `N_REPEATS` times, alternately.
     """
     refuse_changed(config, ['length_scale.model', 'learning.fixed'])
     if config.learning.mode == 'fixed':
         raise ConfigError('learning.mode = fixed: the table is of what is learned, leave it out')
     last = config.grid.n_segments - 1
-    for segment in (segment for choice in choices for segment in choice.segments):
+    for segment in (segment for choice in CHOICES for segment in choice.segments):
         if not 0 <= segment <= last:
             raise ConfigError(f'segment {segment}: must be in [0, {last}]')
     frames = []
-    for choice in choices:
+    for choice in CHOICES:
         own = {frame.index: frame for frame in list_frames(root, choice.sequence, layout)}
         if choice.frame not in own:
             where = f'{choice.sequence}; there are {min(own)} to {max(own)}'
@@ -86,15 +74,15 @@ def table1(
                 config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
             )
             segmenters[name] = stack.enter_context(closing(segmenter))
-        for frame, choice in zip(progress(frames), choices, strict=True):
-            found, result = _rows(frame, choice, segmenters, n_repeats)
+        for frame, choice in zip(progress(frames), CHOICES, strict=True):
+            found, result = _rows(frame, choice, segmenters)
             rows += found
     names = ['n_PG', 'n_L', *VARIANCES]
     others = [n for n in rows[0] if n not in ('segment', *names) and not n.startswith('inliers')]
     variances = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
     errors = (
         'SMSE in sample (at the inliers) and held out (labelled ground); seconds per frame: '
-        f'median of {n_repeats} runs on the whole frame, reading left out'
+        f'median of {N_REPEATS} runs on the whole frame, reading left out'
     )
     tables = {
         'variances': _table(rows, names, variances),
@@ -113,14 +101,14 @@ def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> 
 
 
 def _rows(
-    frame: Frame, choice: Choice, segmenters: dict[str, GroundSegmenter], n_repeats: int
+    frame: Frame, choice: Choice, segmenters: dict[str, GroundSegmenter]
 ) -> tuple[list[dict[str, Any]], Segmentation]:
     """Rows of a frame, by title of the column, and a result of the latent model."""
     scan = load_kitti(frame)
     z = scan.points[:, 2].astype(np.float64)
     seconds: dict[str, list[float]] = {name: [] for name in segmenters}
     results: dict[str, Segmentation] = {}
-    for k in range(n_repeats + 1):
+    for k in range(N_REPEATS + 1):
         for name, segmenter in segmenters.items():
             segmenter.reset()
             results[name] = segmenter.segment(scan.points)

@@ -9,6 +9,12 @@ from gp_ground_seg.gp.kernels import squared_exponential
 from gp_ground_seg.gp.linalg import Padded, add_noise, batches
 from gp_ground_seg.parameters.config import LengthScaleConfig
 
+MAX_ABS_LOG_LENGTH_SCALE = 100.0
+"""Bound of the latent process [log m], far outside all scans, for squares that stay finite.
+
+With `latent.sigma_f_bar` near its upper end the mean between pseudo-inputs swings that far.
+"""
+
 
 def n_wanted_knots(frame: Frame) -> IntArray:
     """Count the knots up to the bin of the last candidate of each segment, (M,) int64.
@@ -49,7 +55,8 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
         cross = squared_exponential(wanted, r_bar, sigma_f_bar, sigma_l_bar)
         is_wanted = np.arange(len(knots)) < n_knots[segments, None]
         at_knots[segments] = np.where(is_wanted, (cross @ weight)[:, :, 0] + mean, np.nan)
-    return at_candidates, at_knots
+    bound = MAX_ABS_LOG_LENGTH_SCALE
+    return np.clip(at_candidates, -bound, bound), np.clip(at_knots, -bound, bound)
 
 
 def given_log_length_scales(

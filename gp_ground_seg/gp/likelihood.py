@@ -9,6 +9,7 @@ import numpy as np
 
 from gp_ground_seg.frame import FloatArray, Inliers, IntArray
 from gp_ground_seg.gp.kernels import squared_exponential
+from gp_ground_seg.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.gp.linalg import Padded, add_noise, batches, single_threaded_blas
 
 _LOG_2PI = math.log(2.0 * math.pi)
@@ -129,8 +130,9 @@ class _Latent(NamedTuple):
         inverse = np.linalg.inv(b).astype(np.float64, copy=False)
         factor = np.linalg.cholesky(b).astype(np.float64, copy=False)
         beta: FloatArray = (inverse @ np.where(bar.mask, l_bar - mean, 0.0)[:, :, None])[:, :, 0]
+        u = mean + theta[5] + (k_star @ beta[:, :, None])[:, :, 0]
         return cls(
-            u=mean + theta[5] + (k_star @ beta[:, :, None])[:, :, 0],
+            u=np.clip(u, -MAX_ABS_LOG_LENGTH_SCALE, MAX_ABS_LOG_LENGTH_SCALE),
             sigma_l_bar=sigma_l_bar,
             sigma_n_bar=sigma_n_bar,
             bar=bar,

@@ -123,13 +123,12 @@ def plot_sheet(
 def write_movie(
     scenes: Iterable[Scene], config: Config, path: str | Path, view: View, fps: float
 ) -> None:
-    """Write a GIF, or an MP4 where `path` ends so, of scenes, replacing the file."""
+    """Write a GIF of scenes, replacing the file."""
     imageio = require('imageio.v2', 'plot')
-    how: dict[str, Any] = {'duration': 1e3 / fps, 'loop': 0}
-    if Path(path).suffix.lower() == '.mp4':
-        require('imageio_ffmpeg', 'movie')
-        how = {'fps': fps}
-    with staged_file(path, force=True) as part, imageio.get_writer(part, **how) as writer:
+    with (
+        staged_file(path, force=True) as part,
+        imageio.get_writer(part, duration=1e3 / fps, loop=0) as writer,
+    ):
         for scene in scenes:
             writer.append_data(style.pixels(_scene_figure(scene, config, view, MOVIE_DPI)))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from rclpy.duration import Duration
@@ -15,7 +15,6 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.errors import DataError
 from gp_ground_seg.ros.input import cloud_profile
 
 DEPTH = 100  # clouds kept until acknowledged: with stock Fast DDS that can take 3 s
@@ -78,8 +77,6 @@ class PlayOptions(NamedTuple):
     """What is played, and how."""
 
     rate: float  # 1 = as recorded
-    start: float  # left out [s]
-    duration: float | None  # played [s]
     loop: bool
     clock: bool
 
@@ -121,7 +118,7 @@ class Player:
         return True
 
     def play(self, on_cloud: Callable[[], object] = lambda: None) -> None:
-        """Play, and call `on_cloud` before each cloud is sent; DataError if there is none."""
+        """Play, and call `on_cloud` before each cloud is sent."""
         start = self._play_once(time.monotonic(), on_cloud)
         while self._options.loop:
             start = self._play_once(start, on_cloud)
@@ -158,7 +155,7 @@ class Player:
         rate, first, last = self._options.rate, 0, 0
         n_clouds: Counter[str] = Counter()
         # The next cloud is read right after one was sent: there is time for it then.
-        for topic, recorded, raw in self._clouds():
+        for topic, recorded, raw in self._bag.messages(self._publishers):
             if not n_clouds:
                 first = last = recorded
                 start = max(start, time.monotonic())
@@ -169,28 +166,9 @@ class Player:
             on_cloud()
             self._send(topic, raw, due)
             n_clouds[topic] += 1
-        if not n_clouds:
-            times = [recorded for _, recorded, _ in self._bag.messages(self._publishers)]
-            span = 1e-9 * (max(times) - min(times)) if times else 0.0
-            raise DataError(
-                f'{self._bag.path}: no cloud in the time asked for (from '
-                f'{self._options.start:g} s on); the last of its {len(times)} clouds is at '
-                f'{span:.3f} s'
-            )
         n_periods, span = max(n_clouds.values()) - 1, 1e-9 * (last - first)
         # A bag of a single cloud begins again after 0.1 s.
         return start + (span + (span / n_periods if n_periods else 0.1)) / rate
-
-    def _clouds(self) -> Iterator[tuple[str, int, bytes]]:
-        start, duration = self._options.start, self._options.duration
-        origin = None
-        for topic, recorded, raw in self._bag.messages(self._publishers):
-            origin = recorded if origin is None else origin
-            offset = 1e-9 * (recorded - origin)
-            if duration is not None and offset >= start + duration:
-                return
-            if offset >= start:
-                yield topic, recorded, raw
 
     def _wait_until(self, due: float, recorded: int) -> None:
         """Wait until a monotonic time [s]; at it, the time of the bag is `recorded` [ns]."""

@@ -42,10 +42,8 @@ _RUN = """\
 from gp_ground_seg.ros.probe import run_node
 sys.exit(run_node(*sys.argv[1:]))
 """
-_DIAGNOSTICS = '/diagnostics'
 _PROBE_FRAME = 'gp_ground_seg_probe'
 _PROBE_PERIOD = 0.2
-_COUNTERS = ('Clouds since startup', 'Dropped since startup')
 _HIGHEST_DOMAIN = 101  # ports above meet those that Linux hands out
 _NETWORK = (
     'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'
@@ -148,7 +146,7 @@ def probe_session(name: str) -> Iterator[tuple[Session, list[str]]]:
     taken the same ROS domain.
     """
     token = secrets.token_hex(8)
-    topics = (INPUT, GROUND, OBSTACLES, _DIAGNOSTICS)
+    topics = (INPUT, GROUND, OBSTACLES, '/diagnostics')
     own = [word for topic in topics for word in ('-r', f'{topic}:=/probe_{token}{topic}')]
     with (
         private_network(),
@@ -190,7 +188,6 @@ class Probe:
     def __init__(
         self, session: Session, on_back: Callable[[CloudMessage, Results], object]
     ) -> None:
-        from diagnostic_msgs.msg import DiagnosticArray
         from sensor_msgs.msg import PointCloud2
 
         from gp_ground_seg.ros.input import cloud_profile
@@ -199,13 +196,11 @@ class Probe:
         self._session = session
         self._on_back = on_back
         self._waiting: dict[tuple[int, int], tuple[Trip, CloudMessage, Results]] = {}
-        self._counts: dict[str, int] = {}
         self._publisher = session.node.create_publisher(PointCloud2, INPUT, cloud_profile(10))
         for topic in (GROUND, OBSTACLES):
             session.node.create_subscription(
                 PointCloud2, topic, partial(self._receive, topic), cloud_profile(50), raw=True
             )
-        session.node.create_subscription(DiagnosticArray, _DIAGNOSTICS, self._diagnosed, 10)
 
     def connect(self, node: NodeProcess) -> None:
         """Send empty clouds until both topics have answered and the node is settled."""
@@ -215,7 +210,7 @@ class Probe:
             while time.monotonic() < next_time:
                 self._session.spin(0.02)
             node.check()
-            if trip.back is not None and self._counts and node.is_settled():
+            if trip.back is not None and node.is_settled():
                 break
             if time.monotonic() > end:
                 raise GroundSegError(
@@ -251,15 +246,6 @@ class Probe:
             self._wait(silence)
         return trips
 
-    def counters(self) -> tuple[int, int]:
-        """Return the clouds that the node has processed and dropped, by its next report."""
-        self._counts.clear()
-        end = time.monotonic() + 5.0
-        while not self._counts and time.monotonic() < end:
-            self._session.spin(0.05)
-        processed, dropped = (self._counts.get(name, -1) for name in _COUNTERS)
-        return processed, dropped
-
     def _send(self, cloud: CloudMessage, raw: bytes) -> Trip:
         trip = Trip(time.time_ns())
         self._waiting[stamp_of(cloud)] = trip, cloud, {}
@@ -293,14 +279,8 @@ class Probe:
             if is_data:
                 self._on_back(sent, results)
 
-    def _diagnosed(self, array: Any) -> None:
-        for status in array.status:
-            if status.name.endswith(': processing'):
-                values = {entry.key: entry.value for entry in status.values}
-                self._counts.update({name: int(values[name]) for name in _COUNTERS})
 
-
-def rate_result(asked: float, trips: Sequence[Trip], n_dropped: int) -> dict[str, Any]:
+def rate_result(asked: float, trips: Sequence[Trip]) -> dict[str, Any]:
     """Return the statistics of clouds sent at a rate of `asked` [Hz]; times in seconds."""
     latency = np.array([trip.latency for trip in trips])
     known = latency[np.isfinite(latency)]
@@ -312,7 +292,5 @@ def rate_result(asked: float, trips: Sequence[Trip], n_dropped: int) -> dict[str
         'n_sent': len(trips),
         'n_back': len(known),
         'n_lost': len(trips) - len(known),
-        'n_dropped': n_dropped,
-        'is_newest_back': trips[-1].back is not None,
         **dict(zip(('p50', 'p95', 'p99', 'worst'), percents.tolist(), strict=True)),
     }

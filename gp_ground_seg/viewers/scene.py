@@ -17,7 +17,7 @@ from gp_ground_seg.evaluation.objects import Objects, count_objects, labelled_ob
 from gp_ground_seg.frame import OUTSIDE, FloatArray, Label
 from gp_ground_seg.ground_model import GroundModel
 from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.scan import COLOURS, COLOURS_ABOVE, N_STD
+from gp_ground_seg.plotting.scan import COLOURS, COLOURS_ABOVE, N_STD, VALUES
 from gp_ground_seg.plotting.style import BLUE, PINK, VIOLET, length_scale_colours
 from gp_ground_seg.result import Segmentation
 
@@ -35,7 +35,7 @@ LEGENDS = {
     'faces': {'in a tile with a vertical face': VIOLET},
     'candidates': {'outlier': BLACK, 'inlier': BLUE},
 }
-RAMPS = {'height': (-0.5, 3.0), 'p_ground': (0.0, 1.0)}
+RAMPS = {name: (low, high) for name, (_, low, high) in VALUES.items()}
 """Ends of the ramp from dark blue to yellow of the height over the ground [m], and of p_ground."""
 
 

@@ -14,6 +14,7 @@ from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.evaluation.metrics import Labels
 from gp_ground_seg.frame import Label
 from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
+from gp_ground_seg.parameters.export import is_logarithmic
 from gp_ground_seg.parameters.schema import AUTO, ParameterSpec, ParameterValue
 from gp_ground_seg.result import Segmentation
 from gp_ground_seg.segmenter import GroundSegmenter
@@ -21,8 +22,6 @@ from gp_ground_seg.viewers.html_page import draw_points, legend
 from gp_ground_seg.viewers.scene import Cloud, point_colours, read_view
 
 N_STEPS = 400  # of a slider
-LOG_RANGE = 100.0
-"""Ratio of the ends of a range from which on its slider is logarithmic."""
 _NO_LABELS = ('frame', 'input', 'runtime', 'diagnostics')
 
 
@@ -35,7 +34,7 @@ def slider_values(spec: ParameterSpec, now: ParameterValue) -> list[ParameterVal
     """Values that the slider of a number goes through, `AUTO` and `now` among them."""
     low, high = spec.minimum, spec.maximum
     assert low is not None and high is not None
-    is_log = low > 0.0 and high >= LOG_RANGE * low
+    is_log = is_logarithmic(spec)
     steps = (np.geomspace if is_log else np.linspace)(low, high, N_STEPS + 1)
     short = [float(f'{step:.{2 if is_log else 3}g}') for step in steps[1:-1]]
     numbers = {spec.type(value) for value in (low, *short, high)}
