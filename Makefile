@@ -1,4 +1,4 @@
-# make demo | make test | make browser-test | make bench | make node-bench | make colcon | make lint: each creates the environment it needs.
+# make demo | make test | make browser-test | make bench | make node-bench | make colcon | make lint | make docs: each creates the environment it needs.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -6,7 +6,7 @@ KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test browser-test torture bench bench-docs figures node-bench colcon lint format generate clean
+.PHONY: help demo test browser-test torture bench bench-docs figures docs node-bench colcon lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
@@ -16,9 +16,10 @@ help:
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.json and its picture'
 	@echo 'make figures   every table and picture of README and docs anew (needs KITTI=PATH; ONLY=word for some)'
+	@echo 'make docs      the documentation as HTML, in docs/_build/html'
 	@echo 'make node-bench  latency and losses of the node over DDS'
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
-	@echo 'make lint      ruff and mypy'
+	@echo 'make lint      ruff, mypy and codespell'
 	@echo 'make format    format the code'
 	@echo 'make generate  rewrite the files derived from gp_ground_seg/parameters'
 	@echo 'make clean     remove the environment and build results'
@@ -35,6 +36,10 @@ $(VENV)/.ros: setup.py $(VENV)/.python
 
 $(VENV)/.dev: setup.py $(VENV)/.ros
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros,dev]'
+	@touch $@
+
+$(VENV)/.docs: setup.py $(VENV)/.dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	@touch $@
 
 demo: $(VENV)/.ros
@@ -63,6 +68,10 @@ bench-docs: $(VENV)/.dev
 figures: $(VENV)/.dev
 	$(BIN)/python docs/figures.py $(KITTI) $(ONLY)
 
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs docs/_build/html
+	@echo 'docs/_build/html/index.html is the first page'
+
 node-bench: $(VENV)/.ros
 	$(BIN)/python test/node_bench.py $(KITTI)
 
@@ -78,6 +87,7 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/codespell
 
 format: $(VENV)/.dev
 	$(BIN)/ruff check --fix .
@@ -87,4 +97,4 @@ generate: $(VENV)/.dev
 	$(BIN)/python docs/generate.py
 
 clean:
-	rm -rf $(VENV) build install log .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) docs/_build build install log .mypy_cache .ruff_cache .pytest_cache .hypothesis

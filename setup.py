@@ -22,12 +22,15 @@ ROS = [
 ]
 # `colcon test` runs pytest because it finds it in an extra of the name `test`.
 TEST = ['hypothesis>=6.100', 'pytest>=7.4']
+# What rosdoc2 installs.
+DOCS = ['myst-parser>=3', 'sphinx>=7.2', 'sphinx-rtd-theme>=2']
 DEV = [
     *TEST,
     *TUNE,
     *SCALE,
     *VIEW,
     'argcomplete>=3.1',
+    'codespell[toml]>=2.3',
     'colcon-common-extensions',
     'flake8>=6',
     'flake8-builtins',
@@ -84,6 +87,7 @@ setup(
         'ros': ROS + BAGS + PLOT,
         'test': TEST,
         'view': VIEW,
+        'docs': DOCS,
         'dev': DEV,
     },
     zip_safe=False,

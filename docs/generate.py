@@ -11,11 +11,11 @@ ROOT = Path(__file__).resolve().parent.parent
 README = 'README.md'
 BEGIN, END = '<!-- parameters:begin -->', '<!-- parameters:end -->'
 PAGE_HEAD = """\
-# All parameters
+# Parameters
 
-Written by `make generate` from gp_ground_seg/parameters/config.py. The basic
-ones, that are set for a robot, are in [README.md](../README.md); the others rarely need another
-value. `gp-ground-seg config dump` prints all with their values and ranges as a parameter file.
+`make generate` writes this page from gp_ground_seg/parameters/config.py. Most users set only those
+in the table of the README. `gp-ground-seg config dump` writes all of them, with their values and
+ranges, as a parameter file. A symbol is that of the paper.
 
 """
 

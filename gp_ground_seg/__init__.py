@@ -36,8 +36,8 @@ _MODULES = {
 }
 
 
-# numba and scipy take most of a second to import: a program that is told to end
-# meanwhile, or to print its usage, does not wait for them.
+# numba and scipy take most of a second to import: a program that gets a
+# signal meanwhile, or that prints its usage, does not wait for them.
 def __getattr__(name: str) -> object:
     """Import the module that defines `name`."""
     if name not in _MODULES:

@@ -1,4 +1,4 @@
-"""What the library logs, told where it is read: on a terminal, by a node, in another process."""
+"""Messages of the library, passed to where they are read: a terminal, a node, a process."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from contextlib import contextmanager
 
 LOGGER = logging.getLogger('gp_ground_seg')
 """Of the whole library."""
-Tell = Callable[[int, str], object]
+Receive = Callable[[int, str], object]
 """Takes the severity of a message, as in `logging`, and its text."""
 
 
-class _Teller(logging.Handler):
-    def __init__(self, tell: Tell) -> None:
+class _Handler(logging.Handler):
+    def __init__(self, receive: Receive) -> None:
         super().__init__()
-        self._tell = tell
+        self._receive = receive
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._tell(record.levelno, record.getMessage())
+        self._receive(record.levelno, record.getMessage())
 
 
 @contextmanager
-def told(tell: Tell, level: int = logging.INFO) -> Iterator[None]:
-    """Call `tell` with each message of that severity or more within the block."""
-    handler, before = _Teller(tell), LOGGER.level
+def passed_to(receive: Receive, level: int = logging.INFO) -> Iterator[None]:
+    """Call `receive` with each message of that severity or more within the block."""
+    handler, before = _Handler(receive), LOGGER.level
     LOGGER.addHandler(handler)
     LOGGER.setLevel(level)
     try:

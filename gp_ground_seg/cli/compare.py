@@ -22,14 +22,14 @@ from gp_ground_seg.plotting.scan import plot_two_labels
 from gp_ground_seg.scale.cluster import Runner
 
 DESCRIPTION = """\
-Run two configurations alternately on the same frames, and say in what they differ: IoU,
+Run two configurations in turns on the same frames, and print their differences: IoU,
 precision, recall, objects lost, error of the height and how often it is within one and two
-standard deviations, time; each difference with a bootstrap interval over the sequences, or over
-blocks of frames of a single one. A tie: the interval holds 0. With -o the frames in which most
+standard deviations, time. Each difference has a bootstrap interval over the sequences, or over
+blocks of frames of a single one. In a tie the interval holds 0. With -o the frames in which most
 points have two labels are drawn.
 
-A and B are parameter files or names of presets. Scans without labels, as of any folder or bag,
-tell the points that have two labels, and the time.
+A and B are parameter files or names of presets. For scans without labels, such as a folder
+or a bag, the table has the points with two labels, and the time.
 """
 EXAMPLES = """\
   gp-ground-seg compare default paper KITTI_ROOT

@@ -242,7 +242,7 @@ sensors have one set of parameters.
     ),
     'sensor-pose': Experiment(
         """\
-Compare the segmentation with height and tilt of the sensor told and estimated. On labelled
+Compare the segmentation with height and tilt of the sensor given and estimated. On labelled
 frames of KITTI's car as they are, and turned by 3 degrees; with --simulated from three
 sensors at four heights.
 """,

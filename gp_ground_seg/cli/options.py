@@ -211,7 +211,7 @@ def note(message: str) -> None:
 
 def library_notes(level: int = logging.INFO) -> AbstractContextManager[None]:
     """Print what the library logs, such as that it compiles, as notes within the block."""
-    return log.told(lambda _, text: note(text), level)
+    return log.passed_to(lambda _, text: note(text), level)
 
 
 @contextmanager

@@ -14,18 +14,18 @@ from gp_ground_seg.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.segmenter import GroundSegmenter
 
 DESCRIPTION = """\
-Estimate from scans how high the sensor is and how it is tilted.
+Estimate height and tilt of the sensor from scans.
 
 INPUT is a scan of any format that `segment` reads, a folder of them, a sequence with
-velodyne/ in it, or a bag. Each scan is judged by itself. Support is the
-share of the low points on the plane that was found, residual their distance to it.
-With enough scans of level ground the medians are values to set: docs/pose.md.
+velodyne/ in it, or a bag. Each scan has an estimate of its own. Support is the share of
+the low points on the plane of the ground, residual their distance to it. With enough scans
+of level ground you can set the medians as parameters: docs/pose.md.
 """
 EXAMPLES = """\
   gp-ground-seg pose 000000.bin
   gp-ground-seg pose KITTI_ROOT/sequences/00
   gp-ground-seg pose drive.mcap
-  gp-ground-seg pose scans --set sensor.height=1.2      does it agree?
+  gp-ground-seg pose scans --set sensor.height=1.2      compare with this height
 """
 
 
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _pose_row(name: str, pose: SensorPose) -> list[Cell]:
-    """Return what was measured, where the scan tells it, and the values used."""
+    """Return what the scan shows of the pose, and the values used."""
     used = f'height {pose.height:.2f}'
     if not pose.height_estimated:
         used = f'height {pose.height:g} (not measured)'
@@ -96,12 +96,12 @@ def _pose_row(name: str, pose: SensorPose) -> list[Cell]:
 
 
 def _pose_summary(poses: list[SensorPose]) -> str:
-    """Return the medians over the scans that tell, as parameters."""
+    """Return the medians over the scans that show the pose, as parameters."""
     found = [pose.measured for pose in poses if pose.measured is not None]
     heights = [one.height for one in found if one.tells_height]
     tilts = [(one.roll, one.pitch) for one in found if one.tells_tilt]
     if not heights:
-        return 'no scan shows enough ground to tell the height: set sensor.height'
+        return 'no scan shows enough ground to estimate the height: set sensor.height'
     words = f'median of {len(heights)}: sensor.height={statistics.median(heights):.2f}'
     if tilts:
         roll, pitch = map(statistics.median, zip(*tilts, strict=True))

@@ -38,7 +38,7 @@ class Input:
     read : callable
         Returns the `Cloud`; raises DataError if it cannot be read, or can be no scan.
     time : float or None
-        When it was recorded [s]; None if the format does not tell.
+        When it was recorded [s]; None if the format has no time.
     """
 
     name: str

@@ -51,7 +51,7 @@ class Difference(NamedTuple):
 
 
 def find_differences(first: MethodScore, second: MethodScore) -> list[Difference]:
-    """Compare two methods by each of `MEASURES`; those that the scans do not tell are NaN."""
+    """Compare two methods by each of `MEASURES`; those without data in the scans are NaN."""
     found = []
     for column, sums in MEASURES:
         one, other = (ratio(*sums(score)) for score in (first, second))

@@ -140,7 +140,7 @@ class ScanScore:
     sequence: str
     index: str
     seconds: float  # without reading
-    stages: dict[str, float] = field(default_factory=dict)  # seconds, if the method tells them
+    stages: dict[str, float] = field(default_factory=dict)  # seconds, if the method reports them
     confusions: dict[str, Confusion] = field(default_factory=dict)  # as `KnownScan.truths`
     height: metrics.HeightError | None = None  # where the truth is known
     classes: dict[int, metrics.ClassCount] = field(default_factory=dict)

@@ -355,7 +355,7 @@ def height_error(
 ) -> HeightError:
     """Compare true with estimated heights of the ground, (n,) [m]; NaN where there is no model.
 
-    `std` are the standard deviations of the differences, (n,) [m], where they are told.
+    `std` are the standard deviations of the differences, (n,) [m], if there are any.
     """
     known = np.isfinite(estimate)
     y = truth[known].astype(np.float64)

@@ -176,7 +176,7 @@ def local_ground(
 
 
 def group_of(word: str) -> str:
-    """Class of an object by what it is called, that of `GROUPS`; other words stay as they are."""
+    """Class of an object by its name, as in `GROUPS`; other names are classes of their own."""
     own = word.lower().removeprefix('moving ')
     return next((name for name, words in GROUPS.items() if own in words), own)
 

@@ -111,7 +111,7 @@ class PatchworkMethod(PatchworkppMethod):
         return self._module.patchwork(parameters)
 
     def result(self) -> MethodResult:
-        """Labels; it does not tell its planes."""
+        """Labels; it does not return its planes."""
         return MethodResult(self._label(), np.full(len(self._points), np.nan))
 
 

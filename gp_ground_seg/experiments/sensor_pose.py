@@ -45,14 +45,14 @@ class Trial(NamedTuple):
 
     group: str
     mount: Mount
-    told: MethodScore  # height and angles as they are
+    given: MethodScore  # height and angles as they are
     level: MethodScore  # the height, the sensor taken to be level
     auto: MethodScore  # all three estimated
 
     @property
     def change(self) -> float:
         """Change of the IoU by the estimate."""
-        return self.auto.iou - self.told.iou
+        return self.auto.iou - self.given.iou
 
 
 def score_poses(
@@ -69,7 +69,7 @@ def score_poses(
     for mount in mounts:
         height, turn = mount
         poses = {
-            'told': (height, *map(math.radians, turn)),
+            'given': (height, *map(math.radians, turn)),
             'level': (height, 0.0, 0.0),
             'auto': (AUTO, AUTO, AUTO),
         }
@@ -116,7 +116,7 @@ def _parts(trials: Sequence[Trial], key: Callable[[Trial], str]) -> dict[str, li
 
 
 def _pooled(trials: Sequence[Trial]) -> tuple[MethodScore, ...]:
-    """Scores of some trials: told, level, auto."""
+    """Scores of some trials: given, level, auto."""
     return tuple(pool(one[0].name, one) for one in zip(*(t[2:] for t in trials), strict=True))
 
 
@@ -128,26 +128,30 @@ def height_table(trials: Sequence[Trial]) -> Table:
     """Return the scores of scans as they are, by group, and over all groups."""
     rows: list[Row] = []
     for group, own in _parts(trials, lambda trial: trial.group).items():
-        told, _, found = _pooled(own)
+        given, _, found = _pooled(own)
         poses = [(s.pose, t.mount[0]) for t in own for s in t.auto.scans if s.pose is not None]
         errors = [pose.height - height for pose, height in poses]
+        n_unknown = sum(not pose.height_estimated for pose, _ in poses)
         rows.append(
             [
                 (Column('scans of'), group),
                 (Column('scans', 'd'), len(poses)),
-                (percent('told'), told.iou),
+                (percent('given', 'told'), given.iou),
                 (percent('auto'), found.iou),
-                (percent('change', form='+.2f'), found.iou - told.iou),
+                (percent('change', form='+.2f'), found.iou - given.iou),
                 (percent('worst', form='+.2f'), min(t.change for t in own)),
                 (Column('low', '+.2f'), min(errors)),
                 (Column('high', '+.2f'), max(errors)),
                 (Column('tilt', '.1f'), max(_lean(pose) for pose, _ in poses)),
                 (Column('levelled', 'd'), _n_levelled(found)),
-                (Column('silent', 'd'), sum(not pose.height_estimated for pose, _ in poses)),
+                (
+                    Column('unknown', 'd', 'silent'),
+                    sum(not pose.height_estimated for pose, _ in poses),
+                ),
             ]
         )
     title = (
-        'Scans as they are: ground IoU [%] with the pose told and estimated (auto); the '
+        'Scans as they are: ground IoU [%] with the pose given and estimated (auto); the '
         'worst change of a sequence or height; lowest and highest error of the height [m]; the '
         'largest tilt measured [degrees]; how many were levelled, and how many do not show '
         'their height'
@@ -170,35 +174,35 @@ def turn_table(trials: Sequence[Trial]) -> Table:
         first, what, key = 'scans of', f' by {turn_text(*turns)}', lambda trial: trial.group
     rows: list[Row] = []
     for name, own in _parts(trials, key).items():
-        told, level, found = _pooled(own)
+        given, level, found = _pooled(own)
         rows.append(
             [
                 (Column(first), name),
-                (Column('scans', 'd'), len(told.scans)),
-                (percent('told'), told.iou),
+                (Column('scans', 'd'), len(given.scans)),
+                (percent('given', 'told'), given.iou),
                 (percent('level'), level.iou),
-                (percent('change', 'change_level', '+.2f'), level.iou - told.iou),
+                (percent('change', 'change_level', '+.2f'), level.iou - given.iou),
                 (percent('auto'), found.iou),
-                (percent('change', 'change_auto', '+.2f'), found.iou - told.iou),
+                (percent('change', 'change_auto', '+.2f'), found.iou - given.iou),
                 (percent('worst', form='+.2f'), min(t.change for t in own)),
                 (Column('levelled', 'd'), _n_levelled(found)),
             ]
         )
     title = (
-        f'Scans turned{what}: ground IoU [%] with the turn told; with only the height '
-        'told, taken to be level; and with all estimated (auto). Each with its change against '
-        'told, the worst one that of a sequence, turn or height; how many scans were levelled'
+        f'Scans turned{what}: ground IoU [%] with the turn given; with only the height '
+        'given, taken to be level; and with all estimated (auto). Each with its change against '
+        'given, the worst one that of a sequence, turn or height; how many scans were levelled'
     )
     return Table.of(rows, title=title, notes=_note(trials))
 
 
 def _note(trials: Sequence[Trial]) -> list[str]:
     """Say how sure the change by the estimate is, over all scans."""
-    told, _, found = _pooled(trials)
-    interval = interval_text(found.parts(), told.parts())
+    given, _, found = _pooled(trials)
+    interval = interval_text(found.parts(), given.parts())
     if interval is None:
         return []
-    clusters = f'{len(told.sequences)} groups of scans'
+    clusters = f'{len(given.sequences)} groups of scans'
     return [f'change by auto over all: {interval} [%] ({interval_note(clusters)})']
 
 

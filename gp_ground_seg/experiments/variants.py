@@ -73,7 +73,7 @@ def simulated_frames(
 
 
 def peer_of(sensor: str, peer: str = methods.PATCHWORKPP) -> PatchworkppMethod:
-    """Return one of `PEERS`, told where a simulated sensor is in its cloud and how high."""
+    """Return one of `PEERS`, with the place and the height of a simulated sensor."""
     model = SENSORS[sensor]
     return PEERS[peer](model.height, model.origin or (0.0, 0.0, 0.0))
 

@@ -44,7 +44,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(NODE_NAME, **options)
         self._library_log = ExitStack()
-        self._library_log.enter_context(log.told(self._pass_on))
+        self._library_log.enter_context(log.passed_to(self._pass_on))
         self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
         self._is_compiled = False
         self._tf: TfListener | None = None

@@ -26,7 +26,7 @@ DELIVERY_TIMEOUT = 5.0  # of the last clouds [s]; Fast DDS asks for lost ones ev
 class TrackedPublisher:
     """Publisher of serialised clouds that counts those not acknowledged by a reliable subscriber.
 
-    The middleware tells only whether *all* clouds sent so far are acknowledged. Others count
+    The middleware reports only whether *all* clouds sent so far are acknowledged. Others count
     as undelivered once newer ones take their place or their subscribers are gone.
     """
 

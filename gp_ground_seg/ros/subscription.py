@@ -21,17 +21,17 @@ from gp_ground_seg.ros.input import STEADY_CLOCK, cloud_profile, in_words
 INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
 LARGE_CLOUD = 500_000  # size up to which stock Fast DDS loses no best-effort cloud [bytes]
 OVERTAKING_TIME = 1.0  # longest wait of a best-effort cloud for reliable ones [s]
-NEAR = 1000  # holes in the numbers of several publishers up to which they are taken for losses
-MAX_IN_FLIGHT = 1000  # clouds that are remembered to know a second copy
+NEAR = 1000  # gap in the numbers of several publishers up to which it counts as a loss
+MAX_IN_FLIGHT = 1000  # clouds that are remembered, to recognise a second copy
 
 
 class SequenceGaps:
     """Counts messages that did not arrive, of publishers that number theirs 1, 2, 3 ... each.
 
     They were lost on the way, or overwritten in a full queue while the node was busy. rclpy does
-    not tell who has sent a message: a number is taken for the next of the publisher whose last one
-    is the nearest below. What that counts too little for one, it counts for another later. Where a
-    publisher has not been heard yet, a gap may be its first message and is not counted.
+    not say who has sent a message: a number counts as the next of the publisher whose last one is
+    the nearest below. What this misses for one publisher, it counts for another later. The first
+    message of a publisher may look like a gap, and is not counted.
     """
 
     def __init__(self) -> None:

@@ -210,7 +210,7 @@ def _compute(
     if other:
         line = f'a worker on {platform.node()} has {"; ".join(other)}: last digits may differ'
         notes.append((logging.WARNING, line))
-    with log.told(lambda *message: notes.append(message)):
+    with log.passed_to(lambda *message: notes.append(message)):
         return function(block, iter), notes
 
 
