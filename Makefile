@@ -97,4 +97,4 @@ generate: $(VENV)/.dev
 	$(BIN)/python docs/generate.py
 
 clean:
-	rm -rf $(VENV) docs/_build build install log .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build dist install log .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -20,13 +20,13 @@ SENSORS = {
 
 def generate_launch_description():
     """Return one group per sensor, so that the arguments of one are not those of the other."""
-    source = PythonLaunchDescriptionSource(str(NODE))
     return LaunchDescription(
         [
             GroupAction(
                 [
                     IncludeLaunchDescription(
-                        source, launch_arguments={'namespace': name, **arguments}.items()
+                        PythonLaunchDescriptionSource(str(NODE)),
+                        launch_arguments={'namespace': name, **arguments}.items(),
                     )
                 ]
             )

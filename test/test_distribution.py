@@ -88,6 +88,27 @@ def test_the_wheel_segments_a_scan(installed, tmp_path):
     assert installed in Path(where.stdout).parents
 
 
+@pytest.mark.parametrize(
+    ('words', 'complaint'),
+    [
+        ((), 'no ROS 2: source /opt/ros/jazzy/setup.bash'),
+        (('src',), 'src has no src: name the workspace, or start this in it'),
+        (('elsewhere',), 'elsewhere: no such folder'),
+    ],
+)
+def test_the_script_for_a_workspace_refuses_in_one_line(tmp_path, words, complaint):
+    (tmp_path / 'src').mkdir()
+    script = REPOSITORY / 'scripts' / 'setup_workspace.sh'
+    done = subprocess.run(
+        [script, *words], cwd=tmp_path, env={'PATH': os.environ['PATH']},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith('setup_workspace.sh: error: ') and line.endswith(complaint)
+    assert [path.name for path in tmp_path.rglob('*')] == ['src']
+
+
 def test_the_node_of_the_wheel_starts(installed, tmp_path):
     """With the transport for large clouds, which is a file beside it."""
     ros = pytest.importorskip('ros_helpers')

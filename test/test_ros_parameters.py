@@ -356,12 +356,12 @@ def test_a_start_with_the_defaults_is_one_line_about_them(capfd):
     assert len(log.splitlines()) <= 4
 
 
-def test_a_given_height_is_not_doubted_before_the_first_cloud(capfd):
-    with ros.bench(*ros.given({'sensor.height': 4.5})):
-        pass
-    log = capfd.readouterr().err
-    assert 'sensor.height: 4.5 m' in log
-    assert 'is sensor.height right' not in log
+def test_a_given_height_is_not_doubted_before_the_first_cloud(tmp_path):
+    words = *ros.IN_NAMESPACE, *ros.given({'sensor.height': 4.5})
+    with ros.Process(*words, folder=tmp_path) as node:
+        node.wait_until_settled()
+        assert 'sensor.height: 4.5 m' in node.log
+        assert 'is sensor.height right' not in node.log
 
 
 def test_parameters_are_set_from_another_process(b, monkeypatch):
