@@ -215,6 +215,7 @@ def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
     [
         (['a.npy', '-o', 'a.npy', '--force'], 'a.npy: is the input'),
         (['folder', '-o', 'folder', '--force'], 'is the input'),
+        (['a.npy', '-o', 'a.xyz'], 'a.xyz: must be a folder, or end in .label, .pcd'),
         (['a.npy', '-o', 'taken.pcd'], 'taken.pcd: exists already'),
         (['folder', '-o', 'x.pcd'], 'x.pcd: must be a folder'),
         (['a.npy', '-o', 'x.pcd', '--format', 'ply'], 'x.pcd: ends in .pcd, which is not ply'),

@@ -198,8 +198,11 @@ def _segment_scans(
     """Write the files of each scan; yield what each holds."""
     scans = options.list_clouds(arguments)
     is_file = target.suffix[1:] in FORMATS
-    if is_file and (scans.topic or Path(arguments.input).is_dir()):
+    has_several = scans.topic or Path(arguments.input).is_dir()
+    if is_file and has_several:
         raise DataError(f'{target}: must be a folder, {arguments.input} has several scans')
+    if target.suffix and not (is_file or has_several or target.is_dir()):
+        raise DataError(f'{target}: must be a folder, or end in .{", .".join(FORMATS)}')
     form = target.suffix[1:] if is_file else arguments.format
     if arguments.format not in (None, form):
         raise DataError(f'{target}: ends in {target.suffix}, which is not {arguments.format}')
