@@ -16,7 +16,7 @@ help:
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.json and its picture'
 	@echo 'make figures   every table and picture of README and docs anew (needs KITTI=PATH; ONLY=word for some)'
-	@echo 'make docs      the documentation as HTML, in docs/_build/html'
+	@echo 'make docs      the documentation as HTML, in build/docs'
 	@echo 'make node-bench  latency and losses of the node over DDS'
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make lint      ruff, mypy and codespell'
@@ -69,8 +69,8 @@ figures: $(VENV)/.dev
 	$(BIN)/python docs/figures.py $(KITTI) $(ONLY)
 
 docs: $(VENV)/.docs
-	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs docs/_build/html
-	@echo 'docs/_build/html/index.html is the first page'
+	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/docs
+	@echo 'build/docs/index.html is the first page'
 
 node-bench: $(VENV)/.ros
 	$(BIN)/python test/node_bench.py $(KITTI)

@@ -26,6 +26,7 @@ TEST = ['hypothesis>=6.100', 'pytest>=7.4']
 DOCS = ['myst-parser>=3', 'sphinx>=7.2', 'sphinx-rtd-theme>=2']
 DEV = [
     *TEST,
+    *FORMATS,
     *TUNE,
     *SCALE,
     *VIEW,
@@ -39,8 +40,10 @@ DEV = [
     'flake8-quotes',
     'moto[server]>=5.0',
     'mypy>=1.10,<2.5',
+    'plyfile>=1.0',
     'pyarrow>=14',
     'pypatchworkpp>=1.4',
+    'pypcd4>=1.1',
     'ruff>=0.6,<0.18',
     's3fs>=2024.2',
     'scikit-learn>=1.4',

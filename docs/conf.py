@@ -22,7 +22,7 @@ html_theme_options = {'navigation_depth': 3, 'style_external_links': True}
 html_static_path = ['_static']
 html_css_files = ['wide.css']
 html_show_sourcelink = False
-exclude_patterns = ['_build', 'scans']
+exclude_patterns = ['scans']
 myst_heading_anchors = 4
 autodoc_typehints = 'none'  # docstrings have types with shapes and units
 # ROS, where it is not installed: the page names functions that import its messages.

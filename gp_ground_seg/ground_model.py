@@ -31,11 +31,11 @@ class GroundModel:
         Height of the ground over the sensor at the knots of each segment [m], so mostly
         negative; NaN where there is no model. Segments go counter-clockwise from -x.
     std : (M, K) float64
-        Its standard deviation [m], as that of ``Segmentation.ground_std``; NaN where there is
-        no model.
+        Standard deviation of the height [m], as in ``Segmentation.ground_std``; NaN where there
+        is no model.
     length_scale : (M, K) float64
-        Over how far the ground is smooth there [m]; NaN in segments without a ground
-        candidate of their own.
+        Distance over which the height of the ground is similar [m]; NaN in segments without
+        a ground candidate of their own.
     roll, pitch : float
         Tilt of the frame of the scan: angles that make it level [rad].
     """

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import zipfile
 
-import lzf
 import numpy as np
 import pytest
 from bag_samples import scan
@@ -24,6 +23,7 @@ from gp_ground_seg.data.scan_layout import ScanLayout
 from gp_ground_seg.errors import DataError
 
 laspy = pytest.importorskip('laspy', reason='needs the extra formats')
+lzf = pytest.importorskip('lzf', reason='needs the extra formats')
 
 RESULTS = ('height', 'ground_z', 'ground_std', 'p_ground')
 EXACT = [suffix for suffix in WRITABLE if suffix not in ('.las', '.laz')]

@@ -5,11 +5,12 @@ import re
 
 import numpy as np
 import pytest
+import yaml
 from cli_runner import run
 from conftest import REPOSITORY, find_kitti, load_script
 from matplotlib.image import imread
 
-from gp_ground_seg import GroundSegmenter
+from gp_ground_seg import GroundSegmenter, __version__
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.main import COMMANDS
 from gp_ground_seg.evaluation.metrics import GROUNDGRID
@@ -212,6 +213,12 @@ def test_links_that_lead_nowhere():
     bad = ['docs/no.md', 'docs/ros.md#no', '#no', 'https://arxiv', 'http://arxiv.org/']
     text = ' '.join(f'[a]({target})' for target in (*good, *bad))
     assert list(broken_links('README.md', text)) == bad
+
+
+def test_the_citation_is_of_this_version():
+    citation = yaml.safe_load((REPOSITORY / 'CITATION.cff').read_text(encoding='utf-8'))
+    assert citation['version'] == __version__
+    assert 'arXiv:2112.05847' in str(citation['preferred-citation']['identifiers'])
 
 
 def test_the_page_of_the_commands_has_all_of_them():

@@ -51,11 +51,11 @@ Offered reliably: a reliable subscriber gets every cloud. Waits for a subscriber
 before it starts. Only PointCloud2 topics are played; for TF and the rest use
 `ros2 bag play`.
 
-In the end one line tells
+At the end one line has
   late         clouds sent more than 20 ms after their time
   undelivered  clouds without a subscriber, or not acknowledged by every reliable one.
-               A subscriber too slow to process what its middleware acknowledged
-               loses it all the same: that is in its own /diagnostics.
+               A slow subscriber may lose clouds that its middleware acknowledged:
+               its own /diagnostics have their number.
 """
 PLAY_EXAMPLES = """\
   gp-ground-seg play drive.mcap

@@ -23,11 +23,10 @@ from gp_ground_seg.jit import HAVE_NUMBA
 from gp_ground_seg.parameters.config import Config
 
 DESCRIPTION = """\
-Time the segmentation on your data: theta fixed and learned in every frame, on one
-thread and on all, by stage; with pypatchworkpp installed beside Patchwork++ (or --peer) on the
-same frames. Each time is taken right before or after that of the peer on that frame, so that
-the ratio of the two holds where the speed of the machine drifts. Reading is left out.
-Let nothing else run meanwhile.
+Measure the time of the segmentation on your data, by stage: with theta fixed and learned in
+every frame, on one thread and on all. If pypatchworkpp is installed, Patchwork++ (or --peer)
+runs on each frame just before or after ours, so the ratio of the two times holds although
+the speed of the machine drifts. Reading is left out. Run nothing else meanwhile.
 
 DATA is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
 """
@@ -51,11 +50,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('data', 'scans or a bag', {'metavar': 'DATA', 'nargs': '?'}),
         ('--frames', 'frames, in runs of ten spread over the data (default: %(default)s)',
          {**options.NUMBER, 'default': 60}),
-        ('--passes', 'go over the frames so often', {**options.NUMBER, 'default': 1}),
+        ('--passes', 'measure all frames N times', {**options.NUMBER, 'default': 1}),
         ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
         ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
-        ('--peer', 'the method beside ours (default: %(default)s)',
+        ('--peer', 'method to compare with (default: %(default)s)',
          {'choices': PEERS, 'default': PATCHWORKPP}),
         ('--numpy', 'time learning without compiled code as well', options.FLAG),
         *options.SCAN_LAYOUT,

@@ -60,10 +60,10 @@ N_TRIALS, TRIAL_TIMEOUT = 5, 60.0
 """Scans sent one by one to see that, and the longest time one may take [s]."""
 
 DESCRIPTION = """\
-See it work, with no data at hand: simulate a short drive along a street, write it
-as a bag, start the node in a second process, send the scans of the bag to it through ROS,
-receive both clouds, check that every point came back exactly once, score the labels against
-the truth, and draw one scan from above. With --kitti the same on real, labelled scans.
+Show the node at work without data: simulate a short drive along a street, write it as a bag,
+start the node in a second process, send the scans of the bag to it through ROS, receive both
+clouds, check that every point came back exactly once, score the labels against the truth, and
+draw one scan from above. With --kitti it does the same on real, labelled scans.
 
 Nothing leaves this machine: the demo has a ROS domain of its own.
 """
@@ -75,8 +75,8 @@ EXAMPLES = f"""\
 Writes into the output folder: {BAG} (what was played), {PICTURE} (ground,
 obstacles and the errors of one scan), {LOG} (what the node said).
 
-exit code: 0, 1 if scans were lost or came back otherwise than they should, 2 for an
-error, 130 when interrupted
+exit code: 0, 1 if scans were lost or came back wrong, 2 for an error, 130 when
+interrupted
 """
 
 

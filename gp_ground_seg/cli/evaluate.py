@@ -30,18 +30,18 @@ from gp_ground_seg.frame import Label
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in both conventions of the field: precision,
-recall, F1, accuracy, IoU, time per frame; and count what is lost on vehicles, persons
-and cyclists: the share of their returns from 0.3 m above the local ground that is called
-ground, and the objects of which more than half of these returns are. Objects are the
-instances of the labels (their upper 16 bits), or given as boxes, a file for each scan:
+recall, F1, accuracy, IoU, time per frame. Count vehicles, persons and cyclists that are
+lost: the share of their returns from 0.3 m above the local ground that is labelled ground,
+and the objects with more than half of these returns labelled ground. Objects are the
+instances of the labels (their upper 16 bits), or boxes, with a file for each scan:
 
   000007.npz   box_class (K,), box_center (K, 3), box_size (K, 3), box_rotation (K, 3, 3):
                rows of the matrix are the axes of the box in the frame of the cloud
 
-Without labels only objects are counted, from the bottom of their boxes.
+Without labels only objects are counted, with heights from the bottom of their boxes.
 
-Patchwork++ or Patchwork (--peer) has its published parameters; a height and a place of the
-sensor that are given (sensor.height, sensor.origin_x, ...) are given to it too.
+Patchwork++ or Patchwork (--peer) has its published parameters. If you give the height or the
+place of the sensor (sensor.height, sensor.origin_x, ...), it gets them too.
 """
 EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
@@ -55,12 +55,12 @@ EXAMPLES = """\
   gp-ground-seg evaluate a.bin --boxes a.npz
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). With --workers
-the tables are the same, but for the times: frames are computed beside one another.
+the scores are the same; the times are not, because frames are computed at the same time.
 """
 
 ROOT = ('root', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'})
 OF_FRAMES = (
-    ('--sequences', 'sequences, as in 00,08 (default: all there are)', {'metavar': 'LIST'}),
+    ('--sequences', 'sequences, as in 00,08 (default: all)', {'metavar': 'LIST'}),
     ('--frame-step', 'every Nth frame of a sequence only', options.NUMBER),
     *options.SCAN_LAYOUT,
 )

@@ -50,7 +50,7 @@ EVERY_SENSOR = _some_of('--sensors', SENSORS, SURVEYED)
 EVERY_MOUNT = _some_of('--sensors', SENSORS, ['all'])
 NO_PEER = ('--no-peer', 'leave the peer out', options.FLAG)
 PEER = (
-    '--peer', 'the method beside ours (default: %(default)s)',
+    '--peer', 'method to compare with (default: %(default)s)',
     {'choices': PEERS, 'default': PATCHWORKPP},
 )  # fmt: skip
 
@@ -193,7 +193,7 @@ rubble, by exact labels and heights.
     ),
     'departures': Experiment(
         """\
-Undo one departure from the paper after the other. They are the rows of
+Switch off one departure from the paper after the other. They are the rows of
 gp_ground_seg/experiments/ablation.py; `compare` measures any other change.
 """,
         (ROOT, *OF_FRAMES),

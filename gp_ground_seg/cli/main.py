@@ -25,7 +25,7 @@ ROS_ARGS = '--ros-args'
 COMMANDS = {
     'segment': ('segment', 'label scans, or split the clouds of a bag'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
-    'compare': ('compare', 'two configurations on the same frames'),
+    'compare': ('compare', 'compare two configurations on the same frames'),
     'optimise': ('optimise', 'search parameters on your labelled frames'),
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
@@ -35,15 +35,15 @@ COMMANDS = {
     'pose': ('pose', 'estimate height and tilt of the sensor from scans'),
     'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),
     'play': ('bags', "publish a bag's clouds as they were recorded"),
-    'demo': ('demo', 'see it work, no data needed'),
+    'demo': ('demo', 'show the node at work, no data needed'),
     'config': ('config', 'write, check and compare parameter files'),
     'node': ('node', 'run the ROS 2 node'),
-    'warm-up': ('node', 'compile beforehand what the first start would compile'),
+    'warm-up': ('node', 'compile the code before the first start'),
 }
 
 EXAMPLES = """\
 examples:
-  gp-ground-seg demo                             see it work, no data needed
+  gp-ground-seg demo                             show the node at work, no data needed
   gp-ground-seg segment drive.mcap -o out.mcap   ground and obstacle clouds of a bag
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud

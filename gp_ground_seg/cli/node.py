@@ -17,7 +17,7 @@ NODE_EXAMPLES = """\
   gp-ground-seg node --ros-args -p label.ground_tolerance:=0.15 --params-file my.yaml
 """
 WARM_UP_DESCRIPTION = """\
-Compile beforehand what a robot, or an image for one, would compile at its first start: the
+Compile what the node would compile at its first start, for a robot or an image of one. The
 node then has its compiled code after a second instead of a minute. The code is kept on disk,
 for this version, this processor and this user.
 """

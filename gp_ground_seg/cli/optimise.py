@@ -28,14 +28,14 @@ from gp_ground_seg.plotting.search import plot_search
 from gp_ground_seg.plotting.style import new_figure
 
 DESCRIPTION = f"""\
-Search parameters on your labelled frames (Optuna, TPE) by IoU in the GroundGrid convention, from
-those given on, and compare what is best with those given on frames that the search has not seen:
-every second sequence, or the second half of a single one. Where the interval of the difference
-holds 0 there is nothing to win, and the parameters given are as good.
+Search parameters on your labelled frames (Optuna, TPE) by IoU in the GroundGrid convention. The
+search begins with the given parameters. The best ones are compared with the given ones on frames
+that the search has not seen: every second sequence, or the second half of a single one. If the
+interval of the difference holds 0 there is nothing to win: the given parameters are as good.
 
-Each parameter is searched in the whole range that is accepted; by default
+Each parameter is searched in its whole accepted range; by default
 {', '.join(optimise.DEFAULT_NAMES)}.
-A search with --journal that was interrupted goes on when it is started again in the same way.
+Start a search with --journal again in the same way, and it continues after an interruption.
 """
 EXAMPLES = """\
   gp-ground-seg optimise ROOT --trials 100 -o best.yaml --picture search.png
@@ -57,9 +57,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {'metavar': 'LIST', 'default': ','.join(optimise.DEFAULT_NAMES)}),
         ('--trials', 'try so many sets of values (default: %(default)s)',
          {**options.NUMBER, 'default': 50}),
-        ('--seed', 'of what is tried (default: %(default)s)',
+        ('--seed', 'of the search (default: %(default)s)',
          {'metavar': 'N', 'type': partial(options.positive, least=0), 'default': 0}),
-        ('--journal', 'keep every trial in this file, and go on with what is in it', file),
+        ('--journal', 'keep every trial in this file, and continue a search that is in it', file),
         ('-o --output', 'write the values that differ to this parameter file (YAML)', file),
         ('--picture', 'draw the trials: IoU over each parameter (PNG)', file),
         options.MARKDOWN,

@@ -28,7 +28,7 @@ from gp_ground_seg.scale.cluster import Runner, open_runner
 
 DEFAULT_PRESET = 'default'
 FLAG = {'action': 'store_true'}
-FORCE = ('--force', 'replace output that exists; take scans that look wrong', FLAG)
+FORCE = ('--force', 'replace existing output; read files that do not look like scans', FLAG)
 MARKDOWN = ('--markdown', 'print the tables as Markdown', FLAG)
 QUIET = ('--quiet', 'no progress bar, no notes', FLAG)
 TO_JSON = ('--json', 'write every number to this file as well', {'metavar': 'FILE'})

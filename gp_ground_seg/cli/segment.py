@@ -29,7 +29,7 @@ DESCRIPTION = """\
 Split scans into ground and obstacles.
 
 INPUT is one of:
-  scan.bin             a scan as KITTI's: float32 x, y, z, intensity; --columns, --dtype: another
+  scan.bin             float32 x, y, z, intensity, as in KITTI; --columns and --dtype for others
   .pcd .ply .las .laz .npy .npz, and .pcd.bin of nuScenes
   folder               of such files, or a sequence with velodyne/ in it
   drive.bag            a ROS 1 bag
@@ -37,28 +37,27 @@ INPUT is one of:
   folder               of a rosbag2 (with metadata.yaml)
   KITTI_ROOT           with sequences/00/velodyne/ and so on in it; several bags; s3://...
 
-Scans .bin give .label files in SemanticKITTI's form, one uint32 per point in input
-order: 40 (road) = ground, 99 (other-object) = obstacle, 0 (unlabelled) = unknown,
-which are the points that are not finite. With --raw: 1, 2 and 0.
+The output of a .bin scan is a .label file as in SemanticKITTI, one uint32 per point in
+the order of the input: 40 (road) = ground, 99 (other-object) = obstacle, 0 (unlabelled) =
+unknown (the point is not finite). With --raw: 1, 2 and 0.
 
-Other formats give their own, the name of OUT or --format another: every field of the
-input, and label (0 unknown, 1 ground, 2 obstacle; LAS: classification 2 ground),
-height, ground_z, ground_std [m], p_ground (docs/datasets.md).
+The output of other formats has the same format; the name of OUT or --format chooses another
+one. It has every field of the input, and label (0 unknown, 1 ground, 2 obstacle; LAS:
+classification 2 ground), height, ground_z, ground_std [m], p_ground (docs/datasets.md).
 
-A bag gives a rosbag2 with all messages of the input as they are, and after each
-point cloud its ground and its obstacles: every field of every point bit for bit,
-the same header, the same recorded time. Unknown points are in neither.
-Messages of ROS 1 are converted to ROS 2.
+The output of a bag is a rosbag2 with all messages of the input, and after each point cloud
+its ground and its obstacles: every field of every point bit for bit, the same header, the
+same recorded time. Unknown points are in neither. Messages of ROS 1 are converted to ROS 2.
 
-Scans whose numbers can be none, as of another layout or in millimetres, are refused
-with what they look like; with --force they are taken.
+A file whose numbers do not look like a scan (another layout, millimetres) is refused, with
+what it looks like. --force reads it anyway.
 
-Nothing is overwritten without --force. Output is written under a hidden name
-(.NAME.partial-...) and takes its name when it is complete.
+Nothing is overwritten without --force. Output has a hidden name (.NAME.partial-...) until
+it is complete.
 
-Of a KITTI_ROOT, several bags, a URL, and with --workers or --resume each file appears
-when it is complete, and OUT/manifest.jsonl has a line for each block of files; --resume
-leaves out what is in it. Labels are the same (docs/datasets.md).
+With a KITTI_ROOT, several bags, a URL, --workers or --resume, each file appears when it is
+complete, and OUT/manifest.jsonl has a line for each block of files. --resume skips these
+files. The labels are the same (docs/datasets.md).
 """
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label

@@ -33,7 +33,7 @@ IoU and objects lost (with labels, as SemanticKITTI has them), theta and latency
 INPUT is what `segment` takes. --web serves to this machine only, until Ctrl-C.
 """
 VIEW_EXAMPLES = """\
-  gp-ground-seg view KITTI_ROOT/sequences/00           scrub through a sequence
+  gp-ground-seg view KITTI_ROOT/sequences/00           move through a sequence
   gp-ground-seg view drive.mcap --frame-step 5 --web   every fifth cloud, in the browser
   gp-ground-seg view drive.mcap --save drive.rrd       for later: rerun drive.rrd
   gp-ground-seg view 000000.bin --labels 000000.label --html scan.html
@@ -41,9 +41,10 @@ VIEW_EXAMPLES = """\
 needs the packages rerun-sdk, and viser for --html (docs/install.md)
 """
 TUNE = """\
-A scan in the browser with sliders for its parameters: labels follow at once, those that
-change in colour; with labels IoU and objects lost too. Buttons write the parameters as
-YAML, and, where ROS runs, set them in a running node. For this machine only, until Ctrl-C.
+Show a scan in the browser, with sliders for the parameters. Labels follow at once, and points
+that change their class have a colour. With labels of SemanticKITTI, IoU and objects lost are
+shown too. Buttons write the parameters as YAML and, with ROS, set them in a running node. The
+page is served to this machine only. Ctrl-C stops it.
 """
 TUNE_EXAMPLES = """\
   gp-ground-seg tune 000000.bin

@@ -101,8 +101,8 @@ def list_inputs(
         A file of a known format; a folder of such files, of one or several formats; a sequence
         of SemanticKITTI, a raw drive of KITTI or KITTI-360; a bag.
     layout : ScanLayout
-        Of ``.bin`` files, and what to do with clouds that can be no scan. nuScenes'
-        ``.pcd.bin``, which has five columns, is known by its name.
+        Layout of ``.bin`` files, and whether to refuse clouds that do not look like a scan.
+        ``.pcd.bin`` of nuScenes has five columns, and is recognised by its name.
     topic : str or None
         PointCloud2 topic of a bag, by default the only one.
     """

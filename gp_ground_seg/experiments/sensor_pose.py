@@ -144,10 +144,7 @@ def height_table(trials: Sequence[Trial]) -> Table:
                 (Column('high', '+.2f'), max(errors)),
                 (Column('tilt', '.1f'), max(_lean(pose) for pose, _ in poses)),
                 (Column('levelled', 'd'), _n_levelled(found)),
-                (
-                    Column('unknown', 'd', 'silent'),
-                    sum(not pose.height_estimated for pose, _ in poses),
-                ),
+                (Column('unknown', 'd', 'silent'), n_unknown),
             ]
         )
     title = (

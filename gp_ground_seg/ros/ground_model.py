@@ -61,8 +61,8 @@ def ground_model_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointC
 def read_ground_model(cloud: PointCloud2) -> GroundModel:
     """Return the model in a cloud of ``~/ground_model``; `GroundModel.at` gives heights.
 
-    `cloud` is as published: rclpy's message, or one of the same attributes, as of rosbags. Raises
-    a PointCloudError if a field is missing, or the points are not such a grid (any more).
+    `cloud` is a message of rclpy, or one with the same attributes, such as that of rosbags. Raises
+    a PointCloudError if a field is missing, or if the points are not such a grid.
     """
     columns = read_columns(cloud, FIELDS)
     if columns['x'].size == 0:
