@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Protocol
 
-from gp_ground_seg.errors import MissingDependencyError
+from gp_ground_seg.errors import MissingDependencyError, install_hint
 from gp_ground_seg.frame import (
     BoolArray,
     Candidates,
@@ -105,17 +105,13 @@ def choose_backend(wanted: str) -> str:
     MissingDependencyError
         If numba is asked for by name and not installed.
     """
-    global _warned_slow
     if wanted == 'numba' and not HAVE_NUMBA:
         raise MissingDependencyError(
-            'runtime.backend = numba, but numba is not installed: pip install numba, '
+            f'runtime.backend = numba, but numba is not installed: {install_hint("numba")}; '
             'or set runtime.backend to auto'
         )
-    if wanted == 'auto' and not HAVE_NUMBA and not _warned_slow:
-        _warned_slow = True
-        _LOGGER.warning(
-            'numba is not installed: using numpy, several times slower (pip install numba)'
-        )
+    if wanted == 'auto' and not HAVE_NUMBA:
+        _warn_slow('is not installed', install_hint('numba'))
     return 'numba' if HAVE_NUMBA and wanted != 'numpy' else 'numpy'
 
 
@@ -126,9 +122,17 @@ def make_backend(runtime: RuntimeConfig) -> Backend:
     try:
         # Imported only where it is used, as it imports numba.
         from gp_ground_seg.compiled.backend import NumbaBackend
-    except ImportError as error:  # a numba that does not fit this numpy, say
+    except Exception as error:  # of many types: a numba that does not fit this numpy, or coverage
         if runtime.backend == 'numba':
             raise MissingDependencyError(f'runtime.backend = numba: {error}') from error
-        _LOGGER.warning('numba cannot be imported: using numpy, several times slower (%s)', error)
+        _warn_slow('cannot be imported', error)
         return NumpyBackend()
     return NumbaBackend(runtime.n_threads)
+
+
+def _warn_slow(reason: str, more: object) -> None:
+    """Say once that numba is missing."""
+    global _warned_slow
+    if not _warned_slow:
+        _warned_slow = True
+        _LOGGER.warning('numba %s: using numpy, several times slower (%s)', reason, more)

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from conftest import hilly_scan
+from conftest import REPOSITORY, hilly_scan
 
 from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.jit import HAVE_NUMBA
@@ -49,7 +49,18 @@ def test_without_numba_labels_are_the_same_and_one_line_says_so(tmp_path):
     assert lines[0] == 'numpy'
     assert errors.count('numba is not installed') == 1
     # By name it is an error.
-    assert 'pip install numba' in lines[1]
+    assert '-m pip install numba; or set runtime.backend to auto' in lines[1]
+
+
+def test_a_numba_that_cannot_be_imported_is_one_line(tmp_path):
+    """As beside python3-coverage of Ubuntu 24.04: numba raises AttributeError."""
+    (tmp_path / 'numba').mkdir()
+    (tmp_path / 'numba' / '__init__.py').write_text("raise AttributeError('no coverage.types')")
+    lines, errors = run(tmp_path, 'open', PYTHONPATH=f'{tmp_path}{os.pathsep}{REPOSITORY}')
+    assert lines == ['numpy']
+    assert errors == (
+        'numba cannot be imported: using numpy, several times slower (no coverage.types)\n'
+    )
 
 
 @pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
