@@ -236,7 +236,7 @@ def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, 
     assert run(*command, '--resume') == 0  # nothing was begun yet
     capsys.readouterr()
     assert run(*command) == 2
-    assert 'exists already; --resume goes on, --force begins anew' in error_line(capsys)
+    assert 'exists already; --resume continues, --force starts anew' in error_line(capsys)
     other = ['--set', 'label.ground_tolerance=0.2']
     before = labels(tmp_path / 'out')
     assert run(*command, '--resume', *other) == 2

@@ -23,10 +23,10 @@ BAG_SUFFIXES = ('.bag', *STORAGE_OF_SUFFIX)
 _FOLDER_SUFFIXES = ('.mcap', '.db3', '.db3-shm', '.db3-wal', '.zstd', '.zst')
 # Part of an error of rosbags -> a hint at what to do.
 _NEXT_STEP = {
-    'end magic': 'truncated, or still being recorded; `mcap recover` saves what is there',
-    'not indexed': 'truncated, or still being recorded; `rosbag reindex` saves what is there',
-    'index looks damaged': 'truncated? `rosbag reindex` saves what is there',
-    'malformed': 'truncated or overwritten? `sqlite3 .recover` saves what is there',
+    'end magic': 'truncated, or still being recorded; `mcap recover` saves the readable part',
+    'not indexed': 'truncated, or still being recorded; `rosbag reindex` saves the readable part',
+    'index looks damaged': 'truncated? `rosbag reindex` saves the readable part',
+    'malformed': 'truncated or overwritten? `sqlite3 .recover` saves the readable part',
 }
 
 

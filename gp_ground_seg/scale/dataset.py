@@ -140,7 +140,7 @@ class Manifest:
         if (existing or self._path.exists()) and not force:
             name = existing[0] if existing else MANIFEST
             raise DataError(
-                f'{folder / name}: exists already; --resume goes on, --force begins anew'
+                f'{folder / name}: exists already; --resume continues, --force starts anew'
             )
         write_file(self._path, b'')
 
