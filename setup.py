@@ -48,6 +48,7 @@ DEV = [
     's3fs>=2024.2',
     'scikit-learn>=1.4',
     'setuptools<80',  # colcon's ament_python build needs `setup.py develop` and `install`
+    'twine>=5',
     'types-PyYAML',
     'types-tqdm',
 ]

@@ -77,6 +77,14 @@ def test_the_files_of_both(built):
     assert {f'{share}/{name}' for name in (*SHARED, 'package.xml')} <= names
 
 
+def test_what_pypi_would_object_to(built):
+    pytest.importorskip('twine', reason='twine is not installed')
+    files = [*built.glob('*.whl'), *built.glob('*.tar.gz')]
+    done = python('-m', 'twine', 'check', '--strict', *files, folder=built)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count('PASSED') == 2
+
+
 def test_the_wheel_segments_a_scan(installed, tmp_path):
     words = '-m', 'gp_ground_seg', 'plot', 'scan', '--simulate', 'flat', '-o', 'scan.png'
     found = {'PYTHONPATH': str(installed), 'NUMBA_DISABLE_JIT': '1'}
