@@ -374,6 +374,6 @@ def test_parameters_are_set_from_another_process(b, monkeypatch):
         with pytest.raises(DataError, match=r'label\.ground_tolerance = 9\.0: must be a number'):
             set_remotely(name, {'label.ground_tolerance': 9.0})
         assert b.node.config == expected
-        monkeypatch.setattr(parameters, 'REMOTE_TIMEOUT', 0.5)
+        monkeypatch.setattr(parameters, 'REMOTE_TIMEOUT', 3.0)  # to discover our node
         with pytest.raises(DataError, match=f'/nobody: no such node.*{name}'):
             set_remotely('/nobody', {'label.ground_tolerance': 0.2})
