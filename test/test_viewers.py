@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tune_bench
 from bag_samples import write_ros2_bag
 from cli_runner import error_line, run, until_ctrl_c
 
@@ -234,6 +235,14 @@ def free_ports():
             except OSError:
                 continue
             return port
+
+
+def test_the_measure_of_how_fast_labels_follow(sequence, monkeypatch, capsys):
+    pytest.importorskip('viser', reason='viser is not installed')
+    monkeypatch.setattr(tune_bench, 'N_MOVES', 2)
+    monkeypatch.setattr(sys, 'argv', ['tune_bench.py', str(sequence)])
+    tune_bench.main()
+    assert ' points, 2 moves: ' in capsys.readouterr().out
 
 
 def test_the_web_viewer_is_served_here_only_and_ends_with_ctrl_c(sequence):

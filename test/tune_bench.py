@@ -22,7 +22,7 @@ N_MOVES = 100
 def main():
     """Move the slider, and print how long that took."""
     inputs, seconds = list_inputs(Path(sys.argv[1])), []
-    with open_server(0, 'tune') as server:
+    with open_server(0) as server:
         tuner = Tuner(server, inputs, Config(), [NAME])
         for k in range(N_MOVES + 1):
             start = time.perf_counter()
