@@ -56,6 +56,8 @@ GOOD = {
     'mostly zero': (lambda p: missing(p, 0.9, 0.0), KITTI),
     'few points': (lambda p: p[:: len(p) // 450], KITTI),
     'no point': (lambda p: p[:0], KITTI),
+    'one point': (lambda p: np.repeat(p[:1], len(p), axis=0), KITTI),
+    'zero, eight': (lambda p: with_columns(missing(p, 0.9, 0.0), 8), ScanLayout(8)),
     'no intensity': (lambda p: p * np.float32([1, 1, 1, 0]), KITTI),
     'x y z': (lambda p: p[:, :3], ScanLayout(3)),
     'ring': (lambda p: with_columns(p, 5), ScanLayout(5)),
@@ -66,6 +68,8 @@ WRONG = {
     'ring': (lambda p: with_columns(p, 5), KITTI, 'repeat every 5, not every 4', '--columns 5 '),
     'six': (lambda p: with_columns(p, 6), KITTI, 'repeat every 6, not', '--columns 6 '),
     'eight': (lambda p: with_columns(p, 8), KITTI, 'repeat every 8, not', '--columns 8 '),
+    'twice in one': (lambda p: p, ScanLayout(8), 'repeat every 4, not every 8', '--columns 4 '),
+    'x y': (lambda p: p[:, :2], KITTI, 'repeat every 2, not every 4: x and y without z', ''),
     'doubles': (lambda p: p.astype('<f8'), KITTI, '% of the coordinates', '--dtype float64 '),
     'rounded doubles': (
         lambda p: np.round(256.0 * p.astype('<f8')) / 256.0, KITTI,

@@ -23,10 +23,11 @@ _MIN_POINTS = 100  # fewer are not judged
 _N_JUDGED = 20_000  # numbers looked at in a larger file
 _LEAST, _LARGEST = 1e-6, 1e6  # of a coordinate that can be measured [m]
 _MAX_UNMEASURABLE = 0.4  # share of them; z may be zero in a whole scan
-_COLUMNS = range(MIN_COLUMNS, 9)  # numbers of columns that are tried
+_COLUMNS = range(2, 9)  # numbers of columns that are tried; of two, a plane has x and y
 _BLOCK = 840  # numbers: a whole number of points for each of these
 # Spread within columns, over that in the layout given, from which on another number of columns
-# fits better; that of a multiple is less by itself where lasers that look elsewhere alternate.
+# fits better; that of a multiple is less by itself where lasers that look elsewhere alternate, and
+# that of a divisor is never less: it is the same where the columns repeat within a point.
 _BETTER, _BETTER_MULTIPLE, _SAME = 0.95, 0.65, 1.03
 _BAGS = (b'#ROSBAG', b'\x89MCAP', b'SQLite format 3')
 
@@ -182,7 +183,15 @@ def _column_objection(points: _Numbers) -> str:
         return ''
     worth = {n: _BETTER if n % own else _BETTER_MULTIPLE for n in spreads if own % n}
     better = {n: spreads[n] for n in worth if spreads[n] < worth[n] * spreads[own]}
-    return f'its numbers repeat every {_fewest(better)}, not every {own}' if better else ''
+    # Of many points without a return, at the origin, all columns are alike.
+    returned = _spreads(points[np.nan_to_num(points[:, :3]).any(axis=1)].reshape(-1))
+    same = {n: returned[n] for n in returned if own % n == 0 and n < own}
+    better |= {n: same[n] for n in same if 0.0 < same[n] <= _SAME * returned[own]}
+    if not better:
+        return ''
+    n_columns = _fewest(better)
+    words = ': x and y without z' if n_columns < MIN_COLUMNS else ''
+    return f'its numbers repeat every {n_columns}, not every {own}{words}'
 
 
 def _fewest(spreads: dict[int, float]) -> int:
@@ -196,6 +205,7 @@ def _likely_layout(data: bytes, layout: ScanLayout) -> ScanLayout | None:
     for dtype in sorted(DTYPES, key=lambda name: name != layout.dtype):
         numbers = ScanLayout(1, dtype).view(data).reshape(-1)
         spreads = _spreads(numbers)
+        spreads.pop(2, None)  # no layout has so few
         other = ScanLayout(_fewest(spreads) if spreads else layout.columns, dtype)
         is_whole = len(data) % other.bytes_per_point == 0
         is_other = str(other) != str(layout)
