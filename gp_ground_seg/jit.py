@@ -53,8 +53,10 @@ def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
     Parameters
     ----------
     fastmath : bool
-        Let sums be taken in any order, so that they use vector instructions. The compiler
-        fixes the order, not the number of threads; NaN and infinity keep their meaning.
+        Let sums be taken in any order, so that they use vector instructions; NaN and infinity
+        keep their meaning. Only for functions that write to no array: where arrays that are
+        written lie close to those that are read, the program leaves the vector instructions
+        aside, and the sums would depend on where the arrays happen to be.
     entry : bool
         Whether it is called from Python: its code, with all that it calls, is kept on disk. It
         returns numbers, or nothing: numba runs Python to return arrays and named tuples, where

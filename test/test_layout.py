@@ -160,12 +160,24 @@ def find_returned_arrays(trees):
                     yield f'{path}: {node.name} returns {ast.unparse(node.returns)}'
 
 
+def find_reordered_sums(trees):
+    """Functions that are compiled to add in any order, and that write to arrays: see `jit`."""
+    for path, tree in trees.items():
+        for node in ast.walk(tree):
+            decorators = getattr(node, 'decorator_list', [])
+            if any('fastmath=True' in ast.unparse(decorator) for decorator in decorators):
+                written = [n for n in ast.walk(node) if isinstance(n, ast.Subscript)]
+                if any(isinstance(n.ctx, ast.Store) for n in written):
+                    yield f'{path}: {node.name} adds in any order, and writes to an array'
+
+
 CHECKS = (
     find_layer_violations,
     find_foreign_violations,
     find_cycles,
     find_long_signatures,
     find_returned_arrays,
+    find_reordered_sums,
 )
 
 
@@ -206,6 +218,7 @@ def test_files_are_of_a_size_worth_opening(trees):
         (find_long_signatures, 'gp/a.py', 'def f(a, b, c, d, e, /, f, g, *, h, i): ...'),
         (find_long_signatures, 'compiled/a.py', f'def f({", ".join("abcdefghijklm")}): ...'),
         (find_returned_arrays, 'gp/a.py', '@jit(entry=True)\ndef f() -> tuple[int, Lines]: ...'),
+        (find_reordered_sums, 'gp/a.py', '@jit(fastmath=True)\ndef f(x, y): x[0] += y[0]'),
     ],
 )
 def test_a_violation_is_found_and_only_that(find, path, source):
@@ -214,7 +227,7 @@ def test_a_violation_is_found_and_only_that(find, path, source):
         'gp/b.py': 'from gp_ground_seg.frame import Label\ndef f(a, b, c, d, e, f, g, h): ...',
         'gp/c.py': 'def f(self, a, b, c, d, e, f, g, h): import gp_ground_seg.gp.c',
         'compiled/b.py': 'import numba\nfrom gp_ground_seg.gp import b\n'
-        '@jit(entry=True)\ndef f() -> tuple[int, float]: ...',
+        '@jit(entry=True, fastmath=True)\ndef f(x) -> tuple[int, float]: return x[0], x[1]',
         'plotting/b.py': 'def f():\n    from matplotlib.figure import Figure',
         'ros/b.py': 'import rclpy',
     }

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 import reference
 
+from gp_ground_seg.backend import make_backend
 from gp_ground_seg.frame import Inliers
+from gp_ground_seg.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
+from gp_ground_seg.parameters.config import RuntimeConfig
 
 TYPICAL = np.log([0.3, 0.05, 0.9, 3.0, 0.25, 0.8])
 
@@ -106,6 +109,37 @@ def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
         value, gradient = model.log_likelihood(theta, inliers, 0.0, False)
         assert value == -np.inf
         assert not gradient.any()
+
+
+def test_beyond_the_bound_of_length_scales_nothing_depends_on_the_latent_process(backend):
+    inliers = random_inliers(5)
+    beyond, within = TYPICAL.copy(), TYPICAL.copy()
+    beyond[5], within[5] = MAX_ABS_LOG_LENGTH_SCALE + 10.0, MAX_ABS_LOG_LENGTH_SCALE - 10.0
+    assert not backend.log_likelihood(beyond, inliers, 0.05, False)[1][2:].any()
+    # Of length-scales of 1e39 m the derivative is negligible, and yet not zero by a rule.
+    assert backend.log_likelihood(beyond, inliers, 0.05, True)[1][4] < -1.0
+    assert backend.log_likelihood(within, inliers, 0.05, True)[1][4] < -1.0
+
+
+def test_results_do_not_depend_on_where_the_arrays_lie():
+    """Each thread has memory of its own, where the arrays of a small segment lie side by side."""
+    pytest.importorskip('numba')
+    rng = np.random.default_rng(9)
+    for _ in range(100):
+        n, n_bar = rng.integers(2, 9), rng.integers(8, 13)
+        in_one, bars_in_one = np.zeros((2, 7), dtype=np.int64)
+        place = rng.integers(1, 7)
+        in_one[place:], bars_in_one[place:] = n, n_bar
+        r, r_bar = (np.sort(rng.uniform(3, 20, size)) for size in (n, n_bar))
+        z, log_extent = rng.normal(0, 0.5, n), rng.choice([0.0, 0.5, 1.2], n_bar)
+        inliers = Inliers(in_one, r, z, np.zeros(n), bars_in_one, r_bar, log_extent)
+        results = set()
+        for n_threads in (1, 4):
+            backend = make_backend(RuntimeConfig(n_threads, 'numba'))
+            value, gradient = backend.log_likelihood(TYPICAL, inliers, 0.05, False)
+            results.add((value, gradient.tobytes()))
+            backend.close()
+        assert len(results) == 1
 
 
 def test_with_one_length_scale_it_is_scikit_learns_regression(backend):

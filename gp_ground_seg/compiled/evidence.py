@@ -13,7 +13,7 @@ from gp_ground_seg.jit import jit
 from gp_ground_seg.parameters.config import GrowthConfig
 
 
-@jit(entry=True, fastmath=True)
+@jit(entry=True)
 def find_seeds(
     frame: Frame,
     theta: FloatArray,
@@ -61,7 +61,7 @@ def find_seeds(
                 seed[i] = z <= table[m, candidates.bin[i]] + noise
 
 
-@jit(fastmath=True)
+@jit()
 def rise_from(own: FloatArray, other: FloatArray, rise: FloatArray) -> None:
     """Let the ground rise from one segment to the next."""
     # Unsigned, as a signed index could count from the end.
@@ -70,7 +70,7 @@ def rise_from(own: FloatArray, other: FloatArray, rise: FloatArray) -> None:
         own[j] = highest if highest < own[j] else own[j]
 
 
-@jit(fastmath=True)
+@jit()
 def rise_along(table: FloatArray, n_bins: int, max_slope: float, knots: FloatArray) -> None:
     """Let the ground rise outwards, then inwards."""
     for m in range(len(table)):
@@ -81,7 +81,7 @@ def rise_along(table: FloatArray, n_bins: int, max_slope: float, knots: FloatArr
             own[j] = min(own[j], own[j + 1] + max_slope * (knots[j + 1] - knots[j]))
 
 
-@jit(entry=True, fastmath=True)
+@jit(entry=True)
 def find_evidence(
     mean: FloatArray,
     std: FloatArray,
@@ -138,7 +138,7 @@ def find_evidence(
             weighted[j] /= total[j] if total[j] > 0.0 else 1.0
 
 
-@jit(entry=True, fastmath=True)
+@jit(entry=True)
 def combine(
     own: SegmentSurfaces,
     aside: FloatArray,

@@ -46,7 +46,7 @@ class SegmentSurfaces(NamedTuple):
     std: FloatArray
 
 
-@jit(entry=True, fastmath=True)
+@jit(entry=True)
 def grow_surfaces(
     part: Part,
     frame: Frame,
@@ -195,7 +195,7 @@ def grow_surfaces(
             std[m, j] = math.sqrt(max(variance[n + j], 0.0))
 
 
-@jit(fastmath=True)
+@jit()
 def fits(
     z: float,
     height: float,

@@ -13,7 +13,7 @@ from gp_ground_seg.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.jit import jit
 
 
-@jit(entry=True, fastmath=True)
+@jit(entry=True)
 def latent_log_length_scales(
     part: Part,
     frame: Frame,

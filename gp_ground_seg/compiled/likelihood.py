@@ -15,7 +15,7 @@ from gp_ground_seg.jit import jit
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-@jit(entry=True, fastmath=True)
+@jit(entry=True)
 def log_likelihood(
     part: Part,
     theta: FloatArray,
@@ -171,6 +171,8 @@ def log_likelihood(
         raised = np.zeros(p)
         g_sum = 0.0
         for i in range(n):
+            if abs(u[i]) >= MAX_ABS_LOG_LENGTH_SCALE:
+                g_u[i] = 0.0
             g_sum += g_u[i]
             for j in range(p):
                 raised[j] += k_star[i, j] * g_u[i]

@@ -21,7 +21,7 @@ _SCALE = -1.0 / 2.0**_HALVINGS
 _C2, _C3, _C4, _C5, _C6, _C7 = 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 720, 1 / 5040
 
 
-@jit(fastmath=True)
+@jit()
 def exp_neg(x: float) -> float:
     """``exp(-x)``, to an error of 1e-14 for x >= 0, and of 1e-11 of its size for -10 < x < 0.
 
@@ -45,7 +45,7 @@ def exp_neg(x: float) -> float:
     return 0.0 if x > NEGLIGIBLE_EXPONENT else value
 
 
-@jit(fastmath=True)
+@jit()
 def solve_in_place(matrix: FloatArray, n: int, vector: FloatArray) -> bool:
     """Replace `vector` by the solution of ``A x = vector``; False if not positive definite.
 
@@ -75,7 +75,7 @@ def solve_in_place(matrix: FloatArray, n: int, vector: FloatArray) -> bool:
     return True
 
 
-@jit(fastmath=True)
+@jit()
 def factorise(a: FloatArray, n: int) -> bool:
     """Replace the upper triangle of ``a[:n, :n]`` by U, ``A = U^T U``; False if not possible."""
     for k in range(n):
@@ -96,7 +96,7 @@ def factorise(a: FloatArray, n: int) -> bool:
     return True
 
 
-@jit(fastmath=True)
+@jit()
 def invert_triangle(factor: FloatArray, n: int, whitened: FloatArray) -> None:
     """Set the lower triangle of `whitened` to ``U^-T``."""
     for i in range(n):
@@ -114,7 +114,7 @@ def invert_triangle(factor: FloatArray, n: int, whitened: FloatArray) -> None:
         row[i] = scale
 
 
-@jit(fastmath=True)
+@jit()
 def invert(factor: FloatArray, n: int, whitened: FloatArray, inverse: FloatArray) -> None:
     """Inverse of ``U^T U``, both triangles, in `inverse`.
 

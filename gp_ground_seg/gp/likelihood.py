@@ -97,7 +97,8 @@ def _add_batch(
     g *= exponent
     g *= inverse_spread
     g_u = row_sum - 2.0 * square * g.sum(axis=2)
-    g_u = np.where(own.mask & has_latent, g_u, 0.0)
+    is_bounded = np.abs(u) >= MAX_ABS_LOG_LENGTH_SCALE
+    g_u = np.where(own.mask & has_latent & ~is_bounded, g_u, 0.0)
     return value + latent.add_gradient(gradient, g_u, latent_terms)
 
 
