@@ -113,12 +113,9 @@ def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
 
 def test_beyond_the_bound_of_length_scales_nothing_depends_on_the_latent_process(backend):
     inliers = random_inliers(5)
-    beyond, within = TYPICAL.copy(), TYPICAL.copy()
-    beyond[5], within[5] = MAX_ABS_LOG_LENGTH_SCALE + 10.0, MAX_ABS_LOG_LENGTH_SCALE - 10.0
+    beyond = TYPICAL.copy()
+    beyond[5] = MAX_ABS_LOG_LENGTH_SCALE + 10.0
     assert not backend.log_likelihood(beyond, inliers, 0.05, False)[1][2:].any()
-    # Of length-scales of 1e39 m the derivative is negligible, and yet not zero by a rule.
-    assert backend.log_likelihood(beyond, inliers, 0.05, True)[1][4] < -1.0
-    assert backend.log_likelihood(within, inliers, 0.05, True)[1][4] < -1.0
 
 
 def test_results_do_not_depend_on_where_the_arrays_lie():

@@ -178,15 +178,15 @@ def _spreads(numbers: _Numbers) -> dict[int, float]:
 
 def _column_objection(points: _Numbers) -> str:
     """Return whether another number of columns fits better, or ''."""
-    own, spreads = points.shape[1], _spreads(points.reshape(-1))
+    # Of many points without a return, at the origin, all columns are alike.
+    returned = points[np.nan_to_num(points[:, :3]).any(axis=1)]
+    own, spreads = points.shape[1], _spreads(returned.reshape(-1))
     if own not in spreads:
         return ''
     worth = {n: _BETTER if n % own else _BETTER_MULTIPLE for n in spreads if own % n}
     better = {n: spreads[n] for n in worth if spreads[n] < worth[n] * spreads[own]}
-    # Of many points without a return, at the origin, all columns are alike.
-    returned = _spreads(points[np.nan_to_num(points[:, :3]).any(axis=1)].reshape(-1))
-    same = {n: returned[n] for n in returned if own % n == 0 and n < own}
-    better |= {n: same[n] for n in same if 0.0 < same[n] <= _SAME * returned[own]}
+    same = {n: spreads[n] for n in spreads if own % n == 0 and n < own}
+    better |= {n: same[n] for n in same if 0.0 < same[n] <= _SAME * spreads[own]}
     if not better:
         return ''
     n_columns = _fewest(better)
