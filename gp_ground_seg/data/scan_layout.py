@@ -205,8 +205,9 @@ def _likely_layout(data: bytes, layout: ScanLayout) -> ScanLayout | None:
     for dtype in sorted(DTYPES, key=lambda name: name != layout.dtype):
         numbers = ScanLayout(1, dtype).view(data).reshape(-1)
         spreads = _spreads(numbers)
-        spreads.pop(2, None)  # no layout has so few
         other = ScanLayout(_fewest(spreads) if spreads else layout.columns, dtype)
+        if other.columns < MIN_COLUMNS:
+            continue
         is_whole = len(data) % other.bytes_per_point == 0
         is_other = str(other) != str(layout)
         points = other.view(data)
