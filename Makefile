@@ -1,16 +1,18 @@
-# make demo | make test | make browser-test | make bench | make node-bench | make colcon | make lint | make docs: each creates the environment it needs.
+# make demo | make test | make test-all | make browser-test | make bench | make node-bench | make colcon | make lint | make docs: each creates the environment it needs.
 PYTHON ?= python3
-VENV ?= .venv
+# Not the .venv of README: two ways of installation in one environment get in each other's way.
+VENV ?= .venv-dev
 BIN := $(VENV)/bin
 KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test browser-test torture bench bench-docs figures docs node-bench colcon lint format generate clean
+.PHONY: help demo test test-all browser-test torture bench bench-docs figures docs node-bench colcon lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
-	@echo 'make test      the whole test suite (KITTI=PATH adds labelled frames)'
+	@echo 'make test      the tests, but those marked slow (KITTI=PATH adds labelled frames)'
+	@echo 'make test-all  all tests'
 	@echo 'make browser-test  pages of view and tune in a headless Chromium, which root gets by apt'
 	@echo 'make torture   adversarial clouds, files and uses (TORTURE_SCALE=100 for a night)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
@@ -46,6 +48,9 @@ demo: $(VENV)/.ros
 	$(BIN)/gp-ground-seg demo --force $(if $(KITTI_ROOT),--kitti $(KITTI_ROOT))
 
 test: $(VENV)/.dev
+	$(WITH_KITTI) $(BIN)/python -m pytest -m 'not slow'
+
+test-all: $(VENV)/.dev
 	$(WITH_KITTI) $(BIN)/python -m pytest
 
 browser-test: $(VENV)/.dev

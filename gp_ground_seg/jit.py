@@ -1,25 +1,22 @@
 """The one policy for code compiled with numba, which is optional, and for keeping it on disk.
 
-numba keeps compiled code itself (``cache=True``). Beside its entries lies a stamp with a digest of
-our sources, versions, and a checksum of each entry; entries that do not fit it are deleted
-before numba reads them, and compiled again. A folder that anyone but the user and root could
-write to is not used, as its entries are code.
+numba keeps compiled code itself (``cache=True``), here in a folder of the user whose name is a
+digest of our sources and of versions: code of other sources is never read. An entry that does not
+fit its checksum, as after a power cut, is compiled again.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import grp
 import hashlib
 import importlib.util
 import json
 import logging
 import os
-import pwd
 import stat
 import sys
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -36,9 +33,9 @@ _Function = TypeVar('_Function', bound=Callable[..., Any])
 _PACKAGE = Path(__file__).parent
 _SOURCES = ('jit.py', 'frame.py', 'parameters', 'pipeline', 'gp', 'compiled')
 _entry_points: list[Any] = []
-_folder: Path | None = None
+_KEPT = 'kept.json'
 _is_warm = False
-_n_ready = _n_stamped = 0
+_n_ready = _n_kept = 0
 
 
 class _Decorator(Protocol):
@@ -85,17 +82,17 @@ def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     """Compile `function` with its code kept on disk, if there is a folder to trust for it."""
     import numba
 
-    # By the XDG specification such a path is invalid; numba would write to the current folder.
-    if os.path.isabs(os.environ.get('XDG_CACHE_HOME', '/')):
+    folder = code_folder()
+    if folder is not None:
+        # numba reads this once, here. Without it, code would lie beside our sources.
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
         try:
             kept = numba.njit(**options, cache=True)(function)
-        except RuntimeError:
-            _log_not_kept('there is no folder to write to')
-        else:
-            if _prepare(Path(kept.stats.cache_path)):
-                return kept
-    else:
-        _log_not_kept('XDG_CACHE_HOME is no absolute path')
+        finally:
+            numba.config.CACHE_DIR = before
+        if folder in Path(kept.stats.cache_path).parents:
+            return kept
+        _log_not_kept(f'{folder} cannot be written to')
     return numba.njit(**options)(function)
 
 
@@ -109,124 +106,107 @@ def _log_not_kept(reason: str) -> None:
 
 
 @functools.cache
-def _prepare(folder: Path) -> bool:
-    """Whether code is kept in `folder`; entries that do not fit the stamp are deleted."""
-    global _folder, _is_warm
-    reason = _why_not_trusted(folder)
-    if reason:
-        _log_not_kept(reason)
-        return False
-    _folder = folder
-    stamp = _read_stamp(folder)
-    if stamp == {**_stamp(folder), 'warm': stamp.get('warm')}:
-        _is_warm = stamp['warm'] is True
-        return True
-    _LOGGER.info('compiling for this processor, which takes 10 to 40 s')
-    for entry in _entries(folder):
-        with contextlib.suppress(OSError):
-            entry.unlink()
-        if entry.exists():
-            _log_not_kept(f'{entry} cannot be deleted')
-            return False
-    return True
+def code_folder() -> Path | None:
+    """Return the folder where compiled code is kept; None where there is none to trust.
+
+    It lies in ``NUMBA_CACHE_DIR``, else in the user's cache folder.
+    """
+    if not JIT_ENABLED:
+        return None
+    chosen = os.environ.get('NUMBA_CACHE_DIR') or os.environ.get('XDG_CACHE_HOME') or '~/.cache'
+    try:
+        folder = Path(chosen).expanduser() / 'gp_ground_seg' / _digest()
+        if not folder.is_absolute():
+            raise PermissionError(f'{chosen} is no absolute path')
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder = folder.resolve()
+        _require_private(folder)
+        _delete_damaged(folder)
+    except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home
+        _log_not_kept(str(error))
+        return None
+    return folder
 
 
-def _why_not_trusted(folder: Path) -> str:
-    """Reason why others could put code into `folder`; empty if they cannot."""
-    if not folder.is_absolute():
-        return f'{folder} is no absolute path'
+def _require_private(folder: Path) -> None:
+    """Raise PermissionError if another user could put code into `folder`."""
+    if folder.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise PermissionError(f'others can open {folder}: chmod 700')
     for path in (folder, *folder.parents):
         status = path.stat()
         if status.st_uid not in (0, os.getuid()):
-            return f'{path} belongs to another user'
+            raise PermissionError(f'{path} belongs to another user')
         # Of a sticky folder, such as /tmp, only the owner of an entry can replace it.
-        is_sticky = path != folder and status.st_mode & stat.S_ISVTX
-        if not is_sticky and _others_can_write(status):
-            return f'others can write to {path}'
-    return next((f'{e} is not yours' for e in _entries(folder) if not _is_own(e)), '')
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            raise PermissionError(f'others can write to {path}')
 
 
-def _is_own(entry: Path) -> bool:
-    status = entry.lstat()
-    return stat.S_ISREG(status.st_mode) and status.st_uid in (0, os.getuid())
-
-
-def _others_can_write(status: os.stat_result) -> bool:
-    if status.st_mode & stat.S_IWOTH:
-        return True
-    if not status.st_mode & stat.S_IWGRP:
-        return False
-    # Ubuntu gives each user a group of the same name, and lets that group write.
-    try:
-        user, group = pwd.getpwuid(os.getuid()).pw_name, grp.getgrgid(status.st_gid)
-    except KeyError:
-        return True
-    return group.gr_name != user or any(member != user for member in group.gr_mem)
-
-
-def _entries(folder: Path) -> list[Path]:
-    """Files in which numba of this Python keeps code."""
-    major, minor = sys.version_info[:2]
-    return sorted(folder.glob(f'*.py{major}{minor}*.nb[ic]'))
-
-
-def _stamp(folder: Path) -> dict[str, Any]:
-    """Describe the entries in `folder`: sources, versions, checksums."""
-    import numba
-
-    sources = hashlib.sha256()
+def _digest() -> str:
+    """Name of what the code was compiled from: sources, where they lie, and versions."""
+    versions = [sys.version, np.__version__, *map(metadata.version, ('numba', 'llvmlite'))]
+    digest = hashlib.sha256('\n'.join([str(_PACKAGE), *versions]).encode())
     for source in sorted(_PACKAGE.rglob('*.py')):
         if source.parent.name in _SOURCES or source.name in _SOURCES:
-            sources.update(source.name.encode() + b'\0' + source.read_bytes())
-    entries = {e.name: hashlib.sha256(e.read_bytes()).hexdigest() for e in _entries(folder)}
-    versions = {'numba': numba.__version__, 'numpy': np.__version__, 'python': sys.version}
-    return {'sources': sources.hexdigest(), 'versions': versions, 'entries': entries}
+            digest.update(source.name.encode() + b'\0' + source.read_bytes())
+    return digest.hexdigest()[:16]
 
 
-def _stamp_file(folder: Path) -> Path:
-    return folder / f'gp_ground_seg.{sys.implementation.cache_tag}.stamp'
+def _checksums(folder: Path) -> dict[str, str]:
+    """SHA-256 of each file in which numba keeps code, by its path in `folder`."""
+    return {
+        entry.relative_to(folder).as_posix(): hashlib.sha256(entry.read_bytes()).hexdigest()
+        for entry in folder.rglob('*.nb[ic]')
+    }
 
 
-def _read_stamp(folder: Path) -> dict[str, Any]:
+def _read_kept(folder: Path) -> dict[str, Any]:
+    """Return what `keep_code` has noted."""
     try:
-        stamp = json.loads(_stamp_file(folder).read_bytes())
+        kept = json.loads((folder / _KEPT).read_bytes())
     except (OSError, ValueError):
         return {}
-    return stamp if isinstance(stamp, dict) else {}
+    return kept if isinstance(kept, dict) else {}
+
+
+def _delete_damaged(folder: Path) -> None:
+    """Delete the files that do not fit their checksum; numba compiles again what they held."""
+    global _is_warm
+    kept, found = _read_kept(folder), _checksums(folder)
+    damaged = [name for name, checksum in found.items() if kept.get(name) != checksum]
+    for name in damaged:
+        (folder / name).unlink()
+    _is_warm = kept.get('warm') is True and not damaged and found.keys() >= kept.keys() - {'warm'}
+    if not _is_warm:
+        _LOGGER.info('compiling for this processor, which takes 10 to 40 s')
 
 
 def keep_code(*, warm: bool = False) -> None:
-    """Stamp the code that numba has kept since the last call, so that the next start uses it.
+    """Note checksums of the code that numba has kept, so that the next start uses it.
 
     Parameters
     ----------
     warm : bool
         Whether all code that a frame needs has been compiled.
     """
-    global _n_ready, _n_stamped, _is_warm
+    global _n_ready, _n_kept, _is_warm
     n_ready = sum(len(entry.overloads) for entry in _entry_points)
-    if _folder is None or (n_ready == _n_ready and not warm):
+    folder = code_folder()
+    if folder is None or (n_ready == _n_ready and not warm):
         return
     _n_ready = n_ready
     # Of those the ones that were compiled, not loaded; slow to count.
     n_compiled = sum(len(entry.stats.cache_misses) for entry in _entry_points)
-    if n_compiled == _n_stamped and (_is_warm or not warm):
+    if n_compiled == _n_kept and (_is_warm or not warm):
         return
-    _n_stamped, _is_warm = n_compiled, _is_warm or warm
-    target = _stamp_file(_folder)
-    unfinished = target.with_suffix(f'.{os.getpid()}')
+    _n_kept, _is_warm = n_compiled, _is_warm or warm
+    unfinished = folder / f'{_KEPT}.{os.getpid()}'
     try:
-        unfinished.write_text(json.dumps({**_stamp(_folder), 'warm': _is_warm}))
-        os.replace(unfinished, target)
+        unfinished.write_text(json.dumps({**_checksums(folder), 'warm': _is_warm}))
+        os.replace(unfinished, folder / _KEPT)
     except OSError as error:
-        _log_not_kept(f'{target}: {error.strerror}')
+        _log_not_kept(str(error))
 
 
 def is_code_kept() -> bool:
     """Whether all code that a frame needs lies on disk; `keep_code` was called with `warm`."""
     return _is_warm
-
-
-def code_folder() -> Path | None:
-    """Folder where compiled code is kept; None where it is not kept."""
-    return _folder

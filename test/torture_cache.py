@@ -50,7 +50,7 @@ def run_case(number, folder, program):
     kept = folder / 'kept'
     shutil.rmtree(program.cache)
     shutil.copytree(kept, program.cache)
-    files = [*program.entries, program.stamp]
+    files = [*program.entries, program.notes]
     chosen = rng.choice(len(files), rng.integers(1, len(files) + 1), replace=False)
     kinds = [damage(files[index], rng, pickle(program)) for index in chosen]
     for run in range(2):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import os
 import subprocess
 import sys
 import threading
@@ -96,14 +95,11 @@ class BackendLoader:
 
     def _compile(self) -> None:
         """Compile in a child process, whose memory is free after it: twice what the node needs."""
-        environment = dict(os.environ)
-        if cache := environment.get('NUMBA_CACHE_DIR'):
-            environment['NUMBA_CACHE_DIR'] = os.path.abspath(cache)
         with self._lock:
             if self._is_stopped:
                 return
             self._compiler = subprocess.Popen(
-                [sys.executable, '-c', own_code(_COMPILE)], cwd='/', env=environment,
+                [sys.executable, '-c', own_code(_COMPILE)], cwd='/',
                 stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
             )  # fmt: skip
         with self._compiler:
