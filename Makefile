@@ -23,7 +23,7 @@ help:
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make lint      ruff, mypy and codespell'
 	@echo 'make format    format the code'
-	@echo 'make generate  rewrite the files derived from gp_ground_seg/parameters'
+	@echo 'make generate  rewrite the files derived from gp_ground_seg/core/parameters'
 	@echo 'make clean     remove the environment and build results'
 
 $(VENV)/.python:

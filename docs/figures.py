@@ -31,7 +31,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from gp_ground_seg.evaluation.report import describe_environment
+from gp_ground_seg.lab.scoring.report import describe_environment
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGES = (

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.parameters.config import parameter_specs
-from gp_ground_seg.parameters.export import accepted_values, to_yaml, yaml_scalar
-from gp_ground_seg.parameters.presets import PRESETS
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.parameters.config import parameter_specs
+from gp_ground_seg.core.parameters.export import accepted_values, to_yaml, yaml_scalar
+from gp_ground_seg.core.parameters.presets import PRESETS
 
 ROOT = Path(__file__).resolve().parent.parent
 README = 'README.md'
@@ -13,8 +13,8 @@ BEGIN, END = '<!-- parameters:begin -->', '<!-- parameters:end -->'
 PAGE_HEAD = """\
 # Parameters
 
-`make generate` writes this page from gp_ground_seg/parameters/config.py. Most users set only those
-in the table of the README. `gp-ground-seg config dump` writes all of them, with their values and
+`make generate` writes this page from `gp_ground_seg/core/parameters/config.py`. Most users set
+only those in the table of the README. `gp-ground-seg config dump` writes all of them, with values and
 ranges, as a parameter file. A symbol is that of the paper.
 
 """

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gp_ground_seg.evaluation.evaluate import TITLES
-from gp_ground_seg.plotting import style
-from gp_ground_seg.plotting.style import add_axes, new_figure, save, write_line
+from gp_ground_seg.lab.plotting import style
+from gp_ground_seg.lab.plotting.style import add_axes, new_figure, save, write_line
+from gp_ground_seg.lab.scoring.evaluate import TITLES
 
 DOCS = Path(__file__).resolve().parent
 STAGE_COLOURS = (

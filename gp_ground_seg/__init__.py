@@ -6,11 +6,11 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gp_ground_seg.errors import ConfigError, GroundSegError, PointCloudError
-    from gp_ground_seg.frame import Label
-    from gp_ground_seg.parameters.config import Config
-    from gp_ground_seg.result import Segmentation
-    from gp_ground_seg.segmenter import GroundSegmenter
+    from gp_ground_seg.core.errors import ConfigError, GroundSegError, PointCloudError
+    from gp_ground_seg.core.frame import Label
+    from gp_ground_seg.core.parameters.config import Config
+    from gp_ground_seg.core.result import Segmentation
+    from gp_ground_seg.core.segmenter import GroundSegmenter
 
 __version__ = '0.2.0'
 
@@ -26,13 +26,13 @@ __all__ = [
 ]
 
 _MODULES = {
-    'Config': 'parameters.config',
-    'ConfigError': 'errors',
-    'GroundSegError': 'errors',
-    'GroundSegmenter': 'segmenter',
-    'Label': 'frame',
-    'PointCloudError': 'errors',
-    'Segmentation': 'result',
+    'Config': 'core.parameters.config',
+    'ConfigError': 'core.errors',
+    'GroundSegError': 'core.errors',
+    'GroundSegmenter': 'core.segmenter',
+    'Label': 'core.frame',
+    'PointCloudError': 'core.errors',
+    'Segmentation': 'core.result',
 }
 
 

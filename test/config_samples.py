@@ -4,8 +4,8 @@ import contextlib
 
 from hypothesis import strategies as st
 
-from gp_ground_seg.errors import ConfigError
-from gp_ground_seg.parameters.config import Config, parameter_specs
+from gp_ground_seg.core.errors import ConfigError
+from gp_ground_seg.core.parameters.config import Config, parameter_specs
 
 
 def accepted_values(spec):

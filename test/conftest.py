@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from gp_ground_seg.backend import Backend, NumpyBackend
-from gp_ground_seg.compiled.backend import NumbaBackend
-from gp_ground_seg.jit import JIT_ENABLED
-from gp_ground_seg.segmenter import warm_up
+from gp_ground_seg.core.backend import Backend, NumpyBackend
+from gp_ground_seg.core.compiled.backend import NumbaBackend
+from gp_ground_seg.core.jit import JIT_ENABLED
+from gp_ground_seg.core.segmenter import warm_up
 
 # The duration of an example depends on the machine more than on the code.
 settings.register_profile('default', deadline=None)
@@ -67,7 +67,7 @@ def fewer(n: int, n_plain: int) -> int:
 @contextmanager
 def sharing(n_threads: int) -> Iterator[NumbaBackend]:
     """Backend that splits even the smallest clouds, in threads also without compiled code."""
-    threads = 'gp_ground_seg.compiled.threads'
+    threads = 'gp_ground_seg.core.compiled.threads'
     with patch(f'{threads}.MIN_POINTS_TO_SPLIT', 1), patch(f'{threads}.JIT_ENABLED', True):
         backend = NumbaBackend(n_threads)
         yield backend

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gp_ground_seg.evaluation.evaluate import MethodResult
-from gp_ground_seg.frame import Label
+from gp_ground_seg.core.frame import Label
+from gp_ground_seg.lab.scoring.evaluate import MethodResult
 
 
 def street(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

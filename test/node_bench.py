@@ -17,7 +17,7 @@ from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.cli.bench import load_frames
 from gp_ground_seg.cli.demo import FRAME_ID, simulated_drive
 from gp_ground_seg.cli.options import progress
-from gp_ground_seg.evaluation.report import (
+from gp_ground_seg.lab.scoring.report import (
     Column,
     Table,
     describe_environment,

@@ -1,7 +1,7 @@
 """The stages as loops that read like the paper: slow oracles of both backends.
 
-Shapes and units are those of `gp_ground_seg.backend.Backend`, which `Reference` implements. One
-point, one tile or one segment at a time; each fit is made anew.
+Shapes and units are those of `gp_ground_seg.core.backend.Backend`, which `Reference` implements.
+One point, one tile or one segment at a time; each fit is made anew.
 """
 
 import math
@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.stats import multivariate_normal, norm
 
-from gp_ground_seg.backend import NumpyBackend
-from gp_ground_seg.frame import (
+from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.frame import (
     NOT_FINITE,
     Candidates,
     Faces,

@@ -31,8 +31,8 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2, PointField
 
-from gp_ground_seg.backend import choose_backend
-from gp_ground_seg.parameters.schema import NODE_NAME
+from gp_ground_seg.core.backend import choose_backend
+from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.ros.node import GroundSegmentationNode, main
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS
 

@@ -15,12 +15,12 @@ from functools import partial
 from pathlib import Path
 
 from gp_ground_seg.cli import options
+from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.files import write_file
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
-from gp_ground_seg.evaluation.report import Column, Table, describe_environment, machine_line
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.scale.cluster import BLOCK_SIZE, open_runner
-from gp_ground_seg.scale.dataset import Scan, segment_block
+from gp_ground_seg.lab.scale.cluster import BLOCK_SIZE, open_runner
+from gp_ground_seg.lab.scale.dataset import Scan, segment_block
+from gp_ground_seg.lab.scoring.report import Column, Table, describe_environment, machine_line
 
 
 def write_labels(path, result):

@@ -16,11 +16,11 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosReliability
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.atomic_output import leftovers, staged_files
 from gp_ground_seg.data.bag_files import POINT_CLOUD2, is_bag, is_bag_folder, resolve_storage
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic, jazzy_topic
 from gp_ground_seg.data.point_cloud2 import encode_cloud
-from gp_ground_seg.errors import DataError
 
 SHAPES = [('drive', 'mcap'), ('drive', 'sqlite3'), ('drive.mcap', None), ('drive.db3', None)]
 
@@ -377,7 +377,7 @@ def test_without_rosbags_the_error_says_what_to_install(tmp_path):
         sys.modules['rosbags'] = None
         from gp_ground_seg.data import bags
         from gp_ground_seg.data.point_cloud2 import decode_cloud
-        from gp_ground_seg.errors import MissingDependencyError
+        from gp_ground_seg.core.errors import MissingDependencyError
         for call in (bags.BagReader, bags.BagWriter, decode_cloud):
             try:
                 call('drive.mcap')

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import Config
 from gp_ground_seg.cli.bench import RUN_LENGTH, bench_text, load_frames, read_record, runs
-from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.evaluation import benchmark
-from gp_ground_seg.evaluation.benchmark import FrameTime, bench_cases, bench_document, run_cases
-from gp_ground_seg.evaluation.evaluate import PATCHWORKPP
-from gp_ground_seg.evaluation.report import describe_environment
+from gp_ground_seg.core.errors import DataError, PointCloudError
+from gp_ground_seg.lab.scoring import benchmark
+from gp_ground_seg.lab.scoring.benchmark import FrameTime, bench_cases, bench_document, run_cases
+from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP
+from gp_ground_seg.lab.scoring.report import describe_environment
 
 QUICK = ('--threads', '1', '--set', 'grid.n_segments=24')
 NUMPY = Config().replace(

@@ -11,9 +11,9 @@ viser = pytest.importorskip('viser', reason='viser is not installed')
 from browser import CHROMIUM, open_browser  # noqa: E402
 from cli_runner import run, until_ctrl_c  # noqa: E402
 
-from gp_ground_seg.parameters.config import Config  # noqa: E402
-from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan  # noqa: E402
-from gp_ground_seg.viewers.scene import LEGENDS, palette  # noqa: E402
+from gp_ground_seg.core.parameters.config import Config  # noqa: E402
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan  # noqa: E402
+from gp_ground_seg.lab.viewers.scene import LEGENDS, palette  # noqa: E402
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
 ROAD, OBJECT = 40, 99  # classes of SemanticKITTI

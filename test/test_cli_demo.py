@@ -18,11 +18,11 @@ from cli_runner import INTERRUPTED, children, is_running
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.demo import Tally, check_scan, numbered_cloud, result_text
 from gp_ground_seg.cli.main import main
+from gp_ground_seg.core.errors import GroundSegError
+from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points, stamp_of
-from gp_ground_seg.errors import GroundSegError
-from gp_ground_seg.frame import Label
 from gp_ground_seg.ros import lifecycle, probe
 from gp_ground_seg.ros.probe import GROUND, OBSTACLES, NodeProcess, private_network, rate_result
 

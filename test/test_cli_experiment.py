@@ -15,14 +15,20 @@ from gp_ground_seg.cli import experiment
 from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation import evaluate as runner
-from gp_ground_seg.experiments import ablation, sensor_pose, variants
-from gp_ground_seg.experiments import table1 as paper_table
-from gp_ground_seg.experiments.table1 import CHOICES, VARIANCES, Choice, table1
-from gp_ground_seg.parameters.presets import PRESETS
-from gp_ground_seg.simulation import DRIVES, HDL_32E, SCENES, semantic_kitti_labels, simulate_scan
+from gp_ground_seg.lab.experiments import ablation, sensor_pose, variants
+from gp_ground_seg.lab.experiments import table1 as paper_table
+from gp_ground_seg.lab.experiments.table1 import CHOICES, VARIANCES, Choice, table1
+from gp_ground_seg.lab.scoring import evaluate as runner
+from gp_ground_seg.lab.simulation import (
+    DRIVES,
+    HDL_32E,
+    SCENES,
+    semantic_kitti_labels,
+    simulate_scan,
+)
 
 SMALL = ['--set', 'grid.n_bins=40']
 

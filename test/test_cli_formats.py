@@ -10,11 +10,11 @@ from bag_samples import scan, write_ros2_bag
 from cli_runner import error_line, run
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file, read_file
 from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.ground_model import GroundModel
 
 laspy = pytest.importorskip('laspy', reason='needs the extra formats')
 

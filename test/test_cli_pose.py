@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from cli_runner import error_line, run
 
-from gp_ground_seg.pipeline.tilt import rotation
-from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_scan
+from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
 SMALL = dataclasses.replace(HDL_64E, n_columns=500)
 

@@ -9,11 +9,11 @@ from evaluation_samples import street, write_streets
 from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.evaluation.comparison import MEASURES, difference_table, find_differences
-from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore
-from gp_ground_seg.evaluation.intervals import clusters
-from gp_ground_seg.evaluation.metrics import Confusion, height_error
-from gp_ground_seg.evaluation.objects import ObjectCount
+from gp_ground_seg.lab.scoring.comparison import MEASURES, difference_table, find_differences
+from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
+from gp_ground_seg.lab.scoring.intervals import clusters
+from gp_ground_seg.lab.scoring.metrics import Confusion, height_error
+from gp_ground_seg.lab.scoring.objects import ObjectCount
 
 
 def score(*frames, sequences=('00', '08')):

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, ConfigError, GroundSegError
-from gp_ground_seg.parameters.config import find_spec, parameter_specs
+from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
 
 SPECS = parameter_specs()
 NUMBERS = [spec for spec in SPECS if spec.type in (int, float)]

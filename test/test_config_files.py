@@ -14,12 +14,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.parameters import export
-from gp_ground_seg.parameters.config import parameter_specs
-from gp_ground_seg.parameters.export import file_problems
-from gp_ground_seg.parameters.presets import PRESETS, find_preset
-from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.parameters import export
+from gp_ground_seg.core.parameters.config import parameter_specs
+from gp_ground_seg.core.parameters.export import file_problems
+from gp_ground_seg.core.parameters.presets import PRESETS, find_preset
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 GENERATE = 'run: make generate'
 generate = load_script('docs/generate.py')

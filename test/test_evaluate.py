@@ -13,15 +13,15 @@ from cli_runner import error_line, run
 from evaluation_samples import HeightRule, street, write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.data.semantic_kitti import labelled_frames
-from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
-from gp_ground_seg.evaluation import evaluate as runner
-from gp_ground_seg.evaluation import metrics
-from gp_ground_seg.evaluation.evaluate import OurMethod
-from gp_ground_seg.evaluation.metrics import ClassCount, Confusion, height_error
-from gp_ground_seg.evaluation.patchworkpp import PatchworkMethod, PatchworkppMethod
-from gp_ground_seg.experiments.variants import SimulatedFrame, load_simulated, peer_of
-from gp_ground_seg.parameters.config import SensorConfig
+from gp_ground_seg.lab.experiments.variants import SimulatedFrame, load_simulated, peer_of
+from gp_ground_seg.lab.scoring import evaluate as runner
+from gp_ground_seg.lab.scoring import metrics
+from gp_ground_seg.lab.scoring.evaluate import OurMethod
+from gp_ground_seg.lab.scoring.metrics import ClassCount, Confusion, height_error
+from gp_ground_seg.lab.scoring.patchworkpp import PatchworkMethod, PatchworkppMethod
 
 
 def evaluate(root, *methods, **options):

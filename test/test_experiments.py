@@ -11,19 +11,12 @@ from evaluation_samples import write_frame, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg import Config, GroundSegmenter, Label, simulation
+from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.core.errors import ConfigError, PointCloudError
+from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
-from gp_ground_seg.errors import ConfigError, PointCloudError
-from gp_ground_seg.evaluation import evaluate as runner
-from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore
-from gp_ground_seg.evaluation.metrics import (
-    Confusion,
-    count_confusion,
-    height_error,
-    pool_height_errors,
-)
-from gp_ground_seg.evaluation.patchworkpp import PatchworkppMethod
-from gp_ground_seg.experiments import (
+from gp_ground_seg.lab import simulation
+from gp_ground_seg.lab.experiments import (
     ablation,
     coverage,
     interpolation,
@@ -32,11 +25,19 @@ from gp_ground_seg.experiments import (
     stepwise,
     variants,
 )
-from gp_ground_seg.experiments.ablation import MODELS, Departure
-from gp_ground_seg.experiments.sensor_pose import MOUNTS, SIMULATED_MOUNTS, score_poses
-from gp_ground_seg.experiments.variants import SimulatedFrame, load_simulated
-from gp_ground_seg.parameters.presets import PRESETS
-from gp_ground_seg.simulation import HDL_64E, SCENES, SENSORS, Kind, simulate_scan
+from gp_ground_seg.lab.experiments.ablation import MODELS, Departure
+from gp_ground_seg.lab.experiments.sensor_pose import MOUNTS, SIMULATED_MOUNTS, score_poses
+from gp_ground_seg.lab.experiments.variants import SimulatedFrame, load_simulated
+from gp_ground_seg.lab.scoring import evaluate as runner
+from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
+from gp_ground_seg.lab.scoring.metrics import (
+    Confusion,
+    count_confusion,
+    height_error,
+    pool_height_errors,
+)
+from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, SENSORS, Kind, simulate_scan
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
 FAR, NEAR = Config(), {'grid.r_max': 15.0}

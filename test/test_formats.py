@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file, read_file
 from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
 from gp_ground_seg.data.pcd import PcdHeader
 from gp_ground_seg.data.ply import PlyHeader
 from gp_ground_seg.data.scan_layout import ScanLayout
-from gp_ground_seg.errors import DataError
 
 laspy = pytest.importorskip('laspy', reason='needs the extra formats')
 lzf = pytest.importorskip('lzf', reason='needs the extra formats')

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config
-from gp_ground_seg.backend import NumpyBackend
-from gp_ground_seg.frame import Frame
-from gp_ground_seg.gp.learning import given_theta, in_rows
+from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.frame import Frame
+from gp_ground_seg.core.gp.learning import given_theta, in_rows
 
 
 def theta_of(config):

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.pipeline.tilt import rotation
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.ground_model import GroundModel
+from gp_ground_seg.core.pipeline.tilt import rotation
 
 # No neighbours, so that segments without a model stay without one; r_min of 0 is the hard case.
 CONFIGS = [

@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config
-from gp_ground_seg.backend import NumpyBackend
-from gp_ground_seg.compiled.backend import NumbaBackend
-from gp_ground_seg.frame import Candidates
-from gp_ground_seg.pipeline import ground_plane
-from gp_ground_seg.pipeline.ground_plane import MIN_CELLS, N_SECTORS, RING_EDGES, solve_plane
-from gp_ground_seg.pipeline.tilt import rotation
+from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.compiled.backend import NumbaBackend
+from gp_ground_seg.core.frame import Candidates
+from gp_ground_seg.core.pipeline import ground_plane
+from gp_ground_seg.core.pipeline.ground_plane import MIN_CELLS, N_SECTORS, RING_EDGES, solve_plane
+from gp_ground_seg.core.pipeline.tilt import rotation
 
 BACKENDS = NumpyBackend(), NumbaBackend(1)
 ORIGIN = (0.0, 0.0, 0.0)
@@ -115,8 +115,8 @@ def test_moments_that_determine_no_plane_or_no_slope():
 
 def test_a_refinement_that_leaves_the_ground_is_not_used(monkeypatch):
     candidates = BACKENDS[0].build_grid(cluttered_plane(0, 1.5, 0.0, 0.0), Config()).candidates
-    monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (99.0, 0.0, 0.0))
+    monkeypatch.setattr(ground_plane, '_refine', lambda *_: (99.0, 0.0, 0.0))
     assert ground_plane.fit_plane(candidates, 0.5, ORIGIN).height == pytest.approx(1.5, abs=0.1)
     # Nor is a plane that no point lies on.
-    monkeypatch.setattr('gp_ground_seg.pipeline.ground_plane._refine', lambda *_: (19.0, 0.0, 0.0))
+    monkeypatch.setattr(ground_plane, '_refine', lambda *_: (19.0, 0.0, 0.0))
     assert ground_plane.fit_plane(candidates, 0.5, ORIGIN) is None

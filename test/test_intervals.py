@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from gp_ground_seg.evaluation.evaluate import MethodScore, ScanScore
-from gp_ground_seg.evaluation.intervals import difference_interval, interval_text, mse_sums
-from gp_ground_seg.evaluation.metrics import Confusion, height_error
+from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
+from gp_ground_seg.lab.scoring.intervals import difference_interval, interval_text, mse_sums
+from gp_ground_seg.lab.scoring.metrics import Confusion, height_error
 
 
 def clusters(*hits, of=100):

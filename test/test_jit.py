@@ -11,10 +11,10 @@ from unittest.mock import patch
 
 import pytest
 
-from gp_ground_seg import jit as jit_module
+from gp_ground_seg.core import jit as jit_module
 
 MODULE = """
-from gp_ground_seg.jit import JIT_ENABLED, code_folder, is_code_kept, jit, keep_code
+from gp_ground_seg.core.jit import JIT_ENABLED, code_folder, is_code_kept, jit, keep_code
 
 @jit(entry=True)
 def double(x):

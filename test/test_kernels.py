@@ -5,8 +5,8 @@ import reference
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.gp.kernels import paciorek, squared_exponential
-from gp_ground_seg.gp.linalg import SEGMENTS_PER_BATCH, Padded, batches
+from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
+from gp_ground_seg.core.gp.linalg import SEGMENTS_PER_BATCH, Padded, batches
 
 
 def kernels(r_a, l_a, r_b, l_b, sigma_f):

@@ -5,7 +5,7 @@ import pytest
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_labels, read_points
-from gp_ground_seg.evaluation import evaluate as runner
+from gp_ground_seg.lab.scoring import evaluate as runner
 
 GROUND_CLASSES = [40, 44, 48, 49, 60, 72]
 LEFT_OUT = [0, 1, 70]

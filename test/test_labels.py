@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.frame import Faces, GroundSurface, Scan
-from gp_ground_seg.pipeline.labels import ground_probability
-from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
+from gp_ground_seg.core.frame import Faces, GroundSurface, Scan
+from gp_ground_seg.core.pipeline.labels import ground_probability
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 CONFIG = Config().replace(
     **{

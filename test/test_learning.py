@@ -6,10 +6,10 @@ import reference
 from conftest import fewer, hilly_scan
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.backend import NumpyBackend
-from gp_ground_seg.compiled.backend import NumbaBackend
-from gp_ground_seg.frame import Frame, Inliers
-from gp_ground_seg.gp.learning import (
+from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.compiled.backend import NumbaBackend
+from gp_ground_seg.core.frame import Frame, Inliers
+from gp_ground_seg.core.gp.learning import (
     ThetaSpace,
     every_segment,
     given_theta,
@@ -17,7 +17,7 @@ from gp_ground_seg.gp.learning import (
     maximise,
     theta_space,
 )
-from gp_ground_seg.jit import JIT_ENABLED
+from gp_ground_seg.core.jit import JIT_ENABLED
 
 MODEL = NumbaBackend(1) if JIT_ENABLED else NumpyBackend()
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import reference
 
-from gp_ground_seg.backend import make_backend
-from gp_ground_seg.frame import Inliers
-from gp_ground_seg.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
-from gp_ground_seg.parameters.config import RuntimeConfig
+from gp_ground_seg.core.backend import make_backend
+from gp_ground_seg.core.frame import Inliers
+from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
+from gp_ground_seg.core.parameters.config import RuntimeConfig
 
 TYPICAL = np.log([0.3, 0.05, 0.9, 3.0, 0.25, 0.8])
 

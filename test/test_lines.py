@@ -11,9 +11,9 @@ from reference import Reference, fit_line
 from scipy.optimize import minimize
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.frame import Candidates, Faces
-from gp_ground_seg.pipeline.lines import deming_slope, differs_in_direction
-from gp_ground_seg.simulation import SCENES, VLP_16, simulate_scan
+from gp_ground_seg.core.frame import Candidates, Faces
+from gp_ground_seg.core.pipeline.lines import deming_slope, differs_in_direction
+from gp_ground_seg.lab.simulation import SCENES, VLP_16, simulate_scan
 
 N_TILES = 50
 NO_FACES = Faces(*np.zeros((2, N_TILES), dtype=bool))

@@ -12,9 +12,9 @@ from sklearn.calibration import calibration_curve
 from sklearn.metrics import brier_score_loss
 
 from gp_ground_seg import Label
-from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation import metrics
-from gp_ground_seg.evaluation.metrics import GROUNDGRID, ClassCount, Confusion
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.lab.scoring import metrics
+from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, ClassCount, Confusion
 
 GROUND_NUMBERS = {40, 44, 48, 49, 60, 72}
 ANY_LABEL = st.sampled_from([0, 1, 2])

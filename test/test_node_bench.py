@@ -10,7 +10,7 @@ import ros_helpers  # noqa: F401  imports type support, which warns
 from conftest import hilly_scan
 
 from gp_ground_seg.cli.bags import scan_cloud
-from gp_ground_seg.errors import GroundSegError
+from gp_ground_seg.core.errors import GroundSegError
 
 
 @pytest.fixture

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.compiled import numerics
-from gp_ground_seg.compiled.numerics import exp_neg, factorise, invert, solve_in_place
+from gp_ground_seg.core.compiled import numerics
+from gp_ground_seg.core.compiled.numerics import exp_neg, factorise, invert, solve_in_place
 
 
 @given(st.floats(0.0, 1e300), st.floats(-10.0, 0.0))

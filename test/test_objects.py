@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
+from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.data.boxes import Boxes, read_boxes
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
-from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.evaluation.evaluate import load_kitti, score_methods
-from gp_ground_seg.evaluation.metrics import GROUND_CLASSES
-from gp_ground_seg.evaluation.objects import (
+from gp_ground_seg.lab.scoring.evaluate import load_kitti, score_methods
+from gp_ground_seg.lab.scoring.metrics import GROUND_CLASSES
+from gp_ground_seg.lab.scoring.objects import (
     BAND_EDGES,
     MIN_HEIGHT,
     MIN_RETURNS,

@@ -12,13 +12,13 @@ from evaluation_samples import write_streets
 from matplotlib.image import imread
 
 from gp_ground_seg import Config
+from gp_ground_seg.core.errors import ConfigError, DataError
+from gp_ground_seg.core.parameters.config import find_spec
+from gp_ground_seg.core.parameters.export import file_problems, is_logarithmic
 from gp_ground_seg.data.semantic_kitti import labelled_frames
-from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.evaluate import OurMethod, load_kitti, score_methods
-from gp_ground_seg.experiments import optimise
-from gp_ground_seg.parameters.config import find_spec
-from gp_ground_seg.parameters.export import file_problems, is_logarithmic
-from gp_ground_seg.scale.cluster import HERE
+from gp_ground_seg.lab.experiments import optimise
+from gp_ground_seg.lab.scale.cluster import HERE
+from gp_ground_seg.lab.scoring.evaluate import OurMethod, load_kitti, score_methods
 
 TOLERANCE = 'label.ground_tolerance'
 BAD = Config().replace(**{'label.rule': 'tolerance', TOLERANCE: 0.001})

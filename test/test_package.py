@@ -151,7 +151,7 @@ HINT = """if True:
     import sys, sysconfig
     sys.prefix, folder = {prefix!r}, {folder!r}
     sysconfig.get_path = lambda name: folder
-    from gp_ground_seg.errors import install_hint
+    from gp_ground_seg.core.errors import install_hint
     print(install_hint('rosbags'))
 """
 

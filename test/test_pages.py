@@ -13,9 +13,9 @@ from matplotlib.image import imread
 from gp_ground_seg import GroundSegmenter, __version__
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.main import COMMANDS
-from gp_ground_seg.evaluation.metrics import GROUNDGRID
-from gp_ground_seg.jit import JIT_ENABLED
-from gp_ground_seg.plotting.scan import plot_birds_eye
+from gp_ground_seg.core.jit import JIT_ENABLED
+from gp_ground_seg.lab.plotting.scan import plot_birds_eye
+from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
 
 figures = load_script('docs/figures.py')
 

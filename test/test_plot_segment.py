@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.parameters.config import GridConfig
-from gp_ground_seg.pipeline.polar_grid import build_polar_grid
-from gp_ground_seg.plotting import segment as colours
-from gp_ground_seg.plotting.segment import SegmentView, line_ends, plot_segment, segment_at
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.parameters.config import GridConfig
+from gp_ground_seg.core.pipeline.polar_grid import build_polar_grid
+from gp_ground_seg.lab.plotting import segment as colours
+from gp_ground_seg.lab.plotting.segment import SegmentView, line_ends, plot_segment, segment_at
 
 SEGMENT = 90
 ROAD, BUILDING, UNLABELLED = 40, 50, 0

@@ -16,9 +16,10 @@ from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.cli import plot
-from gp_ground_seg.errors import DataError, MissingDependencyError, PointCloudError
-from gp_ground_seg.plotting import scan, style
-from gp_ground_seg.plotting.scan import (
+from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.data import colours as colours_
+from gp_ground_seg.lab.plotting import scan, style
+from gp_ground_seg.lab.plotting.scan import (
     CAMERA,
     TARGET,
     ZOOM,
@@ -27,7 +28,7 @@ from gp_ground_seg.plotting.scan import (
     plot_scan_view,
     project,
 )
-from gp_ground_seg.plotting.scan import COLOURS_ABOVE as COLOURS
+from gp_ground_seg.lab.plotting.scan import COLOURS_ABOVE as COLOURS
 
 
 def inches(*lengths):
@@ -140,7 +141,7 @@ def test_bad_input_is_said(tmp_path, keywords, error, message):
 def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeypatch):
     script = (
         'import sys, numpy as np\n'
-        'from gp_ground_seg.plotting import scan, segment\n'
+        'from gp_ground_seg.lab.plotting import scan, segment\n'
         'assert "matplotlib" not in sys.modules\n'
         'scan.plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
         'assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules\n'
@@ -345,7 +346,7 @@ DEFICIENCIES = {
 
 @pytest.mark.parametrize('name', DEFICIENCIES)
 def test_lightness_of_the_colours_rises_for_every_eye(name):
-    colours = style.length_scale_colours(np.geomspace(1.0, 50.0, 30), 1.0, 50.0)
+    colours = colours_.length_scale_colours(np.geomspace(1.0, 50.0, 30), 1.0, 50.0)
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     seen = np.clip(linear @ np.transpose(DEFICIENCIES[name]), 0.0, 1.0)
     lightness = 116.0 * np.cbrt(seen @ [0.2126, 0.7152, 0.0722]) - 16.0
@@ -355,8 +356,8 @@ def test_lightness_of_the_colours_rises_for_every_eye(name):
 
 def test_colours_end_at_the_limits_and_nan_is_grey():
     values = np.array([1.0, 50.0, 0.01, 500.0, np.inf, np.nan])
-    ends = style.length_scale_colours(values, 1.0, 50.0)
+    ends = colours_.length_scale_colours(values, 1.0, 50.0)
     np.testing.assert_array_equal(ends[2], ends[0])
     np.testing.assert_array_equal(ends[3], ends[1])
     assert not np.array_equal(ends[0], ends[1])
-    np.testing.assert_array_equal(ends[5], style.UNKNOWN)
+    np.testing.assert_array_equal(ends[5], colours_.UNKNOWN)

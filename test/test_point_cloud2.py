@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_columns, read_xyz
-from gp_ground_seg.errors import PointCloudError
 
 FLOAT32, FLOAT64 = 7, 8
 STRUCT_CODES = dict(enumerate('bBhHiIfd', 1))

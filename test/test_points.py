@@ -1,6 +1,6 @@
 import numpy as np
 
-from gp_ground_seg.pipeline import points
+from gp_ground_seg.core.pipeline import points
 
 
 def test_points_are_taken_as_they_lie_if_they_can_be_computed_with():

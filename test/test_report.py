@@ -10,8 +10,8 @@ import subprocess
 import pytest
 
 from gp_ground_seg import Config, __version__
-from gp_ground_seg.evaluation import report
-from gp_ground_seg.evaluation.report import Column, Table
+from gp_ground_seg.lab.scoring import report
+from gp_ground_seg.lab.scoring.report import Column, Table
 
 TABLE = Table(
     [

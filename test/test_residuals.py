@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.frame import GroundSurface, Labelled, PolarGrid
-from gp_ground_seg.pipeline.residuals import correct_surface
-from gp_ground_seg.simulation import DRIVES, SENSORS, VLP_16, objects, simulate_scan
-from gp_ground_seg.simulation.scenes import Scene, ramp
+from gp_ground_seg.core.frame import GroundSurface, Labelled, PolarGrid
+from gp_ground_seg.core.pipeline.residuals import correct_surface
+from gp_ground_seg.lab.simulation import DRIVES, SENSORS, VLP_16, objects, simulate_scan
+from gp_ground_seg.lab.simulation.scenes import Scene, ramp
 
 N_SEGMENTS = 7
 KNOTS = np.array([1.0, 2.0, 3.5, 5.0, 7.0, 10.0])
@@ -104,7 +104,7 @@ def test_nothing_is_computed_before_it_is_asked_for(monkeypatch):
     def asked(*_):
         raise AssertionError('asked for')
 
-    monkeypatch.setattr('gp_ground_seg.result.correct_surface', asked)
+    monkeypatch.setattr('gp_ground_seg.core.result.correct_surface', asked)
     result = GroundSegmenter().segment(hilly_scan())
     assert np.isfinite(result.p_ground).all()
     assert result.fit.n_inliers > 0

@@ -14,13 +14,13 @@ from bag_samples import write_ros2_bag
 from conftest import fewer
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
-from gp_ground_seg.backend import NumpyBackend
 from gp_ground_seg.cli import main as cli
-from gp_ground_seg.compiled.backend import NumbaBackend
+from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.compiled.backend import NumbaBackend
+from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
+from gp_ground_seg.core.parameters.config import size_of_tables
 from gp_ground_seg.data.atomic_output import staged_bag_folder
 from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
-from gp_ground_seg.parameters.config import size_of_tables
 
 
 def ring_scan(n=4000, seed=0, height=1.73):

@@ -13,7 +13,7 @@ from cli_runner import run
 from ros_helpers import street, to_message
 
 from gp_ground_seg import Config
-from gp_ground_seg.jit import HAVE_NUMBA, code_folder
+from gp_ground_seg.core.jit import HAVE_NUMBA, code_folder
 from gp_ground_seg.ros import warm_up
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.parameters.config import DiagnosticsConfig
+from gp_ground_seg.core.parameters.config import DiagnosticsConfig
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 

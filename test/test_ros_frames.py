@@ -22,11 +22,11 @@ from sensor_msgs.msg import PointCloud2
 from test_sensor_pose import ROOM
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.pipeline.tilt import rotation
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.input import tilt_of
-from gp_ground_seg.simulation import VLP_16, simulate_scan
 
 HAS_TF2 = importlib.util.find_spec('tf2_ros') is not None
 VALUES = {'learning.mode': 'fixed', 'sensor.height': 1.73}

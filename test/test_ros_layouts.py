@@ -14,7 +14,7 @@ import ros_helpers as ros
 from sensor_msgs.msg import PointCloud2, PointField
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.pipeline.points import single_precision
+from gp_ground_seg.core.pipeline.points import single_precision
 from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
 from gp_ground_seg.ros.outputs import labelled_names
 

@@ -19,7 +19,7 @@ from rcl_interfaces.srv import GetParameters
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.jit import HAVE_NUMBA
+from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.ros.lifecycle import ROS_WHEELS, ros_session
 
 FIXED = (*IN_NAMESPACE, '-p', 'learning.mode:=fixed')

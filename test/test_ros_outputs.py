@@ -11,8 +11,8 @@ from sensor_msgs.msg import PointCloud2, PointField
 from visualization_msgs.msg import Marker, MarkerArray
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.data.point_cloud2 import read_columns
-from gp_ground_seg.parameters.schema import NODE_NAME
 from gp_ground_seg.ros import outputs
 from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS

@@ -18,10 +18,10 @@ from rclpy.qos import qos_profile_parameters
 from ros_helpers import bench, street, to_message
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.parameters.config import find_spec, parameter_specs
-from gp_ground_seg.parameters.export import file_problems
-from gp_ground_seg.parameters.presets import PRESETS
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
+from gp_ground_seg.core.parameters.export import file_problems
+from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.ros import parameters
 from gp_ground_seg.ros.parameters import set_remotely
 

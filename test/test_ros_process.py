@@ -24,7 +24,7 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.cli.bags import scan_cloud
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
-from gp_ground_seg.simulation import HDL_64E, SCENES, simulate_drive
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_drive
 
 # A busy machine must not look like a fault; everything else may.
 PATIENT = {

@@ -21,9 +21,9 @@ from evaluation_samples import street, write_frame, write_streets
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.scale import cluster
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.lab.scale import cluster
 
 distributed = pytest.importorskip('distributed')
 # Dask leaves sockets and event loops to the garbage collector when its processes end.

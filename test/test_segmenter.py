@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 from reference import Reference
 
 from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
-from gp_ground_seg.backend import NumpyBackend
-from gp_ground_seg.compiled.backend import NumbaBackend
-from gp_ground_seg.gp.evidence import STEP
-from gp_ground_seg.jit import HAVE_NUMBA, JIT_ENABLED
+from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.compiled.backend import NumbaBackend
+from gp_ground_seg.core.gp.evidence import STEP
+from gp_ground_seg.core.jit import HAVE_NUMBA, JIT_ENABLED
 
 # Without compilation the twins take a microsecond for each cell and point.
 SIZE = {} if JIT_ENABLED else {'grid.n_segments': 36, 'grid.n_bins': 60, 'grid.bin_growth': 1.5}
@@ -337,7 +337,7 @@ def test_what_a_thread_computes_of_a_result_does_not_hold_up_another_result():
         assert may_go_on.wait(60.0)
         return 'late'
 
-    compute = 'gp_ground_seg.result.correct_surface'
+    compute = 'gp_ground_seg.core.result.correct_surface'
     with ThreadPoolExecutor(2) as pool:
         with patch(compute, wait):
             late = pool.submit(lambda: results[0].corrected)

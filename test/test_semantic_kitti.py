@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import semantic_kitti
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_labels, read_points
-from gp_ground_seg.errors import DataError
 
 FLOATS = st.floats(width=32, allow_nan=True, allow_infinity=True)
 

@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 from test_ground_plane import cluttered_plane
 
 from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
-from gp_ground_seg.backend import NumpyBackend
-from gp_ground_seg.compiled.backend import NumbaBackend
+from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.compiled.backend import NumbaBackend
+from gp_ground_seg.core.jit import JIT_ENABLED
+from gp_ground_seg.core.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
+from gp_ground_seg.core.pipeline.tilt import angles_of, rotate, rotation
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
-from gp_ground_seg.jit import JIT_ENABLED
-from gp_ground_seg.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
-from gp_ground_seg.pipeline.tilt import angles_of, rotate, rotation
-from gp_ground_seg.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan
-from gp_ground_seg.simulation import scenes as landforms
-from gp_ground_seg.simulation.objects import floating_box, wall
+from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan
+from gp_ground_seg.lab.simulation import scenes as landforms
+from gp_ground_seg.lab.simulation.objects import floating_box, wall
 
 # Scans of 100,000 points, too many for the compiled twins as plain Python.
 BACKEND = NumbaBackend(2) if JIT_ENABLED else NumpyBackend()

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from gp_ground_seg import simulation
-from gp_ground_seg.simulation import HDL_64E, PLACES, SCENES, SENSORS, Kind, Scene, objects
-from gp_ground_seg.simulation import scenes as landforms
+from gp_ground_seg.lab import simulation
+from gp_ground_seg.lab.simulation import HDL_64E, PLACES, SCENES, SENSORS, Kind, Scene, objects
+from gp_ground_seg.lab.simulation import scenes as landforms
 
 COARSE = dataclasses.replace(HDL_64E, n_columns=240)
 EXACT = dataclasses.replace(COARSE, range_std=0.0, dropout=0.0)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from gp_ground_seg import simulation
-from gp_ground_seg.simulation import (
+from gp_ground_seg.lab import simulation
+from gp_ground_seg.lab.simulation import (
     HDL_64E,
     PLACES,
     SCENES,
@@ -19,7 +19,7 @@ from gp_ground_seg.simulation import (
     objects,
     traffic,
 )
-from gp_ground_seg.simulation import scenes as landforms
+from gp_ground_seg.lab.simulation import scenes as landforms
 
 EXACT = dataclasses.replace(HDL_64E, n_columns=700, range_std=0.0, dropout=0.0)
 TALL = dataclasses.replace(EXACT, elevations=SENSORS['os1-128'].elevations)

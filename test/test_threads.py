@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config
-from gp_ground_seg.compiled import threads
-from gp_ground_seg.compiled.backend import NumbaBackend
-from gp_ground_seg.compiled.threads import MIN_POINTS_TO_SPLIT, Part, Workers, run_of
-from gp_ground_seg.frame import GroundSurface
+from gp_ground_seg.core.compiled import threads
+from gp_ground_seg.core.compiled.backend import NumbaBackend
+from gp_ground_seg.core.compiled.threads import MIN_POINTS_TO_SPLIT, Part, Workers, run_of
+from gp_ground_seg.core.frame import GroundSurface
 
 
 @pytest.fixture

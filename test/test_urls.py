@@ -12,9 +12,9 @@ import pytest
 from cli_runner import error_line, run
 from evaluation_samples import write_streets
 
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import files
 from gp_ground_seg.data.files import UrlPath
-from gp_ground_seg.errors import DataError
 
 s3fs, _ = pytest.importorskip('s3fs'), pytest.importorskip('moto')
 # Sessions of aiohttp are left to the garbage collector.

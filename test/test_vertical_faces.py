@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 from reference import find_faces
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.frame import OUTSIDE
-from gp_ground_seg.pipeline.vertical_faces import UNITS_PER_METRE
+from gp_ground_seg.core.frame import OUTSIDE
+from gp_ground_seg.core.pipeline.vertical_faces import UNITS_PER_METRE
 
 BASE = Config().replace(**{'grid.r_max': 30.0})
 CORNER = np.array([10.0, 5.0, 0.0])

@@ -8,8 +8,8 @@ import yaml
 from conftest import REPOSITORY
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.backend import NumpyBackend
-from gp_ground_seg.parameters.schema import NODE_NAME
+from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.parameters.schema import NODE_NAME
 
 NODE = '/ground_segmentation_node'
 OPTIONAL = {f'{NODE}/{name}' for name in ('labeled', 'ground_model', 'markers')}

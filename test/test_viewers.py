@@ -13,11 +13,11 @@ from bag_samples import write_ros2_bag
 from cli_runner import error_line, run, until_ctrl_c
 
 from gp_ground_seg import GroundSegmenter, Label
+from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.parameters.config import find_spec
-from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
-from gp_ground_seg.viewers.scene import View, make_scene, palette, point_colours, read_view
-from gp_ground_seg.viewers.tuner import slider_values, tunable
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
+from gp_ground_seg.lab.viewers.scene import View, make_scene, palette, point_colours, read_view
+from gp_ground_seg.lab.viewers.tuner import slider_values, tunable
 
 ROAD, OBJECT = 40, 99  # classes of SemanticKITTI
 CAR = 10 | 7 << 16  # and an instance of one

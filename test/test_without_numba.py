@@ -9,7 +9,7 @@ import pytest
 from conftest import REPOSITORY, hilly_scan
 
 from gp_ground_seg import GroundSegmenter
-from gp_ground_seg.jit import HAVE_NUMBA
+from gp_ground_seg.core.jit import HAVE_NUMBA
 
 SCRIPT = """
 import sys

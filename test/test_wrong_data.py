@@ -12,10 +12,10 @@ from cli_runner import error_line, run
 from evaluation_samples import write_frame
 
 from gp_ground_seg.cli import main as cli
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, find_doubt
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 SPARSE = 300 * 10**9
 RING = ('--columns', '5')

@@ -9,7 +9,7 @@ import numpy as np
 from torture_cases import run_cases
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
-from gp_ground_seg.parameters.config import parameter_specs
+from gp_ground_seg.core.parameters.config import parameter_specs
 
 MAX_DIFFERENT = 0.02
 """Share of the points that rounding may decide differently in the two backends: one candidate

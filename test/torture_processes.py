@@ -21,7 +21,7 @@ from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 import multiprocessing
 import numpy as np
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.segmenter import warm_up
+from gp_ground_seg.core.segmenter import warm_up
 # A campaign in the background of a shell begins with SIGINT ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 random.seed(seed)

@@ -9,11 +9,11 @@ import sys
 import time
 from pathlib import Path
 
+from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.evaluation.report import describe_environment, machine_line
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.viewers.html_page import open_server
-from gp_ground_seg.viewers.tuner import Tuner
+from gp_ground_seg.lab.scoring.report import describe_environment, machine_line
+from gp_ground_seg.lab.viewers.html_page import open_server
+from gp_ground_seg.lab.viewers.tuner import Tuner
 
 NAME = 'label.ground_tolerance'
 N_MOVES = 100

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli import options
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
-from gp_ground_seg.errors import DataError
 from gp_ground_seg.ros.lifecycle import large_cloud_transport, needing_ros, ros_session
 
 if TYPE_CHECKING:

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.cli import options
+from gp_ground_seg.core.errors import DataError, MissingDependencyError
+from gp_ground_seg.core.jit import HAVE_NUMBA
+from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.inputs import holds_bag, list_inputs
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import list_sequences
-from gp_ground_seg.errors import DataError, MissingDependencyError
-from gp_ground_seg.evaluation import report
-from gp_ground_seg.evaluation.benchmark import BenchFrame, bench_cases, bench_document, run_cases
-from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, TITLES
-from gp_ground_seg.evaluation.patchworkpp import PEERS
-from gp_ground_seg.evaluation.report import Cell, Column, Table
-from gp_ground_seg.jit import HAVE_NUMBA
-from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.lab.scoring import report
+from gp_ground_seg.lab.scoring.benchmark import BenchFrame, bench_cases, bench_document, run_cases
+from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, TITLES
+from gp_ground_seg.lab.scoring.patchworkpp import PEERS
+from gp_ground_seg.lab.scoring.report import Cell, Column, Table
 
 DESCRIPTION = """\
 Measure the time of the segmentation on your data, by stage: with theta fixed and learned in
@@ -175,7 +175,7 @@ def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
 
 
 def bench_text(document: dict[str, Any]) -> str:
-    """Lay out a `gp_ground_seg.evaluation.benchmark.bench_document` for the terminal."""
+    """Lay out a `gp_ground_seg.lab.scoring.benchmark.bench_document` for the terminal."""
     cases = document['cases']
     parameters = report.parameters_line(document['config_changes'])
     machine = report.machine_line(document['environment'])

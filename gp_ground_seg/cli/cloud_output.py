@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gp_ground_seg.core.errors import DataError, PointCloudError
+from gp_ground_seg.core.frame import Label
+from gp_ground_seg.core.ground_model import GroundModel
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file
 from gp_ground_seg.data.clouds import Cloud, Columns
 from gp_ground_seg.data.files import AnyPath
 from gp_ground_seg.data.inputs import Input
 from gp_ground_seg.data.numpy_files import encode_arrays
-from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.frame import Label
-from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.result import Segmentation
-from gp_ground_seg.segmenter import GroundSegmenter
 
 LABELS = 'label'
 FORMATS = (LABELS, *(suffix[1:] for suffix in WRITABLE))

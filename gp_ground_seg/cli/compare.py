@@ -10,16 +10,16 @@ from typing import Any
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, frames_from_options
+from gp_ground_seg.core.errors import ConfigError, DataError
+from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation import comparison, report
-from gp_ground_seg.evaluation.evaluate import KnownScan, OurMethod, load_kitti, score_methods
-from gp_ground_seg.evaluation.metrics import Labels
-from gp_ground_seg.evaluation.report import Column, Table, percent
-from gp_ground_seg.frame import Label
-from gp_ground_seg.plotting.scan import plot_two_labels
-from gp_ground_seg.scale.cluster import Runner
+from gp_ground_seg.lab.plotting.scan import plot_two_labels
+from gp_ground_seg.lab.scale.cluster import Runner
+from gp_ground_seg.lab.scoring import comparison, report
+from gp_ground_seg.lab.scoring.evaluate import KnownScan, OurMethod, load_kitti, score_methods
+from gp_ground_seg.lab.scoring.metrics import Labels
+from gp_ground_seg.lab.scoring.report import Column, Table, percent
 
 DESCRIPTION = """\
 Run two configurations in turns on the same frames, and print their differences: IoU,

@@ -6,10 +6,10 @@ import argparse
 import sys
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.parameters import export
-from gp_ground_seg.parameters.config import Config, parameter_specs
-from gp_ground_seg.parameters.presets import find_preset
-from gp_ground_seg.parameters.schema import read_parameters
+from gp_ground_seg.core.parameters import export
+from gp_ground_seg.core.parameters.config import Config, parameter_specs
+from gp_ground_seg.core.parameters.presets import find_preset
+from gp_ground_seg.core.parameters.schema import read_parameters
 
 EXAMPLES = """\
   gp-ground-seg config dump > my.yaml            every parameter, explained, with its default

@@ -12,13 +12,13 @@ from typing import Any
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.cloud_output import FORMATS
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.scale.cluster import Progress, cut, depends_on_past
-from gp_ground_seg.scale.dataset import Manifest, Outcome, Scan, digest, pool, sweep
+from gp_ground_seg.lab.scale.cluster import Progress, cut, depends_on_past
+from gp_ground_seg.lab.scale.dataset import Manifest, Outcome, Scan, digest, pool, sweep
 
 # What the output depends on, beside the parameters and the layout of scans.
 _OPTIONS = ('raw', 'topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')

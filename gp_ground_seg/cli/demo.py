@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.bags import scan_cloud
+from gp_ground_seg.core.errors import DataError, GroundSegError
+from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.atomic_output import staged_files
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
@@ -24,12 +26,11 @@ from gp_ground_seg.data.semantic_kitti import (
     read_labels,
     read_points,
 )
-from gp_ground_seg.errors import DataError, GroundSegError
-from gp_ground_seg.evaluation.metrics import GROUNDGRID, Confusion, Labels, count_confusion
-from gp_ground_seg.evaluation.report import Column
-from gp_ground_seg.frame import Label
-from gp_ground_seg.plotting.scan import plot_birds_eye
-from gp_ground_seg.plotting.style import new_figure
+from gp_ground_seg.lab.plotting.scan import plot_birds_eye
+from gp_ground_seg.lab.plotting.style import new_figure
+from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Confusion, Labels, count_confusion
+from gp_ground_seg.lab.scoring.report import Column
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 from gp_ground_seg.ros.lifecycle import needing_ros
 from gp_ground_seg.ros.probe import (
     GROUND,
@@ -41,7 +42,6 @@ from gp_ground_seg.ros.probe import (
     rate_result,
     restamped,
 )
-from gp_ground_seg.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 
 if TYPE_CHECKING:
     from gp_ground_seg.ros.lifecycle import Session

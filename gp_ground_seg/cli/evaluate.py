@@ -12,21 +12,21 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data.boxes import find_boxes
 from gp_ground_seg.data.files import as_path
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, boxed_frames, labelled_frames
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation import evaluate as methods
-from gp_ground_seg.evaluation import metrics
-from gp_ground_seg.evaluation import report as tables
-from gp_ground_seg.evaluation.evaluate import KnownScan, MethodScore
-from gp_ground_seg.evaluation.intervals import INTERVAL, Sums, interval_note, interval_text
-from gp_ground_seg.evaluation.object_table import object_table
-from gp_ground_seg.evaluation.patchworkpp import PEERS
-from gp_ground_seg.evaluation.report import Cell, Column, Table, percent
-from gp_ground_seg.experiments.variants import make_report
-from gp_ground_seg.frame import Label
+from gp_ground_seg.lab.experiments.variants import make_report
+from gp_ground_seg.lab.scoring import evaluate as methods
+from gp_ground_seg.lab.scoring import metrics
+from gp_ground_seg.lab.scoring import report as tables
+from gp_ground_seg.lab.scoring.evaluate import KnownScan, MethodScore
+from gp_ground_seg.lab.scoring.intervals import INTERVAL, Sums, interval_note, interval_text
+from gp_ground_seg.lab.scoring.object_table import object_table
+from gp_ground_seg.lab.scoring.patchworkpp import PEERS
+from gp_ground_seg.lab.scoring.report import Cell, Column, Table, percent
 
 DESCRIPTION = """\
 Segment labelled frames and score the labels in both conventions of the field: precision,

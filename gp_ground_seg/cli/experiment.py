@@ -9,16 +9,20 @@ from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
-from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.evaluation.evaluate import PATCHWORKPP, load_kitti
-from gp_ground_seg.evaluation.patchworkpp import PEERS
-from gp_ground_seg.evaluation.report import Report, describe_environment, machine_line, written
-from gp_ground_seg.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
-from gp_ground_seg.experiments.table1 import table1
-from gp_ground_seg.experiments.variants import load_simulated, score_simulated, simulated_frames
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.scale.cluster import Runner
-from gp_ground_seg.simulation import DRIVES, SCENES, SENSORS
+from gp_ground_seg.core.errors import ConfigError, DataError
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.lab.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
+from gp_ground_seg.lab.experiments.table1 import table1
+from gp_ground_seg.lab.experiments.variants import (
+    load_simulated,
+    score_simulated,
+    simulated_frames,
+)
+from gp_ground_seg.lab.scale.cluster import Runner
+from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, load_kitti
+from gp_ground_seg.lab.scoring.patchworkpp import PEERS
+from gp_ground_seg.lab.scoring.report import Report, describe_environment, machine_line, written
+from gp_ground_seg.lab.simulation import DRIVES, SCENES, SENSORS
 
 Option = tuple[str, str, dict[str, Any]]
 
@@ -194,7 +198,7 @@ rubble, by exact labels and heights.
     'departures': Experiment(
         """\
 Switch off one departure from the paper after the other. They are the rows of
-gp_ground_seg/experiments/ablation.py; `compare` measures any other change.
+gp_ground_seg/lab/experiments/ablation.py; `compare` measures any other change.
 """,
         (ROOT, *OF_FRAMES),
         _departures,

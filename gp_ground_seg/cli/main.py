@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from gp_ground_seg import __version__
-from gp_ground_seg.errors import GroundSegError
+from gp_ground_seg.core.errors import GroundSegError
 
 ROS_ARGS = '--ros-args'
 

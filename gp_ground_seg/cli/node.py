@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.errors import GroundSegError, MissingDependencyError, install_hint
+from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint
 from gp_ground_seg.ros.lifecycle import needing_ros, stop_on_signals
 
 NODE_EXAMPLES = """\
@@ -58,8 +58,8 @@ def main() -> int:
 
 def run_warm_up(_arguments: argparse.Namespace) -> int:
     """Compile all code that a frame needs, in this process."""
-    from gp_ground_seg.jit import HAVE_NUMBA, code_folder
-    from gp_ground_seg.segmenter import warm_up
+    from gp_ground_seg.core.jit import HAVE_NUMBA, code_folder
+    from gp_ground_seg.core.segmenter import warm_up
 
     if not HAVE_NUMBA:
         raise MissingDependencyError(

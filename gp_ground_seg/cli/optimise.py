@@ -11,21 +11,21 @@ import yaml
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
-from gp_ground_seg.evaluation import comparison
-from gp_ground_seg.evaluation.evaluate import load_kitti
-from gp_ground_seg.evaluation.report import (
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.export import is_logarithmic
+from gp_ground_seg.core.parameters.schema import ROS_NODE_KEY, ROS_PARAMETERS_KEY, ParameterValue
+from gp_ground_seg.lab.experiments import optimise
+from gp_ground_seg.lab.experiments.variants import make_report, score_variants
+from gp_ground_seg.lab.plotting.search import plot_search
+from gp_ground_seg.lab.plotting.style import new_figure
+from gp_ground_seg.lab.scoring import comparison
+from gp_ground_seg.lab.scoring.evaluate import load_kitti
+from gp_ground_seg.lab.scoring.report import (
     changed_parameters,
     describe_environment,
     machine_line,
     written,
 )
-from gp_ground_seg.experiments import optimise
-from gp_ground_seg.experiments.variants import make_report, score_variants
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.export import is_logarithmic
-from gp_ground_seg.parameters.schema import ROS_NODE_KEY, ROS_PARAMETERS_KEY, ParameterValue
-from gp_ground_seg.plotting.search import plot_search
-from gp_ground_seg.plotting.style import new_figure
 
 DESCRIPTION = f"""\
 Search parameters on your labelled frames (Optuna, TPE) by IoU in the GroundGrid convention. The

@@ -15,16 +15,16 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from gp_ground_seg import log
+from gp_ground_seg.core import log
+from gp_ground_seg.core.errors import ConfigError, DataError
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.export import differences, yaml_scalar
+from gp_ground_seg.core.parameters.presets import PRESETS, find_preset
+from gp_ground_seg.core.parameters.schema import load_yaml
 from gp_ground_seg.data.atomic_output import leftovers, staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
-from gp_ground_seg.errors import ConfigError, DataError
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.export import differences, yaml_scalar
-from gp_ground_seg.parameters.presets import PRESETS, find_preset
-from gp_ground_seg.parameters.schema import load_yaml
-from gp_ground_seg.scale.cluster import Runner, open_runner
+from gp_ground_seg.lab.scale.cluster import Runner, open_runner
 
 DEFAULT_PRESET = 'default'
 FLAG = {'action': 'store_true'}

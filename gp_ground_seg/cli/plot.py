@@ -13,11 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli import options
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import read_labels
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.evaluation.metrics import GROUNDGRID
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.scan import (
+from gp_ground_seg.lab.plotting.scan import (
     VALUES,
     Scene,
     View,
@@ -26,10 +27,9 @@ from gp_ground_seg.plotting.scan import (
     plot_sheet,
     write_movie,
 )
-from gp_ground_seg.plotting.segment import plot_segment, segment_at
-from gp_ground_seg.result import Segmentation
-from gp_ground_seg.segmenter import GroundSegmenter
-from gp_ground_seg.simulation import SCENES, SENSORS, simulate_scan
+from gp_ground_seg.lab.plotting.segment import plot_segment, segment_at
+from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 SCAN = """\
 Draw a scan as RViz would show the node's topics: ground, obstacles, and the ground

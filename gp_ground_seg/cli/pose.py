@@ -8,10 +8,10 @@ import statistics
 from contextlib import closing
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.evaluation.report import Cell, Column, Table, percent, write_json
-from gp_ground_seg.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.segmenter import GroundSegmenter
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
+from gp_ground_seg.core.segmenter import GroundSegmenter
+from gp_ground_seg.lab.scoring.report import Cell, Column, Table, percent, write_json
 
 DESCRIPTION = """\
 Estimate height and tilt of the sensor from scans.

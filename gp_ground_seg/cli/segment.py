@@ -11,19 +11,19 @@ from pathlib import Path
 
 from gp_ground_seg.cli import dataset, options
 from gp_ground_seg.cli.cloud_output import FORMATS, CloudOutput, encode_labels
+from gp_ground_seg.core.errors import DataError, PointCloudError
+from gp_ground_seg.core.frame import Label
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.files import AnyPath, as_path, write_file
 from gp_ground_seg.data.inputs import Input, Inputs, holds_bag
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
-from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.frame import Label
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.result import Segmentation
-from gp_ground_seg.scale.cluster import Progress
-from gp_ground_seg.scale.dataset import Outcome, Scan, pool, segment_block
-from gp_ground_seg.segmenter import GroundSegmenter
+from gp_ground_seg.lab.scale.cluster import Progress
+from gp_ground_seg.lab.scale.dataset import Outcome, Scan, pool, segment_block
 
 DESCRIPTION = """\
 Split scans into ground and obstacles.

@@ -12,18 +12,18 @@ from itertools import islice
 from pathlib import Path
 
 from gp_ground_seg.cli import options
+from gp_ground_seg.core.errors import DataError, PointCloudError
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.export import to_yaml
+from gp_ground_seg.core.parameters.schema import NODE_NAME
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.inputs import Inputs
-from gp_ground_seg.errors import DataError, PointCloudError
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.export import to_yaml
-from gp_ground_seg.parameters.schema import NODE_NAME
-from gp_ground_seg.result import Segmentation
-from gp_ground_seg.segmenter import GroundSegmenter
-from gp_ground_seg.viewers.html_page import open_server, write_page
-from gp_ground_seg.viewers.rerun_view import Recording, web_viewer
-from gp_ground_seg.viewers.scene import View, make_scene, read_view
-from gp_ground_seg.viewers.tuner import Tuner, tunable
+from gp_ground_seg.lab.viewers.html_page import open_server, write_page
+from gp_ground_seg.lab.viewers.rerun_view import Recording, web_viewer
+from gp_ground_seg.lab.viewers.scene import View, make_scene, read_view
+from gp_ground_seg.lab.viewers.tuner import Tuner, tunable
 
 VIEW = """\
 Look at segmented scans in Rerun: points by class, height or probability, the surface with

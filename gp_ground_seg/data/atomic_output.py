@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.bag_files import is_bag_folder
-from gp_ground_seg.errors import DataError
 
 PARTIAL_MARK = '.partial-'  # part of the hidden names under which unfinished output is kept
 

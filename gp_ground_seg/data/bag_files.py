@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.errors import DataError, GroundSegError
+from gp_ground_seg.core.errors import DataError, GroundSegError
 
 POINT_CLOUD2 = 'sensor_msgs/msg/PointCloud2'
 UNKNOWN_TYPE_HASH = 'RIHS01_' + 64 * '0'  # what rosbag2 itself stores is no valid hash

@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.data.atomic_output import staged_bag_folder, staged_file
 from gp_ground_seg.data.bag_files import (
     METADATA_FILE,
@@ -29,7 +30,6 @@ from gp_ground_seg.data.bag_files import (
     storage_of,
     writing,
 )
-from gp_ground_seg.errors import DataError, require
 
 _HEADER = 'std_msgs/msg/Header'
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.data.semantic_kitti import Frame, read_bytes
-from gp_ground_seg.errors import DataError
-from gp_ground_seg.frame import FloatArray
 
 ARRAYS = {'box_class': (), 'box_center': (3,), 'box_size': (3,), 'box_rotation': (3, 3)}
 """Arrays of a file, and what follows the number of boxes in the shape of each."""

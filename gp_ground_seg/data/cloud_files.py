@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError
 from gp_ground_seg.data.bag_files import in_one_line
 from gp_ground_seg.data.clouds import Cloud, Columns, name_columns
 from gp_ground_seg.data.files import AnyPath
@@ -19,7 +20,6 @@ from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
 from gp_ground_seg.data.scan_layout import KITTI, MAX_SCAN_BYTES, ScanLayout, find_objection
 from gp_ground_seg.data.semantic_kitti import read_bytes, read_scan
-from gp_ground_seg.errors import DataError, GroundSegError, PointCloudError
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5

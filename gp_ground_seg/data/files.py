@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gp_ground_seg.core.errors import DataError, GroundSegError, MissingDependencyError, require
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
-from gp_ground_seg.errors import DataError, GroundSegError, MissingDependencyError, require
 
 
 @dataclass(frozen=True)

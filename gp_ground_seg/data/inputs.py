@@ -9,6 +9,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
+from gp_ground_seg.core.errors import DataError, PointCloudError
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.cloud_files import NUSCENES_SUFFIX, SUFFIXES, read_file
@@ -16,7 +17,6 @@ from gp_ground_seg.data.clouds import Cloud
 from gp_ground_seg.data.files import AnyPath, as_path
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
-from gp_ground_seg.errors import DataError, PointCloudError
 
 # Where the scans of a data set are, in a folder of one of its drives, and these in its root.
 _SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')

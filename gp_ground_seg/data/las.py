@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.core.errors import PointCloudError, require
+from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data.clouds import Cloud, Columns, cloud_of, gather, in_types, scatter
 from gp_ground_seg.data.scan_layout import MAX_SCAN_BYTES
-from gp_ground_seg.errors import PointCloudError, require
-from gp_ground_seg.frame import Label
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 SCALE = 1e-4

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data.clouds import Cloud, cloud_of, in_types, read_table
-from gp_ground_seg.errors import PointCloudError
 
 _END = re.compile(rb'^end_header[ \t]*\r?\n', re.MULTILINE)
 _MAX_HEADER_BYTES = 1 << 16

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.parameters.config import find_spec
+from gp_ground_seg.core.parameters.config import find_spec
 
 DTYPES = ('float32', 'float64')
 MIN_COLUMNS = 3

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
 from gp_ground_seg.data.scan_layout import KITTI, MAX_SCAN_BYTES, ScanLayout, find_doubt
-from gp_ground_seg.errors import DataError
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt

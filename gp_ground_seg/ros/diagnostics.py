@@ -12,10 +12,10 @@ import numpy.typing as npt
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from gp_ground_seg.frame import FloatArray, Label
-from gp_ground_seg.parameters.config import DiagnosticsConfig
-from gp_ground_seg.pipeline.sensor_pose import SensorPose
-from gp_ground_seg.result import FitReport, Segmentation
+from gp_ground_seg.core.frame import FloatArray, Label
+from gp_ground_seg.core.parameters.config import DiagnosticsConfig
+from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
+from gp_ground_seg.core.result import FitReport, Segmentation
 from gp_ground_seg.ros.input import STEADY_CLOCK
 from gp_ground_seg.ros.status import Hysteresis, Level, Rate, Status
 

@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.ground_model import GroundModel
+from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.point_cloud2 import read_columns
-from gp_ground_seg.errors import PointCloudError
-from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.result import Segmentation
 from gp_ground_seg.ros.input import message_data
 
 FIELDS = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')

@@ -19,10 +19,10 @@ from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from std_msgs.msg import Header
 
+from gp_ground_seg.core.errors import ConfigError, MissingDependencyError, PointCloudError
+from gp_ground_seg.core.parameters.config import NO_FRAME, FrameConfig
+from gp_ground_seg.core.pipeline.tilt import angles_of
 from gp_ground_seg.data import point_cloud2
-from gp_ground_seg.errors import ConfigError, MissingDependencyError, PointCloudError
-from gp_ground_seg.parameters.config import NO_FRAME, FrameConfig
-from gp_ground_seg.pipeline.tilt import angles_of
 
 OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAX_DEPTH = 10_000

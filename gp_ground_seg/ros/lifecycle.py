@@ -22,8 +22,13 @@ from typing import Any
 
 import yaml
 
-from gp_ground_seg.errors import ConfigError, GroundSegError, MissingDependencyError, install_hint
-from gp_ground_seg.parameters.schema import read_yaml
+from gp_ground_seg.core.errors import (
+    ConfigError,
+    GroundSegError,
+    MissingDependencyError,
+    install_hint,
+)
+from gp_ground_seg.core.parameters.schema import read_yaml
 
 HIGHEST_DOMAIN = 232
 ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"

@@ -14,13 +14,14 @@ import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg import log
-from gp_ground_seg.backend import NumpyBackend, choose_backend
+from gp_ground_seg.core import log
+from gp_ground_seg.core.backend import NumpyBackend, choose_backend
+from gp_ground_seg.core.errors import GroundSegError, PointCloudError
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.schema import NODE_NAME
+from gp_ground_seg.core.pipeline.points import single_precision
+from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.point_cloud2 import read_xyz
-from gp_ground_seg.errors import GroundSegError, PointCloudError
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.parameters.schema import NODE_NAME
-from gp_ground_seg.pipeline.points import single_precision
 from gp_ground_seg.ros import lifecycle
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
 from gp_ground_seg.ros.input import THROTTLED, TfListener, TimeJumps, is_tf_used, require_tf2
@@ -28,7 +29,6 @@ from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
 from gp_ground_seg.ros.subscription import CloudSubscription
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader
-from gp_ground_seg.segmenter import GroundSegmenter
 
 
 class GroundSegmentationNode(ConfiguredNode):

@@ -14,12 +14,12 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from gp_ground_seg.core.frame import FloatArray, IntArray, Label
+from gp_ground_seg.core.ground_model import GroundModel
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.data.colours import length_scale_colours
 from gp_ground_seg.data.point_cloud2 import append_columns, read_xyz
-from gp_ground_seg.frame import FloatArray, IntArray, Label
-from gp_ground_seg.ground_model import GroundModel
-from gp_ground_seg.parameters.config import Config
-from gp_ground_seg.plotting.style import length_scale_colours
-from gp_ground_seg.result import Segmentation
 from gp_ground_seg.ros.ground_model import ground_model_cloud
 from gp_ground_seg.ros.input import cloud_profile, message_data, select_points
 

@@ -1,4 +1,4 @@
-"""The parameters of `gp_ground_seg.parameters.config` as ROS parameters of a node."""
+"""The parameters of `gp_ground_seg.core.parameters.config` as ROS parameters of a node."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.parameter_service import ParameterService
 from rclpy.qos import qos_profile_parameters
 
-from gp_ground_seg.errors import ConfigError, DataError, GroundSegError
-from gp_ground_seg.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.parameters.schema import OF_EVERY_NODE, ParameterSpec, ParameterValue
+from gp_ground_seg.core.errors import ConfigError, DataError, GroundSegError
+from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
+from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec, ParameterValue
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.lifecycle import start_errors
 

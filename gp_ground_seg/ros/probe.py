@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
+from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.point_cloud2 import CloudMessage, encode_cloud, stamp_of
-from gp_ground_seg.errors import GroundSegError
 from gp_ground_seg.ros.lifecycle import (
     Session,
     large_cloud_transport,

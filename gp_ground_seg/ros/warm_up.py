@@ -10,11 +10,11 @@ import threading
 import time
 from collections.abc import Callable
 
-from gp_ground_seg.backend import Backend
-from gp_ground_seg.jit import code_folder, is_code_kept
-from gp_ground_seg.parameters.config import Config
+from gp_ground_seg.core.backend import Backend
+from gp_ground_seg.core.jit import code_folder, is_code_kept
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.segmenter import warm_up
 from gp_ground_seg.ros.lifecycle import own_code
-from gp_ground_seg.segmenter import warm_up
 
 FOLLOWS = 'segmenting with numpy until the compiled code is there; to compile takes a minute'
 CHANGED = 'segmenting with numba now'
@@ -24,7 +24,7 @@ _COMPILE = """\
 import os, threading
 # Standard input ends when the process that has started this one does.
 threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
-from gp_ground_seg.segmenter import warm_up
+from gp_ground_seg.core.segmenter import warm_up
 warm_up()
 """
 
@@ -80,7 +80,7 @@ class BackendLoader:
         start = time.monotonic()
         try:
             # What is kept is known once the compiled functions are declared.
-            importlib.import_module('gp_ground_seg.compiled.backend')
+            importlib.import_module('gp_ground_seg.core.compiled.backend')
             if code_folder() is not None and not is_code_kept():
                 self._compile()
             if not self._is_stopped:

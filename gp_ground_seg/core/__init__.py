@@ -1,0 +1,1 @@
+"""What a scan goes through, from points to labels; start with `segmenter`."""

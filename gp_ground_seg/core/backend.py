@@ -1,0 +1,138 @@
+"""Compute backends: the stages of a frame in plain numpy, or compiled with numba."""
+
+from __future__ import annotations
+
+import logging
+from typing import Protocol
+
+from gp_ground_seg.core.errors import MissingDependencyError, install_hint
+from gp_ground_seg.core.frame import (
+    BoolArray,
+    Candidates,
+    Faces,
+    FloatArray,
+    Frame,
+    GroundSurface,
+    Inliers,
+    Labelled,
+    Lines,
+    PointArray,
+    PseudoInputs,
+    Scan,
+)
+from gp_ground_seg.core.gp import ground, likelihood
+from gp_ground_seg.core.jit import HAVE_NUMBA
+from gp_ground_seg.core.parameters.config import Config, RuntimeConfig
+from gp_ground_seg.core.pipeline import ground_plane, labels, lines, polar_grid, vertical_faces
+from gp_ground_seg.core.pipeline.tilt import Direction
+
+_LOGGER = logging.getLogger('gp_ground_seg')
+_warned_slow = False
+
+
+class Backend(Protocol):
+    """One method per stage; theta has one row per segment.
+
+    Each takes the values of the stages before and returns new ones. Those of `build_grid`
+    and `find_faces` may lie in buffers that the next scan reuses.
+    """
+
+    @property
+    def name(self) -> str:
+        """``numba`` or ``numpy``."""
+
+    @property
+    def n_threads(self) -> int:
+        """Number of threads, the caller's included."""
+
+    def build_grid(self, xyz: PointArray, config: Config) -> Scan:
+        """See `gp_ground_seg.core.pipeline.polar_grid.build_scan`."""
+
+    def fit_plane(
+        self, candidates: Candidates, max_slope: float, origin: Direction
+    ) -> ground_plane.GroundPlane | None:
+        """See `gp_ground_seg.core.pipeline.ground_plane.fit_plane`."""
+
+    def find_faces(self, scan: Scan, config: Config) -> Faces:
+        """See `gp_ground_seg.core.pipeline.vertical_faces.find_faces`."""
+
+    def extract_lines(
+        self, candidates: Candidates, faces: Faces, config: Config
+    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
+        """See `gp_ground_seg.core.pipeline.lines.find_lines`."""
+
+    def log_likelihood(
+        self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
+    ) -> tuple[float, FloatArray]:
+        """See `gp_ground_seg.core.gp.likelihood.log_likelihood`."""
+
+    def estimate_surface(
+        self, frame: Frame, theta: FloatArray, config: Config
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
+        """See `gp_ground_seg.core.gp.ground.estimate_surface`."""
+
+    def label_points(
+        self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
+    ) -> Labelled:
+        """See `gp_ground_seg.core.pipeline.labels.label_points`."""
+
+    def close(self) -> None:
+        """End worker threads; they start again if they are needed again."""
+
+
+class NumpyBackend:
+    """Plain numpy, one thread."""
+
+    name = 'numpy'
+    n_threads = 1
+    build_grid = staticmethod(polar_grid.build_scan)
+    fit_plane = staticmethod(ground_plane.fit_plane)
+    find_faces = staticmethod(vertical_faces.find_faces)
+    extract_lines = staticmethod(lines.find_lines)
+    log_likelihood = staticmethod(likelihood.log_likelihood)
+    estimate_surface = staticmethod(ground.estimate_surface)
+    label_points = staticmethod(labels.label_points)
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+def choose_backend(wanted: str) -> str:
+    """Return ``numba`` or ``numpy`` for the parameter ``runtime.backend``.
+
+    Raises
+    ------
+    MissingDependencyError
+        If numba is asked for by name and not installed.
+    """
+    if wanted == 'numba' and not HAVE_NUMBA:
+        raise MissingDependencyError(
+            f'runtime.backend = numba, but numba is not installed: {install_hint("numba")}; '
+            'or set runtime.backend to auto'
+        )
+    if wanted == 'auto' and not HAVE_NUMBA:
+        _warn_slow('is not installed', install_hint('numba'))
+    return 'numba' if HAVE_NUMBA and wanted != 'numpy' else 'numpy'
+
+
+def make_backend(runtime: RuntimeConfig) -> Backend:
+    """Backend for the parameters ``runtime``; raises as `choose_backend`."""
+    if choose_backend(runtime.backend) == 'numpy':
+        return NumpyBackend()
+    try:
+        # Imported only where it is used, as it imports numba.
+        from gp_ground_seg.core.compiled.backend import NumbaBackend
+    except Exception as error:  # of many types: a numba that does not fit this numpy, or coverage
+        if runtime.backend == 'numba':
+            raise MissingDependencyError(f'runtime.backend = numba: {error}') from error
+        _warn_slow('cannot be imported', error)
+        return NumpyBackend()
+    return NumbaBackend(runtime.n_threads)
+
+
+def _warn_slow(reason: str, more: object) -> None:
+    """Say once that numba is missing."""
+    global _warned_slow
+    if not _warned_slow:
+        _warned_slow = True
+        _LOGGER.warning('numba %s: using numpy, several times slower (%s)', reason, more)

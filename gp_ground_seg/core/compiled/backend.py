@@ -1,0 +1,274 @@
+"""The numba backend: each stage as a few calls of compiled functions, in threads."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from gp_ground_seg.core.compiled import (
+    evidence,
+    ground,
+    ground_plane,
+    labels,
+    likelihood,
+    lines,
+    polar_grid,
+)
+from gp_ground_seg.core.compiled import latent as latent_
+from gp_ground_seg.core.compiled import vertical_faces as faces_
+from gp_ground_seg.core.compiled.buffers import Buffers
+from gp_ground_seg.core.compiled.sections import numbers_of
+from gp_ground_seg.core.compiled.threads import Part, Workers, run_of
+from gp_ground_seg.core.frame import (
+    BoolArray,
+    Candidates,
+    Faces,
+    FloatArray,
+    Frame,
+    GroundSurface,
+    Inliers,
+    Labelled,
+    Lines,
+    PointArray,
+    PolarGrid,
+    PseudoInputs,
+    Scan,
+    Tiles,
+)
+from gp_ground_seg.core.gp.evidence import STEP, looks_aside_in
+from gp_ground_seg.core.gp.latent import given_log_length_scales
+from gp_ground_seg.core.jit import keep_code
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
+from gp_ground_seg.core.pipeline.labels import square_units
+from gp_ground_seg.core.pipeline.points import copy_points, points_in
+from gp_ground_seg.core.pipeline.tilt import Direction
+
+
+class NumbaBackend:
+    """See `gp_ground_seg.core.backend.Backend`.
+
+    A process forked off this one has no threads, and perhaps half-filled buffers; after Ctrl-C a
+    thread may still write to the buffers. The next frame then begins with new ones.
+
+    Parameters
+    ----------
+    n_threads : int
+        Number of threads; 0 = all cores, at most 4.
+
+    Attributes
+    ----------
+    workers : Workers
+        The threads.
+    """
+
+    name = 'numba'
+
+    def __init__(self, n_threads: int) -> None:
+        self._wanted_threads = n_threads
+        self._renew()
+
+    def _renew(self) -> None:
+        self._pid = os.getpid()
+        self.workers, self._buffers = Workers(self._wanted_threads), Buffers()
+
+    @property
+    def n_threads(self) -> int:
+        """Number of threads, the caller's included."""
+        return self.workers.n_threads
+
+    def build_grid(self, xyz: PointArray, config: Config) -> Scan:
+        """Sort points into cells and tiles; lowest point of each cell."""
+        if self._pid != os.getpid() or not self.workers.is_idle:
+            self._renew()
+        n_points, dtype, take = len(xyz), xyz.dtype, self._buffers.take
+        geometry = polar_grid.grid_geometry(config.grid, config.faces.cell_size, dtype)
+        n_parts = self.workers.n_parts(n_points)
+        n_segments, n_cells = config.grid.n_segments, config.grid.n_segments * config.grid.n_bins
+        n_tiles = geometry.n_sides**2
+        columns = take('columns', (3, n_points), dtype)
+        cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points, dtype=dtype)
+        tile = take('tile', (n_points,), np.int32)
+        cells = polar_grid.CellTable(
+            take('extremes', (n_parts, n_cells + 1, 3), dtype),
+            take('numbers', (n_parts, n_cells + 1, 2), np.int32),
+        )
+        tiles = self._buffers.tile_table(self.workers.n_threads, n_tiles, dtype)
+        places = polar_grid.Places(cell, r, tile)
+
+        def copy_and_sort(part: Part) -> None:
+            own = run_of(part, n_points)
+            copy_points(xyz[own], columns[:, own])
+            polar_grid.sort_points(part, columns, geometry, places, cells, tiles)
+
+        self.workers.run(copy_and_sort, n_parts)
+        room = Candidates.room(n_cells, n_segments)
+        n = polar_grid.merge_parts(
+            n_parts, cells, tiles, geometry.edges, config.lines.min_density_extent, room
+        )
+        occupied = tiles.occupied[0, 1 : 1 + tiles.occupied[0, 0]]
+        return Scan(
+            points_in(columns),
+            PolarGrid(cell, r, geometry.edges, n_segments),
+            Tiles(tile, tiles.extremes[0, :-1], occupied),
+            room.first(n),
+        )
+
+    def fit_plane(
+        self, candidates: Candidates, max_slope: float, origin: Direction
+    ) -> GroundPlane | None:
+        """Plane of the ground around the sensor."""
+        return ground_plane.fit_plane(candidates, max_slope, origin)
+
+    def find_faces(self, scan: Scan, config: Config) -> Faces:
+        """Tiles that hold a vertical face."""
+        take = self._buffers.take
+        thresholds, heights = numbers_of(config.faces), numbers_of(config.label)
+        n_tiles, n_parts = len(scan.tiles.extremes), self.workers.n_parts(len(scan.xyz))
+        tile_to_row, row_to_tile = take('tile_rows', (2, n_tiles), np.int32)
+        n_tall = faces_.select_tall(scan.tiles, heights, tile_to_row, row_to_tile)
+        sums = take('face_sums', (n_parts, 2 * n_tall, faces_.N_COLUMNS), np.float64)
+        room = faces_.FaceSums(tile_to_row, row_to_tile, sums)
+        self.workers.run(
+            faces_.sum_returns,
+            n_parts,
+            scan.xyz.T,
+            scan.tiles,
+            thresholds.cell_size,
+            heights,
+            n_tall,
+            room,
+        )
+        result = Faces(*take('faces', (2, n_tiles), np.bool_))
+        faces_.decide_faces(n_parts, n_tall, thresholds, heights, room, result)
+        return result
+
+    def extract_lines(
+        self, candidates: Candidates, faces: Faces, config: Config
+    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
+        """Candidates that show ground, lines, pseudo-inputs, candidates that continue a line."""
+        return lines.find_lines(candidates, faces, config)
+
+    def log_likelihood(
+        self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
+    ) -> tuple[float, FloatArray]:
+        """Log marginal likelihood of the frame and its gradient."""
+        n_segments = len(inliers.offsets) - 1
+        values, gradients = np.empty(n_segments), np.empty((n_segments, len(theta)))
+        self.workers.run(
+            likelihood.log_likelihood,
+            self.workers.n_threads,
+            theta,
+            inliers,
+            slope_std,
+            latent_terms,
+            values,
+            gradients,
+        )
+        value = float(values.sum())
+        if not np.isfinite(value):
+            return -np.inf, np.zeros(len(theta))
+        return value, gradients.sum(axis=0)
+
+    def estimate_surface(
+        self, frame: Frame, theta: FloatArray, config: Config
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
+        """Inliers, the surface, and log length-scales at the knots and at the candidates."""
+        take, observation = self._buffers.take, numbers_of(config.observation)
+        growth = numbers_of(config.growth)
+        shape, n_candidates = (len(theta), len(frame.knots)), len(frame.candidates.r)
+        is_latent = config.length_scale.model == 'latent'
+        if is_latent:
+            u, knot_u = take('u', (n_candidates,), np.float64), np.empty(shape)
+        else:
+            u, knot_u = given_log_length_scales(frame, config.length_scale)
+        own = ground.SegmentSurfaces(
+            u,
+            knot_u,
+            take('seed', (n_candidates,), np.bool_),
+            np.empty(n_candidates, np.bool_),
+            *take('surfaces', (2, *shape), np.float64),
+        )
+        slope_std, knots = observation.slope_std, frame.knots
+        looks_aside = looks_aside_in(frame, config)
+        max_slope = growth.max_standardised_residual * slope_std if looks_aside else -1.0
+        room, aside = take('aside', (2, 2, *shape), np.float64)
+        nothing = aside[:, :0]
+        evidence.find_seeds(frame, theta, growth, max_slope, room[0], own.seed)
+
+        def grow(aside: FloatArray, step: int) -> None:
+            self.workers.run(
+                ground.grow_surfaces,
+                self.n_threads,
+                frame,
+                theta,
+                observation,
+                growth,
+                aside,
+                step,
+                own,
+            )
+
+        if is_latent:
+            self.workers.run(
+                latent_.latent_log_length_scales, self.n_threads, frame, theta, u, knot_u
+            )
+        if looks_aside:
+            own.mean.fill(np.nan)
+            own.std.fill(np.nan)
+            grow(nothing, STEP)
+            evidence.find_evidence(own.mean, own.std, theta, knots, slope_std, room, aside)
+        grow(aside if looks_aside else nothing, 1)
+        mean, std = np.empty((2, *shape))
+        if looks_aside:
+            evidence.find_evidence(own.mean, own.std, theta, knots, slope_std, room, aside)
+        shown = aside if looks_aside else nothing
+        evidence.combine(own, shown, theta, knots, slope_std, frame.prior_mean, mean, std)
+        return GroundSurface(knots, mean, std, own.inlier), knot_u, u
+
+    def label_points(
+        self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
+    ) -> Labelled:
+        """Height, label and margin of each point; roughness of each cell."""
+        take, label = self._buffers.take, numbers_of(config.label)
+        is_predictive = config.label.rule == 'predictive'
+        max_depth = label.obstacle_max_height if is_predictive else label.ground_tolerance
+        n_points, n_bins = len(scan.xyz), scan.grid.n_bins
+        n_cells, n_parts = scan.grid.n_segments * n_bins, self.workers.n_parts(n_points)
+        room = labels.LabelRoom(
+            take('pieces', (n_cells + 1, 2), np.float64),
+            take('square_sums', (n_parts, n_cells + 1, 2), np.int64),
+            take('band', (n_cells + 1,), np.float64),
+            square_units(n_points, label.obstacle_min_height),
+        )
+        result = Labelled(
+            np.empty(n_points, dtype=np.uint8),
+            np.empty(n_points),
+            np.empty(n_points),
+            np.empty((scan.grid.n_segments, n_bins)),
+        )
+        labels.fit_pieces(surface, room)
+        self.workers.run(labels.survey, n_parts, scan, faces.is_face, label, result.height, room)
+        labels.set_bands(
+            n_parts, label, is_predictive, config.observation.sigma_n, room, result.roughness
+        )
+        self.workers.run(
+            labels.label_part,
+            n_parts,
+            scan,
+            faces,
+            label.ground_tolerance,
+            max_depth,
+            room.band,
+            result,
+        )
+        keep_code()
+        return result
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._pid != os.getpid():
+            # The pool is that of the parent process, and its lock perhaps held for ever.
+            self._renew()
+        self.workers.close()

@@ -1,0 +1,174 @@
+"""Compiled twin of `gp_ground_seg.core.gp.evidence`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gp_ground_seg.core.compiled.ground import SegmentSurfaces
+from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame
+from gp_ground_seg.core.gp.evidence import LEAST_PRECISION, LEAST_STD
+from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.parameters.config import GrowthConfig
+
+
+@jit(entry=True)
+def find_seeds(
+    frame: Frame,
+    theta: FloatArray,
+    growth: GrowthConfig,
+    max_slope: float,
+    table: FloatArray,
+    seed: BoolArray,
+) -> None:
+    """Do what `seeds` of the twin does, into `seed`; `max_slope` < 0: segments do not look aside.
+
+    `table` (M, K) is overwritten.
+    """
+    candidates, knots = frame.candidates, frame.knots
+    n_segments = len(candidates.offsets) - 1
+    n_bins = 0
+    for i in range(len(seed)):
+        z = candidates.z[i] - frame.prior_mean
+        seed[i] = candidates.r[i] <= growth.seed_range and abs(z) <= growth.seed_height_tolerance
+        if seed[i]:
+            n_bins = max(n_bins, candidates.bin[i] + 1)
+    if max_slope < 0.0 or n_bins == 0:
+        return
+    for m in range(n_segments):
+        for j in range(n_bins):
+            table[m, j] = np.inf
+        for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            if seed[i]:
+                table[m, candidates.bin[i]] = candidates.z[i] - frame.prior_mean
+    rise_along(table, n_bins, max_slope, knots)
+    rise = np.empty(n_bins)
+    for j in range(n_bins):
+        rise[j] = max_slope * 2.0 * math.pi / n_segments * knots[j]
+    # Twice around, as the segments form a ring.
+    for m in range(1, 2 * n_segments):
+        rise_from(table[m % n_segments], table[(m - 1) % n_segments], rise)
+    for m in range(2 * n_segments - 2, -1, -1):
+        rise_from(table[m % n_segments], table[(m + 1) % n_segments], rise)
+    rise_along(table, n_bins, max_slope, knots)
+    limit = growth.max_standardised_residual
+    for m in range(n_segments):
+        noise = limit * math.sqrt(2.0) * math.exp(theta[m, 1])
+        for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            if seed[i]:
+                z = candidates.z[i] - frame.prior_mean
+                seed[i] = z <= table[m, candidates.bin[i]] + noise
+
+
+@jit()
+def rise_from(own: FloatArray, other: FloatArray, rise: FloatArray) -> None:
+    """Let the ground rise from one segment to the next."""
+    # Unsigned, as a signed index could count from the end.
+    for j in range(np.uintp(0), np.uintp(len(rise))):
+        highest = other[j] + rise[j]
+        own[j] = highest if highest < own[j] else own[j]
+
+
+@jit()
+def rise_along(table: FloatArray, n_bins: int, max_slope: float, knots: FloatArray) -> None:
+    """Let the ground rise outwards, then inwards."""
+    for m in range(len(table)):
+        own = table[m]
+        for j in range(1, n_bins):
+            own[j] = min(own[j], own[j - 1] + max_slope * (knots[j] - knots[j - 1]))
+        for j in range(n_bins - 2, -1, -1):
+            own[j] = min(own[j], own[j + 1] + max_slope * (knots[j + 1] - knots[j]))
+
+
+@jit(entry=True)
+def find_evidence(
+    mean: FloatArray,
+    std: FloatArray,
+    theta: FloatArray,
+    knots: FloatArray,
+    slope_std: float,
+    shown: FloatArray,
+    aside: FloatArray,
+) -> None:
+    """Do what `evidence_aside` of the twin does, into `aside` (2, M, K): height and precision.
+
+    `shown` (2, M, K) is overwritten.
+    """
+    n_segments, n_knots = mean.shape
+    # Unsigned, as a signed index could count from the end.
+    start, end = np.uintp(0), np.uintp(n_knots)
+    nearest, nearest_std, rise = np.empty(n_knots), np.empty(n_knots), np.empty(n_knots)
+    for j in range(start, end):
+        rise[j] = slope_std * 2.0 * math.pi / n_segments * knots[j]
+    for m in range(n_segments):
+        sill = math.exp(theta[m, 0]) ** 2
+        own_mean, std_m, height, own_std = mean[m], std[m], shown[0, m], shown[1, m]
+        for j in range(start, end):
+            square = std_m[j] * std_m[j]
+            square = square if square > LEAST_STD**2 else LEAST_STD**2
+            precision = 1.0 / square - 1.0 / (sill + slope_std**2 * knots[j] * knots[j])
+            # False where there is no surface, too.
+            is_known = precision > LEAST_PRECISION and std_m[j] >= 0.0
+            safe = precision if is_known else 1.0
+            height[j] = own_mean[j] / (square * safe) if is_known else 0.0
+            own_std[j] = 1.0 / math.sqrt(safe) if is_known else np.inf
+    aside[:] = 0.0
+    for side in range(2):
+        nearest[:], nearest_std[:] = 0.0, np.inf
+        for k in range(2 * n_segments):
+            m = k % n_segments if side == 0 else n_segments - 1 - k % n_segments
+            height, own_std = shown[0, m], shown[1, m]
+            weighted, total = aside[0, m], aside[1, m]
+            # The first time around finds what the second begins with.
+            if k >= n_segments:
+                for j in range(start, end):
+                    carried = nearest_std[j] + rise[j]
+                    weight = 1.0 / (carried * carried)
+                    total[j] += weight
+                    weighted[j] += weight * nearest[j]
+            for j in range(start, end):
+                carried = nearest_std[j] + rise[j]
+                is_own = own_std[j] <= carried
+                nearest[j] = height[j] if is_own else nearest[j]
+                nearest_std[j] = own_std[j] if is_own else carried
+    for m in range(n_segments):
+        weighted, total = aside[0, m], aside[1, m]
+        for j in range(start, end):
+            weighted[j] /= total[j] if total[j] > 0.0 else 1.0
+
+
+@jit(entry=True)
+def combine(
+    own: SegmentSurfaces,
+    aside: FloatArray,
+    theta: FloatArray,
+    knots: FloatArray,
+    slope_std: float,
+    prior_mean: float,
+    mean: FloatArray,
+    std: FloatArray,
+) -> None:
+    """Do what `combined_surface` of the twin does, into `mean` and `std`, about no prior mean.
+
+    `aside` (2, M, K) is the evidence, (2, 0, 0) if none is wanted.
+    """
+    for m in range(len(mean)):
+        for j in range(len(knots)):
+            mean[m, j] = own.mean[m, j] + prior_mean
+            std[m, j] = own.std[m, j]
+        if aside.shape[1] == 0:
+            continue
+        sill = math.exp(theta[m, 0]) ** 2
+        height, precision = aside[0, m], aside[1, m]
+        for j in range(len(knots)):
+            if math.isnan(own.knot_log_length_scale[m, j]):
+                break
+            variance, own_height = sill + slope_std**2 * knots[j] ** 2, 0.0
+            if not math.isnan(own.std[m, j]):
+                variance, own_height = max(own.std[m, j], LEAST_STD) ** 2, own.mean[m, j]
+            elif precision[j] == 0.0:
+                continue
+            own_share = 1.0 / (1.0 + variance * precision[j])
+            mean[m, j] = own_share * own_height + (1.0 - own_share) * height[j] + prior_mean
+            std[m, j] = math.sqrt(own_share * variance)

@@ -1,0 +1,172 @@
+"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in four calls.
+
+`fit_pieces` prepares the surface of each cell, `survey` measures the heights of a part of the
+points over it, `set_bands` turns the sums of all parts into bands, `label_part` labels a part.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.core.compiled.threads import Part, points_of
+from gp_ground_seg.core.frame import (
+    NOT_FINITE,
+    BoolArray,
+    Faces,
+    FloatArray,
+    GroundSurface,
+    IntArray,
+    Label,
+    Labelled,
+    Scan,
+)
+from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.parameters.config import LabelConfig
+
+# Plain integers, as compiled code has no enumerations.
+_UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
+OBSTACLE_FLAG = 2**32
+"""Added to the number of returns near the surface for each that shows an obstacle: more than there
+are points."""
+
+
+class LabelRoom(NamedTuple):
+    """Working arrays of the labels; the last row of each is for points in no cell.
+
+    Attributes
+    ----------
+    pieces : (M * n_bins + 1, 2) float64
+        Surface in each cell, level and slope over range.
+    sums : (n_parts, M * n_bins + 1, 2) int64
+        For each cell the number of points near the surface, with `OBSTACLE_FLAG` added for
+        each that shows an obstacle, and the sum of squared heights in whole units. Their
+        order does not matter, nor how the points are split.
+    band : (M * n_bins + 1,) float64
+        Largest height of ground [m].
+    units : float
+        Whole units of squared heights [1/m^2].
+    """
+
+    pieces: FloatArray
+    sums: IntArray
+    band: FloatArray
+    units: float
+
+
+@jit(entry=True)
+def fit_pieces(surface: GroundSurface, room: LabelRoom) -> None:
+    """Line of the surface across each cell; NaN in the last row."""
+    knots, mean = surface.knots, surface.mean
+    n_bins = len(knots) - 1
+    for m in range(len(mean)):
+        for n in range(n_bins):
+            slope = (mean[m, n + 1] - mean[m, n]) / (knots[n + 1] - knots[n])
+            room.pieces[m * n_bins + n, 0] = mean[m, n] - slope * knots[n]
+            room.pieces[m * n_bins + n, 1] = slope
+    room.pieces[len(room.pieces) - 1, 0] = room.pieces[len(room.pieces) - 1, 1] = math.nan
+
+
+@jit(entry=True)
+def survey(
+    part: Part,
+    scan: Scan,
+    is_face: BoolArray,
+    config: LabelConfig,
+    height: FloatArray,
+    room: LabelRoom,
+) -> None:
+    """Heights of the points of a part over the surface, and the sums for roughness."""
+    pieces, sums, nearest = room.pieces, room.sums[part.number], scan.grid.edges[0]
+    min_height, max_height = config.obstacle_min_height, config.obstacle_max_height
+    for k in range(len(sums)):
+        sums[k, 0] = sums[k, 1] = 0
+    # Slices, because indices from 0 on need no check for negative ones.
+    own = points_of(part, len(height))
+    z, tile, heights = scan.xyz.T[2, own], scan.tiles.tile[own], height[own]
+    cell, r = scan.grid.cell[own], scan.grid.r[own]
+    for i in range(len(cell)):
+        c = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
+        away = max(np.float64(r[i]), nearest)
+        h = np.float64(z[i]) - (pieces[c, 0] + pieces[c, 1] * away)
+        heights[i] = h
+        if h >= min_height:
+            if h <= max_height:
+                sums[c, 0] += OBSTACLE_FLAG
+        elif h >= -min_height and not is_face[np.uintp(tile[i])]:
+            sums[c, 0] += 1
+            sums[c, 1] += int(h * h * room.units + 0.5)
+
+
+@jit(entry=True)
+def set_bands(
+    n_parts: int,
+    config: LabelConfig,
+    is_predictive: bool,
+    sigma_n: float,
+    room: LabelRoom,
+    roughness: FloatArray,
+) -> None:
+    """Roughness and band of each cell from all parts, see `ground_band` of the twin."""
+    n_segments, n_bins = roughness.shape
+    # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
+    number = np.empty(n_bins + 2, np.int64)
+    squares = np.empty(n_bins + 2, np.int64)
+    obstacle_depth = config.obstacle_max_height - config.obstacle_min_height
+    for m in range(n_segments):
+        for n in range(n_bins + 2):
+            number[n] = squares[n] = 0
+        for index in range(n_parts):
+            for k in range(-1, 2):
+                first = (m + k + n_segments) % n_segments * n_bins
+                for n in range(n_bins):
+                    number[n + 1] += room.sums[index, first + n, 0]
+                    squares[n + 1] += room.sums[index, first + n, 1]
+        for n in range(n_bins):
+            flagged = number[n] + number[n + 1] + number[n + 2]
+            n_near = np.float64(max(flagged & (OBSTACLE_FLAG - 1), 1))
+            total = squares[n] + squares[n + 1] + squares[n + 2]
+            rough = math.sqrt(np.float64(total) / (room.units * n_near))
+            band = config.ground_tolerance
+            if is_predictive:
+                variance = rough**2 + sigma_n**2
+                obstacles_per_metre = np.float64((flagged >> 32) + 1) / obstacle_depth
+                ground_per_metre = n_near / math.sqrt(2.0 * math.pi * variance)
+                log_ratio = math.log(ground_per_metre / obstacles_per_metre)
+                likely = math.sqrt(2.0 * variance * max(log_ratio, 0.0))
+                band = min(max(likely, band), config.obstacle_min_height)
+            room.band[m * n_bins + n] = band
+            roughness[m, n] = rough
+    room.band[n_segments * n_bins] = math.nan
+
+
+@jit(entry=True)
+def label_part(
+    part: Part,
+    scan: Scan,
+    faces: Faces,
+    tolerance: float,
+    max_depth: float,
+    band: FloatArray,
+    result: Labelled,
+) -> None:
+    """Label the points of a part from their heights in `result`.
+
+    Ground reaches `max_depth` below the surface, and on faces `tolerance` above their base.
+    """
+    points = points_of(part, len(result.height))
+    z, tile, cell = scan.xyz.T[2, points], scan.tiles.tile[points], scan.grid.cell[points]
+    height, label, margins = result.height[points], result.label[points], result.margin[points]
+    for i in range(len(cell)):
+        n, h = cell[i], height[i]
+        margin = min(band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + max_depth)
+        t = np.uintp(tile[i] if n >= 0 else 0)
+        if faces.is_face[t]:
+            over_base = max(h, np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0]))
+            limit = -tolerance if faces.has_occluded_base[t] else tolerance
+            margin = min(margin, limit - over_base)
+        margins[i] = margin
+        own = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
+        label[i] = _GROUND if margin >= 0.0 else own

@@ -1,0 +1,393 @@
+"""Compiled twin of `gp_ground_seg.core.pipeline.polar_grid`.
+
+Each part of the points fills tables of its own; `merge_parts` reduces them to the candidates and
+to the first table of the tiles.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.core.compiled.buffers import TileTable
+from gp_ground_seg.core.compiled.threads import Part, points_of
+from gp_ground_seg.core.frame import (
+    NO_TILE,
+    NOT_FINITE,
+    OUTSIDE,
+    Candidates,
+    CellArray,
+    FloatArray,
+    PointArray,
+)
+from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.parameters.config import GridConfig
+from gp_ground_seg.core.pipeline.polar_grid import (
+    bin_edges,
+    round_up_to,
+    segment_edges,
+    tiles_per_side,
+)
+
+BLOCK = 512
+"""Points sorted at a time, so that their intermediate values stay in the nearest cache."""
+LARGEST_TABLE = 2**15
+EARLY = 0.02
+"""Offset of the entries of a table towards smaller values, in entries: more than the error of
+single precision in the largest table."""
+
+
+class BinLookup(NamedTuple):
+    """Edges of bins, and a table that gives the bin of a value without a search.
+
+    Attributes
+    ----------
+    edges : (n + 1,) float32 or float64
+        Edges rounded up to the precision of the values (see `round_up_to`).
+    bins : (T,) int32
+        Bin of the values from ``edges[0] + k / scale`` on, a little early.
+    ends : (T,) float32 or float64
+        Where that bin ends.
+    scale : float
+        Entries per unit.
+    is_coarse : bool
+        Whether more than one edge may lie in an entry.
+    """
+
+    edges: PointArray
+    bins: CellArray
+    ends: PointArray
+    scale: float
+    is_coarse: bool
+
+    @classmethod
+    def of(cls, edges: FloatArray, fineness: int, dtype: np.dtype[np.floating]) -> BinLookup:
+        """Table for values of type `dtype` in the bins between `edges` (n + 1,).
+
+        The narrowest bin has `fineness` entries, as far as `LARGEST_TABLE` allows.
+        """
+        extent, narrowest = float(edges[-1] - edges[0]), float(np.diff(edges).min())
+        scale = min(fineness / narrowest, LARGEST_TABLE / extent)
+        # A little early, so that rounding never gives an entry too far.
+        starts = edges[0] + (np.arange(int(extent * scale) + 2) - EARLY) / scale
+        bins = np.clip(np.searchsorted(edges, starts, side='right') - 1, 0, len(edges) - 2)
+        rounded = np.array([round_up_to(dtype, edge) for edge in edges], dtype=dtype)
+        is_coarse = narrowest * scale < 1.0 + 2.0 * EARLY
+        return cls(rounded, bins.astype(np.int32), rounded[bins + 1], scale, is_coarse)
+
+
+class GridGeometry(NamedTuple):
+    """Where the edges of cells and tiles lie.
+
+    Attributes
+    ----------
+    ranges, azimuths : BinLookup
+        Bins over range [m], segments over azimuth key.
+    edges : (n_bins + 1,) float64
+        Exact ranges of the bin edges [m].
+    tiles_per_metre : float
+        One over the side of a tile [1/m].
+    n_sides : int
+        Tiles along a side of the square.
+    """
+
+    ranges: BinLookup
+    azimuths: BinLookup
+    edges: FloatArray
+    tiles_per_metre: float
+    n_sides: int
+
+
+@lru_cache(maxsize=4)
+def grid_geometry(
+    grid: GridConfig, tile_size: float, dtype: np.dtype[np.floating]
+) -> GridGeometry:
+    """Geometry for points of type `dtype`."""
+    edges = bin_edges(grid)
+    ranges = BinLookup.of(edges, 4, dtype)
+    azimuths = BinLookup.of(segment_edges(grid.n_segments), 8, dtype)
+    n_sides = tiles_per_side(grid.r_max, tile_size)
+    return GridGeometry(ranges, azimuths, edges, 1.0 / tile_size, n_sides)
+
+
+class CellTable(NamedTuple):
+    """Extremes and numbers of the points of each cell, one table for each part.
+
+    Attributes
+    ----------
+    extremes : (n_parts, M * n_bins + 1, 3) float32 or float64
+        Height of the lowest point, its range, and height of the highest point [m]. The last
+        row is for points in no cell.
+    numbers : (n_parts, M * n_bins + 1, 2) int32
+        Number of points; tile of the lowest point.
+    """
+
+    extremes: PointArray
+    numbers: CellArray
+
+
+class Places(NamedTuple):
+    """Cell, range [m] and tile of each point; see `PolarGrid` and `Tiles`."""
+
+    cell: CellArray
+    r: PointArray
+    tile: CellArray
+
+
+@jit(entry=True)
+def sort_points(
+    part: Part,
+    columns: PointArray,
+    geometry: GridGeometry,
+    places: Places,
+    cells: CellTable,
+    tiles: TileTable,
+) -> None:
+    """Sort the points of a part, (3, N), into cells and tiles, with the extremes of each.
+
+    Block by block: first the places of the points, in loops without branches; then the
+    extremes.
+    """
+    cell, r, tile = places.cell, places.r, places.tile
+    points = points_of(part, len(r))
+    extremes, numbers = cells.extremes[part.number], cells.numbers[part.number]
+    tile_extremes, occupied = tiles.extremes[part.number], tiles.occupied[part.number]
+    _clear(extremes, numbers, tile_extremes, occupied)
+    range_entry = np.empty(BLOCK, dtype=np.int32)
+    key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
+    for first in range(points.start, points.stop, BLOCK):
+        own = slice(first, min(first + BLOCK, points.stop))
+        x, y, z = columns[0, own], columns[1, own], columns[2, own]
+        _compute_range(x, y, z, geometry.ranges, r[own], range_entry, cell[own])
+        _compute_azimuth_key(x, y, geometry, cell[own], key, key_entry, tile[own])
+        _look_up(geometry, r[own], range_entry, key, key_entry, cell[own])
+        _widen(z, cell[own], tile[own], extremes, numbers, tile_extremes, occupied)
+    for first in range(points.start, points.stop, BLOCK):
+        own = slice(first, min(first + BLOCK, points.stop))
+        _resolve_lowest(columns[2, own], r[own], cell[own], tile[own], extremes, numbers)
+
+
+@jit()
+def _clear(
+    extremes: PointArray, numbers: CellArray, tile_extremes: PointArray, occupied: CellArray
+) -> None:
+    """Make the tables those of no points; of the tiles only those that were occupied."""
+    for k in range(len(numbers)):
+        extremes[k, 0] = extremes[k, 1] = np.inf
+        extremes[k, 2] = -np.inf
+        numbers[k, 0], numbers[k, 1] = 0, NO_TILE
+    for place in range(1, occupied[0] + 1):
+        k = np.uintp(occupied[place])
+        tile_extremes[k, 0], tile_extremes[k, 1] = np.inf, -np.inf
+    last = len(tile_extremes) - 1
+    tile_extremes[last, 0], tile_extremes[last, 1] = np.inf, -np.inf
+    occupied[0] = 0
+
+
+@jit()
+def _compute_range(
+    x: PointArray,
+    y: PointArray,
+    z: PointArray,
+    ranges: BinLookup,
+    r: PointArray,
+    entry: CellArray,
+    cell: CellArray,
+) -> None:
+    """Range of each point and its entry in the table; ``cell`` is 0, or the reason for none."""
+    number = x.dtype.type
+    zero, infinity, nothing = number(0.0), number(np.inf), number(np.nan)
+    start, end, per_metre = ranges.edges[0], ranges.edges[-1], number(ranges.scale)
+    for i in range(len(r)):
+        finite = (abs(x[i]) < infinity) & (abs(y[i]) < infinity) & (abs(z[i]) < infinity)
+        own_r = math.sqrt(x[i] * x[i] + y[i] * y[i])
+        inside = finite & (own_r < end)
+        r[i] = own_r if finite else nothing
+        cell[i] = 0 if inside else (OUTSIDE if finite else NOT_FINITE)
+        beyond = (own_r - start) * per_metre
+        entry[i] = np.int32(beyond if inside & (beyond > zero) else zero)
+
+
+# A loop of its own: for more arrays the compiler cannot prove that none overlap.
+@jit()
+def _compute_azimuth_key(
+    x: PointArray,
+    y: PointArray,
+    geometry: GridGeometry,
+    cell: CellArray,
+    key: PointArray,
+    entry: CellArray,
+    tile: CellArray,
+) -> None:
+    """Azimuth key of each point that has a cell, its entry in the table, and the tile."""
+    number = x.dtype.type
+    zero, two, four = number(0.0), number(2.0), number(4.0)
+    half, per_metre = number(geometry.ranges.edges[-1]), number(geometry.tiles_per_metre)
+    last, n_sides = number(geometry.n_sides - 1), np.int32(geometry.n_sides)
+    per_key = number(geometry.azimuths.scale)
+    for i in range(len(cell)):
+        inside = cell[i] == 0
+        own_x = x[i] if inside else zero
+        own_y = y[i] if inside else zero
+        size = abs(own_x) + abs(own_y)
+        share = own_y / size if size > zero else zero
+        left = -share if own_y < zero else four - share
+        own_key = two + share if own_x >= zero else left
+        # Exactly 4 is the edge that ends the last segment: that is segment 0 again.
+        own_key = own_key if own_key < four else zero
+        key[i] = own_key
+        entry[i] = np.int32(own_key * per_key)
+        column = np.int32(min((own_x + half) * per_metre, last))
+        row = np.int32(min((own_y + half) * per_metre, last))
+        tile[i] = column * n_sides + row if inside else OUTSIDE
+
+
+@jit()
+def _look_up(
+    geometry: GridGeometry,
+    r: PointArray,
+    range_entry: CellArray,
+    key: PointArray,
+    key_entry: CellArray,
+    cell: CellArray,
+) -> None:
+    """Cell of the points that have one: the bin of the table's entry, or the next."""
+    ranges, azimuths = geometry.ranges, geometry.azimuths
+    n_bins = np.int32(len(ranges.edges) - 1)
+    zero, one = np.int32(0), np.int32(1)
+    for i in range(len(cell)):
+        k, q = np.uintp(range_entry[i]), np.uintp(key_entry[i])
+        n = ranges.bins[k] + (one if r[i] >= ranges.ends[k] else zero)
+        m = azimuths.bins[q] + (one if key[i] >= azimuths.ends[q] else zero)
+        cell[i] = m * n_bins + n if cell[i] == 0 else cell[i]
+    if not ranges.is_coarse and not azimuths.is_coarse:
+        return
+    for i in range(len(cell)):
+        if cell[i] < 0:
+            continue
+        m, n = cell[i] // n_bins, cell[i] % n_bins
+        while r[i] >= ranges.edges[np.uintp(n + 1)]:
+            n += one
+        while key[i] >= azimuths.edges[np.uintp(m + 1)]:
+            m += one
+        cell[i] = m * n_bins + n
+
+
+@jit()
+def _widen(
+    z: PointArray,
+    cell: CellArray,
+    tile: CellArray,
+    extremes: PointArray,
+    numbers: CellArray,
+    tile_extremes: PointArray,
+    occupied: CellArray,
+) -> None:
+    """Heights and number of the points of each cell and tile, without a branch.
+
+    Lists the tiles that become occupied.
+    """
+    n_occupied = occupied[0]
+    for i in range(len(z)):
+        k = np.uintp(cell[i] if cell[i] >= 0 else len(numbers) - 1)
+        low, high = extremes[k, 0], extremes[k, 2]
+        extremes[k, 0] = z[i] if z[i] < low else low
+        extremes[k, 2] = z[i] if z[i] > high else high
+        numbers[k, 0] += np.int32(1)
+        k = np.uintp(tile[i] if tile[i] >= 0 else len(tile_extremes) - 1)
+        low, high = tile_extremes[k, 0], tile_extremes[k, 1]
+        # Written in any case, counted only where the tile was empty.
+        occupied[np.uintp(n_occupied + 1)] = tile[i]
+        n_occupied += np.int32((low > high) & (tile[i] >= 0))
+        tile_extremes[k, 0] = z[i] if z[i] < low else low
+        tile_extremes[k, 1] = z[i] if z[i] > high else high
+    occupied[0] = n_occupied
+
+
+@jit()
+def _resolve_lowest(
+    z: PointArray,
+    r: PointArray,
+    cell: CellArray,
+    tile: CellArray,
+    extremes: PointArray,
+    numbers: CellArray,
+) -> None:
+    """Range and tile of the lowest point of each cell, once it is known which one that is."""
+    outside = len(numbers) - 1
+    # Listed in any case, counted only where it is the lowest: no branch to predict.
+    found = np.empty(BLOCK + 1, dtype=np.int64)
+    n_found = 0
+    for i in range(len(z)):
+        k = np.uintp(cell[i] if cell[i] >= 0 else outside)
+        found[np.uintp(n_found)] = i
+        n_found += np.int64(z[i] == extremes[k, 0])
+    for i in found[:n_found]:
+        if cell[i] < 0:
+            continue
+        k = np.uintp(cell[i])
+        own, low = r[i], extremes[k, 1]
+        if own < low or (own == low and tile[i] < numbers[k, 1]):
+            extremes[k, 1], numbers[k, 1] = own, tile[i]
+
+
+@jit(entry=True)
+def merge_parts(
+    n_parts: int,
+    cells: CellTable,
+    tiles: TileTable,
+    edges: FloatArray,
+    min_extent: float,
+    candidates: Candidates,
+) -> int:
+    """Reduce the tables of all parts: candidates, into arrays with room for all cells.
+
+    Returns the number of candidates. `edges` and `min_extent` are those of `ground_candidates`
+    of the twin. The first table of the tiles becomes that of all points.
+    """
+    _merge_tiles(n_parts, tiles.extremes, tiles.occupied)
+    extremes, numbers, n_bins = cells.extremes, cells.numbers, len(edges) - 1
+    low = near = high = extremes.dtype.type(0.0)
+    lowest_tile = NO_TILE
+    c = 0
+    for m in range(len(candidates.offsets) - 1):
+        candidates.offsets[m] = c
+        for n in range(n_bins):
+            k = m * n_bins + n
+            count = 0
+            for index in range(n_parts):
+                own = numbers[index, k, 0]
+                if own == 0:
+                    continue
+                own_z, own_r = extremes[index, k, 0], extremes[index, k, 1]
+                own_top, own_tile = extremes[index, k, 2], numbers[index, k, 1]
+                if count == 0 or (own_z, own_r, own_tile) < (low, near, lowest_tile):
+                    low, near, lowest_tile = own_z, own_r, own_tile
+                high = own_top if count == 0 else max(high, own_top)
+                count += own
+            if count == 0:
+                continue
+            candidates.z[c], candidates.r[c], candidates.bin[c] = low, near, n
+            candidates.tile[c] = lowest_tile
+            extent = max(np.float64(high) - np.float64(low), min_extent)
+            candidates.density[c] = count / ((edges[n + 1] - edges[n]) * extent)
+            c += 1
+    candidates.offsets[len(candidates.offsets) - 1] = c
+    return c
+
+
+@jit()
+def _merge_tiles(n_parts: int, extremes: PointArray, occupied: CellArray) -> None:
+    n_occupied = occupied[0, 0]
+    for index in range(1, n_parts):
+        for place in range(1, occupied[index, 0] + 1):
+            k = np.uintp(occupied[index, place])
+            if extremes[0, k, 0] > extremes[0, k, 1]:
+                n_occupied += 1
+                occupied[0, n_occupied] = occupied[index, place]
+            extremes[0, k, 0] = min(extremes[0, k, 0], extremes[index, k, 0])
+            extremes[0, k, 1] = max(extremes[0, k, 1], extremes[index, k, 1])
+    occupied[0, 0] = n_occupied

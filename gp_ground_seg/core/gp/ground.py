@@ -1,0 +1,250 @@
+"""Stage 5b: the observation process: inlier growth, and the surface of every segment."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, GroundSurface, IntArray
+from gp_ground_seg.core.gp.evidence import (
+    STEP,
+    Evidence,
+    at_candidates,
+    evidence_aside,
+    looks_aside_in,
+    seeds,
+)
+from gp_ground_seg.core.gp.kernels import paciorek
+from gp_ground_seg.core.gp.latent import given_log_length_scales, latent_log_length_scales
+from gp_ground_seg.core.gp.linalg import Padded, add_noise, batches, single_threaded_blas
+from gp_ground_seg.core.parameters.config import Config, GrowthConfig
+
+
+@single_threaded_blas()
+def estimate_surface(
+    frame: Frame, theta: FloatArray, config: Config
+) -> tuple[GroundSurface, FloatArray, FloatArray]:
+    """Inliers that grow from low, near candidates, and the surface that rests on them.
+
+    A candidate joins when the predictive standard deviation is at most
+    ``growth.max_std`` and its standardised residual is at most
+    ``growth.max_standardised_residual`` above the prediction, or
+    ``growth.max_standardised_depth`` below; or when it continues the line of an inlier.
+    This repeats until none joins (GP-INSAC of Chen et al. 2014; the paper's outlier
+    rejection). The gate is asymmetric because obstacles stand only above the ground. The
+    height and variance of the surface are the paper's eqs. 6 and 7.
+
+    With ``surface.look_aside`` one of `STEP` segments grows by itself first. Then all grow: the
+    prediction is that of the segment and of those beside it together, and what stands above the
+    latter alone neither starts the set nor joins it by a line (see
+    `gp_ground_seg.core.gp.evidence`).
+    The surface, too, is that of the segment and of those beside it together.
+
+    Parameters
+    ----------
+    frame : Frame
+        Candidates, lines, pseudo-inputs, knots.
+    theta : (M, 6) float64
+        Hyper-parameters of each segment (see `gp_ground_seg.core.gp.learning`).
+    config : Config
+        Model of the length-scale, prior slope, gates.
+
+    Returns
+    -------
+    surface : GroundSurface
+        Inliers; height and standard deviation at the knots.
+    knot_log_length_scale : (M, K) float64
+        At the knots [log m].
+    log_length_scale : (C,) float64
+        At the candidates [log m]; may lie in a buffer that the next call reuses.
+    """
+    candidates, knots, slope_std = frame.candidates, frame.knots, config.observation.slope_std
+    if config.length_scale.model == 'latent':
+        u, knot_u = latent_log_length_scales(frame, theta)
+    else:
+        u, knot_u = given_log_length_scales(frame, config.length_scale)
+    z = candidates.z - frame.prior_mean
+    own = SegmentSurfaces.empty(len(z), knot_u.shape)
+    model = _Model(frame, theta, z, np.exp(u), np.exp(knot_u), seeds(frame, theta, config))
+    everywhere = np.arange(len(theta))
+    looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
+    prior_variance = np.exp(2.0 * theta[:, :1]) + slope_std**2 * knots**2
+
+    def aside() -> Evidence:
+        return evidence_aside(own.mean, own.std, prior_variance, knots, slope_std)
+
+    if looks_aside:
+        _grow_segments(everywhere[::STEP], model, Evidence(*none), config, own)
+        beside = at_candidates(aside(), candidates, knots)
+    _grow_segments(everywhere, model, beside if looks_aside else Evidence(*none), config, own)
+    mean, std = own.mean, own.std
+    if looks_aside:
+        mean, std = aside().combined_surface(mean, std, prior_variance)
+        mean[np.isnan(knot_u)] = std[np.isnan(knot_u)] = np.nan
+    return GroundSurface(knots, mean + frame.prior_mean, std, own.inlier), knot_u, u
+
+
+class SegmentSurfaces(NamedTuple):
+    """The surface of each segment by itself."""
+
+    inlier: BoolArray  # (C,) candidates that the surface rests on
+    # (M, K) height about the prior mean and its standard deviation at the knots [m]; NaN where
+    # there is none
+    mean: FloatArray
+    std: FloatArray
+
+    @classmethod
+    def empty(cls, n_candidates: int, shape: tuple[int, ...]) -> SegmentSurfaces:
+        """No inlier, no surface."""
+        none = np.zeros(n_candidates, dtype=np.bool_)
+        return cls(none, *np.full((2, *shape), np.nan))
+
+
+class _Model(NamedTuple):
+    """What the segments grow from."""
+
+    frame: Frame
+    theta: FloatArray  # (M, 6)
+    z: FloatArray  # (C,) about the prior mean [m]
+    length_scale: FloatArray  # (C,) at the candidates [m]
+    knot_length_scale: FloatArray  # (M, K) at the knots [m]
+    seed: BoolArray  # (C,) candidates that start the inlier set
+
+
+def _fits(
+    z: FloatArray,
+    height: FloatArray,
+    variance: FloatArray,
+    noise: FloatArray,
+    growth: GrowthConfig,
+) -> BoolArray:
+    """Whether heights are predicted well enough, and near enough, to join."""
+    residual = (z - height) / np.sqrt(np.maximum(variance, 0.0) + noise)
+    result: BoolArray = (
+        (variance <= growth.max_std**2)
+        & (residual <= growth.max_standardised_residual)
+        & (residual >= -growth.max_standardised_depth)
+    )
+    return result
+
+
+def _grow_segments(
+    segments: IntArray, model: _Model, aside: Evidence, config: Config, own: SegmentSurfaces
+) -> None:
+    """Inliers and surface of `segments`, into `own`; `aside` is the evidence at the candidates."""
+    own.mean[segments] = own.std[segments] = np.nan
+    offsets = model.frame.candidates.offsets
+    size = offsets[segments + 1] - offsets[segments]
+    for batch in batches(np.concatenate([[0], np.cumsum(size)])):
+        _grow_batch(segments[batch], model, aside, config, own)
+
+
+def _grow_batch(
+    segments: IntArray, model: _Model, aside: Evidence, config: Config, own: SegmentSurfaces
+) -> None:
+    frame, theta, slope_std = model.frame, model.theta[segments], config.observation.slope_std
+    layout, knots = Padded.of(segments, frame.candidates.offsets), frame.knots
+    sigma_f, sigma_n = np.exp(theta[:, :2]).T
+    r, own_l = layout.take(frame.candidates.r), layout.take(model.length_scale, 1.0)
+    covariance = paciorek(r, own_l, r, own_l, sigma_f)
+    covariance += slope_std**2 * r[:, :, None] * r[:, None, :]
+    noise = np.exp(2.0 * model.theta[frame.candidates.segment, 1])
+    above = aside.contradicts(model.z, noise, config.growth.max_standardised_residual)
+    batch = _Batch(
+        covariance,
+        layout.take(model.z),
+        np.broadcast_to(sigma_n[:, None] ** 2, r.shape),
+        layout.mask,
+        (model.seed & ~above)[layout.place] & layout.mask,
+        (frame.continues_line & ~above)[layout.place] & layout.mask,
+        Evidence(layout.take(aside.height), layout.take(aside.precision)),
+    )
+    chosen = _grow(batch, config.growth)
+    own.inlier[layout.place[layout.mask]] = chosen[layout.mask]
+    has_surface = chosen.any(axis=1)
+    if len(knots) == 0 or not has_surface.any():
+        return
+    kept, chosen, sigma_f = segments[has_surface], chosen[has_surface], sigma_f[has_surface]
+    is_wanted = np.isfinite(model.knot_length_scale[kept])
+    wanted_l = np.where(is_wanted, model.knot_length_scale[kept], 1.0)
+    everywhere = np.broadcast_to(knots, (len(kept), len(knots)))
+    cross = paciorek(r[has_surface], own_l[has_surface], everywhere, wanted_l, sigma_f)
+    cross += slope_std**2 * r[has_surface][:, :, None] * knots
+    mean, variance = _predict(
+        add_noise(covariance[has_surface], batch.noise[has_surface], chosen),
+        cross * chosen[:, :, None],
+        batch.z[has_surface] * chosen,
+    )
+    variance += sigma_f[:, None] ** 2 + slope_std**2 * knots**2
+    own.mean[kept] = np.where(is_wanted, mean, np.nan)
+    own.std[kept] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+
+
+class _Batch(NamedTuple):
+    """Candidates of S segments, padded to n."""
+
+    covariance: FloatArray  # (S, n, n) prior
+    z: FloatArray  # (S, n) about the prior mean
+    noise: FloatArray  # (S, n) variance
+    mask: BoolArray  # (S, n)
+    seed: BoolArray  # (S, n)
+    continues_line: BoolArray  # (S, n)
+    aside: Evidence  # (S, n)
+
+
+def _predict(
+    covariance: FloatArray, cross: FloatArray, z: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Posterior mean, and the (negative) change of the prior variance by the data."""
+    solution = np.linalg.solve(covariance, np.concatenate([cross, z[:, :, None]], axis=2))
+    mean = np.matmul(z[:, None, :], solution[:, :, :-1])[:, 0]
+    return mean, -np.einsum('sik,sik->sk', cross, solution[:, :, :-1])
+
+
+def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
+    """Inliers of each segment, (S, n).
+
+    Candidates that join in a round are conditioned on at once: the covariance of all
+    candidates given the inliers shrinks by one product, and nothing is factored twice.
+    """
+    chosen = np.zeros_like(batch.seed)
+    # Segments that still grow, and their state.
+    active, joining = np.arange(len(chosen)), batch.seed
+    covariance, height = batch.covariance, np.zeros(joining.shape)
+    while len(active):
+        chosen[active] |= joining
+        z, noise = batch.z[active], batch.noise[active]
+        if joining.any():
+            height, covariance = _condition(covariance, height, z, noise, joining)
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+        aside = Evidence(*(values[active] for values in batch.aside))
+        following = batch.continues_line[active]
+        following[:, 1:] &= chosen[active, :-1]
+        following[:, 0] = False
+        joining = _fits(z, *aside.combined(height, variance), noise, growth) | following
+        joining &= ~chosen[active] & batch.mask[active]
+        # Before anything has joined, only evidence from aside decides.
+        joining &= chosen[active].any(axis=1, keepdims=True) | (aside.precision > 0.0)
+        grows = joining.any(axis=1)
+        active, joining = active[grows], joining[grows]
+        covariance, height = covariance[grows], height[grows]
+    return chosen
+
+
+def _condition(
+    covariance: FloatArray, height: FloatArray, z: FloatArray, noise: FloatArray, new: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Height and covariance of the candidates after observing those that are `new`."""
+    # Places of the new ones, first in each row; the rest is padding.
+    n_new = int(new.sum(axis=1).max())
+    place = np.argsort(~new, axis=1, kind='stable')[:, :n_new]
+    is_new = np.take_along_axis(new, place, axis=1)
+    rows = np.take_along_axis(covariance, place[:, :, None], axis=1) * is_new[:, :, None]
+    within = np.take_along_axis(rows, place[:, None, :], axis=2)
+    add_noise(within, np.take_along_axis(noise, place, axis=1), is_new)
+    innovation = np.take_along_axis(z - height, place, axis=1) * is_new
+    gain = np.linalg.solve(within, np.concatenate([rows, innovation[:, :, None]], axis=2))
+    columns = np.swapaxes(rows, 1, 2)
+    height = height + np.matmul(columns, gain[:, :, -1:])[:, :, 0]
+    return height, covariance - np.matmul(columns, gain[:, :, :-1])

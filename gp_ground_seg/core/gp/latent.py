@@ -1,0 +1,92 @@
+"""Stage 5a: length-scales, from the latent process or simpler models."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gp_ground_seg.core.frame import FloatArray, Frame, IntArray
+from gp_ground_seg.core.gp.kernels import squared_exponential
+from gp_ground_seg.core.gp.linalg import Padded, add_noise, batches
+from gp_ground_seg.core.parameters.config import LengthScaleConfig
+
+MAX_ABS_LOG_LENGTH_SCALE = 100.0
+"""Bound of the latent process [log m], far outside all scans, for squares that stay finite.
+
+With `latent.sigma_f_bar` near its upper end the mean between pseudo-inputs swings that far.
+"""
+
+
+def n_wanted_knots(frame: Frame) -> IntArray:
+    """Count the knots up to the bin of the last candidate of each segment, (M,) int64.
+
+    Behind it nothing is known of the ground.
+    """
+    return np.minimum(frame.candidates.n_edges, len(frame.knots))
+
+
+def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean of the latent process at the candidates and knots (paper, eqs. 10 and 11).
+
+    The pseudo-inputs are centred on their mean, so that equal ones give that very value
+    everywhere.
+
+    `theta`, (M, 6), are the hyper-parameters of each segment (see
+    `gp_ground_seg.core.gp.learning`).
+    Returns log length-scales at the candidates, (C,), and at the knots, (M, K) [log m]; NaN there
+    behind the bin of the last candidate.
+    """
+    candidates, pseudo, knots = frame.candidates, frame.pseudo, frame.knots
+    n_knots = n_wanted_knots(frame)
+    at_candidates = np.empty(len(candidates.r))
+    at_knots = np.full((len(theta), len(knots)), np.nan)
+    for segments in batches(candidates.offsets):
+        own = Padded.of(segments, candidates.offsets)
+        bar = Padded.of(segments, pseudo.offsets)
+        own_r, r_bar = own.take(candidates.r), bar.take(pseudo.r_bar)
+        sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[segments, 2:5]).T
+        l_bar = np.where(bar.mask, bar.take(pseudo.log_extent) + theta[segments, 5:], 0.0)
+        mean = l_bar.sum(axis=1, keepdims=True) / bar.mask.sum(axis=1, keepdims=True)
+        covariance = squared_exponential(r_bar, r_bar, sigma_f_bar, sigma_l_bar)
+        add_noise(covariance, sigma_n_bar[:, None] ** 2, bar.mask)
+        centred = np.where(bar.mask, l_bar - mean, 0.0)
+        weight = np.linalg.solve(covariance, centred[:, :, None])
+        cross = squared_exponential(own_r, r_bar, sigma_f_bar, sigma_l_bar)
+        at_candidates[own.place[own.mask]] = ((cross @ weight)[:, :, 0] + mean)[own.mask]
+        wanted = np.broadcast_to(knots, (len(segments), len(knots)))
+        cross = squared_exponential(wanted, r_bar, sigma_f_bar, sigma_l_bar)
+        is_wanted = np.arange(len(knots)) < n_knots[segments, None]
+        at_knots[segments] = np.where(is_wanted, (cross @ weight)[:, :, 0] + mean, np.nan)
+    bound = MAX_ABS_LOG_LENGTH_SCALE
+    return np.clip(at_candidates, -bound, bound), np.clip(at_knots, -bound, bound)
+
+
+def given_log_length_scales(
+    frame: Frame, length_scale: LengthScaleConfig
+) -> tuple[FloatArray, FloatArray]:
+    """Log length-scales without a latent process; returns as `latent_log_length_scales`.
+
+    One constant, or those of the lines: linear between the candidates.
+    """
+    candidates, knots, n_knots = frame.candidates, frame.knots, n_wanted_knots(frame)
+    if length_scale.model == 'constant':
+        u = np.full(len(candidates.r), np.log(length_scale.constant))
+    else:
+        of_lines = line_gradient_length_scale(frame.lines.slope, length_scale)
+        u = np.log(of_lines)[frame.lines.line]
+    at_knots = np.full((len(n_knots), len(knots)), np.nan)
+    for m in np.flatnonzero(n_knots):
+        own, n = slice(candidates.offsets[m], candidates.offsets[m + 1]), n_knots[m]
+        at_knots[m, :n] = np.interp(knots[:n], candidates.r[own], u[own])
+    return u, at_knots
+
+
+def line_gradient_length_scale(slope: FloatArray, length_scale: LengthScaleConfig) -> FloatArray:
+    """Length-scale of lines of these slopes, (Q,) [m] (Chen et al. 2014, method "Z").
+
+    ``l = a log(1 / max(|slope|, flat_gradient))``, kept within the bounds. A line of one point
+    has no slope (NaN) and gets the smallest length-scale.
+    """
+    steepness = np.maximum(np.abs(slope), length_scale.flat_gradient)
+    value = -length_scale.gradient_gain * np.log(steepness)
+    value = np.where(np.isnan(slope), length_scale.min, value)
+    return np.clip(value, length_scale.min, length_scale.max)

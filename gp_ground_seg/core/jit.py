@@ -1,0 +1,210 @@
+"""The one policy for code compiled with numba, which is optional, and for keeping it on disk.
+
+numba keeps compiled code itself (``cache=True``), here in a folder of the user whose name is a
+digest of our sources and of versions: code of other sources is never read. An entry that does not
+fit its checksum, as after a power cut, is compiled again.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import json
+import logging
+import os
+import stat
+import sys
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+# Ubuntu 24.04 has no package of numba. Its import takes most of a second: it waits until something
+# is to be compiled.
+HAVE_NUMBA = importlib.util.find_spec('numba') is not None
+JIT_ENABLED = HAVE_NUMBA and os.environ.get('NUMBA_DISABLE_JIT', '0') in ('', '0')
+"""Whether functions are compiled, rather than left plain Python."""
+
+_LOGGER = logging.getLogger('gp_ground_seg')
+_Function = TypeVar('_Function', bound=Callable[..., Any])
+_CORE = Path(__file__).parent
+_entry_points: list[Any] = []
+_KEPT = 'kept.json'
+_is_warm = False
+_n_ready = _n_kept = 0
+
+
+class _Decorator(Protocol):
+    def __call__(self, function: _Function) -> _Function: ...
+
+
+def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
+    """Return a decorator that compiles a function where numba is installed.
+
+    Compiled functions release the interpreter's lock.
+
+    Parameters
+    ----------
+    fastmath : bool
+        Let sums be taken in any order, so that they use vector instructions; NaN and infinity
+        keep their meaning. Only for functions that write to no array: where arrays that are
+        written lie close to those that are read, the program leaves the vector instructions
+        aside, and the sums would depend on where the arrays happen to be.
+    entry : bool
+        Whether it is called from Python: its code, with all that it calls, is kept on disk. It
+        returns numbers, or nothing: numba runs Python to return arrays and named tuples, where
+        Ctrl-C ends in a SystemError or a crash.
+    """
+
+    def decorate(function: _Function) -> _Function:
+        if not JIT_ENABLED:
+            return function
+        import numba
+
+        options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
+        if fastmath:
+            options['fastmath'] = {'reassoc', 'contract', 'nsz'}
+        if not entry:
+            part: _Function = numba.njit(**options)(function)
+            return part
+        compiled: _Function = _njit_kept(function, options)
+        _entry_points.append(compiled)
+        return compiled
+
+    return decorate
+
+
+def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    """Compile `function` with its code kept on disk, if there is a folder to trust for it."""
+    import numba
+
+    folder = code_folder()
+    if folder is not None:
+        # numba reads this once, here. Without it, code would lie beside our sources.
+        before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(folder)
+        try:
+            kept = numba.njit(**options, cache=True)(function)
+        finally:
+            numba.config.CACHE_DIR = before
+        if folder in Path(kept.stats.cache_path).parents:
+            return kept
+        _log_not_kept(f'{folder} cannot be written to')
+    return numba.njit(**options)(function)
+
+
+@functools.cache
+def _log_not_kept(reason: str) -> None:
+    _LOGGER.warning(
+        'compiled code is not kept on disk (%s): every start compiles, which takes 10 to 40 s; '
+        'set NUMBA_CACHE_DIR to a folder of your own',
+        reason,
+    )
+
+
+@functools.cache
+def code_folder() -> Path | None:
+    """Return the folder where compiled code is kept; None where there is none to trust.
+
+    It lies in ``NUMBA_CACHE_DIR``, else in the user's cache folder.
+    """
+    if not JIT_ENABLED:
+        return None
+    chosen = os.environ.get('NUMBA_CACHE_DIR') or os.environ.get('XDG_CACHE_HOME') or '~/.cache'
+    try:
+        folder = Path(chosen).expanduser() / 'gp_ground_seg' / _digest()
+        if not folder.is_absolute():
+            raise PermissionError(f'{chosen} is no absolute path')
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        folder = folder.resolve()
+        _require_private(folder)
+        _delete_damaged(folder)
+    except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home
+        _log_not_kept(str(error))
+        return None
+    return folder
+
+
+def _require_private(folder: Path) -> None:
+    """Raise PermissionError if another user could put code into `folder`."""
+    if folder.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise PermissionError(f'others can open {folder}: chmod 700')
+    for path in (folder, *folder.parents):
+        status = path.stat()
+        if status.st_uid not in (0, os.getuid()):
+            raise PermissionError(f'{path} belongs to another user')
+        # Of a sticky folder, such as /tmp, only the owner of an entry can replace it.
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            raise PermissionError(f'others can write to {path}')
+
+
+def _digest() -> str:
+    """Name of what the code was compiled from: sources, where they lie, and versions."""
+    versions = [sys.version, np.__version__, *map(metadata.version, ('numba', 'llvmlite'))]
+    digest = hashlib.sha256('\n'.join([str(_CORE), *versions]).encode())
+    for source in sorted(_CORE.rglob('*.py')):
+        digest.update(source.name.encode() + b'\0' + source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """SHA-256 of each file in which numba keeps code, by its path in `folder`."""
+    return {
+        entry.relative_to(folder).as_posix(): hashlib.sha256(entry.read_bytes()).hexdigest()
+        for entry in folder.rglob('*.nb[ic]')
+    }
+
+
+def _read_kept(folder: Path) -> dict[str, Any]:
+    """Return what `keep_code` has noted."""
+    try:
+        kept = json.loads((folder / _KEPT).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return kept if isinstance(kept, dict) else {}
+
+
+def _delete_damaged(folder: Path) -> None:
+    """Delete the files that do not fit their checksum; numba compiles again what they held."""
+    global _is_warm
+    kept, found = _read_kept(folder), _checksums(folder)
+    damaged = [name for name, checksum in found.items() if kept.get(name) != checksum]
+    for name in damaged:
+        (folder / name).unlink()
+    _is_warm = kept.get('warm') is True and not damaged and found.keys() >= kept.keys() - {'warm'}
+    if not _is_warm:
+        _LOGGER.info('compiling for this processor, which takes 10 to 40 s')
+
+
+def keep_code(*, warm: bool = False) -> None:
+    """Note checksums of the code that numba has kept, so that the next start uses it.
+
+    Parameters
+    ----------
+    warm : bool
+        Whether all code that a frame needs has been compiled.
+    """
+    global _n_ready, _n_kept, _is_warm
+    n_ready = sum(len(entry.overloads) for entry in _entry_points)
+    folder = code_folder()
+    if folder is None or (n_ready == _n_ready and not warm):
+        return
+    _n_ready = n_ready
+    # Of those the ones that were compiled, not loaded; slow to count.
+    n_compiled = sum(len(entry.stats.cache_misses) for entry in _entry_points)
+    if n_compiled == _n_kept and (_is_warm or not warm):
+        return
+    _n_kept, _is_warm = n_compiled, _is_warm or warm
+    unfinished = folder / f'{_KEPT}.{os.getpid()}'
+    try:
+        unfinished.write_text(json.dumps({**_checksums(folder), 'warm': _is_warm}))
+        os.replace(unfinished, folder / _KEPT)
+    except OSError as error:
+        _log_not_kept(str(error))
+
+
+def is_code_kept() -> bool:
+    """Whether all code that a frame needs lies on disk; `keep_code` was called with `warm`."""
+    return _is_warm

@@ -1,0 +1,356 @@
+"""The one declaration of every parameter.
+
+YAML files, ROS parameter descriptors, command-line ``--set`` options and the tables of
+README.md and docs/parameters.md are derived from the dataclasses below. Why not pydantic or
+`generate_parameter_library`: one has no ROS descriptors, the other needs ROS to build.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from gp_ground_seg.core.errors import ConfigError
+from gp_ground_seg.core.parameters.schema import (
+    AUTO,
+    ParameterGroups,
+    ParameterSpec,
+    advanced,
+    basic,
+)
+
+NO_FRAME = 'none'
+SENSOR_HEIGHTS = -5.0, 20.0
+"""Lowest and highest origin of a cloud over the ground near it [m]."""
+
+# Default, accepted values, description, unit, symbol in the paper. `basic` are those that are
+# set for a robot: its sensor and frames, the range and height of what is ground to it, its CPU.
+# fmt: off
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """Where the sensor is; auto = estimated from every scan (docs/pose.md)."""
+
+    height: float | Literal['auto'] = basic(AUTO, SENSOR_HEIGHTS,
+        "height of the cloud's origin above the ground; 0 = that of a vehicle frame on the ground",
+        'm')
+    roll: float | Literal['auto'] = basic(AUTO, (-3.15, 3.15),
+        'roll of the sensor, positive with its left side up; auto = none unless it is clear',
+        'rad')
+    pitch: float | Literal['auto'] = basic(AUTO, (-1.58, 1.58),
+        'pitch of the sensor, positive with its nose down; auto = none unless it is clear', 'rad')
+    origin_x: float = advanced(0.0, (-50.0, 50.0),
+        "where the sensor is in the cloud's frame, which is not its own where clouds are turned "
+        'into that of a vehicle: forward', 'm')
+    origin_y: float = advanced(0.0, (-50.0, 50.0), 'the same: to the left', 'm')
+    origin_z: float = advanced(0.0, (-50.0, 50.0), 'the same: upwards', 'm')
+
+
+@dataclass(frozen=True)
+class FrameConfig:
+    """Where tilt and place of the sensor are taken from; the node only."""
+
+    level: str = basic('sensor', ('sensor', 'tf'),
+        'where the tilt of the sensor is taken from: sensor.roll and sensor.pitch, or TF')
+    base: str = basic('base_link', (), 'frame that is level to TF, with frame.level = tf')
+    sensor: str = advanced(NO_FRAME, (),
+        "frame of the sensor, whose place in the cloud's frame is looked up in TF; none = by "
+        'sensor.origin_x, origin_y, origin_z')
+
+
+@dataclass(frozen=True)
+class InputConfig:
+    """Clouds that are taken; the node only."""
+
+    max_cloud_size: float = advanced(64.0, (0.001, 4294.0),
+        'size of the data of a cloud above which it is refused', 'MB')
+
+
+@dataclass(frozen=True)
+class GridConfig:
+    """Radial grid map."""
+
+    n_segments: int = basic(180, (4, 2048), 'angular segments of the radial grid', symbol='M')
+    n_bins: int = advanced(80, (4, 1024), 'radial bins of each segment', symbol='N')
+    r_min: float = advanced(2.0, (0.0, 50.0),
+        'horizontal range where the first bin starts; nearer points belong to that bin', 'm')
+    r_max: float = basic(120.0, (1.0, 500.0),
+        'horizontal range where the last bin ends; beyond it there is no model', 'm')
+    bin_growth: float = advanced(1.5, (1.0, 4.0),
+        'exponent of the bin edges over range: 1 = equal bins, more = finer bins near the sensor')
+
+
+@dataclass(frozen=True)
+class LinesConfig:
+    """Line extraction over the ground candidates of a segment."""
+
+    slope_tolerance: float = advanced(0.1, (0.001, 1.0),
+        'change of slope that ends a line', 'rad', 'zeta_m')
+    offset_tolerance: float = advanced(0.15, (0.005, 5.0),
+        "change of the line's height at the new point that ends a line", 'm', 'zeta_b')
+    max_line_distance: float = advanced(0.10, (0.005, 5.0),
+        'distance of a point to the line that ends it', 'm', 'delta')
+    max_gap: float = advanced(1.5, (0.05, 50.0),
+        'horizontal gap to the next candidate that ends a line, next to the sensor', 'm')
+    max_gap_growth: float = advanced(0.6, (0.0, 2.0),
+        'growth of the largest gap with range', 'm/m')
+    max_density_ratio: float = advanced(8.0, (1.0, 1e6),
+        'ratio of the vertical densities of two successive bins that ends a line')
+    min_density_extent: float = advanced(0.05, (0.001, 1.0),
+        'least height of a bin in its vertical density', 'm')
+    error_ratio: float = advanced(1.0, (0.0001, 1e6),
+        'variance of the height error over that of the range error in the line regression',
+        symbol='lambda')
+
+
+@dataclass(frozen=True)
+class LengthScaleConfig:
+    """Length-scale of the observation process along a segment."""
+
+    model: str = advanced('latent', ('latent', 'line_gradient', 'constant'),
+        'where the length-scales come from: the latent process, the slopes of the extracted '
+        'lines, or one constant')
+    constant: float = advanced(10.0, (0.05, 200.0), 'length-scale of the constant model', 'm')
+    gradient_gain: float = advanced(2.0, (0.05, 100.0), 'a in l = a log(1/|slope|)', 'm', 'a')
+    flat_gradient: float = advanced(0.1, (0.0001, 0.9),
+        'slope below which a line counts as flat', symbol='g_def')
+    min: float = advanced(1.0, (0.05, 200.0), 'smallest length-scale', 'm')
+    max: float = advanced(50.0, (0.05, 500.0), 'largest length-scale', 'm')
+
+
+@dataclass(frozen=True)
+class ObservationConfig:
+    """Hyper-parameters of the observation process GP_z."""
+
+    sigma_f: float = advanced(0.3, (0.001, 10.0),
+        'prior standard deviation of the ground height about its mean line', 'm', 'sigma_f')
+    sigma_n: float = advanced(0.05, (0.001, 5.0),
+        'standard deviation of the height noise of a ground candidate', 'm', 'sigma_n')
+    slope_std: float = advanced(0.05, (0.0, 2.0),
+        "prior standard deviation of the mean line's slope; 0 = a level mean")
+
+
+@dataclass(frozen=True)
+class LatentConfig:
+    """Latent process GP_l over log length-scale, and its pseudo-inputs."""
+
+    sigma_f_bar: float = advanced(0.9, (0.01, 100.0),
+        'prior standard deviation of the log length-scale about its mean', symbol='sigma_f_bar')
+    sigma_l_bar: float = advanced(2.0, (0.1, 500.0),
+        'length-scale of the latent process', 'm', 'sigma_l_bar')
+    sigma_n_bar: float = advanced(0.25, (0.01, 100.0),
+        'standard deviation of the noise of the log length-scale', symbol='sigma_n_bar')
+    candidates_per_pseudo_input: float = advanced(3.0, (1.0, 100.0),
+        'ground candidates of a line for each pseudo-input: more = faster, less precise')
+
+
+@dataclass(frozen=True)
+class GrowthConfig:
+    """Iterative growth of the inlier set (outlier rejection)."""
+
+    seed_range: float = advanced(20.0, (0.5, 200.0),
+        'horizontal range within which low candidates start the inlier set', 'm')
+    seed_height_tolerance: float = basic(0.45, (0.01, 5.0),
+        'largest height of a seed above or below the expected ground', 'm')
+    max_std: float = advanced(0.35, (0.001, 10.0),
+        'predictive standard deviation above which a candidate is not decided yet', 'm')
+    max_standardised_residual: float = advanced(2.0, (0.1, 50.0),
+        'residual over predictive standard deviation above which a candidate is an outlier')
+    max_standardised_depth: float = advanced(7.0, (0.1, 200.0),
+        'the same for a candidate below the prediction; obstacles lie only above')
+    max_line_slope: float = advanced(1.0, (0.0, 10.0),
+        'slope of a line of candidates up to which those that continue it from inliers join')
+    min_line_size: int = advanced(4, (2, 10000), 'candidates that such a line needs at least')
+    min_bend_extent: float = advanced(10.0, (0.1, 1000.0),
+        'length of a line from which on it joins where the line before it bends into it: longer '
+        'than what stands on the ground', 'm')
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """From the segments' surfaces to the surface of the frame."""
+
+    look_aside: bool = advanced(True, (),
+        'whether the segments beside one decide with it what is ground; false = each by itself')
+
+
+@dataclass(frozen=True)
+class FacesConfig:
+    """Vertical faces, whose bases lie within the tolerance of ground."""
+
+    cell_size: float = advanced(0.5, (0.05, 10.0),
+        'side of the square tiles whose returns are judged together', 'm')
+    max_normal_z: float = advanced(0.45, (0.0, 1.0),
+        'vertical part of the unit normal below which the returns of a tile are a vertical face; '
+        '0 = no tile has one')
+    max_foot_distance: float = advanced(0.06, (0.0, 10.0),
+        'distance (root mean square) of the lowest returns of a face from its plane up to which '
+        'its base is occluded, with no ground seen before it; 0 = never', 'm')
+
+
+@dataclass(frozen=True)
+class LabelConfig:
+    """Labels from the distance to the surface."""
+
+    rule: str = advanced('predictive', ('predictive', 'tolerance'),
+        'predictive = a return is ground where its height is more likely of ground than of an '
+        'obstacle, by the returns about it; tolerance = ground_tolerance alone, above and below')
+    ground_tolerance: float = basic(0.1, (0.001, 5.0),
+        'height above the surface up to which a return is ground in any case; more = more ground',
+        'm', 'zeta_g')
+    obstacle_min_height: float = advanced(0.5, (0.01, 10.0),
+        'height above the surface from which a return is an obstacle however rough the ground',
+        'm')
+    obstacle_max_height: float = advanced(1.0, (0.02, 50.0),
+        'height above the surface up to which a return shows an obstacle, higher ones overhang; '
+        'and depth below it up to which a return is ground', 'm')
+
+
+@dataclass(frozen=True)
+class LearningConfig:
+    """Learning of the hyper-parameters."""
+
+    mode: str = basic('every_frame', ('every_frame', 'every_k', 'first_frame', 'fixed'),
+        'when the hyper-parameters are learned; fixed = never, the values given here are used')
+    period: int = advanced(10, (1, 10000),
+        'frames from one learning to the next in the mode every_k')
+    scope: str = advanced('frame', ('frame', 'segment'),
+        'frame = one set of hyper-parameters for the whole frame; segment = one for each segment '
+        '(slow, for comparison)')
+    segment_step: int = advanced(30, (1, 60),
+        'for the scope frame: one of how many segments is learned from; neighbouring segments see '
+        'much the same ground')
+    objective: str = advanced('map', ('map', 'paper'),
+        'map = likelihood of the heights and priors; paper = as printed, which has no upper bound')
+    warm_start: bool = advanced(False, (),
+        'start from the frame before instead of the lines; the labels then depend on the past')
+    max_evaluations: int = advanced(5, (1, 1000),
+        'evaluations of the objective per frame; the best so far is used')
+    max_time: float = advanced(0.0, (0.0, 60.0),
+        'time for the learning of a frame, after which the best so far is used; 0 = no limit; the '
+        'labels then depend on the speed of the machine', 's')
+    prior_std: float = advanced(1.0, (0.01, 10.0),
+        'standard deviation of the log-normal priors about the values given here')
+    fixed: str = advanced('length_scales', ('none', 'sigma_f_bar', 'latent', 'length_scales'),
+        'hyper-parameters that are not learned')
+
+
+@dataclass(frozen=True)
+class RuntimeConfig:
+    """How the work is done; nothing here changes a label."""
+
+    n_threads: int = basic(0, (0, 64), 'threads of the compiled code; 0 = all cores, at most 4')
+    backend: str = advanced('auto', ('auto', 'numba', 'numpy'),
+        'auto = compiled code where numba is installed, numpy otherwise; or either by name')
+
+
+@dataclass(frozen=True)
+class DiagnosticsConfig:
+    """Diagnostics of the node on /diagnostics."""
+
+    period: float = advanced(1.0, (0.1, 60.0), 'time between two diagnostics messages', 's')
+    stale_after: float = advanced(2.0, (0.1, 600.0),
+        'time without any cloud after which the input is reported STALE', 's')
+    max_latency: float = advanced(0.1, (0.001, 10.0),
+        'median time from arrival to publication above which processing is reported WARN', 's')
+    max_load: float = advanced(0.95, (0.01, 100.0),
+        'median time per cloud, over the time between two clouds sent, above which processing is '
+        'reported WARN')
+    max_drop_ratio: float = advanced(0.0, (0.0, 1.0),
+        'share of the clouds sent since the last report that may be dropped before processing is '
+        'reported WARN')
+    max_refused_ratio: float = advanced(0.0, (0.0, 1.0),
+        'share of the clouds since the last report that may be refused with a WARN; above it, and '
+        'always when all are, the input is reported ERROR')
+    min_quality: float = advanced(0.2, (0.0, 1.0),
+        'frame_quality of the newest cloud below which the model is reported WARN')
+    recover_after: float = advanced(3.0, (0.0, 600.0),
+        'time that a level stays reported after its cause has gone', 's')
+# fmt: on
+
+
+_ASCENDING = (
+    ('grid.r_min', 'grid.r_max'),
+    ('length_scale.min', 'length_scale.max'),
+    ('label.obstacle_min_height', 'label.obstacle_max_height'),
+)
+"""Pairs of which the first must be below the second."""
+NARROWEST_BIN = 1e-4
+"""Least width of a bin [m]: above the resolution of ranges in single precision."""
+DEFAULT_MAX_THREADS = 4
+"""Most threads where their number is not given: each has tables to fill and a wake-up, which
+costs more than a small part of the work saves."""
+MAX_TABLES = 2e9
+"""Most memory that the tables of tiles and cells may take [bytes]."""
+
+
+@dataclass(frozen=True)
+class Config(ParameterGroups):
+    """All parameters, immutable; ConfigError if a value is not accepted or contradicts another."""
+
+    sensor: SensorConfig = SensorConfig()
+    frame: FrameConfig = FrameConfig()
+    input: InputConfig = InputConfig()
+    grid: GridConfig = GridConfig()
+    lines: LinesConfig = LinesConfig()
+    length_scale: LengthScaleConfig = LengthScaleConfig()
+    observation: ObservationConfig = ObservationConfig()
+    latent: LatentConfig = LatentConfig()
+    growth: GrowthConfig = GrowthConfig()
+    surface: SurfaceConfig = SurfaceConfig()
+    faces: FacesConfig = FacesConfig()
+    label: LabelConfig = LabelConfig()
+    learning: LearningConfig = LearningConfig()
+    runtime: RuntimeConfig = RuntimeConfig()
+    diagnostics: DiagnosticsConfig = DiagnosticsConfig()
+
+    def __post_init__(self) -> None:
+        """Check every value, then the rules between values."""
+        super().__post_init__()
+        for lower, upper in _ASCENDING:
+            low, high = float(self[lower]), float(self[upper])
+            if not low < high:
+                raise ConfigError(f'{lower} = {low:g}: must be below {upper} = {high:g}')
+        _check_bins(self.grid)
+        _check_memory(self)
+
+
+def _check_bins(grid: GridConfig) -> None:
+    # Bins widen with range: the first one is the narrowest.
+    width = (grid.r_max - grid.r_min) / float(grid.n_bins) ** grid.bin_growth
+    if width < NARROWEST_BIN:
+        raise ConfigError(
+            f'grid.n_bins = {grid.n_bins}, grid.bin_growth = {grid.bin_growth:g} between '
+            f'grid.r_min = {grid.r_min:g} and grid.r_max = {grid.r_max:g}: the first bin would be '
+            f'{width:.2g} m wide; must be at least {NARROWEST_BIN:g} m'
+        )
+
+
+def size_of_tables(config: Config) -> int:
+    """Memory that tables of tiles and cells take, of points of double precision [bytes]."""
+    n_threads = config.runtime.n_threads or DEFAULT_MAX_THREADS
+    n_tiles = math.ceil(2.0 * config.grid.r_max / config.faces.cell_size) ** 2
+    n_cells = config.grid.n_segments * config.grid.n_bins
+    # Once, and for each thread; held against both backends by test_robustness.py.
+    return (16 + 20 * n_threads) * n_tiles + (160 + 48 * n_threads) * n_cells
+
+
+def _check_memory(config: Config) -> None:
+    size = size_of_tables(config)
+    if size > MAX_TABLES:
+        raise ConfigError(
+            f'grid.r_max = {config.grid.r_max:g}, faces.cell_size = {config.faces.cell_size:g}, '
+            f'runtime.n_threads = {config.runtime.n_threads or DEFAULT_MAX_THREADS}: tables of '
+            f'tiles and cells would take {size / 1e9:.1f} GB; must be at most '
+            f'{MAX_TABLES / 1e9:g} GB'
+        )
+
+
+def parameter_specs() -> tuple[ParameterSpec, ...]:
+    """Return every declared parameter, in order of declaration."""
+    return tuple(Config.specs().values())
+
+
+find_spec = Config.find_spec

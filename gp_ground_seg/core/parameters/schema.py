@@ -1,0 +1,320 @@
+"""Parameters: their declarations, the check of values, groups as one object, reading of files."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import functools
+import numbers
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import yaml
+
+from gp_ground_seg.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+ParameterValue = bool | int | float | str
+
+AUTO: Literal['auto'] = 'auto'
+"""What a number may be instead where its declaration says so: estimated from the scan."""
+ROS_NODE_KEY = '/**'
+NODE_NAME = 'ground_segmentation_node'
+ROS_PARAMETERS_KEY = 'ros__parameters'
+MAX_FILE_BYTES = 1 << 18  # twenty times the largest of config/
+OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
+"""Parameters that every ROS node has."""
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """What is declared of one parameter."""
+
+    name: str  # dotted, ``group.field``
+    type: type  # bool, int, float or str; that of the number where it may be `AUTO`
+    default: ParameterValue
+    description: str
+    unit: str  # SI; empty for a pure number
+    symbol: str  # in the paper; empty if it has none
+    minimum: float | None  # inclusive, of a number; None for other types
+    maximum: float | None
+    choices: tuple[str, ...]  # accepted strings; empty for other types, and for any name
+    auto: bool  # whether a number may also be `AUTO`
+    basic: bool  # whether it is one of the few that are set for a robot
+
+    @property
+    def accepted(self) -> str:
+        """Accepted values in words."""
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        if self.type is bool:
+            return 'true or false'
+        if self.type is str:
+            return 'a name'
+        unit = f' {self.unit}' if self.unit else ''
+        kind = 'an integer' if self.type is int else 'a number'
+        auto = f'{AUTO} or ' if self.auto else ''
+        return f'{auto}{kind} in [{self.minimum:g}, {self.maximum:g}]{unit}'
+
+    def check(self, value: object) -> ParameterValue:
+        """Return `value` in the declared type; ConfigError if it is of another or out of range."""
+        if self.auto and isinstance(value, str) and value == AUTO:
+            return AUTO
+        if self.type is bool:
+            if isinstance(value, bool):
+                return value
+        elif self.type is str:
+            # A name is letters, digits and ``_-./``.
+            known = self.choices or re.findall(r'\A[\w\-./]+\Z', str(value), re.ASCII)
+            if isinstance(value, str) and value in known:
+                return value
+        elif isinstance(value, numbers.Real) and not isinstance(value, bool):
+            assert self.minimum is not None and self.maximum is not None
+            # The bounds are finite: NaN and the infinities are never within.
+            if value <= self.maximum and not value < self.minimum:
+                if self.type is float:
+                    return float(value)
+                if isinstance(value, numbers.Integral):
+                    return int(value)
+        raise ConfigError(f'{self.name} = {value!r}: must be {self.accepted}')
+
+
+def declare(
+    default: ParameterValue,
+    accepted: tuple[Any, ...],
+    description: str,
+    unit: str = '',
+    symbol: str = '',
+    *,
+    basic: bool,
+) -> Any:
+    """Declare a parameter as a field of a frozen dataclass; see `ParameterSpec`.
+
+    `accepted` holds the lowest and highest number, or the accepted strings; it is empty for a bool
+    or any name. A number whose `default` is `AUTO` may be that too.
+    """
+    choices = accepted if accepted and isinstance(accepted[0], str) else ()
+    auto = default == AUTO and not choices
+    kind = float if auto else type(default)
+    low, high = accepted if kind in (int, float) else (None, None)
+    spec = ParameterSpec(
+        '', kind, default, description, unit, symbol, low, high, choices, auto, basic
+    )
+    return field(default=default, metadata={'spec': spec})
+
+
+basic = functools.partial(declare, basic=True)
+advanced = functools.partial(declare, basic=False)
+
+
+@dataclass(frozen=True)
+class ParameterGroups:
+    """Base of a frozen dataclass of groups of declared parameters."""
+
+    @classmethod
+    @functools.cache
+    def specs(cls) -> dict[str, ParameterSpec]:
+        """Every declared parameter by its dotted name, in order of declaration."""
+        specs = {}
+        for group in dataclasses.fields(cls):
+            for entry in dataclasses.fields(group.default):  # type: ignore[arg-type]
+                name = f'{group.name}.{entry.name}'
+                specs[name] = dataclasses.replace(entry.metadata['spec'], name=name)
+        return specs
+
+    @classmethod
+    def find_spec(cls, name: str) -> ParameterSpec:
+        """Return the declaration of one parameter; raises ConfigError with the nearest name."""
+        specs = cls.specs()
+        if name in specs:
+            return specs[name]
+        members = [known for known in specs if known.startswith(f'{name}.')]
+        if members:
+            raise ConfigError(f'{name!r} is a group of parameters: {", ".join(members)}')
+        raise ConfigError(f'unknown parameter {name!r}{did_you_mean(name, specs)}')
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        checked = {name: spec.check(self[name]) for name, spec in self.specs().items()}
+        for group_name, values in _nest(checked).items():
+            # A whole number given for a float becomes one, in a group of our own.
+            group = dataclasses.replace(getattr(self, group_name), **values)
+            object.__setattr__(self, group_name, group)
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        """Value of the parameter with the dotted `name`."""
+        group_name, field_name = self.find_spec(name).name.split('.')
+        value: ParameterValue = getattr(getattr(self, group_name), field_name)
+        return value
+
+    def flat(self) -> dict[str, ParameterValue]:
+        """Every value by its dotted name, in order of declaration."""
+        return {name: self[name] for name in self.specs()}
+
+    def nested(self) -> dict[str, dict[str, ParameterValue]]:
+        """Every value as ``{group: {field: value}}``."""
+        return _nest(self.flat())
+
+    def replace(self, **changes: object) -> Self:
+        """Copy with some values changed, given by dotted names (``**{'grid.r_max': 60.0}``).
+
+        Raises ConfigError if a name is unknown or the changed configuration is invalid.
+        """
+        checked = {name: self.find_spec(name).check(value) for name, value in changes.items()}
+        groups: dict[str, Any] = {
+            group_name: dataclasses.replace(getattr(self, group_name), **values)
+            for group_name, values in _nest(checked).items()
+        }
+        return dataclasses.replace(self, **groups)
+
+    @classmethod
+    def from_yaml(cls, path: str | Path, base: Self | None = None) -> Self:
+        """Read a YAML file: ROS form (``/**: ros__parameters:``) or bare groups.
+
+        Parameters not in the file are as in `base`, by default the defaults. Raises ConfigError,
+        with the path, if the file cannot be read, a name is unknown, or a value is not accepted.
+        """
+        try:
+            file = read_parameters(path)
+            if not file.is_ours:
+                raise ConfigError(
+                    f'parameters of node {file.node}; must be of {ROS_NODE_KEY} or {NODE_NAME}'
+                )
+            return (base or cls()).replace(**file.values)
+        except ConfigError as error:
+            raise ConfigError(f'{path}: {error}') from error
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a hint at the known name nearest to `name`, empty if none is near."""
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f'; did you mean {near[0]}?' if near else ''
+
+
+def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterValue]]:
+    """``{'group.field': value}`` as ``{group: {field: value}}``."""
+    result: dict[str, dict[str, ParameterValue]] = {}
+    for name, value in flat.items():
+        group_name, field_name = name.split('.')
+        result.setdefault(group_name, {})[field_name] = value
+    return result
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, without three of its surprises (see `load_yaml`)."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()  # type: ignore[no-untyped-call]
+            line = event.start_mark.line + 1
+            raise ConfigError(f'line {line}: aliases (*name) are not accepted')
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse a key that is there twice; the last would win silently."""
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise ConfigError(f'{key}: given twice, from line {node.start_mark.line + 1} on')
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float',
+    re.compile(r'^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
+    list('-+.0123456789'),
+)
+
+
+def read_yaml(path: str | Path) -> object:
+    """Read a YAML file as `load_yaml`; ConfigError also if it is too large to be of parameters."""
+    with open(path, 'rb') as file:
+        data = file.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
+        raise ConfigError(f'too large for a parameter file, accepted are {MAX_FILE_BYTES} bytes')
+    return load_yaml(data.decode('utf-8'))
+
+
+def load_yaml(text: str) -> object:
+    """Read YAML, with 1e-3 a number as in ROS; an alias or a key given twice: ConfigError."""
+    document: object = yaml.load(text, Loader=_Loader)
+    return document
+
+
+class ParameterFile(NamedTuple):
+    """Values of a parameter file by dotted names, unchecked."""
+
+    values: dict[str, object]
+    node: str  # whose they are, in the form of ROS; '' for bare groups
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether a node of our name, and commands, use it."""
+        return self.node.split('/')[-1] in ('', '*', '**', NODE_NAME)
+
+
+def read_parameters(path: str | Path) -> ParameterFile:
+    """Read a parameter file; ConfigError if it cannot be read or parsed, or gives a name twice."""
+    try:
+        document = read_yaml(path)
+        values: dict[str, object] = {}
+        for name, value in _flatten(_unwrap_ros(document)):
+            if name in values:
+                raise ConfigError(f'{name}: given twice')
+            values[name] = value
+        node = ''
+        if isinstance(document, Mapping) and _is_ros(document):
+            (node,) = map(str, document)
+        return ParameterFile(values, node)
+    except OSError as error:
+        raise ConfigError(error.strerror or str(error)) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError('not a text file') from error
+    except ConfigError:
+        raise
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        # A ValueError comes from what looks like a date and is none, as in 2011-99-99.
+        raise ConfigError(f'not valid YAML: {" ".join(str(error).split())}') from error
+
+
+def _unwrap_ros(document: object) -> Mapping[str, object]:
+    """Parameters of a ROS parameter file, or of a file of bare groups."""
+    if document is None:
+        return {}
+    if not isinstance(document, Mapping):
+        raise ConfigError('must be a mapping of parameter groups')
+    if not _is_ros(document):
+        return document
+    if len(document) != 1:
+        raise ConfigError(f'parameters of {len(document)} nodes; keep one, keyed {ROS_NODE_KEY}')
+    (node,) = document.values()
+    if not isinstance(node, Mapping) or not isinstance(node.get(ROS_PARAMETERS_KEY), Mapping):
+        raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
+    # Names that every ROS node has are no parameters of the segmentation.
+    return {
+        key: value
+        for key, value in node[ROS_PARAMETERS_KEY].items()
+        if key not in OF_EVERY_NODE and not str(key).startswith('qos_overrides')
+    }
+
+
+def _is_ros(document: Mapping[str, object]) -> bool:
+    return any(
+        str(key).startswith('/') or (isinstance(value, Mapping) and ROS_PARAMETERS_KEY in value)
+        for key, value in document.items()
+    )
+
+
+def _flatten(tree: Mapping[str, object], prefix: str = '') -> Iterator[tuple[str, object]]:
+    for key, value in tree.items():
+        name = f'{prefix}{key}'
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f'{name}.')
+        else:
+            yield name, value

@@ -1,0 +1,262 @@
+"""Stage 2: height and tilt of the sensor over the ground near it, from one scan (docs/pose.md)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.frame import Candidates, FloatArray, PointArray, Scan
+from gp_ground_seg.core.parameters.config import SensorConfig
+from gp_ground_seg.core.parameters.schema import AUTO
+from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, GroundPlane
+from gp_ground_seg.core.pipeline.tilt import (
+    Direction,
+    angles_of,
+    rotate,
+    rotation,
+    rounded,
+    turned_back,
+    vertical,
+)
+from gp_ground_seg.core.pipeline.up_axis import (
+    MIN_CLEARANCE,
+    MIN_SUPPORT,
+    UP_MAX_TILT,
+    View,
+    find_up_axis,
+    is_up_axis_doubtful,
+    refusal,
+)
+
+FitPlane = Callable[[Candidates, float, Direction], GroundPlane | None]
+ScanRotated = Callable[[FloatArray], Scan]
+
+DEFAULT_HEIGHT = 1.73
+"""Height where `sensor.height` is auto and the scan does not determine it: a car's roof [m]."""
+NO_HEIGHT = (
+    f'the scan does not show the ground near the sensor: sensor.height = {DEFAULT_HEIGHT:g} m is '
+    'assumed; set it'
+)
+CLEAR_TILT = 0.05
+"""Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
+lean stay below it."""
+MAX_TILT = math.radians(30.0)
+"""Steepest ground plane that is searched [rad]."""
+
+CLEAR = 0.3
+"""Height from which a return counts as above a plane, or below [m]: over a ceiling, or the ground
+seen from a sensor upside down, there is less than below it, and a scan of one beam has neither."""
+LEAST_COSINE = 0.1
+"""Cosine of the tilt from which the sensor's z axis meets the ground."""
+HEIGHT_CONTRADICTION = 0.3
+"""Difference to a given height from which the scan contradicts it [m]."""
+TILT_CONTRADICTION = 0.15
+"""Tilt left under given angles from which the scan contradicts them [rad]: no usual slope."""
+
+
+@dataclass(frozen=True)
+class MeasuredPose:
+    """What one scan says of the sensor, whatever was given."""
+
+    # of the cloud's origin over the ground plane, along the vertical of the pose used [m]
+    height: float
+    roll: float  # angle that would make the ground plane level [rad]
+    pitch: float  # as `roll`
+    tells_height: bool  # whether the scan shows enough ground for the height
+    tells_tilt: bool  # the same for the tilt
+    # in the frame levelled by the angles given, or where that is far from level in its own
+    plane: GroundPlane
+
+
+@dataclass(frozen=True)
+class SensorPose:
+    """Where the sensor was taken to be; the level frame has its origin and heading.
+
+    Attributes
+    ----------
+    height : float
+        Height of the cloud's origin above the ground near it, negative below it [m].
+    roll, pitch : float
+        Fixed-axis angles that turn the sensor frame level, as those of a URDF [rad]:
+        positive roll lifts the left side, positive pitch lowers the nose (REP-103).
+    height_estimated, roll_estimated, pitch_estimated : bool
+        Whether each comes from this scan rather than from the parameters or a default.
+    measured : MeasuredPose or None
+        What the scan says; None if it shows no plane at all.
+    contradictions : tuple of str
+        Parameters that the scan clearly contradicts, a line for each; they are used as given.
+    is_height_default : bool
+        Whether the height is neither given nor shown by the scan.
+    """
+
+    height: float
+    roll: float
+    pitch: float
+    height_estimated: bool = False
+    roll_estimated: bool = False
+    pitch_estimated: bool = False
+    measured: MeasuredPose | None = None
+    contradictions: tuple[str, ...] = ()
+    is_height_default: bool = False
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the level frame is the sensor's own."""
+        return self.roll == 0.0 and self.pitch == 0.0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know, a line for each."""
+        return (NO_HEIGHT,) if self.is_height_default else ()
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Matrix (3, 3) from the sensor frame to the level frame."""
+        return rotation(self.roll, self.pitch)
+
+    def level(self, xyz: PointArray) -> PointArray:
+        """Points (N, 3) of the sensor frame in the level frame; `xyz` itself without tilt."""
+        return xyz if self.is_level else rotate(xyz, self.rotation)
+
+    def ground_z(self, z: PointArray, height: FloatArray) -> FloatArray:
+        """Height of the surface along the sensor's z axis, sensor frame, (N,) float64 [m].
+
+        `z`, in the sensor frame, and the vertical `height` over the surface are those of the
+        points, (N,) [m]. Exact where the surface is level in the level frame; NaN if the axis
+        lies within 6 degrees of the horizontal: it does not meet the ground.
+        """
+        cosine = math.cos(self.roll) * math.cos(self.pitch)
+        if abs(cosine) < LEAST_COSINE:
+            return np.full_like(height, np.nan)
+        below: FloatArray = z - height / cosine
+        return below
+
+
+@lru_cache(maxsize=4)
+def given_pose(sensor: SensorConfig) -> SensorPose:
+    """Pose by the parameters alone: angles that are auto 0, a height that is auto the default."""
+    return SensorPose(
+        DEFAULT_HEIGHT if sensor.height == AUTO else sensor.height,
+        0.0 if sensor.roll == AUTO else sensor.roll,
+        0.0 if sensor.pitch == AUTO else sensor.pitch,
+        is_height_default=sensor.height == AUTO,
+    )
+
+
+def estimate_pose(
+    scan: Scan, sensor: SensorConfig, fit_plane: FitPlane, scan_rotated: ScanRotated
+) -> SensorPose:
+    """Estimate what is auto, and check what is not against the scan.
+
+    `scan` is in the frame levelled by `given_pose`; `fit_plane` is that of `ground_plane`, and
+    `scan_rotated` returns the same scan, rotated further by a matrix (3, 3): it is called only
+    where z does not seem to be up. Raises a PointCloudError if roll or pitch is auto and z is
+    clearly not up.
+    """
+    given = given_pose(sensor)
+    origin = given.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
+
+    def look(turn: FloatArray | None, max_tilt: float) -> View | None:
+        own = scan if turn is None else scan_rotated(turn)
+        x, y, z = (origin if turn is None else turn @ origin).tolist()
+        plane = fit_plane(own.candidates, math.tan(max_tilt), (x, y, z))
+        if plane is None:
+            return None
+        is_below = float(plane.below(x, y, z)) >= MIN_CLEARANCE
+        if not is_below and not _is_lower_side(plane, own):
+            return None
+        return View(
+            plane, plane.normal if turn is None else turned_back(plane.normal, turn), is_below
+        )
+
+    view = look(None, MAX_TILT)
+    not_up = None
+    if is_up_axis_doubtful(None if view is None else view.plane):
+        found = find_up_axis(None if view is None else view.plane, look)
+        if found is not None and found.up[2] >= math.cos(UP_MAX_TILT):
+            view = found
+        elif found is not None:
+            not_up = refusal(found, given.rotation)
+            if AUTO in (sensor.roll, sensor.pitch):
+                raise PointCloudError(not_up)
+    contradictions = () if not_up is None else (not_up,)
+    if view is None:
+        return dataclasses.replace(given, contradictions=contradictions)
+    plane, own_up = view.plane, view.up
+    tells_height, tells_tilt = view.tells_height, view.tells_tilt
+    up = own_up if given.is_level else turned_back(own_up, given.rotation)
+    roll, pitch = _levelled(up, sensor)
+    levelled = vertical(roll, pitch)
+    corrects = tells_tilt and _angle(levelled, vertical(given.roll, given.pitch)) >= CLEAR_TILT
+    # Along the vertical of the pose used, not across the plane.
+    along = _product(levelled, up) if corrects else own_up[2]
+    if not corrects:
+        roll, pitch = given.roll, given.pitch
+    height = rounded(plane.near_height * plane.normal[2] / along)
+    own_roll, own_pitch = angles_of(up)
+    measured = MeasuredPose(height, own_roll, own_pitch, tells_height, tells_tilt, plane)
+    estimates_height = sensor.height == AUTO and tells_height
+    return SensorPose(
+        height=height if estimates_height else given.height,
+        roll=roll,
+        pitch=pitch,
+        height_estimated=estimates_height,
+        roll_estimated=sensor.roll == AUTO and corrects,
+        pitch_estimated=sensor.pitch == AUTO and corrects,
+        measured=measured,
+        contradictions=contradictions or _contradictions(sensor, measured, own_up),
+        is_height_default=sensor.height == AUTO and not tells_height,
+    )
+
+
+def _is_lower_side(plane: GroundPlane, scan: Scan) -> bool:
+    """Whether more returns are clearly above the plane than below it."""
+    height = plane.below(*scan.xyz[scan.grid.r < FARTHEST].T.astype(np.float64))
+    return bool(np.count_nonzero(height > CLEAR) > np.count_nonzero(height < -CLEAR))
+
+
+def _levelled(up: Direction, sensor: SensorConfig) -> tuple[float, float]:
+    """Roll and pitch [rad] that turn `up` upwards as far as those given allow."""
+    roll = rounded(math.atan2(up[1], up[2])) if sensor.roll == AUTO else sensor.roll
+    if sensor.pitch != AUTO:
+        return roll, sensor.pitch
+    across = up[1] * math.sin(roll) + up[2] * math.cos(roll)
+    return roll, rounded(math.atan2(-up[0], across))
+
+
+def _product(a: Direction, b: Direction) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _angle(a: Direction, b: Direction) -> float:
+    return math.acos(min(max(_product(a, b), -1.0), 1.0))
+
+
+def _contradictions(
+    sensor: SensorConfig, measured: MeasuredPose, up: Direction
+) -> tuple[str, ...]:
+    """Say which parameters are clearly wrong; `up` is that of the ground, as they level it."""
+    found = []
+    if measured.tells_height and measured.plane.support >= MIN_SUPPORT and sensor.height != AUTO:
+        difference = abs(sensor.height - measured.height)
+        if difference > max(HEIGHT_CONTRADICTION, 0.1 * abs(sensor.height)):
+            side = 'below' if measured.height >= 0.0 else 'above'
+            found.append(
+                f'sensor.height = {sensor.height:g}: the ground near the sensor is '
+                f"{abs(measured.height):.2f} m {side} the cloud's origin"
+            )
+    if measured.tells_tilt and math.acos(min(up[2], 1.0)) > TILT_CONTRADICTION:
+        names = [n for n in ('roll', 'pitch') if getattr(sensor, n) != AUTO]
+        if names:
+            words = ', '.join(f'sensor.{name} = {getattr(sensor, name):g}' for name in names)
+            found.append(
+                f'{words}: the ground near the sensor is level with roll = '
+                f'{measured.roll:.3f}, pitch = {measured.pitch:.3f}'
+            )
+    return tuple(found)

@@ -1,0 +1,295 @@
+"""What segmenting a scan gives back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar, overload
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.core.frame import (
+    Candidates,
+    FloatArray,
+    GroundSurface,
+    Label,
+    Labelled,
+    Lines,
+    PolarGrid,
+    PseudoInputs,
+    at_points,
+)
+from gp_ground_seg.core.gp.learning import THETA_NAMES, Learned
+from gp_ground_seg.core.pipeline.labels import ground_probability
+from gp_ground_seg.core.pipeline.residuals import CorrectedSurface, correct_surface
+from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
+
+LEAST_GROUND = 0.001
+"""Share of the points below which next to nothing of a scan is ground."""
+NO_GROUND = 'next to nothing of the scan is ground: is sensor.height right, and z up?'
+
+_Value = TypeVar('_Value')
+
+
+class cached_property(Generic[_Value]):  # noqa: N801 - a decorator
+    """``functools.cached_property`` as it is from Python 3.12 on: without a lock.
+
+    The lock of older versions is one for all objects of the class: a process forked while a
+    thread computes the property of any of them would wait for it for ever. Two threads that ask
+    one object at once may both compute the value, which is the same.
+    """
+
+    def __init__(self, compute: Callable[[Any], _Value]) -> None:
+        self._compute = compute
+        self.__doc__ = compute.__doc__
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> cached_property[_Value]: ...
+
+    @overload
+    def __get__(self, instance: object, owner: type) -> _Value: ...
+
+    def __get__(self, instance: object | None, owner: type) -> cached_property[_Value] | _Value:
+        if instance is None:
+            return self
+        # The next access finds the value in the object and does not come here.
+        value = instance.__dict__[self._name] = self._compute(instance)
+        return value
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """What `FitReport` cannot learn from the results."""
+
+    mode: str  # ``learning.mode`` of the frame
+    # Outcome of the learning, of each segment where each has its own; empty where there was none.
+    learned: list[Learned]
+    backend: str  # ``numba`` or ``numpy``
+    n_threads: int  # that were used
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What the learning and the inlier growth did.
+
+    Attributes
+    ----------
+    mode : str
+        ``learning.mode`` of the frame.
+    status : str
+        ``converged``, ``budget`` or ``failed``; ``kept`` when nothing was learned on this frame.
+    n_evaluations : int
+        Evaluations of the objective, over all segments where each has its own.
+    objective : float
+        Objective per inlier at the end; NaN when nothing was learned.
+    theta : dict of str to float
+        Hyper-parameters used: sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m],
+        sigma_n_bar, and the factor on the length-scales that the lines suggest. Means
+        of the logarithms where each segment has its own.
+    at_bound : tuple of str
+        Those that ended at a bound.
+    n_segments : int
+        Segments with a ground model.
+    n_candidates, n_inliers, n_lines, n_pseudo_inputs : int
+        Ground candidates, those the surface rests on, lines among them, and
+        pseudo-inputs of the latent process.
+    backend : str
+        ``numba`` or ``numpy``.
+    n_threads : int
+        Threads used.
+    """
+
+    mode: str
+    status: str
+    n_evaluations: int
+    objective: float
+    theta: dict[str, float]
+    at_bound: tuple[str, ...]
+    n_segments: int
+    n_candidates: int
+    n_inliers: int
+    n_lines: int
+    n_pseudo_inputs: int
+    backend: str
+    n_threads: int
+
+    @classmethod
+    def of(cls, frame: Segmentation) -> FitReport:
+        """Sum up one frame."""
+        learned = frame.fitting.learned
+        values = np.exp(frame.theta.mean(axis=0))
+        statuses = {one.status for one in learned}
+        at_bound = np.any([one.at_bound for one in learned], axis=0) if learned else []
+        n_inliers = int(frame.surface.inlier.sum())
+        total = sum(one.objective for one in learned)
+        return cls(
+            mode=frame.fitting.mode,
+            status=next((s for s in ('failed', 'budget', 'converged') if s in statuses), 'kept'),
+            n_evaluations=sum(one.n_evaluations for one in learned),
+            objective=total / n_inliers if learned and n_inliers else float('nan'),
+            theta={name: float(value) for name, value in zip(THETA_NAMES, values, strict=True)},
+            at_bound=tuple(n for n, hit in zip(THETA_NAMES, at_bound, strict=False) if hit),
+            n_segments=int(np.isfinite(frame.surface.mean[:, 0]).sum()),
+            n_candidates=len(frame.candidates.r),
+            n_inliers=n_inliers,
+            n_lines=len(frame.lines.slope),
+            n_pseudo_inputs=len(frame.pseudo.r_bar),
+            backend=frame.fitting.backend,
+            n_threads=frame.fitting.n_threads,
+        )
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """A segmented scan; per-point arrays are in input order.
+
+    Attributes
+    ----------
+    labelled : Labelled
+        Labels and what they follow from, heights over `surface` among it; `label`, `margin`
+        and `roughness` are taken from it.
+    timings : dict of str to float
+        Seconds per stage, and ``total``.
+    fitting : Fitting
+        How it was fitted; `fit` sums it up.
+    grid, candidates, lines, pseudo, surface
+        Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
+        process's own, which the labels follow from; `corrected` is what users are given.
+    theta : (M, 6) float64
+        Logarithms of the hyper-parameters of each segment, named by `THETA_NAMES`.
+    log_length_scale : (M, knots) float64
+        Log length-scale at the knots of the surface [log m]; NaN in segments
+        without candidates.
+    pose : SensorPose
+        Height and tilt of the sensor that were used, and what the scan says of them;
+        ``pose.level(xyz)`` gives points in the level frame.
+    tilted_z : (N,) float64 or None
+        Height of `surface` under each point along the sensor's z axis where `pose` has a
+        tilt, sensor frame [m].
+    slope_std : float
+        ``observation.slope_std`` of the frame.
+    """
+
+    labelled: Labelled
+    timings: dict[str, float]
+    fitting: Fitting
+    grid: PolarGrid
+    candidates: Candidates
+    lines: Lines
+    pseudo: PseudoInputs
+    surface: GroundSurface
+    theta: FloatArray
+    log_length_scale: FloatArray
+    pose: SensorPose
+    tilted_z: FloatArray | None
+    slope_std: float
+
+    @property
+    def label(self) -> npt.NDArray[np.uint8]:
+        """`gp_ground_seg.Label` of each point, (N,) uint8.
+
+        Finite points are GROUND or OBSTACLE; where there is no model nothing speaks
+        for ground, and they are OBSTACLE. Points that are not finite are UNKNOWN.
+        """
+        return self.labelled.label
+
+    @property
+    def margin(self) -> FloatArray:
+        """Distance of each point to the nearer edge of the band that is ground, (N,) float64 [m].
+
+        Not negative for ground; NaN where there is no model.
+        """
+        return self.labelled.margin
+
+    @property
+    def roughness(self) -> FloatArray:
+        """Root mean square height of the returns over the surface about each bin, (M, n_bins)."""
+        return self.labelled.roughness
+
+    # What follows is computed when it is first asked for: not every user asks.
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know of the scan, a line for each; logged by the segmenter."""
+        n_ground = np.count_nonzero(self.label == Label.GROUND)
+        n_finite = np.count_nonzero(self.label != Label.UNKNOWN)
+        if not n_finite:
+            return ()
+        is_lost = n_ground < LEAST_GROUND * n_finite
+        return (*self.pose.warnings, *((NO_GROUND,) if is_lost else ()))
+
+    @cached_property
+    def fit(self) -> FitReport:
+        """What the learning and the inlier growth did."""
+        return FitReport.of(self)
+
+    @cached_property
+    def corrected(self) -> CorrectedSurface:
+        """The surface without the bias of lowest points, as uncertain as its residuals say.
+
+        See `gp_ground_seg.core.pipeline.residuals.correct_surface`.
+        """
+        noise_std = np.exp(self.theta[:, 1:2])
+        return correct_surface(self.surface, self.labelled, self.grid, noise_std, self.slope_std)
+
+    @cached_property
+    def height(self) -> FloatArray:
+        """Height of each point over the ground, (N,) float64 [m]; negative below it.
+
+        NaN where there is no model. Vertical in the level frame, like `ground_std`; where
+        `pose` has no tilt, that is the sensor's own, and the height is ``z - ground_z``. The
+        labels follow from ``labelled.height``, which is that over the uncorrected `surface`.
+        """
+        return self.labelled.height - self._correction
+
+    @cached_property
+    def ground_z(self) -> FloatArray:
+        """Height of the ground under each point along the sensor's z axis, (N,) float64 [m].
+
+        In the sensor frame; NaN where there is no model. Without tilt ``z - height``;
+        with it ``z - height / cos(tilt)``, exact where the ground is level (see
+        `gp_ground_seg.core.pipeline.sensor_pose.SensorPose.ground_z`).
+        """
+        if self.tilted_z is not None:
+            return self.pose.ground_z(self.tilted_z, -self._correction)
+        return self._at_points(self.corrected.mean)
+
+    @cached_property
+    def ground_std(self) -> FloatArray:
+        """Standard deviation of the height of the ground, (N,) float64 [m]; NaN without a model.
+
+        It grows with the distance to the nearest return called ground.
+        """
+        return self._at_points(self.corrected.std)
+
+    @cached_property
+    def return_std(self) -> FloatArray:
+        """Standard deviation of the height of a ground return, (N,) float64 [m].
+
+        About `ground_z`: surface, roughness and range noise together. NaN without a model.
+        """
+        return self._at_points(self.corrected.return_std)
+
+    @cached_property
+    def _correction(self) -> FloatArray:
+        return self._at_points(self.corrected.correction)
+
+    def _at_points(self, table: FloatArray) -> FloatArray:
+        return at_points(self.surface.knots, table, self.grid)
+
+    @cached_property
+    def p_ground(self) -> npt.NDArray[np.float32]:
+        """Probability that each point is ground, (N,) float32.
+
+        At least 0.5 for points labelled ground; 0 where there is no model, NaN for
+        points that are not finite.
+        """
+        rough = self.roughness.ravel()[np.maximum(self.grid.cell, 0)]
+        noise = float(np.exp(self.theta[:, 1].mean()))
+        result = ground_probability(self.margin, self._at_points(self.surface.std), rough, noise)
+        result[self.label == Label.UNKNOWN] = np.nan
+        return result

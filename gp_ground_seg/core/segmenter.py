@@ -1,0 +1,294 @@
+"""Ground segmentation of one LiDAR scan: the paper's Algorithm 2, stage by stage. Start here."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.core.backend import Backend, make_backend
+from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan
+from gp_ground_seg.core.gp.learning import Learned, given_theta, in_rows, learn_frame
+from gp_ground_seg.core.jit import keep_code
+from gp_ground_seg.core.parameters.config import Config, SensorConfig
+from gp_ground_seg.core.pipeline.points import take_points
+from gp_ground_seg.core.pipeline.sensor_pose import SensorPose, estimate_pose, given_pose
+from gp_ground_seg.core.pipeline.tilt import rotate_sample
+from gp_ground_seg.core.result import Fitting, Segmentation
+
+_LOGGER = logging.getLogger('gp_ground_seg')
+
+
+class GroundSegmenter:
+    """Splits scans into ground and obstacles.
+
+    It may be called from several threads, which then take turns, and in a forked process.
+
+    Parameters
+    ----------
+    config : Config
+        Parameters; `configure` changes them between scans.
+    clock : callable
+        Source of the seconds in ``Segmentation.timings`` and of ``learning.max_time``.
+    backend : Backend, optional
+        Backend to use until the parameters ``runtime`` change; by default one made from them.
+
+    Raises
+    ------
+    MissingDependencyError
+        If ``runtime.backend`` is numba and numba is not installed.
+    """
+
+    def __init__(
+        self,
+        config: Config | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        backend: Backend | None = None,
+    ) -> None:
+        self._clock = clock
+        self._config = config if config is not None else Config()
+        self._backend = make_backend(self._config.runtime) if backend is None else backend
+        self._sample_backend: Backend | None = None
+        self._theta: FloatArray | None = None
+        self._frames_since_learning = 0
+        self._warned: set[str] = set()
+        self._lock, self._pid = threading.RLock(), os.getpid()
+
+    def segment(
+        self,
+        points: npt.ArrayLike,
+        tilt: tuple[float, float] | None = None,
+        origin: tuple[float, float, float] | None = None,
+    ) -> Segmentation:
+        """Label every point of a scan (paper, Algorithm 2).
+
+        Parameters
+        ----------
+        points : (N, >=3) float array
+            x forward, y left, z up in the sensor frame [m]; never written to.
+        tilt : tuple of float, optional
+            Roll and pitch of the sensor in this scan [rad], instead of ``sensor.roll``
+            and ``sensor.pitch``.
+        origin : tuple of float, optional
+            Where the sensor was in the frame of this scan [m], instead of ``sensor.origin_x``,
+            ``sensor.origin_y`` and ``sensor.origin_z``.
+
+        Raises
+        ------
+        PointCloudError
+            If the array has another shape or type, or z clearly does not point up.
+        """
+        with self._exclusive():
+            config, backend, timer = self._config, self._backend, StageTimer(self._clock)
+            sensor = config.sensor
+            if tilt is not None:
+                sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
+            if origin is not None:
+                x, y, z = origin
+                sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
+
+            # 1. Polar grid: the lowest point of each cell is a ground candidate.
+            # 2. Sensor pose: height and tilt, from a plane through the candidates near the
+            #    sensor; a tilted scan is levelled and sorted again.
+            xyz = take_points(points)
+            scan, pose = self._level(xyz, sensor, timer)
+
+            # 3. Vertical faces: walls, fences, sides of cars.
+            faces = backend.find_faces(scan, config)
+            timer.mark('faces')
+
+            # 4. Lines along each segment, and pseudo-inputs on them. Lowest points of faces
+            #    with occluded base are left out of the candidates.
+            extracted = backend.extract_lines(scan.candidates, faces, config)
+            # Heights are relative to the sensor: the prior mean is the ground below it.
+            frame = Frame(*extracted, scan.grid.edges, prior_mean=-pose.height)
+            timer.mark('lines')
+
+            # 5. Observation process (height over range) and latent process (its log
+            #    length-scale): hyper-parameters theta, in log space, then inliers and surface.
+            theta, learned = self._learn(frame)
+            timer.mark('learning')
+            surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
+            timer.mark('surface')
+
+            # 6. Labels: a point is ground where its height over the surface is more likely of
+            #    ground than of an obstacle.
+            labelled = backend.label_points(scan, faces, surface, config)
+            tilted_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
+            timer.mark('label')
+
+            result = Segmentation(
+                labelled,
+                timer.seconds,
+                Fitting(config.learning.mode, learned, backend.name, backend.n_threads),
+                scan.grid,
+                frame.candidates,
+                frame.lines,
+                frame.pseudo,
+                surface,
+                theta,
+                log_length_scale,
+                pose,
+                tilted_z,
+                config.observation.slope_std,
+            )
+            self._warn(result.warnings)
+            return result
+
+    def estimate_pose(self, points: npt.ArrayLike) -> SensorPose:
+        """Estimate height and tilt of the sensor as `segment` does, and no more.
+
+        Parameters and errors are those of `segment`.
+        """
+        with self._exclusive():
+            xyz, timer = take_points(points), StageTimer(self._clock)
+            pose = self._level(xyz, self._config.sensor, timer)[1]
+            self._warn(pose.warnings)
+            return pose
+
+    @property
+    def config(self) -> Config:
+        """Parameters of the next scan."""
+        return self._config
+
+    @property
+    def backend(self) -> Backend:
+        """Backend of the next scan."""
+        return self._backend
+
+    def configure(self, config: Config) -> None:
+        """Use `config` from the next scan on; what was learned under another is forgotten."""
+        with self._exclusive():
+            if config.runtime != self._config.runtime:
+                self.use_backend(make_backend(config.runtime))
+            if dataclasses.replace(config, diagnostics=self._config.diagnostics) != self._config:
+                self.reset()
+            self._config = config
+            self._warned.clear()
+
+    def use_backend(self, backend: Backend) -> None:
+        """Use `backend` from the next scan on, and close the one before."""
+        with self._exclusive():
+            self.close()
+            self._backend, self._sample_backend = backend, None
+
+    def reset(self) -> None:
+        """Forget what was learned on earlier scans, as after a jump in time."""
+        self._theta = None
+
+    def close(self) -> None:
+        """End the worker threads, once the scan at hand is segmented."""
+        with self._exclusive():
+            self._backend.close()
+
+    def _warn(self, warnings: tuple[str, ...]) -> None:
+        """Log each warning once, until the parameters change: scans come ten times a second."""
+        for line in warnings:
+            if line not in self._warned:
+                self._warned.add(line)
+                _LOGGER.warning(line)
+
+    def _exclusive(self) -> threading.RLock:
+        """Lock that callers from several threads hold in turn."""
+        if self._pid != os.getpid():
+            # In a forked process it may be held by a thread that does not exist here.
+            self._lock, self._pid = threading.RLock(), os.getpid()
+        return self._lock
+
+    def _level(
+        self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer
+    ) -> tuple[Scan, SensorPose]:
+        """Scan in the level frame, by the angles given or estimated."""
+        backend, config, given = self._backend, self._config, given_pose(sensor)
+        scan = backend.build_grid(given.level(xyz), config)
+        timer.mark('grid')
+
+        def scan_rotated(matrix: FloatArray) -> Scan:
+            # `backend` would overwrite the scan in its buffers.
+            if self._sample_backend is None:
+                runtime = dataclasses.replace(config.runtime, n_threads=1, backend=backend.name)
+                self._sample_backend = make_backend(runtime)
+            sample = rotate_sample(scan.xyz, matrix)
+            return self._sample_backend.build_grid(sample, config)
+
+        pose = estimate_pose(scan, sensor, backend.fit_plane, scan_rotated)
+        if (pose.roll, pose.pitch) != (given.roll, given.pitch):
+            scan = backend.build_grid(pose.level(xyz), config)
+        timer.mark('pose')
+        return scan, pose
+
+    def _learn(self, frame: Frame) -> tuple[FloatArray, list[Learned]]:
+        """Theta of this frame by ``learning.mode``; (M, 6) and the outcome, if learned."""
+        learning = self._config.learning
+        if learning.mode == 'fixed':
+            n_segments = len(frame.candidates.offsets) - 1
+            return in_rows(given_theta(self._config), n_segments), []
+        period = {'every_frame': 1, 'every_k': learning.period, 'first_frame': None}[learning.mode]
+        self._frames_since_learning += 1
+        is_kept = period is None or self._frames_since_learning < period
+        if self._theta is not None and is_kept:
+            return self._theta, []
+        started = self._clock() if learning.max_time > 0.0 else 0.0
+
+        def out_of_time() -> bool:
+            return 0.0 < learning.max_time <= self._clock() - started
+
+        before = self._theta if learning.warm_start else None
+        self._theta, learned = learn_frame(frame, before, self._config, self._backend, out_of_time)
+        self._frames_since_learning = 0
+        return self._theta, learned
+
+
+def warm_up(config: Config | None = None) -> Backend:
+    """Compile or load all code that a frame needs, and return a backend that uses it.
+
+    A small scan of single precision, the type of most sensors, is segmented. Where
+    numba is not installed, or not asked for, there is nothing to compile.
+
+    Parameters
+    ----------
+    config : Config, optional
+        Parameters; hyper-parameters are learned even if ``learning.mode`` is fixed.
+
+    Raises
+    ------
+    MissingDependencyError
+        If ``runtime.backend`` is numba and numba is not installed.
+    """
+    config = config if config is not None else Config()
+    segmenter = GroundSegmenter(config.replace(**{'learning.mode': 'every_frame'}))
+    azimuth, r = np.meshgrid(np.linspace(-3.0, 3.0, 400), np.geomspace(2.5, 30.0, 30))
+    xyz = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full_like(r, -1.73)], axis=-1)
+    wall = xyz[25] + [0.0, 0.0, 1.0]
+    points = np.concatenate([xyz.reshape(-1, 3), wall]).astype(np.float32)
+    segmenter.segment(points)
+    keep_code(warm=True)
+    return segmenter.backend
+
+
+class StageTimer:
+    """Time of each stage.
+
+    Parameters
+    ----------
+    clock : callable
+        Returns seconds; only differences are used.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._start = self._last = clock()
+        self.seconds: dict[str, float] = {}
+
+    def mark(self, stage: str) -> None:
+        """Record the seconds since the previous mark under `stage`."""
+        now = self._clock()
+        self.seconds[stage] = now - self._last
+        self.seconds['total'] = now - self._start
+        self._last = now

@@ -1,0 +1,1 @@
+"""What measures and shows the segmentation; a robot never imports it."""

@@ -1,0 +1,66 @@
+"""What a surface without a Gaussian process is worth: lowest points joined by straight lines."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gp_ground_seg.core.backend import Backend, make_backend
+from gp_ground_seg.core.frame import FloatArray, Frame, GroundSurface
+from gp_ground_seg.core.parameters.config import Config, RuntimeConfig
+from gp_ground_seg.lab.scoring.evaluate import OurMethod
+
+TITLE = 'interpolation, our labels'
+MAX_SLOPE, TOLERANCE = 0.15, 0.1
+"""A lowest point is ground up to this slope from the one before, and this much more [m]; the best
+of six pairs on a third of the labelled frames."""
+
+
+def interpolation_method(config: Config) -> OurMethod:
+    """Return our method with this surface in place of the model's, and nothing learned."""
+    fixed = config.replace(**{'learning.mode': 'fixed'})
+    return OurMethod(fixed, TITLE, interpolating_backend)
+
+
+def interpolating_backend(runtime: RuntimeConfig) -> Any:
+    """Make the backend of the parameters, with this surface."""
+    return InterpolatingBackend(make_backend(runtime))
+
+
+class InterpolatingBackend:
+    """The stages of another backend, but for the heights of the surface."""
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a stage of the other backend."""
+        return getattr(self._backend, name)
+
+    def estimate_surface(
+        self, frame: Frame, theta: FloatArray, config: Config
+    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
+        """Interpolate `ground_points` of each segment; take the median of three segments.
+
+        Standard deviation and end of the surface are those of the other backend.
+        """
+        surface, *scales = self._backend.estimate_surface(frame, theta, config)
+        own = np.empty_like(surface.mean)
+        for segment, line in enumerate(own):
+            part = slice(*frame.candidates.offsets[segment : segment + 2])
+            r, z = frame.candidates.r[part], frame.candidates.z[part]
+            line[:] = np.interp(frame.knots, *ground_points(r, z, frame.prior_mean))
+        mean = np.median([np.roll(own, k, axis=0) for k in (-1, 0, 1)], axis=0)
+        mean[np.isnan(surface.mean)] = np.nan
+        return surface._replace(mean=mean), scales[0], scales[1]
+
+
+def ground_points(r: FloatArray, z: FloatArray, start: float) -> tuple[list[float], list[float]]:
+    """Ranges and heights of the ground point at range 0, `start`, and of those that follow it."""
+    ranges, heights = [0.0], [start]
+    for one_r, one_z in zip(r.tolist(), z.tolist(), strict=True):
+        if abs(one_z - heights[-1]) <= MAX_SLOPE * (one_r - ranges[-1]) + TOLERANCE:
+            ranges.append(one_r)
+            heights.append(one_z)
+    return ranges, heights

@@ -1,0 +1,157 @@
+"""The paper's Table I: hyper-parameters, errors and times for segments of real frames."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gp_ground_seg.core.errors import ConfigError, DataError
+from gp_ground_seg.core.frame import OUTSIDE
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.segmenter import GroundSegmenter
+from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
+from gp_ground_seg.data.semantic_kitti import Frame, list_frames
+from gp_ground_seg.lab.experiments.variants import refuse_changed
+from gp_ground_seg.lab.scale.cluster import Progress
+from gp_ground_seg.lab.scoring.evaluate import load_kitti
+from gp_ground_seg.lab.scoring.metrics import height_error
+from gp_ground_seg.lab.scoring.report import Column, Report, Table, changed_parameters
+
+MODELS = {'Z-L': 'latent', 'Z': 'line_gradient'}
+"""The paper's method and the one it is compared with, as values of ``length_scale.model``."""
+VARIANCES = ('sigma_f^2', 'sigma_n^2', 'sigma_f_bar^2', 'sigma_l_bar^2', 'sigma_n_bar^2')
+"""Squares of the first entries of theta: in m^2; those of f_bar and n_bar without unit."""
+
+
+class Choice(NamedTuple):
+    """Segments of a frame."""
+
+    sequence: str
+    frame: str
+    segments: tuple[int, ...]
+
+
+CHOICES = (Choice('10', '000000', (157, 158)), Choice('03', '000006', (147, 148)))
+"""An adjacent pair that climbs a verge and a hill, 3 m over 30 m, and one on uneven ground."""
+N_REPEATS = 9
+
+
+def table1(
+    root: str | Path,
+    config: Config,
+    layout: ScanLayout = KITTI,
+    progress: Progress = iter,
+) -> Report:
+    """Measure the table on the segments of `CHOICES`.
+
+    Each method runs on each frame once without counting, then `N_REPEATS` times, alternately.
+    """
+    refuse_changed(config, ['length_scale.model', 'learning.fixed'])
+    if config.learning.mode == 'fixed':
+        raise ConfigError('learning.mode = fixed: the table is of what is learned, leave it out')
+    last = config.grid.n_segments - 1
+    for segment in (segment for choice in CHOICES for segment in choice.segments):
+        if not 0 <= segment <= last:
+            raise ConfigError(f'segment {segment}: must be in [0, {last}]')
+    frames = []
+    for choice in CHOICES:
+        own = {frame.index: frame for frame in list_frames(root, choice.sequence, layout)}
+        if choice.frame not in own:
+            where = f'{choice.sequence}; there are {min(own)} to {max(own)}'
+            raise DataError(f'{root}: no frame {choice.frame} in sequence {where}')
+        frames.append(own[choice.frame])
+    rows: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        segmenters = {}
+        for name, model in MODELS.items():
+            segmenter = GroundSegmenter(
+                config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
+            )
+            segmenters[name] = stack.enter_context(closing(segmenter))
+        for frame, choice in zip(progress(frames), CHOICES, strict=True):
+            found, result = _rows(frame, choice, segmenters)
+            rows += found
+    names = ['n_PG', 'n_L', *VARIANCES]
+    others = [n for n in rows[0] if n not in ('segment', *names) and not n.startswith('inliers')]
+    variances = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
+    errors = (
+        'SMSE in sample (at the inliers) and held out (labelled ground); seconds per frame: '
+        f'median of {N_REPEATS} runs on the whole frame, reading left out'
+    )
+    tables = {
+        'variances': _table(rows, names, variances),
+        'errors': _table(rows, others, errors),
+    }
+    facts = {'config_changes': changed_parameters(config), 'config': config.nested()}
+    return Report(tables, rows, result.fit, facts)
+
+
+def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> Table:
+    columns = [Column('segment')]
+    for name in names:
+        number = '.4f' if name.startswith('t ') else '#.4g'
+        columns.append(Column(name, 'd' if isinstance(rows[0][name], int) else number))
+    return Table(columns, [[row[c.title] for c in columns] for row in rows], title)
+
+
+def _rows(
+    frame: Frame, choice: Choice, segmenters: dict[str, GroundSegmenter]
+) -> tuple[list[dict[str, Any]], Segmentation]:
+    """Rows of a frame, by title of the column, and a result of the latent model."""
+    scan = load_kitti(frame)
+    z = scan.points[:, 2].astype(np.float64)
+    seconds: dict[str, list[float]] = {name: [] for name in segmenters}
+    results: dict[str, Segmentation] = {}
+    for k in range(N_REPEATS + 1):
+        for name, segmenter in segmenters.items():
+            segmenter.reset()
+            results[name] = segmenter.segment(scan.points)
+            if k > 0:  # compilation and first allocations are not its speed
+                seconds[name].append(results[name].timings['total'])
+    # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
+    common = results['Z-L']
+    candidates = common.candidates
+    # A candidate is the point of its segment with the same range and height.
+    place = common.grid.r + 1j * common.pose.level(scan.points[:, :3])[:, 2]
+    modelled = scan.is_ground & (common.grid.bin != OUTSIDE)
+    rows = []
+    for segment in choice.segments:
+        its = slice(*candidates.offsets[segment : segment + 2])
+        own = modelled & (common.grid.segment == segment)
+        own &= ~np.isin(place, candidates.r[its] + 1j * candidates.z[its])
+        variances = np.exp(2.0 * common.theta[segment, : len(VARIANCES)])
+        in_sample = {name: _in_sample(result, segment) for name, result in results.items()}
+        rows.append(
+            {
+                'segment': f'{frame.sequence}/{frame.index}:{segment}',
+                'n_PG': int(its.stop - its.start),
+                'n_L': int(np.diff(common.pseudo.offsets)[segment]),
+                **dict(zip(VARIANCES, variances.tolist(), strict=True)),
+                **{f'inliers {name}': n for name, (n, _) in in_sample.items()},
+                **{f'in sample {name}': smse for name, (_, smse) in in_sample.items()},
+                'held out': int(own.sum()),
+                **{
+                    # Of the process itself, as in the paper; not the corrected surface.
+                    f'held out {name}': height_error(
+                        z[own], z[own] - result.labelled.height[own]
+                    ).smse
+                    for name, result in results.items()
+                },
+                **{f't {name} [s]': statistics.median(own) for name, own in seconds.items()},
+            }
+        )
+    return rows, common
+
+
+def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:
+    """Inliers of a segment, and the standardised mean squared error of the surface there."""
+    candidates, surface = result.candidates, result.surface
+    own = surface.inlier & (candidates.segment == segment)
+    estimate = np.interp(candidates.r[own], surface.knots, surface.mean[segment])
+    return int(own.sum()), height_error(candidates.z[own], estimate).smse

@@ -1,0 +1,397 @@
+"""A segmented scan: in perspective with the ground model on it, or from above with its errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.core.errors import require
+from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
+from gp_ground_seg.core.ground_model import GroundModel
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.pipeline.points import check_points, finite_points
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.data.atomic_output import staged_file
+from gp_ground_seg.data.colours import length_scale_colours
+from gp_ground_seg.lab.plotting import style
+from gp_ground_seg.lab.plotting.style import add_axes, new_figure, save, write_line
+
+Labels = npt.NDArray[np.uint8]
+
+COLOURS = {'ground': '#B9BFC6', 'obstacles': style.VERMILION}
+VALUES = {
+    'height': ('height over the ground [m]', -0.5, 3.0),
+    'p_ground': ('probability of ground', 0.0, 1.0),
+}
+"""What points are coloured by instead of their class: attributes of `Segmentation`."""
+WIDTH, HEIGHT, TITLE, FOOT = 12.0, 6.0, 0.4, 0.6
+"""Size of the scene, and of the line above and the legend below it [inch]."""
+PANEL, GAP, N_COLUMNS = 4.8, 0.15, 3
+"""Width of a scene of a sheet and of the gap beside it [inch], and how many are in a row."""
+MOVIE_DPI = 80  # 960 by 560: whole blocks of a video
+N_STD = 2.0
+N_PROFILES = 60
+CLOSEST = 1.0
+"""Nothing nearer to the camera than this is drawn [m]."""
+# Places of the camera and of the middle of the picture, sensor frame [m].
+CAMERA, TARGET = (-16.0, -7.0, 10.0), (12.0, 1.0, -3.0)
+ZOOM = 0.75
+"""Focal length over the width of the picture."""
+
+
+class View(NamedTuple):
+    """Where a scene is seen from, sensor frame [m], and what its colours are: of `VALUES`."""
+
+    camera: tuple[float, float, float] = CAMERA
+    colour: str = 'class'
+
+    @classmethod
+    def around(cls, azimuth: float, elevation: float, distance: float) -> View:
+        """Look at the middle of the scene from a direction [degrees] and a distance [m]."""
+        turn, up = math.radians(azimuth), math.radians(elevation)
+        across = math.cos(turn) * math.cos(up), math.sin(turn) * math.cos(up), math.sin(up)
+        x, y, z = np.add(TARGET, np.multiply(distance, across)).tolist()
+        return cls((x, y, z))
+
+
+class Scene(NamedTuple):
+    """A segmented scan to draw."""
+
+    title: str
+    points: npt.ArrayLike  # (N, >=3) [m]
+    segmentation: Segmentation
+
+
+COLOURS_ABOVE = {
+    'ground': '#E3B968',
+    'obstacle': '#1B4F72',
+    'unknown': style.PINK,
+    'not scored': '#E3E6E9',
+    'right': '#BCC2C8',
+    'missed ground': style.BLUE,
+    'false ground': style.VERMILION,
+    'same label': '#BCC2C8',
+    'ground in A only': style.BLUE,
+    'ground in B only': style.VERMILION,
+}
+EXTENT, RING_STEP = 50.0, 10.0
+"""Half the side of the square seen from above, and the step between the rings in it [m]."""
+# Inches: the square of a panel, left, right, below and above it; the line above all panels.
+SQUARE, LEFT, RIGHT, BELOW, ABOVE, LINE = 6.2, 0.8, 0.2, 0.95, 0.4, 0.4
+
+
+def plot_scan_view(
+    points: npt.ArrayLike,
+    segmentation: Segmentation,
+    config: Config,
+    path: str | Path,
+    title: str = '',
+    view: View | None = None,
+) -> str:
+    """Draw a scan in perspective, replacing the file `path`; return numbers of points.
+
+    Ground and obstacles of `points`, (N, >=3) [m], and the ground model coloured by length-scale,
+    with profiles of two standard deviations: what the node's topics show in RViz. Ground less
+    certain than ``label.ground_tolerance`` is not drawn. In a PDF or SVG points are pixels.
+    """
+    figure = _scene_figure(Scene(title, points, segmentation), config, view or View())
+    save(figure, path)
+    return _label_panel(segmentation.label)[0]
+
+
+def plot_sheet(
+    scenes: Iterable[Scene], n_scenes: int, config: Config, path: str | Path, view: View
+) -> None:
+    """Draw scenes side by side as `plot_scan_view` draws one, replacing the file `path`."""
+    height, n_rows = PANEL * HEIGHT / WIDTH, -(-n_scenes // N_COLUMNS)
+    full = FOOT + n_rows * (height + TITLE)
+    figure = new_figure((PANEL + GAP) * N_COLUMNS, full)
+    for k, scene in enumerate(scenes):
+        row, column = divmod(k, N_COLUMNS)
+        bottom = full - (row + 1) * (height + TITLE)
+        axes = add_axes(figure, column * (PANEL + GAP), bottom, (PANEL, height))
+        axes.set_title(scene.title, fontsize=12, parse_math=False)
+        _draw_scene(axes, scene, config, view)
+    _draw_legend(figure, config, view.colour)
+    save(figure, path)
+
+
+def write_movie(
+    scenes: Iterable[Scene], config: Config, path: str | Path, view: View, fps: float
+) -> None:
+    """Write a GIF of scenes, replacing the file."""
+    imageio = require('imageio.v2', 'imageio matplotlib')
+    with (
+        staged_file(path, force=True) as part,
+        imageio.get_writer(part, duration=1e3 / fps, loop=0) as writer,
+    ):
+        for scene in scenes:
+            writer.append_data(style.pixels(_scene_figure(scene, config, view, MOVIE_DPI)))
+
+
+def _scene_figure(scene: Scene, config: Config, view: View, dpi: int = style.DPI) -> Any:
+    figure = new_figure(WIDTH, FOOT + HEIGHT + (TITLE if scene.title else 0.0), dpi)
+    write_line(figure, scene.title, 0.5, 0.5 * TITLE, fontsize=14)
+    _draw_scene(add_axes(figure, 0.0, FOOT, (WIDTH, HEIGHT)), scene, config, view)
+    _draw_legend(figure, config, view.colour)
+    return figure
+
+
+def _draw_scene(axes: Any, scene: Scene, config: Config, view: View) -> None:
+    xyz = check_points(scene.points)
+    style.check_lengths(len(xyz), label=scene.segmentation.label)
+    _draw_points(axes, xyz, scene.segmentation, view)
+    _draw_surface(axes, GroundModel.of(scene.segmentation), config, view)
+    axes.set_axis_off()
+    axes.set_aspect('equal')
+    axes.set_xlim(-0.5, 0.5)
+    axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
+
+
+def project(
+    points: FloatArray, camera: tuple[float, float, float] = CAMERA
+) -> tuple[FloatArray, FloatArray]:
+    """Return places in the picture and depths [m] of points, (..., 2) and (...).
+
+    A place is in widths of the picture, right and up of its middle; NaN nearer than `CLOSEST`.
+    """
+    forward = np.subtract(TARGET, camera)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    seen = (points - camera) @ np.stack([right, np.cross(right, forward), forward]).T
+    depth: FloatArray = seen[..., 2]
+    safe = np.where(depth > CLOSEST, depth, np.nan)
+    place: FloatArray = ZOOM * seen[..., :2] / safe[..., None]
+    return place, depth
+
+
+def _draw_points(axes: Any, xyz: FloatArray, segmentation: Segmentation, view: View) -> None:
+    """Draw far points first, and the ground below all obstacles."""
+    place, depth = project(xyz, view.camera)
+    size = _scale(axes) ** 2
+    labels_and_layers = ((Label.GROUND, 1), (Label.OBSTACLE, 4))
+    for colour, (value, layer) in zip(COLOURS.values(), labels_and_layers, strict=True):
+        chosen = np.flatnonzero((segmentation.label == value) & (depth > CLOSEST))
+        chosen = chosen[np.argsort(-depth[chosen])]
+        look: dict[str, Any] = {'c': colour, 'zorder': layer}
+        if view.colour in VALUES:
+            _, low, high = VALUES[view.colour]
+            look = {'c': getattr(segmentation, view.colour)[chosen], 'vmin': low, 'vmax': high}
+            look |= {'cmap': style.value_colours(), 'plotnonfinite': True, 'zorder': 4}
+        axes.scatter(
+            *place[chosen].T, s=size * np.clip(40.0 / depth[chosen], 0.4, 4.0), linewidths=0.0,
+            rasterized=True, **look,
+        )  # fmt: skip
+
+
+def _scale(axes: Any) -> float:
+    """Return the width of a scene over that of a picture of its own."""
+    width: float = axes.bbox.width / axes.figure.dpi
+    return width / WIDTH
+
+
+def _draw_surface(axes: Any, model: GroundModel, config: Config, view: View) -> None:
+    from matplotlib.collections import LineCollection, PolyCollection
+
+    middle, lower, upper = (
+        project(model.knot_points(n_std), view.camera)[0] for n_std in (0.0, -N_STD, N_STD)
+    )
+    certain = model.std <= config.label.ground_tolerance
+    shown = certain & np.isfinite(upper + lower + middle).all(axis=-1)
+    piece = shown[:, :-1] & shown[:, 1:]
+    limits = config.length_scale
+    colours = length_scale_colours(model.length_scale, limits.min, limits.max)
+    if view.colour in VALUES:
+        colours = np.full_like(colours, 0.6)
+
+    def add(drawn: BoolArray, corners: Sequence[FloatArray], kind: Any, **look: Any) -> None:
+        shapes = np.stack([corner[drawn] for corner in corners], axis=1)
+        collection = kind(list(shapes), rasterized=True, **look)
+        collection.set_color(colours[:, :-1][drawn])
+        axes.add_collection(collection)
+
+    aside = [np.roll(middle, -1, axis=0)[:, ends] for ends in (slice(1, None), slice(-1))]
+    filled = piece & np.roll(piece, -1, axis=0)
+    flat = {'alpha': 0.45, 'linewidths': 0.0, 'antialiaseds': False, 'zorder': 2}
+    add(filled, [middle[:, :-1], middle[:, 1:], *aside], PolyCollection, **flat)
+    piece[np.arange(len(piece)) % -(-len(piece) // N_PROFILES) > 0] = False
+    band = [lower[:, :-1], lower[:, 1:], upper[:, 1:], upper[:, :-1]]
+    add(piece, band, PolyCollection, alpha=0.35, linewidths=0.0, zorder=2)
+    add(
+        piece,
+        [middle[:, :-1], middle[:, 1:]],
+        LineCollection,
+        linewidths=1.3 * _scale(axes),
+        zorder=3,
+    )
+
+
+def _draw_legend(figure: Any, config: Config, colour: str) -> None:
+    """Draw what the colours are below all else."""
+    width = figure.get_size_inches()[0]
+    bar = add_axes(figure, 0.66 * width, 0.26, (0.3 * width, 0.14))
+    bar.set_yticks([])
+    if colour in VALUES:
+        title, low, high = VALUES[colour]
+        ramp, extent = np.linspace(0.0, 1.0, 200)[None], (low, high, 0.0, 1.0)
+        bar.imshow(ramp, extent=extent, aspect='auto', cmap=style.value_colours())
+        bar.set_title(f'{title}; grey points: no model', fontsize=9.5, loc='left', pad=3.0)
+        return
+    dots = style.legend_dots(COLOURS, 7)
+    figure.legend(handles=dots, loc='lower left', fontsize=11, frameon=False, ncols=2)
+    low, high = config.length_scale.min, config.length_scale.max
+    colours = length_scale_colours(np.geomspace(low, high, 200), low, high)
+    # matplotlib takes an array of colours since 3.7, Ubuntu 24.04 has 3.6.
+    listed = require('matplotlib.colors', 'matplotlib').ListedColormap(colours)
+    bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], np.arange(200)[None], cmap=listed)
+    bar.set_xscale('log')
+    bar.set_title(
+        'length-scale of the ground [m]; ribbons: 2 sigma', fontsize=9.5, loc='left', pad=3.0
+    )
+    ticks = [tick for tick in (0.1, 0.3, 1, 3, 10, 30, 100, 300) if low <= tick <= high]
+    bar.set_xticks(ticks, labels=[f'{tick:g}' for tick in ticks])
+    bar.minorticks_off()
+
+
+Layers = dict[str, BoolArray]
+"""Which points, (N,), are drawn in each of `COLOURS_ABOVE`, lowest first."""
+
+
+def plot_birds_eye(
+    points: npt.ArrayLike,
+    label: Labels,
+    path: str | Path,
+    truth: Labels | None = None,
+    title: str = '',
+) -> str:
+    """Draw points (N, >=3) [m] from above by their `Label`, as a PNG, replacing the file `path`.
+
+    With the true labels, UNKNOWN where a point does not count, a second panel shows the errors.
+    Returns the title of the last panel: the numbers of points in it.
+    """
+    xyz = check_points(points)
+    style.check_lengths(len(xyz), label=label, truth=truth)
+    panels = [_label_panel(label)]
+    if truth is not None:
+        panels.append(_error_panel(label, truth))
+    _draw_panels(xyz, panels, path, title)
+    return panels[-1][0]
+
+
+def plot_two_labels(
+    points: npt.ArrayLike,
+    labels: Sequence[Labels],
+    path: str | Path,
+    truth: Labels | None = None,
+    title: str = '',
+) -> None:
+    """Draw what two methods, A and B, say of points (N, >=3) [m] from above, as a PNG.
+
+    A panel for each, with its errors where the true labels are given, and one of where they
+    differ. The file `path` is replaced.
+    """
+    xyz = check_points(points)
+    one, other = labels
+    style.check_lengths(len(xyz), A=one, B=other, truth=truth)
+    own = [
+        _label_panel(label) if truth is None else _error_panel(label, truth) for label in labels
+    ]
+    panels = [(f'{name}: {text}', layers) for name, (text, layers) in zip('AB', own, strict=True)]
+    only_a, only_b = (
+        (a == Label.GROUND) & (b != Label.GROUND) for a, b in ((one, other), (other, one))
+    )
+    layers = {'same label': one == other, 'unknown': (one != other) & ~only_a & ~only_b}
+    layers |= {'ground in A only': only_a, 'ground in B only': only_b}
+    n_a, n_b = (_thousands(int(chosen.sum())) for chosen in (only_a, only_b))
+    panels.append((f'{n_a} ground in A only, {n_b} in B only', layers))
+    _draw_panels(xyz, panels, path, title)
+
+
+def _draw_panels(
+    xyz: FloatArray, panels: Sequence[tuple[str, Layers]], path: str | Path, title: str
+) -> None:
+    """Draw panels side by side."""
+    xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
+    width = LEFT + SQUARE + RIGHT
+    height = BELOW + SQUARE + ABOVE + (LINE if title else 0.0)
+    figure = new_figure(width * len(panels), height)
+    write_line(figure, title, 0.5, 0.6 * LINE, fontsize=15, fontweight='bold')
+    for k, (panel_title, layers) in enumerate(panels):
+        axes = add_axes(figure, k * width + LEFT, BELOW, (SQUARE, SQUARE))
+        axes.set_title(panel_title, fontsize=11)
+        axes.set_xlabel('y, to the left [m]')
+        axes.set_ylabel('x, forward [m]')
+        _draw_panel(axes, xy, layers)
+    save(figure, path)
+
+
+def _label_panel(label: Labels) -> tuple[str, Layers]:
+    """Return title and layers of the given labels."""
+    shown = (Label.GROUND, Label.OBSTACLE, Label.UNKNOWN)
+    layers = {value.name.lower(): label == value for value in shown}
+    numbers = {name: int(chosen.sum()) for name, chosen in layers.items()}
+    named = [f'{_thousands(n)} {name}' for name, n in numbers.items() if n or name != 'unknown']
+    return f'{_thousands(len(label))} points: {", ".join(named)}', layers
+
+
+def _error_panel(label: Labels, truth: Labels) -> tuple[str, Layers]:
+    """Return title and layers of the errors; each point is in one."""
+    given, ground, obstacle = label == Label.GROUND, truth == Label.GROUND, truth == Label.OBSTACLE
+    hit, missed, false = ground & given, ground & ~given, obstacle & given
+    layers = {
+        'not scored': ~(ground | obstacle),
+        'right': hit | (obstacle & ~given),
+        'missed ground': missed,
+        'false ground': false,
+    }
+    n_hit, n_missed, n_false = (int(part.sum()) for part in (hit, missed, false))
+    n_union = n_hit + n_missed + n_false
+    iou = f', IoU {100.0 * n_hit / n_union:.2f} %' if n_union else ''
+    return f'{_thousands(n_false)} false ground, {_thousands(n_missed)} missed ground{iou}', layers
+
+
+def _thousands(number: int) -> str:
+    return f'{number:,}'.replace(',', ' ')
+
+
+def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None:
+    """Draw points, rings of equal range and the sensor, forward up and left to the left."""
+    inside = (np.abs(xy) <= EXTENT).all(axis=1)  # False where it is NaN.
+    shown = {}
+    for depth, (name, chosen) in enumerate(layers.items()):
+        x, y = xy[chosen & inside].T
+        if len(x):
+            shown[name] = colour = COLOURS_ABOVE[name]
+            size = 3.0 if COLOURS_ABOVE[name] in (style.BLUE, style.VERMILION) else 1.0
+            axes.scatter(y, x, s=size, c=colour, linewidths=0.0, zorder=depth, rasterized=True)
+    angle = np.linspace(0.0, 2.0 * np.pi, 361)
+    for radius in np.arange(RING_STEP, EXTENT * math.sqrt(2.0), RING_STEP):
+        axes.plot(
+            radius * np.cos(angle), radius * np.sin(angle), color='#6B7178', linewidth=0.5,
+            linestyle=(0, (4, 4)), zorder=len(layers),
+        )  # fmt: skip
+        if radius < EXTENT:
+            axes.text(
+                *(-radius * math.sqrt(0.5),) * 2, f'{radius:g} m', fontsize=8, color='#3B4046',
+                ha='center', va='center', zorder=len(layers),
+                bbox={'boxstyle': 'round,pad=0.15', 'facecolor': 'white', 'edgecolor': 'none',
+                      'alpha': 0.8},
+            )  # fmt: skip
+    axes.set_aspect('equal')
+    axes.set_xlim(EXTENT, -EXTENT)
+    axes.set_ylim(-EXTENT, EXTENT)
+    (sensor,) = axes.plot(
+        0, 0, marker='^', color='white', markeredgecolor='black', linestyle='none',
+        markersize=8, zorder=len(layers) + 1, label='sensor',
+    )  # fmt: skip
+    axes.legend(
+        handles=[*style.legend_dots(shown, 7), sensor], loc='upper center', frameon=False,
+        bbox_to_anchor=(0.5, -0.08), ncols=len(shown) + 1, fontsize=10.5, handletextpad=0.2,
+        columnspacing=1.5,
+    )  # fmt: skip

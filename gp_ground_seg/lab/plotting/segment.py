@@ -1,0 +1,207 @@
+"""One segment from the side: candidates, lines, surface, length-scale (the paper's Figure 1)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.core.errors import ConfigError
+from gp_ground_seg.core.frame import OUTSIDE, FloatArray, Label
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.pipeline.points import check_points
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.lab.plotting import style
+from gp_ground_seg.lab.plotting.style import new_figure, save
+
+Labels = npt.NDArray[np.uint8]
+
+DPI = 130
+# Inches: the figure, and the part of it that the two panels leave to the legend.
+WIDTH, HEIGHT, LEGEND = 12.2, 7.6, 2.6
+
+# The truth is light, so that what is estimated stands out.
+POINT_COLOUR = '#B4BAC0'
+TRUTH_COLOURS = {
+    'not scored': (Label.UNKNOWN, POINT_COLOUR),
+    'true obstacle': (Label.OBSTACLE, '#A9C4DA'),
+    'true ground': (Label.GROUND, '#E8CF9A'),
+}
+CANDIDATE_COLOUR = '#56636E'
+INLIER_COLOUR = style.BLUE
+LINE_COLOUR = style.GREEN
+SURFACE_COLOUR = style.VERMILION
+PSEUDO_INPUT_COLOUR = style.VIOLET
+
+# Metres kept free below and above the ground, and beyond the last candidate; and the distance
+# from the ground up to which a candidate is always in the picture.
+BELOW, ABOVE, BEYOND, NEAR_GROUND = 0.25, 0.9, 2.0, 1.0
+
+
+def segment_at(azimuth: float, n_segments: int) -> int:
+    """Return the segment towards an azimuth [rad], counter-clockwise from x."""
+    return math.floor((azimuth / math.tau + 0.5) * n_segments) % n_segments
+
+
+def plot_segment(
+    result: Segmentation,
+    config: Config,
+    points: npt.ArrayLike,
+    segment: int,
+    path: str | Path,
+    truth: Labels | None = None,
+    title: str = '',
+    max_range: float | None = None,
+) -> None:
+    """Draw a segment from the side; below it the length-scale and its pseudo-inputs.
+
+    `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
+    labels, UNKNOWN where a point does not count; `max_range` [m] is by default a little more than
+    that of the last candidate. The file `path`, a PDF or else a PNG, is replaced.
+    """
+    z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
+    style.check_lengths(len(z), result=result.label, truth=truth)
+    n_segments = result.grid.n_segments
+    if not 0 <= segment < n_segments:
+        raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
+    if max_range is not None and not (max_range > 0.0 and math.isfinite(max_range)):
+        raise ConfigError(f'max_range = {max_range}: must be a positive number of metres')
+    figure = new_figure(WIDTH, HEIGHT, DPI)
+    from matplotlib.ticker import LogLocator, NullFormatter
+
+    own = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
+    r, z = result.grid.r[own], z[own]
+    view = SegmentView(result, segment)
+    reach = view.reach(r) if max_range is None else max_range
+    low, high = view.heights_shown(reach, z)
+    n_hidden = np.count_nonzero((r > reach) | (z < low) | (z > high))
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
+    figure.subplots_adjust(0.065, 0.075, 1.0 - LEGEND / WIDTH, 0.93, hspace=0.08)
+    width = 360.0 / n_segments
+    first, last = (width * (segment + k) - 180.0 for k in (0, 1))
+    model = '' if np.isfinite(result.surface.mean[segment]).any() else ': no ground model'
+    name = f'segment {segment}, azimuth {first:g}° to {last:g}°{model}; {n_hidden} points outside'
+    name = f'{title}, {name}' if title else name
+    above.set_title(name, fontsize=12, loc='left', parse_math=False)
+    view.draw_points(above, r, z, None if truth is None else truth[own])
+    view.draw_ground(above)
+    above.set_xlim(0.0, reach)
+    above.set_ylim(low, high)
+    view.draw_length_scale(below, reach, with_pseudo_inputs=config.length_scale.model == 'latent')
+    below.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    below.yaxis.set_major_formatter('{x:g}')
+    below.yaxis.set_minor_formatter(NullFormatter())
+    below.set_xlabel('horizontal range r [m]')
+    for axes in (above, below):
+        axes.grid(color='#E9ECEE', linewidth=0.7)
+        axes.set_axisbelow(True)
+        axes.legend(
+            loc='upper left', bbox_to_anchor=(1.01, 1.01), frameon=False, fontsize=10,
+            borderaxespad=0.0, labelspacing=0.8, markerscale=1.3,
+        )  # fmt: skip
+    figure.align_ylabels()
+    save(figure, path)
+
+
+class SegmentView:
+    """The parts of the picture."""
+
+    def __init__(self, result: Segmentation, segment: int) -> None:
+        self._result, self._segment = result, segment
+        self._own = slice(*(int(k) for k in result.candidates.offsets[segment : segment + 2]))
+        self._r, self._z = result.candidates.r[self._own], result.candidates.z[self._own]
+        self._inlier = result.surface.inlier[self._own]
+        self._knots = result.surface.knots
+        self._mean, self._std = result.surface.mean[segment], result.surface.std[segment]
+
+    def reach(self, point_r: FloatArray) -> float:
+        """Range that holds all candidates, or all points where there are none [m]."""
+        r = self._r if len(self._r) else point_r
+        return float(r.max()) + BEYOND if len(r) else float(self._result.grid.edges[-1])
+
+    def draw_points(self, axes: Any, r: FloatArray, z: FloatArray, truth: Labels | None) -> None:
+        """Draw points over range, coloured by their true label if that is known."""
+        groups = {'points': (POINT_COLOUR, np.ones(len(r), dtype=np.bool_))}
+        if truth is not None:
+            groups = {
+                f'points, {name}': (colour, truth == label)
+                for name, (label, colour) in TRUTH_COLOURS.items()
+            }
+        for name, (colour, chosen) in groups.items():
+            look = {'color': colour, 'label': f'{name} ({np.count_nonzero(chosen)})'}
+            axes.plot(r[chosen], z[chosen], 'o', ms=3.6, mew=0, zorder=2, **look)
+
+    def draw_ground(self, axes: Any) -> None:
+        """Draw ground, lines and candidates over range."""
+        low, high = self._mean - 2.0 * self._std, self._mean + 2.0 * self._std
+        look = {'linewidth': 0.0, 'color': SURFACE_COLOUR, 'alpha': 0.2, 'zorder': 3}
+        axes.fill_between(self._knots, low, high, label='ground ± 2 std', **look)
+        self._draw_lines(axes)
+        axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='ground')
+        hollow = {'mfc': 'white', 'mec': CANDIDATE_COLOUR, 'mew': 1.1, 'ms': 5.5, 'zorder': 6}
+        full = {'color': INLIER_COLOUR, 'mew': 0.0, 'ms': 5, 'zorder': 7}
+        groups = (('rejected', ~self._inlier, hollow), ('inliers', self._inlier, full))
+        for name, chosen, look in groups:
+            label = f'candidates, {name} ({np.count_nonzero(chosen)})'
+            axes.plot(self._r[chosen], self._z[chosen], 'o', label=label, **look)
+        axes.set_ylabel('height z, sensor frame [m]')
+
+    def heights_shown(self, reach: float, point_z: FloatArray) -> tuple[float, float]:
+        """Limits around the candidates near the ground, as far as it rests on inliers [m]."""
+        if not (self._inlier & (self._r <= reach)).any():
+            low, high = np.quantile(point_z, (0.0, 0.5)) if len(point_z) else (-2.0, 0.0)
+            return float(low) - BELOW, float(high) + ABOVE
+        height = np.abs(self._z - np.interp(self._r, self._knots, self._mean))
+        near = self._z[(height <= NEAR_GROUND) & (self._r <= reach)]
+        return float(near.min()) - BELOW, float(near.max()) + ABOVE
+
+    def _draw_lines(self, axes: Any) -> None:
+        """Draw each line over its extent, and the critical points where the next one begins."""
+        candidates, lines = self._result.candidates, self._result.lines
+        ids = np.unique(lines.line[self._own])
+        drawn = [q for q in ids if lines.start[q + 1] - lines.start[q] > 1]
+        for q in drawn:
+            own = slice(lines.start[q], lines.start[q + 1])
+            axes.plot(
+                *line_ends(candidates.r[own], candidates.z[own], float(lines.slope[q])),
+                color=LINE_COLOUR, lw=3.2, alpha=0.75, solid_capstyle='butt', zorder=4,
+                label=f'lines ({len(ids)})' if q == drawn[0] else None,
+            )  # fmt: skip
+        critical = lines.start[ids[1:]]
+        axes.plot(
+            candidates.r[critical], candidates.z[critical], 'd', ms=9, mfc='none',
+            mec=LINE_COLOUR, mew=1.2, zorder=8, label=f'critical points ({len(critical)})',
+        )  # fmt: skip
+
+    def draw_length_scale(self, axes: Any, reach: float, *, with_pseudo_inputs: bool) -> None:
+        """Draw the length-scale over range, and the pseudo-inputs it follows."""
+        result = self._result
+        length_scale = np.exp(result.log_length_scale[self._segment])
+        axes.plot(self._knots, length_scale, color=SURFACE_COLOUR, lw=1.8, label='length-scale')
+        shown = length_scale[(self._knots <= reach) & np.isfinite(length_scale)]
+        first, last = result.pseudo.offsets[self._segment : self._segment + 2]
+        if with_pseudo_inputs and last > first:
+            r_bar = result.pseudo.r_bar[first:last]
+            factor = np.exp(result.theta[self._segment, -1])
+            l_bar = factor * np.exp(result.pseudo.log_extent[first:last])
+            look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0}
+            axes.plot(r_bar, l_bar, 's', label=f'pseudo-inputs ({last - first})', **look)
+            shown = np.concatenate([shown, l_bar[r_bar <= reach]])
+        # At least a decade: ripples of a constant must not look like mountains. Set before the
+        # scale, since on a log axis matplotlib warns of limits that a constant makes equal.
+        low, high = (shown.min(), shown.max()) if len(shown) else (1.0, 10.0)
+        factor = max(1.2 * math.sqrt(high / low), math.sqrt(10.0))
+        axes.set_ylim(math.sqrt(low * high) / factor, math.sqrt(low * high) * factor)
+        axes.set_yscale('log')
+        axes.set_ylabel('length-scale l [m]')
+
+
+def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, FloatArray]:
+    """Range and height, (2,) each, of the ends of a line through points (n,) [m]."""
+    angle = math.atan(slope)
+    along = (r - r.mean()) * math.cos(angle) + (z - z.mean()) * math.sin(angle)
+    ends = np.array([along.min(), along.max()])
+    return r.mean() + ends * math.cos(angle), z.mean() + ends * math.sin(angle)

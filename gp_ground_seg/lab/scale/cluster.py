@@ -1,0 +1,287 @@
+"""Blocks of items, computed in this process or by a Dask cluster.
+
+The one module that imports dask and distributed, optional packages.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import itertools
+import logging
+import multiprocessing
+import platform
+import signal
+import threading
+import uuid
+import warnings
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from typing import Any
+
+from tqdm import tqdm
+
+import gp_ground_seg
+from gp_ground_seg.core import log
+from gp_ground_seg.core.errors import DataError, require
+from gp_ground_seg.core.parameters.config import Config
+
+_LOGGER = logging.getLogger('gp_ground_seg')
+BLOCK_SIZE = 64
+"""Items of a block, where there are enough for all workers: they share what a task costs."""
+MAX_SUBMITTED = 1000  # blocks that the scheduler holds at a time
+_CONFIG = {
+    'distributed.admin.tick.limit': '1h',  # it warns where a process had to wait
+    'distributed.comm.timeouts.connect': '10s',
+    # A worker that died and takes its time to start anew is not given up.
+    'distributed.deploy.lost-worker-timeout': '1h',
+    # Dask's workers return freed memory to the system at once, and fetch it anew for each frame:
+    # a quarter of a frame's time.
+    'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': None,
+    'distributed.worker.profile.enabled': False,  # samples the stack 100 times a second
+}
+
+_NO_BAR = partial(tqdm, disable=True)
+Progress = Callable[[Sequence[Any]], Iterable[Any]]
+"""Wraps items to show how far the work is, as tqdm does."""
+Function = Callable[[Sequence[Any], Progress], Any]
+"""Computes a block of items; a module's function or a `partial` of one, to be sent to workers."""
+
+
+class Runner:
+    """Computes blocks of items; by default one after the other, in this process.
+
+    Parameters
+    ----------
+    bar : callable
+        Makes the progress bar of a number of items, ``bar(total=n)``.
+    client : distributed.Client, optional
+        Of the cluster whose workers compute the blocks.
+    """
+
+    def __init__(self, bar: Callable[..., tqdm[Any]] = _NO_BAR, client: Any = None) -> None:
+        self._bar, self._client = bar, client
+
+    @property
+    def n_workers(self) -> int:
+        """Threads of the cluster's workers; 0 in this process."""
+        return sum(self._client.nthreads().values()) if self._client is not None else 0
+
+    def run(
+        self,
+        function: Function,
+        items: Sequence[Any],
+        group: Callable[[Any], Hashable] | None = None,
+    ) -> list[Any]:
+        """Return what `function` makes of each block of the items, in their order.
+
+        In this process they are one block; else `group` is as in `cut`.
+        """
+        on_cluster = self._client is not None
+        blocks = cut(items, group, self.n_workers) if on_cluster else [items]
+        found = dict(self.map_blocks(function, blocks))
+        return [found[k] for k in range(len(blocks))]
+
+    def map_blocks(
+        self, function: Function, blocks: Sequence[Sequence[Any]]
+    ) -> Iterator[tuple[int, Any]]:
+        """Yield the number of each block and what `function` makes of it, as they are finished.
+
+        A block whose worker dies is computed again by another, and a warning says so. Raises what
+        `function` raises.
+        """
+        with self._bar(total=sum(map(len, blocks))) as bar:
+            if self._client is None:
+                for k, block in enumerate(blocks):
+                    yield k, function(block, partial(_count, bar))
+                return
+            for k, found in self._submit(partial(_compute, _versions(), function), blocks):
+                bar.update(len(blocks[k]))
+                yield k, found
+
+    def _submit(
+        self, compute: Callable[..., Any], blocks: Sequence[Sequence[Any]]
+    ) -> Iterator[tuple[int, Any]]:
+        from distributed import KilledWorker, as_completed
+
+        run, said = f'gp_ground_seg-{uuid.uuid4().hex}', set()
+        if not self.n_workers:
+            _LOGGER.warning('the scheduler has no worker yet, waiting for one')
+
+        def submit(k: int) -> Any:
+            return self._client.submit(compute, blocks[k], key=(run, k), pure=False)
+
+        self._client.subscribe_topic('all', partial(_tell_loss, run))
+        waiting = iter(range(len(blocks)))
+        first = [submit(k) for k in itertools.islice(waiting, MAX_SUBMITTED)]
+        try:
+            finished = as_completed(first, loop=self._client.loop)
+            del first  # A future that is kept would keep its result on the cluster.
+            for future in finished:
+                k = future.key[1]
+                try:
+                    found, notes = future.result()
+                except KilledWorker as error:
+                    where = f'{blocks[k][0]} to {blocks[k][-1]}'
+                    raise DataError(
+                        f'{where}: each worker that computed this block died, as where memory is '
+                        'short; fewer --workers have more of it each'
+                    ) from error
+                except (CancelledError, OSError) as error:
+                    if future.status == 'error':  # raised by `function`
+                        raise
+                    raise DataError(f'the scheduler is lost ({error})') from error
+                for level, line in notes:
+                    if line not in said:
+                        said.add(line)
+                        _LOGGER.log(level, '%s', line)
+                finished.update([submit(k) for k in itertools.islice(waiting, 1)])
+                yield k, found
+        finally:
+            self._client.unsubscribe_topic('all')
+
+
+HERE = Runner()
+"""In this process, without a bar."""
+
+
+def _count(bar: tqdm[Any], items: Iterable[Any]) -> Iterator[Any]:
+    for item in items:
+        yield item
+        bar.update()
+
+
+def _tell_loss(run: str, event: tuple[float, Any]) -> None:
+    """Say which blocks of a run a worker was computing that has died."""
+    _, about = event
+    if isinstance(about, dict) and about.get('action') == 'remove-worker':
+        keys = [*about['processing-tasks'], *about.get('lost-computed-tasks', ())]
+        lost = sorted(key[1] for key in keys if key[0] == run)
+        if lost and not about['expected']:
+            numbers = ', '.join(map(str, lost))
+            _LOGGER.warning('worker %s died; computed again: block %s', about['worker'], numbers)
+
+
+def cut(
+    items: Sequence[Any], group: Callable[[Any], Hashable] | None, n_workers: int = 1
+) -> list[list[Any]]:
+    """Cut items into blocks, in their order.
+
+    With `group` a block is all items of one group, which follow one another; else it has
+    `BLOCK_SIZE` items, or fewer if there would not be two for each worker.
+    """
+    if group is not None:
+        return [[*own] for _, own in itertools.groupby(items, key=group)]
+    size = max(1, min(BLOCK_SIZE, -(-len(items) // (2 * max(1, n_workers)))))
+    return [[*items[k : k + size]] for k in range(0, len(items), size)]
+
+
+def depends_on_past(config: Config) -> bool:
+    """Whether the labels of a scan depend on the scans before it."""
+    learning = config.learning
+    return learning.mode in ('every_k', 'first_frame') or (
+        learning.mode == 'every_frame' and learning.warm_start
+    )
+
+
+def _versions() -> dict[str, str | None]:
+    """Versions of what labels depend on."""
+    found: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
+    for package in ('numpy', 'scipy', 'numba'):
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = None
+    return {**found, 'Python': platform.python_version()}
+
+
+def _compute(
+    expected: dict[str, str | None], function: Function, block: Sequence[Any]
+) -> tuple[Any, list[tuple[int, str]]]:
+    """Compute a block in a worker; return the result and what the library logged meanwhile."""
+    here, notes = _versions(), list[tuple[int, str]]()
+    other = [
+        f'{name} {v}, not {expected[name]}' for name, v in here.items() if v != expected[name]
+    ]
+    if here['gp_ground_seg'] != expected['gp_ground_seg']:
+        raise DataError(f'a worker on {platform.node()} has {"; ".join(other)}')
+    if other:
+        line = f'a worker on {platform.node()} has {"; ".join(other)}: last digits may differ'
+        notes.append((logging.WARNING, line))
+    with log.passed_to(lambda *message: notes.append(message)):
+        return function(block, iter), notes
+
+
+@contextmanager
+def _interrupt_kept() -> Iterator[None]:
+    """Keep Ctrl-C, which all processes of a terminal get, from those that are started.
+
+    They inherit the mask of signals. Here it takes effect when they are started.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    # Starts a process of multiprocessing's own, after which the mask of its thread is another.
+    multiprocessing.get_context('spawn').Lock()
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.signal(signal.SIGINT, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def open_runner(
+    workers: int | None, scheduler: str | None, bar: Callable[..., tqdm[Any]]
+) -> Iterator[Runner]:
+    """Runner on `workers` processes of this machine, on the cluster of a scheduler, or neither.
+
+    Raises DataError if the scheduler does not answer, MissingDependencyError without distributed.
+    """
+    if workers is None and scheduler is None:
+        yield Runner(bar)
+        return
+    with ExitStack() as stack:
+        with _interrupt_kept():
+            cluster = scheduler if workers is None else stack.enter_context(_start(workers))
+            client = stack.enter_context(_connect(cluster))
+        if scheduler is not None or importlib.util.find_spec('bokeh'):
+            _LOGGER.info('dashboard: %s', client.dashboard_link)
+        yield Runner(bar, client)
+
+
+def _start(n_workers: int) -> Any:
+    """Start workers of one thread on this machine."""
+    return _distributed().LocalCluster(
+        n_workers=n_workers, threads_per_worker=1, dashboard_address='127.0.0.1:0',
+        silence_logs=logging.CRITICAL,
+    )  # fmt: skip
+
+
+def _connect(cluster: Any) -> Any:
+    if isinstance(cluster, str) and not cluster.startswith(('tcp://', 'tls://')):
+        raise DataError(f'--scheduler {cluster}: must be tcp://HOST:PORT, or tls://')
+    distributed = _distributed()
+    with warnings.catch_warnings():
+        # Versions are compared by `_compute`, which says in one line what differs.
+        warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
+        try:
+            return distributed.Client(cluster, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise DataError(f'--scheduler {cluster}: does not answer ({error})') from error
+
+
+def _distributed() -> Any:
+    """Import distributed; it says nothing but by way of what we do."""
+    distributed = require('distributed', 'distributed')
+    require('dask.config', 'distributed').set(_CONFIG)
+    for name in ('distributed', 'distributed.client'):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    return distributed

@@ -1,0 +1,220 @@
+"""Objects lost: what stands on the ground and is called ground, by class and range.
+
+An object is lost where more than half of its returns from `MIN_HEIGHT` above the local ground are
+called ground. What lies below does not count: there the feet of an object and the ground mix.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Label
+from gp_ground_seg.data.boxes import Boxes
+from gp_ground_seg.lab.scoring.metrics import CLASS_NAMES, Labels, Sums, range_titles, ratio
+
+MIN_HEIGHT = 0.3
+"""Height above the local ground from which on a return on an object counts [m]."""
+MIN_RETURNS = 10
+"""Such returns that an object needs to be counted: of fewer, half is chance."""
+
+BAND_EDGES = (0.0, 10.0, 20.0, 40.0, math.inf)
+"""Edges of the bands of horizontal range [m]; each holds its inner edge, not its outer one."""
+BAND_TITLES = range_titles(BAND_EDGES)
+
+CELL_SIZE = 0.5  # of the cells of ground that is known [m]
+N_CELLS = 5  # of them that make the local ground
+MAX_GROUND_DISTANCE = 5.0  # to the farthest of them [m]
+
+GROUPS = {
+    'vehicle': ('car', 'van', 'truck', 'bus', 'trailer', 'tram', 'on rails', 'other vehicle'),
+    'person': ('pedestrian',),
+    'cyclist': ('bicyclist', 'motorcyclist', 'rider', 'bicycle', 'motorcycle', 'motor'),
+}
+"""Classes of objects, and what else they are called; two-wheelers with or without a rider."""
+
+
+@dataclass(frozen=True)
+class Objects:
+    """Which of the N returns of a scan lie on objects.
+
+    Attributes
+    ----------
+    classes : names of the classes
+    class_of : (N,) index into `classes`; negative: on no object
+    object_id : (N,) number of the object, of its own within its class; 0 = it is not known which
+    ground_z : (N,) height of the local ground [m]; NaN = not known, the return does not count
+    """
+
+    classes: tuple[str, ...]
+    class_of: npt.NDArray[np.integer]
+    object_id: npt.NDArray[np.integer]
+    ground_z: npt.NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class ObjectCount(Sums):
+    """Returns on objects, from `MIN_HEIGHT` above the ground, and objects; over nothing NaN."""
+
+    n_returns: int = 0
+    n_ground: int = 0  # of these called ground
+    n_objects: int = 0  # with at least `MIN_RETURNS` of them
+    n_lost: int = 0  # of these objects, with more than half of them called ground
+    n_unknown: int = 0  # returns at any height that do not count, as their ground is not known
+
+    @property
+    def share_ground(self) -> float:
+        """Share of the returns that is called ground."""
+        return ratio(self.n_ground, self.n_returns)
+
+
+ObjectCounts = dict[str, tuple[ObjectCount, ...]]
+"""By class, in each by `BAND_TITLES`."""
+
+
+def count_objects(
+    points: npt.NDArray[np.floating], label: Labels, objects: Objects
+) -> ObjectCounts:
+    """Count returns on objects and objects that are called ground.
+
+    `points` (N, >=3) are x, y, z [m], `label` (N,) what a method says of them; UNKNOWN is not
+    ground. A return counts in the band of its own horizontal range, an object in that of the
+    median of its returns that count. Classes without a return that counts, or would, are left out.
+    """
+    n = len(points)
+    for name in ('class_of', 'object_id', 'ground_z'):
+        if (shape := getattr(objects, name).shape) != (n,):
+            raise PointCloudError(f'{name} of shape {shape} for {n} points: must be ({n},)')
+    x, y, z = points[:, :3].astype(np.float64).T
+    reach = np.hypot(x, y)
+    on, n_classes = (objects.class_of >= 0) & np.isfinite(reach + z), len(objects.classes)
+    counts, lacks = on & (z - objects.ground_z >= MIN_HEIGHT), on & np.isnan(objects.ground_z)
+    unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks], n_classes)
+    kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
+    returns = _by_class_and_band(kind, reach, is_ground, n_classes)
+
+    known = (own_id := objects.object_id[counts]) != 0
+    pairs = np.column_stack([kind, own_id])[known]
+    of_object, number, n_own = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+    number = number.reshape(-1)
+    n_ground = np.bincount(number, is_ground[known], minlength=len(n_own))
+    middle = _medians(reach[known], number, len(n_own))
+    enough = n_own >= MIN_RETURNS
+    lost = 2 * n_ground[enough] > n_own[enough]
+    found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, n_classes)
+    bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
+    return {
+        name: tuple(ObjectCount(*numbers) for numbers in own.tolist())
+        for name, own in zip(objects.classes, bands, strict=True)
+        if own.any()
+    }
+
+
+def _by_class_and_band(
+    kind: npt.NDArray[np.integer], reach: FloatArray, is_counted: BoolArray, n_classes: int
+) -> IntArray:
+    """Count (classes, bands, 2): all, and those with `is_counted`."""
+    n_bands = len(BAND_TITLES)
+    code = n_bands * kind + np.digitize(reach, BAND_EDGES[1:-1])
+    n = [np.bincount(part, minlength=n_classes * n_bands) for part in (code, code[is_counted])]
+    return np.column_stack(n).reshape(n_classes, n_bands, 2)
+
+
+def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
+    """Median of the values of each group; `ndimage` refuses none at all."""
+    return np.asarray(ndimage.median(values, group, range(n_groups)) if n_groups else values)
+
+
+def pool_objects(counts: Sequence[ObjectCounts]) -> ObjectCounts:
+    """Sum up the counts of several scans."""
+    pooled: ObjectCounts = {}
+    for name, bands in (item for one in counts for item in one.items()):
+        before = pooled.get(name, (ObjectCount(),) * len(bands))
+        pooled[name] = tuple(a + b for a, b in zip(before, bands, strict=True))
+    return {name: pooled[name] for name in _in_order(pooled)}
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    """Names of classes, each once: those of `GROUPS`, then the others by name."""
+    unique = sorted(set(names))
+    return [name for name in GROUPS if name in unique] + [n for n in unique if n not in GROUPS]
+
+
+def local_ground(
+    points: npt.NDArray[np.floating], is_ground: BoolArray, wanted: BoolArray
+) -> FloatArray:
+    """Height of the ground about points (N, >=3), by those that are ground (N,) [m].
+
+    The ground is reduced to the median height of its returns in cells of `CELL_SIZE`; about a
+    point it is the median of the `N_CELLS` nearest of these. NaN where the farthest of them is
+    more than `MAX_GROUND_DISTANCE` away, and where it is not `wanted` (N,).
+    """
+    xyz = points[:, :3].astype(np.float64)
+    finite = np.isfinite(xyz).all(axis=1)
+    ground, wanted = xyz[finite & is_ground], finite & wanted
+    result = np.full(len(xyz), np.nan)
+    if not wanted.any():
+        return result
+    # One complex number for each cell, which sorts much faster than a pair.
+    cell = np.floor(ground[:, 0] / CELL_SIZE) + 1j * np.floor(ground[:, 1] / CELL_SIZE)
+    places, number = np.unique(cell, return_inverse=True)
+    if len(places) < N_CELLS:
+        return result
+    height = _medians(ground[:, 2], number, len(places))
+    tree = KDTree((np.column_stack([places.real, places.imag]) + 0.5) * CELL_SIZE)
+    distance, nearest = tree.query(xyz[wanted, :2], k=N_CELLS)
+    median = np.median(height[nearest], axis=1)
+    result[wanted] = np.where(distance[:, -1] <= MAX_GROUND_DISTANCE, median, np.nan)
+    return result
+
+
+def group_of(word: str) -> str:
+    """Class of an object by its name, as in `GROUPS`; other names are classes of their own."""
+    own = word.lower().removeprefix('moving ')
+    return next((name for name, words in GROUPS.items() if own in words), own)
+
+
+def labelled_objects(
+    points: npt.NDArray[np.floating], entries: npt.NDArray[np.uint32], is_ground: BoolArray
+) -> Objects:
+    """Objects by the entries of a ``.label`` file (N,), and the local ground by what is ground.
+
+    Instances are numbered by class, so that the whole entry is the number of an object.
+    """
+    classes, class_of = tuple(GROUPS), np.full(len(entries), -1)
+    semantic = entries & 0xFFFF
+    for number, word in CLASS_NAMES.items():
+        if (group := group_of(word)) in classes:
+            class_of[semantic == number] = classes.index(group)
+    object_id = np.where(entries >> 16 > 0, entries, 0).astype(np.int64)
+    return Objects(classes, class_of, object_id, local_ground(points, is_ground, class_of >= 0))
+
+
+def boxed_objects(
+    points: npt.NDArray[np.floating], boxes: Boxes, is_ground: BoolArray | None = None
+) -> Objects:
+    """Objects by boxes: what is in a box lies on its object, in several on that of the smallest.
+
+    The local ground is that of `local_ground`, and where it is not known which returns are
+    ground the bottom of the box.
+    """
+    words = [group_of(name) for name in boxes.names]
+    classes = tuple(_in_order(words))
+    class_of, object_id = np.full(len(points), -1), np.zeros(len(points), dtype=np.int64)
+    ground_z = np.full(len(points), np.nan)
+    xyz = points[:, :3].astype(np.float64)
+    for k in np.argsort(-boxes.size.prod(axis=1), kind='stable'):
+        own, half = (xyz - boxes.center[k]) @ boxes.rotation[k].T, 0.5 * boxes.size[k]
+        found = (np.abs(own) <= half).all(axis=1)
+        class_of[found], object_id[found] = classes.index(words[k]), k + 1
+        ground_z[found] = (xyz[:, 2] - own[:, 2] - half[2])[found]
+    if is_ground is not None:
+        ground_z = local_ground(points, is_ground, class_of >= 0)
+    return Objects(classes, class_of, object_id, ground_z)

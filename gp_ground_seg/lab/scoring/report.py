@@ -1,0 +1,288 @@
+"""Results: tables for the terminal, as Markdown and JSON; machine, versions and parameters."""
+
+from __future__ import annotations
+
+import csv
+import importlib.metadata
+import importlib.util
+import itertools
+import json
+import math
+import os
+import platform
+import subprocess
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gp_ground_seg
+from gp_ground_seg.core.errors import DataError, MissingDependencyError, install_hint
+from gp_ground_seg.core.parameters.config import Config, parameter_specs
+from gp_ground_seg.core.parameters.schema import ParameterValue
+from gp_ground_seg.core.result import FitReport
+
+WIDTH = 100
+"""Columns of the terminal that titles and notes are folded to."""
+
+Cell = str | int | float | None
+"""What a row holds; None and NaN are shown as ``-``."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    `format` is that of its numbers, such as ``.2f``; ``_d`` separates thousands by spaces.
+    Without one the column holds text and is aligned left. `key` is its name in JSON, the title
+    by default, `scale` the factor between what a row holds and what is shown.
+    """
+
+    title: str
+    format: str = ''
+    key: str = ''
+    scale: float = 1
+
+    def show(self, value: Cell) -> str:
+        """Return a cell as it is shown."""
+        if isinstance(value, str):
+            return value
+        if value is None or math.isnan(value):
+            return '-'
+        return format(self.scale * value, self.format).replace('_', ' ')
+
+
+def percent(title: str, key: str = '', form: str = '.2f') -> Column:
+    """Column of ratios, shown in percent."""
+    return Column(title, form, key, 100.0)
+
+
+def centimetres(title: str, key: str = '') -> Column:
+    """Column of lengths in metres, shown in centimetres."""
+    return Column(title, '.2f', key, 100.0)
+
+
+def milliseconds(title: str, key: str = '') -> Column:
+    """Column of times in seconds, shown in milliseconds."""
+    return Column(title, '.1f', key, 1e3)
+
+
+Row = list[tuple[Column, Cell]]
+"""A row that names the column of each cell."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of unscaled numbers and text, as many cells in each as there are columns.
+
+    The title stands above it, notes below; `n_sums` rows at the end are set apart in `text`.
+    """
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Cell]]
+    title: str = ''
+    notes: Sequence[str] = ()
+    n_sums: int = 0
+
+    @classmethod
+    def of(cls, rows: Sequence[Row], **options: Any) -> Table:
+        """Make a table of at least one row."""
+        columns = [column for column, _ in rows[0]]
+        return cls(columns, [[cell for _, cell in row] for row in rows], **options)
+
+    def text(self) -> str:
+        """Return aligned text, columns two spaces apart."""
+        lines = self._shown()
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        marks = ['>' if column.format else '<' for column in self.columns]
+        form = '  '.join(f'{{:{mark}{w}}}' for mark, w in zip(marks, widths, strict=True))
+        text = [form.format(*line).rstrip() for line in lines]
+        rule = '-' * (sum(widths) + 2 * (len(widths) - 1))
+        if self.n_sums:
+            text.insert(len(text) - self.n_sums, rule)
+        text.insert(1, rule)
+        above = [fold(self.title)] if self.title else []
+        below = ['', *map(fold, self.notes)] if self.notes else []
+        return '\n'.join([*above, *text, *below])
+
+    def markdown(self) -> str:
+        """Return a Markdown table, title and notes as paragraphs."""
+        titles, *rows = self._shown()
+        rule = ['--:' if column.format else '---' for column in self.columns]
+        table = '\n'.join(f'| {" | ".join(line)} |' for line in [titles, rule, *rows])
+        return '\n\n'.join([*([self.title] if self.title else []), table, *self.notes])
+
+    def json(self) -> list[dict[str, Any]]:
+        """Return one object per row, unscaled."""
+        keys = [column.key or column.title for column in self.columns]
+        return [dict(zip(keys, _plain(row), strict=True)) for row in self.rows]
+
+    def _shown(self) -> list[list[str]]:
+        """Titles and rows, every cell as it is shown."""
+        rows = [
+            [column.show(cell) for column, cell in zip(self.columns, row, strict=True)]
+            for row in self.rows
+        ]
+        return [[column.title for column in self.columns], *rows]
+
+
+def fold(line: str) -> str:
+    """Fold a line for the terminal."""
+    return textwrap.fill(line, WIDTH, subsequent_indent='  ', break_on_hyphens=False)
+
+
+def written(tables: Iterable[Table], lines: Sequence[str], *, markdown: bool) -> str:
+    """Tables, and below them lines on the run, for the terminal or as Markdown."""
+    shown = [table.markdown() if markdown else table.text() for table in tables]
+    below = [*lines] if markdown else ['\n'.join(map(fold, lines))]
+    return '\n\n'.join([*shown, *below])
+
+
+def _plain(value: Any) -> Any:
+    """Nested mappings and sequences with NaN as None: JSON has no NaN."""
+    if isinstance(value, dict):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def write_json(document: Any, path: str | Path) -> None:
+    """Write a document as JSON, NaN as null."""
+    text = json.dumps(_plain(document), indent=2, allow_nan=False) + '\n'
+    Path(path).write_text(text, encoding='utf-8')
+
+
+def check_rows_file(name: str) -> None:
+    """Raise an error if `write_rows` could not write a file of this name."""
+    if not name.endswith(('.csv', '.parquet')):
+        raise DataError(f'{name}: must end in .csv or .parquet')
+    if name.endswith('.parquet') and importlib.util.find_spec('pyarrow') is None:
+        raise MissingDependencyError(f'pyarrow is not installed: {install_hint("pyarrow")}')
+
+
+def write_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write rows as CSV or Parquet; a cell within a cell gets a column, as ``objects_vehicle``."""
+    flat = [dict(_flat(row)) for row in rows]
+    names = list(dict.fromkeys(itertools.chain(*flat)))
+    if path.suffix == '.parquet':
+        from pyarrow import Table as ArrowTable
+        from pyarrow.parquet import write_table
+
+        whole = [{name: row.get(name) for name in names} for row in flat]
+        write_table(ArrowTable.from_pylist(whole), path)
+        return
+    with path.open('w', newline='', encoding='utf-8') as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(flat)
+
+
+def _flat(row: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    for key, value in row.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f'{prefix}{key}_')
+        else:
+            yield prefix + key, _plain(value)
+
+
+def describe_environment(*packages: str) -> dict[str, Any]:
+    """Describe machine and software of a run, with the versions of further `packages`.
+
+    None stands for a package that is not installed, and for the commit outside git.
+    """
+    versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
+    for package in ('numpy', 'scipy', 'numba', *packages):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return {
+        'cpu': _cpu_name(),
+        'n_cores': len(os.sched_getaffinity(0)),
+        'python': platform.python_version(),
+        'versions': versions,
+        'commit': _commit(Path(gp_ground_seg.__file__)),
+    }
+
+
+def machine_line(environment: Mapping[str, Any], fit: FitReport | None = None) -> str:
+    """One line on where a measurement ran."""
+    cores = '1 core' if environment['n_cores'] == 1 else f'{environment["n_cores"]} cores'
+    if fit is not None:
+        threads = '1 thread' if fit.n_threads == 1 else f'{fit.n_threads} threads'
+        if n_workers := environment.get('n_workers'):
+            threads = f'workers with {n_workers} threads in all'
+        cores = f'{threads} on {cores}, {fit.backend}'
+    versions = ', '.join(f'{name} {v or "absent"}' for name, v in environment['versions'].items())
+    commit, _, dirty = (environment['commit'] or 'unknown').partition('-')
+    return (
+        f'machine: {environment["cpu"]}, {cores}; Python {environment["python"]}, {versions}, '
+        f'commit {commit[:12]}{" (changed since)" if dirty else ""}'
+    )
+
+
+def changed_parameters(config: Config) -> dict[str, ParameterValue]:
+    """Parameters that differ from their defaults, by dotted name."""
+    return {
+        spec.name: value
+        for spec in parameter_specs()
+        if (value := config[spec.name]) != spec.default
+    }
+
+
+def parameters_line(changes: dict[str, ParameterValue]) -> str:
+    """One line on the parameters of a run."""
+    words = ', '.join(f'{name}={value}' for name, value in changes.items())
+    return f'parameters: {words or "defaults"}'
+
+
+def _cpu_name() -> str:
+    try:
+        lines = Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(':')[2].strip() for line in lines if line.startswith('model name'))
+    return next(names, platform.processor() or platform.machine())
+
+
+def _commit(source: Path) -> str | None:
+    """Commit that holds the file `source`, None if git does not know the file.
+
+    An installed package may lie inside another repository, whose commit says nothing of it.
+    """
+    if _git(source.parent, 'ls-files', '--error-unmatch', source.name) is None:
+        return None
+    return _git(source.parent, 'describe', '--always', '--abbrev=40', '--dirty', '--exclude=*')
+
+
+def _git(folder: Path, *words: str) -> str | None:
+    try:
+        run = subprocess.run(
+            ['git', *words], cwd=folder, capture_output=True, text=True, timeout=10.0
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return run.stdout.strip() if run.returncode == 0 else None
+
+
+class Report(NamedTuple):
+    """Tables to show, every number by scan or segment, a fit (of any frame), further facts."""
+
+    tables: dict[str, Table]
+    rows: list[dict[str, Any]]
+    fit: FitReport
+    facts: dict[str, Any]
+
+    def write(self, path: Path, environment: dict[str, Any]) -> None:
+        """Write every number as JSON."""
+        document = {
+            **self.facts,
+            'n_threads': self.fit.n_threads,
+            'backend': self.fit.backend,
+            'environment': environment,
+            **{name: table.json() for name, table in self.tables.items()},
+            'rows': self.rows,
+        }
+        write_json(document, path)

@@ -1,0 +1,17 @@
+"""Ray-cast LiDAR scans of analytic scenes, with exact labels and ground heights."""
+
+from gp_ground_seg.lab.simulation.objects import Kind, semantic_kitti_labels
+from gp_ground_seg.lab.simulation.scan import (
+    HDL_32E,
+    HDL_64E,
+    OS1_128,
+    SENSORS,
+    VLP_16,
+    simulate_drive,
+    simulate_scan,
+)
+from gp_ground_seg.lab.simulation.scenes import DRIVES, PLACES, SCENES, Scene
+
+__all__ = ['DRIVES', 'HDL_32E', 'HDL_64E', 'OS1_128', 'PLACES', 'SCENES', 'SENSORS', 'VLP_16']
+__all__ += ['Kind', 'Scene']
+__all__ += ['semantic_kitti_labels', 'simulate_drive', 'simulate_scan']

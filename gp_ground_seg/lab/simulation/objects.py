@@ -1,0 +1,241 @@
+"""Solids that stand on the terrain or float over it: yawed boxes and upright cylinders."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.core.frame import FloatArray, IntArray
+from gp_ground_seg.lab.simulation.terrain import Terrain
+
+KindArray: TypeAlias = npt.NDArray[np.uint8]
+Interval: TypeAlias = tuple[FloatArray, FloatArray]
+Size: TypeAlias = tuple[float, float, float]  # length, width, height [m]
+
+BURIED_DEPTH = 3.0  # of standing solids below the ground at their centre: none hovers [m]
+WALL_PANEL, WALL_THICKNESS = 4.0, 0.3
+"""Longest panel of a wall, each on its own piece of ground, and its thickness [m]."""
+SMALLEST_RATE = 1e-12  # for a zero component of a unit vector; keeps 0 / 0 out of the slab tests
+Kind = IntEnum(
+    'Kind', 'TERRAIN BOX WALL POLE OVERHANG REFLECTION VEGETATION PERSON CYCLIST', start=0
+)
+"""What a ray hit."""
+
+
+# In order of the codes: class in SemanticKITTI, and share of the light that comes back.
+_CLASS_AND_REFLECTANCE: dict[Kind, tuple[int, float]] = {
+    Kind.TERRAIN: (40, 0.25),  # road
+    Kind.BOX: (10, 0.5),  # car
+    Kind.WALL: (50, 0.4),  # building
+    Kind.POLE: (80, 0.6),  # pole
+    Kind.OVERHANG: (52, 0.35),  # other structure; scored as an obstacle, unlike vegetation
+    Kind.REFLECTION: (1, 0.05),  # outlier
+    Kind.VEGETATION: (70, 0.3),  # vegetation
+    Kind.PERSON: (30, 0.3),  # person
+    Kind.CYCLIST: (31, 0.3),  # bicyclist
+}
+
+
+def semantic_kitti_labels(kind: KindArray) -> npt.NDArray[np.uint32]:
+    """Class in SemanticKITTI of each `Kind` code, (N,) uint32, as ``.label`` files hold them."""
+    return np.array([label for label, _ in _CLASS_AND_REFLECTANCE.values()], dtype=np.uint32)[kind]
+
+
+def reflectance(kind: KindArray) -> npt.NDArray[np.float64]:
+    """Share of the light that each `Kind` code sends back, (N,) float64 in [0, 1]."""
+    return np.array([share for _, share in _CLASS_AND_REFLECTANCE.values()])[kind]
+
+
+@dataclass(frozen=True)
+class Solid(ABC):
+    """A convex solid about x, y, from the height `bottom` to `top` [m]."""
+
+    kind: Kind
+    x: float
+    y: float
+    bottom: float
+    top: float
+    radius: float  # of the vertical cylinder around it
+    # x, y [m] of the vehicle or person that it is a part of.
+    part_of: tuple[float, float] | None = field(default=None, kw_only=True)
+
+    @abstractmethod
+    def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
+        """Ranges, all of which a ray in its outline is in.
+
+        The ray begins at `offset` from (x, y, 0) and runs along `rate`, both (R, 3).
+        """
+
+    def entry(self, origin: FloatArray, direction: FloatArray) -> FloatArray:
+        """Range [m] at which each ray (R, 3) enters the solid, infinite if it does not, (R,)."""
+        result = np.full(len(direction), np.inf)
+        offset = origin - np.array([self.x, self.y, 0.0])
+        dx, dy = direction[:, 0], direction[:, 1]
+        aside = np.abs(offset[:, 0] * dy - offset[:, 1] * dx)
+        ahead = offset[:, 0] * dx + offset[:, 1] * dy < self.radius
+        near = np.flatnonzero(ahead & (aside <= self.radius * np.hypot(dx, dy)))
+        offset, direction = offset[near], direction[near]
+
+        between = slab(self.bottom, self.top, offset[:, 2], direction[:, 2])
+        intervals = np.array([between, *self._outline(offset, direction)])
+        enter, leave = intervals[:, 0].max(axis=0), intervals[:, 1].min(axis=0)
+        result[near] = np.where((enter <= leave) & (enter > 0.0), enter, np.inf)
+        return result
+
+
+@dataclass(frozen=True)
+class Box(Solid):
+    """Upright box of a length, a width [m] and a yaw [rad]."""
+
+    length: float
+    width: float
+    yaw: float
+
+    def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
+        xy, rate = offset[:, :2], rate[:, :2]
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        sides = (np.array([cos, sin]), self.length), (np.array([-sin, cos]), self.width)
+        return [slab(-0.5 * size, 0.5 * size, xy @ axis, rate @ axis) for axis, size in sides]
+
+
+@dataclass(frozen=True)
+class Cylinder(Solid):
+    """Upright cylinder."""
+
+    def _outline(self, offset: FloatArray, rate: FloatArray) -> list[Interval]:
+        xy, rate = offset[:, :2], rate[:, :2]
+        a = np.maximum(np.sum(rate * rate, axis=1), SMALLEST_RATE**2)
+        half_b = np.sum(xy * rate, axis=1)
+        c = np.sum(xy * xy, axis=1) - self.radius**2
+        discriminant = half_b**2 - a * c
+        root = np.sqrt(np.maximum(discriminant, 0.0))
+        miss = discriminant < 0.0
+        enter = np.where(miss, np.inf, (-half_b - root) / a)
+        return [(enter, np.where(miss, -np.inf, (-half_b + root) / a))]
+
+
+def slab(low: float, high: float, position: FloatArray, rate: FloatArray) -> Interval:
+    """Ranges between which a coordinate that grows at `rate` is from `low` to `high`."""
+    rate = np.where(np.abs(rate) < SMALLEST_RATE, SMALLEST_RATE, rate)
+    at_low, at_high = (low - position) / rate, (high - position) / rate
+    return np.minimum(at_low, at_high), np.maximum(at_low, at_high)
+
+
+def nearest_solid(
+    solids: Sequence[Solid], origin: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Range [m] at which each ray first meets a solid, and its index: two (R,); inf, -1 if none.
+
+    `origin`, (3,) or (R, 3) [m], is the start of all rays, which is much faster, or of each;
+    `direction`, (R, 3), holds unit vectors.
+    """
+    distance = np.full(len(direction), np.inf)
+    index = np.full(len(direction), -1)
+    starts = np.broadcast_to(origin, direction.shape)
+    azimuth = np.arctan2(direction[:, 1], direction[:, 0])
+    order = np.argsort(azimuth)
+    azimuth = azimuth[order]
+    x, y = starts[0, :2] if origin.ndim == 1 else np.full(2, np.nan)
+    gaps = [math.hypot(solid.x - x, solid.y - y) - solid.radius for solid in solids]
+    for k in np.argsort(gaps, kind='stable').tolist():
+        solid, rays = solids[k], order
+        if origin.ndim == 1:
+            rays = order[_find_towards(solid, origin, azimuth)]
+            rays = rays[distance[rays] > gaps[k]]  # the others end before it
+        entry = solid.entry(starts[rays], direction[rays])
+        nearer = entry < distance[rays]
+        distance[rays[nearer]], index[rays[nearer]] = entry[nearer], k
+    return distance, index
+
+
+def number_objects(solids: Iterable[Solid]) -> npt.NDArray[np.int32]:
+    """Return the number of the object that each solid is a part of, from 1 on; 0: of none."""
+    numbers: dict[tuple[float, float], int] = {}
+    parts = [solid.part_of for solid in solids]
+    found = [0 if part is None else numbers.setdefault(part, len(numbers) + 1) for part in parts]
+    return np.array(found, dtype=np.int32)
+
+
+def parts_of(x: float, y: float, solids: Iterable[Solid]) -> tuple[Solid, ...]:
+    """Return the solids as parts of the one object at x, y."""
+    return tuple(replace(solid, part_of=(x, y)) for solid in solids)
+
+
+def _find_towards(solid: Solid, origin: FloatArray, azimuth: FloatArray) -> IntArray:
+    """Return indices into the ascending `azimuth` of rays from `origin` that may meet a solid."""
+    dx, dy = solid.x - origin[0], solid.y - origin[1]
+    distance = math.hypot(dx, dy)
+    if distance <= solid.radius:
+        return np.arange(len(azimuth))
+    # A hair more than the tangents, for rounding.
+    half = math.asin(solid.radius / distance) + 1e-9
+    turns = math.atan2(dy, dx) + np.array([-2.0 * math.pi, 0.0, 2.0 * math.pi])
+    starts, ends = (np.searchsorted(azimuth, turns + side) for side in (-half, half))
+    return np.concatenate([np.arange(a, b) for a, b in zip(starts, ends, strict=True)])
+
+
+def standing_box(
+    terrain: Terrain, x: float, y: float, size: Size, yaw: float = 0.0, kind: Kind = Kind.BOX
+) -> Box:
+    """Box that stands on the terrain."""
+    length, width, height = size
+    ground, radius = float(terrain.height(x, y)), 0.5 * math.hypot(length, width)
+    return Box(kind, x, y, ground - BURIED_DEPTH, ground + height, radius, length, width, yaw)
+
+
+def floating_box(
+    terrain: Terrain, x: float, y: float, size: Size, clearance: float, kind: Kind = Kind.OVERHANG
+) -> Box:
+    """Box that floats `clearance` [m] over the terrain."""
+    bottom = float(terrain.height(x, y)) + clearance
+    box = standing_box(terrain, x, y, size, kind=kind)
+    return replace(box, bottom=bottom, top=bottom + size[2])
+
+
+def pole(
+    terrain: Terrain, x: float, y: float, height: float = 6.0, radius: float = 0.1
+) -> Cylinder:
+    """Pole that stands on the terrain."""
+    ground = float(terrain.height(x, y))
+    return Cylinder(Kind.POLE, x, y, ground - BURIED_DEPTH, ground + height, radius)
+
+
+def car(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Solid, ...]:
+    """Car: a body and a cabin."""
+    body, cabin = (4.3, 1.8, 0.9), (2.3, 1.6, 1.5)
+    return parts_of(x, y, (standing_box(terrain, x, y, size, yaw) for size in (body, cabin)))
+
+
+def truck(terrain: Terrain, x: float, y: float, yaw: float = 0.0) -> tuple[Solid, ...]:
+    """Truck: a load and a lower cab in front of it."""
+    cab_x, cab_y = x + 4.2 * math.cos(yaw), y + 4.2 * math.sin(yaw)
+    load = standing_box(terrain, x, y, (6.4, 2.5, 3.6), yaw)
+    return parts_of(x, y, (load, standing_box(terrain, cab_x, cab_y, (1.8, 2.3, 2.6), yaw)))
+
+
+def wall(
+    terrain: Terrain, start: tuple[float, float], end: tuple[float, float], height: float
+) -> tuple[Box, ...]:
+    """Wall from `start` to `end` (x, y) [m], in panels that follow the ground."""
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    n_panels = max(1, math.ceil(math.hypot(dx, dy) / WALL_PANEL))
+    size = (math.hypot(dx, dy) / n_panels, WALL_THICKNESS, height)
+    middles = (np.arange(n_panels) + 0.5) / n_panels
+    yaw = math.atan2(dy, dx)
+    return tuple(
+        standing_box(terrain, start[0] + s * dx, start[1] + s * dy, size, yaw, Kind.WALL)
+        for s in middles.tolist()
+    )
+
+
+def tree(terrain: Terrain, x: float, y: float) -> tuple[Solid, ...]:
+    """Tree: a trunk and a floating crown."""
+    trunk = pole(terrain, x, y, height=3.0, radius=0.18)
+    return trunk, floating_box(terrain, x, y, (3.0, 3.0, 3.0), 2.5, Kind.VEGETATION)

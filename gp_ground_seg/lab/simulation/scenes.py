@@ -1,0 +1,373 @@
+"""Landforms; named scenes, each built from a seed around a drive along x from the origin."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import gp_ground_seg.lab.simulation.objects as objects
+import gp_ground_seg.lab.simulation.traffic as traffic
+from gp_ground_seg.lab.simulation.objects import Kind, Solid
+from gp_ground_seg.lab.simulation.terrain import Profile, Terrain, Waves
+
+N_WAVES = 8
+N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
+"""Scattered solids, and their distance from the drive [m], which leaves its lane free."""
+CARS = ('saloon', 'hatchback', 'suv')
+MIXED = (*CARS, *CARS, 'van', 'van', 'truck')
+"""Models of vehicles, among which the parked and the waiting ones are drawn."""
+URBAN_X = (-80.0, 160.0)  # where the street of the urban scene begins and ends [m]
+
+
+def rough(
+    rng: np.random.Generator,
+    rms: float = 0.08,
+    wavelengths: tuple[float, float] = (2.0, 20.0),
+    envelope: Profile | None = None,
+) -> Waves:
+    """Ground with waves of random heading and phase, scaled by `envelope` (see `Waves`).
+
+    `rms` [m] is the height of all waves together where the envelope is one. Their lengths [m] are
+    evenly spread on a log scale between the two ends; all waves are equally steep.
+    """
+    shortest, longest = np.log(wavelengths)
+    wavelength = np.exp(rng.uniform(shortest, longest, N_WAVES))
+    heading = rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
+    phase = rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
+    k = (2.0 * np.pi / wavelength)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+    amplitude = wavelength * rms * np.sqrt(2.0 / np.sum(wavelength**2))
+    return Waves(k, amplitude, phase, flat(1.0) if envelope is None else envelope)
+
+
+def polyline(
+    heading: float, points: Sequence[tuple[float, float]], slope_after: float = 0.0
+) -> Profile:
+    """Profile of straight pieces along `heading` [rad], level before the first corner.
+
+    `points` are the corners (u, z) in ascending u [m]; those of the same u are a vertical step
+    from the first to the last of them. `slope_after` is that after the last corner.
+    """
+    (first_u, first_z), (last_u, last_z) = points[0], points[-1]
+    pieces = [(first_u, first_z, 0.0)]
+    for (u0, z0), (u1, z1) in itertools.pairwise(points):
+        if u1 > u0:
+            pieces.append((u0, z0, (z1 - z0) / (u1 - u0)))
+    anchor, height, rise = np.array([*pieces, (last_u, last_z, slope_after)]).T
+    # A piece ends where the next one begins; one lone vertical step has its one edge at the end.
+    return Profile(heading, anchor[1:], anchor, np.column_stack([height, rise, 0.0 * rise]))
+
+
+def flat(z: float = 0.0) -> Profile:
+    """Level ground at height `z` [m]."""
+    return slope(0.0, 0.0, z)
+
+
+def slope(gradient: float, heading: float = 0.0, z: float = 0.0) -> Profile:
+    """Plane that rises by `gradient` per metre towards `heading` [rad], `z` [m] at the origin."""
+    return Profile(heading, np.empty(0), np.zeros(1), np.array([[z, gradient, 0.0]]))
+
+
+def ramp(start: float, gradient: float, heading: float = 0.0) -> Profile:
+    """Level ground until u = `start` [m], then a plane that rises by `gradient` per metre."""
+    return polyline(heading, [(start, 0.0)], slope_after=gradient)
+
+
+def kerb(
+    half_width: float, height: float, face_width: float = 0.05, heading: float = math.pi / 2
+) -> Profile:
+    """Road between sidewalks, `heading` [rad] across it; a kerb is `face_width` [m] deep."""
+    outer = half_width + face_width
+    corners = [(-outer, height), (-half_width, 0.0), (half_width, 0.0), (outer, height)]
+    return polyline(heading, corners)
+
+
+def ditch(
+    heading: float, start: float, top_width: float, bottom_width: float, depth: float
+) -> Profile:
+    """Trapezoidal ditch in level ground, from u = `start` to `start` + `top_width` [m]."""
+    side = (top_width - bottom_width) / 2.0
+    end = start + top_width
+    corners = [(start, 0.0), (start + side, -depth), (end - side, -depth), (end, 0.0)]
+    return polyline(heading, corners)
+
+
+def crest(
+    start: float, climb: float, gradient: float, rounding: float, heading: float = 0.0
+) -> Profile:
+    """Climb from u = `start` [m], rounded top, descent as steep; horizontal lengths [m]."""
+    top, z, level = start + climb, gradient * climb, (0.0, 0.0, 0.0)
+    edges = np.array([start, top, top + rounding, top + rounding + climb])
+    up, down = (0.0, gradient, 0.0), (z, -gradient, 0.0)
+    coefficients = np.array([level, up, (z, gradient, -gradient / rounding), down, level])
+    return Profile(heading, edges, np.array([start, *edges]), coefficients)
+
+
+def smooth_then_rough(
+    rng: np.random.Generator, start: float, transition: float, rms: float = 0.15
+) -> Waves:
+    """Flat ground that grows rough from x = `start` [m] on, fully so after `transition` [m]."""
+    envelope = polyline(0.0, [(start, 0.0), (start + transition, 1.0)])
+    return rough(rng, rms, (0.8, 6.0), envelope=envelope)
+
+
+@dataclass(frozen=True)
+class WetPatch:
+    """A disc of wet road [m] that mirrors a ray with the probability `reflectivity`."""
+
+    x: float
+    y: float
+    radius: float
+    reflectivity: float = 0.5
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Terrain, the solids on it, and wet patches of it."""
+
+    name: str
+    terrain: Terrain
+    solids: tuple[Solid, ...] = ()
+    wet_patches: tuple[WetPatch, ...] = ()
+
+
+def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
+    """Cars, trucks, crates, walls, poles and trees on both sides of the drive."""
+    solids: list[Solid] = []
+    for k in range(N_SCATTERED):
+        x = rng.uniform(*SCATTER_X)
+        y = rng.uniform(*SCATTER_Y) * rng.choice([-1.0, 1.0])
+        yaw = rng.uniform(0.0, 2.0 * math.pi)
+        match k % 6:
+            case 0 | 1:
+                solids += objects.car(terrain, x, y, yaw)
+            case 2:
+                solids.append(
+                    objects.standing_box(terrain, x, y, (0.8, 0.6, rng.uniform(0.3, 1.0)), yaw)
+                )
+            case 3:
+                solids.append(objects.pole(terrain, x, y))
+            case 4:
+                solids += objects.tree(terrain, x, y)
+            case _:
+                along = rng.uniform(4.0, 12.0)
+                solids += objects.wall(terrain, (x, y), (x + along, y), rng.uniform(1.0, 2.5))
+    return tuple(solids)
+
+
+_OPEN_COUNTRY: dict[str, Callable[[np.random.Generator], Terrain]] = {
+    # Level ground.
+    'flat': lambda rng: flat(),
+    # Plane that rises or falls by 8 % in a random direction.
+    'slope': lambda rng: slope(0.08, rng.uniform(-math.pi, math.pi)),
+    # Level ground, then at once a climb of 12 %.
+    'ramp': lambda rng: ramp(rng.uniform(12.0, 18.0), 0.12, rng.uniform(-0.3, 0.3)),
+    # Waves of 2 to 20 m, 8 cm rms.
+    'rough': rough,
+    # Smooth road that ends in rubble: waves of 0.8 to 6 m, 15 cm rms.
+    'road_then_rubble': lambda rng: smooth_then_rough(rng, rng.uniform(14.0, 20.0), 3.0),
+    # Road between sidewalks 15 cm higher.
+    'kerb': lambda rng: kerb(rng.uniform(3.5, 5.0), 0.15),
+    # Ditch 1 m deep across the drive, at an angle.
+    'ditch': lambda rng: ditch(rng.uniform(-0.5, 0.5), rng.uniform(10.0, 14.0), 4.0, 1.5, 1.0),
+    # Hill of 8 % slopes with a rounded top that hides what is behind it.
+    'crest': lambda rng: crest(rng.uniform(8.0, 12.0), 15.0, 0.08, 12.0),
+}
+
+
+def _open_scene(name: str, seed: int) -> Scene:
+    rng = np.random.default_rng(seed)
+    terrain = _OPEN_COUNTRY[name](rng)
+    return Scene(name, terrain, _scattered(terrain, rng))
+
+
+def _urban(seed: int) -> Scene:
+    """Street: kerbs, parked cars, a truck, houses, awnings, poles, trees, a bridge, puddles."""
+    rng = np.random.default_rng(seed)
+    road, front = 6.0, 10.0
+    terrain = kerb(road, 0.15)
+    solids: list[Solid] = []
+    wet: list[WetPatch] = []
+    for side in (-1.0, 1.0):
+        x = URBAN_X[0]
+        while x < URBAN_X[1]:
+            house = rng.uniform(12.0, 25.0)
+            ends = (x, side * front), (x + house, side * front)
+            solids += objects.wall(terrain, *ends, rng.uniform(4.0, 9.0))
+            x += house + rng.uniform(2.0, 8.0)
+        for x in np.arange(URBAN_X[0], URBAN_X[1], 9.0) + rng.uniform(0.0, 2.0):
+            if rng.random() < 0.6:
+                solids += objects.car(terrain, x, side * (road - 1.1), rng.normal(0.0, 0.02))
+                wet.append(WetPatch(x + rng.uniform(-3.0, 3.0), side * 2.5, rng.uniform(0.8, 1.8)))
+        for x in np.arange(URBAN_X[0], URBAN_X[1], 22.0) + rng.uniform(0.0, 10.0):
+            solids.append(objects.pole(terrain, x, side * 7.0))
+            solids += objects.tree(terrain, x + 8.0, side * 8.0)
+    solids += objects.truck(terrain, rng.uniform(25.0, 35.0), 2.6, math.pi)
+    # Low enough for the flat upper beams of an HDL-64E to meet it.
+    deck = (5.0, 2.0 * front, 0.8)
+    solids.append(objects.floating_box(terrain, rng.uniform(40.0, 50.0), 0.0, deck, 2.8))
+    for x in np.arange(URBAN_X[0], URBAN_X[1], 30.0) + rng.uniform(0.0, 20.0):
+        solids.append(objects.floating_box(terrain, x, front - 1.0, (6.0, 2.0, 0.2), 2.1))
+    solids.append(objects.standing_box(terrain, rng.uniform(10.0, 20.0), -8.0, (0.5, 0.5, 0.4)))
+    return Scene('urban', terrain, tuple(solids), tuple(wet))
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A line of vehicles along `heading` [rad], `aside` [m] to the left of the origin."""
+
+    terrain: Terrain
+    rng: np.random.Generator
+    heading: float
+    aside: float
+
+    def at(self, along: float, aside: float = 0.0) -> tuple[float, float]:
+        """x, y [m] of a place."""
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        aside += self.aside
+        return along * cos - aside * sin, along * sin + aside * cos
+
+    def fill(
+        self,
+        ends: tuple[float, float],
+        gaps: tuple[float, float],
+        turned: float = 0.0,
+        models: Sequence[str] = MIXED,
+        share: float = 1.0,
+    ) -> tuple[list[Solid], list[float]]:
+        """Vehicles from one end [m] to the other, and the places of the gaps between them.
+
+        `turned` [rad] is their yaw against the line, `share` that of the places taken.
+        """
+        solids: list[Solid] = []
+        free: list[float] = []
+        along, sign = ends[0], math.copysign(1.0, ends[1] - ends[0])
+        while sign * (ends[1] - along) > 10.0:
+            name, gap = str(self.rng.choice(models)), self.rng.uniform(*gaps)
+            length, width, *_ = traffic.MODELS[name]
+            size = width if abs(math.sin(turned)) > 0.5 else length
+            x, y = self.at(along + sign * (gap + 0.5 * size), self.rng.uniform(-0.15, 0.15))
+            yaw = self.heading + turned + self.rng.normal(0.0, 0.02)
+            if self.rng.random() < share:
+                solids += traffic.vehicle(self.terrain, name, x, y, yaw)
+            free.append(along + sign * 0.5 * gap)
+            along += sign * (gap + size)
+        return solids, free
+
+
+def _traffic_jam(seed: int) -> Scene:
+    """Five lanes of waiting vehicles between kerbs, cyclists between them, persons who cross."""
+    rng = np.random.default_rng(seed)
+    terrain = kerb(8.2, 0.15)
+    solids: list[Solid] = []
+    with_truck = rng.choice([-1, 1])
+    for lane in range(-2, 3):
+        line = _Line(terrain, rng, 0.0, 3.2 * lane)
+        nearest = 2.4 if lane == 0 else rng.uniform(-2.0, 1.0)
+        if lane == with_truck:
+            x, y = line.at(nearest + 5.5)
+            solids += traffic.vehicle(terrain, 'truck', x, y)
+        ahead = nearest + 9.9 if lane == with_truck else nearest
+        turned = math.pi if lane == 2 else 0.0
+        for ends in ((ahead, 70.0), (-abs(nearest), -60.0)):
+            made, gaps = line.fill(ends, (1.2, 3.0), turned)
+            solids += made
+            for along in gaps[1:]:
+                if rng.random() < 0.12:
+                    solids += traffic.person(terrain, *line.at(along, rng.uniform(-1.0, 1.0)))
+        if lane < 2:
+            for x in rng.uniform((-25.0, 3.0), (-3.0, 25.0)).tolist():
+                solids += traffic.cyclist(terrain, x, 3.2 * lane + 1.6)
+    for side in (-1.0, 1.0):
+        solids += objects.wall(terrain, (-60.0, side * 13.0), (70.0, side * 13.0), 7.0)
+        for x in np.arange(-25.0, 25.0, 10.0) + rng.uniform(0.0, 8.0):
+            solids += traffic.person(terrain, x, side * rng.uniform(9.0, 12.0))
+    return Scene('traffic_jam', terrain, tuple(solids))
+
+
+def _car_park(seed: int) -> Scene:
+    """Rows of parked cars, 0.6 to 1 m apart, along aisles 6 m wide with persons in them."""
+    rng = np.random.default_rng(seed)
+    terrain = slope(rng.uniform(0.0, 0.02), rng.uniform(-math.pi, math.pi))
+    solids: list[Solid] = []
+    for aside, side in itertools.product((5.5, 10.6, 21.5, 26.6), (-1.0, 1.0)):
+        line = _Line(terrain, rng, 0.0, side * aside)
+        turned = rng.choice([-1.0, 1.0]) * math.pi / 2.0
+        solids += line.fill((-45.0, 55.0), (0.6, 1.0), turned, CARS, share=0.88)[0]
+    for x in (-12.0, -7.5, 3.0, 7.5, 12.0, 16.5, 21.0, 25.5):
+        place = x + rng.uniform(0.0, 3.0), rng.uniform(-2.6, 2.6)
+        solids += traffic.person(terrain, *place)
+    return Scene('car_park', terrain, tuple(solids))
+
+
+def _hidden_climb(seed: int) -> Scene:
+    """Parked cars in a row, and right behind it a street that climbs by 10 to 15 %."""
+    rng = np.random.default_rng(seed)
+    heading, near = rng.uniform(-math.pi, math.pi), rng.uniform(4.5, 6.5)
+    foot, gradient = near + rng.uniform(1.5, 2.5), rng.uniform(0.1, 0.15)
+    terrain = polyline(heading, [(foot, 0.0), (foot + 50.0, 50.0 * gradient)])
+    row = _Line(terrain, rng, heading - math.pi / 2.0, near)
+    solids, _ = row.fill((-28.0, 34.0), (0.6, 1.2), models=CARS)
+    for k in range(10):
+        beside = 4.0 * k - 18.0 + rng.uniform(-0.7, 0.7)
+        place = row.at(beside, foot - near + rng.uniform(8.0, 35.0))
+        if k % 2:
+            solids += traffic.person(terrain, *place)
+        else:
+            name, yaw = str(rng.choice(CARS)), heading + rng.normal(0.0, 0.1)
+            solids += traffic.vehicle(terrain, name, *place, yaw)
+    return Scene('hidden_climb', terrain, tuple(solids))
+
+
+def _blind_slope(seed: int) -> Scene:
+    """Slope of 10 to 15 % around a level place 2 to 3 m wide: it begins in the blind spot."""
+    rng = np.random.default_rng(seed)
+    gradient, half = rng.uniform(0.1, 0.15), rng.uniform(1.0, 1.5)
+    rise = 40.0 * gradient
+    corners = [(-half - 40.0, -rise), (-half, 0.0), (half, 0.0), (half + 40.0, rise)]
+    terrain = polyline(rng.uniform(-math.pi, math.pi), corners)
+    return Scene('blind_slope', terrain, _scattered(terrain, rng))
+
+
+def _hedge(seed: int) -> Scene:
+    """Path between dense hedges 0.5 to 0.8 m high, with a fence behind one of them."""
+    rng = np.random.default_rng(seed)
+    terrain = rough(rng, 0.02, (1.5, 10.0))
+    solids: list[Solid] = []
+    side = rng.choice([-1.0, 1.0])
+    for y in (side * rng.uniform(3.0, 6.0), -side * rng.uniform(3.0, 6.0)):
+        high, deep = rng.uniform(0.55, 0.75), rng.uniform(0.6, 1.2)
+        for x in np.arange(-30.0, 50.0, 0.25).tolist():
+            # Leaves stick out by some centimetres.
+            size = (0.27, deep + rng.uniform(-0.15, 0.15), high + rng.uniform(-0.05, 0.05))
+            at = x, y + rng.uniform(-0.05, 0.05)
+            solids.append(objects.standing_box(terrain, *at, size, kind=Kind.VEGETATION))
+    fence = side * rng.uniform(8.0, 10.0)
+    for x in np.arange(-40.0, 60.0, 2.0).tolist():
+        solids.append(objects.pole(terrain, x, fence, 1.3, 0.05))
+        for clearance in (0.52, 0.82, 1.12):
+            rail = objects.floating_box(terrain, x + 1.0, fence, (2.0, 0.04, 0.12), clearance)
+            solids.append(rail)
+    solids += traffic.person(terrain, rng.uniform(5.0, 15.0), rng.uniform(-1.0, 1.0))
+    return Scene('hedge', terrain, tuple(solids))
+
+
+DRIVES: dict[str, Callable[[int], Scene]] = {
+    **{name: functools.partial(_open_scene, name) for name in _OPEN_COUNTRY},
+    'urban': _urban,
+}
+"""Builders of the scenes whose lane along x is free: seed -> scene."""
+PLACES: dict[str, Callable[[int], Scene]] = {
+    'traffic_jam': _traffic_jam,
+    'car_park': _car_park,
+    'hidden_climb': _hidden_climb,
+    'blind_slope': _blind_slope,
+    'hedge': _hedge,
+}
+"""Builders of the scenes around a sensor at the origin."""
+SCENES = {**DRIVES, **PLACES}
+"""Builders of the named scenes: seed -> scene."""

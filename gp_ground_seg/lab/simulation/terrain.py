@@ -1,0 +1,208 @@
+"""Analytic terrain: height, slope and bend at any point, and where rays meet it.
+
+Every terrain is smooth on pieces between parallel break lines, which rays cross one by one, so
+that kinks and vertical steps are met exactly. Within a piece the clearance f(t) of a ray has a
+second derivative of at least -K, with K the terrain's bend bound. So f(t + s) >= f + f' s -
+K s^2 / 2, and the root of that parabola is the largest step that is sure not to pass a crossing.
+Why no mesh library: heights and labels are to be exact.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.core.frame import FloatArray
+
+OptionalArray: TypeAlias = FloatArray | None
+TOLERANCE = 1e-9  # height at which a ray has met the terrain; length of an empty piece [m]
+
+
+class Along(NamedTuple):
+    """The terrain below points that move along a line; arrays of shape (R,)."""
+
+    height: FloatArray  # [m]
+    slope: FloatArray  # change of the height per unit of travel
+    bend: FloatArray  # upper bound of its second derivative over the whole piece
+
+
+class Terrain(ABC):
+    """A surface z(x, y)."""
+
+    @abstractmethod
+    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
+        """Terrain below points `at` (R, 2) [m] that move by `direction` (R, 2).
+
+        `piece`, (R, 2), are points inside the smooth piece to use, continued to `at`; by default
+        the one that `at` lies in, on a break line that on its far side.
+        """
+
+    @abstractmethod
+    def breaks(self) -> FloatArray:
+        """Break lines as rows a, b, c of ``a x + b y = c``, (B, 3)."""
+
+    def ceiling(self) -> Terrain:
+        """Terrain without waves that is nowhere below this one; itself if it has none."""
+        return self
+
+    def height(self, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
+        """Exact height [m] at x, y [m]; scalars or arrays of one shape."""
+        at = np.stack(np.broadcast_arrays(x, y), axis=-1).astype(np.float64)
+        flat = at.reshape(-1, 2)
+        return self.along(flat, np.zeros_like(flat)).height.reshape(at.shape[:-1])
+
+    def gradient(self, at: FloatArray) -> FloatArray:
+        """Slope in x and in y at points (R, 2) [m], (R, 2)."""
+        by_axis = [self.along(at, np.broadcast_to(axis, at.shape)).slope for axis in np.eye(2)]
+        return np.stack(by_axis, axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Profile(Terrain):
+    """Terrain that changes along one heading only: parabolas between parallel break lines.
+
+    Over u = x cos(heading) + y sin(heading), piece k reaches up to ``edges[k]`` and is
+    z = c0 + c1 (u - anchor) + c2 (u - anchor)^2.
+    """
+
+    heading: float  # direction of u [rad]
+    edges: FloatArray  # (B,) ascending u of the break lines [m]
+    anchor: FloatArray  # (B + 1,) reference u of each piece [m]
+    coefficients: FloatArray  # (B + 1, 3) c0 [m], c1, c2 [1/m] of each piece
+
+    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
+        """See `Terrain.along`."""
+        axis = self._axis
+        u, du = at @ axis, direction @ axis
+        k = self.piece_index(at if piece is None else piece)
+        v, (c0, c1, c2) = u - self.anchor[k], self.coefficients[k].T
+        return Along(c0 + v * (c1 + v * c2), du * (c1 + 2.0 * c2 * v), 2.0 * c2 * du**2)
+
+    def piece_index(self, at: FloatArray) -> npt.NDArray[np.intp]:
+        """Piece in which points (R, 2) lie, (R,)."""
+        return np.searchsorted(self.edges, at @ self._axis, side='right')
+
+    def breaks(self) -> FloatArray:
+        """Edges of the pieces, (B, 3)."""
+        return np.column_stack([np.broadcast_to(self._axis, (len(self.edges), 2)), self.edges])
+
+    @property
+    def _axis(self) -> FloatArray:
+        return np.array([math.cos(self.heading), math.sin(self.heading)])
+
+
+@dataclass(frozen=True, eq=False)
+class Waves(Terrain):
+    """Sum of n plane waves A sin(k . (x, y) + phase), times an envelope: >= 0, no parabolas."""
+
+    wave_vectors: FloatArray  # (n, 2) k [rad/m]
+    amplitudes: FloatArray  # (n,) A [m]
+    phases: FloatArray  # (n,) [rad]
+    envelope: Profile
+
+    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
+        """See `Terrain.along`."""
+        factor, factor_slope, _ = self.envelope.along(at, direction, piece)
+        # A smooth road, most of what a sensor sees, has no waves to add up.
+        rough = np.flatnonzero((factor != 0.0) | (factor_slope != 0.0))
+        (x, y), (dx, dy) = at[rough].T, direction[rough].T
+        sums = np.zeros((4, len(rough)))
+        waves = zip(self.wave_vectors, self.amplitudes, self.phases, strict=True)
+        for (kx, ky), amplitude, phase in waves:
+            angle = kx * x + ky * y + phase
+            rate = kx * dx + ky * dy
+            sums += (
+                amplitude * np.sin(angle),
+                amplitude * rate * np.cos(angle),
+                np.abs(amplitude * rate),
+                np.abs(amplitude) * rate**2,
+            )
+        # Height, slope, and bounds of the sizes of slope and bend, where the envelope is one.
+        height, slope, slope_bound, bend_bound = full = np.zeros((4, len(at)))
+        full[:, rough] = sums
+        index = self.envelope.piece_index(at if piece is None else piece)
+        return Along(
+            factor * height,
+            factor * slope + factor_slope * height,
+            self._largest_factors()[index] * bend_bound + 2.0 * np.abs(factor_slope) * slope_bound,
+        )
+
+    def _largest_factors(self) -> FloatArray:
+        """Largest value of the envelope on each piece, at one of its ends, (B + 1,)."""
+        c0, c1, _ = self.envelope.coefficients.T
+        edges, anchor = self.envelope.edges, self.envelope.anchor
+        near = c0 + c1 * (np.concatenate([anchor[:1], edges]) - anchor)
+        far = c0 + c1 * (np.concatenate([edges, anchor[-1:]]) - anchor)
+        return np.asarray(np.maximum(near, far))
+
+    def breaks(self) -> FloatArray:
+        """Edges of the envelope, (B, 3)."""
+        return self.envelope.breaks()
+
+    def ceiling(self) -> Terrain:
+        """Envelope times the sum of all amplitudes."""
+        total = float(np.abs(self.amplitudes).sum())
+        return replace(self.envelope, coefficients=self.envelope.coefficients * total)
+
+
+def first_hit(
+    terrain: Terrain, origin: FloatArray, direction: FloatArray, max_range: float
+) -> FloatArray:
+    """Range [m] at which each ray (R, 3) first meets the terrain, infinite beyond `max_range`."""
+    start, ceiling = np.zeros(len(origin)), terrain.ceiling()
+    if ceiling is not terrain:
+        # Free space above all waves is crossed in a few steps.
+        start = first_hit(ceiling, origin, direction, max_range)
+    hit = np.full(len(origin), np.inf)
+    ray = np.flatnonzero(start <= max_range)
+    ends = _piece_ends(terrain, origin[ray], direction[ray], max_range)
+    t, piece = start[ray].copy(), np.sum(ends < start[ray, None], axis=1)
+    while len(ray):
+        rows = np.arange(len(ray))
+        end = ends[rows, piece]
+        debris = end - t < TOLERANCE
+        middle = 0.5 * (np.where(piece > 0, ends[rows, piece - 1], 0.0) + end)
+        o, d = origin[ray], direction[ray]
+        at, inside = (o[:, :2] + s[:, None] * d[:, :2] for s in (t, middle))
+        height, slope, bend = terrain.along(at, d[:, :2], inside)
+        clearance = o[:, 2] + t * d[:, 2] - height
+        met = (clearance <= TOLERANCE) & ~debris
+        hit[ray[met]] = t[met]
+
+        step = _safe_step(clearance, d[:, 2] - slope, np.maximum(bend, 0.0))
+        leaves = debris | (t + step >= end)
+        t = np.where(leaves, end, t + step)
+        piece = piece + leaves
+        keep = ~met & (piece < ends.shape[1])
+        ray, t, piece, ends = ray[keep], t[keep], piece[keep], ends[keep]
+    return hit
+
+
+def _safe_step(clearance: FloatArray, rate: FloatArray, bend: FloatArray) -> FloatArray:
+    """Smallest positive root s of clearance + rate s - bend s^2 / 2, infinite if none."""
+    root = np.sqrt(rate**2 + 2.0 * bend * np.maximum(clearance, 0.0))
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+        # Two forms of one root; each loses no digits for its sign of the rate.
+        falling = 2.0 * clearance / (root - rate)
+        rising = (rate + root) / bend
+    step = np.where(rate < 0.0, falling, rising)
+    return np.where(np.isnan(step), np.inf, step)
+
+
+def _piece_ends(
+    terrain: Terrain, origin: FloatArray, direction: FloatArray, max_range: float
+) -> FloatArray:
+    """Ranges at which each ray leaves pieces, ascending, the last `max_range`, (R, B + 1)."""
+    a, b, c = terrain.breaks().T
+    rate = direction[:, :1] * a + direction[:, 1:2] * b
+    distance = c - (origin[:, :1] * a + origin[:, 1:2] * b)
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+        crossing = distance / rate
+    ahead = (crossing > 0.0) & (crossing < max_range)
+    last = np.full((len(rate), 1), max_range)
+    return np.sort(np.hstack([np.where(ahead, crossing, max_range), last]), axis=1)

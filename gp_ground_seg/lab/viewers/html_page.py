@@ -1,0 +1,100 @@
+"""A scan in a browser, drawn by viser: on a page that needs no server, or by a server."""
+
+from __future__ import annotations
+
+import html
+import io
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gp_ground_seg.core.errors import DataError, require
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.data.atomic_output import staged_file
+from gp_ground_seg.data.colours import length_scale_colours
+from gp_ground_seg.lab.viewers.scene import CAMERA, LEGENDS, RAMPS, TARGET, Cloud, Mesh, Scene
+
+HOST = '127.0.0.1'
+SHOWN = ('class', 'surface')
+"""What a page shows at first."""
+BAND_COLOUR = (86, 180, 233)
+_BOX = (
+    'position:fixed;left:12px;bottom:12px;z-index:9;padding:8px 12px;background:#ffffffd9;'
+    'font:13px/1.6 sans-serif;border-radius:6px;max-width:330px'
+)
+
+
+@contextmanager
+def open_server(port: int) -> Iterator[Any]:
+    """Viser server on this machine; 0 is any free port. It prints nothing."""
+    viser = require('viser', 'viser')
+    try:
+        with redirect_stdout(io.StringIO()):
+            server = viser.ViserServer(host=HOST, port=port, verbose=False)
+    except OSError as error:
+        raise DataError(f'--port {port}: {error.strerror}') from error
+    server.initial_camera.position, server.initial_camera.look_at = CAMERA, TARGET
+    try:
+        yield server
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def draw_points(server: Any, name: str, cloud: Cloud, visible: bool = True) -> Any:
+    """Add points, and return viser's handle of them."""
+    # Half precision, the default, is 6 cm at 100 m.
+    return server.scene.add_point_cloud(
+        f'/{name}', cloud.points, cloud.colours, precision='float32', point_shading='flat',
+        point_size=0.15 if name == 'candidates' else 0.05, visible=visible,
+    )  # fmt: skip
+
+
+def _draw_surface(server: Any, mesh: Mesh) -> None:
+    # viser takes colours by way of trimesh and glTF, where they are linear.
+    linear = (255.0 * (mesh.colours / 255.0) ** 2.2).astype(np.uint8)
+    trimesh = require('trimesh', 'viser')
+    solid = trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=linear, process=False)
+    server.scene.add_mesh_trimesh('/surface', solid, cast_shadow=False)
+
+
+def write_page(path: str | Path, scene: Scene, title: str, config: Config, force: bool) -> None:
+    """Write a page that holds everything, and opens from disk."""
+    with staged_file(path, force=force) as part, open_server(0) as server:
+        for name, cloud in scene.clouds.items():
+            draw_points(server, name, cloud, visible=name in SHOWN)
+        _draw_surface(server, scene.surface)
+        server.scene.add_mesh_simple(
+            '/band', scene.band.vertices, scene.band.triangles, color=BAND_COLOUR, opacity=0.3,
+            side='double', cast_shadow=False, visible=False,
+        )  # fmt: skip
+        head, body, rest = server.get_scene_serializer().as_html().rpartition('</body>')
+        words = f'<b>{html.escape(title)}</b><br>{legend([*scene.clouds, "surface"], config)}'
+        words += '<br>The button at the top right shows and hides them, and the 2-sigma band.'
+        part.write_text(f'{head}<div style="{_BOX}">{words}</div>{body}{rest}', 'utf-8')
+
+
+def legend(names: Iterable[str], config: Config) -> str:
+    """Return what the colours mean, as HTML: those of points, and of the ``surface``."""
+    limits = config.length_scale
+    ramps = {**RAMPS, 'surface': (limits.min, limits.max)}
+    units = {'height': ' [m]', 'surface': ', length-scale [m]'}
+    samples = length_scale_colours(np.geomspace(1.0, 10.0, 6), 1.0, 10.0)
+    stops = ','.join('rgb({:.0%} {:.0%} {:.0%})'.format(*rgb) for rgb in samples)
+    bar = f'<span style="background:linear-gradient(90deg,{stops})">{"&emsp;" * 5}</span>'
+    lines = []
+    for name in names:
+        if name in ramps:
+            low, high = ramps[name]
+            words = f'{low:g}&nbsp;{bar}&nbsp;{high:g}'
+        else:
+            words = ' '.join(
+                f'<nobr><span style="background:{colour}">&emsp;</span> {word}</nobr>'
+                for word, colour in LEGENDS[name].items()
+                if word != 'unknown'
+            )
+        lines.append(f'{name}{units.get(name, "")}: {words}')
+    return '<br>'.join(lines)

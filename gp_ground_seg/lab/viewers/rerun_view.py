@@ -1,0 +1,126 @@
+"""Scans in Rerun: in its viewer, in a browser, or in a file for either."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+from gp_ground_seg.core.errors import DataError, require
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.lab.viewers.scene import CAMERA, RAMPS, TARGET, Mesh, Scene
+
+HOST = '127.0.0.1'
+HIDDEN = ('height', 'p_ground', 'errors', 'faces', 'candidates', 'band')
+"""What is not shown at first."""
+SERIES = {'IoU': 'IoU [%]', 'lost': 'objects lost', 'theta': 'theta', 'latency': 'latency [ms]'}
+"""What is drawn over the frames, and its titles."""
+NEED_LABELS = ('IoU', 'lost')
+ABOUT = f"""\
+The eyes in the tree on the left show and hide:
+
+- **class**: ground grey, obstacles vermilion
+- **height** over the ground: {RAMPS['height'][0]:g} m dark blue, {RAMPS['height'][1]:g} m yellow
+- **p_ground**, probability of ground: 0 dark blue, 1 yellow
+- **errors**, with labels: missed ground blue, false ground vermilion
+- **surface** of the ground: rough dark blue, smooth yellow (length-scale)
+- **band**: two standard deviations below it and above
+- **faces**: returns in tiles with a vertical face
+- **candidates** of the ground: inliers blue, outliers black
+"""
+
+
+class Recording:
+    """Frames on their way to a viewer or a file, which rerun's ``RecordingStream`` knows."""
+
+    def __init__(self, title: str) -> None:
+        self._rr = rr = require('rerun', 'rerun-sdk')
+        self.stream = rr.RecordingStream('gp_ground_seg')
+        self.stream.send_recording_name(title)
+        self._has_blueprint = False
+        about = rr.TextDocument(ABOUT, media_type='text/markdown')
+        self.stream.log('about', about, static=True)
+
+    def log(self, k: int, scene: Scene, result: Segmentation, scores: dict[str, float]) -> None:
+        """Add frame `k`."""
+        rr, log = self._rr, self.stream.log
+        if not self._has_blueprint:
+            series = [name for name in SERIES if scores or name not in NEED_LABELS]
+            self.stream.send_blueprint(_blueprint(require('rerun.blueprint', 'rerun-sdk'), series))
+            self._has_blueprint = True
+        self.stream.set_time('frame', sequence=k)
+        for name, (points, colours) in scene.clouds.items():
+            size = rr.Radius.ui_points(3.0 if name == 'candidates' else 1.5)
+            log(f'scan/{name}', rr.Points3D(points, radii=size, colors=colours))
+        log('scan/surface', self._mesh(scene.surface, 255))
+        log('scan/band', self._mesh(scene.band, 90))
+        numbers = {name: value for name, value in scores.items() if name in SERIES}
+        numbers |= {f'theta/{name}': value for name, value in result.fit.theta.items()}
+        for name, value in {**numbers, 'latency': 1e3 * result.timings['total']}.items():
+            log(name, rr.Scalars([value]))
+
+    def _mesh(self, mesh: Mesh, alpha: int) -> Any:
+        vertices, triangles, colours = mesh
+        return self._rr.Mesh3D(
+            vertex_positions=vertices, triangle_indices=triangles, vertex_colors=colours,
+            albedo_factor=(255, 255, 255, alpha),
+        )  # fmt: skip
+
+
+def _blueprint(rrb: Any, names: list[str]) -> Any:
+    """Scan on the left, the series of these names on the right."""
+    hidden = {f'scan/{name}': rrb.EntityBehavior(visible=False) for name in HIDDEN}
+    eye = rrb.EyeControls3D(position=CAMERA, look_target=TARGET, eye_up=(0.0, 0.0, 1.0))
+    scan = rrb.Spatial3DView(origin='scan', name='scan', overrides=hidden, eye_controls=eye)
+    about = rrb.TextDocumentView(origin='about', name='what is what')
+    series = [rrb.TimeSeriesView(origin=name, name=SERIES[name]) for name in names]
+    return rrb.Blueprint(
+        rrb.Horizontal(rrb.Tabs(scan, about), rrb.Vertical(*series), column_shares=[2.5, 1.0]),
+        rrb.SelectionPanel(state='collapsed'),
+        rrb.TimePanel(state='collapsed'),
+    )
+
+
+@contextmanager
+def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
+    """Serve Rerun's web viewer; yield its process, the page's address, and where to send frames.
+
+    They arrive at the next port. rerun's own function would listen on every network.
+    """
+    require('rerun', 'rerun-sdk')
+    ports = port, port + 1
+    if any(map(_is_listening, ports)):
+        raise DataError(f'--port {port}: it or the next one is in use; choose another')
+    words = f'--serve-web --bind {HOST} --web-viewer-port {port} --port {port + 1}'
+    server = subprocess.Popen(
+        [sys.executable, '-m', 'rerun', *words.split()], start_new_session=True,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        # A stream that finds nobody gives up after a while.
+        while not all(map(_is_listening, ports)):
+            if server.poll() is not None:
+                raise DataError("Rerun's web viewer does not start: try `rerun --serve-web`")
+            time.sleep(0.1)
+        source = f'rerun%2Bhttp%3A%2F%2F{HOST}%3A{port + 1}%2Fproxy'
+        yield (
+            server,
+            f'http://{HOST}:{port}/?url={source}',
+            f'rerun+http://{HOST}:{port + 1}/proxy',
+        )
+    finally:
+        # The process is a wrapper of the one that serves.
+        with suppress(ProcessLookupError):
+            os.killpg(server.pid, signal.SIGTERM)
+        server.wait()
+
+
+def _is_listening(port: int) -> bool:
+    with socket.socket() as trial:
+        return trial.connect_ex((HOST, port)) == 0

@@ -1,0 +1,186 @@
+"""A scan in the browser, with sliders for the parameters: its labels follow."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from gp_ground_seg.core.errors import GroundSegError
+from gp_ground_seg.core.frame import Label
+from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
+from gp_ground_seg.core.parameters.export import is_logarithmic
+from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec, ParameterValue
+from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.segmenter import GroundSegmenter
+from gp_ground_seg.data.inputs import Inputs
+from gp_ground_seg.lab.scoring.metrics import Labels
+from gp_ground_seg.lab.viewers.html_page import draw_points, legend
+from gp_ground_seg.lab.viewers.scene import Cloud, point_colours, read_view
+
+N_STEPS = 400  # of a slider
+_NO_LABELS = ('frame', 'input', 'runtime', 'diagnostics')
+
+
+def tunable() -> list[ParameterSpec]:
+    """Parameters that the labels of a scan may depend on."""
+    return [spec for spec in parameter_specs() if spec.name.split('.')[0] not in _NO_LABELS]
+
+
+def slider_values(spec: ParameterSpec, now: ParameterValue) -> list[ParameterValue]:
+    """Values that the slider of a number goes through, `AUTO` and `now` among them."""
+    low, high = spec.minimum, spec.maximum
+    assert low is not None and high is not None
+    is_log = is_logarithmic(spec)
+    steps = (np.geomspace if is_log else np.linspace)(low, high, N_STEPS + 1)
+    short = [float(f'{step:.{2 if is_log else 3}g}') for step in steps[1:-1]]
+    numbers = {spec.type(value) for value in (low, *short, high)}
+    numbers |= {value for value in (now, spec.default) if value != AUTO}
+    return [*([AUTO] if spec.auto else []), *sorted(numbers)]
+
+
+class Tuner:
+    """The page of a viser server: `run` keeps its labels up to date with its controls.
+
+    Parameters are those of `config`; those of `names` get a control. `labels` is as of
+    `read_view`, `frame` the number of the first of the `inputs` to show.
+    """
+
+    def __init__(
+        self, server: Any, inputs: Inputs, config: Config, names: Sequence[str],
+        labels: str | None = None, frame: int = 0,
+    ) -> None:  # fmt: skip
+        self._server, self._start, self._reference = server, config, config
+        self._segmenter, self._changed = GroundSegmenter(config), threading.Event()
+        self._changed.set()
+        self._cloud: Any = None
+        self._drawn: object = None
+        self._view = lru_cache(maxsize=1)(lambda number: read_view(inputs[number], labels))
+        self._before = lru_cache(maxsize=1)(self._labels_and_scores)
+
+        gui, last = server.gui, len(inputs) - 1
+        # Sharing would send the scan through a server of viser's makers.
+        gui.configure_theme(control_width='large', show_share_button=False, show_logo=False)
+        gui.set_panel_label(inputs.path.name)
+        self._table, self._legend = gui.add_markdown('segmenting ...'), gui.add_html('')
+        self._frame = gui.add_slider('frame', 0, max(last, 1), 1, frame, visible=last > 0)
+        colours = ('changes', 'class', 'height', 'p_ground', 'errors')
+        self._colours = gui.add_dropdown('colours', colours)
+        for handle in (self._frame, self._colours):
+            handle.on_update(lambda _event: self._changed.set())
+        self._controls = {name: self._add_control(find_spec(name)) for name in names}
+        self.add_button('compare with these values', self._compare)
+
+    @property
+    def config(self) -> Config:
+        """Parameters of the page; raises ConfigError if they contradict each other."""
+        return self._start.replace(**{name: read() for name, read in self._controls.items()})
+
+    def add_button(self, title: str, action: Callable[[Config], str]) -> None:
+        """Add a button; `action` is given the parameters, and returns what to say."""
+        button, said = self._server.gui.add_button(title), self._server.gui.add_markdown('')
+
+        def click(_event: object) -> None:
+            try:
+                said.content = action(self.config)
+            except GroundSegError as error:
+                said.content = f'**{error}**'
+
+        button.on_click(click)
+
+    def run(self) -> None:
+        """Segment for ever whenever something has changed; the newest values count."""
+        while self._changed.wait():
+            self._changed.clear()
+            try:
+                self.show(int(self._frame.value), self._colours.value, self.config)
+            except GroundSegError as error:
+                self._table.content = f'**{error}**'
+
+    def _compare(self, config: Config) -> str:
+        self._reference = config
+        self._changed.set()
+        return ''
+
+    def _add_control(self, spec: ParameterSpec) -> Callable[[], Any]:
+        """Add the control of a parameter, and return what reads it."""
+        gui, now = self._server.gui, self._start[spec.name]
+        hint = f'{spec.description} ({spec.accepted})'
+        if spec.type in (bool, str):
+            options = spec.choices or (False, True)
+            words = [str(option).lower() for option in options]
+            shown = gui.add_dropdown(spec.name, words, initial_value=str(now).lower(), hint=hint)
+            shown.on_update(lambda _event: self._changed.set())
+            return lambda: options[words.index(shown.value)]
+
+        def title(value: ParameterValue) -> str:
+            return f'{spec.name} = {value} {"" if value == AUTO else spec.unit}'.rstrip()
+
+        # A slider of viser goes in even steps: this one over positions in `values`.
+        values = slider_values(spec, now)
+        last = len(values) - 1
+        slider = gui.add_multi_slider(
+            title(now), 0, last, 1, (values.index(now),), hint=hint,
+            marks=((0, str(values[0])), (last, str(values[-1]))),
+        )  # fmt: skip
+
+        def move(_event: object) -> None:
+            slider.label = title(values[slider.value[0]])
+            self._changed.set()
+
+        slider.on_update(move)
+        return lambda: values[slider.value[0]]
+
+    def _segment(self, number: int, config: Config) -> Segmentation:
+        self._segmenter.configure(config)
+        # A scan by itself, whatever was segmented before.
+        self._segmenter.reset()
+        return self._segmenter.segment(self._view(number).points)
+
+    def _labels_and_scores(self, number: int, config: Config) -> tuple[Labels, dict[str, float]]:
+        label = self._segment(number, config).label
+        return label, self._view(number).scores(label)
+
+    def show(self, number: int, name: str, config: Config) -> None:
+        """Segment a frame, and draw it in the colours of that name."""
+        before, old_scores = self._before(number, self._reference)
+        result, view = self._segment(number, config), self._view(number)
+        if name == 'errors' and view.truth is None:
+            name = 'changes'
+        finite = result.label != Label.UNKNOWN
+        colours = point_colours(name, result, view.truth if name == 'errors' else before)[finite]
+        drawn = number, result.pose.roll, result.pose.pitch
+        with self._server.atomic():
+            if drawn == self._drawn:
+                self._cloud.colors = colours
+            else:
+                level = result.pose.level(view.points[:, :3])[finite].astype(np.float32)
+                self._cloud = draw_points(self._server, 'scan', Cloud(level, colours))
+                self._drawn = drawn
+            words = legend(['class', name] if name == 'changes' else [name], config)
+            self._legend.content = f'<div style="font-size:12px;padding:4px 12px">{words}</div>'
+            scores = view.scores(result.label), old_scores
+            self._table.content = _table(result, before, scores)
+
+
+def _table(result: Segmentation, before: Labels, scores: Sequence[dict[str, float]]) -> str:
+    """Numbers of a result and of labels before, and how many labels have changed."""
+    both = result.label, before
+    rows = {
+        word: [f'{np.count_nonzero(label == value):,}' for label in both]
+        for word, value in (('ground', Label.GROUND), ('obstacle', Label.OBSTACLE))
+    }
+    if scores[0]:
+        rows['IoU'] = [f'{one["IoU"]:.2f} %' for one in scores]
+        rows['objects lost'] = [f'{one["lost"]} of {one["objects"]}' for one in scores]
+    rows['time'] = [f'{1e3 * result.timings["total"]:.0f} ms', '']
+    is_ground = (result.label == Label.GROUND)[result.label != before]
+    n_ground, n_changed = np.count_nonzero(is_ground), len(is_ground)
+    return '\n'.join(
+        ['| | now | before |', '|---|--:|--:|',
+         *(f'| {word} | {now} | {then} |' for word, (now, then) in rows.items()), '',
+         f'{n_changed:,} changed: {n_ground:,} now ground, {n_changed - n_ground:,} now obstacle']
+    )  # fmt: skip
