@@ -14,8 +14,8 @@ PAGE_HEAD = """\
 # Parameters
 
 `make generate` writes this page from `gp_ground_seg/core/parameters/config.py`. Most users set
-only those in the table of the README. `gp-ground-seg config dump` writes all of them, with values and
-ranges, as a parameter file. A symbol is that of the paper.
+only those in the table of the README. `gp-ground-seg config dump` writes all of them, with values
+and ranges, as a parameter file. A symbol is that of the paper.
 
 """
 
