@@ -31,7 +31,7 @@ SENSOR_HEIGHTS = -5.0, 20.0
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """Where the sensor is; auto = estimated from every scan (docs/pose.md)."""
+    """Pose of the sensor; auto = estimated from every scan (docs/pose.md)."""
 
     height: float | Literal['auto'] = basic(AUTO, SENSOR_HEIGHTS,
         "height of the cloud's origin above the ground; 0 = that of a vehicle frame on the ground",
@@ -42,22 +42,21 @@ class SensorConfig:
     pitch: float | Literal['auto'] = basic(AUTO, (-1.58, 1.58),
         'pitch of the sensor, positive with its nose down; auto = none unless it is clear', 'rad')
     origin_x: float = advanced(0.0, (-50.0, 50.0),
-        "where the sensor is in the cloud's frame, which is not its own where clouds are turned "
-        'into that of a vehicle: forward', 'm')
-    origin_y: float = advanced(0.0, (-50.0, 50.0), 'the same: to the left', 'm')
-    origin_z: float = advanced(0.0, (-50.0, 50.0), 'the same: upwards', 'm')
+        "sensor position in the cloud's frame, x; needed if clouds are in a vehicle frame", 'm')
+    origin_y: float = advanced(0.0, (-50.0, 50.0), 'the same, y', 'm')
+    origin_z: float = advanced(0.0, (-50.0, 50.0), 'the same, z', 'm')
 
 
 @dataclass(frozen=True)
 class FrameConfig:
-    """Where tilt and place of the sensor are taken from; the node only."""
+    """Source of the tilt and the position of the sensor; the node only."""
 
     level: str = basic('sensor', ('sensor', 'tf'),
-        'where the tilt of the sensor is taken from: sensor.roll and sensor.pitch, or TF')
+        'source of the tilt: sensor = sensor.roll and sensor.pitch, tf = TF')
     base: str = basic('base_link', (), 'frame that is level to TF, with frame.level = tf')
     sensor: str = advanced(NO_FRAME, (),
-        "frame of the sensor, whose place in the cloud's frame is looked up in TF; none = by "
-        'sensor.origin_x, origin_y, origin_z')
+        'frame of the sensor, to look up its position by TF; none = sensor.origin_x, origin_y '
+        'and origin_z are used')
 
 
 @dataclass(frozen=True)
@@ -110,8 +109,8 @@ class LengthScaleConfig:
     """Length-scale of the observation process along a segment."""
 
     model: str = advanced('latent', ('latent', 'line_gradient', 'constant'),
-        'where the length-scales come from: the latent process, the slopes of the extracted '
-        'lines, or one constant')
+        'source of the length-scales: the latent process, the slopes of the lines, or one '
+        'constant')
     constant: float = advanced(10.0, (0.05, 200.0), 'length-scale of the constant model', 'm')
     gradient_gain: float = advanced(2.0, (0.05, 100.0), 'a in l = a log(1/|slope|)', 'm', 'a')
     flat_gradient: float = advanced(0.1, (0.0001, 0.9),
@@ -161,11 +160,11 @@ class GrowthConfig:
     max_standardised_depth: float = advanced(7.0, (0.1, 200.0),
         'the same for a candidate below the prediction; obstacles lie only above')
     max_line_slope: float = advanced(1.0, (0.0, 10.0),
-        'slope of a line of candidates up to which those that continue it from inliers join')
-    min_line_size: int = advanced(4, (2, 10000), 'candidates that such a line needs at least')
+        'maximum slope of a line whose candidates may join because they continue its inliers')
+    min_line_size: int = advanced(4, (2, 10000), 'minimum number of candidates of such a line')
     min_bend_extent: float = advanced(10.0, (0.1, 1000.0),
-        'length of a line from which on it joins where the line before it bends into it: longer '
-        'than what stands on the ground', 'm')
+        'minimum length of a line that may join after a slope break; more than the length of '
+        'objects', 'm')
 
 
 @dataclass(frozen=True)
@@ -173,7 +172,8 @@ class SurfaceConfig:
     """From the segments' surfaces to the surface of the frame."""
 
     look_aside: bool = advanced(True, (),
-        'whether the segments beside one decide with it what is ground; false = each by itself')
+        'whether neighbouring segments are evidence for the ground of a segment; false = each '
+        'segment by itself')
 
 
 @dataclass(frozen=True)
@@ -183,11 +183,10 @@ class FacesConfig:
     cell_size: float = advanced(0.5, (0.05, 10.0),
         'side of the square tiles whose returns are judged together', 'm')
     max_normal_z: float = advanced(0.45, (0.0, 1.0),
-        'vertical part of the unit normal below which the returns of a tile are a vertical face; '
-        '0 = no tile has one')
+        'vertical part of the unit normal below which a tile is a vertical face; 0 = none is')
     max_foot_distance: float = advanced(0.06, (0.0, 10.0),
-        'distance (root mean square) of the lowest returns of a face from its plane up to which '
-        'its base is occluded, with no ground seen before it; 0 = never', 'm')
+        "if the lowest returns are this close to the face's plane (RMS), its base counts as "
+        'hidden; 0 = never', 'm')
 
 
 @dataclass(frozen=True)
@@ -195,17 +194,17 @@ class LabelConfig:
     """Labels from the distance to the surface."""
 
     rule: str = advanced('predictive', ('predictive', 'tolerance'),
-        'predictive = a return is ground where its height is more likely of ground than of an '
-        'obstacle, by the returns about it; tolerance = ground_tolerance alone, above and below')
+        'predictive = ground if the height is more likely of ground than of an obstacle, given '
+        'the returns near it; tolerance = ground_tolerance alone, above and below')
     ground_tolerance: float = basic(0.1, (0.001, 5.0),
         'height above the surface up to which a return is ground in any case; more = more ground',
         'm', 'zeta_g')
     obstacle_min_height: float = advanced(0.5, (0.01, 10.0),
-        'height above the surface from which a return is an obstacle however rough the ground',
+        'height above the surface from which a return is an obstacle on any ground',
         'm')
     obstacle_max_height: float = advanced(1.0, (0.02, 50.0),
-        'height above the surface up to which a return shows an obstacle, higher ones overhang; '
-        'and depth below it up to which a return is ground', 'm')
+        'height above the surface up to which returns are evidence of obstacles (higher ones '
+        'overhang), and depth below it down to which a return is ground', 'm')
 
 
 @dataclass(frozen=True)
@@ -220,8 +219,7 @@ class LearningConfig:
         'frame = one set of hyper-parameters for the whole frame; segment = one for each segment '
         '(slow, for comparison)')
     segment_step: int = advanced(30, (1, 60),
-        'for the scope frame: one of how many segments is learned from; neighbouring segments see '
-        'much the same ground')
+        'for the scope frame: learn from every n-th segment; neighbours see similar ground')
     objective: str = advanced('map', ('map', 'paper'),
         'map = likelihood of the heights and priors; paper = as printed, which has no upper bound')
     warm_start: bool = advanced(False, (),
@@ -243,7 +241,7 @@ class RuntimeConfig:
 
     n_threads: int = basic(0, (0, 64), 'threads of the compiled code; 0 = all cores, at most 4')
     backend: str = advanced('auto', ('auto', 'numba', 'numpy'),
-        'auto = compiled code where numba is installed, numpy otherwise; or either by name')
+        'auto = numba if it is installed, else numpy')
 
 
 @dataclass(frozen=True)
@@ -259,11 +257,9 @@ class DiagnosticsConfig:
         'median time per cloud, over the time between two clouds sent, above which processing is '
         'reported WARN')
     max_drop_ratio: float = advanced(0.0, (0.0, 1.0),
-        'share of the clouds sent since the last report that may be dropped before processing is '
-        'reported WARN')
+        'dropped share of the clouds since the last report above which processing is WARN')
     max_refused_ratio: float = advanced(0.0, (0.0, 1.0),
-        'share of the clouds since the last report that may be refused with a WARN; above it, and '
-        'always when all are, the input is reported ERROR')
+        'refused share above which the input is ERROR instead of WARN; all refused: always ERROR')
     min_quality: float = advanced(0.2, (0.0, 1.0),
         'frame_quality of the newest cloud below which the model is reported WARN')
     recover_after: float = advanced(3.0, (0.0, 600.0),
