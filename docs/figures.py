@@ -8,8 +8,8 @@ else there is to say; what stands between the two is written here:
     -->
     <!-- end of figure -->
 
-sample: WORDS          further words for a run of seconds; its rows are kept in a comment, and
-                       test/test_pages.py computes them again
+sample: WORDS          further words for a run of seconds; its rows are kept in docs/samples.json,
+                       by command, and test/test_pages.py computes them again
 keep: TITLE; TITLE     only the tables whose titles begin so
 picture: FILE -> PATH  the file that the command makes, and its place in the repository
 
@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import json
 import re
 import shlex
 import shutil
@@ -42,7 +43,7 @@ FIGURE = re.compile(
     r'<!-- figure: (?P<head>.*?)\n-->\n(?P<body>.*?)<!-- end of figure ?(?P<digest>\w*) -->',
     re.DOTALL,
 )
-SAMPLE = re.compile(r'<!-- sample\n(.*?)-->\n', re.DOTALL)
+SAMPLES = REPOSITORY / 'docs' / 'samples.json'
 ROOT = 'KITTI_ROOT'
 
 
@@ -119,7 +120,7 @@ def kept(figure: Figure, output: str) -> str:
     return '\n\n'.join([*tables, parts[-1]])
 
 
-def body_of(figure: Figure, output: str, sample: str | None, commit: str) -> str:
+def body_of(figure: Figure, output: str, commit: str) -> str:
     """Write what stands between the comments."""
     shown = f'`gp-ground-seg {figure.command}`'
     if 'picture' in figure.options:
@@ -131,8 +132,19 @@ def body_of(figure: Figure, output: str, sample: str | None, commit: str) -> str
     output = kept(figure, output)
     if '| ---' not in output:
         output = f'```text\n{output}\n```'
-    rows = '' if sample is None else '\n'.join(rows_of(kept(figure, sample)))
-    return f'{shown}\n\n{output}\n\n' + (f'<!-- sample\n{rows}\n-->\n' if rows else '')
+    return f'{shown}\n\n{output}\n\n'
+
+
+def read_samples() -> dict[str, list[str]]:
+    """Read the Markdown rows of each sample, by its command."""
+    samples: dict[str, list[str]] = json.loads(SAMPLES.read_text(encoding='utf-8'))
+    return samples
+
+
+def write_samples(samples: dict[str, list[str]]) -> None:
+    """Write the rows of the samples."""
+    text = json.dumps(samples, indent=1, ensure_ascii=False, sort_keys=True)
+    SAMPLES.write_text(f'{text}\n', encoding='utf-8')
 
 
 def caption(said: str, made: str) -> str:
@@ -152,10 +164,9 @@ def main() -> int:
     if not (Path(kitti) / 'sequences').is_dir():
         parser.error(f'{arguments.kitti}: holds no sequences/; say make figures KITTI=PATH')
     texts = {page: (REPOSITORY / page).read_text(encoding='utf-8') for page in PAGES}
-    figures = [figure for page, text in texts.items() for figure in find_figures(page, text)]
-    if arguments.part:
-        chosen = arguments.part
-        figures = [f for f in figures if any(p in f'{f.page} {f.command}' for p in chosen)]
+    every = [figure for page, text in texts.items() for figure in find_figures(page, text)]
+    chosen = arguments.part or ['']
+    figures = [f for f in every if any(part in f'{f.page} {f.command}' for part in chosen)]
     commands = [c for figure in figures for c in (figure.command, figure.sample) if c is not None]
     commands = list(dict.fromkeys(commands))
     commit = (describe_environment()['commit'] or 'unknown')[:12]
@@ -174,12 +185,18 @@ def main() -> int:
                 print('interrupted: what is done is written')
                 break
         done = [f for f in figures if f.command in outputs and f.sample in outputs]
+        samples = read_samples()
+        for command in samples.keys() - {figure.sample for figure in every}:
+            del samples[command]
         for figure in done:
-            body = body_of(figure, outputs[figure.command], outputs[figure.sample], commit)
+            body = body_of(figure, outputs[figure.command], commit)
+            if figure.sample is not None:
+                samples[figure.sample] = rows_of(kept(figure, outputs[figure.sample]))
             texts[figure.page] = replaced(texts[figure.page], figure, body)
             if 'picture' in figure.options:
                 made, _, place = figure.options['picture'].partition(' -> ')
                 shutil.copyfile(folder / made, REPOSITORY / place)
+    write_samples(samples)
     for page, text in texts.items():
         (REPOSITORY / page).write_text(text, encoding='utf-8')
     seconds = time.monotonic() - started
