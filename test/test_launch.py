@@ -9,7 +9,7 @@ import yaml
 from conftest import REPOSITORY
 
 FILE = REPOSITORY / 'launch' / 'ground_segmentation.launch.py'
-PAGE = (REPOSITORY / 'docs' / 'robot.md').read_text(encoding='utf-8')
+PAGE = (REPOSITORY / 'docs' / 'node.md').read_text(encoding='utf-8')
 
 
 def constants(path):

@@ -209,8 +209,8 @@ def test_links_lead_somewhere(page):
 
 
 def test_links_that_lead_nowhere():
-    good = 'docs/ros.md#time-and-tf', 'docs/images/street.png', 'https://arxiv.org/abs/2112.05847'
-    bad = ['docs/no.md', 'docs/ros.md#no', '#no', 'https://arxiv', 'http://arxiv.org/']
+    good = 'docs/node.md#time-and-tf', 'docs/images/street.png', 'https://arxiv.org/abs/2112.05847'
+    bad = ['docs/no.md', 'docs/node.md#no', '#no', 'https://arxiv', 'http://arxiv.org/']
     text = ' '.join(f'[a]({target})' for target in (*good, *bad))
     assert list(broken_links('README.md', text)) == bad
 

@@ -98,7 +98,7 @@ def test_nav2_snippets_are_yaml_and_fit_the_command_above_them():
 
 
 def test_the_aggregator_of_the_diagnostics_finds_our_statuses():
-    _, (found,) = snippets('diagnostics.md')
+    _, (found,) = snippets('node.md')
     group = found['analyzers']['ros__parameters']['ground_segmentation']
     (part,) = group['contains']
     tasks = ('input', 'processing', 'model', 'output')

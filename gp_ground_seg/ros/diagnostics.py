@@ -181,7 +181,7 @@ class ProcessingTask:
 
 
 def frame_quality(fit: FitReport, n_occupied: int, certainty: float) -> float:
-    """Return how reliable a frame is, 0 to 1: a product of shares (docs/diagnostics.md)."""
+    """Return how reliable a frame is, 0 to 1: a product of shares (docs/node.md)."""
     if fit.status == 'failed' or not fit.n_candidates or not n_occupied:
         return 0.0
     share = min(1.0, fit.n_segments / n_occupied) * (fit.n_inliers / fit.n_candidates)
