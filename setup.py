@@ -8,7 +8,7 @@ from setuptools import find_packages, setup
 PACKAGE = 'gp_ground_seg'
 
 BAGS = ['rosbags>=0.11.9']
-FORMATS = ['laspy[lazrs]>=2.5', 'python-neo-lzf>=0.3']
+FORMATS = ['python-neo-lzf>=0.3']
 PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
 TUNE = ['optuna>=4.0']
 SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']  # 21 MB; s3fs, for s3://, is 36 MB more

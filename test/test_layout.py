@@ -48,7 +48,6 @@ ONLY_IN = {
     'rosbags': ('data/bags.py',),
     **dict.fromkeys(('dask', 'distributed'), ('lab/scale/cluster.py',)),
     'fsspec': ('data/files.py',),
-    **dict.fromkeys(('laspy', 'lazrs'), ('data/las.py',)),
     'lzf': ('data/pcd.py',),
     'pyarrow': ('lab/scoring/report.py',),
     'matplotlib': ('lab/plotting/',),

@@ -30,7 +30,7 @@ Split scans into ground and obstacles.
 
 INPUT is one of:
   scan.bin             float32 x, y, z, intensity, as in KITTI; --columns and --dtype for others
-  .pcd .ply .las .laz .npy .npz, and .pcd.bin of nuScenes
+  .pcd .ply .npy .npz, and .pcd.bin of nuScenes
   folder               of such files, or a sequence with velodyne/ in it
   drive.bag            a ROS 1 bag
   drive.mcap, .db3     a single-file rosbag2
@@ -42,8 +42,8 @@ the order of the input: 40 (road) = ground, 99 (other-object) = obstacle, 0 (unl
 unknown (the point is not finite). With --raw: 1, 2 and 0.
 
 The output of other formats has the same format; the name of OUT or --format chooses another
-one. It has every field of the input, and label (0 unknown, 1 ground, 2 obstacle; LAS:
-classification 2 ground), height, ground_z, ground_std [m], p_ground (docs/datasets.md).
+one. It has every field of the input, and label (0 unknown, 1 ground, 2 obstacle), height,
+ground_z, ground_std [m], p_ground (docs/datasets.md).
 
 The output of a bag is a rosbag2 with all messages of the input, and after each point cloud
 its ground and its obstacles: every field of every point bit for bit, the same header, the
@@ -62,7 +62,7 @@ files. The labels are the same (docs/datasets.md).
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
-  gp-ground-seg segment scan.pcd -o scan.laz --surface
+  gp-ground-seg segment scan.pcd -o scan.npz --surface
   gp-ground-seg segment drive.mcap --format ply --split     files for each cloud
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
   gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3

@@ -14,7 +14,6 @@ from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError
 from gp_ground_seg.data.bag_files import in_one_line
 from gp_ground_seg.data.clouds import Cloud, Columns, name_columns
 from gp_ground_seg.data.files import AnyPath
-from gp_ground_seg.data.las import encode_las, read_las
 from gp_ground_seg.data.numpy_files import encode_npy, encode_npz, read_numpy
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
@@ -26,8 +25,6 @@ NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
 _READERS: dict[str, Callable[[bytes], Cloud]] = {
     '.pcd': read_pcd,
     '.ply': read_ply,
-    '.las': read_las,
-    '.laz': read_las,
     '.npy': read_numpy,
     '.npz': read_numpy,
 }
@@ -66,11 +63,9 @@ def encode_file(
 ) -> bytes:
     """File of a cloud with a `Label` and further values for each point; DataError if none can be.
 
-    Its format is that of `path`, one of `WRITABLE`. LAS has the label as its classification.
+    Its format is that of `path`, one of `WRITABLE`.
     """
     with _named(path, 'cannot be written'), np.errstate(all='ignore'):
-        if path.suffix in ('.las', '.laz'):
-            return encode_las(cloud.join(results), label, path.suffix == '.laz')
         return _ENCODERS[path.suffix](cloud.join({'label': label, **results}))
 
 
@@ -83,6 +78,6 @@ def _named(path: AnyPath, what: str) -> Iterator[None]:
         raise DataError(f'{path}: {error}') from error
     except GroundSegError:
         raise
-    except Exception as error:  # Of many types: ValueError, LaspyException, struct, zlib, ...
+    except Exception as error:  # Of many types: ValueError, struct.error, zlib.error, ...
         said = f'{type(error).__name__}: {in_one_line(error)}'
         raise DataError(f'{path}: {what} as {path.suffix} ({said})') from error
