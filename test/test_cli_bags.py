@@ -26,8 +26,8 @@ from sensor_msgs.msg import PointCloud2
 from gp_ground_seg.cli import options
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
-from gp_ground_seg.ros import lifecycle, playback
-from gp_ground_seg.ros.lifecycle import ros_session
+from gp_ground_seg.ros import playback, start_stop
+from gp_ground_seg.ros.start_stop import ros_session
 
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 SUMMARY = re.compile(
@@ -40,7 +40,7 @@ WAITING = 'gp-ground-seg: note: waiting for a subscriber of /points'
 @pytest.fixture(autouse=True)
 def stock_transport(monkeypatch):
     """Fast DDS would keep a profile for all that follows in this process."""
-    monkeypatch.setattr(lifecycle, '_free_shared_memory', lambda: 0)
+    monkeypatch.setattr(start_stop, '_free_shared_memory', lambda: 0)
 
 
 class Listener:

@@ -23,7 +23,7 @@ from gp_ground_seg.core.frame import Label
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points, stamp_of
-from gp_ground_seg.ros import lifecycle, probe
+from gp_ground_seg.ros import probe, start_stop
 from gp_ground_seg.ros.probe import GROUND, OBSTACLES, NodeProcess, private_network, rate_result
 
 COMMAND = (sys.executable, '-m', 'gp_ground_seg', 'demo')
@@ -293,14 +293,14 @@ def test_private_network(monkeypatch):
 @pytest.fixture
 def no_profile(monkeypatch):
     """A machine with plenty of shared memory, where the user has chosen no transport."""
-    for name in lifecycle._TRANSPORT_VARIABLES:
+    for name in start_stop._TRANSPORT_VARIABLES:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(lifecycle, '_free_shared_memory', lambda: 1 << 30)
+    monkeypatch.setattr(start_stop, '_free_shared_memory', lambda: 1 << 30)
 
 
 def profile_in_use():
     before = dict(os.environ)
-    with lifecycle.large_cloud_transport():
+    with start_stop.large_cloud_transport():
         (found,) = {*os.environ.items()} - {*before.items()} or {(None, None)}
     assert dict(os.environ) == before
     return found[1]
@@ -309,8 +309,8 @@ def profile_in_use():
 def test_profile_of_a_checkout_and_of_an_installation(no_profile, monkeypatch, tmp_path):
     shipped = Path(__file__).parents[1] / 'config' / 'fastdds_large_clouds.xml'
     assert Path(profile_in_use()) == shipped
-    module = tmp_path / 'lib/python3.12/site-packages/gp_ground_seg/ros/lifecycle.py'
-    monkeypatch.setattr(lifecycle, '__file__', str(module))
+    module = tmp_path / 'lib/python3.12/site-packages/gp_ground_seg/ros/start_stop.py'
+    monkeypatch.setattr(start_stop, '__file__', str(module))
     assert profile_in_use() is None
     installed = tmp_path / 'share/gp_ground_seg/config/fastdds_large_clouds.xml'
     installed.parent.mkdir(parents=True)
@@ -318,10 +318,10 @@ def test_profile_of_a_checkout_and_of_an_installation(no_profile, monkeypatch, t
     assert Path(profile_in_use()) == installed
 
 
-@pytest.mark.parametrize('name', lifecycle._TRANSPORT_VARIABLES)
+@pytest.mark.parametrize('name', start_stop._TRANSPORT_VARIABLES)
 def test_no_profile_where_the_user_chose_or_shared_memory_is_short(no_profile, monkeypatch, name):
     with monkeypatch.context() as patched:
         patched.setenv(name, 'mine')
         assert profile_in_use() is None
-    monkeypatch.setattr(lifecycle, '_free_shared_memory', lambda: 64 << 20)
+    monkeypatch.setattr(start_stop, '_free_shared_memory', lambda: 64 << 20)
     assert profile_in_use() is None

@@ -124,8 +124,8 @@ def test_the_node_of_the_wheel_starts(installed, tmp_path):
         import sys
         sys.path.insert(0, {str(installed)!r})
         from gp_ground_seg.cli.node import main
-        from gp_ground_seg.ros import lifecycle
-        print(lifecycle._find_profile(), file=sys.stderr)
+        from gp_ground_seg.ros import start_stop
+        print(start_stop._find_profile(), file=sys.stderr)
         sys.exit(main())
     """
     words = *ros.IN_NAMESPACE, '-p', 'runtime.backend:=numpy'

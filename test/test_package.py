@@ -13,7 +13,7 @@ from conftest import REPOSITORY
 from test_layout import PACKAGE, ROS, imports, parse
 
 import gp_ground_seg
-from gp_ground_seg.ros.lifecycle import ROS_WHEELS
+from gp_ground_seg.ros.start_stop import ROS_WHEELS
 
 
 @pytest.fixture

@@ -20,7 +20,6 @@ from gp_ground_seg.ros import diagnostics
 from gp_ground_seg.ros.diagnostics import InputFacts, InputTask, ModelTask, ProcessingTask
 from gp_ground_seg.ros.input import JUMP_TOLERANCE, StampWatch
 from gp_ground_seg.ros.status import RATE_WINDOW, Hysteresis, Level, Rate, Status
-from gp_ground_seg.ros.subscription import SequenceGaps
 
 LIMITS = DiagnosticsConfig(stale_after=2.0, max_latency=0.1)
 FACTS = InputFacts('/points', 'reliable, keep_last 5, volatile', n_publishers=1, ros_time=1000.5)
@@ -41,17 +40,6 @@ def process(statistics, latencies):
         stages = {'queue': 0.0, 'grid': 0.25 * latency, 'total': latency}
         statistics.processed(latency, stages, fit)
     return statistics
-
-
-@given(st.lists(st.booleans(), min_size=1))
-def test_gaps_count_what_is_missing_between_arrivals(is_received):
-    gaps = SequenceGaps()
-    counted = sum(gaps.note(k) for k, received in enumerate(is_received, 1) if received)
-    inner = ''.join('x' if received else '.' for received in is_received).strip('.')
-    assert counted == inner.count('.')
-    # Another publisher counts from the start.
-    gaps.reset()
-    assert [gaps.note(n) for n in (7, 8, 1, 2, 5, None, 200)] == [0, 0, 0, 0, 2, 0, 0]
 
 
 @given(st.lists(times))

@@ -26,7 +26,7 @@ from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.pipeline.tilt import rotation
 from gp_ground_seg.lab.simulation import VLP_16, simulate_scan
 from gp_ground_seg.ros.ground_model import read_ground_model
-from gp_ground_seg.ros.input import tilt_of
+from gp_ground_seg.ros.transforms import tilt_of
 
 HAS_TF2 = importlib.util.find_spec('tf2_ros') is not None
 VALUES = {'learning.mode': 'fixed', 'sensor.height': 1.73}

@@ -14,7 +14,7 @@ from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
-from gp_ground_seg.ros.lifecycle import large_cloud_transport, needing_ros, ros_session
+from gp_ground_seg.ros.start_stop import large_cloud_transport, needing_ros, ros_session
 
 if TYPE_CHECKING:
     from gp_ground_seg.ros.playback import Player

@@ -31,7 +31,6 @@ from gp_ground_seg.lab.plotting.style import new_figure
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Confusion, Labels, count_confusion
 from gp_ground_seg.lab.scoring.report import Column
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
-from gp_ground_seg.ros.lifecycle import needing_ros
 from gp_ground_seg.ros.probe import (
     GROUND,
     INPUT,
@@ -42,9 +41,10 @@ from gp_ground_seg.ros.probe import (
     rate_result,
     restamped,
 )
+from gp_ground_seg.ros.start_stop import needing_ros
 
 if TYPE_CHECKING:
-    from gp_ground_seg.ros.lifecycle import Session
+    from gp_ground_seg.ros.start_stop import Session
 
 BAG, PICTURE, LOG = 'drive.mcap', 'birds_eye.png', 'node.log'
 FRAME_ID = 'lidar'

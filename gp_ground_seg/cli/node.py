@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint
-from gp_ground_seg.ros.lifecycle import needing_ros, stop_on_signals
+from gp_ground_seg.ros.start_stop import needing_ros, stop_on_signals
 
 NODE_EXAMPLES = """\
   gp-ground-seg node

@@ -121,7 +121,7 @@ class ProcessingTask:
         self._backend, self._n_threads = '', 0
 
     def arrived(self, now: float, n_lost: int) -> None:
-        """Count a cloud that arrived, and `n_lost` before it that did not; -1 if it is late."""
+        """Count a cloud that arrived, and `n_lost` before it that did not."""
         self._sent.count(now, 1 + n_lost)
         self._n_sent_recent += 1 + n_lost
         self._n_dropped += n_lost

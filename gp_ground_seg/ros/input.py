@@ -1,47 +1,31 @@
-"""The input: profiles of clouds, time jumps, tilt and place of the sensor by TF."""
+"""The input: clouds of one topic as their publishers offer them, losses, time jumps."""
 
 from __future__ import annotations
 
-import functools
-import importlib
-from array import array
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-from geometry_msgs.msg import Quaternion
 from rclpy.clock import Clock, JumpThreshold, TimeJump
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
-from rclpy.time import Time
-from std_msgs.msg import Header
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import PointCloud2
 
-from gp_ground_seg.core.errors import ConfigError, MissingDependencyError, PointCloudError
-from gp_ground_seg.core.parameters.config import NO_FRAME, FrameConfig
-from gp_ground_seg.core.pipeline.tilt import angles_of
-from gp_ground_seg.data import point_cloud2
+from gp_ground_seg.core.errors import ConfigError
 
-OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
+INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
+LARGE_CLOUD = 500_000  # size up to which stock Fast DDS loses no best-effort cloud [bytes]
+NEAR = 1000  # gap in the numbers of several publishers up to which it counts as a loss
 JUMP_TOLERANCE = 0.5  # stamps of several sensors on one topic may be that much out of order [s]
-TF_JUMP = 1.0  # jump back up to which transforms are kept: a late stamp, no other run [s]
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)  # the clock of a node may stand or jump
 THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
-"""Options of messages that may come with every cloud."""
-
-
-def message_data(values: npt.NDArray[Any]) -> array[int]:
-    """Return the bytes of an array as the one type that rclpy takes without a look at each."""
-    data = array('B')
-    data.frombytes(np.ascontiguousarray(values).data.cast('B') if values.size else b'')
-    return data
-
-
-select_points = functools.partial(point_cloud2.select_points, as_data=message_data)
+"""Options of log messages that may come with every cloud."""
 
 
 def check_overrides(given: Mapping[str, object]) -> None:
@@ -52,15 +36,163 @@ def check_overrides(given: Mapping[str, object]) -> None:
             raise ConfigError(f'{name} = {value}: must be an integer in [1, {MAX_DEPTH}]')
 
 
-def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
-    """Return the default of a cloud topic: reliable, volatile, the newest `depth` clouds."""
-    return QoSProfile(depth=depth)
+class SequenceGaps:
+    """Counts messages that did not arrive, of publishers that number theirs 1, 2, 3 ... each.
+
+    They were lost on the way, or overwritten in a full queue while the node was busy. rclpy does
+    not say who has sent a message: a number counts as the next of the publisher whose last one is
+    the nearest below. What this misses for one publisher, it counts for another later. The first
+    message of a publisher may look like a gap, and is not counted.
+    """
+
+    def __init__(self) -> None:
+        self._last: list[int] = []  # of each publisher heard
+
+    def reset(self) -> None:
+        """Forget the last numbers: other publishers have their own."""
+        self._last.clear()
+
+    def note(self, number: int | None, n_publishers: int = 1) -> int:
+        """Return how many messages are missing before the one with this `number`."""
+        if number is None:
+            self.reset()
+            return 0
+        below = max((last for last in self._last if last < number), default=None)
+        n_heard = len(self._last)
+        if n_heard < max(1, n_publishers) and below != number - 1:
+            self._last.append(number)
+            return 0
+        # Where none is near, one of them counts anew.
+        is_next = below is not None and (n_heard == 1 or number - below < NEAR)
+        last = below if below is not None else min(self._last)
+        self._last[self._last.index(last)] = number
+        return number - last - 1 if is_next else 0
 
 
-def in_words(profile: QoSProfile) -> str:
-    """Return `profile` as in ``reliable, keep_last 5, volatile``."""
-    reliability, history, durability = profile.reliability, profile.history, profile.durability
-    return f'{reliability.name}, {history.name} {profile.depth}, {durability.name}'.lower()
+class CloudSubscription:
+    """Subscription that is best-effort while any publisher is, and reliable otherwise.
+
+    A best-effort reader loses most of a replayed KITTI bag with stock Fast DDS; a reliable one
+    gets nothing from a best-effort LiDAR driver. ROS decides between them when a subscription with
+    `ReliabilityPolicy.BEST_AVAILABLE` is made: it is made anew when the publishers change. A
+    reliability given in ``qos_overrides`` is kept for any publisher. `callback` takes a cloud, its
+    wait in this process [s] and the number of clouds lost before it.
+    """
+
+    def __init__(
+        self, node: Node, topic: str, callback: Callable[[PointCloud2, float, int], None]
+    ) -> None:
+        self._node = node
+        self._callback = callback
+        self._gaps = SequenceGaps()
+        self._offered: dict[bytes, ReliabilityPolicy] = {}
+        self._large_size = 0
+        self._unresolved_topic = topic
+        self.topic: str = node.resolve_topic_name(topic)
+        # The executor still uses a subscription within its own event; a guard condition runs
+        # after all that became ready with it.
+        self._review_soon = node.create_guard_condition(self._review)
+        self._look_at_publishers()
+        self._reliability = self._wanted_reliability()
+        self._profile = QoSProfile(depth=INPUT_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
+        self._create(QoSOverridingOptions.with_default_policies())
+        self._profile = self._subscription.qos_profile
+        self._is_pinned = self._profile.reliability != ReliabilityPolicy.BEST_AVAILABLE
+        if self._is_pinned:
+            self._reliability = self._profile.reliability
+        # The event can come before the publisher is listed, and there is no event for the end
+        # of the last best-effort publisher: they are looked at every second too.
+        node.create_timer(1.0, self._review_soon.trigger, clock=STEADY_CLOCK)
+
+    @property
+    def qos_words(self) -> str:
+        """Quality of service in use, as in ``reliable, keep_last 5, volatile``."""
+        history, durability = self._profile.history, self._profile.durability
+        words = f'{self._reliability.name}, {history.name} {self._profile.depth}'
+        return f'{words}, {durability.name}'.lower()
+
+    @property
+    def n_publishers(self) -> int:
+        """Publishers, as of the last look."""
+        return len(self._offered)
+
+    @property
+    def fault(self) -> str:
+        """What is wrong with the way clouds are received; empty if nothing."""
+        if not self._large_size:
+            return ''
+        return (
+            f'clouds of {self._large_size / 1e6:.1f} MB come best-effort, of which Fast DDS may '
+            'lose most: let their publisher offer reliable, or start it with '
+            'FASTRTPS_DEFAULT_PROFILES_FILE=config/fastdds_large_clouds.xml'
+        )
+
+    def _create(self, overrides: QoSOverridingOptions | None = None) -> None:
+        self._subscription = self._node.create_subscription(
+            PointCloud2,
+            self._unresolved_topic,
+            self._receive,
+            self._profile,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible),
+            qos_overriding_options=overrides,
+        )
+
+    def _receive(self, cloud: PointCloud2, info: dict[str, Any]) -> None:
+        if not self._offered:
+            self._look_at_publishers()
+        n_lost = self._gaps.note(info.get('publication_sequence_number'), self.n_publishers)
+        if n_lost and self._look_at_publishers():
+            n_lost = 0  # the numbers are those of another publisher
+        if self._reliability == ReliabilityPolicy.BEST_EFFORT:
+            self._check_size(len(cloud.data))
+        # Both are stamps of the system clock; 0 where the middleware gives none.
+        now = time.time_ns()
+        wait = max(0.0, 1e-9 * (now - (info.get('received_timestamp') or now)))
+        self._callback(cloud, wait, n_lost)
+
+    def _check_size(self, size: int) -> None:
+        if size > LARGE_CLOUD:
+            self._large_size = size
+            self._node.get_logger().warning(f'on {self.topic}, {self.fault}', once=True)
+
+    def _on_incompatible(self, _event: object) -> None:
+        if self._is_pinned:
+            self._node.get_logger().error(
+                f'a publisher of {self.topic} does not offer what qos_overrides asks for '
+                f'({self.qos_words}): nothing will arrive from it'
+            )
+        self._review_soon.trigger()
+
+    def _look_at_publishers(self) -> bool:
+        """Take note of the publishers; return whether they are others than at the last look."""
+        before, self._offered = (
+            self._offered.keys(),
+            {
+                bytes(entry.endpoint_gid): entry.qos_profile.reliability
+                for entry in self._node.get_publishers_info_by_topic(self.topic)
+            },
+        )
+        is_changed = self._offered.keys() != before
+        if is_changed:
+            self._gaps.reset()
+        return is_changed
+
+    def _wanted_reliability(self) -> ReliabilityPolicy:
+        """Return what BEST_AVAILABLE is for the publishers of the last look."""
+        is_any = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
+        return ReliabilityPolicy.BEST_EFFORT if is_any else ReliabilityPolicy.RELIABLE
+
+    def _review(self) -> None:
+        self._look_at_publishers()
+        wanted = self._wanted_reliability()
+        if self._is_pinned or wanted == self._reliability:
+            return
+        self._reliability, self._large_size = wanted, 0
+        self._node.destroy_subscription(self._subscription)
+        self._create()
+        self._node.get_logger().info(
+            f'subscribing {self.qos_words} to {self.topic}, as its publishers offer'
+        )
 
 
 class StampWatch:
@@ -111,85 +243,3 @@ class TimeJumps:
             f'time jumped back by {seconds:.1f} s: what earlier clouds taught is forgotten',
             **THROTTLED,
         )
-
-
-def require_tf2(frame: FrameConfig) -> Any:
-    """Return the module tf2_ros; raise a MissingDependencyError if it is not installed."""
-    asked, instead = 'frame.level = tf', 'frame.level = sensor with sensor.roll and sensor.pitch'
-    if frame.level != 'tf':
-        asked = f'frame.sensor = {frame.sensor}'
-        instead = 'frame.sensor = none with sensor.origin_x, origin_y and origin_z'
-    try:
-        return importlib.import_module('tf2_ros')
-    except ImportError as error:
-        raise MissingDependencyError(
-            f'{asked}: needs tf2_ros, which cannot be imported ({error}): sudo apt '
-            f'install ros-jazzy-tf2-ros-py, or use {instead}'
-        ) from error
-
-
-def tilt_of(rotation: Quaternion) -> tuple[float, float]:
-    """Return roll and pitch [rad] of a sensor frame that `rotation` turns into a level one."""
-    x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
-    square = x * x + y * y + z * z + w * w
-    if not abs(square - 1.0) < 1e-3:
-        given = f'({x:g}, {y:g}, {z:g}, {w:g}) of length {square**0.5:g}'
-        raise PointCloudError(f'quaternion {given}: must be 1')
-    # Third row of its matrix: the level frame's z axis in the sensor frame.
-    up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), square - 2.0 * (x * x + y * y)])
-    return angles_of(up / np.linalg.norm(up))
-
-
-def is_tf_used(frame: FrameConfig) -> bool:
-    """Return whether the tilt or the place of the sensor comes from TF."""
-    return frame.level == 'tf' or frame.sensor != NO_FRAME
-
-
-class TfListener:
-    """Listens to TF in the executor of `node`, for what `frame` asks."""
-
-    def __init__(self, node: Node, frame: FrameConfig) -> None:
-        self._tf2_ros = require_tf2(frame)
-        # Without the node: given one, the buffer clears itself at jumps of the node's clock,
-        # and in some releases raises an error there that ends the executor. See `time_jumped`.
-        self._buffer = self._tf2_ros.Buffer()
-        self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
-
-    def look_up(
-        self, header: Header, frame: FrameConfig
-    ) -> tuple[tuple[float, float] | None, tuple[float, float, float] | None]:
-        """Return tilt [rad] and place [m] of the sensor in a cloud; None for what is not asked.
-
-        Raises a PointCloudError if TF does not have them.
-        """
-        tilt, origin, own = None, None, header.frame_id
-        if frame.level == 'tf':
-            way = f'from its frame {own!r} to frame.base = {frame.base!r}'
-            tilt = tilt_of(self._transform(frame.base, own, header, way).rotation)
-        if frame.sensor != NO_FRAME:
-            way = f'from frame.sensor = {frame.sensor!r} to its frame {own!r}'
-            place = self._transform(own, frame.sensor, header, way).translation
-            origin = place.x, place.y, place.z
-            if not np.isfinite(origin).all():
-                raise PointCloudError(f'transform {way}: its translation is {origin}')
-        return tilt, origin
-
-    def _transform(self, target: str, source: str, header: Header, way: str) -> Any:
-        try:
-            try:
-                stamp = Time.from_msg(header.stamp)
-                return self._buffer.lookup_transform(target, source, stamp).transform
-            except self._tf2_ros.ExtrapolationException:
-                # The newest: a sensor is fixed to its vehicle, and waiting would delay the cloud.
-                return self._buffer.lookup_transform(target, source, Time()).transform
-        except self._tf2_ros.TransformException as error:
-            raise PointCloudError(f'no transform {way}: {error}') from error
-
-    def time_jumped(self, seconds: float) -> None:
-        """Forget all transforms after a long jump back."""
-        if seconds > TF_JUMP:
-            self._buffer.clear()
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._listener.unregister()

@@ -22,12 +22,12 @@ from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.pipeline.points import single_precision
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.point_cloud2 import read_xyz
-from gp_ground_seg.ros import lifecycle
+from gp_ground_seg.ros import start_stop
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
-from gp_ground_seg.ros.input import THROTTLED, TfListener, TimeJumps, is_tf_used, require_tf2
+from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, TimeJumps
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
-from gp_ground_seg.ros.subscription import CloudSubscription
+from gp_ground_seg.ros.transforms import TfListener, is_tf_used, require_tf2
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader
 
 
@@ -60,9 +60,9 @@ class GroundSegmentationNode(ConfiguredNode):
     def _start(self) -> None:
         logger = self.get_logger()
         logger.info(describe(self.config, self.get_fully_qualified_name()))
-        with lifecycle.start_errors():
+        with start_stop.start_errors():
             self._outputs = OutputPublishers(self)
-            self._input = CloudSubscription(self, 'points', self.is_given, self._on_cloud)
+            self._input = CloudSubscription(self, 'points', self._on_cloud)
         self._follow_tf(self.config)
         self._time_jumps = TimeJumps(self, self._on_time_jump)
         self._diagnostics = Diagnostics(self, self._state, self.config.diagnostics)
@@ -192,11 +192,11 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the node until a signal or a shutdown; return 0, or 2 for an error at start."""
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None
-    with lifecycle.stop_on_signals() as stop:
+    with start_stop.stop_on_signals() as stop:
         try:
             # Both outputs at once are more than stock Fast DDS sends without loss.
-            with lifecycle.large_cloud_transport():
-                lifecycle.initialize(words)
+            with start_stop.large_cloud_transport():
+                start_stop.initialize(words)
                 node = GroundSegmentationNode()
             executor = SingleThreadedExecutor()
             executor.add_node(node)

@@ -21,7 +21,7 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.colours import length_scale_colours
 from gp_ground_seg.data.point_cloud2 import append_columns, read_xyz
 from gp_ground_seg.ros.ground_model import ground_model_cloud
-from gp_ground_seg.ros.input import cloud_profile, message_data, select_points
+from gp_ground_seg.ros.messages import cloud_profile, message_data, select_points
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""

@@ -21,7 +21,7 @@ from gp_ground_seg.core.errors import ConfigError, DataError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec, ParameterValue
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
-from gp_ground_seg.ros.lifecycle import start_errors
+from gp_ground_seg.ros.start_stop import start_errors
 
 REMOTE_TIMEOUT = 5.0  # of a node that is to be set [s]
 _OWN_NAMES = frozenset(spec.name for spec in parameter_specs())
@@ -121,10 +121,6 @@ class ConfiguredNode(Node):  # type: ignore[misc]
     def config(self) -> Config:
         """Parameters in use."""
         return self._config
-
-    def is_given(self, name: str) -> bool:
-        """Return whether a parameter file or ``-p`` gave the parameter `name`."""
-        return name in self._given_names
 
     def check_config(self, config: Config) -> None:
         """Raise a GroundSegError if `config` cannot be used here; change nothing."""

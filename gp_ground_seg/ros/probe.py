@@ -26,7 +26,7 @@ import numpy as np
 from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.point_cloud2 import CloudMessage, encode_cloud, stamp_of
-from gp_ground_seg.ros.lifecycle import (
+from gp_ground_seg.ros.start_stop import (
     Session,
     large_cloud_transport,
     own_code,
@@ -190,7 +190,7 @@ class Probe:
     ) -> None:
         from sensor_msgs.msg import PointCloud2
 
-        from gp_ground_seg.ros.input import cloud_profile
+        from gp_ground_seg.ros.messages import cloud_profile
 
         self.n_stray = 0
         self._session = session

@@ -14,7 +14,7 @@ from gp_ground_seg.core.backend import Backend
 from gp_ground_seg.core.jit import code_folder, is_code_kept
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.segmenter import warm_up
-from gp_ground_seg.ros.lifecycle import own_code
+from gp_ground_seg.ros.start_stop import own_code
 
 FOLLOWS = 'segmenting with numpy until the compiled code is there; to compile takes a minute'
 CHANGED = 'segmenting with numba now'

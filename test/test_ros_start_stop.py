@@ -20,7 +20,7 @@ from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
-from gp_ground_seg.ros.lifecycle import ROS_WHEELS, ros_session
+from gp_ground_seg.ros.start_stop import ROS_WHEELS, ros_session
 
 FIXED = (*IN_NAMESPACE, '-p', 'learning.mode:=fixed')
 SOON = 4.0
@@ -302,7 +302,7 @@ def test_sigint_that_was_ignored_at_the_start_ends_the_player_and_the_node(tmp_p
 
 UNDISTURBED = """
 import signal
-from gp_ground_seg.ros.lifecycle import stop_on_signals
+from gp_ground_seg.ros.start_stop import stop_on_signals
 before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
 with stop_on_signals() as outer:
     with stop_on_signals() as stop:
