@@ -10,7 +10,6 @@ PACKAGE = 'gp_ground_seg'
 BAGS = ['rosbags>=0.11.9']
 FORMATS = ['python-neo-lzf>=0.3']
 PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
-TUNE = ['optuna>=4.0']
 SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']  # 21 MB; s3fs, for s3://, is 36 MB more
 VISER = ['viser>=1.1']
 VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]
@@ -27,7 +26,6 @@ DOCS = ['myst-parser>=3', 'sphinx>=7.2', 'sphinx-rtd-theme>=2']
 DEV = [
     *TEST,
     *FORMATS,
-    *TUNE,
     *SCALE,
     *VIEW,
     'argcomplete>=3.1',
@@ -85,7 +83,7 @@ setup(
         'bags': BAGS,
         'formats': FORMATS,
         'plot': PLOT,
-        'tune': PLOT + TUNE + VISER,
+        'tune': VISER,
         'scale': SCALE,
         'complete': ['argcomplete>=3.1'],
         'ros': ROS + BAGS + PLOT,

@@ -21,7 +21,7 @@ from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring import metrics
 from gp_ground_seg.lab.scoring.evaluate import OurMethod
 from gp_ground_seg.lab.scoring.metrics import ClassCount, Confusion, height_error
-from gp_ground_seg.lab.scoring.patchworkpp import PatchworkMethod, PatchworkppMethod
+from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 
 
 def evaluate(root, *methods, **options):
@@ -198,47 +198,6 @@ def test_the_peer_has_the_height_of_its_sensor():
         for height in (None, published, 0.8)
     ]
     assert labels[0] == labels[1] != labels[2]
-
-
-def test_patchwork_is_that_of_its_package_and_has_the_height_of_its_sensor():
-    scan = load_simulated(SimulatedFrame('hdl-64e', 'urban', 0, 0.0))
-    parameters = pypatchworkpp.PatchworkParams()
-    labels = {}
-    for height in (None, 1.73, 0.9):
-        if height is not None:
-            parameters.sensor_height, parameters.ATAT_ON = height, False
-        alone = pypatchworkpp.patchwork(parameters)
-        alone.estimateGround(scan.points)
-        method = PatchworkMethod(height)
-        method.run(scan.points)
-        found = method.result()
-        assert np.isnan(found.ground_z).all() and found.ground_z.shape == (len(scan.points),)
-        np.testing.assert_array_equal(
-            np.flatnonzero(found.label == Label.GROUND), np.sort(alone.getGroundIndices())
-        )
-        labels[height] = found.label
-    assert np.mean((labels[1.73] == Label.GROUND) == scan.is_ground) > 0.5
-    assert (labels[1.73] != labels[0.9]).any()
-    of_scenes = peer_of('hdl-64e-vehicle', 'patchwork')
-    vehicle = load_simulated(SimulatedFrame('hdl-64e-vehicle', 'urban', 0, 0.0))
-    of_scenes.run(vehicle.points)
-    assert np.mean(of_scenes.result().label == labels[1.73]) > 0.99
-
-
-def test_patchwork_is_a_peer_of_commands(root, tmp_path, capfd):
-    path = tmp_path / 'a.json'
-    assert run('evaluate', root, '--peer', 'patchwork', '--json', path) == 0
-    said = capfd.readouterr().out
-    assert 'Patchwork IoU' in said and 'Patchwork++' not in said
-    document = json.loads(path.read_text())
-    assert 0.0 < document['groundgrid'][-1]['patchwork_iou'] < 1.0
-    assert document['heights'][-1]['patchwork_rmse'] is None  # It has no surface.
-    words = ['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', 1, '--peer', 'patchwork']
-    assert run('experiment', 'scenes', *words) == 0
-    assert 'its: of Patchwork, which' in capfd.readouterr().out.replace('\n  ', ' ')
-    words = ['--frames', 2, '--threads', 1, '--peer', 'patchwork']
-    assert run('bench', root, *words) == 0
-    assert '/ Patchwork ' in capfd.readouterr().out
 
 
 def test_the_peer_is_told_where_the_sensor_is():

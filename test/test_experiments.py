@@ -195,7 +195,7 @@ def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):
 def test_scene_scores_follow_their_definitions():
     config = Config().replace(**{'grid.n_segments': 120})
     frames = variants.simulated_frames(['vlp-16'], ['kerb'], 2, (6.0,))
-    report = variants.score_simulated(frames, variants.scene_tables, config, peer='patchworkpp')
+    report = variants.score_simulated(frames, variants.scene_tables, config, with_peer=True)
     (row,) = report.tables['scenes'].json()
     total, its_total = Confusion(), Confusion()
     errors, its_errors = [], []
@@ -238,7 +238,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
 
     monkeypatch.setattr(variants, 'score_variants', refuse_hedges)
     frames = variants.simulated_frames([sensor], [scene, 'hedge'], 1, (0.0,))
-    report = variants.score_simulated(frames, lost.lost_tables, FIXED, peer='patchworkpp')
+    report = variants.score_simulated(frames, lost.lost_tables, FIXED, with_peer=True)
     (row,), (shares,) = (report.tables[name].json() for name in ('objects', 'vehicles'))
     made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
     x, y, z, _ = made.points.T.astype(float)
@@ -269,7 +269,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
     assert notes[0] == 'refused: hedge: z does not point up'
     assert notes[1].startswith(f'objects lost: {sensor} {scene} {row["lost_vehicles"]} of')
     with pytest.raises(PointCloudError, match='refused: hedge'):
-        variants.score_simulated(frames[1:], lost.lost_tables, FIXED, peer=None)
+        variants.score_simulated(frames[1:], lost.lost_tables, FIXED, with_peer=False)
 
 
 def test_behind_is_said():
@@ -337,7 +337,7 @@ def test_poses_of_simulated_scans(monkeypatch):
 def test_in_traffic_no_vehicle_is_lost(sensor):
     """Cars hide the ground near the sensor; docs/accuracy.md has the table."""
     frames = variants.simulated_frames([sensor], ['traffic_jam', 'car_park'], 1, (0.0,))
-    report = variants.score_simulated(frames, lost.lost_tables, Config(), peer=None)
+    report = variants.score_simulated(frames, lost.lost_tables, Config(), with_peer=False)
     for row in report.tables['objects'].json():
         assert row['vehicles'] > 20 and row['lost_vehicles'] == 0, row
     for row in report.tables['vehicles'].json():

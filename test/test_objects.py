@@ -1,6 +1,5 @@
-"""Objects lost: counts against plain loops, local ground, boxes and their files, the command."""
+"""Objects lost: counts against plain loops, local ground, the command."""
 
-import contextlib
 import itertools
 import json
 import math
@@ -9,31 +8,28 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cli_runner import error_line, run
+from cli_runner import run
 from evaluation_samples import HeightRule, street, write_frame
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
-from gp_ground_seg.core.errors import DataError, PointCloudError
-from gp_ground_seg.data.boxes import Boxes, read_boxes
+from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
 from gp_ground_seg.lab.scoring.evaluate import load_kitti, score_methods
 from gp_ground_seg.lab.scoring.metrics import GROUND_CLASSES
 from gp_ground_seg.lab.scoring.objects import (
     BAND_EDGES,
+    CLASSES,
     MIN_HEIGHT,
     MIN_RETURNS,
     ObjectCount,
     Objects,
-    boxed_objects,
     count_objects,
     labelled_objects,
     local_ground,
     pool_objects,
 )
-
-CLASSES = ('vehicle', 'person')
 
 
 def returns(n, x, z=1.0, n_ground=0, kind=0, number=1):
@@ -46,9 +42,7 @@ def count(rows, ground_z=0.0):
     points = np.column_stack([x, np.zeros(len(x)), z])
     label = np.where(is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     level = np.full(len(x), ground_z)
-    return count_objects(
-        points, label, Objects(CLASSES, kind.astype(int), number.astype(int), level)
-    )
+    return count_objects(points, label, Objects(kind.astype(int), number.astype(int), level))
 
 
 def of(counts, name, band):
@@ -90,7 +84,7 @@ def test_numbers_restart_in_each_class_and_0_is_no_object():
 
 def test_unknown_is_not_ground_and_shares_of_nothing_are_nan():
     points, ones = np.full((10, 3), 5.0), np.ones(10, dtype=int)
-    objects = Objects(CLASSES, 0 * ones, ones, 0.0 * ones)
+    objects = Objects(0 * ones, ones, 0.0 * ones)
     counts = count_objects(points, np.full(10, Label.UNKNOWN, dtype=np.uint8), objects)
     assert of(counts, 'vehicle', 0) == (10, 0, 1, 0)
     assert counts['vehicle'][0].share_ground == 0.0
@@ -126,7 +120,7 @@ def counted_by_loops(points, label, objects):
             ), unknown.count((kind, band)))
             for band in range(4)
         )
-        for kind, name in enumerate(objects.classes)
+        for kind, name in enumerate(CLASSES)
         if any(k == kind for k, _ in [*share, *unknown])
     }  # fmt: skip
 
@@ -142,7 +136,7 @@ def drawn_scan(seed, n):
     label = rng.integers(0, 3, n).astype(np.uint8)
     ground_z = np.where(rng.random(n) < 0.1, np.nan, 0.0)
     kind, number = rng.integers(-1, 2, n), rng.integers(0, 4, n)
-    return points, label, Objects(CLASSES, kind, number, ground_z)
+    return points, label, Objects(kind, number, ground_z)
 
 
 @given(st.integers(0, 2**32), st.integers(0, 200))
@@ -151,16 +145,15 @@ def test_counts_are_those_of_plain_loops_in_any_order(seed, n):
     expected = counted_by_loops(points, label, objects)
     assert count_objects(points, label, objects) == expected
     order = np.random.default_rng(seed).permutation(n)
-    mixed = Objects(CLASSES, *(getattr(objects, name)[order]
-                               for name in ('class_of', 'object_id', 'ground_z')))  # fmt: skip
+    mixed = Objects(objects.class_of[order], objects.object_id[order], objects.ground_z[order])
     assert count_objects(points[order], label[order], mixed) == expected
 
 
 def test_counts_of_scans_are_summed_by_class():
     one = count(returns(10, 5.0, n_ground=10))
     other = count(returns(12, 5.0, kind=1) + returns(12, 15.0))
-    pooled = pool_objects([other, one, {}, {'tree': (ObjectCount(1),) * 4}])
-    assert [*pooled] == ['vehicle', 'person', 'tree']
+    pooled = pool_objects([other, one, {}])
+    assert [*pooled] == ['vehicle', 'person']
     assert of(pooled, 'vehicle', 0) == (10, 10, 1, 1)
     assert of(pooled, 'vehicle', 1) == (12, 0, 1, 0)
     assert of(pooled, 'person', 0) == (12, 0, 1, 0)
@@ -227,7 +220,7 @@ def test_the_local_ground_does_not_depend_on_the_order(seed):
     np.testing.assert_array_equal(first[order], again)
 
 
-# Objects of labels and of boxes.
+# Objects of labels.
 
 
 def test_objects_of_labels_are_instances_by_group():
@@ -236,123 +229,11 @@ def test_objects_of_labels_are_instances_by_group():
     entries = np.array([number | 5 << 16 for number in known] + [10, 30], dtype=np.uint32)
     points, nothing = np.zeros((len(entries), 3)), np.zeros(len(entries), dtype=bool)
     found = labelled_objects(points, entries, nothing)
-    assert found.classes == ('vehicle', 'person', 'cyclist')
+    assert [*CLASSES] == ['vehicle', 'person', 'cyclist']
     assert found.class_of.tolist() == [*known.values(), 0, 1]
     assert found.object_id[-2:].tolist() == [0, 0]
     assert len(set(found.object_id[:-2].tolist())) == len(known)
     assert np.isnan(found.ground_z).all()
-
-
-def turned(yaw, pitch=0.0):
-    """Axes of a box, as rows."""
-    c, s, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
-    return np.array([[cp, 0, -sp], [0, 1, 0], [sp, 0, cp]]) @ [[c, s, 0], [-s, c, 0], [0, 0, 1]]
-
-
-def test_objects_of_boxes_are_what_is_in_them_over_their_bottom():
-    car = turned(math.radians(60.0), 0.1)
-    boxes = Boxes(
-        ['Car', 'dog', 'Pedestrian'],
-        np.array([[10.0, 5.0, 1.0], [-5.0, 0.0, 0.0], [10.0, 5.0, 1.0]]),
-        np.array([[4.0, 2.0, 1.6], [1.0, 1.0, 1.0], [0.5, 0.5, 1.5]]),
-        np.array([car, np.eye(3), np.eye(3)]),
-    )
-    own = np.array([[1.99, 0.99, 0.79], [2.01, 0.0, 0.0], [0.0, 1.01, 0.0], [0.0, 0.0, -0.81]])
-    points = np.concatenate([own @ car + boxes.center[0], [[10.0, 5.0, 1.5], [-5.5, 0.0, 0.2]]])
-    found = boxed_objects(points, boxes)
-    assert found.classes == ('vehicle', 'person', 'dog')
-    assert found.class_of.tolist() == [0, -1, -1, -1, 1, 2]  # of two boxes the smaller
-    assert found.object_id.tolist() == [1, 0, 0, 0, 3, 2]
-    height = points[:, 2] - found.ground_z
-    assert height[[0, 4, 5]] == pytest.approx([1.59, 1.25, 0.7])
-    assert np.isnan(height[1:4]).all()
-    # Where the ground is known the bottoms do not count.
-    xy = lattice(-8.0, 12.0)
-    ground = np.column_stack([xy, np.full(len(xy), -0.9)])
-    is_ground = np.arange(len(ground) + 6) >= 6
-    found = boxed_objects(np.concatenate([points, ground]), boxes, is_ground)
-    assert found.ground_z[[0, 4, 5]].tolist() == [-0.9] * 3
-    nothing = boxed_objects(points, Boxes([], *(np.zeros((0, *n)) for n in ((3,), (3,), (3, 3)))))
-    assert (nothing.class_of == -1).all() and count_objects(points, np.ones(6), nothing) == {}
-
-
-# Files of boxes.
-
-
-def box_arrays(**changes):
-    arrays = {
-        'box_class': np.array(['car', 'dog, a']),
-        'box_center': np.array([[10.0, 5, 1], [0, -2, 0]]),
-        'box_size': np.array([[4.0, 2, 1.6], [1, 1, 1]]),
-        'box_rotation': np.array([turned(math.radians(30.0)), np.eye(3)]),
-    }
-    return arrays | changes
-
-
-def test_a_file_holds_boxes_and_may_hold_its_scan(tmp_path):
-    np.savez(tmp_path / 'a.npz', xyzi=np.zeros((5, 4)), **box_arrays())
-    found = read_boxes(tmp_path / 'a.npz')
-    assert found.names == ['car', 'dog, a']
-    for own, other in zip(found[1:], list(box_arrays().values())[1:], strict=True):
-        np.testing.assert_array_equal(own, other)
-    np.savez(tmp_path / 'none.npz', **{name: own[:0] for name, own in box_arrays().items()})
-    none = read_boxes(tmp_path / 'none.npz')
-    assert [len(part) for part in none] == [0] * 4 and none.rotation.shape == (0, 3, 3)
-
-
-@pytest.mark.parametrize(
-    ('changes', 'message'),
-    [
-        ({'box_size': np.ones((2, 2))}, r'box_size of shape \(2, 2\): must be \(2, 3\)'),
-        ({'box_center': np.ones((3, 3))}, r'box_center of shape \(3, 3\): must be \(2, 3\)'),
-        ({'box_rotation': np.ones((2, 4))}, r'box_rotation of shape .*must be \(2, 3, 3\)'),
-        ({'box_class': np.array('car')}, r'box_class of shape \(\)'),
-        ({'box_size': -np.ones((2, 3))}, r'box 1 \(car\): size -1, -1, -1: must be above 0'),
-        ({'box_center': np.full((2, 3), np.nan)}, r'box 1 \(car\): a number is not finite'),
-        ({'box_rotation': 2.0 * np.array([np.eye(3)] * 2)}, 'no orthonormal axes'),
-        ({'box_center': np.array([['a'] * 3] * 2)}, 'could not convert'),
-        ({'box_class': np.array([None, None])}, 'allow_pickle'),
-    ],
-)
-def test_arrays_that_are_no_boxes_are_refused(tmp_path, changes, message):
-    np.savez(tmp_path / 'a.npz', **box_arrays(**changes))
-    with pytest.raises(DataError, match=message) as caught:
-        read_boxes(tmp_path / 'a.npz')
-    assert str(caught.value).startswith(f'{tmp_path / "a.npz"}: ')
-    assert '\n' not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ('name', 'content', 'message'),
-    [
-        ('a.npz', b'PK\x03\x04nothing', r'a\.npz: '),
-        ('a.csv', b'class,x,y', 'not an .npz file'),
-        ('b.npz', None, 'No such file'),
-    ],
-)
-def test_files_that_hold_no_boxes_are_refused(tmp_path, name, content, message):
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(DataError, match=message) as caught:
-        read_boxes(tmp_path / name)
-    assert '\n' not in str(caught.value)
-
-
-def test_an_archive_that_is_damaged_or_has_no_boxes_is_refused(tmp_path):
-    path = tmp_path / 'a.npz'
-    np.savez_compressed(path, **box_arrays())
-    data = path.read_bytes()
-    for end in range(0, len(data) - 1, 97):
-        path.write_bytes(data[:end])
-        with pytest.raises(DataError):
-            read_boxes(path)
-    for at in range(len(data)):
-        path.write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
-        with contextlib.suppress(DataError):  # nothing else; some bytes mean nothing
-            read_boxes(path)
-    np.savez(tmp_path / 'a.npz', points=np.zeros(3))
-    with pytest.raises(DataError, match='no array box_class, box_center, box_size, box_rotation'):
-        read_boxes(tmp_path / 'a.npz')
 
 
 # The command.
@@ -372,23 +253,11 @@ def street_with_cars(seed):
     return np.concatenate(parts).astype('<f4'), np.concatenate(entries)
 
 
-def write_cars(root, *sequences, with_labels=True):
+def write_cars(root, *sequences):
     for k, name in enumerate(sequences):
         points, entries = street_with_cars(k)
-        write_frame(root, name, k, points, entries if with_labels else None)
+        write_frame(root, name, k, points, entries)
     return root
-
-
-def write_boxes(path, names=('Car', 'Van')):
-    """Boxes of the two cars, down to the road."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(
-        path,
-        box_class=names,
-        box_center=[(x, y, -0.96) for x, y in CARS],
-        box_size=[(4.1, 1.9, 1.54)] * len(CARS),
-        box_rotation=[np.eye(3)] * len(CARS),
-    )
 
 
 def evaluated(root, folder, *words):
@@ -461,79 +330,6 @@ def test_where_nothing_stands_or_nothing_has_a_number_it_is_said(tmp_path, capsy
     write_frame(tmp_path / 'c', '00', 0, points, entries)
     assert row_of(evaluated(tmp_path / 'c', tmp_path), 'vehicle', 'all')['share_ground'] is None
     assert '600 returns on objects do not count: no labels of the g' in capsys.readouterr().out
-
-
-def test_boxes_count_without_labels_in_folders_and_files(tmp_path, capsys):
-    root = write_cars(tmp_path / 'kitti', '00', '08', with_labels=False)
-    for k, name in enumerate(('00', '08')):
-        write_boxes(tmp_path / 'boxes' / name / f'{k:06d}.npz')
-    document = evaluated(root, tmp_path, '--boxes', tmp_path / 'boxes', '--peer', 'patchworkpp')
-    assert capsys.readouterr().out.startswith('IoU not available, no labels of the ground  (2 fr')
-    row = row_of(document, 'vehicle', 'all')
-    # Down to 0.3 m over the bottom of the boxes, that is 1.23 of 1.4 m.
-    assert row['returns'] == pytest.approx(1200 * 1.23 / 1.4, rel=0.05)
-    assert (row['objects'], row['lost'], row['patchworkpp_lost']) == (4, 0, 0)
-    assert 'groundgrid' not in document and 'rings' not in document
-    # The same scans, each by itself, and as a folder without sequences.
-    (tmp_path / 'flat').mkdir()
-    shares = []
-    for k, name in enumerate(('00', '08')):
-        scan = root / 'sequences' / name / 'velodyne' / f'{k:06d}.bin'
-        boxes = tmp_path / 'boxes' / name / f'{k:06d}.npz'
-        alone = evaluated(scan, tmp_path, '--boxes', boxes)
-        shares.append(row_of(alone, 'vehicle', 'all'))
-        (tmp_path / 'flat' / scan.name).write_bytes(scan.read_bytes())
-        (tmp_path / 'flat' / boxes.name).write_bytes(boxes.read_bytes())
-    assert sum(own['returns'] for own in shares) == row['returns']
-    flat = evaluated(tmp_path / 'flat', tmp_path, '--boxes', tmp_path / 'flat')
-    assert row_of(flat, 'vehicle', 'all')['returns'] == row['returns']
-
-
-def test_boxes_beside_labels_take_the_ground_from_these(tmp_path, capsys):
-    root = write_cars(tmp_path / 'kitti', '00')
-    write_boxes(tmp_path / '000000.npz', names=('robot', 'Van'))
-    document = evaluated(root, tmp_path, '--boxes', tmp_path / '000000.npz')
-    assert document['groundgrid'][-1]['iou'] > 0.9
-    assert [row['class'] for row in document['objects'][::5]] == ['vehicle', 'robot']
-    labelled = row_of(evaluated(root, tmp_path), 'vehicle', 'all')
-    both = [row_of(document, name, 'all') for name in ('vehicle', 'robot')]
-    assert sum(row['returns'] for row in both) == labelled['returns']
-    # Frames without labels among them: none of the labels count.
-    write_frame(root, '00', 1, street_with_cars(1)[0])
-    write_boxes(tmp_path / 'boxes' / '000000.npz')
-    write_boxes(tmp_path / 'boxes' / '000001.npz')
-    capsys.readouterr()
-    assert 'groundgrid' not in evaluated(root, tmp_path, '--boxes', tmp_path / 'boxes')
-    assert 'note: labels left out: 1 of 2 frames have none' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ('words', 'message'),
-    [
-        ('ROOT --boxes BOXES/none', 'BOXES/none: no such file or folder'),
-        ('ROOT --boxes BOXES', 'BOXES/08/000001.npz: no such file'),
-        ('ROOT --boxes BOXES/00/000000.npz', 'boxes of one scan, 000000; give a folder with a fi'),
-        (
-            'SCAN --boxes BOXES/other.npz',
-            'other.npz: boxes of one scan, other; give those of 00',
-        ),
-        ('SCAN --boxes BOXES/00/000000.npz --worst 3', '--worst: needs labels of the ground'),
-        ('BOXES --boxes BOXES', 'objects are counted in .bin scans, none here'),
-        ('SCAN', 'no sequences/*/velodyne folder below it'),
-        ('SCAN --boxes BOXES/00/000000.npz --sequences 00', 'no sequences/*/velodyne folder'),
-    ],
-)
-def test_boxes_that_do_not_fit_are_one_line(tmp_path, monkeypatch, capsys, words, message):
-    monkeypatch.chdir(tmp_path)
-    root = write_cars(tmp_path / 'kitti', '00', '08', with_labels=False)
-    for name in ('00/000000.npz', 'other.npz'):
-        write_boxes(tmp_path / 'boxes' / name)
-    scan = root / 'sequences/00/velodyne/000000.bin'
-    before = sorted(tmp_path.rglob('*'))
-    words = words.replace('ROOT', str(root)).replace('SCAN', str(scan)).replace('BOXES', 'boxes')
-    assert run('evaluate', *words.split(), '--json', tmp_path / 'a.json') == 2
-    assert message.replace('BOXES', 'boxes') in error_line(capsys)
-    assert sorted(tmp_path.rglob('*')) == before
 
 
 def test_objects_of_the_frames_at_hand(kitti):

@@ -81,16 +81,12 @@ def make_samples(folder):
     write_ros2_bag(folder / 'drive.db3')
     write_ros1_bag(folder / 'drive.bag')
     write_ros2_bag(folder / 'drive')
-    boxes = {'box_class': ['car'], 'box_center': [[5.0, 0.0, 0.0]], 'box_size': [[4.0, 2.0, 2.0]]}
-    np.savez_compressed(folder / 'scan.npz', **boxes, box_rotation=[np.eye(3)])
-    boxed = ['evaluate', folder / 'scan.bin', '--boxes', folder / 'scan.npz']
     out = ['-o', folder / 'out.mcap']
     robot = folder / 'robot.yaml'
     samples = {
         'scan': (folder / 'scan.bin', ['segment', folder / 'scan.bin']),
         'scan of a root': (root / 'velodyne' / '000000.bin', ['evaluate', folder / 'root']),
         'labels': (root / 'labels' / '000000.label', ['evaluate', folder / 'root']),
-        'boxes': (folder / 'scan.npz', boxed),
         'parameters': (robot, ['config', 'check', robot]),
         'parameters used': (robot, ['segment', folder / 'scan.bin', '--config', robot]),
     }

@@ -18,15 +18,15 @@ from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import list_sequences
 from gp_ground_seg.lab.scoring import report
 from gp_ground_seg.lab.scoring.benchmark import BenchFrame, bench_cases, bench_document, run_cases
-from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, TITLES
-from gp_ground_seg.lab.scoring.patchworkpp import PEERS
+from gp_ground_seg.lab.scoring.evaluate import TITLES
+from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import Cell, Column, Table
 
 DESCRIPTION = """\
 Measure the time of the segmentation on your data, by stage: with theta fixed and learned in
-every frame, on one thread and on all. If pypatchworkpp is installed, Patchwork++ (or --peer)
-runs on each frame just before or after ours, so the ratio of the two times holds although
-the speed of the machine drifts. Reading is left out. Run nothing else meanwhile.
+every frame, on one thread and on all. If pypatchworkpp is installed, Patchwork++ runs on
+each frame just before or after ours, so the ratio of the two times holds although the speed
+of the machine drifts. Reading is left out. Run nothing else meanwhile.
 
 DATA is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
 """
@@ -54,8 +54,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
         ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
-        ('--peer', 'method to compare with (default: %(default)s)',
-         {'choices': PEERS, 'default': PATCHWORKPP}),
         ('--numpy', 'time learning without compiled code as well', options.FLAG),
         *options.SCAN_LAYOUT,
         options.TO_JSON,
@@ -96,15 +94,14 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     environment = report.describe_environment('pypatchworkpp')
     threads = _threads(arguments.threads, config, environment['n_cores'])
     try:
-        PEERS[arguments.peer]()
-        baseline = arguments.peer
+        baseline = PatchworkppMethod().name
     except MissingDependencyError as error:
         options.note(f'no ratios without the baseline: {error}')
         baseline = None
     measured = run_cases(
         frames_from_options(arguments, arguments.frames),
         bench_cases(config, threads, with_numpy=arguments.numpy),
-        PEERS[baseline] if baseline else None,
+        PatchworkppMethod if baseline else None,
         arguments.passes,
         progress=options.progress('bench'),
     )

@@ -6,26 +6,22 @@ import argparse
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
-from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.data.boxes import find_boxes
 from gp_ground_seg.data.files import as_path
-from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.data.semantic_kitti import Frame, boxed_frames, labelled_frames
+from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
 from gp_ground_seg.lab.experiments.variants import make_report
 from gp_ground_seg.lab.scoring import evaluate as methods
 from gp_ground_seg.lab.scoring import metrics
 from gp_ground_seg.lab.scoring import report as tables
-from gp_ground_seg.lab.scoring.evaluate import KnownScan, MethodScore
+from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, MethodScore
 from gp_ground_seg.lab.scoring.intervals import INTERVAL, Sums, interval_note, interval_text
 from gp_ground_seg.lab.scoring.object_table import object_table
-from gp_ground_seg.lab.scoring.patchworkpp import PEERS
+from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import Cell, Column, Table, percent
 
 DESCRIPTION = """\
@@ -33,14 +29,9 @@ Segment labelled frames and score the labels in both conventions of the field: p
 recall, F1, accuracy, IoU, time per frame. Count vehicles, persons and cyclists that are
 lost: the share of their returns from 0.3 m above the local ground that is labelled ground,
 and the objects with more than half of these returns labelled ground. Objects are the
-instances of the labels (their upper 16 bits), or boxes, with a file for each scan:
+instances of the labels (their upper 16 bits).
 
-  000007.npz   box_class (K,), box_center (K, 3), box_size (K, 3), box_rotation (K, 3, 3):
-               rows of the matrix are the axes of the box in the frame of the cloud
-
-Without labels only objects are counted, with heights from the bottom of their boxes.
-
-Patchwork++ or Patchwork (--peer) has its published parameters. If you give the height or the
+Patchwork++ (--peer patchworkpp) has its published parameters. If you give the height or the
 place of the sensor (sensor.height, sensor.origin_x, ...), it gets them too.
 """
 EXAMPLES = """\
@@ -50,9 +41,6 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
   gp-ground-seg evaluate KITTI_ROOT --worst 9 --per-frame frames.csv
   gp-ground-seg evaluate s3://bucket/kitti --workers 8
-  gp-ground-seg evaluate KITTI_ROOT --boxes boxes --peer patchworkpp      boxes/00/000000.npz, ...
-  gp-ground-seg evaluate scans --boxes boxes                scans/a.bin with boxes/a.npz, ...
-  gp-ground-seg evaluate a.bin --boxes a.npz
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). With --workers
 the scores are the same; the times are not, because frames are computed at the same time.
@@ -71,16 +59,13 @@ RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'evaluate', DESCRIPTION, EXAMPLES)
-    peers = {'choices': PEERS}
     options.add(
         parser,
         ROOT,
         *OF_FRAMES,
         ('--per-frame', 'write the numbers of each frame (.csv, .parquet)', {'metavar': 'FILE'}),
         ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
-        ('--boxes', 'objects: a file, or a folder of files; ROOT may be .bin scans without labels',
-         {'metavar': 'PATH'}),
-        ('--peer', 'run this one on the same frames, alternately', peers),
+        ('--peer', 'run this method on the same frames, alternately', {'choices': [PATCHWORKPP]}),
         options.MARKDOWN,
         options.TO_JSON,
         options.FORCE,
@@ -97,12 +82,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.per_frame is not None:
         tables.check_rows_file(arguments.per_frame)
     with options.staged_options(arguments, *files) as parts, ExitStack() as stack:
-        items, load = _items_from_options(arguments)
+        items = frames_from_options(arguments)
         chosen: list[methods.Method] = [stack.enter_context(closing(methods.OurMethod(config)))]
         if arguments.peer is not None:
-            chosen.append(PEERS[arguments.peer].of_sensor(config.sensor))
+            chosen.append(PatchworkppMethod.of_sensor(config.sensor))
         runner = stack.enter_context(options.runner(arguments, 'evaluate'))
-        scores = methods.score_methods(items, load, chosen, runner=runner)
+        scores = methods.score_methods(items, methods.load_kitti, chosen, runner=runner)
         report = make_report(
             score_tables(scores, arguments.worst, runner.n_workers), scores, config,
             data=arguments.root, reliability=reliability_rows(scores[0]),
@@ -123,28 +108,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _items_from_options(
-    arguments: argparse.Namespace,
-) -> tuple[Sequence[Any], Callable[[Any], KnownScan]]:
-    """Return what is scored, frames or frames and files of boxes, and what reads one of them."""
-    frames = frames_from_options(arguments)
-    if arguments.boxes is None:
-        return frames, methods.load_kitti
-    if arguments.worst is not None and frames[0].labels_path is None:
-        raise DataError(f'--worst: needs labels of the ground, which {arguments.root} lacks')
-    return [*zip(frames, find_boxes(arguments.boxes, frames), strict=True)], methods.load_boxed
-
-
 def _headline(scores: Sequence[MethodScore]) -> str:
-    ious = [f'{one.title} {100.0 * one.iou:.2f} %' for one in scores if one.has_labels]
+    ious = [f'{one.title} {100.0 * one.iou:.2f} %' for one in scores]
     times = [f'{one.title} {1e3 * one.seconds():.1f} ms' for one in scores]
     frames, sequences = len(scores[0].scans), len(scores[0].sequences)
     pooled = f'{options.count(frames, "frame")} of {options.count(sequences, "sequence")}'
     iou, seconds = (', '.join(own).removeprefix(methods.OURS).strip() for own in (ious, times))
-    first = f'IoU {iou}  (GroundGrid convention, {pooled})'
-    if not scores[0].has_labels:
-        first = f'IoU not available, no labels of the ground  ({pooled})'
-    return f'{first}\n{seconds} per frame  (median)'
+    return f'IoU {iou}  (GroundGrid convention, {pooled})\n{seconds} per frame  (median)'
 
 
 def score_tables(
@@ -152,8 +122,6 @@ def score_tables(
 ) -> dict[str, Table]:
     """Tables of an evaluation by name, ours first in `scores`."""
     objects = object_table(scores, options.count(len(scores[0].sequences), 'sequence'))
-    if not scores[0].has_labels:
-        return {'objects': objects, 'times': _time_table(scores, n_workers)}
     return {
         **{one.key: _convention_table(scores, one) for one in metrics.CONVENTIONS},
         **({'differences': _difference_table(*scores)} if len(scores) > 1 else {}),
@@ -337,24 +305,10 @@ def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
 
 
 def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
-    """Frames of the options, grouped by sequence; labelled, unless objects are given as boxes."""
+    """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
     root, layout = as_path(arguments.root), options.scan_layout(arguments)
-    if getattr(arguments, 'boxes', None) is None:
-        frames = labelled_frames(root, chosen, layout)
-    elif chosen is None and not any(root.glob('sequences/*/velodyne')):
-        name = Path(arguments.root).resolve().stem
-        scans = [one for one in list_inputs(root) if one.path.suffix == '.bin']
-        if not scans:
-            raise DataError(f'{root}: objects are counted in .bin scans, none here')
-        # Boxes beside a scan, of the same stem, make its whole file name the name of the input.
-        names = [one.name.removesuffix('.bin') for one in scans]
-        frames = [
-            Frame(name, own, one.path, None, 0.0, layout)
-            for own, one in zip(names, scans, strict=True)
-        ]
-    else:
-        frames = boxed_frames(root, chosen, layout)
+    frames = labelled_frames(root, chosen, layout)
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]

@@ -19,8 +19,7 @@ from gp_ground_seg.lab.experiments.variants import (
     simulated_frames,
 )
 from gp_ground_seg.lab.scale.cluster import Runner
-from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, load_kitti
-from gp_ground_seg.lab.scoring.patchworkpp import PEERS
+from gp_ground_seg.lab.scoring.evaluate import load_kitti
 from gp_ground_seg.lab.scoring.report import Report, describe_environment, machine_line, written
 from gp_ground_seg.lab.simulation import DRIVES, SCENES, SENSORS
 
@@ -52,11 +51,7 @@ CROWDED_LIST = _some_of('--scenes', SCENES, lost.SCENES)
 SENSOR_LIST = _some_of('--sensors', SENSORS, DEFAULT_SENSORS)
 EVERY_SENSOR = _some_of('--sensors', SENSORS, SURVEYED)
 EVERY_MOUNT = _some_of('--sensors', SENSORS, ['all'])
-NO_PEER = ('--no-peer', 'leave the peer out', options.FLAG)
-PEER = (
-    '--peer', 'method to compare with (default: %(default)s)',
-    {'choices': PEERS, 'default': PATCHWORKPP},
-)  # fmt: skip
+NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
 
 
 class Experiment(NamedTuple):
@@ -112,10 +107,6 @@ def _name(option: Option) -> str:
     return option[0].lstrip('-').replace('-', '_')
 
 
-def _peer(arguments: argparse.Namespace) -> str | None:
-    return None if arguments.no_peer else arguments.peer
-
-
 def _check_source(arguments: argparse.Namespace) -> None:
     """Refuse options that contradict one another."""
     if arguments.simulated == (arguments.root is not None):
@@ -142,7 +133,7 @@ def _steps(arguments: argparse.Namespace, config: Config, runner: Runner) -> Rep
     if config != Config():
         raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
     frames = frames_from_options(arguments)
-    return stepwise.score_steps(frames, _peer(arguments), runner)
+    return stepwise.score_steps(frames, not arguments.no_peer, runner)
 
 
 def _wrong_values(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
@@ -152,13 +143,13 @@ def _wrong_values(arguments: argparse.Namespace, config: Config, runner: Runner)
 def _scenes(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(DRIVES)
     frames = simulated_frames(sensors, scenes, arguments.seeds or 3, variants.SCENE_PLACES)
-    return score_simulated(frames, variants.scene_tables, config, _peer(arguments), runner)
+    return score_simulated(frames, variants.scene_tables, config, not arguments.no_peer, runner)
 
 
 def _objects(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
     sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or lost.SCENES
     frames = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
-    return score_simulated(frames, lost.lost_tables, config, _peer(arguments), runner)
+    return score_simulated(frames, lost.lost_tables, config, not arguments.no_peer, runner)
 
 
 def _coverage(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
@@ -198,7 +189,7 @@ rubble, by exact labels and heights.
     'departures': Experiment(
         """\
 Switch off one departure from the paper after the other. They are the rows of
-gp_ground_seg/lab/experiments/ablation.py; `compare` measures any other change.
+gp_ground_seg/lab/experiments/ablation.py; `evaluate --against` measures any other change.
 """,
         (ROOT, *OF_FRAMES),
         _departures,
@@ -217,7 +208,7 @@ and two, by sequence and range. On labelled frames that of the returns (return_s
 Go from the paper's method to the defaults, one step after the other, beside Patchwork++ and a
 surface that is interpolated, with our labels.
 """,
-        (ROOT, *OF_FRAMES, PEER, NO_PEER),
+        (ROOT, *OF_FRAMES, NO_PEER),
         _steps,
     ),
     'wrong-values': Experiment(
@@ -232,7 +223,7 @@ Give hyper-parameters that are wrong by factors of 3 and 10, with and without le
 Score simulated scans by exact labels and heights, beside Patchwork++ with its published
 parameters and the true height of the sensor. All sensors have one set of parameters.
 """,
-        (SENSOR_LIST, SCENE_LIST, SEEDS, PEER, NO_PEER),
+        (SENSOR_LIST, SCENE_LIST, SEEDS, NO_PEER),
         _scenes,
     ),
     'objects': Experiment(
@@ -241,7 +232,7 @@ Count vehicles, persons and cyclists of simulated scans that are called ground, 
 Patchwork++ with its published parameters and the true height and place of the sensor. All
 sensors have one set of parameters.
 """,
-        (EVERY_MOUNT, CROWDED_LIST, SEEDS, PEER, NO_PEER),
+        (EVERY_MOUNT, CROWDED_LIST, SEEDS, NO_PEER),
         _objects,
     ),
     'sensor-pose': Experiment(

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import GroundSegError
+from gp_ground_seg.core.errors import ConfigError, GroundSegError
 
 ROS_ARGS = '--ros-args'
 
@@ -26,7 +26,6 @@ COMMANDS = {
     'segment': ('segment', 'label scans, or split the clouds of a bag'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
     'compare': ('compare', 'compare two configurations on the same frames'),
-    'optimise': ('optimise', 'search parameters on your labelled frames'),
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
     'view': ('view', 'look at scans in Rerun, a browser or a page'),
@@ -40,6 +39,11 @@ COMMANDS = {
     'node': ('node', 'run the ROS 2 node'),
     'warm-up': ('node', 'compile the code before the first start'),
 }
+
+RETIRED = {
+    'optimise': 'score settings with `evaluate ROOT --config FILE`, try them with `tune`',
+}
+"""Commands that earlier releases had, and what to use in place of them."""
 
 EXAMPLES = """\
 examples:
@@ -82,6 +86,8 @@ def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
     n_own = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
     command = next((word for word in words[:n_own] if not word.startswith('-')), None)
+    if command in RETIRED:
+        raise ConfigError(f'{command}: is no command any more: {RETIRED[command]}')
     parser = build_parser(command if command in COMMANDS else None)
     arguments = parser.parse_args(words[:n_own])
     arguments.ros_args = words[n_own:]

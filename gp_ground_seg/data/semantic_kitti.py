@@ -6,7 +6,7 @@ import logging
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -100,18 +100,6 @@ def _chosen(root: str | AnyPath, sequences: Sequence[str] | None) -> list[str]:
         problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
         raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
     return chosen
-
-
-def boxed_frames(
-    root: str | AnyPath, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
-) -> list[Frame]:
-    """Frames of the named sequences, or of all; labels count where each frame has some."""
-    found = [one for name in _chosen(root, sequences) for one in list_frames(root, name, layout)]
-    n_bare = sum(frame.labels_path is None for frame in found)
-    if 0 < n_bare < len(found):
-        _LOGGER.info('labels left out: %d of %d frames have none', n_bare, len(found))
-        return [replace(frame, labels_path=None) for frame in found]
-    return found
 
 
 def _read_times(path: AnyPath, frames: Sequence[AnyPath]) -> list[float]:

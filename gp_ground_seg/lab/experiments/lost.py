@@ -14,10 +14,10 @@ from gp_ground_seg.lab.simulation import PLACES
 SCENES = (*PLACES, 'urban')
 """Scenes where objects hide the ground."""
 BANDS = {'0-10 m': slice(0, 1), '10-20 m': slice(1, 2), '> 20 m': slice(2, None)}
-"""Bands of range of the columns, as parts of `evaluation.objects.BAND_TITLES`."""
+"""Bands of range of the columns, as parts of `scoring.objects.BAND_TITLES`."""
 
 COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
-"""Classes of `evaluation.objects.GROUPS` by column."""
+"""Classes of `scoring.objects.CLASSES` by column."""
 
 
 def lost_tables(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> dict[str, Table]:

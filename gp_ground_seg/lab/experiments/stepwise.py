@@ -14,7 +14,7 @@ from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring import report as results
 from gp_ground_seg.lab.scoring.evaluate import Method, load_kitti
 from gp_ground_seg.lab.scoring.intervals import INTERVAL, interval_note, interval_text
-from gp_ground_seg.lab.scoring.patchworkpp import PEERS
+from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import (
     Column,
     Report,
@@ -53,11 +53,11 @@ def paper_steps() -> dict[str, Config]:
     return steps
 
 
-def score_steps(frames: Sequence[Frame], peer: str | None, runner: Runner = HERE) -> Report:
-    """Score `paper_steps`, and beside them an interpolation and one of `PEERS`."""
+def score_steps(frames: Sequence[Frame], with_peer: bool, runner: Runner = HERE) -> Report:
+    """Score `paper_steps`, and beside them an interpolation and Patchwork++."""
     steps = paper_steps()
     with closing(interpolation_method(Config())) as plain:
-        peers: list[Method] = [plain, *([PEERS[peer]()] if peer else [])]
+        peers: list[Method] = [plain, *([PatchworkppMethod()] if with_peer else [])]
         scores = score_variants(frames, load_kitti, steps, peers, runner=runner)
     rows: list[Row] = []
     for k, one in enumerate(scores):

@@ -21,8 +21,8 @@ from gp_ground_seg.lab.scoring import report as results
 from gp_ground_seg.lab.scoring.evaluate import KnownScan, MethodScore, OurMethod
 from gp_ground_seg.lab.scoring.intervals import INTERVAL, interval_note, interval_text
 from gp_ground_seg.lab.scoring.metrics import RATIOS, class_errors, class_name, ratio
-from gp_ground_seg.lab.scoring.objects import BAND_TITLES, GROUPS, Objects
-from gp_ground_seg.lab.scoring.patchworkpp import PEERS, PatchworkppMethod
+from gp_ground_seg.lab.scoring.objects import BAND_TITLES, CLASSES, Objects
+from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import Column, Report, Row, Table, percent
 from gp_ground_seg.lab.simulation import PLACES, SCENES, SENSORS, Kind, simulate_scan
 
@@ -32,7 +32,7 @@ Changes = Mapping[str, ParameterValue]
 SCENE_PLACES = (0.0, 6.0)
 """Where the sensor stands in each scene [m]."""
 OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
-"""What rays hit of objects, by the classes of `GROUPS`; crates are boxes too, but no objects."""
+"""What rays hit of objects, by `CLASSES`; crates are boxes too, but no objects."""
 
 
 class SimulatedFrame(NamedTuple):
@@ -55,9 +55,9 @@ def load_simulated(frame: SimulatedFrame) -> KnownScan:
     made = simulate_scan(scene, SENSORS[frame.sensor], rng, x=frame.x)
     truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     class_of = np.full(len(truth), -1)
-    for number, name in enumerate(GROUPS):
+    for number, name in enumerate(CLASSES):
         class_of[(made.kind == OBJECT_KINDS[name]) & (made.object_id > 0)] = number
-    objects = Objects(tuple(GROUPS), class_of, made.object_id, made.ground_z)
+    objects = Objects(class_of, made.object_id, made.ground_z)
     return KnownScan(
         frame.sequence, f'{frame.seed}/{frame.x:g}', made.points, {'exact': truth},
         ground_z=made.ground_z, is_ground=made.is_ground, objects=objects,
@@ -72,10 +72,10 @@ def simulated_frames(
     return [SimulatedFrame(*case) for case in cases if not case[3] or case[1] not in PLACES]
 
 
-def peer_of(sensor: str, peer: str = methods.PATCHWORKPP) -> PatchworkppMethod:
-    """Return one of `PEERS`, with the place and the height of a simulated sensor."""
+def peer_of(sensor: str) -> PatchworkppMethod:
+    """Return Patchwork++ with the place and the height of a simulated sensor."""
     model = SENSORS[sensor]
-    return PEERS[peer](model.height, model.origin or (0.0, 0.0, 0.0))
+    return PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
 
 
 def refuse_changed(config: Config, names: Iterable[str]) -> None:
@@ -147,16 +147,16 @@ def score_simulated(
     frames: Sequence[SimulatedFrame],
     tables: Callable[[Sequence[MethodScore], Sequence[str]], dict[str, Table]],
     config: Config,
-    peer: str | None,
+    with_peer: bool,
     runner: Runner = HERE,
 ) -> Report:
     """Segment simulated scans, all sensors with the parameters `config`.
 
-    The one of `PEERS` named runs on the same clouds, as `peer_of` makes it. A sensor and scene of
+    `with_peer` runs Patchwork++ on the same clouds, as `peer_of` makes it. A sensor and scene of
     which a scan is refused is left out; `tables` lays out the scores, with notes that say so.
     """
     groups = [list(own) for _, own in itertools.groupby(frames, lambda frame: frame.sequence)]
-    parts = runner.run(partial(_score_groups, config, peer), groups)
+    parts = runner.run(partial(_score_groups, config, with_peer), groups)
     outcomes = list(itertools.chain(*parts))
     refused = [one for one in outcomes if isinstance(one, str)]
     found = [one for one in outcomes if not isinstance(one, str)]
@@ -168,14 +168,14 @@ def score_simulated(
 
 def _score_groups(
     config: Config,
-    peer: str | None,
+    with_peer: bool,
     groups: Sequence[Sequence[SimulatedFrame]],
     progress: Progress,
 ) -> list[list[MethodScore] | str]:
     """Scores of each group of scans, of one sensor in one scene, or why one is refused."""
     outcomes: list[list[MethodScore] | str] = []
     for frames in progress(groups):
-        peers = [peer_of(frames[0].sensor, peer)] if peer else []
+        peers = [peer_of(frames[0].sensor)] if with_peer else []
         try:
             ours = {methods.OURS: config}
             outcomes.append(score_variants(frames, load_simulated, ours, peers))

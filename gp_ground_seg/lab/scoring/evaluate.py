@@ -8,9 +8,8 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,7 +22,6 @@ from gp_ground_seg.core.parameters.config import Config, RuntimeConfig
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import FitReport
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.boxes import read_boxes
 from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
 from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner, depends_on_past
 from gp_ground_seg.lab.scoring import metrics
@@ -31,7 +29,6 @@ from gp_ground_seg.lab.scoring.metrics import CONVENTIONS, GROUNDGRID, Confusion
 from gp_ground_seg.lab.scoring.objects import (
     ObjectCounts,
     Objects,
-    boxed_objects,
     count_objects,
     labelled_objects,
     pool_objects,
@@ -39,8 +36,8 @@ from gp_ground_seg.lab.scoring.objects import (
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 OURS = 'gp_ground_seg'
-PATCHWORKPP, PATCHWORK = 'patchworkpp', 'patchwork'
-TITLES = {PATCHWORKPP: 'Patchwork++', PATCHWORK: 'Patchwork'}
+PATCHWORKPP = 'patchworkpp'
+TITLES = {PATCHWORKPP: 'Patchwork++'}
 """Names of methods in tables, where they differ from those in files."""
 ALL = 'all'
 Points = npt.NDArray[np.floating]
@@ -169,11 +166,6 @@ class MethodScore:
         return TITLES.get(self.name, self.name)
 
     @property
-    def has_labels(self) -> bool:
-        """Whether the ground of the scans is known."""
-        return any(scan.confusions for scan in self.scans)
-
-    @property
     def sequences(self) -> list[str]:
         """Names of the sequences, in order."""
         return list(dict.fromkeys(scan.sequence for scan in self.scans))
@@ -267,18 +259,6 @@ def load_kitti(frame: Frame) -> KnownScan:
     return KnownScan(frame.sequence, frame.index, points, truths, semantic, z, is_ground, objects)
 
 
-def load_boxed(item: tuple[Frame, Path]) -> KnownScan:
-    """Read a frame and the boxes of its objects; without labels its ground is not known."""
-    frame, path = item
-    boxes = read_boxes(path)
-    if frame.labels_path is not None:
-        scan = load_kitti(frame)
-        return replace(scan, objects=boxed_objects(scan.points, boxes, scan.is_ground))
-    points = read_points(frame.points_path, frame.layout)
-    objects = boxed_objects(points, boxes)
-    return KnownScan(frame.sequence, frame.index, points, {}, objects=objects)
-
-
 def score_methods(
     items: Sequence[Any],
     load: Callable[[Any], KnownScan],
@@ -304,7 +284,7 @@ def score_methods(
 
 
 def _sequence_of(item: Any) -> str:
-    name: str = (item if isinstance(item, Frame) else item[0]).sequence
+    name: str = item.sequence
     return name
 
 

@@ -47,7 +47,7 @@ def object_table(scores: Sequence[MethodScore], clusters: str) -> Table:
         title += f'; its: of {scores[1].title}; {note}'
     notes = []
     if not rows:
-        notes = ['no return on an object: no class of objects in the labels, or no box holds one']
+        notes = ['no return on an object: no class of objects in the labels']
     elif not any(found[name][-1].n_objects for found in counts for name in found):
         notes = ['no object with enough returns: only classes, if labels have no instances']
     if n_unknown := sum(own[-1].n_unknown for own in counts[0].values()):

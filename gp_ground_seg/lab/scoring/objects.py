@@ -7,7 +7,7 @@ called ground. What lies below does not count: there the feet of an object and t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +17,7 @@ from scipy.spatial import KDTree
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Label
-from gp_ground_seg.data.boxes import Boxes
-from gp_ground_seg.lab.scoring.metrics import CLASS_NAMES, Labels, Sums, range_titles, ratio
+from gp_ground_seg.lab.scoring.metrics import Labels, Sums, range_titles, ratio
 
 MIN_HEIGHT = 0.3
 """Height above the local ground from which on a return on an object counts [m]."""
@@ -33,12 +32,12 @@ CELL_SIZE = 0.5  # of the cells of ground that is known [m]
 N_CELLS = 5  # of them that make the local ground
 MAX_GROUND_DISTANCE = 5.0  # to the farthest of them [m]
 
-GROUPS = {
-    'vehicle': ('car', 'van', 'truck', 'bus', 'trailer', 'tram', 'on rails', 'other vehicle'),
-    'person': ('pedestrian',),
-    'cyclist': ('bicyclist', 'motorcyclist', 'rider', 'bicycle', 'motorcycle', 'motor'),
+CLASSES = {
+    'vehicle': (10, 13, 16, 18, 20, 252, 256, 257, 258, 259),
+    'person': (30, 254),
+    'cyclist': (11, 15, 31, 32, 253, 255),
 }
-"""Classes of objects, and what else they are called; two-wheelers with or without a rider."""
+"""Classes of objects, by numbers of SemanticKITTI; two-wheelers with or without a rider."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +46,11 @@ class Objects:
 
     Attributes
     ----------
-    classes : names of the classes
-    class_of : (N,) index into `classes`; negative: on no object
-    object_id : (N,) number of the object, of its own within its class; 0 = it is not known which
+    class_of : (N,) index into `CLASSES`; negative: on no object
+    object_id : (N,) number of the object within its class; 0 = not known
     ground_z : (N,) height of the local ground [m]; NaN = not known, the return does not count
     """
 
-    classes: tuple[str, ...]
     class_of: npt.NDArray[np.integer]
     object_id: npt.NDArray[np.integer]
     ground_z: npt.NDArray[np.floating]
@@ -94,7 +91,7 @@ def count_objects(
             raise PointCloudError(f'{name} of shape {shape} for {n} points: must be ({n},)')
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
-    on, n_classes = (objects.class_of >= 0) & np.isfinite(reach + z), len(objects.classes)
+    on, n_classes = (objects.class_of >= 0) & np.isfinite(reach + z), len(CLASSES)
     counts, lacks = on & (z - objects.ground_z >= MIN_HEIGHT), on & np.isnan(objects.ground_z)
     unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks], n_classes)
     kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
@@ -112,7 +109,7 @@ def count_objects(
     bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
     return {
         name: tuple(ObjectCount(*numbers) for numbers in own.tolist())
-        for name, own in zip(objects.classes, bands, strict=True)
+        for name, own in zip(CLASSES, bands, strict=True)
         if own.any()
     }
 
@@ -138,13 +135,7 @@ def pool_objects(counts: Sequence[ObjectCounts]) -> ObjectCounts:
     for name, bands in (item for one in counts for item in one.items()):
         before = pooled.get(name, (ObjectCount(),) * len(bands))
         pooled[name] = tuple(a + b for a, b in zip(before, bands, strict=True))
-    return {name: pooled[name] for name in _in_order(pooled)}
-
-
-def _in_order(names: Iterable[str]) -> list[str]:
-    """Names of classes, each once: those of `GROUPS`, then the others by name."""
-    unique = sorted(set(names))
-    return [name for name in GROUPS if name in unique] + [n for n in unique if n not in GROUPS]
+    return {name: pooled[name] for name in CLASSES if name in pooled}
 
 
 def local_ground(
@@ -175,12 +166,6 @@ def local_ground(
     return result
 
 
-def group_of(word: str) -> str:
-    """Class of an object by its name, as in `GROUPS`; other names are classes of their own."""
-    own = word.lower().removeprefix('moving ')
-    return next((name for name, words in GROUPS.items() if own in words), own)
-
-
 def labelled_objects(
     points: npt.NDArray[np.floating], entries: npt.NDArray[np.uint32], is_ground: BoolArray
 ) -> Objects:
@@ -188,33 +173,8 @@ def labelled_objects(
 
     Instances are numbered by class, so that the whole entry is the number of an object.
     """
-    classes, class_of = tuple(GROUPS), np.full(len(entries), -1)
-    semantic = entries & 0xFFFF
-    for number, word in CLASS_NAMES.items():
-        if (group := group_of(word)) in classes:
-            class_of[semantic == number] = classes.index(group)
+    class_of = np.full(len(entries), -1)
+    for k, numbers in enumerate(CLASSES.values()):
+        class_of[np.isin(entries & 0xFFFF, numbers)] = k
     object_id = np.where(entries >> 16 > 0, entries, 0).astype(np.int64)
-    return Objects(classes, class_of, object_id, local_ground(points, is_ground, class_of >= 0))
-
-
-def boxed_objects(
-    points: npt.NDArray[np.floating], boxes: Boxes, is_ground: BoolArray | None = None
-) -> Objects:
-    """Objects by boxes: what is in a box lies on its object, in several on that of the smallest.
-
-    The local ground is that of `local_ground`, and where it is not known which returns are
-    ground the bottom of the box.
-    """
-    words = [group_of(name) for name in boxes.names]
-    classes = tuple(_in_order(words))
-    class_of, object_id = np.full(len(points), -1), np.zeros(len(points), dtype=np.int64)
-    ground_z = np.full(len(points), np.nan)
-    xyz = points[:, :3].astype(np.float64)
-    for k in np.argsort(-boxes.size.prod(axis=1), kind='stable'):
-        own, half = (xyz - boxes.center[k]) @ boxes.rotation[k].T, 0.5 * boxes.size[k]
-        found = (np.abs(own) <= half).all(axis=1)
-        class_of[found], object_id[found] = classes.index(words[k]), k + 1
-        ground_z[found] = (xyz[:, 2] - own[:, 2] - half[2])[found]
-    if is_ground is not None:
-        ground_z = local_ground(points, is_ground, class_of >= 0)
-    return Objects(classes, class_of, object_id, ground_z)
+    return Objects(class_of, object_id, local_ground(points, is_ground, class_of >= 0))

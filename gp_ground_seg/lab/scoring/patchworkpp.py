@@ -1,4 +1,4 @@
-"""Patchwork++, and Patchwork before it, as methods to compare with."""
+"""Patchwork++ as a method to compare with."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ from gp_ground_seg.core.errors import ConfigError, require
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
-from gp_ground_seg.lab.scoring.evaluate import PATCHWORK, PATCHWORKPP, MethodResult, Points
-from gp_ground_seg.lab.scoring.metrics import Labels
+from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, MethodResult, Points
 
 
 class PatchworkppMethod:
@@ -58,14 +57,11 @@ class PatchworkppMethod:
     def reset(self) -> None:
         """Start anew with its default thresholds."""
         with _c_stdout_silenced():  # it greets on standard output, which is for tables
-            self._estimator = self._make_estimator()
-
-    def _make_estimator(self) -> Any:
-        parameters = self._module.Parameters()
-        if self._sensor_height is not None:
-            parameters.sensor_height = self._sensor_height
-        self._uprightness = float(parameters.uprightness_thr)
-        return self._module.patchworkpp(parameters)
+            parameters = self._module.Parameters()
+            if self._sensor_height is not None:
+                parameters.sensor_height = self._sensor_height
+            self._uprightness = float(parameters.uprightness_thr)
+            self._estimator = self._module.patchworkpp(parameters)
 
     def run(self, points: Points) -> None:
         """Segment a scan."""
@@ -77,7 +73,8 @@ class PatchworkppMethod:
 
     def result(self) -> MethodResult:
         """Labels, and the plane of the nearest upright patch: it has no surface of its own."""
-        label = self._label()
+        label = np.full(len(self._points), Label.OBSTACLE, dtype=np.uint8)
+        label[self._estimator.getGroundIndices()] = Label.GROUND
         centre = np.asarray(self._estimator.getCenters(), dtype=np.float64).reshape(-1, 3)
         normal = np.asarray(self._estimator.getNormals(), dtype=np.float64).reshape(-1, 3)
         upright = np.abs(normal[:, 2]) > self._uprightness
@@ -89,34 +86,6 @@ class PatchworkppMethod:
         centre, normal = centre[nearest], normal[nearest]
         fall = np.sum((xy - centre[:, :2]) * normal[:, :2], axis=1) / normal[:, 2]
         return MethodResult(label, np.asarray(centre[:, 2] - fall + self._origin[2]))
-
-    def _label(self) -> Labels:
-        label = np.full(len(self._points), Label.OBSTACLE, dtype=np.uint8)
-        label[self._estimator.getGroundIndices()] = Label.GROUND
-        return label
-
-
-class PatchworkMethod(PatchworkppMethod):
-    """Patchwork (Lim, Oh, Myung, RA-L 2021) from the same package; it gives labels only.
-
-    It estimates the height of the sensor from its first scan where none is given.
-    """
-
-    name = PATCHWORK
-
-    def _make_estimator(self) -> Any:
-        parameters = self._module.PatchworkParams()
-        if self._sensor_height is not None:
-            parameters.sensor_height, parameters.ATAT_ON = self._sensor_height, False
-        return self._module.patchwork(parameters)
-
-    def result(self) -> MethodResult:
-        """Labels; it does not return its planes."""
-        return MethodResult(self._label(), np.full(len(self._points), np.nan))
-
-
-PEERS = {peer.name: peer for peer in (PatchworkppMethod, PatchworkMethod)}
-"""What to compare with, by name."""
 
 
 @contextlib.contextmanager
