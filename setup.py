@@ -9,7 +9,7 @@ PACKAGE = 'gp_ground_seg'
 
 BAGS = ['rosbags>=0.11.9']
 FORMATS = ['python-neo-lzf>=0.3']
-PLOT = ['imageio>=2.28', 'matplotlib>=3.6']
+PLOT = ['matplotlib>=3.6']
 SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']  # 21 MB; s3fs, for s3://, is 36 MB more
 VISER = ['viser>=1.1']
 VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]

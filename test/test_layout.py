@@ -54,7 +54,6 @@ ONLY_IN = {
     'numba': ('core/jit.py', 'core/compiled/'),
     'rerun': ('lab/viewers/rerun_view.py',),
     **dict.fromkeys(('viser', 'trimesh'), ('lab/viewers/html_page.py',)),
-    'imageio': ('lab/plotting/',),
     'argcomplete': ('cli/main.py',),
     'pypatchworkpp': ('lab/scoring/patchworkpp.py',),
 }

@@ -1,11 +1,9 @@
 """The pictures of scans and scores, by their pixels."""
 
-import itertools
 import re
 import subprocess
 import sys
 
-import imageio.v3 as imageio
 import numpy as np
 import pytest
 from cli_runner import error_line, run
@@ -15,7 +13,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.cli import plot
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.data import colours as colours_
 from gp_ground_seg.lab.plotting import scan, style
@@ -23,7 +20,7 @@ from gp_ground_seg.lab.plotting.scan import (
     CAMERA,
     TARGET,
     ZOOM,
-    View,
+    camera_at,
     plot_birds_eye,
     plot_scan_view,
     project,
@@ -199,13 +196,13 @@ def test_a_camera_stands_where_it_is_told():
     distance = np.linalg.norm(np.subtract(CAMERA, TARGET))
     up = np.degrees(np.arcsin((CAMERA[2] - TARGET[2]) / distance))
     assert (turn + 360, up, distance) == pytest.approx((196, 24, 32), abs=0.2)  # as --help says
-    np.testing.assert_allclose(View.around(turn, up, distance).camera, CAMERA, atol=1e-9)
+    np.testing.assert_allclose(camera_at(turn, up, distance), CAMERA, atol=1e-9)
     ahead, left = np.add(TARGET, (5, 0, 0)), np.add(TARGET, (0, 5, 0))
     # From the left what is ahead is to the left; from ahead what is left is to the right.
-    (x, _), (_, y) = on_screen(View.around(90, 0, 20).camera, ahead, np.add(TARGET, (0, 0, 1)))
+    (x, _), (_, y) = on_screen(camera_at(90, 0, 20), ahead, np.add(TARGET, (0, 0, 1)))
     assert x == pytest.approx(-0.25 * ZOOM) and y > 0
-    assert on_screen(View.around(0, 10, 20).camera, left)[0, 0] > 0.2 * ZOOM
-    assert on_screen(View.around(0, 10, 40).camera, left)[0, 0] < 0.2 * ZOOM
+    assert on_screen(camera_at(0, 10, 20), left)[0, 0] > 0.2 * ZOOM
+    assert on_screen(camera_at(0, 10, 40), left)[0, 0] < 0.2 * ZOOM
 
 
 @pytest.fixture(scope='module')
@@ -248,49 +245,6 @@ def test_pdf_and_svg_hold_points_as_pixels_and_are_the_same_each_time(drawn, tmp
     assert found[0].count(b'<image') >= 1 and found[0].count(b'<use') < 100
     assert run('plot', 'above', drawn, '-o', tmp_path / 'b.svg') == 0
     assert (tmp_path / 'b.svg').read_bytes().count(b'<use') < 200
-
-
-def test_a_sheet_has_a_panel_for_each_scene(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(plot, 'SCENES', dict(itertools.islice(plot.SCENES.items(), 4)))
-    path = tmp_path / 'sheet.png'
-    assert run('plot', 'scan', '--sheet', '--sensor', 'vlp-16', '-o', path) == 0
-    assert capsys.readouterr().out == f'4 scenes, written to {path}\n'
-    picture = imread(path)[..., :3]
-    width, height = inches(scan.PANEL + scan.GAP, scan.PANEL / 2 + scan.TITLE)
-    assert picture.shape[1] == 3 * width
-    for k in range(6):
-        row, column = divmod(k, 3)
-        panel = picture[row * height + 60 : (row + 1) * height - 5, column * width :][:, :width]
-        assert (panel.min(axis=-1) < 0.9).any() == (k < 4)
-
-
-def test_a_drive_is_a_movie_of_its_clouds(drawn, tmp_path, capsys):
-    points = np.fromfile(drawn, '<f4').reshape(-1, 4)
-    (tmp_path / 'scans').mkdir()
-    for k, n in enumerate((20000, 24000, 20000)):  # the wall is at the end
-        points[:n].tofile(tmp_path / 'scans' / f'{k}.bin')
-    path = tmp_path / 'drive.gif'
-    words = ['plot', 'drive', tmp_path / 'scans', '-o', path]
-    assert run(*words) == 0
-    assert capsys.readouterr().out == f'3 clouds, written to {path}\n'
-    movie = imageio.imread(path)
-    assert movie.shape == (3, 560, 960, 3)
-    orange = [
-        (np.abs(one[50:480].astype(int) - (213, 94, 0)).max(axis=-1) < 60).sum() for one in movie
-    ]
-    assert max(orange[0], orange[2]) < 100 < orange[1]
-    assert run(*words, '--frames', 1) == 2
-    assert '--force replaces it' in error_line(capsys)
-    assert run(*words, '--frames', 2, '--force', '--fps', 5) == 0
-    assert len(imageio.imread(path)) == 2
-    assert [one.name for one in tmp_path.iterdir() if one.name != 'scans'] == [path.name]
-
-
-def test_what_movies_need_is_optional(drawn, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'imageio.v2', None)
-    assert run('plot', 'drive', drawn, '-o', tmp_path / 'a.gif') == 2
-    assert 'pip install imageio matplotlib' in error_line(capsys)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize('camera', ['90', '90,30', 'a,b,c', '0,90,20', '0,20,0.5', '0,20,nan'])

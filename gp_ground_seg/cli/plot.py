@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from contextlib import closing
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,12 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import read_labels
 from gp_ground_seg.lab.plotting.scan import (
+    CAMERA,
     VALUES,
-    Scene,
-    View,
+    Place,
+    camera_at,
     plot_birds_eye,
     plot_scan_view,
-    plot_sheet,
-    write_movie,
 )
 from gp_ground_seg.lab.plotting.segment import plot_segment, segment_at
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
@@ -41,15 +39,6 @@ SCAN_EXAMPLES = """\
   gp-ground-seg plot scan --simulate road_then_rubble -o scan.png
   gp-ground-seg plot scan --simulate urban --sensor vlp-16 --colour height -o scan.svg
   gp-ground-seg plot scan 000000.bin --camera 90,30,40 -o from_the_left.pdf
-  gp-ground-seg plot scan --sheet -o scenes.png             one panel per simulated scene
-"""
-
-DRIVE = """\
-Draw clouds of a bag, sequence or folder as `plot scan` does, one after the other, as a movie.
-"""
-DRIVE_EXAMPLES = """\
-  gp-ground-seg plot drive drive.mcap -o drive.gif
-  gp-ground-seg plot drive KITTI_ROOT/sequences/00 --frames 30 --colour p_ground -o drive.gif
 """
 
 ABOVE = """\
@@ -74,125 +63,99 @@ Segments are numbered counter-clockwise from straight behind.
 """
 
 
+KINDS = ('.png', '.pdf', '.svg')
+ENDINGS = ' or '.join(KINDS)
+INPUT = ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'})
+LABELS = ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'})
+INTEGER: dict[str, Any] = {'metavar': 'N', 'type': int}
+
+
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its pictures."""
     description = 'Draw a segmented scan: in perspective, from above, or one segment of it.'
-    examples = SCAN_EXAMPLES + DRIVE_EXAMPLES + ABOVE_EXAMPLES + SEGMENT_EXAMPLES
+    examples = SCAN_EXAMPLES + ABOVE_EXAMPLES + SEGMENT_EXAMPLES
     parser = options.new_parser(subparsers, 'plot', description, examples)
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
-    number: dict[str, Any] = {'metavar': 'N', 'type': int}
-    scan = ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'})
-    labels = ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'})
-
-    view = options.new_parser(pictures, 'scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective')
-    options.add(
-        view.add_mutually_exclusive_group(required=True),
-        (*scan[:2], {'metavar': 'INPUT', 'nargs': '?'}),
-        ('--simulate', ', '.join(SCENES), {'metavar': 'SCENE', 'choices': SCENES}),
-        ('--sheet', 'all these scenes, each in a panel', options.FLAG),
-    )
-    sensor = 'sensor of the simulated scan (default: %(default)s)'
-    options.add(
-        view,
-        ('--sensor', sensor, {'choices': SENSORS, 'default': 'hdl-64e'}),
-        ('--seed', 'of the simulated scene (default: %(default)s)', {**number, 'default': 0}),
-    )
-    drive = options.new_parser(pictures, 'drive', DRIVE, DRIVE_EXAMPLES, 'clouds as a movie')
-    options.add(
-        drive,
-        ('input', 'bag, sequence, or folder of scans', {'metavar': 'INPUT'}),
-        ('--frames', 'the first N clouds only', options.NUMBER),
-        ('--fps', 'clouds per second (default: %(default)s)', {**options.NUMBER, 'default': 10}),
-        options.QUIET,
-    )
-    camera = {'metavar': 'AZIMUTH,ELEVATION,DISTANCE', 'type': _camera, 'default': View()}
-    for picture in (view, drive):
+    for name, text, examples, purpose, declare in (
+        ('scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective', _declare_scan),
+        ('above', ABOVE, ABOVE_EXAMPLES, 'a scan and its errors from above', _declare_above),
+        ('segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side', _declare_segment),
+    ):
+        picture = options.new_parser(pictures, name, text, examples, purpose)
+        declare(picture)
         options.add(
             picture,
-            ('--camera', 'where it stands, seen from the middle of the scene: counter-clockwise '
-             'from ahead [deg], upwards [deg], away [m] (default: 196,24,32)', camera),
-            ('--colour', 'colour points by class, or by the height over the ground or the '
-             'probability of ground', {'choices': ('class', *VALUES), 'default': 'class'}),
-        )  # fmt: skip
-    purpose = 'a scan and its errors from above'
-    above = options.new_parser(pictures, 'above', ABOVE, ABOVE_EXAMPLES, purpose)
-    options.add(above, scan, labels)
+            ('--frame', 'which of several, from 0 (default: 0)', {**INTEGER, 'default': 0}),
+            ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
+            *options.CLOUDS,
+            options.FORCE,
+        )
+        options.add_config(picture)
+        picture.set_defaults(run=run)
 
-    purpose = 'a segment from the side'
-    segment = options.new_parser(pictures, 'segment', SEGMENT, SEGMENT_EXAMPLES, purpose)
+
+def _declare_scan(parser: argparse.ArgumentParser) -> None:
+    options.add(
+        parser.add_mutually_exclusive_group(required=True),
+        (*INPUT[:2], {**INPUT[2], 'nargs': '?'}),
+        ('--simulate', ', '.join(SCENES), {'metavar': 'SCENE', 'choices': SCENES}),
+    )
+    camera = {'metavar': 'AZIMUTH,ELEVATION,DISTANCE', 'type': _camera, 'default': CAMERA}
+    options.add(
+        parser,
+        ('--sensor', 'sensor of the simulated scan (default: %(default)s)',
+         {'choices': SENSORS, 'default': 'hdl-64e'}),
+        ('--seed', 'of the simulated scene (default: %(default)s)', {**INTEGER, 'default': 0}),
+        ('--camera', 'where it stands, seen from the middle of the scene: counter-clockwise '
+         'from ahead [deg], upwards [deg], away [m] (default: 196,24,32)', camera),
+        ('--colour', 'colour points by class, or by the height over the ground or the '
+         'probability of ground', {'choices': ('class', *VALUES), 'default': 'class'}),
+    )  # fmt: skip
+
+
+def _declare_above(parser: argparse.ArgumentParser) -> None:
+    options.add(parser, INPUT, LABELS)
+
+
+def _declare_segment(parser: argparse.ArgumentParser) -> None:
     metres, degrees = {'metavar': 'R', 'type': float}, {'metavar': 'DEG', 'type': float}
     shown = ('--max-range', 'range shown [m] (default: all candidates)', metres)
-    options.add(segment, scan, labels, shown)
+    options.add(parser, INPUT, LABELS, shown)
     options.add(
-        segment.add_mutually_exclusive_group(required=True),
-        ('--segment', 'number of the segment', number),
-        ('--azimuth', 'the one that looks there, 90 = left', degrees),
+        parser.add_mutually_exclusive_group(required=True),
+        ('--segment', 'number of the segment', INTEGER),
+        ('--azimuth', 'the segment in this direction, 90 = left', degrees),
     )
-    for picture in (view, drive, above, segment):
-        endings = ('.gif',) if picture is drive else ('.png', '.pdf', '.svg')
-        output = (f'{" or ".join(endings)} file', {'metavar': 'OUT', 'required': True})
-        if picture is not drive:
-            which = {**number, 'default': 0}
-            options.add(picture, ('--frame', 'which of several, from 0 (default: 0)', which))
-        options.add(picture, ('-o --output', *output), *options.CLOUDS, options.FORCE)
-        options.add_config(picture)
-        picture.set_defaults(run=run, endings=endings)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Segment the scan and draw it."""
     config = options.read_config(arguments)
     path = Path(arguments.output)
-    if path.suffix.lower() not in arguments.endings:
-        raise DataError(f'{path}: must end in {" or ".join(arguments.endings)}')
+    if path.suffix.lower() not in KINDS:
+        raise DataError(f'{path}: must end in {ENDINGS}')
     if path.exists() and not arguments.force:
         raise DataError(f'{path}: exists already; --force replaces it')
+    points, title = _read(arguments) if arguments.input is not None else _simulate(arguments)
+    truth = None
+    if getattr(arguments, 'labels', None) is not None:
+        truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
     with closing(GroundSegmenter(config)) as segmenter:
-        if arguments.picture == 'drive' or getattr(arguments, 'sheet', False):
-            said = _draw_scenes(arguments, config, segmenter)
-        else:
-            said = _draw_scan(arguments, config, segmenter)
+        result = segmenter.segment(points)
+    if arguments.picture == 'scan':
+        look = arguments.camera, arguments.colour
+        said = plot_scan_view(points, result, config, path, title, *look)
+    elif arguments.picture == 'above':
+        said = plot_birds_eye(points, result.label, path, truth, title)
+    else:
+        segment, reach = _segment_number(arguments, config), arguments.max_range
+        plot_segment(result, config, points, segment, path, truth, title, reach)
+        said = _segment_counts(result, segment)
     print(f'{said}, written to {path}')
     return 0
 
 
-def _draw_scan(arguments: argparse.Namespace, config: Config, segmenter: GroundSegmenter) -> str:
-    path = arguments.output
-    simulated = arguments.input is None
-    points, title = _simulate(arguments, arguments.simulate) if simulated else _read(arguments)
-    truth = None
-    if getattr(arguments, 'labels', None) is not None:
-        truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
-    result = segmenter.segment(points)
-    if arguments.picture == 'scan':
-        view = arguments.camera._replace(colour=arguments.colour)
-        return plot_scan_view(points, result, config, path, title, view)
-    if arguments.picture == 'above':
-        return plot_birds_eye(points, result.label, path, truth, title)
-    segment, reach = _segment_number(arguments, config), arguments.max_range
-    plot_segment(result, config, points, segment, path, truth, title, reach)
-    return _segment_counts(result, segment)
-
-
-def _draw_scenes(arguments: argparse.Namespace, config: Config, segmenter: GroundSegmenter) -> str:
-    """Draw all simulated scenes on a sheet, or the clouds of the input as a movie."""
-    path, view = arguments.output, arguments.camera._replace(colour=arguments.colour)
-    bar = options.progress('plot', quiet=getattr(arguments, 'quiet', False))
-    if arguments.picture == 'scan':
-        clouds = ((name, _simulate(arguments, name)[0]) for name in bar(list(SCENES)))
-        scenes = (Scene(name, points, segmenter.segment(points)) for name, points in clouds)
-        plot_sheet(scenes, len(SCENES), config, path, view)
-        return f'{len(SCENES)} scenes'
-    inputs = options.list_clouds(arguments)
-    n_clouds = min(len(inputs), arguments.frames or len(inputs))
-    chosen = bar(islice(inputs, n_clouds), total=n_clouds)
-    clouds = ((one.title, one.read().xyz) for one in chosen)
-    scenes = (Scene(title, points, segmenter.segment(points)) for title, points in clouds)
-    write_movie(scenes, config, path, view, arguments.fps)
-    return options.count(n_clouds, 'cloud')
-
-
-def _camera(text: str) -> View:
+def _camera(text: str) -> Place:
     """Read azimuth, elevation and distance; straight from above no side of a picture is up."""
     try:
         azimuth, elevation, distance = map(float, text.split(','))
@@ -201,7 +164,7 @@ def _camera(text: str) -> View:
     if not (abs(azimuth) <= 360.0 and abs(elevation) <= 89.0 and 1.0 <= distance <= 1000.0):
         wanted = 'azimuth within 360 and elevation within 89 degrees, distance 1 to 1000 m'
         raise argparse.ArgumentTypeError(f'{text!r}: must be {wanted}, as in 90,30,40')
-    return View.around(azimuth, elevation, distance)
+    return camera_at(azimuth, elevation, distance)
 
 
 def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]:
@@ -212,13 +175,14 @@ def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]
     return scan.read().xyz, title
 
 
-def _simulate(arguments: argparse.Namespace, name: str) -> tuple[npt.NDArray[np.floating], str]:
+def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]:
+    """Points of a simulated scan, and a title that names it."""
     options.refuse_scan_layout(arguments, 'a simulated one')
     if arguments.seed < 0:
         raise DataError(f'--seed {arguments.seed}: must not be negative')
-    scene, rng = SCENES[name], np.random.default_rng(arguments.seed)
+    scene, rng = SCENES[arguments.simulate], np.random.default_rng(arguments.seed)
     points = simulate_scan(scene(arguments.seed), SENSORS[arguments.sensor], rng).points
-    return points, f'simulated {arguments.sensor}: {name}'
+    return points, f'simulated {arguments.sensor}: {arguments.simulate}'
 
 
 def _segment_number(arguments: argparse.Namespace, config: Config) -> int:
@@ -230,12 +194,10 @@ def _segment_number(arguments: argparse.Namespace, config: Config) -> int:
 
 
 def _segment_counts(result: Segmentation, segment: int) -> str:
-    own, pseudo = (
-        slice(*offsets[segment : segment + 2])
-        for offsets in (result.candidates.offsets, result.pseudo.offsets)
-    )
+    first, last = result.candidates.offsets[segment : segment + 2].tolist()
+    n_inliers = int(result.surface.inlier[first:last].sum())
+    n_pseudo = int(np.diff(result.pseudo.offsets)[segment])
     return (
-        f'segment {segment}: {own.stop - own.start} candidates, '
-        f'{int(result.surface.inlier[own].sum())} inliers, {pseudo.stop - pseudo.start} '
-        'pseudo-inputs'
+        f'segment {segment}: {last - first} candidates, {n_inliers} inliers, '
+        f'{n_pseudo} pseudo-inputs'
     )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,6 @@ from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import check_points, finite_points
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.colours import length_scale_colours
 from gp_ground_seg.lab.plotting import style
 from gp_ground_seg.lab.plotting.style import add_axes, new_figure, save, write_line
@@ -28,45 +27,7 @@ VALUES = {
     'height': ('height over the ground [m]', -0.5, 3.0),
     'p_ground': ('probability of ground', 0.0, 1.0),
 }
-"""What points are coloured by instead of their class: attributes of `Segmentation`."""
-WIDTH, HEIGHT, TITLE, FOOT = 12.0, 6.0, 0.4, 0.6
-"""Size of the scene, and of the line above and the legend below it [inch]."""
-PANEL, GAP, N_COLUMNS = 4.8, 0.15, 3
-"""Width of a scene of a sheet and of the gap beside it [inch], and how many are in a row."""
-MOVIE_DPI = 80  # 960 by 560: whole blocks of a video
-N_STD = 2.0
-N_PROFILES = 60
-CLOSEST = 1.0
-"""Nothing nearer to the camera than this is drawn [m]."""
-# Places of the camera and of the middle of the picture, sensor frame [m].
-CAMERA, TARGET = (-16.0, -7.0, 10.0), (12.0, 1.0, -3.0)
-ZOOM = 0.75
-"""Focal length over the width of the picture."""
-
-
-class View(NamedTuple):
-    """Where a scene is seen from, sensor frame [m], and what its colours are: of `VALUES`."""
-
-    camera: tuple[float, float, float] = CAMERA
-    colour: str = 'class'
-
-    @classmethod
-    def around(cls, azimuth: float, elevation: float, distance: float) -> View:
-        """Look at the middle of the scene from a direction [degrees] and a distance [m]."""
-        turn, up = math.radians(azimuth), math.radians(elevation)
-        across = math.cos(turn) * math.cos(up), math.sin(turn) * math.cos(up), math.sin(up)
-        x, y, z = np.add(TARGET, np.multiply(distance, across)).tolist()
-        return cls((x, y, z))
-
-
-class Scene(NamedTuple):
-    """A segmented scan to draw."""
-
-    title: str
-    points: npt.ArrayLike  # (N, >=3) [m]
-    segmentation: Segmentation
-
-
+"""Attributes of `Segmentation` that points can be coloured by: title and ends of the scale."""
 COLOURS_ABOVE = {
     'ground': '#E3B968',
     'obstacle': '#1B4F72',
@@ -79,10 +40,27 @@ COLOURS_ABOVE = {
     'ground in A only': style.BLUE,
     'ground in B only': style.VERMILION,
 }
+"""Colours of the points seen from above."""
+
+# In perspective. Size of the scene, of the title above it and of the legend below it [inch].
+WIDTH, HEIGHT, TITLE, FOOT = 12.0, 6.0, 0.4, 0.6
+N_STD, N_PROFILES = 2.0, 60
+CLOSEST = 1.0
+"""Nothing nearer to the camera than this is drawn [m]."""
+# Places of the camera and of the middle of the picture, sensor frame [m].
+CAMERA, TARGET = (-16.0, -7.0, 10.0), (12.0, 1.0, -3.0)
+ZOOM = 0.75
+"""Focal length over the width of the picture."""
+
+# From above.
 EXTENT, RING_STEP = 50.0, 10.0
-"""Half the side of the square seen from above, and the step between the rings in it [m]."""
+"""Half the side of the square that is shown, and the step between the rings in it [m]."""
 # Inches: the square of a panel, left, right, below and above it; the line above all panels.
 SQUARE, LEFT, RIGHT, BELOW, ABOVE, LINE = 6.2, 0.8, 0.2, 0.95, 0.4, 0.4
+
+Place = tuple[float, float, float]
+Layers = dict[str, BoolArray]
+"""Which points, (N,), are drawn in each of `COLOURS_ABOVE`, lowest first."""
 
 
 def plot_scan_view(
@@ -91,71 +69,44 @@ def plot_scan_view(
     config: Config,
     path: str | Path,
     title: str = '',
-    view: View | None = None,
+    camera: Place = CAMERA,
+    colour: str = 'class',
 ) -> str:
     """Draw a scan in perspective, replacing the file `path`; return numbers of points.
 
     Ground and obstacles of `points`, (N, >=3) [m], and the ground model coloured by length-scale,
     with profiles of two standard deviations: what the node's topics show in RViz. Ground less
     certain than ``label.ground_tolerance`` is not drawn. In a PDF or SVG points are pixels.
+    `camera` is in the sensor frame [m]; `colour` is ``class`` or of `VALUES`.
     """
-    figure = _scene_figure(Scene(title, points, segmentation), config, view or View())
-    save(figure, path)
-    return _label_panel(segmentation.label)[0]
-
-
-def plot_sheet(
-    scenes: Iterable[Scene], n_scenes: int, config: Config, path: str | Path, view: View
-) -> None:
-    """Draw scenes side by side as `plot_scan_view` draws one, replacing the file `path`."""
-    height, n_rows = PANEL * HEIGHT / WIDTH, -(-n_scenes // N_COLUMNS)
-    full = FOOT + n_rows * (height + TITLE)
-    figure = new_figure((PANEL + GAP) * N_COLUMNS, full)
-    for k, scene in enumerate(scenes):
-        row, column = divmod(k, N_COLUMNS)
-        bottom = full - (row + 1) * (height + TITLE)
-        axes = add_axes(figure, column * (PANEL + GAP), bottom, (PANEL, height))
-        axes.set_title(scene.title, fontsize=12, parse_math=False)
-        _draw_scene(axes, scene, config, view)
-    _draw_legend(figure, config, view.colour)
-    save(figure, path)
-
-
-def write_movie(
-    scenes: Iterable[Scene], config: Config, path: str | Path, view: View, fps: float
-) -> None:
-    """Write a GIF of scenes, replacing the file."""
-    imageio = require('imageio.v2', 'imageio matplotlib')
-    with (
-        staged_file(path, force=True) as part,
-        imageio.get_writer(part, duration=1e3 / fps, loop=0) as writer,
-    ):
-        for scene in scenes:
-            writer.append_data(style.pixels(_scene_figure(scene, config, view, MOVIE_DPI)))
-
-
-def _scene_figure(scene: Scene, config: Config, view: View, dpi: int = style.DPI) -> Any:
-    figure = new_figure(WIDTH, FOOT + HEIGHT + (TITLE if scene.title else 0.0), dpi)
-    write_line(figure, scene.title, 0.5, 0.5 * TITLE, fontsize=14)
-    _draw_scene(add_axes(figure, 0.0, FOOT, (WIDTH, HEIGHT)), scene, config, view)
-    _draw_legend(figure, config, view.colour)
-    return figure
-
-
-def _draw_scene(axes: Any, scene: Scene, config: Config, view: View) -> None:
-    xyz = check_points(scene.points)
-    style.check_lengths(len(xyz), label=scene.segmentation.label)
-    _draw_points(axes, xyz, scene.segmentation, view)
-    _draw_surface(axes, GroundModel.of(scene.segmentation), config, view)
+    xyz = check_points(points)
+    style.check_lengths(len(xyz), label=segmentation.label)
+    figure = new_figure(WIDTH, FOOT + HEIGHT + (TITLE if title else 0.0))
+    write_line(figure, title, 0.5, 0.5 * TITLE, fontsize=14)
+    axes = add_axes(figure, 0.0, FOOT, (WIDTH, HEIGHT))
+    _draw_points(axes, xyz, segmentation, camera, colour)
+    _draw_surface(axes, GroundModel.of(segmentation), config, camera, is_plain=colour in VALUES)
     axes.set_axis_off()
     axes.set_aspect('equal')
     axes.set_xlim(-0.5, 0.5)
     axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
+    _draw_legend(figure, config, colour)
+    save(figure, path)
+    return _label_panel(segmentation.label)[0]
 
 
-def project(
-    points: FloatArray, camera: tuple[float, float, float] = CAMERA
-) -> tuple[FloatArray, FloatArray]:
+def camera_at(azimuth: float, elevation: float, distance: float) -> Place:
+    """Return where a camera stands that looks at the middle of the scene, sensor frame [m].
+
+    The direction [degrees] and the distance [m] are seen from that middle.
+    """
+    turn, up = math.radians(azimuth), math.radians(elevation)
+    across = math.cos(turn) * math.cos(up), math.sin(turn) * math.cos(up), math.sin(up)
+    x, y, z = np.add(TARGET, np.multiply(distance, across)).tolist()
+    return x, y, z
+
+
+def project(points: FloatArray, camera: Place = CAMERA) -> tuple[FloatArray, FloatArray]:
     """Return places in the picture and depths [m] of points, (..., 2) and (...).
 
     A place is in widths of the picture, right and up of its middle; NaN nearer than `CLOSEST`.
@@ -171,43 +122,41 @@ def project(
     return place, depth
 
 
-def _draw_points(axes: Any, xyz: FloatArray, segmentation: Segmentation, view: View) -> None:
+def _draw_points(
+    axes: Any, xyz: FloatArray, segmentation: Segmentation, camera: Place, colour: str
+) -> None:
     """Draw far points first, and the ground below all obstacles."""
-    place, depth = project(xyz, view.camera)
-    size = _scale(axes) ** 2
+    place, depth = project(xyz, camera)
     labels_and_layers = ((Label.GROUND, 1), (Label.OBSTACLE, 4))
-    for colour, (value, layer) in zip(COLOURS.values(), labels_and_layers, strict=True):
+    for class_colour, (value, layer) in zip(COLOURS.values(), labels_and_layers, strict=True):
         chosen = np.flatnonzero((segmentation.label == value) & (depth > CLOSEST))
         chosen = chosen[np.argsort(-depth[chosen])]
-        look: dict[str, Any] = {'c': colour, 'zorder': layer}
-        if view.colour in VALUES:
-            _, low, high = VALUES[view.colour]
-            look = {'c': getattr(segmentation, view.colour)[chosen], 'vmin': low, 'vmax': high}
+        look: dict[str, Any] = {'c': class_colour, 'zorder': layer}
+        if colour in VALUES:
+            _, low, high = VALUES[colour]
+            look = {'c': getattr(segmentation, colour)[chosen], 'vmin': low, 'vmax': high}
             look |= {'cmap': style.value_colours(), 'plotnonfinite': True, 'zorder': 4}
         axes.scatter(
-            *place[chosen].T, s=size * np.clip(40.0 / depth[chosen], 0.4, 4.0), linewidths=0.0,
+            *place[chosen].T, s=np.clip(40.0 / depth[chosen], 0.4, 4.0), linewidths=0.0,
             rasterized=True, **look,
         )  # fmt: skip
 
 
-def _scale(axes: Any) -> float:
-    """Return the width of a scene over that of a picture of its own."""
-    width: float = axes.bbox.width / axes.figure.dpi
-    return width / WIDTH
-
-
-def _draw_surface(axes: Any, model: GroundModel, config: Config, view: View) -> None:
+def _draw_surface(
+    axes: Any, model: GroundModel, config: Config, camera: Place, *, is_plain: bool
+) -> None:
+    """Draw the surface, its profiles and their bands; grey if `is_plain`."""
     from matplotlib.collections import LineCollection, PolyCollection
 
     middle, lower, upper = (
-        project(model.knot_points(n_std), view.camera)[0] for n_std in (0.0, -N_STD, N_STD)
+        project(model.knot_points(n_std), camera)[0] for n_std in (0.0, -N_STD, N_STD)
     )
     certain = model.std <= config.label.ground_tolerance
     shown = certain & np.isfinite(upper + lower + middle).all(axis=-1)
     piece = shown[:, :-1] & shown[:, 1:]
     limits = config.length_scale
     colours = length_scale_colours(model.length_scale, limits.min, limits.max)
-    if view.colour in VALUES:
+    if is_plain:
         colours = np.full_like(colours, 0.6)
 
     def add(drawn: BoolArray, corners: Sequence[FloatArray], kind: Any, **look: Any) -> None:
@@ -216,26 +165,20 @@ def _draw_surface(axes: Any, model: GroundModel, config: Config, view: View) -> 
         collection.set_color(colours[:, :-1][drawn])
         axes.add_collection(collection)
 
+    along = [middle[:, :-1], middle[:, 1:]]
     aside = [np.roll(middle, -1, axis=0)[:, ends] for ends in (slice(1, None), slice(-1))]
     filled = piece & np.roll(piece, -1, axis=0)
     flat = {'alpha': 0.45, 'linewidths': 0.0, 'antialiaseds': False, 'zorder': 2}
-    add(filled, [middle[:, :-1], middle[:, 1:], *aside], PolyCollection, **flat)
+    add(filled, [*along, *aside], PolyCollection, **flat)
     piece[np.arange(len(piece)) % -(-len(piece) // N_PROFILES) > 0] = False
     band = [lower[:, :-1], lower[:, 1:], upper[:, 1:], upper[:, :-1]]
     add(piece, band, PolyCollection, alpha=0.35, linewidths=0.0, zorder=2)
-    add(
-        piece,
-        [middle[:, :-1], middle[:, 1:]],
-        LineCollection,
-        linewidths=1.3 * _scale(axes),
-        zorder=3,
-    )
+    add(piece, along, LineCollection, linewidths=1.3, zorder=3)
 
 
 def _draw_legend(figure: Any, config: Config, colour: str) -> None:
-    """Draw what the colours are below all else."""
-    width = figure.get_size_inches()[0]
-    bar = add_axes(figure, 0.66 * width, 0.26, (0.3 * width, 0.14))
+    """Draw the legend below the scene."""
+    bar = add_axes(figure, 0.66 * WIDTH, 0.26, (0.3 * WIDTH, 0.14))
     bar.set_yticks([])
     if colour in VALUES:
         title, low, high = VALUES[colour]
@@ -257,10 +200,6 @@ def _draw_legend(figure: Any, config: Config, colour: str) -> None:
     ticks = [tick for tick in (0.1, 0.3, 1, 3, 10, 30, 100, 300) if low <= tick <= high]
     bar.set_xticks(ticks, labels=[f'{tick:g}' for tick in ticks])
     bar.minorticks_off()
-
-
-Layers = dict[str, BoolArray]
-"""Which points, (N,), are drawn in each of `COLOURS_ABOVE`, lowest first."""
 
 
 def plot_birds_eye(
@@ -368,21 +307,9 @@ def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None
         x, y = xy[chosen & inside].T
         if len(x):
             shown[name] = colour = COLOURS_ABOVE[name]
-            size = 3.0 if COLOURS_ABOVE[name] in (style.BLUE, style.VERMILION) else 1.0
+            size = 3.0 if colour in (style.BLUE, style.VERMILION) else 1.0
             axes.scatter(y, x, s=size, c=colour, linewidths=0.0, zorder=depth, rasterized=True)
-    angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    for radius in np.arange(RING_STEP, EXTENT * math.sqrt(2.0), RING_STEP):
-        axes.plot(
-            radius * np.cos(angle), radius * np.sin(angle), color='#6B7178', linewidth=0.5,
-            linestyle=(0, (4, 4)), zorder=len(layers),
-        )  # fmt: skip
-        if radius < EXTENT:
-            axes.text(
-                *(-radius * math.sqrt(0.5),) * 2, f'{radius:g} m', fontsize=8, color='#3B4046',
-                ha='center', va='center', zorder=len(layers),
-                bbox={'boxstyle': 'round,pad=0.15', 'facecolor': 'white', 'edgecolor': 'none',
-                      'alpha': 0.8},
-            )  # fmt: skip
+    _draw_rings(axes, len(layers))
     axes.set_aspect('equal')
     axes.set_xlim(EXTENT, -EXTENT)
     axes.set_ylim(-EXTENT, EXTENT)
@@ -395,3 +322,20 @@ def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None
         bbox_to_anchor=(0.5, -0.08), ncols=len(shown) + 1, fontsize=10.5, handletextpad=0.2,
         columnspacing=1.5,
     )  # fmt: skip
+
+
+def _draw_rings(axes: Any, layer: int) -> None:
+    """Draw rings of equal range, with their ranges."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 361)
+    for radius in np.arange(RING_STEP, EXTENT * math.sqrt(2.0), RING_STEP):
+        axes.plot(
+            radius * np.cos(angle), radius * np.sin(angle), color='#6B7178', linewidth=0.5,
+            linestyle=(0, (4, 4)), zorder=layer,
+        )  # fmt: skip
+        if radius < EXTENT:
+            axes.text(
+                *(-radius * math.sqrt(0.5),) * 2, f'{radius:g} m', fontsize=8, color='#3B4046',
+                ha='center', va='center', zorder=layer,
+                bbox={'boxstyle': 'round,pad=0.15', 'facecolor': 'white', 'edgecolor': 'none',
+                      'alpha': 0.8},
+            )  # fmt: skip

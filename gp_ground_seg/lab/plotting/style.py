@@ -6,9 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from gp_ground_seg.core.errors import PointCloudError, require
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.colours import UNKNOWN
@@ -60,15 +57,6 @@ def save(figure: Any, path: str | Path) -> None:
     metadata = {'pdf': {'CreationDate': None}, 'svg': {'Date': None}}.get(kind, {})
     with staged_file(path, force=True) as part, rc_context({'svg.hashsalt': 'gp_ground_seg'}):
         figure.savefig(part, format=kind, metadata=metadata)
-
-
-def pixels(figure: Any) -> npt.NDArray[np.uint8]:
-    """Return a figure as an image, (height, width, 3)."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
 def value_colours() -> Any:
