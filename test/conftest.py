@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from functools import lru_cache
 from pathlib import Path
 from unittest.mock import patch
 
@@ -16,12 +17,14 @@ from gp_ground_seg.core.backend import Backend, NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.core.segmenter import warm_up
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 # The duration of an example depends on the machine more than on the code.
 settings.register_profile('default', deadline=None)
 settings.load_profile('default')
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+ROAD, OTHER_OBJECT = 40, 99  # classes of SemanticKITTI
 
 
 def load_script(path):
@@ -57,6 +60,29 @@ def hilly_scan(n_points: int = 4000, seed: int = 0, sensor_height: float = 1.73)
     standing = rng.random(n_points) < 0.2
     z[standing] += rng.uniform(0.5, 2.0, standing.sum())
     return np.column_stack([x, y, z])
+
+
+@lru_cache(maxsize=64)
+def simulated(scene: str, sensor: str = 'vlp-16', seed: int = 0):
+    """Scan of a simulated scene, made once for all tests: not to be changed."""
+    rng = np.random.default_rng(seed)
+    made = simulate_scan(SCENES[scene](seed), SENSORS[sensor], rng)
+    made.points.setflags(write=False)
+    return made
+
+
+@pytest.fixture(scope='session')
+def sequence(tmp_path_factory):
+    """Folder of two simulated scans with labels, as SemanticKITTI has them."""
+    folder = tmp_path_factory.mktemp('sequence')
+    for name in ('velodyne', 'labels'):
+        (folder / name).mkdir()
+    for k in range(2):
+        made = simulated('urban', seed=k)
+        made.points.astype('<f4').tofile(folder / 'velodyne' / f'{k:06d}.bin')
+        labels = np.where(made.is_ground, ROAD, OTHER_OBJECT).astype('<u4')
+        labels.tofile(folder / 'labels' / f'{k:06d}.label')
+    return folder
 
 
 def fewer(n: int, n_plain: int) -> int:

@@ -12,26 +12,13 @@ from browser import CHROMIUM, open_browser  # noqa: E402
 from cli_runner import run, until_ctrl_c  # noqa: E402
 
 from gp_ground_seg.core.parameters.config import Config  # noqa: E402
-from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan  # noqa: E402
 from gp_ground_seg.lab.viewers.scene import LEGENDS, palette  # noqa: E402
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
-ROAD, OBJECT = 40, 99  # classes of SemanticKITTI
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed'),
+    pytest.mark.slow,
+]
 SHADED = 40  # difference of a shaded colour, from 0 to 255
-
-
-@pytest.fixture(scope='module')
-def sequence(tmp_path_factory):
-    """Two simulated scans with labels, as SemanticKITTI has them."""
-    folder = tmp_path_factory.mktemp('sequence')
-    for name in ('velodyne', 'labels'):
-        (folder / name).mkdir()
-    for k in range(2):
-        scan = simulate_scan(SCENES['urban'](k), SENSORS['vlp-16'], np.random.default_rng(k))
-        scan.points.astype('<f4').tofile(folder / 'velodyne' / f'{k:06d}.bin')
-        labels = np.where(scan.is_ground, ROAD, OBJECT).astype('<u4')
-        labels.tofile(folder / 'labels' / f'{k:06d}.label')
-    return folder
 
 
 @pytest.fixture

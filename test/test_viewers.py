@@ -11,35 +11,16 @@ import pytest
 import tune_bench
 from bag_samples import write_ros2_bag
 from cli_runner import error_line, run, until_ctrl_c
+from conftest import ROAD, simulated
 
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
-from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 from gp_ground_seg.lab.viewers.scene import View, make_scene, palette, point_colours, read_view
 from gp_ground_seg.lab.viewers.tuner import slider_values, tunable
 
-ROAD, OBJECT = 40, 99  # classes of SemanticKITTI
-CAR = 10 | 7 << 16  # and an instance of one
+CAR = 10 | 7 << 16  # class of SemanticKITTI, and an instance of it
 PATIENCE = 60.0
-
-
-def scan_of(k, scene='urban'):
-    return simulate_scan(SCENES[scene](k), SENSORS['vlp-16'], np.random.default_rng(k))
-
-
-@pytest.fixture(scope='module')
-def sequence(tmp_path_factory):
-    """Two simulated scans with labels, as SemanticKITTI has them."""
-    folder = tmp_path_factory.mktemp('sequence')
-    for name in ('velodyne', 'labels'):
-        (folder / name).mkdir()
-    for k in range(2):
-        scan = scan_of(k)
-        scan.points.astype('<f4').tofile(folder / 'velodyne' / f'{k:06d}.bin')
-        labels = np.where(scan.is_ground, ROAD, OBJECT).astype('<u4')
-        labels.tofile(folder / 'labels' / f'{k:06d}.label')
-    return folder
 
 
 def segment(points, config=None):
@@ -48,7 +29,7 @@ def segment(points, config=None):
 
 
 def test_colours_are_those_of_the_legends():
-    points = scan_of(0).points
+    points = simulated('urban').points.copy()
     points[0, 0] = np.nan
     result, _ = segment(points)
     label, n = result.label, len(points)
@@ -82,7 +63,7 @@ def test_colours_are_those_of_the_legends():
 def test_a_tilted_scan_is_drawn_level_and_the_mesh_lies_under_its_ground():
     tilt = 0.3
     cosine, sine = np.cos(tilt), np.sin(tilt)
-    turned = scan_of(0, 'flat').points[:, :3] @ [[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]
+    turned = simulated('flat').points[:, :3] @ [[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]
     turned = turned.astype(np.float32)
     result, segmenter = segment(turned)
     assert not result.pose.is_level
@@ -110,7 +91,7 @@ def test_faces_are_on_walls(sequence):
     view = read_view(list_inputs(sequence)[0])
     result, segmenter = segment(view.points)
     scene = make_scene(view, result, segmenter.config, segmenter.backend)
-    kinds = scan_of(0)
+    kinds = simulated('urban')
     tall = np.isin(scene.clouds['faces'].points, kinds.points[~kinds.is_ground, :3]).all(axis=1)
     assert len(tall) > 300 and tall.mean() > 0.8
     assert set(scene.clouds) == {'class', 'height', 'p_ground', 'errors', 'faces', 'candidates'}
@@ -160,27 +141,39 @@ def test_a_slider_holds_the_value_at_hand_and_is_logarithmic_where_that_helps():
 rerun = functools.partial(pytest.importorskip, 'rerun', reason='rerun is not installed')
 
 
-def test_a_recording_has_every_frame(sequence, tmp_path):
+@pytest.fixture
+def record(tmp_path):
+    """Values by frame and by path of what `view --save` records, and what its views show."""
     rerun()
     from rerun.chunk import RrdReader
 
-    path = tmp_path / 'a.rrd'
-    assert run('view', sequence, '--save', path, '--quiet') == 0
-    reader = RrdReader(path)
-    assert len(reader.recordings()) == len(reader.blueprints()) == 1
-    found = {}
-    for chunk in reader.stream():
-        if not chunk.is_static:
-            batch = chunk.to_record_batch()
-            values = (':positions', ':scalars', ':vertex_positions')
-            (name,) = (n for n in batch.schema.names if n.endswith(values))
-            pairs = zip(batch['frame'].to_pylist(), batch[name].to_pylist(), strict=True)
-            found.setdefault(chunk.entity_path, {}).update(pairs)
+    def record(*words):
+        path = tmp_path / 'a.rrd'
+        assert run('view', *words, '--save', path, '--quiet') == 0
+        reader, found = RrdReader(path), {}
+        (blueprint,) = reader.blueprints()
+        for chunk in reader.stream():
+            if not chunk.is_static:
+                batch = chunk.to_record_batch()
+                values = (':positions', ':scalars', ':vertex_positions')
+                (name,) = (n for n in batch.schema.names if n.endswith(values))
+                pairs = zip(batch['frame'].to_pylist(), batch[name].to_pylist(), strict=True)
+                found.setdefault(chunk.entity_path, {}).update(pairs)
+        batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
+        origin = 'ViewBlueprint:space_origin'
+        origins = [b[origin].to_pylist() for b in batches if origin in b.schema.names]
+        return found, {name for ((name,),) in origins} - {'scan', 'about'}
+
+    return record
+
+
+def test_a_recording_has_every_frame(sequence, record):
+    found, shown = record(sequence)
+    assert shown == {'theta', 'latency', 'IoU', 'lost'}
     layers = {'class', 'height', 'p_ground', 'errors', 'faces', 'candidates', 'surface', 'band'}
     assert {f'/scan/{name}' for name in layers} | {'/IoU', '/lost', '/latency'} <= found.keys()
-    assert {name for name in found if name.startswith('/theta/')} and all(
-        sorted(values) == [0, 1] for values in found.values()
-    )
+    assert any(name.startswith('/theta/') for name in found)
+    assert all(sorted(values) == [0, 1] for values in found.values())
     segmenter = GroundSegmenter()
     for k, item in enumerate(list_inputs(sequence)):
         view = read_view(item)
@@ -189,39 +182,12 @@ def test_a_recording_has_every_frame(sequence, tmp_path):
         assert np.array_equal(np.float32(found['/scan/class'][k]), view.points[:, :3])
 
 
-def test_only_the_frames_that_were_asked_for(sequence, tmp_path):
-    rerun()
-    from rerun.chunk import RrdReader
-
-    for words, expected in (
-        (('--frame', 0), [0]),
-        (('--frame', 1), [1]),
-        (('--frame-step', 2), [0]),
-    ):
-        path = tmp_path / f'{"".join(map(str, words))}.rrd'
-        assert run('view', sequence, '--save', path, '--quiet', *words) == 0
-        chunks = [c for c in RrdReader(path).stream() if c.entity_path == '/scan/class']
-        frames = [chunk.to_record_batch()['frame'].to_pylist() for chunk in chunks]
-        assert frames == [expected]
-
-
-def test_a_bag_has_no_series_that_need_labels(sequence, tmp_path):
-    rerun()
-    from rerun.chunk import RrdReader
-
+def test_only_the_frames_asked_for_and_no_series_that_need_labels(tmp_path, record):
     write_ros2_bag(tmp_path / 'drive.mcap')
-    for words, expected in (
-        ((tmp_path / 'drive.mcap', '--frame-step', 2), {'theta', 'latency'}),
-        ((sequence,), {'theta', 'latency', 'IoU', 'lost'}),
-    ):
-        path = tmp_path / f'{len(words)}.rrd'
-        assert run('view', *words, '--save', path, '--quiet') == 0
-        reader = RrdReader(path)
-        (blueprint,) = reader.blueprints()
-        batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
-        origin = 'ViewBlueprint:space_origin'
-        views = [b[origin].to_pylist() for b in batches if origin in b.schema.names]
-        assert {name for ((name,),) in views} == {'scan', 'about', *expected}
+    for words, expected in ((['--frame', 1], [1]), (['--frame-step', 2, '--force'], [0, 2])):
+        found, shown = record(tmp_path / 'drive.mcap', *words)
+        assert sorted(found['/scan/class']) == expected
+        assert shown == {'theta', 'latency'}
 
 
 def free_ports():

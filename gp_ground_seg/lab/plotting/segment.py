@@ -64,58 +64,63 @@ def plot_segment(
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     style.check_lengths(len(z), result=result.label, truth=truth)
-    n_segments = result.grid.n_segments
-    if not 0 <= segment < n_segments:
-        raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
+    view = SegmentView(result, segment)
     if max_range is not None and not (max_range > 0.0 and math.isfinite(max_range)):
         raise ConfigError(f'max_range = {max_range}: must be a positive number of metres')
-    figure = new_figure(WIDTH, HEIGHT, DPI)
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    own = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
-    r, z = result.grid.r[own], z[own]
-    view = SegmentView(result, segment)
+    inside = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
+    r, z = result.grid.r[inside], z[inside]
     reach = view.reach(r) if max_range is None else max_range
     low, high = view.heights_shown(reach, z)
     n_hidden = np.count_nonzero((r > reach) | (z < low) | (z > high))
+    figure = new_figure(WIDTH, HEIGHT, DPI)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
     figure.subplots_adjust(0.065, 0.075, 1.0 - LEGEND / WIDTH, 0.93, hspace=0.08)
-    width = 360.0 / n_segments
-    first, last = (width * (segment + k) - 180.0 for k in (0, 1))
-    model = '' if np.isfinite(result.surface.mean[segment]).any() else ': no ground model'
-    name = f'segment {segment}, azimuth {first:g}° to {last:g}°{model}; {n_hidden} points outside'
-    name = f'{title}, {name}' if title else name
+    name = f'{title}, {view.name}' if title else view.name
+    name = f'{name}; {n_hidden} points outside'
     above.set_title(name, fontsize=12, loc='left', parse_math=False)
-    view.draw_points(above, r, z, None if truth is None else truth[own])
+    view.draw_points(above, r, z, None if truth is None else truth[inside])
     view.draw_ground(above)
     above.set_xlim(0.0, reach)
     above.set_ylim(low, high)
     view.draw_length_scale(below, reach, with_pseudo_inputs=config.length_scale.model == 'latent')
-    below.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    below.yaxis.set_major_formatter('{x:g}')
-    below.yaxis.set_minor_formatter(NullFormatter())
-    below.set_xlabel('horizontal range r [m]')
     for axes in (above, below):
-        axes.grid(color='#E9ECEE', linewidth=0.7)
-        axes.set_axisbelow(True)
-        axes.legend(
-            loc='upper left', bbox_to_anchor=(1.01, 1.01), frameon=False, fontsize=10,
-            borderaxespad=0.0, labelspacing=0.8, markerscale=1.3,
-        )  # fmt: skip
+        _finish(axes)
     figure.align_ylabels()
     save(figure, path)
 
 
+def _finish(axes: Any) -> None:
+    """Draw the grid of a panel, and its legend beside it."""
+    axes.grid(color='#E9ECEE', linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.legend(
+        loc='upper left', bbox_to_anchor=(1.01, 1.01), frameon=False, fontsize=10,
+        borderaxespad=0.0, labelspacing=0.8, markerscale=1.3,
+    )  # fmt: skip
+
+
 class SegmentView:
-    """The parts of the picture."""
+    """The parts of the picture of a segment; ConfigError if there is no such segment."""
 
     def __init__(self, result: Segmentation, segment: int) -> None:
+        n_segments = result.grid.n_segments
+        if not 0 <= segment < n_segments:
+            raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
         self._result, self._segment = result, segment
-        self._own = slice(*(int(k) for k in result.candidates.offsets[segment : segment + 2]))
-        self._r, self._z = result.candidates.r[self._own], result.candidates.z[self._own]
-        self._inlier = result.surface.inlier[self._own]
+        first, last = result.candidates.offsets[segment : segment + 2].tolist()
+        self._r, self._z = result.candidates.r[first:last], result.candidates.z[first:last]
+        self._inlier = result.surface.inlier[first:last]
+        self._lines = np.unique(result.lines.line[first:last])
         self._knots = result.surface.knots
         self._mean, self._std = result.surface.mean[segment], result.surface.std[segment]
+
+    @property
+    def name(self) -> str:
+        """Number of the segment and its azimuths, and whether it has a ground model."""
+        width = 360.0 / self._result.grid.n_segments
+        first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
+        model = '' if np.isfinite(self._mean).any() else ': no ground model'
+        return f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
 
     def reach(self, point_r: FloatArray) -> float:
         """Range that holds all candidates, or all points where there are none [m]."""
@@ -161,16 +166,15 @@ class SegmentView:
     def _draw_lines(self, axes: Any) -> None:
         """Draw each line over its extent, and the critical points where the next one begins."""
         candidates, lines = self._result.candidates, self._result.lines
-        ids = np.unique(lines.line[self._own])
-        drawn = [q for q in ids if lines.start[q + 1] - lines.start[q] > 1]
+        drawn = [q for q in self._lines if lines.start[q + 1] - lines.start[q] > 1]
         for q in drawn:
-            own = slice(lines.start[q], lines.start[q + 1])
+            points = slice(lines.start[q], lines.start[q + 1])
             axes.plot(
-                *line_ends(candidates.r[own], candidates.z[own], float(lines.slope[q])),
+                *line_ends(candidates.r[points], candidates.z[points], float(lines.slope[q])),
                 color=LINE_COLOUR, lw=3.2, alpha=0.75, solid_capstyle='butt', zorder=4,
-                label=f'lines ({len(ids)})' if q == drawn[0] else None,
+                label=f'lines ({len(self._lines)})' if q == drawn[0] else None,
             )  # fmt: skip
-        critical = lines.start[ids[1:]]
+        critical = lines.start[self._lines[1:]]
         axes.plot(
             candidates.r[critical], candidates.z[critical], 'd', ms=9, mfc='none',
             mec=LINE_COLOUR, mew=1.2, zorder=8, label=f'critical points ({len(critical)})',
@@ -178,6 +182,8 @@ class SegmentView:
 
     def draw_length_scale(self, axes: Any, reach: float, *, with_pseudo_inputs: bool) -> None:
         """Draw the length-scale over range, and the pseudo-inputs it follows."""
+        from matplotlib.ticker import LogLocator, NullFormatter
+
         result = self._result
         length_scale = np.exp(result.log_length_scale[self._segment])
         axes.plot(self._knots, length_scale, color=SURFACE_COLOUR, lw=1.8, label='length-scale')
@@ -196,11 +202,15 @@ class SegmentView:
         factor = max(1.2 * math.sqrt(high / low), math.sqrt(10.0))
         axes.set_ylim(math.sqrt(low * high) / factor, math.sqrt(low * high) * factor)
         axes.set_yscale('log')
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter('{x:g}')
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.set_xlabel('horizontal range r [m]')
         axes.set_ylabel('length-scale l [m]')
 
 
 def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, FloatArray]:
-    """Range and height, (2,) each, of the ends of a line through points (n,) [m]."""
+    """Return range and height, (2,) each, of the ends of a line through points (n,) [m]."""
     angle = math.atan(slope)
     along = (r - r.mean()) * math.cos(angle) + (z - z.mean()) * math.sin(angle)
     ends = np.array([along.min(), along.max()])
