@@ -66,7 +66,8 @@ SLOPES = st.floats(allow_nan=False) | st.floats(-1.57, 1.57).map(math.tan)
 def test_difference_in_direction(slope, new_slope, tolerance):
     difference = abs(math.atan(new_slope) - math.atan(slope))
     if abs(difference - tolerance) > 1e-9:
-        assert differs_in_direction(slope, new_slope, tolerance) == (difference > tolerance)
+        found = differs_in_direction(slope, new_slope, math.tan(tolerance))
+        assert found == (difference > tolerance)
 
 
 def draw_candidates(seed, n_segments=8, most=30):

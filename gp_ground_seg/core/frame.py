@@ -110,7 +110,7 @@ class Candidates(NamedTuple):
         return result
 
     @classmethod
-    def room(cls, n: int, n_segments: int) -> Candidates:
+    def buffers(cls, n: int, n_segments: int) -> Candidates:
         """Arrays for at most `n` candidates, with arbitrary content."""
         return cls(
             r=np.empty(n),

@@ -32,6 +32,7 @@ _LOGGER = logging.getLogger('gp_ground_seg')
 _Function = TypeVar('_Function', bound=Callable[..., Any])
 _CORE = Path(__file__).parent
 _entry_points: list[Any] = []
+_shared: list[Callable[..., Any]] = []
 _KEPT = 'kept.json'
 _is_warm = False
 _n_ready = _n_kept = 0
@@ -39,6 +40,40 @@ _n_ready = _n_kept = 0
 
 class _Decorator(Protocol):
     def __call__(self, function: _Function) -> _Function: ...
+
+
+def shared(function: _Function) -> _Function:
+    """Let compiled code call a plain function by its name.
+
+    It stays plain Python, as importing numba takes most of a second: numpy code calls it with
+    arrays, or loops in it run uncompiled.
+    """
+    _shared.append(function)
+    return function
+
+
+def compiled_form(plain: Callable[..., Any], *, fastmath: bool = False) -> _Decorator:
+    """Return a decorator for what runs in compiled code where it calls `plain`.
+
+    For functions that are a call of numpy to arrays, and a loop or a branch to compiled code.
+    """
+
+    def decorate(function: _Function) -> _Function:
+        if JIT_ENABLED:
+            from numba.extending import overload
+
+            options = _options(fastmath)
+            overload(plain, jit_options=options, strict=False)(lambda *arguments: function)
+        return function
+
+    return decorate
+
+
+def _options(fastmath: bool) -> dict[str, Any]:
+    options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
+    if fastmath:
+        options['fastmath'] = {'reassoc', 'contract', 'nsz'}
+    return options
 
 
 def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
@@ -64,9 +99,10 @@ def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
             return function
         import numba
 
-        options: dict[str, Any] = {'nogil': True, 'error_model': 'numpy'}
-        if fastmath:
-            options['fastmath'] = {'reassoc', 'contract', 'nsz'}
+        while _shared:
+            plain = _shared.pop()
+            compiled_form(plain)(plain)
+        options = _options(fastmath)
         if not entry:
             part: _Function = numba.njit(**options)(function)
             return part

@@ -18,7 +18,6 @@ from gp_ground_seg.core.compiled import (
 from gp_ground_seg.core.compiled import latent as latent_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
 from gp_ground_seg.core.compiled.buffers import Buffers
-from gp_ground_seg.core.compiled.sections import numbers_of
 from gp_ground_seg.core.compiled.threads import Part, Workers, run_of
 from gp_ground_seg.core.frame import (
     BoolArray,
@@ -40,8 +39,10 @@ from gp_ground_seg.core.gp.evidence import STEP, looks_aside_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.numbers import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.labels import square_units
+from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.tilt import Direction
 
@@ -103,7 +104,7 @@ class NumbaBackend:
             polar_grid.sort_points(part, columns, geometry, places, cells, tiles)
 
         self.workers.run(copy_and_sort, n_parts)
-        room = Candidates.room(n_cells, n_segments)
+        room = Candidates.buffers(n_cells, n_segments)
         n = polar_grid.merge_parts(
             n_parts, cells, tiles, geometry.edges, config.lines.min_density_extent, room
         )
@@ -148,7 +149,9 @@ class NumbaBackend:
         self, candidates: Candidates, faces: Faces, config: Config
     ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
         """Candidates that show ground, lines, pseudo-inputs, candidates that continue a line."""
-        return lines.find_lines(candidates, faces, config)
+        buffers = Candidates.buffers(len(candidates.r), len(candidates.offsets) - 1)
+        kept = buffers.first(lines.keep_visible(candidates, faces.has_occluded_base, buffers))
+        return kept, *lines_through(kept, config, lines.trace)
 
     def log_likelihood(
         self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool

@@ -1,8 +1,12 @@
-"""Stage 4: lines through the candidates of a segment, and pseudo-inputs on them."""
+"""Stage 4: lines through the candidates of a segment, and pseudo-inputs on them.
+
+The loops are those of both backends: numba compiles `trace` with all that it calls.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -10,10 +14,19 @@ from gp_ground_seg.core.frame import (
     BoolArray,
     Candidates,
     Faces,
+    FloatArray,
     Lines,
     PseudoInputs,
 )
-from gp_ground_seg.core.parameters.config import Config, LinesConfig
+from gp_ground_seg.core.jit import shared
+from gp_ground_seg.core.parameters.config import (
+    Config,
+    GrowthConfig,
+    LatentConfig,
+    LengthScaleConfig,
+    LinesConfig,
+)
+from gp_ground_seg.core.parameters.numbers import numbers_of
 
 MIN_BREAK_CANDIDATES = 3
 """Candidates that a line after a slope break needs: through two there is always one."""
@@ -25,83 +38,131 @@ def find_lines(
     """Lines through the candidates that show ground, and what follows from the lines.
 
     The lowest point of a face with occluded base is no candidate. Returns the candidates kept;
-    see `extract_lines`, `select_pseudo_inputs` and `candidates_on_lines` for the others.
+    see `lines_through` for the others.
     """
     kept = candidates.where(~faces.has_occluded_base[candidates.tile])
-    lines = extract_lines(kept, config.lines)
-    pseudo = select_pseudo_inputs(kept, lines, config)
-    return kept, lines, pseudo, candidates_on_lines(lines, kept, config)
-
-
-def extract_lines(candidates: Candidates, lines: LinesConfig) -> Lines:
-    """Cut each segment's candidates into lines (paper, section III-D and Algorithm 1).
-
-    A line grows over the candidates in order of range until the next one makes
-    a critical point: a gap, a change of slope or of height at the new point, a
-    distance from the line that is too large, or a sharp change of the vertical
-    density. The next line starts there, independent of the one before.
-    """
-    columns = candidates.offsets, candidates.r, candidates.z, candidates.density
     # Plain Python reads lists much faster than arrays.
-    offsets, r, z, density = (column.tolist() for column in columns)
-    line: list[int] = []
-    start, slopes = [0], list[float]()
+    lists = Candidates(*(column.tolist() for column in kept))
+    return kept, *lines_through(lists, config, trace)
+
+
+def lines_through(
+    candidates: Candidates, config: Config, trace_lines: Callable[..., tuple[int, int]]
+) -> tuple[Lines, PseudoInputs, BoolArray]:
+    """Lines, pseudo-inputs, and which candidates continue a line, by `trace`, compiled or not."""
+    n = len(candidates.r)
+    lines = Lines(np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64))
+    pseudo = PseudoInputs(np.empty(n), np.empty(n), np.empty(len(candidates.offsets), np.int64))
+    continues_line = np.empty(n, np.bool_)
+    groups = config.lines, config.growth, config.latent, config.length_scale
+    n_lines, n_pseudo = trace_lines(
+        candidates, *map(numbers_of, groups), lines, pseudo, continues_line
+    )
+    lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
+    pseudo = PseudoInputs(pseudo.r_bar[:n_pseudo], pseudo.log_extent[:n_pseudo], pseudo.offsets)
+    return lines, pseudo, continues_line
+
+
+def trace(
+    candidates: Candidates,
+    tolerances: LinesConfig,
+    growth: GrowthConfig,
+    latent: LatentConfig,
+    limits: LengthScaleConfig,
+    lines: Lines,
+    pseudo: PseudoInputs,
+    continues_line: BoolArray,
+) -> tuple[int, int]:
+    """Fill the last three; return the number of lines, and that of pseudo-inputs.
+
+    There is room for as many as there are candidates.
+    """
+    n_lines = extract_lines(candidates, tolerances, lines)
+    mark_continued(candidates, lines, n_lines, tolerances, growth, continues_line)
+    return n_lines, select_pseudo_inputs(candidates, lines, n_lines, latent, limits, pseudo)
+
+
+@shared
+def extract_lines(candidates: Candidates, tolerances: LinesConfig, lines: Lines) -> int:
+    """Cut each segment's candidates into lines; return their number.
+
+    Paper, section III-D and Algorithm 1. A line grows over the candidates in order of range until
+    the next one makes a critical point: a gap, a change of slope or of height at the new point, a
+    distance from the line that is too large, or a sharp change of the vertical density. The next
+    line starts there, independent of the one before.
+    """
+    r, z, density, offsets = candidates.r, candidates.z, candidates.density, candidates.offsets
+    tangent = math.tan(tolerances.slope_tolerance)
+    n_lines = 0
     for m in range(len(offsets) - 1):
         first, stop = offsets[m], offsets[m + 1]
         while first < stop:
-            behind, slope = _grow_line(first, stop, r, z, density, lines)
-            line += [len(slopes)] * (behind - first)
-            slopes.append(slope)
-            start.append(behind)
+            behind, slope = grow_line(first, stop, r, z, density, tolerances, tangent)
+            lines.start[n_lines], lines.slope[n_lines] = first, slope
+            for c in range(first, behind):
+                lines.line[c] = n_lines
+            n_lines += 1
             first = behind
-    return Lines(np.array(line, dtype=np.int64), np.array(slopes), np.array(start, dtype=np.int64))
+    lines.start[n_lines] = len(r)
+    return n_lines
 
 
-def _grow_line(
+@shared
+def grow_line(
     first: int,
     stop: int,
-    r: list[float],
-    z: list[float],
-    density: list[float],
-    lines: LinesConfig,
+    r: FloatArray,
+    z: FloatArray,
+    density: FloatArray,
+    tolerances: LinesConfig,
+    tangent: float,
 ) -> tuple[int, float]:
-    """Candidate behind the line from `first`, at most `stop`, and the line's slope."""
+    """Candidate behind the line from `first`, at most `stop`, and the line's slope.
+
+    `tangent` is that of ``tolerances.slope_tolerance``.
+    """
+    square_distance = tolerances.max_line_distance * tolerances.max_line_distance
     # Sums relative to the first point of the line keep their digits.
     sum_r = sum_z = sum_rr = sum_zz = sum_rz = mean_r = mean_z = 0.0
     slope, n = math.nan, 1
     for j in range(first + 1, stop):
-        ratio = lines.max_density_ratio
-        if (
-            r[j] - r[j - 1] > lines.max_gap + lines.max_gap_growth * r[j]
-            or density[j] > ratio * density[j - 1]
-            or density[j - 1] > ratio * density[j]
-        ):
+        if ends_before(j, r, density, tolerances):
             return j, slope
         dr, dz = r[j] - r[first], z[j] - z[first]
         expected = mean_z + slope * (dr - mean_r)
         missed = dz - expected
-        if n > 1 and missed * missed > lines.max_line_distance**2 * (1.0 + slope * slope):
+        if n > 1 and missed * missed > square_distance * (1.0 + slope * slope):
             return j, slope
         n += 1
         sum_r, sum_z = sum_r + dr, sum_z + dz
         sum_rr, sum_zz, sum_rz = sum_rr + dr * dr, sum_zz + dz * dz, sum_rz + dr * dz
         mean_r, mean_z = sum_r / n, sum_z / n
-        new_slope = deming_slope(
-            sum_rr - n * mean_r * mean_r,
-            sum_zz - n * mean_z * mean_z,
-            sum_rz - n * mean_r * mean_z,
-            lines.error_ratio,
-        )
+        s_rr, s_zz = sum_rr - n * mean_r * mean_r, sum_zz - n * mean_z * mean_z
+        s_rz = sum_rz - n * mean_r * mean_z
+        new_slope = deming_slope(s_rr, s_zz, s_rz, tolerances.error_ratio)
         if n > 2:
             moved = mean_z + new_slope * (dr - mean_r) - expected
-            if abs(moved) > lines.offset_tolerance or differs_in_direction(
-                slope, new_slope, lines.slope_tolerance
-            ):
+            if abs(moved) > tolerances.offset_tolerance:
+                return j, slope
+            if differs_in_direction(slope, new_slope, tangent):
                 return j, slope
         slope = new_slope
     return stop, slope
 
 
+@shared
+def ends_before(j: int, r: FloatArray, density: FloatArray, tolerances: LinesConfig) -> bool:
+    """Whether a gap, or a sharp change of the density, lies before candidate `j`."""
+    ratio = tolerances.max_density_ratio
+    ends: bool = (
+        r[j] - r[j - 1] > tolerances.max_gap + tolerances.max_gap_growth * r[j]
+        or density[j] > ratio * density[j - 1]
+        or density[j - 1] > ratio * density[j]
+    )
+    return ends
+
+
+@shared
 def deming_slope(s_rr: float, s_zz: float, s_rz: float, error_ratio: float) -> float:
     """Slope dz/dr of the line with errors in both variables: Deming's regression.
 
@@ -122,81 +183,104 @@ def deming_slope(s_rr: float, s_zz: float, s_rz: float, error_ratio: float) -> f
     return numerator / denominator
 
 
-def differs_in_direction(slope: float, new_slope: float, tolerance: float) -> bool:
-    """Whether lines of these slopes differ in direction by more than `tolerance` [rad]."""
+@shared
+def differs_in_direction(slope: float, new_slope: float, tangent: float) -> bool:
+    """Whether lines of these slopes differ in direction by an angle of more than this tangent."""
     # The tangent of the difference of two angles follows from their tangents, which saves
     # an arctangent for each candidate.
     along = 1.0 + slope * new_slope
     if math.isfinite(along):
-        return along <= 0.0 or abs(new_slope - slope) > math.tan(tolerance) * along
-    return abs(math.atan(new_slope) - math.atan(slope)) > tolerance
+        return along <= 0.0 or abs(new_slope - slope) > tangent * along
+    return abs(math.atan(new_slope) - math.atan(slope)) > math.atan(tangent)
 
 
-def select_pseudo_inputs(candidates: Candidates, lines: Lines, config: Config) -> PseudoInputs:
-    """Spread pseudo-inputs evenly over the candidates of each line (paper, section III-C).
+@shared
+def select_pseudo_inputs(
+    candidates: Candidates,
+    lines: Lines,
+    n_lines: int,
+    latent: LatentConfig,
+    limits: LengthScaleConfig,
+    pseudo: PseudoInputs,
+) -> int:
+    """Spread pseudo-inputs evenly over the candidates of each line; return their number.
 
-    Every line gets at least one.
+    Paper, section III-C. Every line gets at least one.
     """
-    limits, size = config.length_scale, np.diff(lines.start)
-    wanted = np.rint(size / config.latent.candidates_per_pseudo_input).astype(np.int64)
-    number = np.maximum(wanted, 1)
-    extent = lines.extent(candidates)
-    log_extent = np.log(np.clip(extent, limits.min, limits.max))
-    line = np.repeat(np.arange(len(number)), number)
-    rank = np.arange(len(line)) - np.repeat(np.cumsum(number) - number, number)
-    # The middle of each of `number` equal shares of the line's candidates.
-    position = lines.start[line] + (size[line] * (2 * rank + 1)) // (2 * number[line])
-    return PseudoInputs(
-        r_bar=candidates.r[position],
-        log_extent=log_extent[line],
-        offsets=np.searchsorted(position, candidates.offsets),
-    )
+    r, start = candidates.r, lines.start
+    m = p = 0
+    for q in range(n_lines):
+        first, size = start[q], start[q + 1] - start[q]
+        while candidates.offsets[m] <= first:
+            pseudo.offsets[m] = p
+            m += 1
+        extent = r[first + size - 1] - r[first]
+        log_extent = math.log(min(max(extent, limits.min), limits.max))
+        number = max(int(np.rint(size / latent.candidates_per_pseudo_input)), 1)
+        for rank in range(number):
+            # The middle of each of `number` equal shares of the line's candidates.
+            pseudo.r_bar[p] = r[first + (size * (2 * rank + 1)) // (2 * number)]
+            pseudo.log_extent[p] = log_extent
+            p += 1
+    for k in range(m, len(pseudo.offsets)):
+        pseudo.offsets[k] = p
+    return p
 
 
-def candidates_on_lines(lines: Lines, candidates: Candidates, config: Config) -> BoolArray:
-    """Candidates that join the inliers if the one before them has joined, (C,) bool.
+@shared
+def mark_continued(
+    candidates: Candidates,
+    lines: Lines,
+    n_lines: int,
+    tolerances: LinesConfig,
+    growth: GrowthConfig,
+    continues_line: BoolArray,
+) -> None:
+    """Mark the candidates that join the inliers if the one before them has joined.
 
     They continue a line that is longer and flatter than an obstacle, or their line starts
-    at a slope break (see `starts_at_slope_break`).
+    at a slope break (see `meets_line_before`).
     """
-    growth = config.growth
-    is_long = np.diff(lines.start) >= growth.min_line_size
-    continued = ((np.abs(lines.slope) <= growth.max_line_slope) & is_long)[lines.line]
-    continued[lines.start[:-1]] = False
-    at_break = starts_at_slope_break(lines, candidates, config)
-    result: BoolArray = continued | at_break[lines.line]
-    return result
+    r, offsets = candidates.r, candidates.offsets
+    m = 0
+    for q in range(n_lines):
+        first, stop = lines.start[q], lines.start[q + 1]
+        while offsets[m] < first:
+            m += 1
+        is_flat = abs(lines.slope[q]) <= growth.max_line_slope
+        is_long = r[stop - 1] - r[first] >= growth.min_bend_extent
+        at_break = False
+        if is_flat and is_long and stop - first >= MIN_BREAK_CANDIDATES and offsets[m] != first:
+            before = lines.slope[q - 1]
+            # A single candidate, or one above the other, has no usable slope: level.
+            before = before if abs(before) <= growth.max_line_slope else 0.0
+            at_break = meets_line_before(
+                first, stop, candidates, before, lines.slope[q], tolerances.offset_tolerance
+            )
+        continues_line[first] = at_break
+        for c in range(first + 1, stop):
+            continues_line[c] = at_break or (is_flat and stop - first >= growth.min_line_size)
 
 
-def starts_at_slope_break(lines: Lines, candidates: Candidates, config: Config) -> BoolArray:
-    """Lines that intersect the one before them in the gap between the two, (Q,) bool.
+@shared
+def meets_line_before(
+    first: int, stop: int, candidates: Candidates, before: float, slope: float, tolerance: float
+) -> bool:
+    """Whether the line of candidates `first` to `stop` meets that before it in the gap between.
 
     Where the slope of the ground changes, as at the start of a ramp between two rings, the
     extended lines before and after intersect between the last candidate of the one and the
     first of the other. At a step they do not: an obstacle's line passes over, or starts
-    over, the ground's. Parameters are those of `candidates_on_lines`.
+    over, the ground's. `before` and `slope` are those of the two lines.
     """
-    tolerance, max_slope = config.lines.offset_tolerance, config.growth.max_line_slope
-    first, behind = lines.start[:-1], lines.start[1:]
-    size = behind - first
-    steep = np.abs(np.nan_to_num(lines.slope, nan=np.inf)) > max_slope
-    is_long = lines.extent(candidates) >= config.growth.min_bend_extent
-    possible = (size >= MIN_BREAK_CANDIDATES) & is_long & ~steep & (first > 0)
-    chosen = np.flatnonzero(possible)
-    segment = candidates.segment
-    chosen = chosen[segment[first[chosen]] == segment[first[chosen] - 1]]
-    start, number = first[chosen], size[chosen]
-    last = start - 1
     r, z = candidates.r, candidates.z
-    mean_r = np.add.reduceat(r, first)[chosen] / number
-    mean_z = np.add.reduceat(z, first)[chosen] / number
-    over_last = mean_z + lines.slope[chosen] * (r[last] - mean_r) - z[last]
-    slope_before = lines.slope[lines.line[last]]
-    # A single candidate, or one above the other, has no usable slope: level.
-    slope_before = np.where(np.abs(slope_before) <= max_slope, slope_before, 0.0)
-    over_line = z[start] - (z[last] + slope_before * (r[start] - r[last]))
-    upwards = (over_last <= tolerance) & (over_line >= -tolerance)
-    downwards = (over_last >= -tolerance) & (over_line <= tolerance)
-    result = np.zeros(len(size), dtype=np.bool_)
-    result[chosen] = upwards | downwards
-    return result
+    mean_r = mean_z = 0.0
+    for c in range(first, stop):
+        mean_r += r[c] / (stop - first)
+        mean_z += z[c] / (stop - first)
+    last = first - 1
+    over_last = mean_z + slope * (r[last] - mean_r) - z[last]
+    over_line = z[first] - (z[last] + before * (r[first] - r[last]))
+    upwards = over_last <= tolerance and over_line >= -tolerance
+    meets: bool = upwards or (over_last >= -tolerance and over_line <= tolerance)
+    return meets
