@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import pytest
+from cli_runner import error_line
 
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.cli.experiment import EXPERIMENTS
@@ -25,6 +26,26 @@ def test_every_command_has_a_parser_and_explains_itself(name, capsys):
     text = capsys.readouterr().out
     assert text.startswith(f'usage: gp-ground-seg {name}')
     assert f'gp-ground-seg {name}' in text.partition('options:')[2]
+
+
+def test_the_help_groups_the_commands(capsys):
+    with pytest.raises(SystemExit, match='0'):
+        cli.main(['--help'])
+    lines = capsys.readouterr().out.partition('commands:\n')[2].partition('examples:')[0]
+    words = [line.split()[0] for line in lines.splitlines() if line.strip()]
+    titles = [f'{title}:' for title in cli.GROUPS]
+    assert [word for word in words if word in titles] == titles
+    assert [word for word in words if word in cli.COMMANDS] == list(cli.COMMANDS)
+    assert words.index('files:') < words.index('segment') < words.index('laboratory:')
+
+
+@pytest.mark.parametrize('name', sorted(cli.REMOVED.keys() - cli.COMMANDS.keys()))
+def test_a_removed_command_names_what_has_taken_its_place(name, capsys):
+    assert cli.main([name, 'a.bin', '--json', 'a.json']) == 2
+    line = error_line(capsys)
+    assert line == f'{name}: was removed; {cli.REMOVED[name]}'
+    for command in re.findall(r'gp-ground-seg ([\w-]+)', line):
+        assert command in cli.COMMANDS
 
 
 def parsers_below(parser):
@@ -53,7 +74,7 @@ def test_whatever_prints_a_table_has_json():
     leaves = [leaf for name in cli.COMMANDS for leaf in parsers_below(cli.build_parser(name))]
     found = {leaf.prog.split(' ', 1)[1] for leaf in leaves if '--json' in leaf.format_usage()}
     experiments = {f'experiment {name}' for name in EXPERIMENTS}
-    tables = {'evaluate', 'compare', 'bench', 'pose'}
+    tables = {'evaluate', 'compare', 'optimise', 'bench'} & set(cli.COMMANDS)
     assert found == tables | experiments
     printing = set()
     for leaf in leaves:

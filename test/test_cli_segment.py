@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import io
+import math
 import os
 import re
 import resource
@@ -16,12 +17,15 @@ import pytest
 from cli_runner import error_line, run, start
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.core.pipeline.tilt import rotation
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
 SUMMARY = re.compile(
     r'(\d+) frames?, (\d+) points?, (\d+\.\d)% ground, \d+\.\d ms (?:per frame \(median|for the '
     r'first frame \(with loading code), segmentation only\), written to (.*)\n'
+    r'measured in \d+ frames?: sensor.height=.*\n'
 )
 
 
@@ -318,6 +322,83 @@ def test_progress_bar_on_a_terminal(tmp_path, monkeypatch, words, shown):
     monkeypatch.setattr('sys.stderr', terminal)
     assert segment(tmp_path / 'velodyne', *words) == 0
     assert ('segment:' in terminal.getvalue()) == ('/3 [' in terminal.getvalue()) == shown
+
+
+# Height and tilt of the sensor.
+
+SMALL = dataclasses.replace(HDL_64E, n_columns=500)
+
+
+def write_scan(path, height, roll=0.0, pitch=0.0, turn=(0.0, 0.0)):
+    mounted = dataclasses.replace(SMALL, height=height, roll=roll, pitch=pitch)
+    points = simulate_scan(SCENES['flat'](1), mounted, np.random.default_rng(1)).points.copy()
+    points[:, :3] = points[:, :3] @ rotation(*turn)
+    path.write_bytes(points.astype('<f4').tobytes())
+
+
+def pose_line(capsys):
+    """Median and standard deviation of each parameter, and how many frames show it."""
+    _, line, *rest = capsys.readouterr().out.splitlines()
+    found = re.findall(r'sensor\.(\w+)=(\S+)(?: \(std (\S+)\))? (?:m|rad)', line)
+    n_frames = int(re.match(r'measured in (\d+) frame', line)[1])
+    return n_frames, {name: (float(x), float(std or 'nan')) for name, x, std in found}, rest
+
+
+def test_the_summary_has_height_and_tilt_of_the_sensor(tmp_path, capsys):
+    tilts = ((0.0, 0.0), (5.0, -4.0), (5.0, -4.0))
+    for name, (roll, pitch) in zip('abc', tilts, strict=True):
+        path = tmp_path / f'{name}.bin'
+        write_scan(path, 1.2, roll=math.radians(roll), pitch=math.radians(pitch))
+    assert segment(tmp_path, '-o', tmp_path / 'labels') == 0
+    n_frames, found, rest = pose_line(capsys)
+    assert (n_frames, rest) == (3, [])
+    assert found['height'] == pytest.approx((1.2, 0.01), abs=0.03)
+    for name, median in (('roll', math.radians(5.0)), ('pitch', math.radians(-4.0))):
+        # Of the values 0, m and m the standard deviation is |m| / sqrt(3).
+        assert found[name] == pytest.approx((median, abs(median) / 3.0**0.5), abs=0.003)
+    assert segment(tmp_path / 'b.bin', '-o', tmp_path / 'b.label') == 0
+    _, found, _ = pose_line(capsys)
+    assert np.isnan(found['roll'][1])
+
+
+def test_the_summary_says_which_parameter_the_scans_contradict(tmp_path, capsys):
+    write_scan(tmp_path / 'a.bin', 1.2)
+    words = ['-o', tmp_path / 'a.label', '--set', 'sensor.height=2.5']
+    assert segment(tmp_path / 'a.bin', *words) == 0
+    _, found, (line,) = pose_line(capsys)
+    assert found['height'][0] == pytest.approx(1.2, abs=0.03)
+    assert line.startswith('sensor.height = 2.5: the ground near the sensor is 1.2')
+    assert line.endswith('(1 frame: docs/pose.md)')
+
+
+def test_segment_names_the_scan_that_it_refuses(tmp_path, capsys):
+    write_scan(tmp_path / 'a.bin', 1.2, turn=(math.pi, 0.0))
+    words = [tmp_path / 'a.bin', '-o', tmp_path / 'a.label', '--quiet']
+    assert segment(*words) == 2
+    said = error_line(capsys)
+    assert said.startswith(f'{tmp_path / "a.bin"}: z does not point up: ')
+    assert not (tmp_path / 'a.label').exists()
+    roll, pitch = (re.search(rf'sensor\.{n} to (\S+)', said)[1] for n in ('roll', 'pitch'))
+    assert segment(*words, '--set', f'sensor.roll={roll}', '--set', f'sensor.pitch={pitch}') == 0
+    assert (tmp_path / 'a.label').exists()
+
+
+def test_a_scan_without_ground_is_named_on_stderr_and_never_a_silent_zero(tmp_path, capsys):
+    flat_beam = dataclasses.replace(SMALL, elevations=(0.0,))
+    points = simulate_scan(SCENES['urban'](1), flat_beam, np.random.default_rng(1)).points
+    (tmp_path / 'a.bin').write_bytes(points.astype('<f4').tobytes())
+    words = [tmp_path / 'a.bin', '--quiet', '-o', tmp_path / 'a.label']
+    assert segment(*words) == 0
+    said = capsys.readouterr()
+    assert 'no frame shows enough ground to estimate the height' in said.out
+    lines = said.err.splitlines()
+    assert [line for line in lines if 'does not show the ground' in line and '1.73 m' in line]
+    assert [line for line in lines if 'next to nothing of the scan is ground' in line]
+    assert segment(*words, '--force', '--set', 'sensor.origin_z=up') == 2
+    assert "sensor.origin_z = 'up': must be a number in [-50, 50] m" in error_line(capsys)
+
+
+# Runs that are stopped.
 
 
 @pytest.fixture(scope='module')

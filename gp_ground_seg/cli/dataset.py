@@ -118,7 +118,7 @@ def run(
 
 
 def print_summary(found: Outcome, target: AnyPath, n_workers: int = 0) -> None:
-    """Print a line on what was segmented."""
+    """Print points, ground, time, and height and tilt of the sensor."""
     seconds = found.seconds
     share = f'{found.n_ground / found.n_points:.1%} ground' if found.n_points else 'no ground'
     pace = f'{1e3 * statistics.median(seconds[1:] or seconds):.1f} ms'
@@ -128,3 +128,26 @@ def print_summary(found: Outcome, target: AnyPath, n_workers: int = 0) -> None:
         f'{options.count(len(seconds), "frame")}, {options.count(found.n_points, "point")}, '
         f'{share}, {pace}, segmentation only){beside}, written to {target}'
     )
+    if seconds:
+        print(_pose_summary(found))
+    if found.contradictions:
+        n_frames = options.count(len(found.contradictions), 'frame')
+        print(f'{found.contradictions[0]} ({n_frames}: docs/pose.md)')
+
+
+def _pose_summary(found: Outcome) -> str:
+    """Median and standard deviation over the scans that show the pose, as parameters."""
+    if not found.heights:
+        return 'no frame shows enough ground to estimate the height of the sensor'
+    rolls, pitches = zip(*found.tilts, strict=True) if found.tilts else ((), ())
+    words = []
+    for name, values, digits, unit in (
+        ('height', found.heights, 2, 'm'),
+        ('roll', rolls, 3, 'rad'),
+        ('pitch', pitches, 3, 'rad'),
+    ):
+        if not values:
+            continue
+        spread = f' (std {statistics.stdev(values):.{digits}f})' if len(values) > 1 else ''
+        words.append(f'sensor.{name}={statistics.median(values):.{digits}f}{spread} {unit}')
+    return f'measured in {options.count(len(found.heights), "frame")}: {", ".join(words)}'

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import ConfigError, GroundSegError
+from gp_ground_seg.core.errors import GroundSegError
 
 ROS_ARGS = '--ros-args'
 
@@ -23,27 +23,29 @@ ROS_ARGS = '--ros-args'
 # arguments that returns an exit code. One that sets the default `accepts_ros_args` finds them in
 # `ros_args`. Only the module of the command at hand is imported: all of them take a second.
 COMMANDS = {
+    'node': ('node', 'run the ROS 2 node'),
+    'warm-up': ('node', 'compile the code before the first start'),
+    'config': ('config', 'write, check and compare parameter files'),
+    'play': ('bags', "publish a bag's clouds as they were recorded"),
+    'demo': ('demo', 'show the node at work, no data needed'),
+    'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),
     'segment': ('segment', 'label scans, or split the clouds of a bag'),
+    'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
+    'view': ('view', 'look at scans in Rerun, a browser or a page'),
+    'tune': ('view', 'set parameters by sliders, and see the labels change'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
     'compare': ('compare', 'compare two configurations on the same frames'),
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
-    'view': ('view', 'look at scans in Rerun, a browser or a page'),
-    'tune': ('view', 'set parameters by sliders, and see the labels change'),
-    'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
-    'pose': ('pose', 'estimate height and tilt of the sensor from scans'),
-    'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),
-    'play': ('bags', "publish a bag's clouds as they were recorded"),
-    'demo': ('demo', 'show the node at work, no data needed'),
-    'config': ('config', 'write, check and compare parameter files'),
-    'node': ('node', 'run the ROS 2 node'),
-    'warm-up': ('node', 'compile the code before the first start'),
 }
-
-RETIRED = {
-    'optimise': 'score settings with `evaluate ROOT --config FILE`, try them with `tune`',
+GROUPS = {'robot': 'node', 'files': 'segment', 'laboratory': 'evaluate'}
+"""Groups of commands in the help, each with its first command."""
+REMOVED = {
+    'pose': '`gp-ground-seg segment INPUT` prints height and tilt of the sensor',
+    'compare': 'use `gp-ground-seg evaluate ROOT --against FILE_OR_PRESET`',
+    'optimise': 'use `gp-ground-seg tune`, and `gp-ground-seg evaluate ROOT --against FILE`',
 }
-"""Commands that earlier releases had, and what to use in place of them."""
+"""Commands of earlier releases, and what has taken their place."""
 
 EXAMPLES = """\
 examples:
@@ -52,6 +54,17 @@ examples:
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08
   gp-ground-seg node --ros-args -r points:=/kitti/velo/pointcloud
 """
+
+
+def _grouped_commands() -> str:
+    """Return a line for each command, under the title of its group."""
+    titles = {first: title for title, first in GROUPS.items()}
+    lines = []
+    for name, (_, purpose) in COMMANDS.items():
+        if name in titles:
+            lines.append(f'{titles[name]}:')
+        lines.append(f'  {name:<14}{purpose}')
+    return '\n'.join(lines)
 
 
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
@@ -63,13 +76,19 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument('--version', action='version', version=__version__)
-    subparsers = parser.add_subparsers(metavar='COMMAND', required=True)
+    subparsers = parser.add_subparsers(
+        title='commands',
+        description=_grouped_commands(),
+        metavar='COMMAND',
+        help='explained by `gp-ground-seg COMMAND --help`',
+        required=True,
+    )
     if command is not None:
         module = COMMANDS[command][0]
         importlib.import_module(f'gp_ground_seg.cli.{module}').add_parser(subparsers)
     else:
-        for name, (_, purpose) in COMMANDS.items():
-            subparsers.add_parser(name, help=purpose)
+        for name in COMMANDS:
+            subparsers.add_parser(name)
     return parser
 
 
@@ -84,20 +103,20 @@ def _complete() -> None:
 
 def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
-    n_own = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
-    command = next((word for word in words[:n_own] if not word.startswith('-')), None)
-    if command in RETIRED:
-        raise ConfigError(f'{command}: is no command any more: {RETIRED[command]}')
+    n_before = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
+    command = next((word for word in words[:n_before] if not word.startswith('-')), None)
+    if command in REMOVED and command not in COMMANDS:
+        raise GroundSegError(f'{command}: was removed; {REMOVED[command]}')
     parser = build_parser(command if command in COMMANDS else None)
-    arguments = parser.parse_args(words[:n_own])
-    arguments.ros_args = words[n_own:]
+    arguments = parser.parse_args(words[:n_before])
+    arguments.ros_args = words[n_before:]
     if arguments.ros_args and not getattr(arguments, 'accepts_ros_args', False):
         parser.error(f'{ROS_ARGS}: this command takes none')
     return arguments
 
 
 def _notes(arguments: argparse.Namespace) -> AbstractContextManager[None]:
-    """Say what the library logs as notes, but not where it has a log of its own."""
+    """Print what the library logs as notes, except in a node, which logs by way of ROS."""
     if getattr(arguments, 'accepts_ros_args', False):
         return nullcontext()
     from gp_ground_seg.cli.options import library_notes

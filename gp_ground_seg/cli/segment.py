@@ -1,4 +1,4 @@
-"""``segment``: label scans, or split the clouds of a bag; ``pose``: height and tilt."""
+"""``segment``: label scans, or split the clouds of a bag."""
 
 from __future__ import annotations
 
@@ -49,8 +49,11 @@ The output of a bag is a rosbag2 with all messages of the input, and after each 
 its ground and its obstacles: every field of every point bit for bit, the same header, the
 same recorded time. Unknown points are in neither. Messages of ROS 1 are converted to ROS 2.
 
-A file whose numbers do not look like a scan (another layout, millimetres) is refused, with
-what it looks like. --force reads it anyway.
+At the end it prints height and tilt of the sensor over the frames that show enough ground,
+median and standard deviation. With level ground they can be set as parameters (docs/pose.md).
+
+A file whose coordinates can be no scan (another layout, millimetres, a map) is refused.
+--force reads it anyway.
 
 Nothing is overwritten without --force. Output has a hidden name (.NAME.partial-...) until
 it is complete.

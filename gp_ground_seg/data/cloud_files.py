@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,14 +12,12 @@ import numpy.typing as npt
 from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError
 from gp_ground_seg.data.bag_files import in_one_line
 from gp_ground_seg.data.clouds import Cloud, Columns, name_columns
-from gp_ground_seg.data.files import AnyPath
+from gp_ground_seg.data.files import MAX_SCAN_BYTES, AnyPath, read_bytes
 from gp_ground_seg.data.numpy_files import encode_npy, encode_npz, read_numpy
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
-from gp_ground_seg.data.scan_layout import KITTI, MAX_SCAN_BYTES, ScanLayout, find_objection
-from gp_ground_seg.data.semantic_kitti import read_bytes, read_scan
+from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, check_scan, four_columns, read_scan
 
-_LOGGER = logging.getLogger('gp_ground_seg')
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
 _READERS: dict[str, Callable[[bytes], Cloud]] = {
     '.pcd': read_pcd,
@@ -43,18 +40,16 @@ def read_file(path: AnyPath, layout: ScanLayout = KITTI) -> Cloud:
     if suffix == '.bin':
         if path.name.endswith(NUSCENES_SUFFIX) and layout.columns == KITTI.columns:
             layout = replace(layout, columns=NUSCENES_COLUMNS)
-        data = read_scan(path, layout)
-        cloud = Cloud(name_columns(layout.view(data)), layout.points(data))
-        return cloud.about(layout.origin)
-    data = read_bytes(path, MAX_SCAN_BYTES)
-    with _named(path, 'cannot be read'), np.errstate(all='ignore'):
-        cloud = _READERS[suffix](data)
+        table = read_scan(path, layout)
+        # Coordinates of a map need their double precision until the origin is subtracted.
+        xyz = four_columns(table) if layout.origin is None else table
+        cloud = Cloud(name_columns(table), xyz)
+    else:
+        data = read_bytes(path, MAX_SCAN_BYTES)
+        with _named(path, 'cannot be read'), np.errstate(all='ignore'):
+            cloud = _READERS[suffix](data)
     cloud = cloud.about(layout.origin)
-    doubt = '' if layout.doubts == 'ignore' else find_objection(cloud.xyz)
-    if doubt and layout.doubts == 'raise':
-        raise DataError(f'{path}: {doubt}; --force takes it as it is')
-    if doubt:
-        _LOGGER.warning('%s: %s', path, doubt)
+    check_scan(path, cloud.xyz[:, :3], layout)
     return cloud
 
 

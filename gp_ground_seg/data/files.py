@@ -18,6 +18,8 @@ from typing import Any
 from gp_ground_seg.core.errors import DataError, GroundSegError, MissingDependencyError, require
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
 
+MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dense scan
+
 
 @dataclass(frozen=True)
 class UrlPath:
@@ -110,6 +112,25 @@ def as_path(place: str | AnyPath) -> AnyPath:
     if isinstance(place, str) and '://' in place:
         return UrlPath(place)
     return Path(place) if isinstance(place, str) else place
+
+
+def read_bytes(path: str | AnyPath, most: int, expected: str = '') -> bytes:
+    """Read a file; DataError if it cannot be read or has more than `most` bytes."""
+    try:
+        place = as_path(path)
+        if isinstance(place, UrlPath):
+            data, size = place.read(most)
+        else:
+            with open(place, 'rb') as file:
+                size = os.fstat(file.fileno()).st_size
+                # A pipe or a device has the size 0, and may have no end.
+                data = b'' if size > most else file.read(size or most + 1)
+    except OSError as error:
+        raise DataError(f'{path}: {error.strerror or error}') from error
+    if max(size, len(data)) > most:
+        expected = expected or f'accepted are at most {most}'
+        raise DataError(f'{path}: {max(size, len(data))} bytes, {expected}')
+    return data
 
 
 def write_file(path: AnyPath, data: bytes) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data.clouds import Cloud, Columns, cloud_of, gather, name_columns, scatter
-from gp_ground_seg.data.scan_layout import MAX_SCAN_BYTES
+from gp_ground_seg.data.files import MAX_SCAN_BYTES
 
 TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N,)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError, require
 from gp_ground_seg.data.clouds import Cloud, Fields, cloud_of, gather, in_types, read_table
-from gp_ground_seg.data.scan_layout import MAX_SCAN_BYTES
+from gp_ground_seg.data.files import MAX_SCAN_BYTES
 
 _END = re.compile(rb'^DATA[ \t]+(\w+)[ \t]*\r?\n', re.MULTILINE)
 _MAX_HEADER_BYTES = 1 << 16

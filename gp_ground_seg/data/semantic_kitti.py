@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
-from gp_ground_seg.data.scan_layout import KITTI, MAX_SCAN_BYTES, ScanLayout, find_doubt
+from gp_ground_seg.data.files import AnyPath, UrlPath, as_path, read_bytes
+from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, check_scan, four_columns, read_scan
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 FRAME_PERIOD = 0.1  # time between frames [s] where a sequence has no times.txt
@@ -124,26 +123,14 @@ def _read_times(path: AnyPath, frames: Sequence[AnyPath]) -> list[float]:
 
 
 def read_points(path: str | AnyPath, layout: ScanLayout = KITTI) -> npt.NDArray[np.float32]:
-    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4); raises as `read_scan`."""
-    return layout.points(read_scan(path, layout))
-
-
-def read_scan(path: str | AnyPath, layout: ScanLayout) -> bytes:
-    """Bytes of a ``.bin`` file.
+    """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4).
 
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
-    points, or, where the layout asks for that, its numbers can be no scan.
+    points, or, where the layout asks for that, can be no scan.
     """
-    data = read_bytes(path, MAX_SCAN_BYTES)
-    doubt = '' if layout.doubts == 'ignore' else find_doubt(data, layout)
-    if len(data) % layout.bytes_per_point:
-        problem = f'is not a whole number of points ({layout.bytes_per_point} bytes each)'
-        raise DataError(f'{path}: {len(data)} bytes {problem}; {doubt or "truncated?"}')
-    if doubt and layout.doubts == 'raise':
-        raise DataError(f'{path}: {doubt}; --force takes it as it is')
-    if doubt:
-        _LOGGER.warning('%s: %s', path, doubt)
-    return data
+    table = read_scan(path, layout)
+    check_scan(path, table[:, :3], layout)
+    return four_columns(table)
 
 
 def read_labels(path: str | AnyPath, n_points: int) -> npt.NDArray[np.uint16]:
@@ -158,22 +145,3 @@ def read_entries(path: str | AnyPath, n_points: int) -> npt.NDArray[np.uint32]:
     if len(data) != 4 * n_points:
         raise DataError(f'{path}: {len(data)} bytes, {expected}')
     return np.frombuffer(data, dtype='<u4').astype(np.uint32)
-
-
-def read_bytes(path: str | AnyPath, most: int, expected: str = '') -> bytes:
-    """Read a file; DataError if it cannot be read or has more than `most` bytes."""
-    try:
-        place = as_path(path)
-        if isinstance(place, UrlPath):
-            data, size = place.read(most)
-        else:
-            with open(place, 'rb') as file:
-                size = os.fstat(file.fileno()).st_size
-                # A pipe or a device has the size 0, and may have no end.
-                data = b'' if size > most else file.read(size or most + 1)
-    except OSError as error:
-        raise DataError(f'{path}: {error.strerror or error}') from error
-    if max(size, len(data)) > most:
-        expected = expected or f'accepted are at most {most}'
-        raise DataError(f'{path}: {max(size, len(data))} bytes, {expected}')
-    return data

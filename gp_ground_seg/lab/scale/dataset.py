@@ -17,8 +17,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
-from gp_ground_seg.data.files import AnyPath, UrlPath, write_file
-from gp_ground_seg.data.semantic_kitti import read_bytes
+from gp_ground_seg.data.files import AnyPath, UrlPath, read_bytes, write_file
 from gp_ground_seg.lab.scale.cluster import Progress
 
 MANIFEST = 'manifest.jsonl'
@@ -38,28 +37,38 @@ class Scan(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a number of scans was."""
+    """Numbers of the segmented scans: points, times, and what they show of the sensor's pose."""
 
     n_points: int
     n_ground: int
     seconds: list[float]  # of each scan, segmentation only
+    heights: list[float]  # of the sensor, by the scans that show it [m]
+    tilts: list[tuple[float, float]]  # roll and pitch, by the scans that show them [rad]
+    contradictions: list[str]  # of the scans that contradict a parameter
 
     @classmethod
     def of(cls, results: Iterable[Segmentation]) -> Outcome:
         """Sum up scans, one by one."""
-        n_points = n_ground = 0
-        seconds = []
+        found = cls(0, 0, [], [], [], [])
         for result in results:
-            n_points += len(result.label)
-            n_ground += int((result.label == Label.GROUND).sum())
-            seconds.append(result.timings['total'])
-        return cls(n_points, n_ground, seconds)
+            n_ground = int((result.label == Label.GROUND).sum())
+            found = found._replace(
+                n_points=found.n_points + len(result.label), n_ground=found.n_ground + n_ground
+            )
+            found.seconds.append(result.timings['total'])
+            found.contradictions.extend(result.pose.contradictions)
+            measured = result.pose.measured
+            if measured is not None and measured.tells_height:
+                found.heights.append(measured.height)
+            if measured is not None and measured.tells_tilt:
+                found.tilts.append((measured.roll, measured.pitch))
+        return found
 
 
 def pool(outcomes: Iterable[Outcome]) -> Outcome:
     """Put the scans of several outcomes together."""
-    n_points, n_ground, seconds = zip(*outcomes, strict=True)
-    return Outcome(sum(n_points), sum(n_ground), [*itertools.chain(*seconds)])
+    n_points, n_ground, *lists = zip(*outcomes, strict=True)
+    return Outcome(sum(n_points), sum(n_ground), *([*itertools.chain(*parts)] for parts in lists))
 
 
 def segment_block(
