@@ -5,7 +5,7 @@ import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from unittest.mock import patch
 
@@ -62,11 +62,21 @@ def hilly_scan(n_points: int = 4000, seed: int = 0, sensor_height: float = 1.73)
     return np.column_stack([x, y, z])
 
 
-@lru_cache(maxsize=64)
-def simulated(scene: str, sensor: str = 'vlp-16', seed: int = 0):
-    """Scan of a simulated scene, made once for all tests: not to be changed."""
-    rng = np.random.default_rng(seed)
-    made = simulate_scan(SCENES[scene](seed), SENSORS[sensor], rng)
+@cache
+def scene_of(name: str, seed: int = 0):
+    """Simulated scene, made once for all tests."""
+    return SCENES[name](seed)
+
+
+@lru_cache(maxsize=100)
+def simulated(scene, sensor='vlp-16', seed: int = 0):
+    """Scan of a scene by a sensor, names or what they name, made once for all tests.
+
+    `seed` is that of the noise, and of a scene given by its name. The points are read-only.
+    """
+    scene = scene_of(scene, seed) if isinstance(scene, str) else scene
+    sensor = SENSORS[sensor] if isinstance(sensor, str) else sensor
+    made = simulate_scan(scene, sensor, np.random.default_rng(seed))
     made.points.setflags(write=False)
     return made
 

@@ -134,12 +134,11 @@ def test_hit_is_the_first_crossing(terrain):
     assert above.min() > -1e-8
     hit = np.isfinite(t)
     assert 50 < hit.sum() < 200
-    ahead = clearance(terrain, position, direction[hit], t[hit, None] + 1e-7)
-    behind = clearance(terrain, position, direction[hit], t[hit, None] - 1e-7)
+    ahead, behind = (
+        clearance(terrain, position, direction[hit], t[hit, None] + hair) for hair in (1e-7, -1e-7)
+    )
     # At a vertical face the ray goes from well above to well below.
-    on_surface = np.abs(behind) < 1e-6
-    through_face = (behind > 0.0) & (ahead <= 0.0)
-    assert (on_surface | through_face).all()
+    assert ((np.abs(behind) < 1e-6) | ((behind > 0.0) & (ahead <= 0.0))).all()
     assert (ahead < 1e-6).all()
 
 
@@ -154,9 +153,8 @@ def test_grazing_rays_meet_the_first_wave(terrain):
     assert later.min() > -1e-9
     # A sampling steps over a crest that a ray only shaves; such a hit must be on the surface.
     shaved = later > 1.001e-3
-    np.testing.assert_allclose(
-        clearance(terrain, position, direction[shaved], t[shaved, None]), 0.0, atol=1e-6
-    )
+    left = clearance(terrain, position, direction[shaved], t[shaved, None])
+    np.testing.assert_allclose(left, 0.0, atol=1e-6)
 
 
 def test_slope_bend_bound_and_ceiling_hold(terrain):

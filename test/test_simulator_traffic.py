@@ -1,13 +1,13 @@
 """Vehicles, persons, cyclists; the scenes around the sensor; mounts and merged clouds."""
 
-import dataclasses
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import scene_of, simulated
 
-from gp_ground_seg.lab import simulation
 from gp_ground_seg.lab.simulation import (
     HDL_64E,
     PLACES,
@@ -17,28 +17,21 @@ from gp_ground_seg.lab.simulation import (
     Kind,
     Scene,
     objects,
+    semantic_kitti_labels,
     traffic,
 )
-from gp_ground_seg.lab.simulation import scenes as landforms
+from gp_ground_seg.lab.simulation.scenes import flat, slope
 
-EXACT = dataclasses.replace(HDL_64E, n_columns=700, range_std=0.0, dropout=0.0)
-TALL = dataclasses.replace(EXACT, elevations=SENSORS['os1-128'].elevations)
-FLAT = landforms.flat()
+EXACT = replace(HDL_64E, n_columns=700, range_std=0.0, dropout=0.0)
+TALL = replace(EXACT, elevations=SENSORS['os1-128'].elevations)
+FLAT = flat()
+BARE = Scene('bare', FLAT)
 OF_OBJECTS = (Kind.BOX, Kind.PERSON, Kind.CYCLIST)
-
-
-def scan(scene, sensor=EXACT, seed=0):
-    return simulation.simulate_scan(scene, sensor, np.random.default_rng(seed))
+of_three_seeds = pytest.mark.parametrize('seed', range(3))
 
 
 def in_world(made):
     return made.points[:, :3].astype(float) @ made.rotation.T + made.position
-
-
-@pytest.fixture(params=PLACES, scope='module')
-def place(request):
-    scene = SCENES[request.param](1)
-    return scene, scan(scene)
 
 
 @pytest.mark.parametrize('name', traffic.MODELS)
@@ -73,30 +66,25 @@ def profile(model, ahead):
 def test_returns_of_a_vehicle_lie_on_it(name, yaw, gradient):
     """In its own axes no return is outside its length, width and profile, on slopes too."""
     model, heading = traffic.MODELS[name], 0.4
-    terrain = landforms.slope(gradient, heading)
+    terrain = slope(gradient, heading)
     x, y = 8.0, 2.0
-    made = scan(Scene('one', terrain, traffic.vehicle(terrain, name, x, y, yaw)), TALL)
-    dx, dy, z = in_world(made)[made.object_id == 1].T - np.array([[x], [y], [0.0]])
-    assert len(z) > 300
+    made = simulated(Scene('one', terrain, traffic.vehicle(terrain, name, x, y, yaw)), TALL)
+    dx, dy, z = (in_world(made) - [x, y, 0.0]).T
+    returns = made.object_id == 1
     ahead = dx * math.cos(yaw) + dy * math.sin(yaw)
     left = dy * math.cos(yaw) - dx * math.sin(yaw)
-    above = z - terrain.height(x + dx, y + dy)
+    # Ground is seen below it.
+    is_below = (np.abs(ahead) < 0.45 * model.length) & (np.abs(left) < 0.3 * model.width)
+    assert (made.is_ground & is_below).any()
+    above = (z - terrain.height(x + dx, y + dy))[returns]
+    ahead, left = ahead[returns], left[returns]
+    assert len(above) > 300
     assert np.abs(ahead).max() <= model.length / 2 + 1e-4
     assert np.abs(left).max() <= model.width / 2 + 1e-4
     assert above.min() >= -1e-4
     top = profile(model, ahead)
     assert (above <= np.maximum(top, 2.0 * model.wheel) + 1e-3).all()
     assert above.max() > 0.95 * top.max()
-
-
-def test_a_bonnet_is_lower_than_the_roof_and_ground_is_seen_below_the_car():
-    made = scan(Scene('car', FLAT, traffic.vehicle(FLAT, 'saloon', 8.0, 0.0, math.pi)))
-    x, y, z = in_world(made).T
-    car = made.object_id == 1
-    bonnet, roof = (car & (x > a) & (x < b) for a, b in ((5.9, 6.7), (7.5, 8.5)))
-    assert 0.7 < z[bonnet & (np.abs(y) < 0.5)].max() < 1.0
-    assert 1.38 < z[roof].max() < 1.5
-    assert (made.is_ground & (np.abs(y) < 0.6) & (x > 5.9) & (x < 6.3)).any()
 
 
 @pytest.mark.parametrize(
@@ -107,11 +95,11 @@ def test_a_bonnet_is_lower_than_the_roof_and_ground_is_seen_below_the_car():
     ],
 )
 def test_persons_and_cyclists(make, kind, label, height, wide):
-    made = scan(Scene('one', FLAT, make(FLAT, 6.0, 1.0)))
+    made = simulated(Scene('one', FLAT, make(FLAT, 6.0, 1.0)), EXACT)
     x, y, z = in_world(made)[made.object_id == 1].T
     assert len(z) > 50
     assert (made.kind[made.object_id == 1] == kind).all()
-    assert set(simulation.semantic_kitti_labels(made.kind)) == {40, label}
+    assert set(semantic_kitti_labels(made.kind)) == {40, label}
     assert height - 0.06 < z.max() <= height + 1e-4
     assert z.min() < 0.1
     assert np.hypot(x - 6.0, y - 1.0).max() < wide
@@ -119,16 +107,16 @@ def test_persons_and_cyclists(make, kind, label, height, wide):
 
 @pytest.mark.parametrize('name', SCENES)
 def test_numbers_of_objects_go_with_their_kinds(name):
-    made = scan(SCENES[name](2))
+    made = simulated(name, EXACT, 2)
     numbered = made.object_id > 0
     assert np.isin(made.kind[numbered], OF_OBJECTS).all()
     assert numbered[np.isin(made.kind, [Kind.PERSON, Kind.CYCLIST])].all()
     assert (made.object_id[~np.isin(made.kind, OF_OBJECTS)] == 0).all()
     x, y, _ = in_world(made).T
     for number in np.unique(made.object_id[numbered]):
-        own = made.object_id == number
-        assert len(set(made.kind[own])) == 1
-        assert np.hypot(np.ptp(x[own]), np.ptp(y[own])) < 11.0  # a truck
+        returns = made.object_id == number
+        assert len(set(made.kind[returns])) == 1
+        assert np.hypot(np.ptp(x[returns]), np.ptp(y[returns])) < 11.0  # a truck
 
 
 def test_a_vehicle_of_several_solids_is_one_object():
@@ -136,14 +124,15 @@ def test_a_vehicle_of_several_solids_is_one_object():
     crate = objects.standing_box(FLAT, 8.0, 0.0, (1.0, 1.0, 0.6))
     scene = Scene('two', FLAT, (*cars[0], crate, *cars[1], *objects.truck(FLAT, 16.0, 0.0)))
     assert objects.number_objects(scene.solids).tolist() == [1, 1, 0, 2, 2, 3, 3]
-    made = scan(scene)
+    made = simulated(scene, EXACT)
     y, boxes = made.points[:, 1], made.kind == Kind.BOX
     assert set(made.object_id[boxes & (y > 2.0) & (made.points[:, 0] < 11.0)]) == {2}
     assert set(made.object_id[boxes]) == {0, 1, 2, 3}
 
 
-def test_places_leave_room_for_the_own_car(place):
-    scene, made = place
+@pytest.mark.parametrize('name', PLACES)
+def test_places_leave_room_for_the_own_car(name):
+    scene, made = scene_of(name, 2), simulated(name, EXACT, 2)
     world = in_world(made)
     near = (np.abs(world[:, 0]) < 2.3) & (np.abs(world[:, 1]) < 0.95)
     assert not (near & ~made.is_ground).any()
@@ -154,10 +143,9 @@ def test_places_leave_room_for_the_own_car(place):
         assert apart.min() > 0.5
 
 
-@pytest.mark.parametrize('seed', range(3))
+@of_three_seeds
 def test_a_traffic_jam_stands_around_the_sensor(seed):
-    scene = SCENES['traffic_jam'](seed)
-    made = scan(scene)
+    scene, made = scene_of('traffic_jam', seed), simulated('traffic_jam', EXACT, seed)
     x, y, _ = in_world(made).T
     car = (made.kind == Kind.BOX) & (np.hypot(x, y) < 8.0)
     azimuth = np.degrees(np.arctan2(y, x)) % 360.0
@@ -167,14 +155,16 @@ def test_a_traffic_jam_stands_around_the_sensor(seed):
     highest = max(one.top for one in scene.solids if one.kind == Kind.BOX)
     assert highest > 3.5  # a truck
     # It hides most of the ground within 15 m.
-    share = [np.sum(one.is_ground & (np.hypot(*one.points[:, :2].T) < 15.0)) for one in (
-        made, scan(Scene('empty', scene.terrain)))]  # fmt: skip
-    assert share[0] < 0.6 * share[1]
+    hidden, all_seen = (
+        np.sum(found.is_ground & (np.hypot(*found.points[:, :2].T) < 15.0))
+        for found in (made, simulated(Scene('empty', scene.terrain), EXACT))
+    )
+    assert hidden < 0.6 * all_seen
 
 
-@pytest.mark.parametrize('seed', range(3))
+@of_three_seeds
 def test_a_car_park_has_rows_with_narrow_gaps_beside_a_free_aisle(seed):
-    scene = SCENES['car_park'](seed)
+    scene = scene_of('car_park', seed)
     cars = {one.part_of: one for one in scene.solids if one.kind == Kind.BOX}
     x, y = np.array(sorted(cars)).T
     assert len(cars) > 100
@@ -183,14 +173,14 @@ def test_a_car_park_has_rows_with_narrow_gaps_beside_a_free_aisle(seed):
         step = np.diff(row)
         # Widths of 1.7 to 1.9 m, gaps of 0.6 to 1 m; an empty place doubles them.
         assert step.min() >= 2.3 and np.median(step) < 2.9
-    made = scan(scene)
+    made = simulated('car_park', EXACT, seed)
     aisle = made.kind[np.abs(in_world(made)[:, 1]) < 2.9]
     assert set(aisle) <= {Kind.TERRAIN, Kind.PERSON} and (aisle == Kind.PERSON).sum() > 50
 
 
-@pytest.mark.parametrize('seed', range(3))
+@of_three_seeds
 def test_a_climb_is_hidden_by_the_parked_cars(seed):
-    scene = SCENES['hidden_climb'](seed)
+    scene = scene_of('hidden_climb', seed)
     assert not scene.terrain.gradient(np.zeros((1, 2))).any()  # level at the sensor
     heading, foot = scene.terrain.heading, float(scene.terrain.edges[0])
     at = (foot + 5.0) * np.array([[math.cos(heading), math.sin(heading)]])
@@ -198,7 +188,7 @@ def test_a_climb_is_hidden_by_the_parked_cars(seed):
     assert foot < 9.0
     seen = []
     for solids in (scene.solids, ()):
-        made = scan(Scene('climb', scene.terrain, solids))
+        made = simulated(Scene('climb', scene.terrain, solids), EXACT)
         along = in_world(made)[:, :2] @ [math.cos(heading), math.sin(heading)]
         aside = in_world(made)[:, :2] @ [-math.sin(heading), math.cos(heading)]
         ahead = made.is_ground & (np.abs(aside) < 0.7 * along)
@@ -208,22 +198,21 @@ def test_a_climb_is_hidden_by_the_parked_cars(seed):
     assert far > 0.1 * all_far
 
 
-@pytest.mark.parametrize('seed', range(3))
+@of_three_seeds
 def test_a_slope_begins_in_the_blind_spot(seed):
-    terrain = SCENES['blind_slope'](seed).terrain
+    terrain = scene_of('blind_slope', seed).terrain
     across = np.array([math.cos(terrain.heading), math.sin(terrain.heading)])
     at = np.array([-20.0, -1.6, -0.99, 0.99, 1.6, 20.0])
     down, lower, *level, upper, up = (terrain.gradient(at[:, None] * across) @ across).tolist()
     assert level == [0.0, 0.0]
     assert [lower, upper, up] == pytest.approx([down] * 3)
     assert 0.1 <= down <= 0.15
-    nearest = np.hypot(*scan(SCENES['blind_slope'](seed)).points[:, :2].T).min()
+    nearest = np.hypot(*simulated('blind_slope', EXACT, seed).points[:, :2].T).min()
     assert nearest > 1.6
 
 
 def test_hedges_are_low_dense_and_beside_the_path():
-    scene = SCENES['hedge'](1)
-    made = scan(scene)
+    made = simulated('hedge', EXACT, 1)
     world, above = in_world(made), made.points[:, 2] - made.ground_z
     leaves = made.kind == Kind.VEGETATION
     assert 0.5 < np.quantile(above[leaves], 0.98) < above[leaves].max() < 0.9
@@ -238,20 +227,20 @@ def test_hedges_are_low_dense_and_beside_the_path():
 
 @pytest.mark.parametrize('name', ['blind_slope', 'hedge'])
 def test_a_cloud_in_the_vehicle_frame_is_that_of_the_sensor_moved(name):
-    scene = SCENES[name](3)
-    own, moved = (scan(scene, SENSORS[sensor]) for sensor in ('hdl-64e', 'hdl-64e-vehicle'))
-    np.testing.assert_allclose(moved.points[:, :3] - own.points[:, :3], [[0.0, 0.0, 1.73]] * len(
-        own.points), atol=2e-5)  # fmt: skip
-    np.testing.assert_array_equal(moved.kind, own.kind)
-    np.testing.assert_allclose(moved.ground_z - own.ground_z, 1.73)
-    assert moved.position[2] == pytest.approx(float(scene.terrain.height(0.0, 0.0)))
+    seen, moved = (simulated(name, sensor, 3) for sensor in ('hdl-64e', 'hdl-64e-vehicle'))
+    shift = np.tile([0.0, 0.0, 1.73], (len(seen.points), 1))
+    np.testing.assert_allclose(moved.points[:, :3] - seen.points[:, :3], shift, atol=2e-5)
+    np.testing.assert_array_equal(moved.kind, seen.kind)
+    np.testing.assert_allclose(moved.ground_z - seen.ground_z, 1.73)
+    height = float(scene_of(name, 3).terrain.height(0.0, 0.0))
+    assert moved.position[2] == pytest.approx(height)
     assert SENSORS['hdl-64e-vehicle'].height_of_cloud == 0.0
     assert SENSORS['hdl-64e'].height_of_cloud == 1.73
 
 
 def test_a_tilted_sensor_in_a_vehicle_frame_sees_level_ground_level():
-    tilted = dataclasses.replace(EXACT, roll=0.3, pitch=-0.1, origin=(1.2, -0.4, 1.5))
-    made = scan(Scene('bare', FLAT), tilted)
+    tilted = replace(EXACT, roll=0.3, pitch=-0.1, origin=(1.2, -0.4, 1.5))
+    made = simulated(BARE, tilted)
     assert tilted.height_of_cloud == pytest.approx(0.23)
     np.testing.assert_allclose(made.points[:, 2], -0.23, atol=2e-5)
     np.testing.assert_allclose(made.ground_z, -0.23, atol=1e-9)
@@ -264,8 +253,10 @@ def test_a_tilted_sensor_in_a_vehicle_frame_sees_level_ground_level():
 
 
 def test_a_merged_cloud_is_of_both_sensors_in_one_frame():
-    pair, scene = SENSORS['vlp-32c-pair'], SCENES['hidden_climb'](1)
-    made, upright = scan(scene, pair), scan(scene, dataclasses.replace(pair, others=()))
+    pair = SENSORS['vlp-32c-pair']
+    made, upright = (
+        simulated('hidden_climb', sensor, 1) for sensor in (pair, replace(pair, others=()))
+    )
     n = len(upright.points)
     np.testing.assert_array_equal(made.points[:n], upright.points)
     np.testing.assert_array_equal(made.object_id[:n], upright.object_id)
@@ -291,19 +282,18 @@ def test_a_sector_has_limits():
     azimuth = np.degrees(np.arctan2(y, x))
     assert (len(sensor.elevations), azimuth.min()) == (128, pytest.approx(-60.0))
     assert azimuth.max() == pytest.approx(60.0 - 0.1)
-    made = scan(Scene('bare', FLAT), sensor)
+    made = simulated(BARE, sensor)
     azimuth = np.degrees(np.arctan2(made.points[:, 1], made.points[:, 0]))
     assert -60.0 <= azimuth.min() < -59.8 and 59.8 < azimuth.max() <= 60.0
     assert np.histogram(azimuth, 12, (-60.0, 60.0))[0].min() > 0.9 * len(azimuth) / 12
 
 
 def test_the_low_and_the_tilted_sensor():
-    low = scan(Scene('bare', FLAT), SENSORS['vlp-16-low'])
+    low = simulated(BARE, SENSORS['vlp-16-low'])
     assert np.median(low.points[:, 2]) == pytest.approx(-0.15, abs=0.01)
-    tilted = scan(Scene('bare', FLAT), SENSORS['qt64-tilted'])
+    tilted = simulated(BARE, SENSORS['qt64-tilted'])
     up = tilted.rotation[2]
     assert math.degrees(math.acos(up[2])) == pytest.approx(36.2, abs=0.1)
     np.testing.assert_allclose(np.median(tilted.points[:, :3] @ up), -1.2, atol=0.01)
-    assert dataclasses.replace(
-        SENSORS['vlp-16-low'], name='vlp-16', height=0.8, min_range=0.5
-    ) == (VLP_16)
+    known = {'name': 'vlp-16', 'height': 0.8, 'min_range': 0.5}
+    assert replace(SENSORS['vlp-16-low'], **known) == VLP_16

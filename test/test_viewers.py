@@ -1,6 +1,7 @@
 """Scenes, recordings for Rerun, sliders; and what the commands refuse."""
 
 import functools
+import re
 import socket
 import sys
 import urllib.request
@@ -8,23 +9,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tune_bench
 from bag_samples import write_ros2_bag
 from cli_runner import error_line, run, until_ctrl_c
 from conftest import ROAD, simulated
 
-from gp_ground_seg import GroundSegmenter, Label
+from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
+from gp_ground_seg.lab.viewers.html_page import open_server
 from gp_ground_seg.lab.viewers.scene import View, make_scene, palette, point_colours, read_view
-from gp_ground_seg.lab.viewers.tuner import slider_values, tunable
+from gp_ground_seg.lab.viewers.tuner import Tuner, slider_values, tunable
 
 CAR = 10 | 7 << 16  # class of SemanticKITTI, and an instance of it
 PATIENCE = 60.0
 
 
-def segment(points, config=None):
-    segmenter = GroundSegmenter(config)
+def segment(points):
+    segmenter = GroundSegmenter()
     return segmenter.segment(points), segmenter
 
 
@@ -203,12 +204,19 @@ def free_ports():
             return port
 
 
-def test_the_measure_of_how_fast_labels_follow(sequence, monkeypatch, capsys):
+def test_the_tuner_draws_the_labels_of_its_parameters(sequence):
     pytest.importorskip('viser', reason='viser is not installed')
-    monkeypatch.setattr(tune_bench, 'N_MOVES', 2)
-    monkeypatch.setattr(sys, 'argv', ['tune_bench.py', str(sequence)])
-    tune_bench.main()
-    assert ' points, 2 moves: ' in capsys.readouterr().out
+    name = 'label.ground_tolerance'
+    with open_server(0) as server:
+        tuner = Tuner(server, list_inputs(sequence), Config(), [name])
+        assert tuner.config == Config()
+        for tolerance, changed in ((Config()[name], '0 changed: 0 now ground'), (0.01, 'changed')):
+            tuner.show(0, 'changes', Config().replace(**{name: tolerance}))
+            assert changed in tuner._table.content
+        n_ground, n_before = re.search(
+            r'ground \| ([\d,]+) \| ([\d,]+)', tuner._table.content
+        ).groups()
+        assert int(n_ground.replace(',', '')) < int(n_before.replace(',', ''))
 
 
 def test_the_web_viewer_is_served_here_only_and_ends_with_ctrl_c(sequence):
@@ -237,7 +245,7 @@ def listening(port):
     tables = [Path(f'/proc/net/{name}').read_text() for name in ('tcp', 'tcp6')]
     lines = [line.split() for table in tables for line in table.splitlines()[1:]]
     found = [line[1].split(':') for line in lines if line[3] == '0A']
-    return {address for address, own in found if int(own, 16) == port}
+    return {address for address, number in found if int(number, 16) == port}
 
 
 def test_what_is_refused(sequence, tmp_path, monkeypatch, capsys):

@@ -31,7 +31,6 @@ from gp_ground_seg.core.parameters.config import Config
 _LOGGER = logging.getLogger('gp_ground_seg')
 BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
-MAX_SUBMITTED = 1000  # blocks that the scheduler holds at a time
 _CONFIG = {
     'distributed.admin.tick.limit': '1h',  # it warns where a process had to wait
     'distributed.comm.timeouts.connect': '10s',
@@ -104,40 +103,29 @@ class Runner:
     def _submit(
         self, compute: Callable[..., Any], blocks: Sequence[Sequence[Any]]
     ) -> Iterator[tuple[int, Any]]:
-        from distributed import KilledWorker, as_completed
+        from distributed import as_completed
 
         run, said = f'gp_ground_seg-{uuid.uuid4().hex}', set()
         if not self.n_workers:
             _LOGGER.warning('the scheduler has no worker yet, waiting for one')
 
-        def submit(k: int) -> Any:
-            return self._client.submit(compute, blocks[k], key=(run, k), pure=False)
-
         self._client.subscribe_topic('all', partial(_tell_loss, run))
-        waiting = iter(range(len(blocks)))
-        first = [submit(k) for k in itertools.islice(waiting, MAX_SUBMITTED)]
         try:
-            finished = as_completed(first, loop=self._client.loop)
-            del first  # A future that is kept would keep its result on the cluster.
+            # A list of futures that is kept would keep their results on the cluster.
+            finished = as_completed(
+                [
+                    self._client.submit(compute, block, key=(run, k), pure=False)
+                    for k, block in enumerate(blocks)
+                ],
+                loop=self._client.loop,
+            )
             for future in finished:
                 k = future.key[1]
-                try:
-                    found, notes = future.result()
-                except KilledWorker as error:
-                    where = f'{blocks[k][0]} to {blocks[k][-1]}'
-                    raise DataError(
-                        f'{where}: each worker that computed this block died, as where memory is '
-                        'short; fewer --workers have more of it each'
-                    ) from error
-                except (CancelledError, OSError) as error:
-                    if future.status == 'error':  # raised by `function`
-                        raise
-                    raise DataError(f'the scheduler is lost ({error})') from error
+                found, notes = _result(future, blocks[k])
                 for level, line in notes:
                     if line not in said:
                         said.add(line)
                         _LOGGER.log(level, '%s', line)
-                finished.update([submit(k) for k in itertools.islice(waiting, 1)])
                 yield k, found
         finally:
             self._client.unsubscribe_topic('all')
@@ -153,8 +141,26 @@ def _count(bar: tqdm[Any], items: Iterable[Any]) -> Iterator[Any]:
         bar.update()
 
 
+def _result(future: Any, block: Sequence[Any]) -> tuple[Any, list[tuple[int, str]]]:
+    """Return what `_compute` returned for a block; DataError where the cluster failed."""
+    from distributed import KilledWorker
+
+    try:
+        found: tuple[Any, list[tuple[int, str]]] = future.result()
+    except KilledWorker as error:
+        raise DataError(
+            f'{block[0]} to {block[-1]}: each worker that computed this block died, as where '
+            'memory is short; fewer --workers have more of it each'
+        ) from error
+    except (CancelledError, OSError) as error:
+        if future.status == 'error':  # raised by the function
+            raise
+        raise DataError(f'the scheduler is lost ({error})') from error
+    return found
+
+
 def _tell_loss(run: str, event: tuple[float, Any]) -> None:
-    """Say which blocks of a run a worker was computing that has died."""
+    """Log the blocks of a run that a worker was computing when it died."""
     _, about = event
     if isinstance(about, dict) and about.get('action') == 'remove-worker':
         keys = [*about['processing-tasks'], *about.get('lost-computed-tasks', ())]
@@ -173,7 +179,7 @@ def cut(
     `BLOCK_SIZE` items, or fewer if there would not be two for each worker.
     """
     if group is not None:
-        return [[*own] for _, own in itertools.groupby(items, key=group)]
+        return [[*members] for _, members in itertools.groupby(items, key=group)]
     size = max(1, min(BLOCK_SIZE, -(-len(items) // (2 * max(1, n_workers)))))
     return [[*items[k : k + size]] for k in range(0, len(items), size)]
 
@@ -224,7 +230,7 @@ def _interrupt_kept() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    # Starts a process of multiprocessing's own, after which the mask of its thread is another.
+    # Starts the resource tracker of multiprocessing, which changes the mask of this thread.
     multiprocessing.get_context('spawn').Lock()
     before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -113,7 +113,7 @@ class Manifest:
 
     def __init__(self, folder: AnyPath, configuration: str) -> None:
         self._path = folder / MANIFEST
-        self._own = {'configuration': configuration, 'version': gp_ground_seg.__version__}
+        self._run = {'configuration': configuration, 'version': gp_ground_seg.__version__}
         self._text = b''
 
     def resume(self) -> set[str] | None:
@@ -127,12 +127,12 @@ class Manifest:
         for number, line in enumerate(self._text.splitlines(), 1):
             try:
                 entry = json.loads(line)
-                known = {key: entry[key] for key in self._own}
+                known = {key: entry[key] for key in self._run}
                 names.update(entry['names'])
             except (ValueError, KeyError, TypeError) as error:
                 raise DataError(f'{self._path}: line {number} is none of a manifest') from error
-            if known != self._own:
-                was, now = (f'{d["configuration"]} of {d["version"]}' for d in (known, self._own))
+            if known != self._run:
+                was, now = (f'{d["configuration"]} of {d["version"]}' for d in (known, self._run))
                 raise DataError(
                     f'{self._path}: was begun with the configuration {was}, this is {now}; give '
                     'the parameters of then, or another output folder'
@@ -155,7 +155,7 @@ class Manifest:
 
     def add(self, names: Sequence[str]) -> None:
         """Note that a block is finished."""
-        entry = {'block': self._text.count(b'\n'), 'names': list(names), **self._own}
+        entry = {'block': self._text.count(b'\n'), 'names': list(names), **self._run}
         line = json.dumps(entry).encode() + b'\n'
         self._text += line
         if isinstance(self._path, UrlPath):  # An object cannot be appended to.

@@ -15,11 +15,12 @@ from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.colours import length_scale_colours
-from gp_ground_seg.lab.viewers.scene import CAMERA, LEGENDS, RAMPS, TARGET, Cloud, Mesh, Scene
+from gp_ground_seg.lab.plotting.scan import CAMERA, TARGET
+from gp_ground_seg.lab.viewers.scene import LEGENDS, RAMPS, Cloud, Mesh, Scene
 
 HOST = '127.0.0.1'
 SHOWN = ('class', 'surface')
-"""What a page shows at first."""
+"""Clouds that a page shows at first."""
 BAND_COLOUR = (86, 180, 233)
 _BOX = (
     'position:fixed;left:12px;bottom:12px;z-index:9;padding:8px 12px;background:#ffffffd9;'
@@ -29,7 +30,7 @@ _BOX = (
 
 @contextmanager
 def open_server(port: int) -> Iterator[Any]:
-    """Viser server on this machine; 0 is any free port. It prints nothing."""
+    """Yield viser's server on this machine; 0 is any free port. It prints nothing."""
     viser = require('viser', 'viser')
     try:
         with redirect_stdout(io.StringIO()):

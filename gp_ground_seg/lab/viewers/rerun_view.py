@@ -14,13 +14,14 @@ from typing import Any
 
 from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.lab.viewers.scene import CAMERA, RAMPS, TARGET, Mesh, Scene
+from gp_ground_seg.lab.plotting.scan import CAMERA, TARGET
+from gp_ground_seg.lab.viewers.scene import RAMPS, Mesh, Scene
 
 HOST = '127.0.0.1'
 HIDDEN = ('height', 'p_ground', 'errors', 'faces', 'candidates', 'band')
-"""What is not shown at first."""
+"""Clouds and meshes that are hidden at first."""
 SERIES = {'IoU': 'IoU [%]', 'lost': 'objects lost', 'theta': 'theta', 'latency': 'latency [ms]'}
-"""What is drawn over the frames, and its titles."""
+"""Numbers that are drawn over the frames, and their titles."""
 NEED_LABELS = ('IoU', 'lost')
 ABOUT = f"""\
 The eyes in the tree on the left show and hide:
@@ -37,7 +38,7 @@ The eyes in the tree on the left show and hide:
 
 
 class Recording:
-    """Frames on their way to a viewer or a file, which rerun's ``RecordingStream`` knows."""
+    """Frames on their way to a viewer or a file, which `stream` is told."""
 
     def __init__(self, title: str) -> None:
         self._rr = rr = require('rerun', 'rerun-sdk')
@@ -74,7 +75,7 @@ class Recording:
 
 
 def _blueprint(rrb: Any, names: list[str]) -> Any:
-    """Scan on the left, the series of these names on the right."""
+    """Return the layout: scan on the left, the series of these names on the right."""
     hidden = {f'scan/{name}': rrb.EntityBehavior(visible=False) for name in HIDDEN}
     eye = rrb.EyeControls3D(position=CAMERA, look_target=TARGET, eye_up=(0.0, 0.0, 1.0))
     scan = rrb.Spatial3DView(origin='scan', name='scan', overrides=hidden, eye_controls=eye)

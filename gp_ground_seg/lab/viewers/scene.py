@@ -1,4 +1,4 @@
-"""What the viewers show of a segmented scan, as arrays in its level frame."""
+"""Points, surface and colours that the viewers show, as arrays in the level frame of a scan."""
 
 from __future__ import annotations
 
@@ -23,8 +23,6 @@ from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_confusio
 from gp_ground_seg.lab.scoring.objects import Objects, count_objects, labelled_objects
 
 Colours = npt.NDArray[np.uint8]
-CAMERA, TARGET = (-18.0, -8.0, 11.0), (9.0, 1.0, -3.0)
-"""Where the camera is at first, behind and above the sensor, and what it looks at [m]."""
 BLACK = '#111111'
 LEGENDS = {
     'class': {'unknown': PINK, 'ground': COLOURS['ground'], 'obstacle': COLOURS['obstacles']},
@@ -41,7 +39,7 @@ RAMPS = {name: (low, high) for name, (_, low, high) in VALUES.items()}
 
 
 class View(NamedTuple):
-    """A scan to look at, and its truth where that is known."""
+    """A scan to look at, with its true labels and objects where they are known."""
 
     title: str
     points: npt.NDArray[np.floating]  # (N, >=3)
@@ -53,7 +51,7 @@ class View(NamedTuple):
         if self.truth is None or self.objects is None:
             return {}
         bands = count_objects(self.points, label, self.objects).values()
-        counts = [(one.n_lost, one.n_objects) for found in bands for one in found]
+        counts = [(group.n_lost, group.n_objects) for groups in bands for group in groups]
         n_lost, n_objects = np.sum([(0, 0), *counts], axis=0).tolist()
         iou = 100.0 * count_confusion(label, self.truth).iou
         return {'IoU': iou, 'lost': n_lost, 'objects': n_objects}
@@ -89,9 +87,9 @@ class Mesh(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What there is to see of a scan, in its level frame, by name."""
+    """Clouds and meshes of a scan, in its level frame."""
 
-    clouds: dict[str, Cloud]
+    clouds: dict[str, Cloud]  # by name
     surface: Mesh  # coloured by length-scale
     band: Mesh  # the same, two standard deviations below the surface and above it
 
@@ -100,28 +98,23 @@ def make_scene(view: View, result: Segmentation, config: Config, backend: Backen
     """Draw a segmented scan; `backend` finds the vertical faces again."""
     finite = result.label != Label.UNKNOWN
     level = result.pose.level(view.points[:, :3])
+    drawn = level.astype(np.float32)
     names = ['class', *RAMPS, *([] if view.truth is None else ['errors'])]
     clouds = {
-        name: _cloud(level[finite], point_colours(name, result, view.truth)[finite])
+        name: Cloud(drawn[finite], point_colours(name, result, view.truth)[finite])
         for name in names
     }
     scan = backend.build_grid(level, config)
     faces = backend.find_faces(scan, config).is_face
-    on_face = level[(scan.tiles.tile != OUTSIDE) & faces[np.maximum(scan.tiles.tile, 0)]]
-    clouds['faces'] = _cloud(on_face, np.tile(palette('faces'), (len(on_face), 1)))
-    own, model = result.candidates, _level_model(result)
-    azimuth = model.azimuth[own.segment]
-    places = np.stack([own.r * np.cos(azimuth), own.r * np.sin(azimuth), own.z], axis=1)
-    clouds['candidates'] = _cloud(places, palette('candidates')[result.surface.inlier.astype(int)])
+    on_face = drawn[(scan.tiles.tile != OUTSIDE) & faces[np.maximum(scan.tiles.tile, 0)]]
+    clouds['faces'] = Cloud(on_face, np.tile(palette('faces'), (len(on_face), 1)))
+    model = dataclasses.replace(GroundModel.of(result), roll=0.0, pitch=0.0)
+    found = result.candidates
+    azimuth = model.azimuth[found.segment]
+    places = np.stack([found.r * np.cos(azimuth), found.r * np.sin(azimuth), found.z], axis=1)
+    is_inlier = result.surface.inlier.astype(np.intp)
+    clouds['candidates'] = Cloud(places.astype(np.float32), palette('candidates')[is_inlier])
     return Scene(clouds, _mesh(model, config, 0.0), _mesh(model, config, -N_STD, N_STD))
-
-
-def _level_model(result: Segmentation) -> GroundModel:
-    return dataclasses.replace(GroundModel.of(result), roll=0.0, pitch=0.0)
-
-
-def _cloud(points: npt.NDArray[np.floating], colours: Colours) -> Cloud:
-    return Cloud(points.astype(np.float32), colours)
 
 
 def point_colours(name: str, result: Segmentation, other: Labels | None = None) -> Colours:
@@ -159,7 +152,7 @@ def _bytes(colours: FloatArray) -> Colours:
 
 
 def _mesh(model: GroundModel, config: Config, *n_std: float) -> Mesh:
-    """Surfaces so many standard deviations above the ground, where `plot` shows it too."""
+    """Return surfaces that many standard deviations above the ground, where `plot` shows it."""
     n_segments, n_knots = model.height.shape
     known = np.isfinite(model.height) & (model.std <= config.label.ground_tolerance)
     quad = known & np.roll(known, -1, axis=0)
