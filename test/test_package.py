@@ -65,31 +65,25 @@ def test_one_version(package):
 
 
 @pytest.mark.filterwarnings('ignore:nodes.Node.traverse')  # docutils, of catkin_pkg
-def test_the_tools_of_a_release_read_the_changelog_and_set_the_version(tmp_path):
-    """Those of catkin, which bloom uses as well."""
-    changelogs = pytest.importorskip('catkin_pkg.changelog', reason='catkin_pkg is not installed')
-    packages = pytest.importorskip('catkin_pkg.package')
-    versions = pytest.importorskip('catkin_pkg.package_version')
+def test_the_tools_of_ros_take_package_xml_and_changelog_and_set_the_version(tmp_path):
+    """Those of catkin, which colcon and bloom use as well."""
+    reason = 'catkin_pkg is not installed'
+    changelogs = pytest.importorskip('catkin_pkg.changelog', reason=reason)
+    packages = pytest.importorskip('catkin_pkg.package', reason=reason)
+    versions = pytest.importorskip('catkin_pkg.package_version', reason=reason)
     changelog = changelogs.get_changelog_from_path(str(REPOSITORY / 'CHANGELOG.rst'))
     newest, _, entries = next(iter(changelog.foreach_version()))
     assert newest in (gp_ground_seg.__version__, 'forthcoming') and len(entries) > 0
     for name in ('package.xml', 'setup.py'):
         shutil.copy(REPOSITORY / name, tmp_path)
-    found = packages.parse_package(str(tmp_path / 'package.xml'))
+    warnings = []
+    found = packages.parse_package(str(tmp_path / 'package.xml'), warnings=warnings)
+    assert found.get_build_type() == 'ament_python'
+    found.validate(warnings=warnings)
+    assert warnings == []
     versions.update_versions({str(tmp_path): found}, '9.8.7')
     assert packages.parse_package(str(tmp_path / 'package.xml')).version == '9.8.7'
     assert "version='9.8.7'," in (tmp_path / 'setup.py').read_text()
-
-
-def test_package_xml_is_accepted_by_the_tools_of_ros():
-    catkin_pkg = pytest.importorskip('catkin_pkg.package', reason='catkin_pkg is not installed')
-    warnings = []
-    path = REPOSITORY / 'package.xml'
-    package = catkin_pkg.parse_package_string(path.read_text(), str(path), warnings=warnings)
-    assert warnings == []
-    assert package.get_build_type() == 'ament_python'
-    package.validate(warnings=warnings)
-    assert warnings == []
 
 
 def loaded_by(statement):
