@@ -132,7 +132,7 @@ def test_height_and_ground_z_are_of_one_surface(tilt):
 
 @pytest.mark.parametrize('sensor', ['hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360'])
 def test_errors_against_exact_heights_are_as_large_as_said(sensor):
-    """Every scene once; docs/accuracy.md has the table of two seeds."""
+    """Every scene once; docs/accuracy.md has the numbers of two seeds."""
     segmenter = GroundSegmenter()
     ratios, errors = [], []
     for scene in DRIVES.values():
