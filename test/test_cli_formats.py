@@ -78,7 +78,7 @@ def test_the_ground_as_a_grid(tmp_path, expected):
         gather({name: POINTS[:, k].astype(float) + MAP[k] for k, name in enumerate('xyz')})
     )
     path = tmp_path / 'a.npy'
-    path.write_bytes(encode_file(path, cloud, expected.label, {}))
+    path.write_bytes(encode_file(path, cloud, {'label': expected.label}))
     words = ('--origin', *MAP, '--surface')
     assert run('segment', path, '-o', tmp_path / 'out.pcd', *words, '--quiet') == 0
     with np.load(tmp_path / 'out_surface.npz') as found:
@@ -232,7 +232,7 @@ def test_refused(tmp_path, monkeypatch, capsys, words, message):
 def test_a_missing_package_is_named(tmp_path, monkeypatch, capsys, name, module, packages):
     path = tmp_path / name
     cloud = cloud_of(name_columns(np.zeros((50, 3), np.float32)))
-    whole = encode_file(path, cloud, np.zeros(50, np.uint8), {})
+    whole = encode_file(path, cloud, {'label': np.zeros(50, np.uint8)})
     compressed = b'DATA binary_compressed\n' + struct.pack('<II', 9, 50 * 13)
     path.write_bytes(whole.replace(b'DATA binary\n', compressed))
     monkeypatch.setitem(sys.modules, module, None)

@@ -40,7 +40,7 @@ def sample(n=500, seed=0):
 def encode(name, fields, header=None, label=None, **results):
     label = np.zeros(len(fields), np.uint8) if label is None else label
     cloud = cloud_of(fields, header)
-    return encode_file(name, cloud, label, results)
+    return encode_file(name, cloud, {'label': label, **results})
 
 
 def reread(path, data, layout=None):
@@ -103,7 +103,7 @@ def test_what_a_format_beside_its_points_says_is_kept(tmp_path):
     assert reread(path, encode(path, fields, remarks)).header == remarks
     path = tmp_path / 'a.npz'
     np.savez(path, pose=np.eye(4), **{name: fields[name] for name in fields.dtype.names})
-    path.write_bytes(encode_file(path, read_file(path), np.zeros(60, np.uint8), {}))
+    path.write_bytes(encode_file(path, read_file(path), {'label': np.zeros(60, np.uint8)}))
     with np.load(path) as found:
         np.testing.assert_array_equal(found['pose'], np.eye(4))
 

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.cli.cloud_output import FORMATS
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.data.cloud_output import FORMATS
 from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
-from gp_ground_seg.lab.scale.cluster import Progress, cut, depends_on_past
-from gp_ground_seg.lab.scale.dataset import Manifest, Outcome, Scan, digest, pool, sweep
+from gp_ground_seg.lab.scale.cluster import Progress
+from gp_ground_seg.lab.scale.dataset import Manifest, Outcome, Scan, digest, run_blocks, sweep
 
 # What the output depends on, beside the parameters and the layout of scans.
 _OPTIONS = ('raw', 'topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
@@ -74,16 +74,16 @@ def run(
     target: AnyPath,
     items: Sequence[Scan],
     function: Callable[[Config, Sequence[Scan], Progress], Outcome],
+    unit: str = 'frame',
 ) -> None:
-    """Compute the blocks that are not finished, and say what they were.
+    """Compute the blocks that are not finished, and print a summary.
 
-    `function` computes a block, and writes below `target`.
+    `function` computes a block of items, called `unit` in the bar, and writes below `target`.
     """
     if target.suffix[1:] in FORMATS:
         raise DataError(f'{target}: must be a folder')
     if isinstance(target, Path) and not target.resolve().parent.is_dir():
         raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')
-    is_bag = items[0].read is list
     layout = replace(options.scan_layout(arguments), doubts='ignore')
     given = [getattr(arguments, name) for name in _OPTIONS]
     manifest = Manifest(target, digest(config, layout, given))
@@ -92,29 +92,16 @@ def run(
     if done is None:
         done = set()
         manifest.begin(names, force=arguments.force)
-    left, n_workers = [item for item in items if item.name not in done], 0
-    found = []
-    if left:
-        with options.runner(arguments, 'segment', 'bag' if is_bag else 'frame') as runner:
+    n_left = len(items) - len(done.intersection(names))
+    if n_left < len(items):
+        print(f'{len(items) - n_left} of {len(items)} were finished before')
+    if n_left:
+        with options.runner(arguments, 'segment', unit) as runner:
+            found = run_blocks(runner, function, config, items, manifest, done, unit == 'bag')
             n_workers = runner.n_workers
-            if n_workers:
-                config = config.replace(**{'runtime.n_threads': 1})
-            if is_bag or depends_on_past(config):
-                # A sequence that is not finished is computed again from its first scan.
-                behind = {item.sequence for item in left}
-                again = [item for item in items if item.sequence in behind]
-                blocks = cut(again, lambda item: item.sequence)
-            else:
-                blocks = cut(left, None, n_workers)
-            for k, outcome in runner.map_blocks(partial(function, config), blocks):
-                manifest.add([item.name for item in blocks[k]])
-                found.append(outcome)
+        print_summary(found, target, n_workers)
     if isinstance(target, Path):
         sweep(target, names)
-    if done:
-        print(f'{len(items) - len(left)} of {len(items)} were finished before')
-    if left:
-        print_summary(pool(found), target, n_workers)
 
 
 def print_summary(found: Outcome, target: AnyPath, n_workers: int = 0) -> None:

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
 from gp_ground_seg.cli import dataset, options
-from gp_ground_seg.cli.cloud_output import FORMATS, CloudOutput, encode_labels
-from gp_ground_seg.core.errors import DataError, PointCloudError
-from gp_ground_seg.core.frame import Label
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.atomic_output import staged_file, staged_files
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
+from gp_ground_seg.data.bag_output import GROUND_TOPIC, OBSTACLES_TOPIC, BagOutput
+from gp_ground_seg.data.cloud_output import FORMATS, CloudOutput, encode_labels
 from gp_ground_seg.data.files import AnyPath, as_path, write_file
-from gp_ground_seg.data.inputs import Input, Inputs, holds_bag
-from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
+from gp_ground_seg.data.inputs import holds_bag
 from gp_ground_seg.lab.scale.cluster import Progress
 from gp_ground_seg.lab.scale.dataset import Outcome, Scan, pool, segment_block
 
@@ -73,10 +69,8 @@ EXAMPLES = """\
   gp-ground-seg segment s3://bucket/kitti -o s3://bucket/labels --scheduler tcp://host:8786
 """
 
-GROUND_TOPIC, OBSTACLES_TOPIC = '/ground', '/obstacles'
 FOR_BAGS = ('ground_topic', 'obstacles_topic', 'drop')
 FOR_SCANS = ('raw', 'split', 'surface', 'origin')
-_TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -157,14 +151,15 @@ def _segment_dataset(arguments: argparse.Namespace, config: Config, is_bag: bool
         if not isinstance(target, Path):
             raise DataError(f'{target}: bags are written to folders of this machine')
         bags = dataset.list_bags(arguments, lambda path: _default_output(path).name)
-        dataset.run(arguments, config, target, bags, partial(_segment_bags, arguments, target))
+        write_bags = partial(_segment_bags, _bag_output(arguments), target)
+        dataset.run(arguments, config, target, bags, write_bags, 'bag')
         return
     scans, write = dataset.list_scans(arguments), partial(_write_labels, arguments.raw)
     dataset.run(arguments, config, target, scans, partial(segment_block, write, target))
 
 
 def _segment_bags(
-    arguments: argparse.Namespace,
+    output: BagOutput,
     target: Path,
     config: Config,
     bags: Sequence[Scan],
@@ -173,10 +168,9 @@ def _segment_bags(
     """Segment bags, each into one in the folder `target`."""
     outcomes = []
     for bag in progress(bags):
-        given = {'input': str(bag.path), 'quiet': True, 'force': True}
-        own = argparse.Namespace(**{**vars(arguments), **given})
         with closing(GroundSegmenter(config)) as segmenter:
-            outcomes.append(Outcome.of(_segment_bag(target / bag.name, own, segmenter)))
+            source, path = Path(str(bag.path)), target / bag.name
+            outcomes.append(Outcome.of(output.write(source, path, segmenter, force=True)))
     return pool(outcomes)
 
 
@@ -198,7 +192,7 @@ def _default_output(source: Path, form: str | None = None) -> Path:
 def _segment_scans(
     target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
 ) -> Iterator[Segmentation]:
-    """Write the files of each scan; yield what each holds."""
+    """Write the files of each scan; yield the results."""
     scans = options.list_clouds(arguments)
     is_file = target.suffix[1:] in FORMATS
     has_several = scans.topic or Path(arguments.input).is_dir()
@@ -212,95 +206,30 @@ def _segment_scans(
     output = CloudOutput(form, arguments.raw, arguments.split, arguments.surface)
     if not arguments.quiet:
         options.note_leftovers(target)
-    with (
-        _staged(scans, output, target, is_file, arguments.force) as paths,
-        options.progress('segment', quiet=arguments.quiet)(total=len(scans)) as bar,
-    ):
-        for scan in scans:
+    bar = options.progress('segment', quiet=arguments.quiet)
+    with output.staged(scans, target, is_file=is_file, force=arguments.force) as paths:
+        for scan in bar(scans, total=len(scans)):
             yield output.write(scan, segmenter, paths(scan))
-            bar.update()
-
-
-@contextmanager
-def _staged(
-    scans: Inputs, output: CloudOutput, target: Path, is_file: bool, force: bool
-) -> Iterator[Callable[[Input], list[Path]]]:
-    """Yield what returns where to write the files of a scan; all take their names at the end."""
-    folder, stem = (target.parent, target.stem) if is_file else (target, None)
-    names = [name for scan in scans for name in output.names(scan, stem)]
-    inputs = {Path(str(scan.path)).resolve() for scan in scans}
-    for name in names:
-        if (folder / name).resolve() in inputs:
-            raise DataError(f'{folder / name}: is the input; name another output')
-    with ExitStack() as stack:
-        if is_file:
-            paths = [stack.enter_context(staged_file(folder / n, force=force)) for n in names]
-            yield lambda _: paths
-        else:
-            hidden = stack.enter_context(staged_files(folder, names, force=force))
-            yield lambda scan: [hidden / name for name in output.names(scan)]
 
 
 def _segment_bag(
     target: Path, arguments: argparse.Namespace, segmenter: GroundSegmenter
 ) -> Iterator[Segmentation]:
-    """Copy a bag, the ground and the obstacles of each cloud after it; yield the results."""
-    n_done = 0
-    source = Path(arguments.input)
-    here = source.resolve()
-    if target.resolve() in (here, *here.parents):
-        raise DataError(f'{target}: is the input, or has it in it; name another output')
-    topics = (arguments.ground_topic or GROUND_TOPIC, arguments.obstacles_topic or OBSTACLES_TOPIC)
-    outputs = dict(zip(topics, (Label.GROUND, Label.OBSTACLE), strict=True))
-    with BagReader(source) as bag:
-        topic = bag.pick_point_cloud_topic(arguments.topic)
-        for name in arguments.drop:
-            bag.topic(name)  # Raises where there is none.
-        copied = [name for name in bag.topics if name not in arguments.drop]
-        _check_output_topics(source, topics, copied)
-        storage = arguments.format
-        if storage is None and target.suffix not in BAG_SUFFIXES and bag.storage != 'ros1':
-            storage = bag.storage
-        if not arguments.quiet:
-            options.note_leftovers(target)
-            for name in set(bag.migrated_topics) & set(copied):
-                kind = bag.topics[name]
-                options.note(f'topic {name}: {kind} has other fields in ROS 2; new ones are zero')
-        with (
-            BagWriter(target, storage=storage, force=arguments.force) as output,
-            options.progress('segment', quiet=arguments.quiet)(total=bag.n_messages(topic)) as bar,
-        ):
-            for name in copied:
-                output.add_topic(bag.topic(name))
-            for name in outputs:
-                output.add_topic(cloud_topic(name))
-            for name, time, raw in bag.messages([*copied, topic]):
-                if name in copied:
-                    output.write(name, time, raw)
-                if name != topic:
-                    continue
-                try:
-                    cloud = decode_cloud(raw)
-                    result = segmenter.segment(read_xyz(cloud))
-                except PointCloudError as error:
-                    raise DataError(
-                        f'{source}: message {n_done} of topic {topic}, '
-                        f'recorded at {time} ns: {error}'
-                    ) from error
-                for part, label in outputs.items():
-                    chosen = select_points(cloud, result.label == label)
-                    output.write(part, time, encode_cloud(chosen))
-                yield result
-                n_done += 1
-                bar.update()
+    """Write the bag of a bag; yield the results."""
+    clouds = options.list_clouds(arguments)
+    if not arguments.quiet:
+        options.note_leftovers(target)
+    output = _bag_output(arguments)
+    results = output.write(Path(arguments.input), target, segmenter, force=arguments.force)
+    bar = options.progress('segment', quiet=arguments.quiet)
+    yield from bar(results, total=len(clouds))
 
 
-def _check_output_topics(source: Path, topics: tuple[str, str], copied: list[str]) -> None:
-    for option, name in zip(('--ground-topic', '--obstacles-topic'), topics, strict=True):
-        if not _TOPIC_NAME.fullmatch(name):
-            raise DataError(f'{option} {name}: must be a full topic name, as in {GROUND_TOPIC}')
-        if name in copied:
-            choices = f'choose another with {option}, or leave that one out with --drop {name}'
-            raise DataError(f'{source}: has a topic {name} already; {choices}')
-    if topics[0] == topics[1]:
-        raise DataError(f'--obstacles-topic {topics[1]}: is the topic of the ground as well')
+def _bag_output(arguments: argparse.Namespace) -> BagOutput:
+    return BagOutput(
+        arguments.topic,
+        arguments.ground_topic or GROUND_TOPIC,
+        arguments.obstacles_topic or OBSTACLES_TOPIC,
+        arguments.drop,
+        arguments.format,
+    )

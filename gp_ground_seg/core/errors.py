@@ -4,6 +4,7 @@ import importlib
 import shlex
 import sys
 import sysconfig
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,11 @@ class DataError(GroundSegError):
 
 class MissingDependencyError(GroundSegError, ImportError):
     """An optional package that this command needs is not installed."""
+
+
+def in_one_line(error: Exception) -> str:
+    """Text of an error, shortened to one line, or the name of its type if it has none."""
+    return textwrap.shorten(str(error), 200, placeholder=' ...') or type(error).__name__
 
 
 def install_hint(packages: str) -> str:

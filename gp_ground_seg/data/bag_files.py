@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.core.errors import DataError, GroundSegError
+from gp_ground_seg.core.errors import DataError, GroundSegError, in_one_line
 
 POINT_CLOUD2 = 'sensor_msgs/msg/PointCloud2'
 UNKNOWN_TYPE_HASH = 'RIHS01_' + 64 * '0'  # what rosbag2 itself stores is no valid hash
@@ -148,9 +147,3 @@ def writing(path: Path) -> Iterator[None]:
     except (OSError, sqlite3.Error) as error:
         reason = getattr(error, 'strerror', None) or error
         raise DataError(f'{path}: cannot be written: {reason}') from error
-
-
-def in_one_line(error: Exception) -> str:
-    """Text of an error, shortened to one line, or its type if it has none."""
-    # Some of rosbags' messages quote a whole message definition.
-    return textwrap.shorten(str(error), 200, placeholder=' ...') or type(error).__name__

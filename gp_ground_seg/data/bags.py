@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.core.errors import DataError, require
+from gp_ground_seg.core.errors import DataError, in_one_line, require
 from gp_ground_seg.data.atomic_output import staged_bag_folder, staged_file
 from gp_ground_seg.data.bag_files import (
     METADATA_FILE,
@@ -24,7 +24,6 @@ from gp_ground_seg.data.bag_files import (
     UNKNOWN_TYPE_HASH,
     BagTopic,
     check_is_bag,
-    in_one_line,
     reading,
     resolve_storage,
     storage_of,

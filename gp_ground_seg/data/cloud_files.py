@@ -1,31 +1,79 @@
-"""Point clouds in files, their format known by the suffix; what libraries raise, in one line."""
+"""Point clouds in files, their format known by the suffix; those of numpy are read here.
+
+``.npy`` is one table or structured array, ``.npz`` has an array for each field.
+"""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
-from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError
-from gp_ground_seg.data.bag_files import in_one_line
-from gp_ground_seg.data.clouds import Cloud, Columns, name_columns
+from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError, in_one_line
+from gp_ground_seg.data.clouds import Cloud, Columns, cloud_of, gather, name_columns, scatter
 from gp_ground_seg.data.files import MAX_SCAN_BYTES, AnyPath, read_bytes
-from gp_ground_seg.data.numpy_files import encode_npy, encode_npz, read_numpy
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, check_scan, four_columns, read_scan
 
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
+TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N,)
+
+
+def _read_numpy(data: bytes) -> Cloud:
+    """Read a table x, y, z, intensity, ..., a structured array, or arrays by name."""
+    found = np.load(io.BytesIO(data), allow_pickle=False)
+    if isinstance(found, np.ndarray):
+        return _named_cloud({TABLE: found})
+    size = sum(entry.file_size for entry in found.zip.infolist())
+    if size > MAX_SCAN_BYTES:
+        raise PointCloudError(f'{size} bytes unpacked, accepted are at most {MAX_SCAN_BYTES}')
+    return _named_cloud(dict(found))
+
+
+def _named_cloud(arrays: Columns) -> Cloud:
+    """Cloud of the fields and the table; arrays of another length become its header."""
+    table = arrays.pop(TABLE, None)
+    if table is not None and table.dtype.names is None:
+        if table.ndim != 2 or table.shape[1] < 3:
+            raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider')
+        table = name_columns(table)
+    columns = {**({} if table is None else scatter(table.ravel())), **arrays}
+    shape = columns['x'].shape if 'x' in columns else ()
+    fields = {name: v for name, v in columns.items() if shape and v.shape[:1] == shape}
+    return cloud_of(gather(fields), {name: v for name, v in columns.items() if name not in fields})
+
+
+def _encode_npy(cloud: Cloud) -> bytes:
+    """File of a structured array."""
+    file = io.BytesIO()
+    np.save(file, cloud.fields)
+    return file.getvalue()
+
+
+def _encode_npz(cloud: Cloud) -> bytes:
+    """File of an array for each field, and of arrays of another length."""
+    others = cloud.header if isinstance(cloud.header, dict) else {}
+    return encode_arrays({**others, **scatter(cloud.fields)})
+
+
+def encode_arrays(arrays: Columns) -> bytes:
+    """File .npz of arrays by name."""
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # any names
+    return file.getvalue()
+
+
 _READERS: dict[str, Callable[[bytes], Cloud]] = {
     '.pcd': read_pcd,
     '.ply': read_ply,
-    '.npy': read_numpy,
-    '.npz': read_numpy,
+    '.npy': _read_numpy,
+    '.npz': _read_numpy,
 }
-_ENCODERS = {'.pcd': encode_pcd, '.ply': encode_ply, '.npy': encode_npy, '.npz': encode_npz}
+_ENCODERS = {'.pcd': encode_pcd, '.ply': encode_ply, '.npy': _encode_npy, '.npz': _encode_npz}
 SUFFIXES = ('.bin', *_READERS)
 WRITABLE = tuple(_READERS)
 
@@ -53,15 +101,13 @@ def read_file(path: AnyPath, layout: ScanLayout = KITTI) -> Cloud:
     return cloud
 
 
-def encode_file(
-    path: AnyPath, cloud: Cloud, label: npt.NDArray[np.uint8], results: Columns
-) -> bytes:
-    """File of a cloud with a `Label` and further values for each point; DataError if none can be.
+def encode_file(path: AnyPath, cloud: Cloud, columns: Columns) -> bytes:
+    """File of a cloud with further values for each point; DataError if none can be.
 
     Its format is that of `path`, one of `WRITABLE`.
     """
     with _named(path, 'cannot be written'), np.errstate(all='ignore'):
-        return _ENCODERS[path.suffix](cloud.join({'label': label, **results}))
+        return _ENCODERS[path.suffix](cloud.join(columns))
 
 
 @contextmanager

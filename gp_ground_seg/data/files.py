@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import posixpath
-import textwrap
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.core.errors import DataError, GroundSegError, MissingDependencyError, require
+from gp_ground_seg.core.errors import (
+    DataError,
+    GroundSegError,
+    MissingDependencyError,
+    in_one_line,
+    require,
+)
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
 
 MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dense scan
@@ -100,8 +105,7 @@ class UrlPath:
         except FileNotFoundError as error:
             raise DataError(f'{self.url}: no such file or folder') from error
         except Exception as error:  # of many types: botocore, aiohttp, google.auth, ...
-            said = textwrap.shorten(str(error), 200, placeholder=' ...') or type(error).__name__
-            raise DataError(f'{self.url}: {said}') from error
+            raise DataError(f'{self.url}: {in_one_line(error)}') from error
 
 
 AnyPath = Path | UrlPath

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.recfunctions import repack_fields
 
-from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.data.bag_files import POINT_CLOUD2, in_one_line
+from gp_ground_seg.core.errors import PointCloudError, in_one_line
+from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import jazzy_types
 
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}

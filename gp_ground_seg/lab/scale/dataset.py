@@ -7,6 +7,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
 from gp_ground_seg.data.files import AnyPath, UrlPath, read_bytes, write_file
-from gp_ground_seg.lab.scale.cluster import Progress
+from gp_ground_seg.lab.scale.cluster import Progress, Runner, cut, depends_on_past
 
 MANIFEST = 'manifest.jsonl'
 _MAX_MANIFEST_BYTES = 1 << 32
@@ -163,6 +164,36 @@ class Manifest:
             return
         with self._path.open('ab') as file:
             file.write(line)
+
+
+def run_blocks(
+    runner: Runner,
+    function: Callable[[Config, Sequence[Scan], Progress], Outcome],
+    config: Config,
+    items: Sequence[Scan],
+    manifest: Manifest,
+    done: set[str],
+    by_sequence: bool = False,
+) -> Outcome:
+    """Compute the items whose names are not `done`, and add each block to the manifest.
+
+    With `by_sequence`, or where the labels of a scan depend on the scans before it, a block is a
+    whole sequence, computed again from its first scan if it is not finished.
+    """
+    left = [item for item in items if item.name not in done]
+    if runner.n_workers:
+        config = config.replace(**{'runtime.n_threads': 1})
+    if by_sequence or depends_on_past(config):
+        unfinished = {item.sequence for item in left}
+        again = [item for item in items if item.sequence in unfinished]
+        blocks = cut(again, lambda item: item.sequence)
+    else:
+        blocks = cut(left, None, runner.n_workers)
+    found = []
+    for k, outcome in runner.map_blocks(partial(function, config), blocks):
+        manifest.add([item.name for item in blocks[k]])
+        found.append(outcome)
+    return pool(found)
 
 
 def digest(config: Config, *more: object) -> str:
