@@ -39,7 +39,7 @@ from gp_ground_seg.core.gp.evidence import STEP, looks_aside_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.parameters.numbers import numbers_of
+from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.labels import square_units
 from gp_ground_seg.core.pipeline.lines import lines_through

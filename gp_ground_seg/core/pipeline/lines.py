@@ -26,7 +26,7 @@ from gp_ground_seg.core.parameters.config import (
     LengthScaleConfig,
     LinesConfig,
 )
-from gp_ground_seg.core.parameters.numbers import numbers_of
+from gp_ground_seg.core.parameters.number_tuples import numbers_of
 
 MIN_BREAK_CANDIDATES = 3
 """Candidates that a line after a slope break needs: through two there is always one."""
