@@ -20,20 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 TEST = Path(__file__).parent
-SEGMENTATION = ['test/torture_clouds.py', 'test/torture_cases.py']
-for own in (
-    'backend.py',
-    'compiled',
-    'frame.py',
-    'gp',
-    'jit.py',
-    'parameters/config.py',
-    'parameters/schema.py',
-    'pipeline',
-    'result.py',
-    'segmenter.py',
-):
-    SEGMENTATION.append(f'gp_ground_seg/{own}')
+SEGMENTATION = ('test/torture_clouds.py', 'test/torture_cases.py', 'gp_ground_seg/core')
 
 
 class Part(NamedTuple):
@@ -50,10 +37,7 @@ class Part(NamedTuple):
 PARTS = {
     'clouds': Part('torture_clouds.py', 1000, 100, sources=SEGMENTATION),
     'clouds, debugging allocator': Part(
-        'torture_clouds.py',
-        100,
-        50,
-        ('PYTHONMALLOC=debug', 'MALLOC_PERTURB_=165'),
+        'torture_clouds.py', 100, 50, ('PYTHONMALLOC=debug', 'MALLOC_PERTURB_=165'),
         sources=SEGMENTATION,
     ),
     'threads, processes, signals, limits': Part('torture_processes.py', 110, 11),
@@ -61,7 +45,7 @@ PARTS = {
     'commands killed, interrupted, disk full': Part('torture_writes.py', 40, 20),
     'damaged files': Part('torture_files.py', 600, 200),
     'hostile clouds over DDS': Part('torture_ros.py', 400, 200),
-}
+}  # fmt: skip
 
 
 def git(*words):
@@ -79,14 +63,9 @@ def run_chunk(part, first, stop):
     environment['PYTHONPATH'] = os.pathsep.join([str(TEST.parent), str(TEST)])
     try:
         done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            errors='replace',
-            env=environment,
-            timeout=part.timeout,
-            check=False,
-        )
+            command, capture_output=True, text=True, errors='replace', env=environment,
+            timeout=part.timeout, check=False,
+        )  # fmt: skip
     except subprocess.TimeoutExpired as error:
         last = (error.stdout or b'')[-200:].decode(errors='replace').split('\r')[-1]
         return [f'no end within {part.timeout:.0f} s, at case {last}']
@@ -124,14 +103,9 @@ def main():
         failed = run_chunk(PARTS[name], first, stop)
         seconds = time.monotonic() - started
         entry = {
-            'commit': commit,
-            'code': code[name],
-            'part': name,
-            'first': first,
-            'stop': stop,
-            'failed': failed,
-            'seconds': round(seconds, 1),
-        }
+            'commit': commit, 'code': code[name], 'part': name, 'first': first, 'stop': stop,
+            'failed': failed, 'seconds': round(seconds, 1),
+        }  # fmt: skip
         with options.state.open('a') as file:
             file.write(json.dumps(entry) + '\n')
         for line in failed:
@@ -149,11 +123,12 @@ def main():
     n_failed = 0
     print(f'\ncommit {commit}, {time.strftime("%Y-%m-%d")}, scale {options.scale:g}')
     for name in options.part or PARTS:
-        own = [done[chunk] for chunk in wanted if chunk[0] == name]
-        failures = sum(len(entry['failed']) for entry in own)
+        entries = [done[chunk] for chunk in wanted if chunk[0] == name]
+        failures = sum(len(entry['failed']) for entry in entries)
         n_failed += failures
-        cases, seconds = sum(e['stop'] - e['first'] for e in own), sum(e['seconds'] for e in own)
-        others = sorted({entry['commit'] for entry in own} - {commit})
+        cases = sum(entry['stop'] - entry['first'] for entry in entries)
+        seconds = sum(entry['seconds'] for entry in entries)
+        others = sorted({entry['commit'] for entry in entries} - {commit})
         where = f' (same code: {", ".join(others)})' if others else ''
         print(f'{name:40} {cases:8} cases {seconds:8.0f} s {failures:4} failures{where}')
     sys.exit(1 if n_failed else 0)
