@@ -27,7 +27,6 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import decode_cloud, stamp_of
 from gp_ground_seg.ros import playback, start_stop
-from gp_ground_seg.ros.start_stop import ros_session
 
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 SUMMARY = re.compile(
@@ -263,24 +262,6 @@ def test_loop_until_interrupted(tmp_path, number):
     # A period between the last of a round and the first of the next, as between the others.
     steps = np.diff(listener.times['/points'])
     assert steps.min() > 0.5 * PERIOD / 2 - 1e6 * float(numbers[4])
-
-
-def test_signals_of_a_session():
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.getsignal(number) for number in numbers}
-    nohup = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with isolated_context(), ros_session('any') as running:
-            assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-            # Python swallows what a signal raises within a destructor: it comes again.
-            with contextlib.suppress(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGTERM)
-            for wait in (running.sleep, running.spin):
-                with pytest.raises(KeyboardInterrupt):
-                    wait(0.001)
-    finally:
-        signal.signal(signal.SIGHUP, nohup)
-    assert {number: signal.getsignal(number) for number in numbers} == before
 
 
 SUBSCRIBER = """

@@ -282,11 +282,11 @@ def test_what_is_dumped_is_what_runs_and_can_be_given_at_start(b, tmp_path, heig
 
 def test_one_bad_value_of_a_file_is_refused_and_the_others_taken(b):
     assert b.set('grid.r_max', 30.0).successful
-    # r_min can only come after r_max, which stands behind it.
-    asked = {'grid.r_min': 40.0, 'label.ground_tolerance': 9.0, 'grid.r_max': 50.0}
+    # One by one, r_min comes after the r_max that it has to be below.
+    asked = {'label.ground_tolerance': 9.0, 'grid.r_max': 50.0, 'grid.r_min': 40.0}
     results = b.load(asked)
-    assert [result.successful for result in results] == [True, False, True]
-    assert 'label.ground_tolerance = 9.0: must be' in results[1].reason
+    assert [result.successful for result in results] == [False, True, True]
+    assert 'label.ground_tolerance = 9.0: must be' in results[0].reason
     assert b.node.config == Config().replace(**{'grid.r_min': 40.0, 'grid.r_max': 50.0})
 
 

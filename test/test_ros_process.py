@@ -17,6 +17,7 @@ from bag_samples import START, write_ros2_bag
 from cli_runner import run
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.srv import SetParameters
 from rclpy.serialization import serialize_message as bytes_of
 from ros_helpers import NAMESPACE, street, to_message
 
@@ -234,6 +235,21 @@ def test_clouds_of_two_megabytes_at_10_hz_all_come_back():
             link.ground.wait(k - 3)
         for parts in (link.ground.wait(20), link.obstacles.wait(20)):
             assert [part.header.stamp.sec for part in parts] == list(range(20))
+
+
+@pytest.mark.usefixtures('node')
+def test_what_rclpy_raises_does_not_end_the_node(node):
+    """A value of a type that does not exist: nobody answers, and the node goes on."""
+    with ros.linked() as link:
+        link.segment(to_message(street(500)))
+        name = f'{link.node_name}/set_parameters'
+        client = link.probe.create_client(SetParameters, name)
+        ros.wait_for(client.service_is_ready, name)
+        for message in ros.parameter_messages({'grid.r_max': 50.0}):
+            message.value.type = 99
+            client.call_async(SetParameters.Request(parameters=[message]))
+        ros.wait_for(lambda: '99' in node.log, 'message about the type')
+        link.segment(to_message(street(500)))
 
 
 GOOD = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -119,6 +120,11 @@ class GroundSegmentationNode(ConfiguredNode):
             self._tf.close()
             self._tf = None
 
+    @property
+    def is_compiling(self) -> bool:
+        """Whether the compiled backend is being made, in a thread of this process."""
+        return self._loader.is_busy
+
     def destroy_node(self) -> None:
         """Free what the node holds, the worker threads too."""
         self._loader.stop()
@@ -188,6 +194,21 @@ class GroundSegmentationNode(ConfiguredNode):
         return facts, self._outputs.n_subscribers()
 
 
+def _spin(node: GroundSegmentationNode, stop: start_stop.StopRequest) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while rclpy.ok() and not stop.made:
+        try:
+            # Python handles a signal after the wait, not within it.
+            executor.spin_once(timeout_sec=0.1)
+        except ExternalShutdownException:
+            return
+        except Exception as error:
+            # rclpy raises at parameters of an unknown type, and at a negative time on /clock.
+            if rclpy.ok():
+                node.get_logger().error(f'{type(error).__name__}: {error}', **THROTTLED)
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until a signal or a shutdown; return 0, or 2 for an error at start."""
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
@@ -198,18 +219,15 @@ def main(args: Sequence[str] | None = None) -> int:
             with start_stop.large_cloud_transport():
                 start_stop.initialize(words)
                 node = GroundSegmentationNode()
-            executor = SingleThreadedExecutor()
-            executor.add_node(node)
-            while rclpy.ok() and not stop.made:
-                # Python handles a signal after the wait, not within it.
-                executor.spin_once(timeout_sec=0.1)
+            _spin(node, stop)
         except GroundSegError as error:
             sys.stderr.write(f'{NODE_NAME}: error: {error}\n')
             return 2
-        except ExternalShutdownException:
-            pass
         finally:
             if node is not None:
                 node.destroy_node()
             rclpy.try_shutdown()
+    if node is not None and node.is_compiling:
+        # The end of the interpreter would wait for LLVM, for ten seconds and more.
+        os._exit(0)
     return 0

@@ -24,7 +24,7 @@ from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.start_stop import start_errors
 
 REMOTE_TIMEOUT = 5.0  # of a node that is to be set [s]
-_OWN_NAMES = frozenset(spec.name for spec in parameter_specs())
+_NAMES = frozenset(spec.name for spec in parameter_specs())
 
 
 def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
@@ -53,7 +53,7 @@ def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
     values = {
         parameter.name: find_spec(parameter.name).check(parameter.value)
         for parameter in parameters
-        if parameter.name in _OWN_NAMES
+        if parameter.name in _NAMES
     }
     return config.replace(**values)
 
@@ -107,15 +107,11 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
         self._parameter_service = ParameterService(self)
-        for service in list(self.services):
-            if service.srv_type is SetParameters:
-                self.destroy_service(service)
-        self.create_service(
-            SetParameters,
-            '~/set_parameters',
-            self._on_set_request,
-            qos_profile=qos_profile_parameters,
-        )
+        # It sets the values of a request one by one: see `_on_request`.
+        (setter,) = (s for s in self.services if s.srv_type is SetParameters)
+        self.destroy_service(setter)
+        name, qos = '~/set_parameters', qos_profile_parameters
+        self.create_service(SetParameters, name, self._on_request, qos_profile=qos)
 
     @property
     def config(self) -> Config:
@@ -139,28 +135,23 @@ class ConfiguredNode(Node):  # type: ignore[misc]
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> Result:
         """Set all or none; checked before rclpy does, whose reasons do not contain the name."""
         for parameter in parameter_list:
-            if parameter.name not in _OWN_NAMES and not self.has_parameter(parameter.name):
+            if parameter.name not in _NAMES and not self.has_parameter(parameter.name):
                 return Result(successful=False, reason=_unknown(parameter.name))
         result = self._on_set(parameter_list)
         return super().set_parameters_atomically(parameter_list) if result.successful else result
 
-    def _on_set_request(self, request: Any, response: Any) -> Any:
-        """Set what ``ros2 param load`` sends at once, a whole file, in any order.
+    def _on_request(self, request: Any, response: Any) -> Any:
+        """Set all at once, or one by one if that is refused.
 
-        Set one by one, as rclpy does, a value that contradicts one still to come would be
-        refused. Here all are tried together; if that fails, one by one, and the refused ones
-        again after every round that set any.
+        ``ros2 param load`` sends a whole file: one by one, a value that contradicts another
+        still to come would be refused.
         """
         parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
-        results = [self.set_parameters_atomically(parameters)] * len(parameters)
-        n_left = len(parameters) + 1
-        while (n_refused := sum(not result.successful for result in results)) < n_left:
-            n_left = n_refused
-            results = [
-                result if result.successful else self.set_parameters_atomically([parameter])
-                for parameter, result in zip(parameters, results, strict=True)
-            ]
-        response.results = results
+        result = self.set_parameters_atomically(parameters)
+        if result.successful:
+            response.results = [result] * len(parameters)
+        else:
+            response.results = [self.set_parameters_atomically([one]) for one in parameters]
         return response
 
     def _on_set(self, parameters: list[Parameter]) -> Result:
@@ -187,8 +178,8 @@ class ConfiguredNode(Node):  # type: ignore[misc]
 
 
 def _typed(parameter: Parameter) -> Parameter:
-    """Make an integer that is given for a number one, as YAML and ``ros2 param set`` read 2."""
-    is_number = parameter.name in _OWN_NAMES and find_spec(parameter.name).type is float
+    """Return an integer given for a number as a number: YAML and ``ros2 param set`` read 2 so."""
+    is_number = parameter.name in _NAMES and find_spec(parameter.name).type is float
     if is_number and parameter.type_ == Parameter.Type.INTEGER:
         return Parameter(parameter.name, value=float(parameter.value))
     return parameter
@@ -218,7 +209,7 @@ def set_remotely(node_name: str, values: Mapping[str, ParameterValue]) -> None:
         rclpy.spin_until_future_complete(node, future, executor, REMOTE_TIMEOUT)
         if not future.done():
             raise DataError(f'{node_name}: no answer in {REMOTE_TIMEOUT:g} s')
-        if refused := [one.reason for one in future.result().results if not one.successful]:
+        if refused := [r.reason for r in future.result().results if not r.successful]:
             raise DataError(f'{node_name}: {refused[0]}')
     finally:
         executor.shutdown()

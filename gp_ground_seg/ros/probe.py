@@ -28,8 +28,8 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.point_cloud2 import CloudMessage, encode_cloud, stamp_of
 from gp_ground_seg.ros.start_stop import (
     Session,
+    child_code,
     large_cloud_transport,
-    own_code,
     ros_session,
     stop_on_signals,
 )
@@ -77,7 +77,7 @@ class NodeProcess:
     ) -> None:
         self._log = log
         words = [str(unfinished or ''), '--ros-args', *ros_args]
-        self._command = [sys.executable, '-c', own_code(_RUN), *words]
+        self._command = [sys.executable, '-c', child_code(_RUN), *words]
 
     def __enter__(self) -> NodeProcess:
         """Start it."""

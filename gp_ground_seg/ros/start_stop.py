@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -104,8 +104,11 @@ def needing_ros(command: str) -> Iterator[None]:
         ) from error
 
 
-def own_code(code: str) -> str:
-    """Code for ``python -c`` that imports nothing from the current folder, which may be any."""
+def child_code(code: str) -> str:
+    """Return `code` for ``python -c`` with the import path of this process.
+
+    The current folder, which may be any, is not on it.
+    """
     path = [entry for entry in sys.path if os.path.isabs(entry)]
     return f'import sys\nsys.path[:] = {path!r}\n{code}'
 
@@ -150,9 +153,7 @@ def _free_shared_memory() -> int:
         return 0
 
 
-GRACE = 0.5  # time from the signal to the end of the process, if the work does not end before [s]
 _STOPS = (signal.SIGINT, signal.SIGTERM)
-_INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class StopRequest:
@@ -166,77 +167,41 @@ class StopRequest:
 
 
 @contextmanager
-def _watchdog() -> Iterator[None]:
-    """End the process with code 0 if the block does not end within `GRACE` of a signal."""
-    # Python calls its handlers between two steps of the main thread, and the next may be seconds
-    # away. The number of a signal is written to a pipe at once, where a thread waits for it.
-    done = threading.Event()
-    read_end, write_end = os.pipe()
-    os.set_blocking(write_end, False)
+def stop_on_signals(numbers: Iterable[signal.Signals] = _STOPS) -> Iterator[StopRequest]:
+    """Have the signals `numbers` within the block noted in the `StopRequest` that it yields.
 
-    def watch() -> None:
-        with contextlib.suppress(OSError):
-            while number := os.read(read_end, 1):
-                if number[0] in _STOPS:
-                    break
-        # At the end of the pipe too; then `done` is set.
-        if not done.wait(GRACE):
-            os._exit(0)
-
-    before = signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
-    thread = threading.Thread(target=watch, name='signals', daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        signal.set_wakeup_fd(before)
-        os.close(write_end)
-        thread.join()
-        os.close(read_end)
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[StopRequest]:
-    """Have SIGINT and SIGTERM within the block noted in the `StopRequest` that it yields.
-
-    After the first signal both stay ignored: a terminal and ``ros2 launch`` both send one, and
-    the second must not break the clean-up. In other threads than the main one nothing is changed.
+    After the first signal all of them stay ignored: a terminal and ``ros2 launch`` both send one,
+    and the second must not break the clean-up. Only the main thread can do that; in another one
+    nothing is changed.
     """
     request = StopRequest()
-    if threading.current_thread() is not threading.main_thread():
-        yield request
-        return
-    with _watchdog(), _handling(_STOPS, request.note, lambda: not request.made):
-        yield request
-
-
-@contextmanager
-def _handling(
-    numbers: Iterable[signal.Signals],
-    handler: Callable[[int, FrameType | None], None],
-    is_over: Callable[[], bool] = lambda: True,
-) -> Iterator[None]:
-    """Handle signals within the block; the handlers before are back after it if `is_over`."""
-    before = {number: signal.signal(number, handler) for number in numbers}
+    is_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.signal(number, request.note) for number in numbers if is_main}
     try:
-        yield
+        yield request
     finally:
-        for number, earlier in before.items() if is_over() else ():
+        for number, earlier in {} if request.made else before.items():
             signal.signal(number, signal.SIG_DFL if earlier is None else earlier)
 
 
 class Session:
-    """The node of a command, without services and /rosout, and the time it spends waiting."""
+    """The node of a command, without services and /rosout, and the time it spends waiting.
 
-    _is_interrupted = False
+    Every method raises KeyboardInterrupt once `stop` is made.
+    """
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node: Any, stop: StopRequest) -> None:
         from rclpy.executors import SingleThreadedExecutor
 
         self.node = node
+        self._stop = stop
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
+
+    def check(self) -> None:
+        """Do nothing else; long loops call it."""
+        if self._stop.made:
+            raise KeyboardInterrupt
 
     def sleep(self, seconds: float) -> None:
         """Wait without handling messages; as exact as the system's clock is."""
@@ -244,25 +209,14 @@ class Session:
         self.check()
 
     def spin(self, seconds: float) -> None:
-        """Handle one message, or wait that long for it."""
-        self._executor.spin_once(timeout_sec=seconds)
+        """Handle one message, or wait that long for it, 0.1 s at most."""
+        self._executor.spin_once(timeout_sec=min(seconds, 0.1))
         self.check()
-
-    def interrupt(self, _number: int, _frame: FrameType | None) -> None:
-        """Raise KeyboardInterrupt, now and at the next wait."""
-        self._is_interrupted = True
-        raise KeyboardInterrupt
 
     def close(self) -> None:
         """Destroy the node."""
         self._executor.shutdown()
         self.node.destroy_node()
-
-    def check(self, cause: Exception | None = None) -> None:
-        """Raise KeyboardInterrupt once interrupted; `cause` is what the interrupt came out as."""
-        # Python swallows what a signal raises within a destructor: long loops call this.
-        if self._is_interrupted:
-            raise KeyboardInterrupt from cause
 
 
 @contextmanager
@@ -278,23 +232,18 @@ def ros_session(name: str, ros_args: Sequence[str] = ()) -> Iterator[Session]:
     _check_surroundings(ros_args)
     context = Context()
     _init([name, *ros_args], context)
+    # What is ignored on purpose, as by nohup, stays so.
+    heeded = [n for n in (*_STOPS, signal.SIGHUP) if signal.getsignal(n) != signal.SIG_IGN]
     try:
         with start_errors():
             node = rclpy.create_node(
                 name, context=context, start_parameter_services=False, enable_rosout=False
             )
-        is_main = threading.current_thread() is threading.main_thread()
-        # What is ignored on purpose, as by nohup, stays so.
-        heeded = [n for n in _INTERRUPTS if is_main and signal.getsignal(n) != signal.SIG_IGN]
         with (
-            contextlib.closing(Session(node)) as session,
-            _handling(heeded, session.interrupt),
+            stop_on_signals(heeded) as stop,
+            contextlib.closing(Session(node, stop)) as session,
         ):
-            try:
-                yield session
-            except Exception as error:
-                # An interrupt within rclpy's bindings may come out of them as another exception.
-                session.check(error)
-                raise
+            yield session
+            session.check()
     finally:
         rclpy.try_shutdown(context=context)

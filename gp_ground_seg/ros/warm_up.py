@@ -14,11 +14,12 @@ from gp_ground_seg.core.backend import Backend
 from gp_ground_seg.core.jit import code_folder, is_code_kept
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.segmenter import warm_up
-from gp_ground_seg.ros.start_stop import own_code
+from gp_ground_seg.ros.start_stop import child_code
 
 FOLLOWS = 'segmenting with numpy until the compiled code is there; to compile takes a minute'
 CHANGED = 'segmenting with numba now'
 STAYS = 'segmenting with numpy from now on'
+JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
 
 _COMPILE = """\
 import os, threading
@@ -51,6 +52,11 @@ class BackendLoader:
         """Whether `start` has been called."""
         return self._thread is not None
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread is not None and self._thread.is_alive()
+
     def start(self, config: Config) -> None:
         """Begin to make the backend for `config`."""
         self._thread = threading.Thread(target=self._run, args=(config,), daemon=True)
@@ -69,15 +75,20 @@ class BackendLoader:
                 self._compiler.kill()
 
     def close(self) -> None:
-        """Wait for the thread; free a backend that was not taken."""
+        """Stop; free a backend that was not taken.
+
+        A thread that compiles in this process, as where no folder can keep the code, does so for
+        a minute: nobody waits for it, and it frees what it makes.
+        """
         self.stop()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(JOIN_TIMEOUT)
         if (backend := self.take_backend()) is not None:
             backend.close()
 
     def _run(self, config: Config) -> None:
         start = time.monotonic()
+        backend = None
         try:
             # What is kept is known once the compiled functions are declared.
             importlib.import_module('gp_ground_seg.core.compiled.backend')
@@ -85,13 +96,16 @@ class BackendLoader:
                 self._compile()
             if not self._is_stopped:
                 # A given height is not that of the scan which is segmented for this.
-                self._backend = warm_up(dataclasses.replace(config, sensor=Config().sensor))
+                backend = warm_up(dataclasses.replace(config, sensor=Config().sensor))
         except Exception as error:
             self.error = f'{type(error).__name__}: {error}'
         self.seconds = time.monotonic() - start
         with self._lock:
             if not self._is_stopped:
+                self._backend = backend
                 self._on_done()
+            elif backend is not None:
+                backend.close()
 
     def _compile(self) -> None:
         """Compile in a child process, whose memory is free after it: twice what the node needs."""
@@ -99,7 +113,7 @@ class BackendLoader:
             if self._is_stopped:
                 return
             self._compiler = subprocess.Popen(
-                [sys.executable, '-c', own_code(_COMPILE)], cwd='/',
+                [sys.executable, '-c', child_code(_COMPILE)], cwd='/',
                 stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
             )  # fmt: skip
         with self._compiler:
