@@ -1,7 +1,7 @@
 """Latency and losses of the node: ``python test/node_bench.py [DATA]``, on an idle machine.
 
-The node runs in a second process and is sent clouds through ROS at several rates; both processes
-have a ROS domain of their own. DATA is a folder with sequences/*/velodyne below it, a scan, a
+The node runs in a second process and is sent clouds through ROS at several rates, in a namespace
+of a random name. DATA is a folder with sequences/*/velodyne below it, a scan, a
 folder of scans, or a bag; without it, simulated scans of an HDL-64E. What follows ``--ros-args``
 goes to the node.
 """
@@ -57,7 +57,7 @@ def measure(clouds, rates, n_frames, ros_args=()):
     with (
         probe_session('node_bench') as (session, own),
         tempfile.TemporaryDirectory(prefix='gp_ground_seg-') as folder,
-        NodeProcess(Path(folder, 'log'), [*own, *ros_args], Path(folder)) as node,
+        NodeProcess(Path(folder, 'log'), [*own, *ros_args]) as node,
     ):
         arrays, results = [], []
         session.node.create_subscription(DiagnosticArray, '/diagnostics', arrays.append, 10)

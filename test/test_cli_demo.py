@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cli_runner import INTERRUPTED, children, is_running
+from cli_runner import INTERRUPTED, children, is_running, start
 
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.demo import Tally, check_scan, numbered_cloud, result_text
@@ -24,10 +24,11 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.point_cloud2 import read_xyz, select_points, stamp_of
 from gp_ground_seg.ros import probe, start_stop
-from gp_ground_seg.ros.probe import GROUND, OBSTACLES, NodeProcess, private_network, rate_result
+from gp_ground_seg.ros.probe import GROUND, OBSTACLES, NodeProcess, probe_session, rate_result
 
 COMMAND = (sys.executable, '-m', 'gp_ground_seg', 'demo')
 PATIENCE = 120.0
+OTHER_SIGNALS = signal.SIGTERM, signal.SIGHUP
 
 
 def sent_cloud(n=40, seed=0, stamp=5_000_000_007):
@@ -191,7 +192,7 @@ def test_demo_without_data(rclpy, tmp_path):
     assert 'XML' not in (folder / 'node.log').read_text()
     with BagReader(folder / 'drive.mcap') as bag:
         n_points = sum(
-            point_cloud2.decode_cloud(raw).width for _, _, raw in bag.messages([probe.INPUT])
+            point_cloud2.decode_cloud(raw).width for _, _, raw in bag.messages([demo.TOPIC])
         )
     assert f'{n_points:,}'.replace(',', ' ') + ' of these scans' in said
     (error,) = run_demo(tmp_path, '--frames', 4).splitlines()
@@ -206,17 +207,19 @@ def test_demo_on_real_scans(rclpy, kitti, tmp_path):
     assert (tmp_path / 'real' / 'birds_eye.png').is_file()
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@contextlib.contextmanager
+def running_demo(folder):
+    """A demo of 500 scans, and the processes that it has started: the node."""
+    with start('demo', '--frames', 500, cwd=folder) as process:
+        wait_until(lambda: children(process.pid))
+        yield process, children(process.pid)
+
+
+@pytest.mark.parametrize(
+    'number', [signal.SIGINT, *(pytest.param(n, marks=pytest.mark.slow) for n in OTHER_SIGNALS)]
+)
 def test_interrupted_demo_leaves_nothing(rclpy, tmp_path, heeded_hangup, number):
-    command = [*COMMAND, '--frames', '500']
-    with subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline().startswith('[1/3]')
-        end = time.monotonic() + PATIENCE
-        while not (nodes := children(process.pid)):
-            assert time.monotonic() < end
-            time.sleep(0.01)
+    with running_demo(tmp_path) as (process, nodes):
         # To this process alone, as `kill` does; a terminal tells the node too.
         process.send_signal(number)
         _, errors = process.communicate(timeout=PATIENCE)
@@ -224,6 +227,13 @@ def test_interrupted_demo_leaves_nothing(rclpy, tmp_path, heeded_hangup, number)
     assert errors.splitlines()[-1] == 'gp-ground-seg: interrupted'
     assert not any(is_running(pid) for pid in nodes)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_node_ends_with_a_demo_that_is_killed(rclpy, tmp_path):
+    with running_demo(tmp_path) as (process, nodes):
+        process.send_signal(signal.SIGKILL)
+        process.communicate(timeout=PATIENCE)
+    wait_until(lambda: not any(is_running(pid) for pid in nodes))
 
 
 def test_refused_options(rclpy, tmp_path, capsys):
@@ -256,38 +266,39 @@ def test_rate_that_a_machine_can_do(seconds, rate, capsys):
     assert ('per second' in capsys.readouterr().out) == (rate < 10.0)
 
 
+def wait_until(condition):
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
 def test_node_that_does_not_start_and_node_that_ends_with_its_block(rclpy, tmp_path):
     words = ('-p', 'label.ground_tolerance:=-1.0')
-
-    def wait_for_its_end(node):
-        end = time.monotonic() + PATIENCE
-        while time.monotonic() < end:
-            node.check()
-            time.sleep(0.02)
-
     message = r'^the node ended with code 2; its last words:\n[\s\S]*label\.ground_tolerance'
-    failed = pytest.raises(GroundSegError, match=message)
-    with private_network(), NodeProcess(tmp_path / 'node.log', words) as node, failed:
-        wait_for_its_end(node)
+    with (
+        NodeProcess(tmp_path / 'node.log', words) as node,
+        pytest.raises(GroundSegError, match=message),
+    ):
+        wait_until(node.check)
     node = NodeProcess(tmp_path / 'node.log')
-    with contextlib.suppress(ZeroDivisionError), private_network(), node:
+    with contextlib.suppress(ZeroDivisionError), node:
         assert is_running(node.pid)
         raise ZeroDivisionError
     assert not is_running(node.pid)
 
 
-def test_private_network(monkeypatch):
-    own = 1 + os.getpid() % 101
-    monkeypatch.setenv('ROS_DOMAIN_ID', str(own))
-    monkeypatch.setenv('ROS_LOCALHOST_ONLY', '0')
-    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
-    before = dict(os.environ)
-    with private_network():
-        assert os.environ['ROS_DOMAIN_ID'] != str(own)
-        assert 1 <= int(os.environ['ROS_DOMAIN_ID']) <= 101
-        assert os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
-        assert 'ROS_LOCALHOST_ONLY' not in os.environ
-    assert dict(os.environ) == before
+def test_the_node_imports_nothing_from_the_current_folder(rclpy, tmp_path, monkeypatch):
+    for name in ('numpy', 'yaml', 'rclpy', 'gp_ground_seg'):
+        (tmp_path / f'{name}.py').write_text(f'raise SystemExit({name!r})')
+    monkeypatch.chdir(tmp_path)
+    log = tmp_path / 'log'
+    with probe_session('probe') as (session, words), NodeProcess(log, words) as node:
+        wait_until(lambda: node.check() or 'listening to' in log.read_text())
+        namespace = session.node.get_namespace()
+        assert f'listening to {namespace}/points' in log.read_text()
+    with probe_session('probe') as (session, _):
+        assert session.node.get_namespace() != namespace
 
 
 @pytest.fixture

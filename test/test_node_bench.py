@@ -21,6 +21,7 @@ def clouds():
     return [scan_cloud(scan, 0, 'lidar') for scan in scans]
 
 
+@pytest.mark.slow
 def test_losses_are_reported(clouds):
     words = ['-p', 'learning.mode:=fixed']
     slow, fast = rates = node_bench.measure(clouds, [5.0, 1000.0], 30, words)

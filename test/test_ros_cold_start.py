@@ -27,6 +27,7 @@ SAFE_START = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_node_segments_while_its_code_is_compiled_and_then_changes_over(monkeypatch, tmp_path):
     message = to_message(street(2000))
     cache = tmp_path / 'cache'
@@ -107,7 +108,7 @@ def test_numpy_asked_for_meanwhile_stays(b, held_back):
 
 def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, capfd):
     monkeypatch.setattr(warm_up, 'is_code_kept', lambda: False)
-    monkeypatch.setattr(warm_up, '_COMPILE', "raise OSError('no space left')  # {path}")
+    monkeypatch.setattr(warm_up, '_COMPILE', "raise OSError('no space left')")
     with ros.bench(settled=False) as b:
         assert 'OSError: no space left' in ros.said_by(capfd, STAYS)
         b.segment(to_message(street(1000)))
@@ -130,7 +131,7 @@ def test_relative_folder_and_path_are_not_those_of_the_child(monkeypatch, tmp_pa
 
     class Compiler:
         def __init__(self, command, **options):
-            seen.update(options, program=command[-1])
+            seen.update(options, program=' '.join(command))
             raise OSError('not started')
 
     monkeypatch.setattr(warm_up.subprocess, 'Popen', Compiler)

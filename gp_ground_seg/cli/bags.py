@@ -51,19 +51,17 @@ Offered reliably: a reliable subscriber gets every cloud. Waits for a subscriber
 before it starts. Only PointCloud2 topics are played; for TF and the rest use
 `ros2 bag play`.
 
-At the end one line has
-  late         clouds sent more than 20 ms after their time
-  undelivered  clouds without a subscriber, or not acknowledged by every reliable one.
-               A slow subscriber may lose clouds that its middleware acknowledged:
-               its own /diagnostics have their number.
+The last line tells how many clouds were sent more than 20 ms after their time, and
+how many without a subscriber. A slow subscriber may lose clouds that its middleware
+acknowledged: its own /diagnostics have their number.
 """
 PLAY_EXAMPLES = """\
   gp-ground-seg play drive.mcap
   gp-ground-seg play drive.mcap --clock --rate 0.5
   gp-ground-seg play drive.mcap --loop --ros-args -r /kitti/velo/pointcloud:=/points
 
-exit code: 0, 1 if clouds were not delivered (always 0 with --no-wait), 2 for an error,
-130 when interrupted
+exit code: 0, 1 if clouds had no subscriber or were not acknowledged (always 0 with
+--no-wait), 2 for an error, 130 when interrupted
 """
 
 
@@ -171,9 +169,10 @@ def run_play(arguments: argparse.Namespace) -> int:
                 # After an interrupt, too: with --loop it is the only end.
                 if summary := player.summary():
                     print(summary, flush=True)
-                    for topic in [] if arguments.quiet else player.best_effort_topics():
-                        options.note(f'{topic} has a best-effort subscriber, losses unknown')
-    return 1 if player.n_undelivered and not arguments.no_wait else 0
+    if not player.is_acknowledged:
+        options.note('not every reliable subscriber has acknowledged all clouds')
+    is_delivered = player.is_acknowledged and not player.n_unheard
+    return 0 if is_delivered or arguments.no_wait else 1
 
 
 def _wait_for_subscribers(player: Player, *, quiet: bool) -> None:

@@ -33,7 +33,6 @@ from gp_ground_seg.lab.scoring.report import Column
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, semantic_kitti_labels, simulate_drive
 from gp_ground_seg.ros.probe import (
     GROUND,
-    INPUT,
     OBSTACLES,
     NodeProcess,
     Probe,
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from gp_ground_seg.ros.start_stop import Session
 
 BAG, PICTURE, LOG = 'drive.mcap', 'birds_eye.png', 'node.log'
+TOPIC = '/points'  # of the bag
 FRAME_ID = 'lidar'
 EPOCH = 1_700_000_000
 """Second at which every drive starts: the same drive gives the same bag."""
@@ -65,7 +65,7 @@ start the node in a second process, send the scans of the bag to it through ROS,
 clouds, check that every point came back exactly once, score the labels against the truth, and
 draw one scan from above. With --kitti it does the same on real, labelled scans.
 
-Nothing leaves this machine: the demo has a ROS domain of its own.
+Its topics are in a namespace of a random name: other nodes are not disturbed.
 """
 EXAMPLES = f"""\
   gp-ground-seg demo
@@ -236,9 +236,8 @@ def run(arguments: argparse.Namespace) -> int:
     with (
         needing_ros('the demo'),
         probe_session('demo') as (session, words),
-        # Right before the process that removes the folder if this one is killed.
         staged_files(folder, (BAG, PICTURE, LOG), force=arguments.force) as part,
-        NodeProcess(part / LOG, words, part.parent) as node,
+        NodeProcess(part / LOG, words) as node,
     ):
         tally = Tally(_write(drive, part / BAG, session))
         print('[2/3] connecting to the node, whose code is compiled at a first start', flush=True)
@@ -264,10 +263,10 @@ def _write(drive: Drive, path: Path, session: Session) -> list[tuple[int, int]]:
     print(f'[1/3] writing {scans} as a bag: {drive.name}; meanwhile the node starts', flush=True)
     stamps = []
     with options.progress('scans')(total=drive.n_frames) as bar, BagWriter(path) as bag:
-        bag.add_topic(cloud_topic(INPUT))
+        bag.add_topic(cloud_topic(TOPIC))
         for points, semantic, seconds in drive.scans:
             stamp = EPOCH * 10**9 + round(seconds * 1e9)
-            bag.write(INPUT, stamp, encode_cloud(numbered_cloud(points, semantic, stamp)))
+            bag.write(TOPIC, stamp, encode_cloud(numbered_cloud(points, semantic, stamp)))
             stamps.append(divmod(stamp, 10**9))
             session.check()
             bar.update()
@@ -278,12 +277,12 @@ def _play(path: Path, n_frames: int, wanted: float | None, probe: Probe) -> dict
     """Send the scans of a bag to the node; return the statistics of `rate_result`."""
     with BagReader(path) as bag:
         rate = wanted or sustainable_rate(
-            next(decode_cloud(raw) for _, _, raw in bag.messages([INPUT])), probe
+            next(decode_cloud(raw) for _, _, raw in bag.messages([TOPIC])), probe
         )
         what = f'playing the bag to the node, {rate:g} scans per second'
         print(f'[3/3] {what}, and receiving both clouds', flush=True)
         with options.progress('scans')(total=n_frames) as bar:
-            clouds = (decode_cloud(raw) for _, _, raw in bag.messages([INPUT]))
+            clouds = (decode_cloud(raw) for _, _, raw in bag.messages([TOPIC]))
             return rate_result(rate, probe.paced(clouds, rate, bar.update))
 
 

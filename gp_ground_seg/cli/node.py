@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint
-from gp_ground_seg.ros.start_stop import needing_ros, stop_on_signals
+from gp_ground_seg.ros.start_stop import run_node
 
 NODE_EXAMPLES = """\
   gp-ground-seg node
@@ -32,25 +31,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     description = 'Run the ROS 2 node: points in, ground and obstacles out.'
     parser = options.new_parser(subparsers, 'node', description, NODE_EXAMPLES)
     parser.usage = 'gp-ground-seg node [--ros-args ...]'
-    parser.set_defaults(run=lambda a: start(a.ros_args), accepts_ros_args=True)
+    parser.set_defaults(run=lambda a: run_node(a.ros_args), accepts_ros_args=True)
 
     parser = options.new_parser(subparsers, 'warm-up', WARM_UP_DESCRIPTION, WARM_UP_EXAMPLES)
     parser.set_defaults(run=run_warm_up)
 
 
-def start(words: Sequence[str]) -> int:
-    """Run the node until a signal; return its exit code, or raise where there is no ROS."""
-    # Importing ROS takes most of a second; a signal within it is obeyed as well.
-    with stop_on_signals() as stop:
-        with needing_ros('the node'):
-            from gp_ground_seg.ros.node import main as run_node
-        return 0 if stop.made else run_node(words)
-
-
 def main() -> int:
     """Entry point ``ground_segmentation_node``; says what is missing where there is no ROS."""
     try:
-        return start(sys.argv[1:])
+        return run_node(sys.argv[1:])
     except GroundSegError as error:
         print(f'ground_segmentation_node: error: {error}', file=sys.stderr)
         return 2

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import ReliabilityPolicy
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
@@ -19,58 +18,8 @@ from gp_ground_seg.ros.messages import cloud_profile
 
 DEPTH = 100  # clouds kept until acknowledged: with stock Fast DDS that can take 3 s
 LATE = 0.02  # a cloud that is sent more than this after its time is late [s]
-SLICE = 0.02  # longest wait in one piece [s]: /clock and acknowledgements are served in between
+SLICE = 0.02  # longest wait in one piece [s]: /clock is published in between
 DELIVERY_TIMEOUT = 5.0  # of the last clouds [s]; Fast DDS asks for lost ones every 3 s
-
-
-class TrackedPublisher:
-    """Publisher of serialised clouds that counts those not acknowledged by a reliable subscriber.
-
-    The middleware reports only whether *all* clouds sent so far are acknowledged. Others count
-    as undelivered once newer ones take their place or their subscribers are gone.
-    """
-
-    n_sent = n_pending = n_missed = 0
-    has_best_effort_subscriber = False
-
-    def __init__(self, node: Node, topic: str) -> None:
-        self._node = node
-        self._publisher = node.create_publisher(PointCloud2, topic, cloud_profile(DEPTH))
-        self.topic: str = self._publisher.topic_name
-
-    @property
-    def n_subscribers(self) -> int:
-        """Subscribers that can receive."""
-        return int(self._publisher.get_subscription_count())
-
-    def publish(self, raw: bytes) -> None:
-        """Send one cloud of CDR bytes."""
-        if self.n_sent == 0:
-            self.look_at_subscribers()
-        self.update()
-        if self.n_subscribers == 0 or self.n_pending == DEPTH:
-            # Not received by any; or it takes the place of the oldest in a full queue.
-            self.n_missed += 1
-        else:
-            self.n_pending += 1
-        self._publisher.publish(raw)
-        self.n_sent += 1
-
-    def update(self) -> None:
-        """Take note of what has been acknowledged since the last time."""
-        # First: without subscribers everything is "acknowledged".
-        if self.n_subscribers == 0:
-            self.n_missed += self.n_pending
-            self.n_pending = 0
-        elif self.n_pending and self._publisher.wait_for_all_acked(Duration(seconds=0)):
-            self.n_pending = 0
-
-    def look_at_subscribers(self) -> None:
-        """Note whether there is a best-effort one, whose losses stay unknown."""
-        self.has_best_effort_subscriber |= any(
-            entry.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-            for entry in self._node.get_subscriptions_info_by_topic(self.topic)
-        )
 
 
 class PlayOptions(NamedTuple):
@@ -84,6 +33,10 @@ class PlayOptions(NamedTuple):
 class Player:
     """Publishes PointCloud2 `topics` of a bag as recorded; `pause` waits at most that long [s]."""
 
+    is_acknowledged = True
+    """Whether every reliable subscriber has acknowledged all clouds at the end."""
+    n_unheard = 0
+    """Clouds that were sent while their topic had no subscriber."""
     _first_sent: float | None = None
     _last_sent = _worst_delay = 0.0
     _n_late = 0
@@ -99,22 +52,24 @@ class Player:
         self._bag = bag
         self._options = options
         self._pause = pause
-        self._publishers = {topic: TrackedPublisher(node, topic) for topic in topics}
+        self._n_sent: Counter[str] = Counter()
+        profile = cloud_profile(DEPTH)
+        self._publishers = {t: node.create_publisher(PointCloud2, t, profile) for t in topics}
         # Reliable, which serves both kinds of subscribers.
         self._clock = node.create_publisher(Clock, '/clock', 1) if options.clock else None
 
     def topics_without_subscriber(self) -> list[str]:
         """Return the topics, as remapped, that have no subscriber."""
-        return [p.topic for p in self._publishers.values() if p.n_subscribers == 0]
+        publishers = self._publishers.values()
+        return [p.topic_name for p in publishers if p.get_subscription_count() == 0]
 
     def wait_for_subscribers(self, limit: float | None = None) -> bool:
         """Return whether all topics have a subscriber within `limit` [s]; None = no limit."""
         end = None if limit is None else time.monotonic() + limit
         while self.topics_without_subscriber():
-            left = SLICE if end is None else end - time.monotonic()
-            if left <= 0.0:
+            if end is not None and time.monotonic() > end:
                 return False
-            self._pause(min(SLICE, left))
+            self._pause(SLICE)
         return True
 
     def play(self, on_cloud: Callable[[], object] = lambda: None) -> None:
@@ -124,30 +79,17 @@ class Player:
             start = self._play_once(start, on_cloud)
         self._wait_for_delivery()
 
-    @property
-    def n_undelivered(self) -> int:
-        """Clouds without a subscriber, or not acknowledged by every reliable one."""
-        return sum(p.n_missed + p.n_pending for p in self._publishers.values())
-
-    def best_effort_topics(self) -> list[str]:
-        """Return the topics with subscribers that may have lost clouds unnoticed."""
-        return [p.topic for p in self._publishers.values() if p.has_best_effort_subscriber]
-
     def summary(self) -> str:
         """Return one line on what was played up to now; nothing if no cloud was sent."""
-        publishers = self._publishers.values()
-        for publisher in publishers:
-            publisher.update()
         if self._first_sent is None:
             return ''
-        n_sent = sum(p.n_sent for p in publishers)
-        n_topics = sum(p.n_sent > 0 for p in publishers)
+        n_sent, n_topics = self._n_sent.total(), len(self._n_sent)
         seconds = self._last_sent - self._first_sent
         rate = f' ({(n_sent / n_topics - 1) / seconds:.2f} Hz)' if seconds > 0.0 else ''
         return (
             f'{n_sent} cloud{"s" if n_sent != 1 else ""} sent in {seconds:.1f} s{rate}, '
             f'{self._n_late} more than {1e3 * LATE:.0f} ms late (worst '
-            f'{1e3 * self._worst_delay:.1f} ms), {self.n_undelivered} undelivered'
+            f'{1e3 * self._worst_delay:.1f} ms), {self.n_unheard} without a subscriber'
         )
 
     def _play_once(self, start: float, on_cloud: Callable[[], object]) -> float:
@@ -178,8 +120,6 @@ class Player:
             if left <= 0.0:
                 return
             self._pause(min(SLICE, left))
-            for publisher in self._publishers.values():
-                publisher.update()
 
     def _publish_time(self, nanoseconds: int) -> None:
         if self._clock is not None:
@@ -187,7 +127,9 @@ class Player:
 
     def _send(self, topic: str, raw: bytes, due: float) -> None:
         publisher, now = self._publishers[topic], time.monotonic()
+        self.n_unheard += publisher.get_subscription_count() == 0
         publisher.publish(raw)
+        self._n_sent[topic] += 1
         self._first_sent = now if self._first_sent is None else self._first_sent
         self._last_sent = now
         self._n_late += now - due > LATE
@@ -197,8 +139,8 @@ class Player:
         """Wait until the last clouds are acknowledged: they go with their publisher."""
         end = time.monotonic() + DELIVERY_TIMEOUT
         for publisher in self._publishers.values():
-            publisher.look_at_subscribers()
-            publisher.update()
-            while publisher.n_pending and time.monotonic() < end:
+            while not publisher.wait_for_all_acked(Duration(seconds=0)):
+                if time.monotonic() > end:
+                    self.is_acknowledged = False
+                    return
                 self._pause(SLICE)
-                publisher.update()

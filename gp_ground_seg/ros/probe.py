@@ -8,13 +8,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
-import os
 import secrets
-import shutil
-import signal
 import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -28,56 +23,29 @@ from gp_ground_seg.data import point_cloud2
 from gp_ground_seg.data.point_cloud2 import CloudMessage, encode_cloud, stamp_of
 from gp_ground_seg.ros.start_stop import (
     Session,
-    child_code,
+    child_command,
     large_cloud_transport,
     ros_session,
-    stop_on_signals,
 )
 
-INPUT, GROUND, OBSTACLES = '/points', '/ground', '/obstacles'  # topics of the node
+INPUT, GROUND, OBSTACLES = 'points', 'ground', 'obstacles'  # topics of the node
 START_TIMEOUT = 300.0  # time the node has to start, and to compile on a slow machine [s]
 SILENCE = 2.0  # time without a cloud after which what is still missing is lost [s]
 
-_RUN = """\
-from gp_ground_seg.ros.probe import run_node
-sys.exit(run_node(*sys.argv[1:]))
-"""
+_RUN = 'from gp_ground_seg.ros.start_stop import run_node; sys.exit(run_node(sys.argv[1:]))'
 _PROBE_FRAME = 'gp_ground_seg_probe'
 _PROBE_PERIOD = 0.2
-_HIGHEST_DOMAIN = 101  # ports above meet those that Linux hands out
-_NETWORK = (
-    'ROS_STATIC_PEERS', 'ROS_LOCALHOST_ONLY', 'ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-)  # fmt: skip
-
-
-@contextlib.contextmanager
-def private_network() -> Iterator[None]:
-    """Keep this process and its children to this machine, on a ROS domain of their own."""
-    kept = {name: os.environ.pop(name) for name in _NETWORK if name in os.environ}
-    own = kept.get('ROS_DOMAIN_ID')
-    domain = secrets.choice([k for k in range(1, _HIGHEST_DOMAIN + 1) if str(k) != own])
-    os.environ['ROS_DOMAIN_ID'] = str(domain)
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    try:
-        yield
-    finally:
-        for name in _NETWORK:
-            os.environ.pop(name, None)
-        os.environ.update(kept)
 
 
 class NodeProcess:
     """A node in a second process, for a ``with`` statement; its output goes to the file `log`.
 
-    It ends when this process does, however that ends, and then removes the folder `unfinished`.
+    It ends when this process does, however that ends.
     """
 
-    def __init__(
-        self, log: Path, ros_args: Sequence[str] = (), unfinished: Path | None = None
-    ) -> None:
+    def __init__(self, log: Path, ros_args: Sequence[str] = ()) -> None:
         self._log = log
-        words = [str(unfinished or ''), '--ros-args', *ros_args]
-        self._command = [sys.executable, '-c', child_code(_RUN), *words]
+        self._command = [*child_command(_RUN), '--ros-args', *ros_args]
 
     def __enter__(self) -> NodeProcess:
         """Start it."""
@@ -91,13 +59,10 @@ class NodeProcess:
     def __exit__(self, *_error: object) -> None:
         """Stop it."""
         self._process.terminate()
-        try:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(5.0)
-        finally:
-            # Also when interrupted while waiting; does nothing to a process that has ended.
-            self._process.kill()
-            self._process.communicate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(5.0)
+        self._process.kill()  # does nothing to a process that has ended
+        self._process.communicate()
 
     def _said(self) -> str:
         return self._log.read_text(encoding='utf-8', errors='replace')
@@ -121,39 +86,16 @@ class NodeProcess:
             raise GroundSegError(f'the node {ended}; its last words:\n{self.log_tail()}')
 
 
-def run_node(unfinished: str, *words: str) -> int:
-    """Run the node of a `NodeProcess`: in that process."""
-
-    def end_with_parent() -> None:
-        # Nothing is ever written: this returns when the other end is closed, by a kill too.
-        os.read(0, 1)
-        if unfinished:
-            shutil.rmtree(unfinished, ignore_errors=True)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=end_with_parent, daemon=True).start()
-    with stop_on_signals() as stop:
-        from gp_ground_seg.ros.node import main
-
-        return 0 if stop.made else main(words)
-
-
 @contextlib.contextmanager
 def probe_session(name: str) -> Iterator[tuple[Session, list[str]]]:
     """Yield a session named `name` to talk to a `NodeProcess`, and the ROS arguments of that.
 
-    Both are on a network of their own. Their topics have random names: another run may have
-    taken the same ROS domain.
+    Both are in a namespace of a random name, so that other nodes and other runs do not matter.
     """
-    token = secrets.token_hex(8)
-    topics = (INPUT, GROUND, OBSTACLES, '/diagnostics')
-    own = [word for topic in topics for word in ('-r', f'{topic}:=/probe_{token}{topic}')]
-    with (
-        private_network(),
-        large_cloud_transport(),
-        ros_session(name, ['--ros-args', *own]) as session,
-    ):
-        yield session, own
+    namespace = f'/gp_ground_seg_{secrets.token_hex(4)}'
+    words = ['-r', f'__ns:={namespace}', '-r', '/diagnostics:=diagnostics']
+    with large_cloud_transport(), ros_session(name, ['--ros-args', *words]) as session:
+        yield session, words
 
 
 @dataclasses.dataclass
@@ -263,10 +205,6 @@ class Probe:
 
     def _receive(self, topic: str, raw: bytes, info: dict[str, Any]) -> None:
         cloud, now = point_cloud2.decode_cloud(raw), info.get('received_timestamp')
-        self.arrived(topic, cloud, now or time.time_ns())
-
-    def arrived(self, topic: str, cloud: CloudMessage, now: int) -> None:
-        """Take a result on `topic` that arrived at the system time `now` [ns]."""
         stamp, is_data = stamp_of(cloud), cloud.header.frame_id != _PROBE_FRAME
         if stamp not in self._waiting or topic in self._waiting[stamp][2]:
             self.n_stray += is_data
@@ -275,7 +213,7 @@ class Probe:
         results[topic] = cloud
         if len(results) == 2:
             del self._waiting[stamp]
-            trip.back = now
+            trip.back = now or time.time_ns()
             if is_data:
                 self._on_back(sent, results)
 

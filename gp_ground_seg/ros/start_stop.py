@@ -104,13 +104,33 @@ def needing_ros(command: str) -> Iterator[None]:
         ) from error
 
 
-def child_code(code: str) -> str:
-    """Return `code` for ``python -c`` with the import path of this process.
+_CHILD = """\
+import os, signal, sys, threading
+sys.path[:] = {path!r}
+# Standard input ends when the process that has started this one does.
+end = lambda: (os.read(0, 1), os.kill(os.getpid(), signal.SIGTERM))
+threading.Thread(target=end, daemon=True).start()
+{code}
+"""
 
-    The current folder, which may be any, is not on it.
+
+def child_command(code: str) -> list[str]:
+    """Return the command of a Python process that runs `code`, and ends when this one does.
+
+    Start it with a pipe as standard input. It imports what this process does, and nothing from
+    the current folder, which may be any.
     """
     path = [entry for entry in sys.path if os.path.isabs(entry)]
-    return f'import sys\nsys.path[:] = {path!r}\n{code}'
+    return [sys.executable, '-c', _CHILD.format(path=path, code=code)]
+
+
+def run_node(words: Sequence[str]) -> int:
+    """Run the node until a signal; return its exit code, or raise where there is no ROS."""
+    # Importing ROS takes most of a second; a signal within it is obeyed as well.
+    with stop_on_signals() as stop:
+        with needing_ros('the node'):
+            from gp_ground_seg.ros.node import main
+        return 0 if stop.made else main(words)
 
 
 _PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'

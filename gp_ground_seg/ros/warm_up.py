@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -14,20 +13,14 @@ from gp_ground_seg.core.backend import Backend
 from gp_ground_seg.core.jit import code_folder, is_code_kept
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.segmenter import warm_up
-from gp_ground_seg.ros.start_stop import child_code
+from gp_ground_seg.ros.start_stop import child_command
 
 FOLLOWS = 'segmenting with numpy until the compiled code is there; to compile takes a minute'
 CHANGED = 'segmenting with numba now'
 STAYS = 'segmenting with numpy from now on'
 JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
 
-_COMPILE = """\
-import os, threading
-# Standard input ends when the process that has started this one does.
-threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
-from gp_ground_seg.core.segmenter import warm_up
-warm_up()
-"""
+_COMPILE = 'from gp_ground_seg.core.segmenter import warm_up; warm_up()'
 
 
 class BackendLoader:
@@ -112,10 +105,10 @@ class BackendLoader:
         with self._lock:
             if self._is_stopped:
                 return
+            pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
             self._compiler = subprocess.Popen(
-                [sys.executable, '-c', child_code(_COMPILE)], cwd='/',
-                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            )  # fmt: skip
+                child_command(_COMPILE), cwd='/', stdin=pipe, stdout=nowhere, stderr=pipe
+            )
         with self._compiler:
             assert self._compiler.stderr is not None
             said = self._compiler.stderr.read().decode(errors='replace').strip()
