@@ -43,14 +43,14 @@ class Page:
             self._keep(found)
 
     def _keep(self, event):
-        own = event['params']
-        if event['method'] == 'Runtime.consoleAPICalled' and own['type'] != 'debug':
-            words = [str(word.get('value', word.get('description'))) for word in own['args']]
-            self.messages.append((own['type'], ' '.join(words)))
+        given = event['params']
+        if event['method'] == 'Runtime.consoleAPICalled' and given['type'] != 'debug':
+            words = [str(word.get('value', word.get('description'))) for word in given['args']]
+            self.messages.append((given['type'], ' '.join(words)))
         elif event['method'] == 'Runtime.exceptionThrown':
-            self.messages.append(('error', json.dumps(own['exceptionDetails'])))
+            self.messages.append(('error', json.dumps(given['exceptionDetails'])))
         elif event['method'] == 'Log.entryAdded':
-            self.messages.append((own['entry']['level'], own['entry']['text']))
+            self.messages.append((given['entry']['level'], given['entry']['text']))
         elif event['method'] == 'Page.loadEventFired':
             self._is_loaded = True
 
@@ -122,7 +122,7 @@ class Page:
 
 @contextlib.contextmanager
 def open_browser(folder):
-    """Page of a browser of its own, whose profile is in `folder`."""
+    """Start a browser whose profile is in `folder`, and yield a page of it."""
     from websockets.sync.client import connect
 
     words = [CHROMIUM, f'--user-data-dir={folder}', *FLAGS]

@@ -98,7 +98,7 @@ def test_counts_are_in_the_titles():
     ]
     errors, layers = scan._error_panel(label, truth)
     assert errors == '1 false ground, 2 missed ground, IoU 25.00 %'
-    np.testing.assert_array_equal(sum(one.astype(int) for one in layers.values()), 1)
+    np.testing.assert_array_equal(sum(drawn.astype(int) for drawn in layers.values()), 1)
     assert scan._error_panel(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
 
 

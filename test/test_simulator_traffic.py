@@ -53,18 +53,18 @@ def profile(model, ahead):
     for _, corners in model.bodies:
         for (u0, z0), (u1, z1) in itertools.pairwise((*corners, corners[0])):
             low, high = sorted(((u0, z0), (u1, z1)))
-            own = (ahead >= low[0] - 1e-4) & (ahead <= high[0] + 1e-4)
+            over = (ahead >= low[0] - 1e-4) & (ahead <= high[0] + 1e-4)
             share = np.clip((ahead - low[0]) / max(high[0] - low[0], 1e-4), 0.0, 1.0)
             height = low[1] + share * (high[1] - low[1])
             height = np.where(high[0] - low[0] < 1e-4, max(z0, z1), height)
-            top = np.where(own, np.maximum(top, height), top)
+            top = np.where(over, np.maximum(top, height), top)
     return top
 
 
 @pytest.mark.parametrize('name', traffic.MODELS)
 @pytest.mark.parametrize(('yaw', 'gradient'), [(0.7, 0.0), (-2.0, 0.12), (math.pi / 2, 0.15)])
 def test_returns_of_a_vehicle_lie_on_it(name, yaw, gradient):
-    """In its own axes no return is outside its length, width and profile, on slopes too."""
+    """In the axes of the vehicle no return is outside length, width and profile, on slopes too."""
     model, heading = traffic.MODELS[name], 0.4
     terrain = slope(gradient, heading)
     x, y = 8.0, 2.0
@@ -137,7 +137,7 @@ def test_places_leave_room_for_the_own_car(name):
     near = (np.abs(world[:, 0]) < 2.3) & (np.abs(world[:, 1]) < 0.95)
     assert not (near & ~made.is_ground).any()
     # No two objects stand in one another: of each pair the parts are apart.
-    at = np.array(sorted({one.part_of for one in scene.solids if one.part_of}))
+    at = np.array(sorted({solid.part_of for solid in scene.solids if solid.part_of}))
     if len(at):
         apart = np.linalg.norm(at[:, None] - at, axis=-1) + 100.0 * np.eye(len(at))
         assert apart.min() > 0.5
@@ -152,7 +152,7 @@ def test_a_traffic_jam_stands_around_the_sensor(seed):
     assert len(set((azimuth[car] // 45.0).astype(int))) >= 7
     assert np.hypot(x, y)[made.object_id > 0].min() > 1.5
     assert {Kind.PERSON, Kind.CYCLIST} <= set(made.kind)
-    highest = max(one.top for one in scene.solids if one.kind == Kind.BOX)
+    highest = max(solid.top for solid in scene.solids if solid.kind == Kind.BOX)
     assert highest > 3.5  # a truck
     # It hides most of the ground within 15 m.
     hidden, all_seen = (
@@ -165,7 +165,7 @@ def test_a_traffic_jam_stands_around_the_sensor(seed):
 @of_three_seeds
 def test_a_car_park_has_rows_with_narrow_gaps_beside_a_free_aisle(seed):
     scene = scene_of('car_park', seed)
-    cars = {one.part_of: one for one in scene.solids if one.kind == Kind.BOX}
+    cars = {solid.part_of for solid in scene.solids if solid.kind == Kind.BOX}
     x, y = np.array(sorted(cars)).T
     assert len(cars) > 100
     for side in (-1.0, 1.0):
@@ -246,7 +246,7 @@ def test_a_tilted_sensor_in_a_vehicle_frame_sees_level_ground_level():
     np.testing.assert_allclose(made.ground_z, -0.23, atol=1e-9)
     np.testing.assert_array_equal(made.rotation, np.eye(3))
     np.testing.assert_allclose(made.position, [-1.2, 0.4, 0.23])
-    # The rays start at the sensor: its beams are cones about its own axis.
+    # The rays start at the sensor: its beams are cones about the axis it turns around.
     rays = (made.points[:, :3].astype(float) - tilted.origin) @ tilted.rotation()
     elevation = np.arcsin(rays[:, 2] / np.linalg.norm(rays, axis=1))
     assert np.abs(elevation[:, None] - tilted.elevations).min(axis=1).max() < 1e-5

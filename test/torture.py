@@ -112,17 +112,18 @@ def main():
             print(f'{name}: {line}', flush=True)
         done[name, first, stop] = entry
 
+    names = options.part or list(PARTS)
     wanted = []
-    for name in options.part or PARTS:
+    for name in names:
         part = PARTS[name]
         n_cases = max(1, round(part.n_cases * options.scale))
-        for first in range(0, n_cases, part.chunk):
-            wanted.append((name, first, min(first + part.chunk, n_cases)))
+        starts = range(0, n_cases, part.chunk)
+        wanted += [(name, first, min(first + part.chunk, n_cases)) for first in starts]
     with ThreadPoolExecutor(max(1, len(os.sched_getaffinity(0)))) as pool:
         list(pool.map(lambda chunk: run(*chunk), [c for c in wanted if c not in done]))
     n_failed = 0
     print(f'\ncommit {commit}, {time.strftime("%Y-%m-%d")}, scale {options.scale:g}')
-    for name in options.part or PARTS:
+    for name in names:
         entries = [done[chunk] for chunk in wanted if chunk[0] == name]
         failures = sum(len(entry['failed']) for entry in entries)
         n_failed += failures

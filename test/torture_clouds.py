@@ -79,7 +79,7 @@ def random_config(rng):
                 changes[spec.name] = rng.uniform(spec.minimum, spec.maximum)
             if spec.type is int:
                 changes[spec.name] = int(changes[spec.name])
-        # What a grid may cost is a test of its own; here it would take the night.
+        # Another test tries large grids; here they would take the night.
         changes['grid.n_segments'] = min(changes.get('grid.n_segments', 180), 720)
         changes['grid.n_bins'] = min(changes.get('grid.n_bins', 160), 400)
         changes['faces.cell_size'] = max(changes.get('faces.cell_size', 0.5), 0.25)

@@ -176,14 +176,14 @@ def simulate_scan(
 ) -> SimulatedScan:
     """Scan the scene at `time` [s], the (first) sensor over the place `x` [m] of the drive.
 
-    Every ray has its own random numbers, drawn from `rng` whether or not it hits anything: the
-    same generator state gives the same noise in another scene.
+    `rng` draws numbers for each ray, whether or not it hits anything: the same generator state
+    gives the same noise in another scene.
     """
     ground = float(scene.terrain.height(x, 0.0))
     ahead, left, _ = sensor.origin or (0.0, 0.0, 0.0)
     position = np.array([x - ahead, 0.0 - left, ground + sensor.height_of_cloud])
     rotation = np.eye(3) if sensor.origin else sensor.rotation()
-    parts = [_cast(scene, one, rng, position) for one in (sensor, *sensor.others)]
+    parts = [_cast(scene, lidar, rng, position) for lidar in (sensor, *sensor.others)]
     points, kind, object_id = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     ground_z = _ground_below(scene.terrain, points, position, rotation)
     is_ground = kind == Kind.TERRAIN
@@ -212,7 +212,7 @@ def _cast(
     distance = np.where(blocked, solid_distance, distance)
     # The last row of each table is of rays that meet no solid.
     solid = np.where(blocked, solid, -1)
-    kind = np.array([*(one.kind for one in scene.solids), Kind.TERRAIN], dtype=np.uint8)[solid]
+    kind = np.array([*(hit.kind for hit in scene.solids), Kind.TERRAIN], dtype=np.uint8)[solid]
     object_id = np.append(number_objects(scene.solids), np.int32(0))[solid]
     _mirror(scene, origin, direction, distance, kind, mirror_draw)
 

@@ -92,7 +92,7 @@ def _blueprint(rrb: Any, names: list[str]) -> Any:
 def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
     """Serve Rerun's web viewer; yield its process, the page's address, and where to send frames.
 
-    They arrive at the next port. rerun's own function would listen on every network.
+    They arrive at the next port. rerun's function for this listens on every network.
     """
     require('rerun', 'rerun-sdk')
     ports = port, port + 1

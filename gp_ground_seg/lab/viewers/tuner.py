@@ -174,8 +174,8 @@ def _table(result: Segmentation, before: Labels, scores: Sequence[dict[str, floa
         for word, value in (('ground', Label.GROUND), ('obstacle', Label.OBSTACLE))
     }
     if scores[0]:
-        rows['IoU'] = [f'{one["IoU"]:.2f} %' for one in scores]
-        rows['objects lost'] = [f'{one["lost"]} of {one["objects"]}' for one in scores]
+        rows['IoU'] = [f'{score["IoU"]:.2f} %' for score in scores]
+        rows['objects lost'] = [f'{score["lost"]} of {score["objects"]}' for score in scores]
     rows['time'] = [f'{1e3 * result.timings["total"]:.0f} ms', '']
     is_ground = (result.label == Label.GROUND)[result.label != before]
     n_ground, n_changed = np.count_nonzero(is_ground), len(is_ground)
