@@ -95,7 +95,7 @@ def main():
     n_points = sum(map(len, scans)) / len(scans)
     title = f'{given.data or "simulated HDL-64E"}: {len(scans)} clouds of {n_points:.0f} points'
     rows = [[rate[column.key] for column in COLUMNS] for rate in rates]
-    print(Table(COLUMNS, rows, title).text())
+    print(Table([[*zip(COLUMNS, row, strict=True)] for row in rows], title).text())
     print(machine_line(describe_environment()))
 
 

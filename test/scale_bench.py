@@ -64,7 +64,11 @@ def main():
     rows = [[way, own, median['one process'] / own] for way, own in median.items()]
     overhead = median['one worker'] / median['one process, 1 thread'] - 1.0
     note = f'overhead of a worker: {overhead:.1%} of a frame; {given.passes} passes, median'
-    print(Table(columns, rows, f'{len(scans)} frames', [note]).text())
+    print(
+        Table(
+            [[*zip(columns, row, strict=True)] for row in rows], f'{len(scans)} frames', [note]
+        ).text()
+    )
     print(machine_line(describe_environment('distributed')))
 
 

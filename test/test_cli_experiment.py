@@ -11,14 +11,13 @@ from conftest import REPOSITORY
 from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.cli import experiment
 from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.presets import PRESETS
-from gp_ground_seg.data.semantic_kitti import read_labels, read_points
-from gp_ground_seg.lab.experiments import ablation, sensor_pose, variants
+from gp_ground_seg.data.semantic_kitti import labelled_frames, read_labels, read_points
+from gp_ground_seg.lab.experiments import ablation, scenes, sensor_pose
 from gp_ground_seg.lab.experiments import table1 as paper_table
 from gp_ground_seg.lab.experiments.table1 import CHOICES, VARIANCES, Choice, table1
 from gp_ground_seg.lab.scoring import evaluate as runner
@@ -40,8 +39,11 @@ def root(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch):
-    monkeypatch.setattr(variants, 'SCENE_PLACES', (0.0,))
-    monkeypatch.setattr(ablation, 'PLACES', (12.0,))
+    for name in ('ablation', 'scenes'):
+        experiment = EXPERIMENTS[name]
+        fewer = experiment.simulated._replace(places=(12.0 * (name == 'ablation'),))
+        monkeypatch.setitem(EXPERIMENTS, name, experiment._replace(simulated=fewer))
+    monkeypatch.setattr(sensor_pose, 'MOUNTS', sensor_pose.MOUNTS[:2])
     some = ablation.Departure('near', {'grid.r_max': 15.0}), ablation.DEPARTURES[3]
     monkeypatch.setattr(ablation, 'DEPARTURES', some)
     chosen = Choice('00', '000000', (3, 4)), Choice('00', '000001', (5,))
@@ -55,9 +57,9 @@ CASES = {
     'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
     'wrong-values': (['ROOT', '--frame-step', '3', *SMALL], 'values', 26 * 2),
     'departures': (['ROOT', *SMALL], 'departures', 3 * 4),
-    'coverage': (['ROOT', *SMALL], 'sequence', 4 * 6),
+    'coverage': (['ROOT', *SMALL], 'sequence', 4),
     'coverage --simulated': (
-        ['--sensors', 'vlp-16,mid-360', '--scenes', 'kerb', '--seeds', '1'], 'sensor', 2 * 6,
+        ['--sensors', 'vlp-16,mid-360', '--scenes', 'kerb', '--seeds', '1'], 'sensor', 2,
     ),
     'scenes': (
         ['--sensors', 'vlp-16,os1-128', '--scenes', 'flat,slope', '--seeds', '1'],
@@ -68,7 +70,7 @@ CASES = {
         ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
     ),
     'sensor-pose': (
-        ['ROOT', '--sequences', '08', '--set', 'learning.mode=fixed'], 'turns', 27,
+        ['ROOT', '--sequences', '08', '--set', 'learning.mode=fixed'], 'poses', 2 * 3,
     ),
     'table1': (['ROOT'], 'errors', 3),
 }  # fmt: skip
@@ -102,7 +104,7 @@ def test_tables_as_markdown(capsys):
     assert run('experiment', 'scenes', *words) == 0
     _title, table, machine = capsys.readouterr().out.strip().split('\n\n')
     header, rule, row = table.splitlines()
-    assert header == '| sensor | scene | IoU | RMSE | median | no model |'
+    assert header == '| sensor | scene | IoU | RMSE | median | gaps |'
     assert rule == '| --- | --- | --: | --: | --: | --: |'
     assert row.startswith('| vlp-16 | kerb | ') and machine.startswith('machine: ')
 
@@ -110,12 +112,12 @@ def test_tables_as_markdown(capsys):
 def test_all_sensors_have_the_parameters_given(monkeypatch):
     found = []
 
-    def note(frames, _tables, config, *_):
+    def note(frames, config, *_, with_peer):
         found.append(([*dict.fromkeys(frame.sensor for frame in frames)], config))
         assert {frame.scene for frame in frames} == set(DRIVES)  # those of the page
         raise DataError('enough')
 
-    monkeypatch.setattr(experiment, 'score_simulated', note)
+    monkeypatch.setattr(scenes, 'score_simulated', note)
     sensors = ['mid-360', 'hdl-64e']
     for extra, config in (([], Config()), (['--preset', 'paper'], PRESETS['paper'].config)):
         assert run('experiment', 'scenes', '--sensors', ','.join(sensors), *extra) == 2
@@ -125,12 +127,13 @@ def test_all_sensors_have_the_parameters_given(monkeypatch):
 def test_simulated_poses_have_their_own_options(monkeypatch, capsys):
     found = []
 
-    def note(frames, load, mounts, config, _):
+    def note(frames, config, *_):
+        """Note the scans."""
         found.append((len(frames), {frame.scene for frame in frames}, config.grid.n_bins))
-        assert (load, mounts) == (sensor_pose.load_mounted, sensor_pose.SIMULATED_MOUNTS)
         raise DataError('enough')
 
-    monkeypatch.setattr(sensor_pose, 'score_poses', note)
+    chosen = EXPERIMENTS['sensor-pose']._replace(run=note)
+    monkeypatch.setitem(EXPERIMENTS, 'sensor-pose', chosen)
     words = ['--simulated', '--seeds', 2, '--scenes', 'flat,kerb', *SMALL]
     assert run('experiment', 'sensor-pose', *words) == 2
     assert error_line(capsys) == 'enough'
@@ -234,7 +237,7 @@ def measured(rubble):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_table, 'CHOICES', [Choice('00', '000000', SEGMENTS)])
         patch.setattr(paper_table, 'N_REPEATS', 1)
-        return table1(rubble, Config()).rows
+        return table1(labelled_frames(rubble), Config()).rows
 
 
 @pytest.mark.parametrize(
@@ -290,7 +293,7 @@ def test_theta_is_of_the_whole_frame_and_learned(measured):
 @pytest.mark.parametrize(
     ('words', 'message'),
     [
-        ([], 'no frame 000001 in sequence 00; there are 000000'),
+        ([], 'no frame 000001 in sequence 00'),
         (['--set', 'grid.n_segments=4'], 'segment 4: must be in [0, 3]'),
         (['--set', 'length_scale.model=constant'], 'leave it out'),
         (['--set', 'learning.mode=fixed'], 'leave it out'),
@@ -305,13 +308,13 @@ def test_frames_without_labels(tmp_path, capsys):
     root = write_streets(tmp_path, s00=2)
     (root / 'sequences/00/labels/000000.label').unlink()
     assert run('experiment', 'table1', root) == 2
-    assert 'has no labels' in error_line(capsys)
+    assert 'frames of sequence 00 have no labels' in error_line(capsys)
 
 
 def test_default_segments_of_real_frames(kitti, monkeypatch):
     """A pair on a slope and one on uneven ground, both predicted better than by their mean."""
     monkeypatch.setattr(paper_table, 'CHOICES', CHOICES)
-    rows = table1(kitti, Config()).rows
+    rows = table1(labelled_frames(kitti, ['10', '03']), Config()).rows
     assert [row['segment'][-3:] for row in rows] == ['157', '158', '147', '148']
     for row in rows:
         assert row['held out'] > 200

@@ -20,21 +20,19 @@ from gp_ground_seg.lab.experiments import (
     ablation,
     coverage,
     interpolation,
-    lost,
+    scenes,
     sensor_pose,
-    stepwise,
     variants,
 )
 from gp_ground_seg.lab.experiments.ablation import MODELS, Departure
-from gp_ground_seg.lab.experiments.sensor_pose import MOUNTS, SIMULATED_MOUNTS, score_poses
 from gp_ground_seg.lab.experiments.variants import SimulatedFrame, load_simulated
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
 from gp_ground_seg.lab.scoring.metrics import (
     Confusion,
+    HeightError,
     count_confusion,
     height_error,
-    pool_height_errors,
 )
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, SENSORS, Kind, simulate_scan
@@ -66,7 +64,7 @@ def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(fra
         assert (config.learning.scope == 'segment') == ('per segment' in title)
     # The last one is the paper's method.
     assert config == Config().replace(**{'learning.fixed': 'none'})
-    scores = variants.score_variants(frames[:1], runner.load_kitti, configs)
+    scores = variants.score_variants(frames[:1], configs)
     theta = {score.name: tuple(score.scans[-1].fit.theta.values()) for score in scores}
     assert len(set(theta.values())) == len(MODELS) - 2
     assert len({values for name, values in theta.items() if 'not learned' in name}) == 1
@@ -77,13 +75,13 @@ def test_latent_length_scales_win_where_smoothness_changes(monkeypatch):
     names = ('constant, learned', 'Z, learned', 'Z-L, learned over the frame')
     monkeypatch.setattr(ablation, 'MODELS', {name: MODELS[name] for name in names})
     frames = variants.simulated_frames(['hdl-64e'], [ablation.SCENE], 2, ablation.PLACES)
-    report = ablation.compare_models(frames, load_simulated, Config())
+    report = ablation.compare_models(frames, Config())
     constant, gradient, latent, _ = (row['rmse'] for row in report.tables['models'].json())
     assert latent < 0.95 * min(constant, gradient)
 
 
 def test_steps_go_from_the_paper_to_the_defaults():
-    steps = list(stepwise.paper_steps().values())
+    steps = list(ablation.paper_steps().values())
     assert (steps[0], steps[-1]) == (PRESETS['paper'].config, Config())
     for before, after in itertools.pairwise(steps):
         assert before != after
@@ -128,9 +126,7 @@ def test_worth_is_what_having_it_adds(frames, monkeypatch):
     monkeypatch.setattr(ablation, 'DEPARTURES', departures)
     report = ablation.compare_departures(frames, FAR)
     rows = {row['departure']: row for row in report.tables['departures'].json()}
-    given, near = variants.score_variants(
-        frames, runner.load_kitti, {'given': FAR, 'near': FAR.replace(**NEAR)}
-    )
+    given, near = variants.score_variants(frames, {'given': FAR, 'near': FAR.replace(**NEAR)})
     gain = given.iou - near.iou
     assert gain > 0.1
     assert list(rows) == ['as given', 'far grid', 'near grid']  # the largest worth first
@@ -160,7 +156,7 @@ def test_coverage_of_normal_errors_is_what_the_normal_distribution_says(seed, fa
     said, known = factor * std, np.isfinite(error)
     truth = rng.normal(size=5000)
     parts = [height_error(truth[k], (truth + error)[k], said[k]) for k in (np.s_[:99], np.s_[99:])]
-    found = pool_height_errors(parts)
+    found = sum(parts, HeightError())
     e, s = error[known], said[known]
     assert found.n_points == known.sum()
     assert found.within_1 == np.mean(np.abs(e) <= s)
@@ -168,12 +164,11 @@ def test_coverage_of_normal_errors_is_what_the_normal_distribution_says(seed, fa
     assert found.bias == pytest.approx(np.mean(e))
     assert found.rmse == pytest.approx(np.sqrt(np.mean(e**2)))
     assert found.nlpd == pytest.approx(-np.mean(scipy.stats.norm.logpdf(e, 0.0, s)))
-    nothing = pool_height_errors([])
-    assert np.isnan(nothing.within_1) and np.isnan(nothing.nlpd)
+    assert np.isnan(HeightError().within_1) and np.isnan(HeightError().nlpd)
 
 
 def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):
-    report = coverage.compare_coverage(frames, runner.load_kitti, FIXED, coverage.LABELLED)
+    report = coverage.score_coverage(frames, FIXED)
     errors, ratios, p = [], [], []
     for frame in frames:
         scan = runner.load_kitti(frame)
@@ -189,13 +184,13 @@ def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):
     assert row['bias'] == pytest.approx(np.mean(np.concatenate(errors)), abs=1e-6)
     assert row['ece'] == pytest.approx(sum(p[1:], p[0]).ece)
     assert [one['range'] for one in report.tables['range'].json()][:2] == ['0-10 m', '10-20 m']
-    assert sum(one['n_points'] for one in report.rows) == row['points']
+    assert sum(one['n_points_all'] for one in report.rows) == row['points']
 
 
 def test_scene_scores_follow_their_definitions():
     config = Config().replace(**{'grid.n_segments': 120})
     frames = variants.simulated_frames(['vlp-16'], ['kerb'], 2, (6.0,))
-    report = variants.score_simulated(frames, variants.scene_tables, config, with_peer=True)
+    report = scenes.score_scenes(frames, config)
     (row,) = report.tables['scenes'].json()
     total, its_total = Confusion(), Confusion()
     errors, its_errors = [], []
@@ -238,7 +233,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
 
     monkeypatch.setattr(variants, 'score_variants', refuse_hedges)
     frames = variants.simulated_frames([sensor], [scene, 'hedge'], 1, (0.0,))
-    report = variants.score_simulated(frames, lost.lost_tables, FIXED, with_peer=True)
+    report = scenes.score_objects(frames, FIXED)
     (row,), (shares,) = (report.tables[name].json() for name in ('objects', 'vehicles'))
     made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
     x, y, z, _ = made.points.T.astype(float)
@@ -269,7 +264,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
     assert notes[0] == 'refused: hedge: z does not point up'
     assert notes[1].startswith(f'objects lost: {sensor} {scene} {row["lost_vehicles"]} of')
     with pytest.raises(PointCloudError, match='refused: hedge'):
-        variants.score_simulated(frames[1:], lost.lost_tables, FIXED, with_peer=False)
+        scenes.score_objects(frames[1:], FIXED, with_peer=False)
 
 
 def test_behind_is_said():
@@ -282,7 +277,7 @@ def test_behind_is_said():
         ))  # fmt: skip
 
     scores = score(90, 80, 70), score(89, 81, 70)
-    (note,) = variants.scene_tables(scores)['scenes'].notes
+    (note,) = scenes.scene_table(scores).notes
     assert note == 'ahead of x on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
 
 
@@ -297,47 +292,46 @@ def streets(tmp_path_factory):
     return labelled_frames(root)
 
 
-def test_frames_turned(streets):
-    report = score_poses(streets, sensor_pose.load_turned, MOUNTS, FIXED)
-    level, pooled = report.tables['heights'].json()
-    assert {**level, 'scans of': 'all'} == pooled
-    assert level['told'] > 0.9
+def test_frames_turned(streets, monkeypatch):
+    monkeypatch.setattr(
+        sensor_pose, 'MOUNTS', [(1.73, turn) for turn in ((0, 0), (0, 3), (3, -3))]
+    )
+    report = sensor_pose.score_poses(streets, FIXED)
+    level, pitched, turned, pooled = report.tables['poses'].json()
+    assert level['told'] == level['level'] > 0.9
     assert (level['scans'], level['levelled'], level['silent']) == (2, 0, 0)
-    assert max(abs(level['low']), abs(level['high'])) < 0.1
-    turns = report.tables['turns'].json()
-    n_turns = len(MOUNTS) - 1
-    assert len(turns) == n_turns + 1
-    for row in turns:
+    for row in (level, pitched, turned):
         assert row['told'] == pytest.approx(level['told'], abs=1e-3)
         assert row['auto'] > level['told'] - 0.01
-        assert row['worst'] <= row['change_auto'] + 1e-12
-    by_angle = {row['turned by']: row for row in turns}
-    assert by_angle['all']['scans'] == 2 * n_turns
-    assert by_angle['all']['worst'] == min(row['worst'] for row in turns)
-    assert by_angle['roll +3° pitch -3°']['levelled'] == 2
-    assert len(report.rows) == 2 * 3 * len(MOUNTS)
+        assert row['worst'] == pytest.approx(row['change'])  # of one sequence
+        assert max(abs(row['low']), abs(row['high'])) < 0.1
+    assert (turned['mount'], turned['levelled']) == ('1.73 m roll +3° pitch -3°', 2)
+    assert (pooled['mount'], pooled['scans'], pooled['levelled']) == ('all', 6, 4)
+    assert [row['method'] for row in report.rows[::2]][:3] == [
+        'given 1.73 m', 'level 1.73 m', 'auto 1.73 m',
+    ]  # fmt: skip
+    assert len(report.rows) == 2 * 3 * 3
 
 
 def test_poses_of_simulated_scans(monkeypatch):
     small = dataclasses.replace(simulation.VLP_16, n_columns=600)
     monkeypatch.setitem(sensor_pose.SENSORS, 'vlp-16', small)
     frames = variants.simulated_frames(['vlp-16'], ['flat'], 1, (0.0,))
-    report = score_poses(frames, sensor_pose.load_mounted, SIMULATED_MOUNTS, FIXED)
-    level, _ = report.tables['heights'].json()
-    n_heights = len(SIMULATED_MOUNTS) // 2
-    assert level['scans'] == n_heights
-    assert max(abs(level['low']), abs(level['high'])) < 0.06
-    turned, pooled = report.tables['turns'].json()
-    assert pooled['auto'] == turned['auto'] > turned['level']
-    assert turned['levelled'] == n_heights
-    assert 'by roll +3° pitch -3°' in report.tables['turns'].title
+    report = sensor_pose.score_poses(frames, FIXED)
+    *rows, _ = report.tables['poses'].json()
+    assert len(rows) == len(sensor_pose.SIMULATED_MOUNTS)
+    for row in rows:
+        assert max(abs(row['low']), abs(row['high'])) < 0.06
+        is_turned = 'roll' in row['mount']
+        assert row['levelled'] == is_turned
+        assert not is_turned or row['auto'] > row['level']
 
 
 @pytest.mark.parametrize('sensor', ['hdl-64e', 'os1-128', 'vlp-32c-pair'])
 def test_in_traffic_no_vehicle_is_lost(sensor):
     """Cars hide the ground near the sensor; docs/accuracy.md has the table."""
     frames = variants.simulated_frames([sensor], ['traffic_jam', 'car_park'], 1, (0.0,))
-    report = variants.score_simulated(frames, lost.lost_tables, Config(), with_peer=False)
+    report = scenes.score_objects(frames, Config(), with_peer=False)
     for row in report.tables['objects'].json():
         assert row['vehicles'] > 20 and row['lost_vehicles'] == 0, row
     for row in report.tables['vehicles'].json():

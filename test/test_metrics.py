@@ -197,7 +197,7 @@ def test_height_error_by_hand():
     [
         metrics.height_error(np.empty(0), np.empty(0)),
         metrics.height_error(np.ones(2), np.full(2, np.nan)),
-        metrics.pool_height_errors([]),
+        metrics.HeightError(),
     ],
 )
 def test_height_error_of_nothing(error):
@@ -214,7 +214,7 @@ HEIGHTS = hnp.arrays(
 @given(HEIGHTS, HEIGHTS)
 def test_pooled_height_errors_are_those_of_all_points(first, second):
     frames = [first, second]
-    pooled = metrics.pool_height_errors([metrics.height_error(*frame.T) for frame in frames])
+    pooled = sum((metrics.height_error(*frame.T) for frame in frames), metrics.HeightError())
     both = np.concatenate(frames)
     difference = both[:, 1] - both[:, 0]
     assert pooled.n_points == len(both)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
-from gp_ground_seg.lab.scoring.evaluate import load_kitti, score_methods
+from gp_ground_seg.lab.scoring.evaluate import score_methods
 from gp_ground_seg.lab.scoring.metrics import GROUND_CLASSES
 from gp_ground_seg.lab.scoring.objects import (
     BAND_EDGES,
@@ -307,7 +307,7 @@ def test_a_rule_of_height_loses_what_is_below_it(tmp_path):
     root = write_cars(tmp_path, '00', '08')
     frames = labelled_frames(root)
     for height, n_lost in ((9.0, 4), (-0.5, 4), (-1.2, 0), (-9.0, 0)):
-        (score,) = score_methods(frames, load_kitti, [HeightRule('rule', height)])
+        (score,) = score_methods(frames, [HeightRule('rule', height)])
         (found,) = score.objects.values()
         total = sum(found, ObjectCount())
         assert (total.n_objects, total.n_lost) == (4, n_lost), height

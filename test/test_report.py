@@ -15,12 +15,18 @@ from gp_ground_seg.lab.scoring.report import Column, Table
 
 TABLE = Table(
     [
-        Column('sequence', key='name'),
-        Column('points', '_d'),
-        Column('IoU [%]', '.2f', 'iou', 100.0),
-        Column('change [%]', '+.1f', 'change', 100.0),
+        [
+            (Column('sequence', key='name'), name),
+            (Column('points', '_d'), n_points),
+            (Column('IoU [%]', '.2f', 'iou', 100.0), iou),
+            (Column('change [%]', '+.1f', 'change', 100.0), change),
+        ]
+        for name, n_points, iou, change in (
+            ('00', 1234567, 0.9876, -0.001),
+            ('08', 5, math.nan, None),
+            ('all', 1234572, 0.5, 0.25),
+        )
     ],
-    [['00', 1234567, 0.9876, -0.001], ['08', 5, math.nan, None], ['all', 1234572, 0.5, 0.25]],
     title='Scores',
     notes=['a note'],
     n_sums=1,
@@ -60,17 +66,20 @@ def test_forms_of_a_table(form):
 
 
 def test_long_titles_are_folded_in_the_terminal_only():
-    table = Table([Column('a')], [['b']], title='word ' * 40)
+    table = Table([[(Column('a'), 'b')]], title='word ' * 40)
     assert max(map(len, table.text().splitlines())) <= report.WIDTH
     assert len(table.markdown().splitlines()[0]) > report.WIDTH
 
 
-def test_rows_that_name_their_columns_and_rows_of_another_length():
-    rows = [[(Column('a'), 'x'), (Column('b', 'd'), 1)], [(Column('a'), 'y'), (Column('b'), 2)]]
-    found = Table.of(rows, title='t', n_sums=1)
-    assert found == Table([Column('a'), Column('b', 'd')], [['x', 1], ['y', 2]], 't', n_sums=1)
+def test_rows_of_several_units_of_another_length_and_none():
+    rows = [[(Column('what'), 'share'), (Column('n', '.1f', scale=100), 0.5)],
+            [(Column('what'), 'time'), (Column('n', '.3f'), 2)]]  # fmt: skip
+    assert Table(rows).text().splitlines()[2:] == ['share   50.0', 'time   2.000']
+    assert Table(rows).json() == [{'what': 'share', 'n': 0.5}, {'what': 'time', 'n': 2}]
     with pytest.raises(ValueError, match='zip'):
-        Table([Column('a'), Column('b')], [['only one']]).text()
+        Table([rows[0], rows[1][:1]]).text()
+    nothing = Table([], 'title', ['nothing'])
+    assert (nothing.text(), nothing.json()) == ('title\n\nnothing', [])
 
 
 def test_json_files_have_null_for_what_is_undefined(tmp_path):

@@ -20,7 +20,7 @@ from gp_ground_seg.lab.scoring import report
 from gp_ground_seg.lab.scoring.benchmark import BenchFrame, bench_cases, bench_document, run_cases
 from gp_ground_seg.lab.scoring.evaluate import TITLES
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
-from gp_ground_seg.lab.scoring.report import Cell, Column, Table
+from gp_ground_seg.lab.scoring.report import Column, Row, Table
 
 DESCRIPTION = """\
 Measure the time of the segmentation on your data, by stage: with theta fixed and learned in
@@ -176,10 +176,14 @@ def bench_text(document: dict[str, Any]) -> str:
     cases = document['cases']
     parameters = report.parameters_line(document['config_changes'])
     machine = report.machine_line(document['environment'])
-    stages = [Column(name, '.2f') for name in cases[0]['stages_ms']]
     by_stage = Table(
-        [Column('stage, median [ms]'), *stages],
-        [[case['name'], *case['stages_ms'].values()] for case in cases],
+        [
+            [
+                (Column('stage, median [ms]'), case['name']),
+                *((Column(name, '.2f'), time) for name, time in case['stages_ms'].items()),
+            ]
+            for case in cases
+        ]
     )
     footer = f'{report.fold(parameters)}\n{report.fold(machine)}'
     return '\n\n'.join([_case_table(document).text(), by_stage.text(), footer])
@@ -189,17 +193,27 @@ def _case_table(document: dict[str, Any]) -> Table:
     cases, peer = document['cases'], document['baseline_ms']
     n_points = document['n_points']
     median, largest = (Column('', '_d').show(round(n_points[key])) for key in ('median', 'max'))
-    rows: list[list[Cell]] = [[c['name'], c['ms']['median'], c['ms']['p99']] for c in cases]
-    columns = [Column('time per frame, reading left out')]
-    columns += [Column('median [ms]', '.2f'), Column('p99 [ms]', '.2f')]
+    name = TITLES[document['baseline']] if peer else ''
+
+    def row(case: str, ms: dict[str, float], median: float | None, p99: float | None) -> Row:
+        cells: Row = [
+            (Column('time per frame, reading left out'), case),
+            (Column('median [ms]', '.2f'), ms['median']),
+            (Column('p99 [ms]', '.2f'), ms['p99']),
+        ]
+        if peer:
+            cells.append((Column(f'/ {name}', '.2f'), median))
+            cells.append((Column(f'p99 / {name} median', '.2f'), p99))
+        return cells
+
+    rows = [
+        row(case['name'], case['ms'], *(case['ratio'].values() if peer else (None, None)))
+        for case in cases
+    ]
     if peer:
-        name = TITLES[document['baseline']]
-        columns += [Column(f'/ {name}', '.2f'), Column('p99 / its median', '.2f')]
-        for row, case in zip(rows, cases, strict=True):
-            row += case['ratio'].values()
-        rows.append([name, peer['median'], peer['p99'], 1.0, peer['p99'] / peer['median']])
+        rows.append(row(name, peer, 1.0, peer['p99'] / peer['median']))
     title = (
         f'{document["n_frames"]} frames of {document["data"]}, {median} points (median), '
         f'at most {largest}'
     )
-    return Table(columns, rows, title, n_sums=1 if peer else 0)
+    return Table(rows, title, n_sums=1 if peer else 0)

@@ -1,43 +1,103 @@
-"""``experiment``: the experiments of docs/, each a list of configurations scored over frames."""
+"""``experiment``: the experiments of docs/, each a function from scans to tables."""
 
 from __future__ import annotations
 
 import argparse
-import re
-from collections.abc import Callable, Iterable
+import inspect
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
-from gp_ground_seg.core.errors import ConfigError, DataError
-from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.experiments import ablation, coverage, lost, sensor_pose, stepwise, variants
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.lab.experiments import ablation
+from gp_ground_seg.lab.experiments.coverage import score_coverage
+from gp_ground_seg.lab.experiments.scenes import CROWDED, score_objects, score_scenes
+from gp_ground_seg.lab.experiments.sensor_pose import score_poses
 from gp_ground_seg.lab.experiments.table1 import table1
-from gp_ground_seg.lab.experiments.variants import (
-    load_simulated,
-    score_simulated,
-    simulated_frames,
-)
-from gp_ground_seg.lab.scale.cluster import Runner
-from gp_ground_seg.lab.scoring.evaluate import load_kitti
+from gp_ground_seg.lab.experiments.variants import simulated_frames
 from gp_ground_seg.lab.scoring.report import Report, describe_environment, machine_line, written
 from gp_ground_seg.lab.simulation import DRIVES, SCENES, SENSORS
 
 Option = tuple[str, str, dict[str, Any]]
 
-DEFAULT_SENSORS = ('hdl-64e', 'vlp-16', 'os1-128')
-SURVEYED = ('hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360')  # by `coverage`
-
-ONE_PROCESS = ('table1',)  # it measures times
+THREE = ('hdl-64e', 'vlp-16', 'os1-128')
+FIVE = ('hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360')
 EXAMPLES = """\
   gp-ground-seg experiment ablation KITTI_ROOT
   gp-ground-seg experiment scenes --sensors vlp-16 --scenes kerb
   gp-ground-seg experiment NAME --help          describes one of them
 """
-
-OPTIONAL_ROOT = (*ROOT[:2], {'metavar': 'ROOT', 'nargs': '?'})
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
-SEEDS = ('--seeds', 'simulated scenes of each kind', options.NUMBER)
+NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
+
+
+class Simulated(NamedTuple):
+    """Scans that an experiment simulates by default."""
+
+    sensors: Sequence[str]
+    scenes: Sequence[str] = (*DRIVES,)
+    n_seeds: int = 1  # scenes of each kind
+    places: Sequence[float] = (0.0,)  # of the sensor in each scene [m]
+
+
+class Experiment(NamedTuple):
+    """A function from scans, parameters and a runner to tables; its docstring is the help."""
+
+    run: Callable[..., Report]
+    simulated: Simulated | None = None
+    labelled: bool = True  # whether it takes labelled frames
+    is_timed: bool = False  # then it runs in one process
+
+    @property
+    def has_peer(self) -> bool:
+        """Whether Patchwork++ can run beside it."""
+        return 'with_peer' in inspect.signature(self.run).parameters
+
+    @property
+    def options(self) -> list[Option]:
+        """Options of its scans, and ``--no-peer``."""
+        found: list[Option] = []
+        if self.labelled:
+            optional = (*ROOT[:2], {**ROOT[2], 'nargs': '?'})
+            found += [optional, SIMULATED] if self.simulated else [ROOT]
+            found += OF_FRAMES
+        return [*found, *self.simulated_options, *([NO_PEER] if self.has_peer else [])]
+
+    @property
+    def simulated_options(self) -> list[Option]:
+        """Options of simulated scans."""
+        if self.simulated is None:
+            return []
+        return [
+            _some_of('--sensors', SENSORS, self.simulated.sensors),
+            _some_of('--scenes', SCENES, self.simulated.scenes),
+            (
+                '--seeds',
+                f'scenes of each kind (default: {self.simulated.n_seeds})',
+                options.NUMBER,
+            ),
+        ]  # fmt: skip
+
+
+EXPERIMENTS = {
+    'ablation': Experiment(
+        ablation.compare_models, Simulated(['hdl-64e'], [ablation.SCENE], 10, ablation.PLACES)
+    ),
+    'departures': Experiment(ablation.compare_departures),
+    'coverage': Experiment(score_coverage, Simulated(FIVE, n_seeds=2)),
+    'steps': Experiment(ablation.compare_steps),
+    'wrong-values': Experiment(ablation.compare_wrong_values),
+    'scenes': Experiment(
+        score_scenes, Simulated(THREE, n_seeds=3, places=(0.0, 6.0)), labelled=False
+    ),
+    'objects': Experiment(
+        score_objects, Simulated([*SENSORS], CROWDED, n_seeds=2), labelled=False
+    ),
+    'sensor-pose': Experiment(score_poses, Simulated(THREE)),
+    'table1': Experiment(table1, is_timed=True),
+}
+"""Experiments by name. A new one is a row here and its function."""
 
 
 def _some_of(option: str, known: Iterable[str], default: Iterable[str]) -> Option:
@@ -46,53 +106,38 @@ def _some_of(option: str, known: Iterable[str], default: Iterable[str]) -> Optio
     return option, text, {'metavar': 'LIST', 'type': options.some_of(known)}
 
 
-SCENE_LIST = _some_of('--scenes', SCENES, DRIVES)
-CROWDED_LIST = _some_of('--scenes', SCENES, lost.SCENES)
-SENSOR_LIST = _some_of('--sensors', SENSORS, DEFAULT_SENSORS)
-EVERY_SENSOR = _some_of('--sensors', SENSORS, SURVEYED)
-EVERY_MOUNT = _some_of('--sensors', SENSORS, ['all'])
-NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
-
-
-class Experiment(NamedTuple):
-    """An experiment: what it is for, its options, and how it is run."""
-
-    description: str
-    options: tuple[Option, ...]
-    run: Callable[[argparse.Namespace, Config, Runner], Report]
-
-
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and a command below it for each of `EXPERIMENTS`."""
-    description = 'Repeat an experiment of docs/: configurations scored over frames.'
+    description = 'Repeat an experiment of docs/: configurations scored over scans.'
     parser = options.new_parser(subparsers, 'experiment', description, EXAMPLES)
     names = parser.add_subparsers(metavar='NAME', required=True, dest='experiment')
     for name, experiment in EXPERIMENTS.items():
-        purpose = re.split(r'\.(?:\s|$)', experiment.description)[0]
-        source = ' KITTI_ROOT' if experiment.options[0][0] == 'root' else ' --sensors vlp-16'
+        description = inspect.getdoc(experiment.run) or name
+        source = ' KITTI_ROOT' if experiment.labelled else ' --sensors vlp-16'
         example = f'  gp-ground-seg experiment {name}{source} --json {name}.json'
-        own = options.new_parser(names, name, experiment.description, example, purpose)
-        options.add(own, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
-        if name in ONE_PROCESS:
-            own.set_defaults(workers=None, scheduler=None)
+        purpose = description.splitlines()[0].removesuffix('.')
+        child = options.new_parser(names, name, f'{description}\n', example, purpose)
+        options.add(child, *experiment.options, options.MARKDOWN, options.TO_JSON, options.FORCE)
+        if experiment.is_timed:
+            child.set_defaults(workers=None, scheduler=None)
         else:
-            options.add_cluster(own)
-        options.add_config(own)
-        own.set_defaults(run=run)
+            options.add_cluster(child)
+        options.add_config(child)
+        child.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, write the file, print the tables."""
     experiment = EXPERIMENTS[arguments.experiment]
-    if SIMULATED in experiment.options:
-        _check_source(arguments)
+    _check_source(arguments, experiment)
     config = options.read_config(arguments)
+    peer = {'with_peer': not arguments.no_peer} if experiment.has_peer else {}
     with options.staged_options(arguments, 'json') as parts:
         with options.runner(arguments, arguments.experiment) as runner:
-            report = experiment.run(arguments, config, runner)
+            report = experiment.run(_scans(arguments, experiment), config, runner, **peer)
             n_workers = runner.n_workers
-        has_peer = not getattr(arguments, 'no_peer', True)
-        environment = describe_environment(*(['pypatchworkpp'] if has_peer else []))
+        packages = ['pypatchworkpp'] if any(peer.values()) else []
+        environment = describe_environment(*packages)
         environment['n_workers'] = n_workers
         if 'json' in parts:
             given = {name: getattr(arguments, name) for name in map(_name, experiment.options)}
@@ -107,149 +152,23 @@ def _name(option: Option) -> str:
     return option[0].lstrip('-').replace('-', '_')
 
 
-def _check_source(arguments: argparse.Namespace) -> None:
+def _check_source(arguments: argparse.Namespace, experiment: Experiment) -> None:
     """Refuse options that contradict one another."""
+    if not (experiment.labelled and experiment.simulated):
+        return
     if arguments.simulated == (arguments.root is not None):
         raise DataError(f'{arguments.experiment}: give either ROOT or --simulated')
-    for option in OF_FRAMES if arguments.simulated else (SEEDS, SCENE_LIST, EVERY_SENSOR):
-        if getattr(arguments, _name(option), None) is not None:
+    refused = OF_FRAMES if arguments.simulated else experiment.simulated_options
+    for option in refused:
+        if getattr(arguments, _name(option)) is not None:
             kind = 'labelled frames' if arguments.simulated else '--simulated'
             raise DataError(f'{option[0]}: is for {kind} only')
 
 
-def _ablation(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
-    if not arguments.simulated:
-        return ablation.compare_models(frames_from_options(arguments), load_kitti, config, runner)
-    seeds = arguments.seeds or 10
-    frames = simulated_frames(['hdl-64e'], [ablation.SCENE], seeds, ablation.PLACES)
-    return ablation.compare_models(frames, load_simulated, config, runner)
-
-
-def _departures(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
-    return ablation.compare_departures(frames_from_options(arguments), config, runner)
-
-
-def _steps(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
-    if config != Config():
-        raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
-    frames = frames_from_options(arguments)
-    return stepwise.score_steps(frames, not arguments.no_peer, runner)
-
-
-def _wrong_values(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
-    return stepwise.score_wrong_values(frames_from_options(arguments), config, runner)
-
-
-def _scenes(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
-    sensors, scenes = arguments.sensors or DEFAULT_SENSORS, arguments.scenes or list(DRIVES)
-    frames = simulated_frames(sensors, scenes, arguments.seeds or 3, variants.SCENE_PLACES)
-    return score_simulated(frames, variants.scene_tables, config, not arguments.no_peer, runner)
-
-
-def _objects(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
-    sensors, scenes = arguments.sensors or list(SENSORS), arguments.scenes or lost.SCENES
-    frames = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
-    return score_simulated(frames, lost.lost_tables, config, not arguments.no_peer, runner)
-
-
-def _coverage(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
-    if not arguments.simulated:
-        frames = frames_from_options(arguments)
-        return coverage.compare_coverage(frames, load_kitti, config, coverage.LABELLED, runner)
-    sensors, scenes = arguments.sensors or list(SURVEYED), arguments.scenes or list(DRIVES)
-    scans = simulated_frames(sensors, scenes, arguments.seeds or 2, (0.0,))
-    return coverage.compare_coverage(scans, load_simulated, config, coverage.SIMULATED, runner)
-
-
-def _sensor_pose(arguments: argparse.Namespace, config: Config, runner: Runner) -> Report:
-    if not arguments.simulated:
-        frames, mounts = frames_from_options(arguments), sensor_pose.MOUNTS
-        return sensor_pose.score_poses(frames, sensor_pose.load_turned, mounts, config, runner)
-    scenes, mounts = arguments.scenes or list(DRIVES), sensor_pose.SIMULATED_MOUNTS
-    scans = simulated_frames(DEFAULT_SENSORS, scenes, arguments.seeds or 1, (0.0,))
-    return sensor_pose.score_poses(scans, sensor_pose.load_mounted, mounts, config, runner)
-
-
-def _table1(arguments: argparse.Namespace, config: Config, _: Runner) -> Report:
-    bar = options.progress('table1')
-    return table1(arguments.root, config, options.scan_layout(arguments), bar)
-
-
-EXPERIMENTS = {
-    'ablation': Experiment(
-        """\
-Compare length-scale models and ways to learn: a constant length-scale, the gradients of the
-lines (Z), and the latent process (Z-L), and beside them a surface that is interpolated
-between lowest points, on labelled frames; with --simulated on a smooth road that ends in
-rubble, by exact labels and heights.
-""",
-        (OPTIONAL_ROOT, SIMULATED, *OF_FRAMES, SEEDS),
-        _ablation,
-    ),
-    'departures': Experiment(
-        """\
-Switch off one departure from the paper after the other. They are the rows of
-gp_ground_seg/lab/experiments/ablation.py; `evaluate --against` measures any other change.
-""",
-        (ROOT, *OF_FRAMES),
-        _departures,
-    ),
-    'coverage': Experiment(
-        """\
-Compare errors of the ground's height with their standard deviations: how many lie within one
-and two, by sequence and range. On labelled frames that of the returns (return_std), with
---simulated that of the ground (ground_std) by exact heights.
-""",
-        (OPTIONAL_ROOT, SIMULATED, *OF_FRAMES, EVERY_SENSOR, SCENE_LIST, SEEDS),
-        _coverage,
-    ),
-    'steps': Experiment(
-        """\
-Go from the paper's method to the defaults, one step after the other, beside Patchwork++ and a
-surface that is interpolated, with our labels.
-""",
-        (ROOT, *OF_FRAMES, NO_PEER),
-        _steps,
-    ),
-    'wrong-values': Experiment(
-        """\
-Give hyper-parameters that are wrong by factors of 3 and 10, with and without learning.
-""",
-        (ROOT, *OF_FRAMES),
-        _wrong_values,
-    ),
-    'scenes': Experiment(
-        """\
-Score simulated scans by exact labels and heights, beside Patchwork++ with its published
-parameters and the true height of the sensor. All sensors have one set of parameters.
-""",
-        (SENSOR_LIST, SCENE_LIST, SEEDS, NO_PEER),
-        _scenes,
-    ),
-    'objects': Experiment(
-        """\
-Count vehicles, persons and cyclists of simulated scans that are called ground, beside
-Patchwork++ with its published parameters and the true height and place of the sensor. All
-sensors have one set of parameters.
-""",
-        (EVERY_MOUNT, CROWDED_LIST, SEEDS, NO_PEER),
-        _objects,
-    ),
-    'sensor-pose': Experiment(
-        """\
-Compare the segmentation with height and tilt of the sensor given and estimated. On labelled
-frames of KITTI's car as they are, and turned by 3 degrees; with --simulated from three
-sensors at four heights.
-""",
-        (OPTIONAL_ROOT, SIMULATED, *OF_FRAMES, SEEDS, SCENE_LIST),
-        _sensor_pose,
-    ),
-    'table1': Experiment(
-        """\
-Measure the paper's Table I on segments of labelled frames.
-""",
-        (ROOT, *options.SCAN_LAYOUT),
-        _table1,
-    ),
-}
-"""Experiments by name. A new one is a row here and a function that returns a `Report`."""
+def _scans(arguments: argparse.Namespace, experiment: Experiment) -> Sequence[Any]:
+    """Return labelled frames, or scans to simulate."""
+    default = experiment.simulated
+    if default is None or (experiment.labelled and not arguments.simulated):
+        return frames_from_options(arguments)
+    sensors, scenes = arguments.sensors or default.sensors, arguments.scenes or default.scenes
+    return simulated_frames(sensors, scenes, arguments.seeds or default.n_seeds, default.places)

@@ -34,7 +34,6 @@ COMMANDS = {
     'view': ('view', 'look at scans in Rerun, a browser or a page'),
     'tune': ('view', 'set parameters by sliders, and see the labels change'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
-    'compare': ('compare', 'compare two configurations on the same frames'),
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
 }

@@ -1,28 +1,31 @@
-"""What settings are worth: length-scale models, departures from the paper."""
+"""Variants of the method on the same scans: models, departures, steps, wrong values."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from typing import Any, NamedTuple
 
 from gp_ground_seg.core.errors import ConfigError
-from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.data.semantic_kitti import Frame
+from gp_ground_seg.core.parameters.config import Config, find_spec
+from gp_ground_seg.core.parameters.presets import find_preset
 from gp_ground_seg.lab.experiments.interpolation import interpolation_method
-from gp_ground_seg.lab.experiments.variants import (
-    Changes,
-    make_report,
-    refuse_changed,
-    scene_parts,
-    score_variants,
-)
+from gp_ground_seg.lab.experiments.variants import Changes, refuse_changed, score_variants
 from gp_ground_seg.lab.scale.cluster import HERE, Runner
-from gp_ground_seg.lab.scoring import report
-from gp_ground_seg.lab.scoring.evaluate import KnownScan, MethodScore, load_kitti
-from gp_ground_seg.lab.scoring.intervals import INTERVAL, interval_note, interval_text, mse_sums
-from gp_ground_seg.lab.scoring.report import Column, Report, Row, Table, percent
+from gp_ground_seg.lab.scoring.comparison import INTERVAL, interval_note, interval_text, mse_sums
+from gp_ground_seg.lab.scoring.evaluate import Method, MethodScore
+from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
+from gp_ground_seg.lab.scoring.report import (
+    Column,
+    Report,
+    Row,
+    Table,
+    centimetres,
+    changed_parameters,
+    percent,
+)
+from gp_ground_seg.lab.scoring.tables import make_report
 
 _FIXED: Changes = {'learning.mode': 'fixed'}
 _WHOLE_FRAME: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'frame'}
@@ -76,94 +79,185 @@ DEPARTURES: tuple[Departure, ...] = (
     Departure('a wider gate (3)', {'growth.max_standardised_residual': 3.0}, kept=False),
     Departure('obstacles from 0.3 m on', {'label.obstacle_min_height': 0.3}, kept=False),
 )
-"""What `departures` measures. A new row here is all that a further one takes."""
+"""Rows of `compare_departures`. A new row here is all that a further one takes."""
+
+STEPS = {
+    'vertical faces': ('faces.',),
+    'labels by the predictive distribution': ('label.',),
+    'sloping mean': ('observation.slope_std',),
+    'segments look aside': ('surface.',),
+    'gate and lines of the growth': ('growth.', 'lines.'),
+    'all else: bins, learning, sensor pose': ('',),
+}
+"""Steps from the preset ``paper`` to the defaults: beginnings of the names that change."""
+
+FACTORS = (0.1, 1 / 3, 3.0, 10.0)
+GIVEN = {
+    'sigma_f': ('observation.sigma_f',),
+    'sigma_n': ('observation.sigma_n',),
+    'both': ('observation.sigma_f', 'observation.sigma_n'),
+}
+"""Hyper-parameters that are given wrong by these factors."""
 
 
-def compare_models(
-    items: Sequence[Any],
-    load: Callable[[Any], KnownScan],
-    config: Config,
-    runner: Runner = HERE,
-) -> Report:
-    """Score `MODELS` and an interpolation; ConfigError if `config` sets what they set."""
+def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
+    """Compare length-scale models and ways to learn.
+
+    A constant length-scale, the gradients of the lines (Z), and the latent process (Z-L), and
+    beside them a surface that is interpolated between lowest points. On labelled frames, or on a
+    simulated smooth road that ends in rubble, by exact labels and heights.
+    """
     refuse_changed(config, {name for changes in MODELS.values() for name in changes})
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     with closing(interpolation_method(config)) as plain:
-        scores = score_variants(items, load, variants, [plain], runner=runner)
+        scores = score_variants(items, variants, [plain], runner=runner)
     last = scores[len(MODELS) - 1]
-    # Simulated scans are of one sequence, and of many scenes.
-    parts = MethodScore.parts if len(last.sequences) > 1 else scene_parts
     rows: list[Row] = [
         [
-            (Column('method'), one.name),
-            (percent('IoU [%]', 'iou'), one.iou),
-            *_worst_and_rmse(one),
-            (INTERVAL, None if one is last else interval_text(parts(one), parts(last), mse_sums)),
-            (report.centimetres('median [cm]', 'median_absolute'), one.height.median_absolute),
+            (Column('method'), score.name),
+            (percent('IoU [%]', 'iou'), score.iou),
+            *_worst(score),
+            (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
+            (INTERVAL, None if score is last else interval_text(score, last, mse_sums)),
+            (centimetres('median [cm]', 'median_absolute'), score.height.median_absolute),
         ]
-        for one in scores
+        for score in scores
     ]
-    clusters = 'sequences' if len(last.sequences) > 1 else 'scenes'
     title = (
-        f'{_counted(last)}; RMSE and median of the height under true ground, RMSE minus that of '
-        f'{last.name}: {interval_note(f"{len(parts(last))} {clusters}")}'
+        f'{_counted(last)}; RMSE and median of the height under true ground, interval of the RMSE '
+        f'minus that of {last.name}; {interval_note(last)}'
     )
-    return make_report({'models': Table.of(rows, title=title)}, scores, config, changes=MODELS)
+    return make_report({'models': Table(rows, title)}, scores, config, changes=MODELS)
 
 
-def compare_departures(frames: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
-    """Switch one departure after the other, on the same frames in the same run."""
+def compare_departures(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
+    """Switch off one departure from the paper after the other.
+
+    They are the rows of gp_ground_seg/lab/experiments/ablation.py; `evaluate --against` measures
+    any other change.
+    """
     variants = {'as given': config}
-    for one in DEPARTURES:
-        variants[one.title] = config.replace(**one.changes)
-        if variants[one.title] == config:
-            raise ConfigError(f'departure {one.title!r}: its switch changes nothing')
-    scores = score_variants(frames, load_kitti, variants, runner=runner)
+    for departure in DEPARTURES:
+        variants[departure.title] = config.replace(**departure.changes)
+        if variants[departure.title] == config:
+            raise ConfigError(f'departure {departure.title!r}: its switch changes nothing')
+    scores = score_variants(items, variants, runner=runner)
     given, *switched = scores
 
     def row(
         score: MethodScore,
         switch: str | None = None,
-        worth: float | None = None,
+        gain: float | None = None,
         interval: str | None = None,
     ) -> Row:
         pairs = zip(score.scans, given.scans, strict=True)
-        time_ratio = statistics.median(one.seconds / other.seconds for one, other in pairs)
+        time_ratio = statistics.median(scan.seconds / base.seconds for scan, base in pairs)
         return [
             (Column('departure'), score.name),
             (Column('switch'), switch),
             (percent('IoU [%]', 'iou'), score.iou),
-            (percent('worth [%]', 'worth', '+.2f'), worth),
+            (percent('gained [%]', 'worth', '+.2f'), gain),
             (INTERVAL, interval),
-            *_worst_and_rmse(score),
+            *_worst(score),
+            (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
             (Column('time', '.2f', 'time_ratio'), time_ratio),
         ]
 
-    switches = []
-    for one, score in zip(DEPARTURES, switched, strict=True):
-        having, without = (given, score) if one.kept else (score, given)
-        interval = interval_text(having.parts(), without.parts())
-        switch = 'off' if one.kept else 'on'
-        switches.append((score, switch, having.iou - without.iou, interval))
-    rows = [row(given), *(row(*one) for one in sorted(switches, key=lambda one: -one[2]))]
+    rows = []
+    for departure, score in zip(DEPARTURES, switched, strict=True):
+        having, without = (given, score) if departure.kept else (score, given)
+        interval = interval_text(having, without)
+        switch = 'off' if departure.kept else 'on'
+        rows.append((score, switch, having.iou - without.iou, interval))
+    rows.sort(key=lambda one: -one[2])
     title = (
-        f'{_counted(given)}; worth: what having it adds to the IoU; '
-        f'{interval_note(f"{len(given.sequences)} sequences")}; RMSE of the height; '
-        'time: over that as given, median of the frames'
+        f'{_counted(given)}, and gained with the departure on; {interval_note(given)}; RMSE of '
+        'the height; time relative to the parameters as given, median of the frames'
     )
-    tables = {'departures': Table.of(rows, title=title)}
-    changes = {one.title: one.changes for one in DEPARTURES}
+    tables = {'departures': Table([row(given), *(row(*one) for one in rows)], title)}
+    changes = {departure.title: departure.changes for departure in DEPARTURES}
     return make_report(tables, scores, config, changes=changes)
 
 
-def _worst_and_rmse(score: MethodScore) -> Row:
-    """Cells of the sequence with the lowest IoU, if there are several, and of the height error."""
+def paper_steps() -> dict[str, Config]:
+    """Return configurations from the paper to the defaults, by what is new in each."""
+    steps = {'the paper (preset paper)': find_preset('paper').config}
+    for title, beginnings in STEPS.items():
+        *_, last = steps.values()
+        names = [name for name in changed_parameters(last) if name.startswith(beginnings)]
+        steps[f'+ {title}'] = last.replace(**{name: find_spec(name).default for name in names})
+    return steps
+
+
+def compare_steps(
+    items: Sequence[Any], config: Config, runner: Runner = HERE, *, with_peer: bool = True
+) -> Report:
+    """Go from the paper's method to the defaults, one step after the other.
+
+    Beside Patchwork++, and a surface that is interpolated between lowest points, with our labels.
+    """
+    if config != Config():
+        raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
+    steps = paper_steps()
+    with closing(interpolation_method(config)) as plain:
+        peers: list[Method] = [plain, *([PatchworkppMethod()] if with_peer else [])]
+        scores = score_variants(items, steps, peers, runner=runner)
+    rows: list[Row] = []
+    for k, score in enumerate(scores):
+        other = scores[min(max(k, 1), len(steps)) - 1]
+        rows.append(
+            [
+                (Column('method'), score.title),
+                (percent('IoU [%]', 'iou'), score.iou),
+                (percent('difference', form='+.2f'), score.iou - other.iou if k else None),
+                (INTERVAL, interval_text(score, other) if k else None),
+                (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
+            ]
+        )
+    title = (
+        f'{_counted(scores[0])}, each by itself; difference to the row above, below the steps to '
+        f'the last of them; {interval_note(scores[0])}; RMSE of the height under labelled ground'
+    )
+    return make_report({'steps': Table(rows, title)}, scores, config)
+
+
+def compare_wrong_values(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
+    """Give hyper-parameters that are wrong by factors of 3 and 10, with and without learning."""
+    refuse_changed(config, [*GIVEN['both'], 'learning.mode'])
+    wrong = {
+        f'{title} times {factor:.2g}': {name: factor * float(config[name]) for name in names}
+        for title, names in GIVEN.items()
+        for factor in FACTORS
+    }
+    variants = {}
+    for title, changes in {'the defaults': {}, **wrong}.items():
+        variants[title] = config.replace(**changes)
+        variants[f'{title}, fixed'] = config.replace(**changes, **_FIXED)
+    scores = score_variants(items, variants, runner=runner)
+    rows: list[Row] = [
+        [
+            (Column('given'), learned.name),
+            (percent('as given', 'iou_fixed'), fixed.iou),
+            (percent('learned', 'iou'), learned.iou),
+            (percent('difference', form='+.2f'), learned.iou - fixed.iou),
+            (INTERVAL, interval_text(learned, fixed)),
+            (centimetres('RMSE as given', 'rmse_fixed'), fixed.height.rmse),
+            (centimetres('learned', 'rmse'), learned.height.rmse),
+        ]
+        for learned, fixed in zip(scores[::2], scores[1::2], strict=True)
+    ]
+    title = (
+        f'{_counted(scores[0])} [%] with hyper-parameters given wrong, as they are and learned '
+        f'from there; {interval_note(scores[0])}; RMSE of the height [cm]'
+    )
+    return make_report({'values': Table(rows, title)}, scores, config)
+
+
+def _worst(score: MethodScore) -> Row:
+    """Cells of the sequence with the lowest IoU, if there are several."""
     iou, name = min((score.of(name).iou, name) for name in score.sequences)
-    rmse: Row = [(report.centimetres('RMSE [cm]', 'rmse'), score.height.rmse)]
-    if len(score.sequences) == 1:
-        return rmse
-    where = (Column('in', '', 'worst_sequence'), name)
-    return [(percent('worst [%]', 'worst_iou'), iou), where, *rmse]
+    where: Row = [(percent('worst [%]', 'worst_iou'), iou), (Column('in', '', 'worst_seq'), name)]
+    return where if len(score.sequences) > 1 else []
 
 
 def _counted(score: MethodScore) -> str:

@@ -1,4 +1,4 @@
-"""What a surface without a Gaussian process is worth: lowest points joined by straight lines."""
+"""A surface without a Gaussian process: lowest points joined by straight lines."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class InterpolatingBackend:
         Standard deviation and end of the surface are those of the other backend.
         """
         surface, *scales = self._backend.estimate_surface(frame, theta, config)
-        own = np.empty_like(surface.mean)
-        for segment, line in enumerate(own):
+        lines = np.empty_like(surface.mean)
+        for segment, line in enumerate(lines):
             part = slice(*frame.candidates.offsets[segment : segment + 2])
             r, z = frame.candidates.r[part], frame.candidates.z[part]
             line[:] = np.interp(frame.knots, *ground_points(r, z, frame.prior_mean))
-        mean = np.median([np.roll(own, k, axis=0) for k in (-1, 0, 1)], axis=0)
+        mean = np.median([np.roll(lines, k, axis=0) for k in (-1, 0, 1)], axis=0)
         mean[np.isnan(surface.mean)] = np.nan
         return surface._replace(mean=mean), scales[0], scales[1]
 
@@ -59,8 +59,8 @@ class InterpolatingBackend:
 def ground_points(r: FloatArray, z: FloatArray, start: float) -> tuple[list[float], list[float]]:
     """Ranges and heights of the ground point at range 0, `start`, and of those that follow it."""
     ranges, heights = [0.0], [start]
-    for one_r, one_z in zip(r.tolist(), z.tolist(), strict=True):
-        if abs(one_z - heights[-1]) <= MAX_SLOPE * (one_r - ranges[-1]) + TOLERANCE:
-            ranges.append(one_r)
-            heights.append(one_z)
+    for r_k, z_k in zip(r.tolist(), z.tolist(), strict=True):
+        if abs(z_k - heights[-1]) <= MAX_SLOPE * (r_k - ranges[-1]) + TOLERANCE:
+            ranges.append(r_k)
+            heights.append(z_k)
     return ranges, heights

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
-from pathlib import Path
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,12 +13,11 @@ import numpy as np
 from gp_ground_seg.core.errors import ConfigError, DataError
 from gp_ground_seg.core.frame import OUTSIDE
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.result import FitReport, Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
-from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
-from gp_ground_seg.data.semantic_kitti import Frame, list_frames
+from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.experiments.variants import refuse_changed
-from gp_ground_seg.lab.scale.cluster import Progress
+from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring.evaluate import load_kitti
 from gp_ground_seg.lab.scoring.metrics import height_error
 from gp_ground_seg.lab.scoring.report import Column, Report, Table, changed_parameters
@@ -42,15 +41,11 @@ CHOICES = (Choice('10', '000000', (157, 158)), Choice('03', '000006', (147, 148)
 N_REPEATS = 9
 
 
-def table1(
-    root: str | Path,
-    config: Config,
-    layout: ScanLayout = KITTI,
-    progress: Progress = iter,
-) -> Report:
-    """Measure the table on the segments of `CHOICES`.
+def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Report:
+    """Measure the paper's Table I on segments of labelled frames.
 
-    Each method runs on each frame once without counting, then `N_REPEATS` times, alternately.
+    Each method runs on each frame of `CHOICES` once without counting, then `N_REPEATS` times,
+    alternately.
     """
     refuse_changed(config, ['length_scale.model', 'learning.fixed'])
     if config.learning.mode == 'fixed':
@@ -59,24 +54,11 @@ def table1(
     for segment in (segment for choice in CHOICES for segment in choice.segments):
         if not 0 <= segment <= last:
             raise ConfigError(f'segment {segment}: must be in [0, {last}]')
-    frames = []
+    frames = {(frame.sequence, frame.index): frame for frame in items}
     for choice in CHOICES:
-        own = {frame.index: frame for frame in list_frames(root, choice.sequence, layout)}
-        if choice.frame not in own:
-            where = f'{choice.sequence}; there are {min(own)} to {max(own)}'
-            raise DataError(f'{root}: no frame {choice.frame} in sequence {where}')
-        frames.append(own[choice.frame])
-    rows: list[dict[str, Any]] = []
-    with ExitStack() as stack:
-        segmenters = {}
-        for name, model in MODELS.items():
-            segmenter = GroundSegmenter(
-                config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
-            )
-            segmenters[name] = stack.enter_context(closing(segmenter))
-        for frame, choice in zip(progress(frames), CHOICES, strict=True):
-            found, result = _rows(frame, choice, segmenters)
-            rows += found
+        if (choice.sequence, choice.frame) not in frames:
+            raise DataError(f'no frame {choice.frame} in sequence {choice.sequence}')
+    ((rows, fit),) = runner.run(partial(_measure, config, frames), CHOICES)
     names = ['n_PG', 'n_L', *VARIANCES]
     others = [n for n in rows[0] if n not in ('segment', *names) and not n.startswith('inliers')]
     variances = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
@@ -89,7 +71,28 @@ def table1(
         'errors': _table(rows, others, errors),
     }
     facts = {'config_changes': changed_parameters(config), 'config': config.nested()}
-    return Report(tables, rows, result.fit, facts)
+    return Report(tables, rows, fit, facts)
+
+
+def _measure(
+    config: Config,
+    frames: Mapping[tuple[str, str], Frame],
+    choices: Sequence[Choice],
+    progress: Progress,
+) -> tuple[list[dict[str, Any]], FitReport]:
+    """Rows of the segments chosen, and a fit of the latent model."""
+    rows: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        segmenters = {}
+        for name, model in MODELS.items():
+            segmenter = GroundSegmenter(
+                config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
+            )
+            segmenters[name] = stack.enter_context(closing(segmenter))
+        for choice in progress(choices):
+            found, result = _rows(frames[choice.sequence, choice.frame], choice, segmenters)
+            rows += found
+    return rows, result.fit
 
 
 def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> Table:
@@ -97,7 +100,7 @@ def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> 
     for name in names:
         number = '.4f' if name.startswith('t ') else '#.4g'
         columns.append(Column(name, 'd' if isinstance(rows[0][name], int) else number))
-    return Table(columns, [[row[c.title] for c in columns] for row in rows], title)
+    return Table([[(column, row[column.title]) for column in columns] for row in rows], title)
 
 
 def _rows(
@@ -122,28 +125,28 @@ def _rows(
     modelled = scan.is_ground & (common.grid.bin != OUTSIDE)
     rows = []
     for segment in choice.segments:
-        its = slice(*candidates.offsets[segment : segment + 2])
-        own = modelled & (common.grid.segment == segment)
-        own &= ~np.isin(place, candidates.r[its] + 1j * candidates.z[its])
+        part = slice(*candidates.offsets[segment : segment + 2])
+        held_out = modelled & (common.grid.segment == segment)
+        held_out &= ~np.isin(place, candidates.r[part] + 1j * candidates.z[part])
         variances = np.exp(2.0 * common.theta[segment, : len(VARIANCES)])
         in_sample = {name: _in_sample(result, segment) for name, result in results.items()}
         rows.append(
             {
                 'segment': f'{frame.sequence}/{frame.index}:{segment}',
-                'n_PG': int(its.stop - its.start),
+                'n_PG': int(part.stop - part.start),
                 'n_L': int(np.diff(common.pseudo.offsets)[segment]),
                 **dict(zip(VARIANCES, variances.tolist(), strict=True)),
                 **{f'inliers {name}': n for name, (n, _) in in_sample.items()},
                 **{f'in sample {name}': smse for name, (_, smse) in in_sample.items()},
-                'held out': int(own.sum()),
+                'held out': int(held_out.sum()),
                 **{
                     # Of the process itself, as in the paper; not the corrected surface.
                     f'held out {name}': height_error(
-                        z[own], z[own] - result.labelled.height[own]
+                        z[held_out], z[held_out] - result.labelled.height[held_out]
                     ).smse
                     for name, result in results.items()
                 },
-                **{f't {name} [s]': statistics.median(own) for name, own in seconds.items()},
+                **{f't {name} [s]': statistics.median(times) for name, times in seconds.items()},
             }
         )
     return rows, common
@@ -152,6 +155,6 @@ def _rows(
 def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:
     """Inliers of a segment, and the standardised mean squared error of the surface there."""
     candidates, surface = result.candidates, result.surface
-    own = surface.inlier & (candidates.segment == segment)
-    estimate = np.interp(candidates.r[own], surface.knots, surface.mean[segment])
-    return int(own.sum()), height_error(candidates.z[own], estimate).smse
+    inlier = surface.inlier & (candidates.segment == segment)
+    estimate = np.interp(candidates.r[inlier], surface.knots, surface.mean[segment])
+    return int(inlier.sum()), height_error(candidates.z[inlier], estimate).smse

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import logging
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol
@@ -25,7 +24,16 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
 from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner, depends_on_past
 from gp_ground_seg.lab.scoring import metrics
-from gp_ground_seg.lab.scoring.metrics import CONVENTIONS, GROUNDGRID, Confusion, Labels
+from gp_ground_seg.lab.scoring.metrics import (
+    CONVENTIONS,
+    GROUNDGRID,
+    Calibration,
+    ClassCount,
+    Confusion,
+    HeightError,
+    Labels,
+    Sums,
+)
 from gp_ground_seg.lab.scoring.objects import (
     ObjectCounts,
     Objects,
@@ -34,7 +42,6 @@ from gp_ground_seg.lab.scoring.objects import (
     pool_objects,
 )
 
-_LOGGER = logging.getLogger('gp_ground_seg')
 OURS = 'gp_ground_seg'
 PATCHWORKPP = 'patchworkpp'
 TITLES = {PATCHWORKPP: 'Patchwork++'}
@@ -45,12 +52,13 @@ Points = npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class MethodResult:
-    """What a method says of a scan."""
+    """Labels of a scan of N points, and the surface under it."""
 
     label: Labels  # (N,)
     ground_z: FloatArray  # (N,) height of the ground under each point [m]; NaN = no model
-    p_ground: npt.NDArray[np.floating] | None = None  # (N,), where it has probabilities
+    p_ground: npt.NDArray[np.floating] | None = None  # (N,), where the method has probabilities
     return_std: FloatArray | None = None  # (N,) of a ground return about `ground_z` [m]
+    ground_std: FloatArray | None = None  # (N,) of the ground about `ground_z` [m]
     stages: dict[str, float] = field(default_factory=dict)  # seconds
     pose: SensorPose | None = None
     fit: FitReport | None = None
@@ -85,7 +93,7 @@ class OurMethod:
         self._segmenter = GroundSegmenter(config, backend=make(config.runtime))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Send a worker what to make it of; it has one thread there, as there are many."""
+        """Send the configuration to a worker, with one thread: there are many workers."""
         config = self._segmenter.config.replace(**{'runtime.n_threads': 1})
         return type(self), (config, self.name, self._make)
 
@@ -104,11 +112,12 @@ class OurMethod:
         return {stage: timings[stage] for stage in timings if stage != 'total'}
 
     def result(self) -> MethodResult:
-        """Return all there is of the last scan."""
-        own = self.last
+        """Return the result of the last scan."""
+        last = self.last
         return MethodResult(
-            own.label, own.ground_z, own.p_ground, own.return_std, self.stages, own.pose, own.fit
-        )
+            last.label, last.ground_z, last.p_ground, last.return_std, last.ground_std,
+            self.stages, last.pose, last.fit,
+        )  # fmt: skip
 
     def close(self) -> None:
         """End the worker threads."""
@@ -128,6 +137,19 @@ class KnownScan:
     ground_z: npt.NDArray[np.floating] | None = None  # (N,) true height of the ground [m]
     is_ground: BoolArray | None = None  # (N,) points under which the surface is compared with it
     objects: Objects | None = None  # what stands on the ground, if known
+    std: str = 'return_std'
+    """Field of `MethodResult` that the errors of the height are compared with: heights of ground
+    returns scatter by `return_std`, exact heights by `ground_std`."""
+    cluster: str = ''  # scans that the bootstrap draws together; by default the sequence
+
+
+@dataclass(frozen=True)
+class RingScore(Sums):
+    """Scores within one ring of horizontal range."""
+
+    confusion: Confusion = field(default_factory=Confusion)
+    height: HeightError = field(default_factory=HeightError)
+    calibration: Calibration = field(default_factory=Calibration)
 
 
 @dataclass(frozen=True)
@@ -139,23 +161,33 @@ class ScanScore:
     seconds: float  # without reading
     stages: dict[str, float] = field(default_factory=dict)  # seconds, if the method reports them
     confusions: dict[str, Confusion] = field(default_factory=dict)  # as `KnownScan.truths`
-    height: metrics.HeightError | None = None  # where the truth is known
-    classes: dict[int, metrics.ClassCount] = field(default_factory=dict)
-    rings: tuple[Confusion, ...] = ()  # by `RING_TITLES`
-    calibration: metrics.Calibration | None = None  # where the method has probabilities
+    height: HeightError = field(default_factory=HeightError)
+    classes: dict[int, ClassCount] = field(default_factory=dict)
+    rings: tuple[RingScore, ...] = ()  # by `metrics.RING_TITLES`, where the truth is known
     objects: ObjectCounts = field(default_factory=dict)
     pose: SensorPose | None = None  # of our own method
     fit: FitReport | None = None
+    cluster: str = ''  # as in `KnownScan`
+    n_points: int = 0
+    n_changed: int = 0  # of them with another label than by the first method
 
     @property
     def confusion(self) -> Confusion:
         """Counts in the convention that counts."""
         return next(iter(self.confusions.values()), Confusion())
 
+    @property
+    def calibration(self) -> Calibration:
+        """Sum over the rings; empty if the method has no probabilities."""
+        return sum((ring.calibration for ring in self.rings), Calibration())
+
 
 @dataclass(frozen=True)
 class MethodScore:
-    """How one method, or one variant of ours, did on all scans, in their order."""
+    """How one method, or one variant of ours, did on all scans, in their order.
+
+    The properties are sums over the scans.
+    """
 
     name: str
     scans: tuple[ScanScore, ...]
@@ -166,6 +198,11 @@ class MethodScore:
         return TITLES.get(self.name, self.name)
 
     @property
+    def has_labels(self) -> bool:
+        """Whether the ground of the scans is known."""
+        return any(scan.confusions for scan in self.scans)
+
+    @property
     def sequences(self) -> list[str]:
         """Names of the sequences, in order."""
         return list(dict.fromkeys(scan.sequence for scan in self.scans))
@@ -173,10 +210,6 @@ class MethodScore:
     def of(self, *sequences: str) -> MethodScore:
         """Return the part of some sequences."""
         return MethodScore(self.name, tuple(s for s in self.scans if s.sequence in sequences))
-
-    def parts(self) -> list[MethodScore]:
-        """Return the part of each sequence."""
-        return [self.of(name) for name in self.sequences]
 
     def by_sequence(self) -> list[tuple[str, MethodScore]]:
         """Return the parts of the sequences by name, and the whole as `ALL`."""
@@ -188,7 +221,7 @@ class MethodScore:
 
     @property
     def confusion(self) -> Confusion:
-        """Sum of the counts in the convention that counts."""
+        """Counts in the convention that counts."""
         return sum((scan.confusion for scan in self.scans), Confusion())
 
     @property
@@ -197,37 +230,33 @@ class MethodScore:
         return self.confusion.iou
 
     @property
-    def classes(self) -> dict[int, metrics.ClassCount]:
-        """Sum of the counts by class, by ascending class number."""
-        numbers = sorted({number for scan in self.scans for number in scan.classes})
-        counts = {n: [s.classes[n] for s in self.scans if n in s.classes] for n in numbers}
-        return {
-            n: metrics.ClassCount(*map(sum, zip(*own, strict=True))) for n, own in counts.items()
-        }
+    def classes(self) -> dict[int, ClassCount]:
+        """Counts by class, by ascending class number."""
+        counts: dict[int, ClassCount] = {}
+        for number, count in (item for scan in self.scans for item in scan.classes.items()):
+            counts[number] = counts.get(number, ClassCount()) + count
+        return dict(sorted(counts.items()))
 
     @property
-    def rings(self) -> tuple[Confusion, ...]:
-        """Sum of the counts by ring."""
+    def rings(self) -> tuple[RingScore, ...]:
+        """Scores by ring."""
         of_scans = [scan.rings for scan in self.scans]
-        return tuple(sum(ring, Confusion()) for ring in zip(*of_scans, strict=True))
+        return tuple(sum(ring, RingScore()) for ring in zip(*of_scans, strict=True))
 
     @property
     def objects(self) -> ObjectCounts:
-        """Sum of the counts of objects."""
+        """Counts of objects."""
         return pool_objects([scan.objects for scan in self.scans])
 
     @property
-    def calibration(self) -> metrics.Calibration | None:
-        """Sum over the scans; None unless every scan has one."""
-        found = [scan.calibration for scan in self.scans if scan.calibration is not None]
-        if not found or len(found) < len(self.scans):
-            return None
-        return sum(found[1:], found[0])
+    def calibration(self) -> Calibration:
+        """Probabilities against the truth."""
+        return sum((scan.calibration for scan in self.scans), Calibration())
 
     @property
-    def height(self) -> metrics.HeightError:
-        """Pooled height error."""
-        return metrics.pool_height_errors([s.height for s in self.scans if s.height is not None])
+    def height(self) -> HeightError:
+        """Height errors."""
+        return sum((scan.height for scan in self.scans), HeightError())
 
     def seconds(self, average: Callable[[list[float]], float] = statistics.median) -> float:
         """Average time per scan; NaN without scans."""
@@ -240,9 +269,9 @@ class MethodScore:
         return {name: statistics.median(s.stages[name] for s in self.scans) for name in names}
 
 
-def pool(name: str, scores: Iterable[MethodScore]) -> MethodScore:
+def pool(name: str, scores: Sequence[MethodScore]) -> MethodScore:
     """Put the scans of several scores together."""
-    return MethodScore(name, tuple(scan for one in scores for scan in one.scans))
+    return MethodScore(name, tuple(scan for score in scores for scan in score.scans))
 
 
 def load_kitti(frame: Frame) -> KnownScan:
@@ -261,26 +290,24 @@ def load_kitti(frame: Frame) -> KnownScan:
 
 def score_methods(
     items: Sequence[Any],
-    load: Callable[[Any], KnownScan],
     methods: Sequence[Method],
+    load: Callable[[Any], KnownScan] = load_kitti,
     *,
     each_alone: bool = False,
     clock: Callable[[], float] = time.perf_counter,
     runner: Runner = HERE,
-    watch: Callable[[KnownScan], None] | None = None,
 ) -> list[MethodScore]:
     """Run methods alternately on the same scans and score each run, in the order of `methods`.
 
     Which method goes first changes from scan to scan. Each runs once without counting:
     compilation and first allocations are not its speed. `items`, grouped by sequence, are loaded
     one by one. Methods are reset before each sequence, or with `each_alone` before each scan.
-    `watch` is called with each scan after all methods have run on it.
     """
-    score = partial(_score_block, load, methods, each_alone, clock, watch)
+    score = partial(_score_block, load, methods, each_alone, clock)
     has_past = not each_alone and any(method.depends_on_past for method in methods)
     parts = runner.run(score, items, _sequence_of if has_past else None)
-    scans = [tuple(itertools.chain(*own)) for own in zip(*parts, strict=True)]
-    return [MethodScore(one.name, own) for one, own in zip(methods, scans, strict=True)]
+    scans = [tuple(itertools.chain(*blocks)) for blocks in zip(*parts, strict=True)]
+    return [MethodScore(m.name, found) for m, found in zip(methods, scans, strict=True)]
 
 
 def _sequence_of(item: Any) -> str:
@@ -293,12 +320,11 @@ def _score_block(
     methods: Sequence[Method],
     each_alone: bool,
     clock: Callable[[], float],
-    watch: Callable[[KnownScan], None] | None,
     items: Sequence[Any],
     progress: Progress,
 ) -> list[list[ScanScore]]:
     """Scores of some scans, by method."""
-    scores: dict[str, list[ScanScore]] = {method.name: [] for method in methods}
+    scores: list[list[ScanScore]] = [[] for _ in methods]
     sequence = None
     for k, item in enumerate(progress(items)):
         scan = load(item)
@@ -307,15 +333,17 @@ def _score_block(
                 _run(method, scan)
         forgets = each_alone or scan.sequence != sequence
         sequence = scan.sequence
+        seconds = {}
         for method in methods if k % 2 == 0 else reversed(methods):
             if forgets:
                 method.reset()
             start = clock()
             _run(method, scan)
-            scores[method.name].append(_score(scan, method, clock() - start))
-        if watch is not None:
-            watch(scan)
-    return list(scores.values())
+            seconds[method.name] = clock() - start
+        results = [method.result() for method in methods]
+        for method, result, found in zip(methods, results, scores, strict=True):
+            found.append(_score(scan, result, seconds[method.name], results[0].label))
+    return scores
 
 
 def _run(method: Method, scan: KnownScan) -> None:
@@ -325,22 +353,45 @@ def _run(method: Method, scan: KnownScan) -> None:
         raise PointCloudError(f'{scan.sequence}/{scan.index}: {method.name}: {error}') from error
 
 
-def _score(scan: KnownScan, method: Method, seconds: float) -> ScanScore:
-    result = method.result()
-    label, p_ground = result.label, result.p_ground
-    truth = next(iter(scan.truths.values()), None)
-    height = None
-    if scan.ground_z is not None:
-        own = scan.is_ground
-        std = None if result.return_std is None else result.return_std[own]
-        height = metrics.height_error(scan.ground_z[own], result.ground_z[own], std)
+def _score(scan: KnownScan, result: MethodResult, seconds: float, first: Labels) -> ScanScore:
+    label = result.label
     return ScanScore(
         scan.sequence, scan.index, seconds, result.stages,
         {key: metrics.count_confusion(label, one) for key, one in scan.truths.items()},
-        height,
+        _height_error(scan, result),
         {} if scan.semantic is None else metrics.count_classes(label, scan.semantic),
-        () if truth is None else metrics.count_rings(label, truth, scan.points),
-        None if p_ground is None or truth is None else metrics.count_calibration(p_ground, truth),
+        _score_rings(scan, result),
         {} if scan.objects is None else count_objects(scan.points, label, scan.objects),
-        result.pose, result.fit,
+        result.pose, result.fit, scan.cluster or scan.sequence,
+        len(label), int((label != first).sum()),
     )  # fmt: skip
+
+
+def _height_error(
+    scan: KnownScan, result: MethodResult, inside: BoolArray | slice = slice(None)
+) -> HeightError:
+    """Error of the surface under the ground points `inside` a part of the scan."""
+    if scan.ground_z is None or scan.is_ground is None:
+        return HeightError()
+    ground = scan.is_ground[inside]
+    std = getattr(result, scan.std)
+    return metrics.height_error(
+        scan.ground_z[inside][ground],
+        result.ground_z[inside][ground],
+        None if std is None else std[inside][ground],
+    )
+
+
+def _score_rings(scan: KnownScan, result: MethodResult) -> tuple[RingScore, ...]:
+    truth = next(iter(scan.truths.values()), None)
+    if truth is None:
+        return ()
+    confusions = metrics.count_rings(result.label, truth, scan.points)
+    ring = metrics.ring_of(scan.points)
+    found = []
+    for k, confusion in enumerate(confusions):
+        inside, calibration = ring == k, Calibration()
+        if result.p_ground is not None:
+            calibration = metrics.count_calibration(result.p_ground[inside], truth[inside])
+        found.append(RingScore(confusion, _height_error(scan, result, inside), calibration))
+    return tuple(found)

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -111,7 +111,7 @@ class Sums:
 
     def __add__(self, other: Self) -> Self:
         """Add the sums of both."""
-        names = [field.name for field in dataclasses.fields(self)]
+        names = [entry.name for entry in dataclasses.fields(self)]
         sums = {name: getattr(self, name) + getattr(other, name) for name in names}
         return dataclasses.replace(self, **sums)
 
@@ -181,21 +181,31 @@ def count_rings(
 
     A point without a finite range is in no ring.
     """
-    x, y = points[:, :2].astype(np.float64).T
-    reach = np.hypot(x, y)
-    n_rings = len(RING_TITLES)
-    scored = np.isfinite(reach) & ((truth == Label.GROUND) | (truth == Label.OBSTACLE))
+    ring, n_rings = ring_of(points), len(RING_TITLES)
+    scored = (ring < n_rings) & ((truth == Label.GROUND) | (truth == Label.OBSTACLE))
     given, ground = label == Label.GROUND, truth == Label.GROUND
-    code = 4 * np.digitize(reach, RING_EDGES[1:-1]) + 2 * given + ground
+    code = 4 * ring + 2 * given + ground
     counts = np.bincount(code[scored], minlength=4 * n_rings).reshape(n_rings, 4)
     return tuple(Confusion(int(tp), int(fp), int(fn), int(tn)) for tn, fn, fp, tp in counts)
 
 
-class ClassCount(NamedTuple):
+def ring_of(points: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
+    """Index of the ring that each of the points (N, >=2) is in, (N,).
+
+    A point without a finite range has the index after the last one.
+    """
+    x, y = points[:, :2].astype(np.float64).T
+    reach = np.hypot(x, y)
+    ring: npt.NDArray[np.intp] = np.digitize(reach, RING_EDGES[1:-1])
+    return np.where(np.isfinite(reach), ring, len(RING_TITLES))
+
+
+@dataclass(frozen=True)
+class ClassCount(Sums):
     """Points of one semantic class, and how many of them were labelled ground."""
 
-    n_points: int
-    n_ground: int
+    n_points: int = 0
+    n_ground: int = 0
 
 
 def count_classes(label: Labels, semantic: npt.NDArray[np.integer]) -> dict[int, ClassCount]:
@@ -227,12 +237,21 @@ class ClassErrors(NamedTuple):
 def class_errors(classes: Mapping[int, ClassCount]) -> list[ClassErrors]:
     """Errors by class in the GroundGrid convention, the largest first."""
     found = []
-    for number, (n_points, n_ground) in classes.items():
+    for number, count in classes.items():
+        n_points, n_ground = count.n_points, count.n_ground
         truth = Label(int(GROUNDGRID.truth(np.array([number]), np.zeros(1))[0]))
         missed = n_points - n_ground if truth is Label.GROUND else 0
         false = n_ground if truth is Label.OBSTACLE else 0
         found.append(ClassErrors(number, truth, n_points, n_ground, missed, false))
     return sorted(found, key=lambda one: (-one.errors, -one.n_points, one.number))
+
+
+def _no_points() -> npt.NDArray[np.int64]:
+    return np.zeros(N_BINS, dtype=np.int64)
+
+
+def _no_sums() -> FloatArray:
+    return np.zeros(N_BINS)
 
 
 @dataclass(frozen=True)
@@ -242,10 +261,10 @@ class Calibration(Sums):
     Sums by bin of probability, (N_BINS,); a bin holds its lower edge, the last one 1 as well.
     """
 
-    n_points: npt.NDArray[np.int64]
-    n_ground: npt.NDArray[np.int64]
-    sum_p: FloatArray
-    sum_squared_error: float  # of probability minus truth, 1 for ground, over all bins
+    n_points: npt.NDArray[np.int64] = field(default_factory=_no_points)
+    n_ground: npt.NDArray[np.int64] = field(default_factory=_no_points)
+    sum_p: FloatArray = field(default_factory=_no_sums)
+    sum_squared_error: float = 0.0  # of probability minus truth, 1 for ground, over all bins
 
     @property
     def n_total(self) -> int:
@@ -300,22 +319,27 @@ density of a handful of returns that happen to agree would outweigh all others."
 
 
 @dataclass(frozen=True)
-class HeightError:
+class HeightError(Sums):
     """Errors of the surface under points whose ground height is known; over no points NaN.
 
     Points without a surface do not count. The error is estimate minus truth.
     """
 
-    n_points: int
-    n_without_model: int
-    sum_error: float  # [m]
-    sum_squared_error: float  # [m^2]
-    sum_squared_deviation: float  # of the truth from its mean in the frame [m^2]
-    n_with_std: int  # points whose standard deviation is known
-    n_within_1: int  # of these the ones with an error of at most one standard deviation
-    n_within_2: int
-    sum_nlpd: float  # of these, negative logs of the predictive density, of a density per metre
-    median_absolute: float  # [m]; pooled the median over the frames
+    n_points: int = 0
+    n_without_model: int = 0
+    sum_error: float = 0.0  # [m]
+    sum_squared_error: float = 0.0  # [m^2]
+    sum_squared_deviation: float = 0.0  # of the truth from its mean in the frame [m^2]
+    n_with_std: int = 0  # points whose standard deviation is known
+    n_within_1: int = 0  # of these the ones with an error of at most one standard deviation
+    n_within_2: int = 0
+    sum_nlpd: float = 0.0  # of these, negative logs of the predictive density per metre
+    medians: tuple[float, ...] = ()  # median absolute error of each frame [m]
+
+    @property
+    def median_absolute(self) -> float:
+        """Median over the frames of the median absolute error [m]."""
+        return float(np.median(self.medians)) if self.medians else math.nan
 
     @property
     def rmse(self) -> float:
@@ -374,13 +398,5 @@ def height_error(
         n_within_1=int((np.abs(error) <= spread).sum()),
         n_within_2=int((np.abs(error) <= 2.0 * spread).sum()),
         sum_nlpd=float(nlpd[np.isfinite(spread)].sum()),
-        median_absolute=float(np.median(np.abs(error))) if len(y) else math.nan,
+        medians=(float(np.median(np.abs(error))),) if len(y) else (),
     )
-
-
-def pool_height_errors(errors: Sequence[HeightError]) -> HeightError:
-    """Sum up the errors of several frames."""
-    medians = [one.median_absolute for one in errors if one.n_points]
-    *names, _median = (field.name for field in dataclasses.fields(HeightError))
-    sums = {name: sum(getattr(one, name) for one in errors) for name in names}
-    return HeightError(**sums, median_absolute=float(np.median(medians)) if medians else math.nan)

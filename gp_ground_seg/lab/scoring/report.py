@@ -74,57 +74,53 @@ Row = list[tuple[Column, Cell]]
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of unscaled numbers and text, as many cells in each as there are columns.
+    """Rows of unscaled numbers and text; the columns of the first are those of the table.
 
     The title stands above it, notes below; `n_sums` rows at the end are set apart in `text`.
     """
 
-    columns: Sequence[Column]
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Row]
     title: str = ''
     notes: Sequence[str] = ()
     n_sums: int = 0
 
-    @classmethod
-    def of(cls, rows: Sequence[Row], **options: Any) -> Table:
-        """Make a table of at least one row."""
-        columns = [column for column, _ in rows[0]]
-        return cls(columns, [[cell for _, cell in row] for row in rows], **options)
-
     def text(self) -> str:
         """Return aligned text, columns two spaces apart."""
+        above = [fold(self.title)] if self.title else []
+        below = ['', *map(fold, self.notes)] if self.notes else []
+        return '\n'.join([*above, *self._lines(), *below])
+
+    def _lines(self) -> list[str]:
+        if not self.rows:
+            return []
         lines = self._shown()
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        marks = ['>' if column.format else '<' for column in self.columns]
+        marks = ['>' if column.format else '<' for column, _ in self.rows[0]]
         form = '  '.join(f'{{:{mark}{w}}}' for mark, w in zip(marks, widths, strict=True))
         text = [form.format(*line).rstrip() for line in lines]
         rule = '-' * (sum(widths) + 2 * (len(widths) - 1))
         if self.n_sums:
             text.insert(len(text) - self.n_sums, rule)
         text.insert(1, rule)
-        above = [fold(self.title)] if self.title else []
-        below = ['', *map(fold, self.notes)] if self.notes else []
-        return '\n'.join([*above, *text, *below])
+        return text
 
     def markdown(self) -> str:
         """Return a Markdown table, title and notes as paragraphs."""
         titles, *rows = self._shown()
-        rule = ['--:' if column.format else '---' for column in self.columns]
+        rule = ['--:' if column.format else '---' for column, _ in (self.rows or [[]])[0]]
         table = '\n'.join(f'| {" | ".join(line)} |' for line in [titles, rule, *rows])
         return '\n\n'.join([*([self.title] if self.title else []), table, *self.notes])
 
     def json(self) -> list[dict[str, Any]]:
         """Return one object per row, unscaled."""
-        keys = [column.key or column.title for column in self.columns]
-        return [dict(zip(keys, _plain(row), strict=True)) for row in self.rows]
+        return [
+            {column.key or column.title: _plain(cell) for column, cell in row} for row in self.rows
+        ]
 
     def _shown(self) -> list[list[str]]:
         """Titles and rows, every cell as it is shown."""
-        rows = [
-            [column.show(cell) for column, cell in zip(self.columns, row, strict=True)]
-            for row in self.rows
-        ]
-        return [[column.title for column in self.columns], *rows]
+        titles = [column.title for column, _ in (self.rows or [[]])[0]]
+        return [titles, *([column.show(cell) for column, cell in row] for row in self.rows)]
 
 
 def fold(line: str) -> str:

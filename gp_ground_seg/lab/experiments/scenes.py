@@ -1,0 +1,162 @@
+"""Simulated scenes beside Patchwork++: IoU and height, and objects that are called ground."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.lab.experiments.variants import SimulatedFrame, score_simulated
+from gp_ground_seg.lab.scale.cluster import HERE, Runner
+from gp_ground_seg.lab.scoring.comparison import INTERVAL, interval_text
+from gp_ground_seg.lab.scoring.evaluate import MethodScore
+from gp_ground_seg.lab.scoring.metrics import ratio
+from gp_ground_seg.lab.scoring.objects import MIN_HEIGHT, MIN_RETURNS, ObjectCount
+from gp_ground_seg.lab.scoring.report import Column, Report, Row, Table, centimetres, percent
+from gp_ground_seg.lab.scoring.tables import make_report
+from gp_ground_seg.lab.simulation import PLACES
+
+CROWDED = (*PLACES, 'urban')
+"""Scenes where objects hide the ground."""
+BANDS = {'0-10 m': slice(0, 1), '10-20 m': slice(1, 2), '> 20 m': slice(2, None)}
+"""Bands of range of the columns, as parts of `scoring.objects.BAND_TITLES`."""
+COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
+"""Classes of `scoring.objects.CLASSES` by column."""
+
+
+def score_scenes(
+    frames: Sequence[SimulatedFrame],
+    config: Config,
+    runner: Runner = HERE,
+    *,
+    with_peer: bool = True,
+) -> Report:
+    """Score simulated scans by exact labels and heights, beside Patchwork++.
+
+    Patchwork++ has its published parameters and the true height of the sensor. All sensors have
+    one set of parameters.
+    """
+    scores, refused = score_simulated(frames, config, runner, with_peer=with_peer)
+    return make_report({'scenes': scene_table(scores, refused)}, scores, config)
+
+
+def score_objects(
+    frames: Sequence[SimulatedFrame],
+    config: Config,
+    runner: Runner = HERE,
+    *,
+    with_peer: bool = True,
+) -> Report:
+    """Count vehicles, persons and cyclists of simulated scans that are called ground.
+
+    Beside Patchwork++ with its published parameters and the true height and place of the sensor.
+    All sensors have one set of parameters.
+    """
+    scores, refused = score_simulated(frames, config, runner, with_peer=with_peer)
+    tables = {'objects': lost_table(scores, refused), 'vehicles': return_table(scores)}
+    return make_report(tables, scores, config)
+
+
+def _groups(scores: Sequence[MethodScore]) -> list[tuple[str, Row, list[MethodScore]]]:
+    """Each sensor and scene: its name, the first cells of its row, ours and the peer's score."""
+    return [
+        (name, list(zip((Column('sensor'), Column('scene')), name.split(), strict=True)),
+         [score.of(name) for score in scores])
+        for name in scores[0].sequences
+    ]  # fmt: skip
+
+
+def _of_each(column: Column, values: Sequence[float | int]) -> Row:
+    """Cells of ours and of the peer, if there is one."""
+    ours = replace(column, key=column.key or column.title)
+    columns = ours, replace(ours, title=f'peer {column.title}', key=f'peer_{ours.key}')
+    return list(zip(columns[: len(values)], values, strict=True))
+
+
+def scene_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> Table:
+    """One row for each sensor and scene; a note says where the peer is ahead in IoU."""
+    rows: list[Row] = []
+    behind, ties = [], []
+    for name, row, parts in _groups(scores):
+        height = parts[0].height
+        share = ratio(height.n_without_model, height.n_points + height.n_without_model)
+        row += _of_each(percent('IoU', 'iou'), [score.iou for score in parts])
+        row += _of_each(centimetres('RMSE', 'rmse'), [score.height.rmse for score in parts])
+        medians = [score.height.median_absolute for score in parts]
+        row += _of_each(centimetres('median', 'median_absolute'), medians)
+        row.append((percent('gaps', 'share_without_model'), share))
+        if len(parts) > 1:
+            difference, interval = parts[0].iou - parts[1].iou, interval_text(parts[0], parts[1])
+            row += [(percent('ahead', 'difference', '+.2f'), difference), (INTERVAL, interval)]
+            if interval is not None and interval.endswith('tie'):
+                ties.append(name)
+            elif not difference > 0.0:
+                behind.append(name)
+        rows.append(row)
+    n_scans = len(scores[0].of(scores[0].sequences[0]).scans)
+    title = (
+        f'{n_scans} simulated scans per row; IoU against exact labels [%], every point counts; '
+        'height of the surface under true ground [cm]; gaps: share of it without a model [%]'
+    )
+    notes = [*refused]
+    if len(scores) > 1:
+        peer = scores[1].title
+        title += (
+            f'; peer: {peer}, which gets the true sensor height; its surface is the nearest patch'
+            '; 95 % interval: bootstrap over the scenes of each row; tie: it holds 0'
+        )
+        where = f'; ties on {", ".join(ties)}' if ties else ''
+        where += f'; behind on {", ".join(behind)}' if behind else ''
+        n_ahead = len(rows) - len(behind) - len(ties)
+        notes.append(f'ahead of {peer} on {n_ahead} of {len(rows)} rows{where}')
+    return Table(rows, title, notes)
+
+
+def lost_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> Table:
+    """Objects lost; ours, then the peer if there is one."""
+    rows: list[Row] = []
+    behind, lost = [], []
+    for name, row, parts in _groups(scores):
+        row += _of_each(percent('IoU', 'iou'), [score.iou for score in parts])
+        if parts[0].iou < parts[-1].iou:
+            behind.append(name)
+        for title, classes in COUNTED.items():
+            bands = [[score.objects.get(kind, ()) for kind in classes] for score in parts]
+            counts = [sum(itertools.chain(*found), ObjectCount()) for found in bands]
+            row.append((Column(title, '_d'), counts[0].n_objects))
+            row += _of_each(Column('lost', '_d', f'lost_{title}'), [c.n_lost for c in counts])
+            if counts[0].n_lost:
+                lost.append(f'{name} {counts[0].n_lost} of {counts[0].n_objects} {title}')
+        rows.append(row)
+    title = (
+        'IoU of the ground against exact labels [%]; vehicles, persons and cyclists with at least '
+        f'{MIN_RETURNS} returns from {MIN_HEIGHT:g} m above the exact ground, and how many are '
+        'lost: more than half of these returns called ground'
+    )
+    notes = [*refused, f'objects lost: {", ".join(lost) or "none"}']
+    if len(scores) > 1:
+        peer = scores[1].title
+        title += f'; peer: {peer}, which gets the true height and place of the sensor'
+        notes.append(f'IoU behind {peer}: {", ".join(behind) or "nowhere"}')
+    return Table(rows, title, notes)
+
+
+def return_table(scores: Sequence[MethodScore]) -> Table:
+    """Lay out the returns on vehicles by range; ours, then the peer if there is one."""
+    rows: list[Row] = []
+    more = []
+    for name, row, parts in _groups(scores):
+        for title, band in BANDS.items():
+            counts = [sum(s.objects.get('vehicle', ())[band], ObjectCount()) for s in parts]
+            shares = [count.share_ground for count in counts]
+            row += _of_each(percent(title), shares)
+            if shares[0] > shares[-1]:
+                more.append(f'{name} {title}')
+        rows.append(row)
+    title = (
+        f'Share of the returns on vehicles from {MIN_HEIGHT:g} m above the exact ground that is '
+        'called ground, by range [%]'
+    )
+    more_text = f'more than {scores[-1].title}: {", ".join(more) or "nowhere"}'
+    return Table(rows, title, [more_text] if len(scores) > 1 else [])
