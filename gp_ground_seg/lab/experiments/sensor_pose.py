@@ -52,6 +52,7 @@ def score_poses(items: Sequence[Any], config: Config, runner: Runner = HERE) -> 
     mounts = SIMULATED_MOUNTS if isinstance(items[0], SimulatedFrame) else MOUNTS
     trials: dict[str, list[MethodScore]] = {}
     rows: list[Row] = []
+    worsts: list[float] = []
     for height, turn in mounts:
         poses = {
             'given': (height, *map(math.radians, turn)),
@@ -65,16 +66,18 @@ def score_poses(items: Sequence[Any], config: Config, runner: Runner = HERE) -> 
         load = partial(load_mounted, (height, turn))
         name = mount_text(height, turn)
         trials[name] = score_variants(items, variants, load=load, runner=runner)
-        rows.append(_row(name, trials[name], [height] * len(items)))
+        worsts.append(_worst(trials[name]))
+        rows.append(_row(name, trials[name], [height] * len(items), worsts[-1]))
     pooled = [pool(found[0].name, found) for found in zip(*trials.values(), strict=True)]
     heights = [height for height, _ in mounts for _ in items]
     title = (
         'Ground IoU [%] with the pose given; with the height given, the sensor taken to be '
         'level; and with all estimated (auto). Change of auto against given, and the worst of a '
-        'sequence; lowest and highest error of the height [m]; how many scans were levelled, and '
-        'how many do not show their height'
+        'sequence under a mount; lowest and highest error of the height [m]; how many scans were '
+        'levelled, and how many do not show their height'
     )
-    table = Table([*rows, _row(ALL, pooled, heights)], title, _note(pooled), n_sums=1)
+    rows.append(_row(ALL, pooled, heights, min(worsts)))
+    table = Table(rows, title, _note(pooled), n_sums=1)
     scores = [
         MethodScore(f'{score.name} {name}', score.scans)
         for name, found in trials.items()
@@ -83,12 +86,17 @@ def score_poses(items: Sequence[Any], config: Config, runner: Runner = HERE) -> 
     return make_report({'poses': table}, scores, config)
 
 
-def _row(name: str, scores: Sequence[MethodScore], heights: Sequence[float]) -> Row:
+def _worst(scores: Sequence[MethodScore]) -> float:
+    """Lowest change of the IoU of a sequence by the estimate."""
+    given, _, auto = scores
+    return min(auto.of(name).iou - given.of(name).iou for name in given.sequences)
+
+
+def _row(name: str, scores: Sequence[MethodScore], heights: Sequence[float], worst: float) -> Row:
     """Row of scans with the pose given, level and estimated; `heights` are the true ones [m]."""
     given, level, auto = scores
     poses = [scan.pose for scan in auto.scans if scan.pose is not None]
     errors = [pose.height - height for pose, height in zip(poses, heights, strict=True)]
-    worst = min(auto.of(part).iou - given.of(part).iou for part in given.sequences)
     return [
         (Column('mount'), name),
         (Column('scans', 'd'), len(poses)),
