@@ -32,7 +32,7 @@ Exit code 1 if any differ, as that of diff(1).
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the command and its own commands."""
+    """Declare the command and its subcommands."""
     description = 'Show the parameters, their units and ranges.'
     parser = options.new_parser(subparsers, 'config', description, EXAMPLES)
     commands = parser.add_subparsers(metavar='WHAT', required=True)

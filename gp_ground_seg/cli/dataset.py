@@ -20,7 +20,7 @@ from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_
 from gp_ground_seg.lab.scale.cluster import Progress
 from gp_ground_seg.lab.scale.dataset import Manifest, Outcome, Scan, digest, run_blocks, sweep
 
-# What the output depends on, beside the parameters and the layout of scans.
+# Options that the output depends on, beside the parameters and the layout of scans.
 _OPTIONS = ('raw', 'topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
 
 
@@ -39,24 +39,26 @@ def list_scans(arguments: argparse.Namespace) -> list[Scan]:
     layout = options.scan_layout(arguments)
     if not _is_root(arguments.input):
         found = list_inputs(as_path(arguments.input), layout)
-        return [Scan(one.path, f'{one.name}.label', '', partial(_read, one)) for one in found]
+        return [
+            Scan(item.path, f'{item.name}.label', '', partial(_read, item)) for item in found
+        ]
     names = list_sequences(arguments.input)
     frames = [frame for name in names for frame in list_frames(arguments.input, name, layout)]
     return [
         Scan(
-            one.points_path, f'sequences/{one.sequence}/predictions/{one.index}.label',
-            one.sequence, partial(read_points, one.points_path, layout),
+            frame.points_path, f'sequences/{frame.sequence}/predictions/{frame.index}.label',
+            frame.sequence, partial(read_points, frame.points_path, layout),
         )
-        for one in frames
+        for frame in frames
     ]  # fmt: skip
 
 
-def _read(one: Input) -> Any:
-    return one.read().xyz
+def _read(item: Input) -> Any:
+    return item.read().xyz
 
 
 def list_bags(arguments: argparse.Namespace, name_of: Callable[[Path], str]) -> list[Scan]:
-    """List the bags of the input, each a sequence of its own."""
+    """List the bags of the input, each as a sequence."""
     paths = [Path(source) for source in (arguments.input, *arguments.more)]
     for path in paths:
         if not holds_bag(path):

@@ -92,7 +92,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
 
 def _complete() -> None:
-    """Tell the shell what may follow its line, and end: argcomplete asks by the environment."""
+    """Answer argcomplete, which asks by environment variables how a line may go on, and end."""
     import argcomplete
 
     words = os.environ['COMP_LINE'].split()
@@ -139,7 +139,7 @@ def _interruptible() -> Iterator[None]:
     def note(_number: int, _frame: object) -> None:
         nonlocal is_interrupted
         is_interrupted = True
-        # What it is lost in is written to stderr otherwise.
+        # Python would print the exception where it cannot be passed on.
         sys.unraisablehook = lambda _what: None
         raise KeyboardInterrupt
 

@@ -87,7 +87,7 @@ CLOUDS: tuple[tuple[str, str, dict[str, Any]], ...] = (
 def list_clouds(arguments: argparse.Namespace) -> Inputs:
     """Return the clouds of the input; DataError if ``--frame`` is none of them."""
     found = list_inputs(arguments.input, scan_layout(arguments), arguments.topic)
-    if found.topic is not None or not any(one.path.suffix == '.bin' for one in found):
+    if found.topic is not None or not any(scan.path.suffix == '.bin' for scan in found):
         refuse_scan_layout(arguments, arguments.input)
     frame = getattr(arguments, 'frame', None)
     if frame is not None and not 0 <= frame < len(found):
@@ -96,7 +96,7 @@ def list_clouds(arguments: argparse.Namespace) -> Inputs:
 
 
 def scan_layout(arguments: argparse.Namespace) -> ScanLayout:
-    """Return how scans are read; what can be no scan is refused, without ``--force``."""
+    """Return how scans are read: without ``--force`` those that can be no scan are refused."""
     doubts = 'warn' if arguments.force else 'raise'
     columns, dtype = arguments.columns or KITTI.columns, arguments.dtype or KITTI.dtype
     origin = getattr(arguments, 'origin', None)
@@ -125,10 +125,10 @@ def add_cluster(parser: argparse._ActionsContainer) -> None:
 def runner(
     arguments: argparse.Namespace, title: str, unit: str = 'frame'
 ) -> AbstractContextManager[Runner]:
-    """Return what computes blocks of frames by the options of `add_cluster`, with a bar."""
+    """Return a runner of blocks of frames by the options of `add_cluster`, with a bar."""
     workers, scheduler = arguments.workers, arguments.scheduler
     if workers and scheduler:
-        raise DataError('--workers: the cluster of --scheduler has its own, give one of the two')
+        raise DataError('--workers: the cluster of --scheduler has workers, give one of the two')
     bar = progress(title, quiet=getattr(arguments, 'quiet', False), unit=unit)
     return open_runner(workers, scheduler, bar)
 

@@ -1,1 +1,1 @@
-"""Data that scans come from: KITTI frames, bags, simulated scenes."""
+"""Clouds in and out: files of scans, data sets, bags, messages."""

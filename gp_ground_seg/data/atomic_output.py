@@ -64,9 +64,9 @@ def staged_files(folder: str | Path, names: Sequence[str], *, force: bool) -> It
     """Yield a folder to write the files `names` into; all appear in `folder` at the end.
 
     A folder that does not exist yet appears at once; into an existing one the
-    files are moved one by one, each of them whole, beside what is there. Until then they are in a
-    hidden folder of their own, the parent of what is yielded. Raises DataError if one
-    of the files exists and `force` is false, or they cannot be written.
+    files are moved one by one, each complete, beside the files that are there. Until then they
+    are in a hidden folder, the parent of the yielded one. Raises DataError if one of the files
+    exists and `force` is false, or they cannot be written.
     """
 
     def check(path: Path) -> None:

@@ -128,7 +128,7 @@ def resolve_storage(path: str | Path, wanted: str | None = None) -> str:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Raise what goes wrong while a bag is parsed as `DataError` with its path."""
+    """Raise errors of parsing a bag as `DataError` with its path."""
     try:
         yield
     except GroundSegError:
@@ -141,7 +141,7 @@ def reading(path: Path) -> Iterator[None]:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Raise what goes wrong while a bag is written, as on a full disk, as `DataError`."""
+    """Raise errors of writing a bag, as on a full disk, as `DataError` with its path."""
     try:
         yield
     except (OSError, sqlite3.Error) as error:

@@ -69,7 +69,7 @@ def _reliable_qos(durability: str) -> Any:
 
 @functools.cache
 def _parse_definition(text: str, msgtype: str) -> Any:
-    """Types of one definition (.msg or .idl text) in a store of their own, to read only."""
+    """Types of one definition (.msg or .idl text) in a separate store, only to be read."""
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.EMPTY)
@@ -221,7 +221,7 @@ class BagReader(AbstractContextManager['BagReader']):
         found: Counter[str] = Counter()
         source = iter(self._reader.messages(connections=connections) if connections else ())
         while True:
-            # The caller's own errors, raised at the yield, must not pass through here.
+            # Errors of the caller, raised at the yield, must not pass through here.
             with reading(self.path):
                 if (entry := next(source, None)) is None:
                     break

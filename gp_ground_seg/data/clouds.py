@@ -25,12 +25,12 @@ class Cloud:
     Attributes
     ----------
     fields : (N,) structured array
-        Every field of the file under its own name and in its own type; x, y, z [m] among them.
+        Every field of the file under its name and in its type; x, y, z [m] among them.
     xyz : (N, 3) or wider float32 or float64 array
-        What `GroundSegmenter.segment` takes: x, y, z [m], the sensor at the origin; of a ``.bin``
+        Points for `GroundSegmenter.segment`: x, y, z [m], the sensor at the origin; of a ``.bin``
         scan (N, 4), with the intensity.
     header : opaque
-        What the format needs to write the cloud as it was read, None if nothing.
+        Contents of the file beside the points, with which it is written again; None without.
     origin : tuple of three floats
         Place of the sensor in the coordinates of `fields` [m].
     """
@@ -98,9 +98,8 @@ def in_types(
 ) -> Fields:
     """Fields as a format can hold them, little-endian, without spaces in their names.
 
-    Bools become uint8 and half floats float32; where `flat`, each number of a field of several
-    becomes a field of its own. PointCloudError for a
-    type that is not `accepted`.
+    Bools become uint8 and half floats float32; where `flat`, a field ``a`` of several numbers
+    becomes fields ``a_0``, ``a_1``, ... Raises PointCloudError for a type that is not `accepted`.
     """
     columns = {}
     for name, values in scatter(fields).items():

@@ -30,8 +30,8 @@ MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dens
 class UrlPath:
     """A file or folder by URL: the part of `pathlib.Path` that data sets are read with.
 
-    Credentials and endpoints are those that fsspec finds, as in the environment. Raises DataError
-    with the URL for what goes wrong.
+    Credentials and endpoints are those that fsspec finds, as in the environment. Errors are
+    raised as a DataError with the URL.
     """
 
     url: str
@@ -76,7 +76,7 @@ class UrlPath:
         """Files and folders below it whose path has this form."""
         with self._open() as (system, path):
             found = system.glob(f'{path.rstrip("/")}/{pattern}')
-            return [UrlPath(system.unstrip_protocol(one)) for one in found]
+            return [UrlPath(system.unstrip_protocol(name)) for name in found]
 
     def read(self, most: int) -> tuple[bytes, int]:
         """Bytes and their number; none of them if there are more than `most`."""
@@ -94,7 +94,7 @@ class UrlPath:
 
     @contextmanager
     def _open(self) -> Iterator[tuple[Any, str]]:
-        """File system, and the path in it; what goes wrong becomes a DataError."""
+        """File system, and the path in it; errors in the block become a DataError."""
         core = require('fsspec.core', 'fsspec')
         try:
             yield core.url_to_fs(self.url, use_listings_cache=False)
@@ -143,7 +143,7 @@ def write_file(path: AnyPath, data: bytes) -> None:
         path.write_bytes(data)
         return
     try:
-        # Of that name only this one is written, should two workers compute the same.
+        # Two workers that compute the same file write under different names.
         partial = path.with_name(f'.{path.name}{PARTIAL_MARK}{uuid.uuid4().hex}')
         path.parent.mkdir(parents=True, exist_ok=True)
         try:

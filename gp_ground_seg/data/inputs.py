@@ -1,4 +1,4 @@
-"""The clouds of whatever the user has: files of any format, folders of them, data sets, bags."""
+"""Clouds of an input: a file of any format, a folder of files, a data set, a bag."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def _find_files(source: AnyPath) -> Sequence[AnyPath]:
         folder = source / name
         if files := sorted((file for file in folder.glob('*') if is_cloud_file(file)), key=str):
             return files
-    drives = sorted({str(one.parent) for pattern in _DRIVES for one in source.glob(pattern)})
+    drives = sorted({str(path.parent) for pattern in _DRIVES for path in source.glob(pattern)})
     hint = ''
     if drives:
         names = ', '.join(Path(drive).name for drive in drives)

@@ -1,7 +1,8 @@
 """PCD files of the Point Cloud Library: text, binary and compressed are read, binary written.
 
-Why not pypcd4: it reads fields of several numbers wrongly from compressed files, takes what a
-header says of sizes for granted, and cannot leave out padding. Compressed files need its codec.
+Why not pypcd4 1.5: it mixes up the numbers of a field of several in compressed files, returns
+fewer points than the header says from a file that is cut off, misreads padding, refuses headers
+without COUNT, and allocates whatever size a header names. Compressed files need the codec lzf.
 
 Source: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, pcl/io/pcd_io.cpp.
 """
@@ -24,7 +25,7 @@ _TYPES = {f'{kind}{n}' for kind in 'iu' for n in (1, 2, 4, 8)} | {'f4', 'f8'}
 
 
 class PcdHeader(NamedTuple):
-    """What a file says besides its points."""
+    """Entries of a header that are kept beside the points."""
 
     width: int = 0
     height: int = 1
@@ -55,7 +56,7 @@ def read_pcd(data: bytes) -> Cloud:
             raise PointCloudError(f'field {name}: no type {kind} of {size} bytes')
         unique = f'_ {len(types)}' if name == '_' else name
         types.append((unique, f'<{code}', () if count == 1 else (count,)))
-    kept = [one for one in types if not one[0].startswith('_ ')]
+    kept = [entry for entry in types if not entry[0].startswith('_ ')]
     form, rest = end[1], data[end.end() :]
     if form == b'binary_compressed':
         fields = _read_compressed(rest, np.dtype(kept), n_points)

@@ -75,14 +75,14 @@ def labelled_frames(
     known = list_sequences(root)
     frames, left_out = [], []
     for name in _chosen(root, sequences):
-        own = list_frames(root, name, layout)
-        bare = [frame.index for frame in own if frame.labels_path is None]
-        if sequences is None and len(bare) == len(own):
+        listed = list_frames(root, name, layout)
+        bare = [frame.index for frame in listed if frame.labels_path is None]
+        if sequences is None and len(bare) == len(listed):
             left_out.append(name)
             continue
         if bare:
             raise DataError(f'{root}: frames of sequence {name} have no labels, as {bare[0]}')
-        frames += own
+        frames += listed
     if not frames:
         raise DataError(f'{root}: no sequence has labels, of {", ".join(known)}')
     if left_out:
