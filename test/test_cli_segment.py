@@ -30,6 +30,7 @@ SUMMARY = re.compile(
 
 
 segment = functools.partial(run, 'segment')
+slow = functools.partial(pytest.param, marks=pytest.mark.slow)
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -405,8 +406,8 @@ def test_a_scan_without_ground_is_named_on_stderr_and_never_a_silent_zero(tmp_pa
 def long_inputs(tmp_path_factory):
     """Inputs that take a few seconds."""
     folder = tmp_path_factory.mktemp('long')
-    samples.write_ros2_bag(folder / 'long.mcap', n_clouds=150, n_ground=30_000, n_wall=5000)
-    write_scans(folder / 'velodyne', 100, n_ground=30_000, n_wall=5000)
+    samples.write_ros2_bag(folder / 'long.mcap', n_clouds=60, n_ground=30_000, n_wall=5000)
+    write_scans(folder / 'velodyne', 60, n_ground=30_000, n_wall=5000)
     return folder
 
 
@@ -428,7 +429,8 @@ def stop_in_the_middle(tmp_path, source, out, how, *words):
 
 
 @pytest.mark.parametrize(
-    ('source', 'out'), [('long.mcap', 'out'), ('long.mcap', 'out.mcap'), ('velodyne', 'labels')]
+    ('source', 'out'),
+    [slow('long.mcap', 'out'), slow('long.mcap', 'out.mcap'), ('velodyne', 'labels')],
 )
 def test_a_killed_run_leaves_nothing_under_the_final_name(
     tmp_path, capsys, long_inputs, source, out
@@ -445,7 +447,7 @@ def test_a_killed_run_leaves_nothing_under_the_final_name(
     assert f'{left} is the unfinished output of another run' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(('how', 'code'), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(('how', 'code'), [slow(signal.SIGKILL, -9), (signal.SIGINT, 130)])
 def test_a_stopped_run_with_force_leaves_the_old_bag(tmp_path, long_inputs, how, code):
     before = samples.write_ros2_bag(tmp_path / 'out')
     source = long_inputs / 'long.mcap'
@@ -458,7 +460,7 @@ def test_a_stopped_run_with_force_leaves_the_old_bag(tmp_path, long_inputs, how,
 
 @pytest.mark.parametrize(
     ('source', 'out'),
-    [('long.mcap', 'out.mcap'), ('long.mcap', 'out.db3'), ('velodyne', 'labels')],
+    [slow('long.mcap', 'out.mcap'), slow('long.mcap', 'out.db3'), ('velodyne', 'labels')],
 )
 def test_a_full_disk_is_one_line(tmp_path, long_inputs, source, out):
     def limit_file_size():

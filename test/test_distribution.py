@@ -59,6 +59,7 @@ def installed(built):
     return target
 
 
+@pytest.mark.slow
 def test_the_files_of_both(built):
     (wheel,) = built.glob('*.whl')
     assert wheel.name == f'gp_ground_seg-{VERSION}-py3-none-any.whl'
@@ -77,6 +78,7 @@ def test_the_files_of_both(built):
     assert {f'{share}/{name}' for name in (*SHARED, 'package.xml')} <= names
 
 
+@pytest.mark.slow
 def test_what_pypi_would_object_to(built):
     pytest.importorskip('twine', reason='twine is not installed')
     files = [*built.glob('*.whl'), *built.glob('*.tar.gz')]
@@ -85,6 +87,7 @@ def test_what_pypi_would_object_to(built):
     assert done.stdout.count('PASSED') == 2
 
 
+@pytest.mark.slow
 def test_the_wheel_segments_a_scan(installed, tmp_path):
     words = '-m', 'gp_ground_seg', 'plot', 'scan', '--simulate', 'flat', '-o', 'scan.png'
     found = {'PYTHONPATH': str(installed), 'NUMBA_DISABLE_JIT': '1'}
@@ -117,6 +120,7 @@ def test_the_script_for_a_workspace_refuses_in_one_line(tmp_path, words, complai
     assert [path.name for path in tmp_path.rglob('*')] == ['src']
 
 
+@pytest.mark.slow
 def test_the_node_of_the_wheel_starts(installed, tmp_path):
     """With the transport for large clouds, which is a file beside it."""
     ros = pytest.importorskip('ros_helpers')

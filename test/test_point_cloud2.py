@@ -71,7 +71,7 @@ def all_points(layout, raw):
     return [raw[start : start + layout.point_step] for start in starts]
 
 
-@settings(max_examples=400)
+@settings(max_examples=100)
 @given(layouts(), st.randoms(use_true_random=False))
 def test_coordinates_and_selections_agree_with_struct(case, random):
     layout, raw = case
@@ -259,7 +259,7 @@ def test_cloud_from_columns_is_packed_and_typed():
     assert point_cloud2.cloud_from_columns((0, 0), '', {}).width == 0
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(st.integers(0, 400), st.binary(max_size=8))
 def test_bytes_that_are_no_cloud_are_refused_or_read(length, junk):
     damaged = encode_cloud(samples.cloud(0, n_ground=5, n_wall=1))[:length] + junk

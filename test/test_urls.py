@@ -127,23 +127,16 @@ def test_an_evaluation_by_url(url, root, capsys):
         ('s3://drives/cut', {}, 's3://drives/cut/000000.bin: 1001 bytes is not a whole number'),
     ],
 )
-@pytest.mark.parametrize('command', ['segment', 'evaluate'])
-def test_faults_take_one_line(
-    command, source, environment, problem, url, store, root, monkeypatch, capsys
-):
-    if source.endswith('cut'):
-        if command == 'evaluate':
-            pytest.skip('needs labels')
-        data = (root / 'sequences/00/velodyne/000000.bin').read_bytes()
-        store.pipe_file('drives/cut/000000.bin', data[:1001])
+def test_faults_take_one_line(source, environment, problem, url, store, root, monkeypatch, capsys):
+    data = (root / 'sequences/00/velodyne/000000.bin').read_bytes()
+    store.pipe_file('drives/cut/000000.bin', data[:1001])
     for name, value in environment.items():
         if value is None:
             monkeypatch.delenv(f'AWS_{name}')
         else:
             monkeypatch.setenv(f'AWS_{name}', value)
     s3fs.S3FileSystem.clear_instance_cache()
-    where = ['-o', 's3://drives/faults', '--force'] if command == 'segment' else []
-    assert run(command, source, *where) == 2
+    assert run('segment', source, '-o', 's3://drives/faults', '--force') == 2
     assert problem in error_line(capsys)
 
 
@@ -168,6 +161,7 @@ def test_output_to_a_bucket_that_is_not_there(url, capsys):
     assert 's3://nowhere/out' in error_line(capsys)
 
 
+@pytest.mark.slow
 def test_a_server_that_dies_meanwhile(store, root, monkeypatch, capsys):
     port = free_port()
     other = serve(port)

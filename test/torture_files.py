@@ -16,6 +16,8 @@ from bag_samples import scan, write_ros1_bag, write_ros2_bag
 from torture_cases import run_cases
 
 from gp_ground_seg.cli import main as cli
+from gp_ground_seg.data.cloud_files import WRITABLE, encode_file
+from gp_ground_seg.data.clouds import cloud_of, name_columns
 
 SLOWEST = 30.0
 """Time that a command may take [s]."""
@@ -92,6 +94,11 @@ def make_samples(folder):
     }
     for name in ('drive.mcap', 'drive.db3', 'drive.bag'):
         samples[name] = (folder / name, ['segment', folder / name, *out])
+    cloud = cloud_of(name_columns(points))
+    for suffix in WRITABLE:
+        path = folder / f'cloud{suffix}'
+        path.write_bytes(encode_file(path, cloud, {}))
+        samples[path.name] = (path, ['segment', path, '-o', folder / 'out.npz'])
     for path in sorted((folder / 'drive').iterdir()):
         samples[f'drive/{path.name}'] = (path, ['segment', folder / 'drive', *out])
     return samples
@@ -103,7 +110,7 @@ def run_case(number, samples, folder):
     name = list(samples)[number % len(samples)]
     path, words = samples[name]
     whole = path.read_bytes()
-    out = folder / 'out.mcap'
+    outputs = [folder / 'out.mcap', folder / 'out.npz']
     try:
         path.write_bytes(damage(whole, rng, path.suffix == '.yaml'))
         said, errors, started = io.StringIO(), io.StringIO(), time.monotonic()
@@ -119,11 +126,11 @@ def run_case(number, samples, folder):
         n_lines = sum(mark in line for line in errors.getvalue().splitlines())
         if code not in (0, 2) or (code == 2 and not (n_lines == 1 or words[1] == 'check')):
             return f'{name}: exit code {code}, {errors.getvalue()[-200:]!r}'
-        if code == 2 and out.exists():
+        if code == 2 and any(out.exists() for out in outputs):
             return f'{name}: something was written'
         if time.monotonic() - started > SLOWEST:
             return f'{name}: took {time.monotonic() - started:.0f} s'
-        left = [p.name for p in folder.iterdir() if 'out' in p.name and p != out]
+        left = [p.name for p in folder.iterdir() if 'out' in p.name and p not in outputs]
         return f'{name}: left {left}' if left else None
     finally:
         path.write_bytes(whole)

@@ -39,9 +39,7 @@ def list_scans(arguments: argparse.Namespace) -> list[Scan]:
     layout = options.scan_layout(arguments)
     if not _is_root(arguments.input):
         found = list_inputs(as_path(arguments.input), layout)
-        return [
-            Scan(item.path, f'{item.name}.label', '', partial(_read, item)) for item in found
-        ]
+        return [Scan(item.path, f'{item.name}.label', '', partial(_read, item)) for item in found]
     names = list_sequences(arguments.input)
     frames = [frame for name in names for frame in list_frames(arguments.input, name, layout)]
     return [
