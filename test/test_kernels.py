@@ -10,10 +10,9 @@ from gp_ground_seg.core.gp.linalg import SEGMENTS_PER_BATCH, Padded, batches
 
 
 def kernels(r_a, l_a, r_b, l_b, sigma_f):
-    """Of one segment by `gp.kernels`, and by the reference."""
-    batched = (a[None] for a in (r_a, l_a, r_b, l_b))
-    expected = reference.paciorek(r_a, l_a, r_b, l_b, sigma_f)
-    return paciorek(*batched, np.array([sigma_f]))[0], expected
+    """Of `gp.kernels`, and of the reference."""
+    found = paciorek(r_a[:, None], l_a[:, None], r_b, l_b, sigma_f**2)
+    return found, reference.paciorek(r_a, l_a, r_b, l_b, sigma_f)
 
 
 def random_inputs(seed, n):
@@ -32,9 +31,9 @@ def test_kernel_contract(seed, n, sigma_f):
     # A constant length-scale gives the squared exponential.
     same = np.full(n, 4.0)
     stationary = sigma_f**2 * np.exp(-((r[:, None] - r) ** 2) / (2 * 4.0**2))
-    batched = squared_exponential(r[None], r[None], np.array([sigma_f]), np.full(1, 4.0))[0]
-    alone = reference.squared_exponential(r, r, sigma_f, 4.0)
-    for k in (*kernels(r, same, r, same, sigma_f), batched, alone):
+    ours = squared_exponential(r[:, None], r, sigma_f**2, 0.5 / 4.0**2)
+    plain = reference.squared_exponential(r, r, sigma_f, 4.0)
+    for k in (*kernels(r, same, r, same, sigma_f), ours, plain):
         np.testing.assert_allclose(k, stationary, rtol=1e-12, atol=1e-15)
 
 

@@ -26,7 +26,7 @@ CORE = {
     'errors': set(),
     'jit': set(),
     'log': set(),
-    'frame': {'errors'},
+    'frame': {'errors', 'jit'},
     'parameters': VALUES,
     'pipeline': VALUES | {'parameters'},
     'gp': VALUES | {'parameters', 'pipeline'},

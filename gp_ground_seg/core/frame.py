@@ -7,10 +7,12 @@ values and `offsets`: those of segment m are ``offsets[m]:offsets[m + 1]``.
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from gp_ground_seg.core.jit import shared
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -18,6 +20,8 @@ CellArray = npt.NDArray[np.int32]
 BoolArray = npt.NDArray[np.bool_]
 PointArray = npt.NDArray[np.floating]
 """Coordinates, in single or double precision."""
+Values = Any
+"""What a shared formula takes and returns: arrays in numpy code, numbers in compiled code."""
 
 OUTSIDE = -1
 """Bin, cell and tile of a point that is beyond the grid."""
@@ -244,8 +248,15 @@ def linear_pieces(knots: FloatArray, table: FloatArray) -> tuple[FloatArray, Flo
 
     `knots` (K,) are ranges [m], `table` (M, K) the values there, linear between them.
     """
-    slope = np.diff(table, axis=1) / np.diff(knots)
-    return (table[:, :-1] - slope * knots[:-1]).ravel(), slope.ravel()
+    level, slope = line_between(knots[:-1], knots[1:], table[:, :-1], table[:, 1:])
+    return level.ravel(), slope.ravel()
+
+
+@shared
+def line_between(r_a: Values, r_b: Values, a: Values, b: Values) -> tuple[Values, Values]:
+    """Value at range 0, and slope, of the line with value `a` at range `r_a` and `b` at `r_b`."""
+    slope = (b - a) / (r_b - r_a)
+    return a - slope * r_a, slope
 
 
 class Labelled(NamedTuple):

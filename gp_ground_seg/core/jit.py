@@ -52,6 +52,11 @@ def shared(function: _Function) -> _Function:
     return function
 
 
+def choose(condition: Any, a: Any, b: Any) -> Any:
+    """Return `a` where the condition holds, else `b`; of numbers in compiled code."""
+    return np.where(condition, a, b)
+
+
 def compiled_form(plain: Callable[..., Any], *, fastmath: bool = False) -> _Decorator:
     """Return a decorator for what runs in compiled code where it calls `plain`.
 
@@ -76,7 +81,7 @@ def _options(fastmath: bool) -> dict[str, Any]:
     return options
 
 
-def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
+def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _Decorator:
     """Return a decorator that compiles a function where numba is installed.
 
     Compiled functions release the interpreter's lock.
@@ -92,6 +97,9 @@ def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
         Whether it is called from Python: its code, with all that it calls, is kept on disk. It
         returns numbers, or nothing: numba runs Python to return arrays and named tuples, where
         Ctrl-C ends in a SystemError or a crash.
+    part : bool
+        Whether it is called in one place, as a part of a long kernel: compiled there, and not by
+        itself first, which takes twice as long.
     """
 
     def decorate(function: _Function) -> _Function:
@@ -103,9 +111,11 @@ def jit(*, fastmath: bool = False, entry: bool = False) -> _Decorator:
             plain = _shared.pop()
             compiled_form(plain)(plain)
         options = _options(fastmath)
+        if part:
+            options['inline'] = 'always'
         if not entry:
-            part: _Function = numba.njit(**options)(function)
-            return part
+            inner: _Function = numba.njit(**options)(function)
+            return inner
         compiled: _Function = _njit_kept(function, options)
         _entry_points.append(compiled)
         return compiled

@@ -41,7 +41,7 @@ from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.labels import square_units
+from gp_ground_seg.core.pipeline.labels import depth_of_ground, square_units
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.tilt import Direction
@@ -130,7 +130,7 @@ class NumbaBackend:
         tile_to_row, row_to_tile = take('tile_rows', (2, n_tiles), np.int32)
         n_tall = faces_.select_tall(scan.tiles, heights, tile_to_row, row_to_tile)
         sums = take('face_sums', (n_parts, 2 * n_tall, faces_.N_COLUMNS), np.float64)
-        room = faces_.FaceSums(tile_to_row, row_to_tile, sums)
+        buffers = faces_.FaceSums(tile_to_row, row_to_tile, sums)
         self.workers.run(
             faces_.sum_returns,
             n_parts,
@@ -139,10 +139,10 @@ class NumbaBackend:
             thresholds.cell_size,
             heights,
             n_tall,
-            room,
+            buffers,
         )
         result = Faces(*take('faces', (2, n_tiles), np.bool_))
-        faces_.decide_faces(n_parts, n_tall, thresholds, heights, room, result)
+        faces_.decide_faces(n_parts, n_tall, thresholds, heights, buffers, result)
         return result
 
     def extract_lines(
@@ -178,68 +178,61 @@ class NumbaBackend:
         self, frame: Frame, theta: FloatArray, config: Config
     ) -> tuple[GroundSurface, FloatArray, FloatArray]:
         """Inliers, the surface, and log length-scales at the knots and at the candidates."""
-        take, observation = self._buffers.take, numbers_of(config.observation)
-        growth = numbers_of(config.growth)
-        shape, n_candidates = (len(theta), len(frame.knots)), len(frame.candidates.r)
-        is_latent = config.length_scale.model == 'latent'
-        if is_latent:
-            u, knot_u = take('u', (n_candidates,), np.float64), np.empty(shape)
-        else:
-            u, knot_u = given_log_length_scales(frame, config.length_scale)
-        own = ground.SegmentSurfaces(
+        take, knots, slope_std = self._buffers.take, frame.knots, config.observation.slope_std
+        observation, growth = numbers_of(config.observation), numbers_of(config.growth)
+        shape, n_candidates = (len(theta), len(knots)), len(frame.candidates.r)
+        u, knot_u = self._log_length_scales(frame, theta, config)
+        alone = ground.SegmentSurfaces(
             u,
             knot_u,
             take('seed', (n_candidates,), np.bool_),
             np.empty(n_candidates, np.bool_),
             *take('surfaces', (2, *shape), np.float64),
         )
-        slope_std, knots = observation.slope_std, frame.knots
         looks_aside = looks_aside_in(frame, config)
         max_slope = growth.max_standardised_residual * slope_std if looks_aside else -1.0
-        room, aside = take('aside', (2, 2, *shape), np.float64)
-        nothing = aside[:, :0]
-        evidence.find_seeds(frame, theta, growth, max_slope, room[0], own.seed)
+        shown, beside = take('aside', (2, 2, *shape), np.float64)
+        evidence.find_seeds(frame, theta, growth, max_slope, shown[0], alone.seed)
 
         def grow(aside: FloatArray, step: int) -> None:
-            self.workers.run(
-                ground.grow_surfaces,
-                self.n_threads,
-                frame,
-                theta,
-                observation,
-                growth,
-                aside,
-                step,
-                own,
-            )
+            grow_surfaces = ground.grow_surfaces, self.n_threads, frame, theta, observation
+            self.workers.run(*grow_surfaces, growth, aside, step, alone)
 
-        if is_latent:
-            self.workers.run(
-                latent_.latent_log_length_scales, self.n_threads, frame, theta, u, knot_u
-            )
+        def find_evidence() -> None:
+            evidence.find_evidence(alone.mean, alone.std, theta, knots, slope_std, shown, beside)
+
+        aside = beside if looks_aside else beside[:, :0]
         if looks_aside:
-            own.mean.fill(np.nan)
-            own.std.fill(np.nan)
-            grow(nothing, STEP)
-            evidence.find_evidence(own.mean, own.std, theta, knots, slope_std, room, aside)
-        grow(aside if looks_aside else nothing, 1)
+            alone.mean.fill(np.nan)
+            alone.std.fill(np.nan)
+            grow(beside[:, :0], STEP)
+            find_evidence()
+        grow(aside, 1)
+        if looks_aside:
+            find_evidence()
         mean, std = np.empty((2, *shape))
-        if looks_aside:
-            evidence.find_evidence(own.mean, own.std, theta, knots, slope_std, room, aside)
-        shown = aside if looks_aside else nothing
-        evidence.combine(own, shown, theta, knots, slope_std, frame.prior_mean, mean, std)
-        return GroundSurface(knots, mean, std, own.inlier), knot_u, u
+        evidence.combine(alone, aside, theta, knots, slope_std, frame.prior_mean, mean, std)
+        return GroundSurface(knots, mean, std, alone.inlier), knot_u, u
+
+    def _log_length_scales(
+        self, frame: Frame, theta: FloatArray, config: Config
+    ) -> tuple[FloatArray, FloatArray]:
+        """Log length-scales at the candidates and at the knots."""
+        if config.length_scale.model != 'latent':
+            return given_log_length_scales(frame, config.length_scale)
+        u = self._buffers.take('u', (len(frame.candidates.r),), np.float64)
+        knot_u = np.empty((len(theta), len(frame.knots)))
+        self.workers.run(latent_.latent_log_length_scales, self.n_threads, frame, theta, u, knot_u)
+        return u, knot_u
 
     def label_points(
         self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
     ) -> Labelled:
         """Height, label and margin of each point; roughness of each cell."""
         take, label = self._buffers.take, numbers_of(config.label)
-        is_predictive = config.label.rule == 'predictive'
-        max_depth = label.obstacle_max_height if is_predictive else label.ground_tolerance
         n_points, n_bins = len(scan.xyz), scan.grid.n_bins
         n_cells, n_parts = scan.grid.n_segments * n_bins, self.workers.n_parts(n_points)
-        room = labels.LabelRoom(
+        buffers = labels.LabelBuffers(
             take('pieces', (n_cells + 1, 2), np.float64),
             take('square_sums', (n_parts, n_cells + 1, 2), np.int64),
             take('band', (n_cells + 1,), np.float64),
@@ -251,19 +244,20 @@ class NumbaBackend:
             np.empty(n_points),
             np.empty((scan.grid.n_segments, n_bins)),
         )
-        labels.fit_pieces(surface, room)
-        self.workers.run(labels.survey, n_parts, scan, faces.is_face, label, result.height, room)
-        labels.set_bands(
-            n_parts, label, is_predictive, config.observation.sigma_n, room, result.roughness
+        labels.fit_pieces(surface, buffers)
+        self.workers.run(
+            labels.survey, n_parts, scan, faces.is_face, label, result.height, buffers
         )
+        is_predictive, sigma_n = config.label.rule == 'predictive', config.observation.sigma_n
+        labels.set_bands(n_parts, label, is_predictive, sigma_n, buffers, result.roughness)
         self.workers.run(
             labels.label_part,
             n_parts,
             scan,
             faces,
             label.ground_tolerance,
-            max_depth,
-            room.band,
+            depth_of_ground(config.label),
+            buffers.band,
             result,
         )
         keep_code()

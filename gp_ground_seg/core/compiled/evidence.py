@@ -8,7 +8,13 @@ import numpy as np
 
 from gp_ground_seg.core.compiled.ground import SegmentSurfaces
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame
-from gp_ground_seg.core.gp.evidence import LEAST_PRECISION, LEAST_STD
+from gp_ground_seg.core.gp.evidence import (
+    combined_surface,
+    is_low_and_near,
+    shown_by,
+    stands_on,
+)
+from gp_ground_seg.core.gp.kernels import prior_variance
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig
 
@@ -31,7 +37,7 @@ def find_seeds(
     n_bins = 0
     for i in range(len(seed)):
         z = candidates.z[i] - frame.prior_mean
-        seed[i] = candidates.r[i] <= growth.seed_range and abs(z) <= growth.seed_height_tolerance
+        seed[i] = is_low_and_near(candidates.r[i], z, growth)
         if seed[i]:
             n_bins = max(n_bins, candidates.bin[i] + 1)
     if max_slope < 0.0 or n_bins == 0:
@@ -52,33 +58,31 @@ def find_seeds(
     for m in range(2 * n_segments - 2, -1, -1):
         rise_from(table[m % n_segments], table[(m + 1) % n_segments], rise)
     rise_along(table, n_bins, max_slope, knots)
-    limit = growth.max_standardised_residual
     for m in range(n_segments):
-        noise = limit * math.sqrt(2.0) * math.exp(theta[m, 1])
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if seed[i]:
                 z = candidates.z[i] - frame.prior_mean
-                seed[i] = z <= table[m, candidates.bin[i]] + noise
+                seed[i] = not stands_on(z, table[m, candidates.bin[i]], theta[m, 1], growth)
 
 
 @jit()
-def rise_from(own: FloatArray, other: FloatArray, rise: FloatArray) -> None:
+def rise_from(row: FloatArray, other: FloatArray, rise: FloatArray) -> None:
     """Let the ground rise from one segment to the next."""
     # Unsigned, as a signed index could count from the end.
     for j in range(np.uintp(0), np.uintp(len(rise))):
         highest = other[j] + rise[j]
-        own[j] = highest if highest < own[j] else own[j]
+        row[j] = highest if highest < row[j] else row[j]
 
 
 @jit()
 def rise_along(table: FloatArray, n_bins: int, max_slope: float, knots: FloatArray) -> None:
     """Let the ground rise outwards, then inwards."""
     for m in range(len(table)):
-        own = table[m]
+        row = table[m]
         for j in range(1, n_bins):
-            own[j] = min(own[j], own[j - 1] + max_slope * (knots[j] - knots[j - 1]))
+            row[j] = min(row[j], row[j - 1] + max_slope * (knots[j] - knots[j - 1]))
         for j in range(n_bins - 2, -1, -1):
-            own[j] = min(own[j], own[j + 1] + max_slope * (knots[j + 1] - knots[j]))
+            row[j] = min(row[j], row[j + 1] + max_slope * (knots[j + 1] - knots[j]))
 
 
 @jit(entry=True)
@@ -103,22 +107,16 @@ def find_evidence(
         rise[j] = slope_std * 2.0 * math.pi / n_segments * knots[j]
     for m in range(n_segments):
         sill = math.exp(theta[m, 0]) ** 2
-        own_mean, std_m, height, own_std = mean[m], std[m], shown[0, m], shown[1, m]
+        mean_m, std_m, height, deviation = mean[m], std[m], shown[0, m], shown[1, m]
         for j in range(start, end):
-            square = std_m[j] * std_m[j]
-            square = square if square > LEAST_STD**2 else LEAST_STD**2
-            precision = 1.0 / square - 1.0 / (sill + slope_std**2 * knots[j] * knots[j])
-            # False where there is no surface, too.
-            is_known = precision > LEAST_PRECISION and std_m[j] >= 0.0
-            safe = precision if is_known else 1.0
-            height[j] = own_mean[j] / (square * safe) if is_known else 0.0
-            own_std[j] = 1.0 / math.sqrt(safe) if is_known else np.inf
+            prior = prior_variance(sill, slope_std, knots[j])
+            height[j], deviation[j] = shown_by(mean_m[j], std_m[j], prior)
     aside[:] = 0.0
     for side in range(2):
         nearest[:], nearest_std[:] = 0.0, np.inf
         for k in range(2 * n_segments):
             m = k % n_segments if side == 0 else n_segments - 1 - k % n_segments
-            height, own_std = shown[0, m], shown[1, m]
+            height, deviation = shown[0, m], shown[1, m]
             weighted, total = aside[0, m], aside[1, m]
             # The first time around finds what the second begins with.
             if k >= n_segments:
@@ -129,9 +127,9 @@ def find_evidence(
                     weighted[j] += weight * nearest[j]
             for j in range(start, end):
                 carried = nearest_std[j] + rise[j]
-                is_own = own_std[j] <= carried
-                nearest[j] = height[j] if is_own else nearest[j]
-                nearest_std[j] = own_std[j] if is_own else carried
+                is_better = deviation[j] <= carried
+                nearest[j] = height[j] if is_better else nearest[j]
+                nearest_std[j] = deviation[j] if is_better else carried
     for m in range(n_segments):
         weighted, total = aside[0, m], aside[1, m]
         for j in range(start, end):
@@ -140,7 +138,7 @@ def find_evidence(
 
 @jit(entry=True)
 def combine(
-    own: SegmentSurfaces,
+    alone: SegmentSurfaces,
     aside: FloatArray,
     theta: FloatArray,
     knots: FloatArray,
@@ -149,26 +147,20 @@ def combine(
     mean: FloatArray,
     std: FloatArray,
 ) -> None:
-    """Do what `combined_surface` of the twin does, into `mean` and `std`, about no prior mean.
+    """Set `mean` and `std` to the surface of each segment and the evidence together.
 
     `aside` (2, M, K) is the evidence, (2, 0, 0) if none is wanted.
     """
     for m in range(len(mean)):
-        for j in range(len(knots)):
-            mean[m, j] = own.mean[m, j] + prior_mean
-            std[m, j] = own.std[m, j]
-        if aside.shape[1] == 0:
-            continue
         sill = math.exp(theta[m, 0]) ** 2
-        height, precision = aside[0, m], aside[1, m]
         for j in range(len(knots)):
-            if math.isnan(own.knot_log_length_scale[m, j]):
-                break
-            variance, own_height = sill + slope_std**2 * knots[j] ** 2, 0.0
-            if not math.isnan(own.std[m, j]):
-                variance, own_height = max(own.std[m, j], LEAST_STD) ** 2, own.mean[m, j]
-            elif precision[j] == 0.0:
-                continue
-            own_share = 1.0 / (1.0 + variance * precision[j])
-            mean[m, j] = own_share * own_height + (1.0 - own_share) * height[j] + prior_mean
-            std[m, j] = math.sqrt(own_share * variance)
+            mean[m, j], std[m, j] = alone.mean[m, j], alone.std[m, j]
+            if aside.shape[1] > 0 and not math.isnan(alone.knot_log_length_scale[m, j]):
+                mean[m, j], std[m, j] = combined_surface(
+                    mean[m, j],
+                    std[m, j],
+                    prior_variance(sill, slope_std, knots[j]),
+                    aside[0, m, j],
+                    aside[1, m, j],
+                )
+            mean[m, j] += prior_mean

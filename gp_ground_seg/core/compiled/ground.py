@@ -13,9 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.numerics import LANES, exp_neg
+from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.compiled.threads import Part
-from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame
+from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
+from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
+from gp_ground_seg.core.gp.ground import fits
+from gp_ground_seg.core.gp.kernels import exp_neg, paciorek
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
 
@@ -46,6 +49,39 @@ class SegmentSurfaces(NamedTuple):
     std: FloatArray
 
 
+class _Columns(NamedTuple):
+    """State of the candidates of a segment, and of the knots behind them; one column each.
+
+    Attributes
+    ----------
+    r, length_scale : (size,) float64
+        Ranges and length-scales [m].
+    height, variance : (size,) float64
+        Prediction about the prior mean [m], and its variance [m^2].
+    z : (size,) float64
+        Heights of the candidates about the prior mean [m].
+    aside_height, aside_precision : (size,) float64
+        Evidence at the candidates.
+    above : (n,) bool
+        Candidates that the evidence contradicts.
+    new : (n,) int64
+        Candidates that join in this round.
+    whitened : (n, size) float64
+        One row for each inlier.
+    """
+
+    r: FloatArray
+    length_scale: FloatArray
+    height: FloatArray
+    variance: FloatArray
+    z: FloatArray
+    aside_height: FloatArray
+    aside_precision: FloatArray
+    above: BoolArray
+    new: IntArray
+    whitened: FloatArray
+
+
 @jit(entry=True)
 def grow_surfaces(
     part: Part,
@@ -55,165 +91,206 @@ def grow_surfaces(
     growth: GrowthConfig,
     aside: FloatArray,
     step: int,
-    own: SegmentSurfaces,
+    alone: SegmentSurfaces,
 ) -> None:
-    """Inliers and surface of one of `step` segments of a part, into `own`.
+    """Inliers and surface of one of `step` segments of a part, into `alone`.
 
     `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none.
     """
-    candidates, knots = frame.candidates, frame.knots
-    offsets, r = candidates.offsets, candidates.r
-    inlier, mean, std = own.inlier, own.mean, own.std
-    looks_aside = aside.shape[1] > 0
+    offsets, mean, std = frame.candidates.offsets, alone.mean, alone.std
     most = 0
     for m in range(part.number * step, len(mean), part.n_parts * step):
         most = max(most, offsets[m + 1] - offsets[m])
-    room = (most + len(knots) + LANES - 1) & -LANES
-    columns, whitened = np.empty((8, room)), np.empty((most, room))
+    width = (most + len(frame.knots) + LANES - 1) & -LANES
+    table = np.empty((7, width))
     # One by one, so that the compiler knows them to be contiguous.
-    all_r, all_l, square = columns[0], columns[1], columns[2]
-    predicted, variance, observed = columns[3], columns[4], columns[5]
-    aside_height, aside_precision = columns[6], columns[7]
-    above = np.zeros(most, np.bool_)
-    new = np.empty(most, np.int64)
+    columns = _Columns(
+        table[0],
+        table[1],
+        table[2],
+        table[3],
+        table[4],
+        table[5],
+        table[6],
+        np.zeros(most, np.bool_),
+        np.empty(most, np.int64),
+        np.empty((most, width)),
+    )
     slope = observation.slope_std**2
     for m in range(part.number * step, len(mean), part.n_parts * step):
-        first = offsets[m]
-        n = offsets[m + 1] - first
-        sigma_n = math.exp(theta[m, 1])
-        sill, noise = math.exp(theta[m, 0]) ** 2, sigma_n**2
-        for j in range(len(knots)):
+        sill, noise = math.exp(theta[m, 0]) ** 2, math.exp(theta[m, 1]) ** 2
+        for j in range(len(frame.knots)):
             mean[m, j] = std[m, j] = np.nan
-        n_new, has_aside = 0, False
-        for i in range(n):
-            observed[i] = candidates.z[first + i] - frame.prior_mean
-            if not looks_aside:
-                aside_height[i] = aside_precision[i] = 0.0
-                continue
-            j = candidates.bin[first + i]
-            share = (r[first + i] - knots[j]) / (knots[j + 1] - knots[j])
-            share = min(max(share, 0.0), 1.0)
-            height, precision = aside[0, m], aside[1, m]
-            aside_height[i] = height[j] + share * (height[j + 1] - height[j])
-            weight = precision[j] + share * (precision[j + 1] - precision[j])
-            aside_precision[i] = weight
-            has_aside |= weight > 0.0
-            spread = math.sqrt(1.0 / weight + noise)
-            residual = observed[i] - aside_height[i]
-            above[i] = weight > 0.0 and residual > growth.max_standardised_residual * spread
-        for i in range(n):
-            inlier[first + i] = False
-            if own.seed[first + i] and not above[i]:
-                new[n_new] = i
-                n_new += 1
+        n, n_new, has_aside = _begin(frame, m, noise, growth, aside, alone, columns)
         if n_new == 0 and not has_aside:
             continue
         n_knots = 0
-        while n_knots < len(knots) and not math.isnan(own.knot_log_length_scale[m, n_knots]):
+        knot_u = alone.knot_log_length_scale[m]
+        while n_knots < len(knot_u) and not math.isnan(knot_u[n_knots]):
             n_knots += 1
         size = (n + n_knots + LANES - 1) & -LANES
-        # Element by element: assigned slices take as long, and seconds to compile.
-        for i in range(n):
-            all_r[i], all_l[i] = r[first + i], own.log_length_scale[first + i]
-        for j in range(n_knots):
-            all_r[n + j], all_l[n + j] = knots[j], own.knot_log_length_scale[m, j]
-        for j in range(n + n_knots, size):
-            all_r[j] = all_l[j] = 0.0
-        for j in range(size):
-            all_l[j] = exp_neg(-all_l[j])
-            square[j] = all_l[j] * all_l[j]
-            predicted[j] = 0.0
-            variance[j] = sill + slope * all_r[j] * all_r[j]
-        n_inliers = done = 0
-        # Unsigned, as a signed index could count from the end.
-        end = np.uintp(size)
-        while True:
-            for a in range(n_new):
-                i = new[a]
-                inlier[first + i] = True
-                while done < n and inlier[first + done]:
-                    done += 1
-                # The columns before are not needed any more.
-                near = np.uintp(min(i, done) & -LANES)
-                row = whitened[n_inliers]
-                own_r, own_l, own_square = all_r[i], 2.0 * all_l[i], square[i]
-                # Prior covariance of column i with the columns from `near` on (paper, eq. 8).
-                for j in range(near, end):
-                    inverse = 1.0 / (own_square + square[j])
-                    distance = own_r - all_r[j]
-                    root = math.sqrt(own_l * all_l[j] * inverse)
-                    value = sill * root * exp_neg(distance * distance * inverse)
-                    row[j] = value + slope * own_r * all_r[j]
-                # Subtract the projection on the rows before, four rows at a time, so that the
-                # new row is read and written once for all of them.
-                k = 0
-                while k + 4 <= n_inliers:
-                    row_0, row_1 = whitened[k], whitened[k + 1]
-                    row_2, row_3 = whitened[k + 2], whitened[k + 3]
-                    w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
-                    for j in range(near, end):
-                        row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
-                    k += 4
-                while k < n_inliers:
-                    row_0, w_0 = whitened[k], whitened[k, i]
-                    for j in range(near, end):
-                        row[j] -= w_0 * row_0[j]
-                    k += 1
-                scale = 1.0 / math.sqrt(variance[i] + noise)
-                innovation = (observed[i] - predicted[i]) * scale
-                for j in range(near, end):
-                    value = row[j] * scale
-                    row[j] = value
-                    predicted[j] += value * innovation
-                    variance[j] -= value * value
-                n_inliers += 1
-            n_new = 0
-            for i in range(done, n):
-                if inlier[first + i]:
-                    continue
-                follows = i > 0 and inlier[first + i - 1] and frame.continues_line[first + i]
-                # Before anything has joined, only evidence from aside decides.
-                if n_inliers == 0 and aside_precision[i] == 0.0:
-                    continue
-                if (follows and not above[i]) or fits(
-                    observed[i],
-                    predicted[i],
-                    variance[i],
-                    aside_height[i],
-                    aside_precision[i],
-                    noise,
-                    growth,
-                ):
-                    new[n_new] = i
-                    n_new += 1
-            if n_new == 0:
-                break
+        _lay_out(frame, m, n_knots, size, sill, slope, alone, columns)
+        n_inliers = _grow(frame, m, size, n_new, sill, slope, noise, growth, alone, columns)
         if n_inliers == 0:
             continue
         for j in range(n_knots):
-            mean[m, j] = predicted[n + j]
-            std[m, j] = math.sqrt(max(variance[n + j], 0.0))
+            mean[m, j] = columns.height[n + j]
+            std[m, j] = math.sqrt(max(columns.variance[n + j], 0.0))
 
 
-@jit()
-def fits(
-    z: float,
-    height: float,
-    variance: float,
-    aside_height: float,
-    aside_precision: float,
+@jit(part=True)
+def _begin(
+    frame: Frame,
+    m: int,
     noise: float,
     growth: GrowthConfig,
-) -> bool:
-    """Whether a candidate is predicted well enough, and near enough, to join."""
-    if aside_precision > 0.0:
-        variance = max(variance, 0.0)
-        own_share = 1.0 / (1.0 + variance * aside_precision)
-        height = own_share * height + (1.0 - own_share) * aside_height
-        variance *= own_share
-    residual = z - height
-    limit = growth.max_standardised_depth
-    if residual > 0.0:
-        limit = growth.max_standardised_residual
-    spread = max(variance, 0.0) + noise
-    return variance <= growth.max_std**2 and residual * residual <= limit * limit * spread
+    aside: FloatArray,
+    alone: SegmentSurfaces,
+    columns: _Columns,
+) -> tuple[int, int, bool]:
+    """Set heights of the candidates of segment `m`, evidence there, and seeds as the new ones.
+
+    Returns how many candidates and how many seeds there are, and whether any evidence.
+    """
+    candidates, knots = frame.candidates, frame.knots
+    first, stop = candidates.offsets[m], candidates.offsets[m + 1]
+    limit = growth.max_standardised_residual
+    n_new, has_aside = 0, False
+    for i in range(stop - first):
+        c = first + i
+        z = candidates.z[c] - frame.prior_mean
+        columns.z[i] = z
+        height = precision = 0.0
+        if aside.shape[1] > 0:
+            j, r = candidates.bin[c], candidates.r[c]
+            heights, precisions = aside[0, m], aside[1, m]
+            height = between_knots(r, knots[j], knots[j + 1], heights[j], heights[j + 1])
+            precision = between_knots(r, knots[j], knots[j + 1], precisions[j], precisions[j + 1])
+        columns.aside_height[i], columns.aside_precision[i] = height, precision
+        columns.above[i] = contradicts(height, precision, z, noise, limit)
+        has_aside |= precision > 0.0
+        alone.inlier[c] = False
+        if alone.seed[c] and not columns.above[i]:
+            columns.new[n_new] = i
+            n_new += 1
+    return stop - first, n_new, has_aside
+
+
+@jit(part=True)
+def _lay_out(
+    frame: Frame,
+    m: int,
+    n_knots: int,
+    size: int,
+    sill: float,
+    slope: float,
+    alone: SegmentSurfaces,
+    columns: _Columns,
+) -> None:
+    """Set ranges and length-scales of candidates and knots, and their prior."""
+    first = frame.candidates.offsets[m]
+    n = frame.candidates.offsets[m + 1] - first
+    r, length_scale, variance = columns.r, columns.length_scale, columns.variance
+    # Element by element: assigned slices take as long, and seconds to compile.
+    for i in range(n):
+        r[i] = frame.candidates.r[first + i]
+        length_scale[i] = alone.log_length_scale[first + i]
+    for j in range(n_knots):
+        r[n + j], length_scale[n + j] = frame.knots[j], alone.knot_log_length_scale[m, j]
+    for j in range(n + n_knots, size):
+        r[j] = length_scale[j] = 0.0
+    for j in range(size):
+        length_scale[j] = exp_neg(-length_scale[j])
+        columns.height[j] = 0.0
+        variance[j] = sill + slope * r[j] * r[j]
+
+
+@jit(part=True)
+def _grow(
+    frame: Frame,
+    m: int,
+    size: int,
+    n_new: int,
+    sill: float,
+    slope: float,
+    noise: float,
+    growth: GrowthConfig,
+    alone: SegmentSurfaces,
+    columns: _Columns,
+) -> int:
+    """Let the new ones join, and those that then fit, until none does; return the number."""
+    first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
+    inlier, continues_line = alone.inlier[first:stop], frame.continues_line[first:stop]
+    n_inliers = done = 0
+    while n_new > 0 or n_inliers == 0:
+        for a in range(n_new):
+            i = columns.new[a]
+            inlier[i] = True
+            while done < len(inlier) and inlier[done]:
+                done += 1
+            # The columns before are not needed any more.
+            _observe(i, n_inliers, min(i, done) & -LANES, size, sill, slope, noise, columns)
+            n_inliers += 1
+        n_new = 0
+        for i in range(done, len(inlier)):
+            precision = columns.aside_precision[i]
+            # Before anything has joined, only evidence from aside decides.
+            if inlier[i] or (n_inliers == 0 and precision == 0.0):
+                continue
+            follows = i > 0 and inlier[i - 1] and continues_line[i] and not columns.above[i]
+            if not follows:
+                height, variance = combined(
+                    columns.height[i], columns.variance[i], columns.aside_height[i], precision
+                )
+                follows = fits(columns.z[i], height, variance, noise, growth)
+            if follows:
+                columns.new[n_new] = i
+                n_new += 1
+        if n_new == 0:
+            break
+    return n_inliers
+
+
+@jit(part=True)
+def _observe(
+    i: int,
+    n_inliers: int,
+    near: int,
+    size: int,
+    sill: float,
+    slope: float,
+    noise: float,
+    columns: _Columns,
+) -> None:
+    """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
+    r, length_scale, whitened = columns.r, columns.length_scale, columns.whitened
+    row, r_i, l_i = whitened[n_inliers], r[i], length_scale[i]
+    # Unsigned, as a signed index could count from the end.
+    start, end = np.uintp(near), np.uintp(size)
+    # Prior covariance of column i with the others (paper, eq. 8).
+    for j in range(start, end):
+        value = paciorek(r_i, l_i, r[j], length_scale[j], sill)
+        row[j] = value + slope * r_i * r[j]
+    # Subtract the projection on the rows before, four rows at a time, so that the
+    # new row is read and written once for all of them.
+    k = 0
+    while k + 4 <= n_inliers:
+        row_0, row_1 = whitened[k], whitened[k + 1]
+        row_2, row_3 = whitened[k + 2], whitened[k + 3]
+        w_0, w_1, w_2, w_3 = row_0[i], row_1[i], row_2[i], row_3[i]
+        for j in range(start, end):
+            row[j] -= w_0 * row_0[j] + w_1 * row_1[j] + w_2 * row_2[j] + w_3 * row_3[j]
+        k += 4
+    while k < n_inliers:
+        row_0, w_0 = whitened[k], whitened[k, i]
+        for j in range(start, end):
+            row[j] -= w_0 * row_0[j]
+        k += 1
+    height, variance = columns.height, columns.variance
+    scale = 1.0 / math.sqrt(variance[i] + noise)
+    innovation = (columns.z[i] - height[i]) * scale
+    for j in range(start, end):
+        value = row[j] * scale
+        row[j] = value
+        height[j] += value * innovation
+        variance[j] -= value * value

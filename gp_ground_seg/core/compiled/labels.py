@@ -22,9 +22,18 @@ from gp_ground_seg.core.frame import (
     Label,
     Labelled,
     Scan,
+    line_between,
 )
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import LabelConfig
+from gp_ground_seg.core.pipeline.labels import (
+    band_margin,
+    face_margin,
+    ground_band,
+    is_near,
+    roughness_of,
+    shows_obstacle,
+)
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
@@ -33,7 +42,7 @@ OBSTACLE_FLAG = 2**32
 are points."""
 
 
-class LabelRoom(NamedTuple):
+class LabelBuffers(NamedTuple):
     """Working arrays of the labels; the last row of each is for points in no cell.
 
     Attributes
@@ -57,16 +66,15 @@ class LabelRoom(NamedTuple):
 
 
 @jit(entry=True)
-def fit_pieces(surface: GroundSurface, room: LabelRoom) -> None:
+def fit_pieces(surface: GroundSurface, buffers: LabelBuffers) -> None:
     """Line of the surface across each cell; NaN in the last row."""
-    knots, mean = surface.knots, surface.mean
+    knots, mean, pieces = surface.knots, surface.mean, buffers.pieces
     n_bins = len(knots) - 1
     for m in range(len(mean)):
         for n in range(n_bins):
-            slope = (mean[m, n + 1] - mean[m, n]) / (knots[n + 1] - knots[n])
-            room.pieces[m * n_bins + n, 0] = mean[m, n] - slope * knots[n]
-            room.pieces[m * n_bins + n, 1] = slope
-    room.pieces[len(room.pieces) - 1, 0] = room.pieces[len(room.pieces) - 1, 1] = math.nan
+            piece = line_between(knots[n], knots[n + 1], mean[m, n], mean[m, n + 1])
+            pieces[m * n_bins + n, 0], pieces[m * n_bins + n, 1] = piece
+    pieces[len(pieces) - 1, 0] = pieces[len(pieces) - 1, 1] = math.nan
 
 
 @jit(entry=True)
@@ -76,28 +84,26 @@ def survey(
     is_face: BoolArray,
     config: LabelConfig,
     height: FloatArray,
-    room: LabelRoom,
+    buffers: LabelBuffers,
 ) -> None:
     """Heights of the points of a part over the surface, and the sums for roughness."""
-    pieces, sums, nearest = room.pieces, room.sums[part.number], scan.grid.edges[0]
-    min_height, max_height = config.obstacle_min_height, config.obstacle_max_height
+    pieces, sums, nearest = buffers.pieces, buffers.sums[part.number], scan.grid.edges[0]
     for k in range(len(sums)):
         sums[k, 0] = sums[k, 1] = 0
     # Slices, because indices from 0 on need no check for negative ones.
-    own = points_of(part, len(height))
-    z, tile, heights = scan.xyz.T[2, own], scan.tiles.tile[own], height[own]
-    cell, r = scan.grid.cell[own], scan.grid.r[own]
+    points = points_of(part, len(height))
+    z, tile, heights = scan.xyz.T[2, points], scan.tiles.tile[points], height[points]
+    cell, r = scan.grid.cell[points], scan.grid.r[points]
     for i in range(len(cell)):
         c = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
         away = max(np.float64(r[i]), nearest)
         h = np.float64(z[i]) - (pieces[c, 0] + pieces[c, 1] * away)
         heights[i] = h
-        if h >= min_height:
-            if h <= max_height:
-                sums[c, 0] += OBSTACLE_FLAG
-        elif h >= -min_height and not is_face[np.uintp(tile[i])]:
+        if shows_obstacle(h, config):
+            sums[c, 0] += OBSTACLE_FLAG
+        elif is_near(h, config) and not is_face[np.uintp(tile[i])]:
             sums[c, 0] += 1
-            sums[c, 1] += int(h * h * room.units + 0.5)
+            sums[c, 1] += int(h * h * buffers.units + 0.5)
 
 
 @jit(entry=True)
@@ -106,15 +112,14 @@ def set_bands(
     config: LabelConfig,
     is_predictive: bool,
     sigma_n: float,
-    room: LabelRoom,
+    buffers: LabelBuffers,
     roughness: FloatArray,
 ) -> None:
-    """Roughness and band of each cell from all parts, see `ground_band` of the twin."""
+    """Roughness and band of each cell from the sums of all parts."""
     n_segments, n_bins = roughness.shape
     # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
     number = np.empty(n_bins + 2, np.int64)
     squares = np.empty(n_bins + 2, np.int64)
-    obstacle_depth = config.obstacle_max_height - config.obstacle_min_height
     for m in range(n_segments):
         for n in range(n_bins + 2):
             number[n] = squares[n] = 0
@@ -122,24 +127,19 @@ def set_bands(
             for k in range(-1, 2):
                 first = (m + k + n_segments) % n_segments * n_bins
                 for n in range(n_bins):
-                    number[n + 1] += room.sums[index, first + n, 0]
-                    squares[n + 1] += room.sums[index, first + n, 1]
+                    number[n + 1] += buffers.sums[index, first + n, 0]
+                    squares[n + 1] += buffers.sums[index, first + n, 1]
         for n in range(n_bins):
             flagged = number[n] + number[n + 1] + number[n + 2]
-            n_near = np.float64(max(flagged & (OBSTACLE_FLAG - 1), 1))
+            n_near, n_obstacles = flagged & (OBSTACLE_FLAG - 1), flagged >> 32
             total = squares[n] + squares[n + 1] + squares[n + 2]
-            rough = math.sqrt(np.float64(total) / (room.units * n_near))
+            rough = roughness_of(total, n_near, buffers.units)
             band = config.ground_tolerance
             if is_predictive:
-                variance = rough**2 + sigma_n**2
-                obstacles_per_metre = np.float64((flagged >> 32) + 1) / obstacle_depth
-                ground_per_metre = n_near / math.sqrt(2.0 * math.pi * variance)
-                log_ratio = math.log(ground_per_metre / obstacles_per_metre)
-                likely = math.sqrt(2.0 * variance * max(log_ratio, 0.0))
-                band = min(max(likely, band), config.obstacle_min_height)
-            room.band[m * n_bins + n] = band
+                band = ground_band(n_near, rough, n_obstacles, config, sigma_n)
+            buffers.band[m * n_bins + n] = band
             roughness[m, n] = rough
-    room.band[n_segments * n_bins] = math.nan
+    buffers.band[n_segments * n_bins] = math.nan
 
 
 @jit(entry=True)
@@ -148,25 +148,24 @@ def label_part(
     scan: Scan,
     faces: Faces,
     tolerance: float,
-    max_depth: float,
+    depth: float,
     band: FloatArray,
     result: Labelled,
 ) -> None:
     """Label the points of a part from their heights in `result`.
 
-    Ground reaches `max_depth` below the surface, and on faces `tolerance` above their base.
+    Ground reaches `depth` below the surface, and on faces `tolerance` above their base.
     """
     points = points_of(part, len(result.height))
     z, tile, cell = scan.xyz.T[2, points], scan.tiles.tile[points], scan.grid.cell[points]
     height, label, margins = result.height[points], result.label[points], result.margin[points]
     for i in range(len(cell)):
         n, h = cell[i], height[i]
-        margin = min(band[np.uintp(n if n >= 0 else len(band) - 1)] - h, h + max_depth)
+        margin = band_margin(h, band[np.uintp(n if n >= 0 else len(band) - 1)], depth)
         t = np.uintp(tile[i] if n >= 0 else 0)
         if faces.is_face[t]:
-            over_base = max(h, np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0]))
-            limit = -tolerance if faces.has_occluded_base[t] else tolerance
-            margin = min(margin, limit - over_base)
+            over_lowest = np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0])
+            margin = face_margin(margin, h, over_lowest, faces.has_occluded_base[t], tolerance)
         margins[i] = margin
-        own = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
-        label[i] = _GROUND if margin >= 0.0 else own
+        otherwise = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
+        label[i] = _GROUND if margin >= 0.0 else otherwise

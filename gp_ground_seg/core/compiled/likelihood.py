@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.numerics import exp_neg, factorise, invert, invert_triangle
+from gp_ground_seg.core.compiled.numerics import factorise, invert, invert_triangle
 from gp_ground_seg.core.compiled.threads import Part
 from gp_ground_seg.core.frame import FloatArray, Inliers
+from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.jit import jit
 
 _LOG_2PI = math.log(2.0 * math.pi)
+
+
+class _Latent(NamedTuple):
+    """Latent process of a segment with p pseudo-inputs, at the ranges of its n inliers."""
+
+    r_bar: FloatArray  # (p,) ranges of the pseudo-inputs [m]
+    k_bar: FloatArray  # (p, p) without noise
+    factor: FloatArray  # (p, p) Cholesky factor of B
+    inverse: FloatArray  # (p, p) of B
+    k_star: FloatArray  # (n, p)
+    beta: FloatArray  # (p,)
 
 
 @jit(entry=True)
@@ -26,181 +39,222 @@ def log_likelihood(
     gradients: FloatArray,
 ) -> None:
     """Set ``values[m]`` and ``gradients[m]`` of the segments of a part; -inf where not defined."""
-    sigma_f, sigma_n = math.exp(theta[0]), math.exp(theta[1])
-    sigma_f_bar, sigma_l_bar = math.exp(theta[2]), math.exp(theta[3])
-    sigma_n_bar = math.exp(theta[4])
     for m in range(part.number, len(values), part.n_parts):
         first, bar_first = inliers.offsets[m], inliers.bar_offsets[m]
         n, p = inliers.offsets[m + 1] - first, inliers.bar_offsets[m + 1] - bar_first
-        values[m] = 0.0
+        gradient, values[m] = gradients[m], 0.0
         for i in range(len(theta)):
-            gradients[m, i] = 0.0
+            gradient[i] = 0.0
         if n == 0:
             continue
+        r, z = inliers.r[first : first + n], inliers.z[first : first + n]
         u = np.empty(n)
-        l_bar = np.empty(p)
-        k_bar = np.empty((p, p))
-        b_factor = np.empty((p, p))
-        b_inverse = np.empty((p, p))
-        k_star = np.empty((n, p))
-        beta = np.zeros(p)
-        mean = 0.0
-        own_r = inliers.r[first : first + n]
-        own_z = inliers.z[first : first + n]
-        own_r_bar = inliers.r_bar[bar_first : bar_first + p]
-        sharpness = 0.5 / sigma_l_bar**2
-        if p > 0:
-            for i in range(p):
-                l_bar[i] = inliers.log_extent[bar_first + i]
-                mean += l_bar[i] / p
-                centre = own_r_bar[i]
-                for j in range(p):
-                    d = centre - own_r_bar[j]
-                    value = sigma_f_bar**2 * exp_neg(sharpness * d * d)
-                    k_bar[i, j] = value
-                    b_factor[i, j] = value
-                b_factor[i, i] += sigma_n_bar**2
-            if not factorise(b_factor, p):
-                values[m] = -np.inf
-                continue
-            invert(b_factor, p, np.empty((p, p)), b_inverse)
-            for i in range(p):
-                for j in range(p):
-                    beta[i] += b_inverse[i, j] * (l_bar[j] - mean)
-            for i in range(n):
-                value = mean + theta[5]
-                centre = own_r[i]
-                for j in range(p):
-                    d = centre - own_r_bar[j]
-                    covariance = sigma_f_bar**2 * exp_neg(sharpness * d * d)
-                    k_star[i, j] = covariance
-                    value += covariance * beta[j]
-                u[i] = min(max(value, -MAX_ABS_LOG_LENGTH_SCALE), MAX_ABS_LOG_LENGTH_SCALE)
-        else:
-            for i in range(n):
-                u[i] = inliers.log_length_scale[first + i]
-
-        length_scale, square = np.empty(n), np.empty(n)
         for i in range(n):
-            length_scale[i] = math.exp(u[i])
-            square[i] = length_scale[i] * length_scale[i]
-        k = np.empty((n, n))
-        factor = np.empty((n, n))
-        # l_i^2 / (l_i^2 + l_j^2), from which dlog k / du follows.
-        ratios = np.empty((n, n))
-        for i in range(n):
-            centre, own_l, own_square = own_r[i], length_scale[i], square[i]
-            tilt = slope_std**2 * centre
-            row, ratio_row, factor_row = k[i], ratios[i], factor[i]
-            for j in range(i, n):
-                inverse_spread = 1.0 / (own_square + square[j])
-                d = centre - own_r[j]
-                exponent = d * d * inverse_spread
-                root = math.sqrt(2.0 * own_l * length_scale[j] * inverse_spread)
-                value = sigma_f**2 * root * exp_neg(exponent)
-                row[j] = value
-                factor_row[j] = value + tilt * own_r[j]
-                ratio_row[j] = own_square * inverse_spread
-            factor_row[i] += sigma_n**2
-        if not factorise(factor, n):
+            u[i] = inliers.log_length_scale[first + i]
+        latent = _Latent(
+            inliers.r_bar[bar_first : bar_first + p],
+            np.empty((p, p)),
+            np.empty((p, p)),
+            np.empty((p, p)),
+            np.empty((n, p)),
+            np.zeros(p),
+        )
+        log_extent = inliers.log_extent[bar_first : bar_first + p]
+        if p > 0 and not _predict_log_length_scales(theta, log_extent, r, latent, u):
             values[m] = -np.inf
             continue
-        whitened = np.empty((n, n))
-        alpha = np.zeros(n)
-        if p == 0:
-            # Both derivatives follow from traces: K is A without noise and slope.
-            invert_triangle(factor, n, whitened)
-            value = -0.5 * n * _LOG_2PI
-            trace = square_sum = tilt_trace = tilt_sum = fit = 0.0
-            for i in range(n):
-                row = whitened[i]
-                own_sum = own_tilt = 0.0
-                for j in range(i + 1):
-                    own_sum += row[j] * own_z[j]
-                    own_tilt += row[j] * own_r[j]
-                    trace += row[j] * row[j]
-                for j in range(i + 1):
-                    alpha[j] += row[j] * own_sum
-                tilt_trace += own_tilt * own_tilt
-                fit += own_sum * own_sum
-                value -= math.log(factor[i, i])
-            for i in range(n):
-                square_sum += alpha[i] * alpha[i]
-                tilt_sum += alpha[i] * own_r[i]
-            noise, slope = sigma_n**2, slope_std**2
-            gradients[m, 1] = noise * (square_sum - trace)
-            gradients[m, 0] = fit - slope * tilt_sum * tilt_sum - n + slope * tilt_trace
-            gradients[m, 0] -= gradients[m, 1]
-            values[m] = value - 0.5 * fit
-            continue
-        inverse = np.empty((n, n))
-        invert(factor, n, whitened, inverse)
-        for i in range(n):
-            value = 0.0
-            row = inverse[i]
-            for j in range(n):
-                value += row[j] * own_z[j]
-            alpha[i] = value
-        value = -0.5 * n * _LOG_2PI
-        for i in range(n):
-            value -= 0.5 * own_z[i] * alpha[i] + math.log(factor[i, i])
+        k, factor, whitened = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+        if not _factorise_covariance(theta, slope_std, r, u, k, factor):
+            values[m] = -np.inf
+        elif p == 0:
+            values[m] = _of_given_length_scales(theta, slope_std, r, z, factor, whitened, gradient)
+        else:
+            g_u, inverse = np.zeros(n), np.empty((n, n))
+            invert(factor, n, whitened, inverse)
+            values[m] = _of_observations(theta, r, z, u, k, factor, inverse, gradient, g_u)
+            values[m] += _of_latent_process(theta, latent_terms, r, latent, g_u, gradient)
 
-        g_sigma_f = g_trace = 0.0
-        g_u = np.zeros(n)
-        for i in range(n):
-            g_ii = 0.5 * (alpha[i] * alpha[i] - inverse[i, i])
-            g_trace += g_ii
-            g_sigma_f += 2.0 * g_ii * k[i, i]
-            own_alpha, centre, own_square = alpha[i], own_r[i], square[i]
-            row, ratio_row, inverse_row = k[i], ratios[i], inverse[i]
-            total = own = 0.0
-            for j in range(i + 1, n):
-                g_k = (own_alpha * alpha[j] - inverse_row[j]) * row[j]
-                total += g_k
-                d = centre - own_r[j]
-                ratio = ratio_row[j]
-                curvature = 2.0 * d * d * ratio / own_square
-                own += g_k * (0.5 - ratio + ratio * curvature)
-                g_u[j] += g_k * (ratio - 0.5 + (1.0 - ratio) * curvature)
-            g_sigma_f += 2.0 * total
-            g_u[i] += own
-        gradients[m, 0] = g_sigma_f
-        gradients[m, 1] = 2.0 * sigma_n**2 * g_trace
 
-        weight = np.zeros(p)
-        raised = np.zeros(p)
-        g_sum = 0.0
-        for i in range(n):
-            if abs(u[i]) >= MAX_ABS_LOG_LENGTH_SCALE:
-                g_u[i] = 0.0
-            g_sum += g_u[i]
-            for j in range(p):
-                raised[j] += k_star[i, j] * g_u[i]
-        for i in range(p):
-            for j in range(p):
-                weight[i] += b_inverse[i, j] * raised[j]
-            if latent_terms:
-                value -= math.log(b_factor[i, i]) + 0.5 * _LOG_2PI
-        gradients[m, 5] = g_sum
-        g_sigma_f_bar = g_sigma_l_bar = g_noise_bar = 0.0
-        share = 0.5 if latent_terms else 0.0
-        for i in range(n):
-            own, centre, row = g_u[i], own_r[i], k_star[i]
-            for j in range(p):
-                d = centre - own_r_bar[j]
-                term = own * row[j] * beta[j]
-                g_sigma_f_bar += term
-                g_sigma_l_bar += term * d * d
-        for i in range(p):
-            own, centre, row, inverse_row = weight[i], own_r_bar[i], k_bar[i], b_inverse[i]
-            for j in range(p):
-                d = centre - own_r_bar[j]
-                # Adjoint of B: every derivative of B is contracted with it.
-                adjoint = -own * beta[j] - share * inverse_row[j]
-                g_sigma_f_bar += adjoint * row[j]
-                g_sigma_l_bar += adjoint * row[j] * d * d
-            g_noise_bar -= own * beta[i] + share * inverse_row[i]
-        gradients[m, 2] = 2.0 * g_sigma_f_bar
-        gradients[m, 3] = g_sigma_l_bar / sigma_l_bar**2
-        gradients[m, 4] = 2.0 * sigma_n_bar**2 * g_noise_bar
-        values[m] = value
+@jit(part=True)
+def _predict_log_length_scales(
+    theta: FloatArray, log_extent: FloatArray, r: FloatArray, latent: _Latent, u: FloatArray
+) -> bool:
+    """Set the arrays of `latent`, and `u`; False if B is not positive definite."""
+    r_bar, n, p = latent.r_bar, len(r), len(latent.r_bar)
+    variance, noise = math.exp(theta[2]) ** 2, math.exp(theta[4]) ** 2
+    sharpness = 0.5 / math.exp(theta[3]) ** 2
+    mean = 0.0
+    for i in range(p):
+        mean += log_extent[i] / p
+        centre, row, factor_row = r_bar[i], latent.k_bar[i], latent.factor[i]
+        for j in range(p):
+            row[j] = factor_row[j] = squared_exponential(centre, r_bar[j], variance, sharpness)
+        factor_row[i] += noise
+    if not factorise(latent.factor, p):
+        return False
+    invert(latent.factor, p, np.empty((p, p)), latent.inverse)
+    for i in range(p):
+        for j in range(p):
+            latent.beta[i] += latent.inverse[i, j] * (log_extent[j] - mean)
+    for i in range(n):
+        value, centre, row = mean + theta[5], r[i], latent.k_star[i]
+        for j in range(p):
+            row[j] = squared_exponential(centre, r_bar[j], variance, sharpness)
+            value += row[j] * latent.beta[j]
+        u[i] = min(max(value, -MAX_ABS_LOG_LENGTH_SCALE), MAX_ABS_LOG_LENGTH_SCALE)
+    return True
+
+
+@jit(part=True)
+def _factorise_covariance(
+    theta: FloatArray,
+    slope_std: float,
+    r: FloatArray,
+    u: FloatArray,
+    k: FloatArray,
+    factor: FloatArray,
+) -> bool:
+    """Set the upper triangles of K, and of the factor of A; False if that is not possible."""
+    n, variance, noise = len(r), math.exp(theta[0]) ** 2, math.exp(theta[1]) ** 2
+    length_scale = np.empty(n)
+    for i in range(n):
+        length_scale[i] = math.exp(u[i])
+    for i in range(n):
+        r_i, l_i, tilt = r[i], length_scale[i], slope_std**2 * r[i]
+        row, factor_row = k[i], factor[i]
+        for j in range(i, n):
+            value = paciorek(r_i, l_i, r[j], length_scale[j], variance)
+            row[j] = value
+            factor_row[j] = value + tilt * r[j]
+        factor_row[i] += noise
+    return factorise(factor, n)
+
+
+@jit(part=True)
+def _of_given_length_scales(
+    theta: FloatArray,
+    slope_std: float,
+    r: FloatArray,
+    z: FloatArray,
+    factor: FloatArray,
+    whitened: FloatArray,
+    gradient: FloatArray,
+) -> float:
+    """Return the value without a latent process; set the gradient.
+
+    Both derivatives follow from traces: K is A without noise and slope.
+    """
+    n, noise, slope = len(r), math.exp(theta[1]) ** 2, slope_std**2
+    invert_triangle(factor, n, whitened)
+    alpha = np.zeros(n)
+    value = -0.5 * n * _LOG_2PI
+    trace = square_sum = tilt_trace = tilt_sum = fit = 0.0
+    for i in range(n):
+        row = whitened[i]
+        sum_z = sum_r = 0.0
+        for j in range(i + 1):
+            sum_z += row[j] * z[j]
+            sum_r += row[j] * r[j]
+            trace += row[j] * row[j]
+        for j in range(i + 1):
+            alpha[j] += row[j] * sum_z
+        tilt_trace += sum_r * sum_r
+        fit += sum_z * sum_z
+        value -= math.log(factor[i, i])
+    for i in range(n):
+        square_sum += alpha[i] * alpha[i]
+        tilt_sum += alpha[i] * r[i]
+    gradient[1] = noise * (square_sum - trace)
+    gradient[0] = fit - slope * tilt_sum * tilt_sum - n + slope * tilt_trace - gradient[1]
+    return value - 0.5 * fit
+
+
+@jit(part=True)
+def _of_observations(
+    theta: FloatArray,
+    r: FloatArray,
+    z: FloatArray,
+    u: FloatArray,
+    k: FloatArray,
+    factor: FloatArray,
+    inverse: FloatArray,
+    gradient: FloatArray,
+    g_u: FloatArray,
+) -> float:
+    """Return the value of the observations; set their gradient, and that in `u`."""
+    n = len(r)
+    alpha, square = np.zeros(n), np.empty(n)
+    value = -0.5 * n * _LOG_2PI
+    for i in range(n):
+        row = inverse[i]
+        for j in range(n):
+            alpha[i] += row[j] * z[j]
+        value -= 0.5 * z[i] * alpha[i] + math.log(factor[i, i])
+        square[i] = math.exp(2.0 * u[i])
+    g_sigma_f = g_trace = 0.0
+    for i in range(n):
+        g_ii = 0.5 * (alpha[i] * alpha[i] - inverse[i, i])
+        g_trace += g_ii
+        g_sigma_f += 2.0 * g_ii * k[i, i]
+        alpha_i, r_i, square_i, row, inverse_row = alpha[i], r[i], square[i], k[i], inverse[i]
+        total = g_u_i = 0.0
+        for j in range(i + 1, n):
+            g_k = (alpha_i * alpha[j] - inverse_row[j]) * row[j]
+            total += g_k
+            d = r_i - r[j]
+            # l_i^2 / (l_i^2 + l_j^2), from which dlog k / du follows.
+            inverse_spread = 1.0 / (square_i + square[j])
+            ratio = square_i * inverse_spread
+            curvature = 2.0 * d * d * inverse_spread
+            g_u_i += g_k * (0.5 - ratio + ratio * curvature)
+            g_u[j] += g_k * (ratio - 0.5 + (1.0 - ratio) * curvature)
+        g_sigma_f += 2.0 * total
+        g_u[i] += g_u_i
+    gradient[0] = g_sigma_f
+    gradient[1] = 2.0 * math.exp(theta[1]) ** 2 * g_trace
+    for i in range(n):
+        if abs(u[i]) >= MAX_ABS_LOG_LENGTH_SCALE:
+            g_u[i] = 0.0
+    return value
+
+
+@jit(part=True)
+def _of_latent_process(
+    theta: FloatArray,
+    latent_terms: bool,
+    r: FloatArray,
+    latent: _Latent,
+    g_u: FloatArray,
+    gradient: FloatArray,
+) -> float:
+    """Propagate the gradient in u to theta; return the latent terms of the value."""
+    r_bar, beta, n, p = latent.r_bar, latent.beta, len(r), len(latent.r_bar)
+    weight, raised = np.zeros(p), np.zeros(p)
+    value = g_sigma_f_bar = g_sigma_l_bar = g_noise_bar = 0.0
+    for i in range(n):
+        gradient[5] += g_u[i]
+        g_i, r_i, row = g_u[i], r[i], latent.k_star[i]
+        for j in range(p):
+            raised[j] += row[j] * g_i
+            d = r_i - r_bar[j]
+            term = g_i * row[j] * beta[j]
+            g_sigma_f_bar += term
+            g_sigma_l_bar += term * d * d
+    share = 0.5 if latent_terms else 0.0
+    for i in range(p):
+        r_i, row, inverse_row = r_bar[i], latent.k_bar[i], latent.inverse[i]
+        for j in range(p):
+            weight[i] += inverse_row[j] * raised[j]
+        if latent_terms:
+            value -= math.log(latent.factor[i, i]) + 0.5 * _LOG_2PI
+        for j in range(p):
+            d = r_i - r_bar[j]
+            # Adjoint of B: every derivative of B is contracted with it.
+            adjoint = -weight[i] * beta[j] - share * inverse_row[j]
+            g_sigma_f_bar += adjoint * row[j]
+            g_sigma_l_bar += adjoint * row[j] * d * d
+        g_noise_bar -= weight[i] * beta[i] + share * inverse_row[i]
+    gradient[2] = 2.0 * g_sigma_f_bar
+    gradient[3] = g_sigma_l_bar / math.exp(theta[3]) ** 2
+    gradient[4] = 2.0 * math.exp(theta[4]) ** 2 * g_noise_bar
+    return value

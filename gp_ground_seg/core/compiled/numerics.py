@@ -6,9 +6,11 @@ Every inner loop runs along a row, so that the compiler can use vector instructi
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from gp_ground_seg.core.frame import FloatArray
-from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.gp import kernels
+from gp_ground_seg.core.jit import choose, compiled_form, jit
 
 LANES = 4
 """Columns that vector instructions take at once: rows end at multiples of it, because a
@@ -21,7 +23,13 @@ _SCALE = -1.0 / 2.0**_HALVINGS
 _C2, _C3, _C4, _C5, _C6, _C7 = 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 720, 1 / 5040
 
 
-@jit()
+@compiled_form(choose)
+def branch(condition: bool, a: Any, b: Any) -> Any:
+    """Return `a` if the condition holds, else `b`: `numpy.where` of numbers would make arrays."""
+    return a if condition else b
+
+
+@compiled_form(kernels.exp_neg)
 def exp_neg(x: float) -> float:
     """``exp(-x)``, to an error of 1e-14 for x >= 0, and of 1e-11 of its size for -10 < x < 0.
 

@@ -17,17 +17,18 @@ from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, Poin
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
 from gp_ground_seg.core.pipeline.vertical_faces import (
-    FLATNESS,
     FOOT_SHARE,
-    MIN_RETURNS,
+    SUMS,
     UNITS_PER_METRE,
+    is_base_occluded,
+    is_vertical,
 )
 
-# Each tall tile has two rows of sums, for the lowest returns and for those above: number, x, y, z,
-# their squares, x y, x z, y z; the greatest height. The first row also holds `_TO_UNITS` less
-# the origin of x and y, and the origin of z.
-_TOP, _TO_UNITS_X, _TO_UNITS_Y, _BASE = 10, 11, 12, 13
-N_COLUMNS = 14
+# Each tall tile has two rows, for the lowest returns and for those above: their sums and the
+# greatest height. The first row also holds `_TO_UNITS` less the origin of x and y, and the origin
+# of z.
+_TOP, _TO_UNITS_X, _TO_UNITS_Y, _BASE = SUMS, SUMS + 1, SUMS + 2, SUMS + 3
+N_COLUMNS = SUMS + 4
 NOT_TALL = -1
 """Row of a tile without a tall return."""
 # Adding this to a number and subtracting it again leaves whole units.
@@ -78,19 +79,20 @@ def sum_returns(
     tile_size: float,
     label: LabelConfig,
     n_tall: int,
-    room: FaceSums,
+    buffers: FaceSums,
 ) -> None:
     """Sum over the returns of a part of the points, (3, N), in tall tiles."""
-    sums = room.sums[part.number]
-    _clear_sums(tiles.extremes, tile_size, n_tall, room.row_to_tile, sums)
+    sums = buffers.sums[part.number]
+    _clear_sums(tiles.extremes, tile_size, n_tall, buffers.row_to_tile, sums)
     foot_height, max_height = FOOT_SHARE * label.obstacle_min_height, label.obstacle_max_height
     # Slices, because indices from 0 on need no check for negative ones.
-    own = points_of(part, len(tiles.tile))
-    x, y, z, tile = columns[0, own], columns[1, own], columns[2, own], tiles.tile[own]
+    points = points_of(part, len(tiles.tile))
+    x, y, z = columns[0, points], columns[1, points], columns[2, points]
+    tile = tiles.tile[points]
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
             continue
-        k = room.tile_to_row[np.uintp(tile[i])]
+        k = buffers.tile_to_row[np.uintp(tile[i])]
         if k == NOT_TALL:
             continue
         low = sums[np.uintp(k)]
@@ -138,7 +140,7 @@ def decide_faces(
     n_tall: int,
     config: FacesConfig,
     label: LabelConfig,
-    room: FaceSums,
+    buffers: FaceSums,
     faces: Faces,
 ) -> None:
     """Decide from the sums of all parts which tiles hold a face, into `faces`."""
@@ -146,13 +148,13 @@ def decide_faces(
         faces.is_face[t] = faces.has_occluded_base[t] = False
     low, high = np.empty(N_COLUMNS), np.empty(N_COLUMNS)
     for k in range(n_tall):
-        _add_parts(n_parts, 2 * k, room.sums, low)
-        _add_parts(n_parts, 2 * k + 1, room.sums, high)
+        _add_parts(n_parts, 2 * k, buffers.sums, low)
+        _add_parts(n_parts, 2 * k + 1, buffers.sums, high)
         top = max(low[_TOP], high[_TOP])
-        if top > label.obstacle_min_height and _is_vertical(low, high, config.max_normal_z):
-            t = room.row_to_tile[k]
+        if top > label.obstacle_min_height and is_vertical(low, high, config.max_normal_z):
+            t = buffers.row_to_tile[k]
             faces.is_face[t] = True
-            faces.has_occluded_base[t] = _is_base_occluded(low, high, config.max_foot_distance)
+            faces.has_occluded_base[t] = is_base_occluded(low, high, config.max_foot_distance)
 
 
 @jit()
@@ -163,44 +165,3 @@ def _add_parts(n_parts: int, row: int, sums: FloatArray, total: FloatArray) -> N
         for c in range(_TOP):
             total[c] += sums[index, row, c]
         total[_TOP] = max(total[_TOP], sums[index, row, _TOP])
-
-
-@jit()
-def _is_vertical(low: FloatArray, high: FloatArray, max_normal_z: float) -> bool:
-    """Whether the returns of a tile form a vertical face, see `normal_z` of the twin."""
-    n, x, y, z = low[0] + high[0], low[1] + high[1], low[2] + high[2], low[3] + high[3]
-    if n < MIN_RETURNS:
-        return False
-    xx = low[4] + high[4] - x * x / n
-    yy = low[5] + high[5] - y * y / n
-    zz = low[6] + high[6] - z * z / n
-    xy = low[7] + high[7] - x * y / n
-    xz = low[8] + high[8] - x * z / n
-    yz = low[9] + high[9] - y * z / n
-    vertical = max(xx * yy - xy * xy, 0.0)
-    trace = vertical + max(yy * zz - yz * yz, 0.0) + max(xx * zz - xz * xz, 0.0)
-    if trace <= FLATNESS * (xx + yy + zz) ** 2:
-        return False
-    return math.sqrt(vertical / trace) < max_normal_z
-
-
-@jit()
-def _is_base_occluded(low: FloatArray, high: FloatArray, max_foot_distance: float) -> bool:
-    """Whether the lowest returns are the face's own, see `is_base_occluded` of the twin."""
-    n_low, n_high = low[0], high[0]
-    if max_foot_distance <= 0.0 or n_high < 2.0:
-        return False
-    mean_x, mean_y = high[1] / n_high, high[2] / n_high
-    xx = high[4] - n_high * mean_x * mean_x
-    yy = high[5] - n_high * mean_y * mean_y
-    xy = high[7] - n_high * mean_x * mean_y
-    low_xx = low[4] - 2.0 * mean_x * low[1] + n_low * mean_x * mean_x
-    low_yy = low[5] - 2.0 * mean_y * low[2] + n_low * mean_y * mean_y
-    low_xy = low[7] - mean_x * low[2] - mean_y * low[1] + n_low * mean_x * mean_y
-    size = math.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)
-    aligned = 0.0
-    if size > FLATNESS * n_high:
-        aligned = ((low_xx - low_yy) * (xx - yy) + 4.0 * low_xy * xy) / size
-    square: float = 0.5 * (low_xx + low_yy - aligned)
-    in_plane: bool = square <= n_low * max_foot_distance * max_foot_distance
-    return in_plane

@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, Frame
-from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, Frame, Values
+from gp_ground_seg.core.jit import choose, shared
+from gp_ground_seg.core.parameters.config import Config, GrowthConfig
 
 STEP = 4
 """One of how many segments shows its ground to those beside it: neighbours see much the same."""
@@ -38,30 +39,86 @@ class Evidence(NamedTuple):
     height: FloatArray
     precision: FloatArray
 
-    def contradicts(self, z: FloatArray, noise: FloatArray, limit: float) -> BoolArray:
-        """Whether heights `z` [m] with variances `noise` stand above it by `limit` deviations."""
-        known = self.precision > 0.0
-        variance = 1.0 / np.where(known, self.precision, 1.0) + noise
-        result: BoolArray = known & (z - self.height > limit * np.sqrt(variance))
-        return result
 
-    def combined(self, height: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Height and variance of an estimate together with the evidence."""
-        own_share = 1.0 / (1.0 + np.maximum(variance, 0.0) * self.precision)
-        return own_share * height + (1.0 - own_share) * self.height, own_share * variance
+@shared
+def contradicts(
+    height: Values, precision: Values, z: Values, noise: Values, limit: float
+) -> Values:
+    """Whether heights `z` [m] with variances `noise` stand above the evidence.
 
-    def combined_surface(
-        self, mean: FloatArray, std: FloatArray, prior_variance: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Height and standard deviation of surfaces together with the evidence [m].
+    By more than `limit` standard deviations; the first two are the evidence.
+    """
+    is_known = precision > 0.0
+    spread = np.sqrt(1.0 / choose(is_known, precision, 1.0) + noise)
+    return is_known & (z - height > limit * spread)
 
-        NaN where there is neither.
-        """
-        has_own = np.isfinite(std)
-        variance = np.where(has_own, np.maximum(std, LEAST_STD) ** 2, prior_variance)
-        height, variance = self.combined(np.where(has_own, mean, 0.0), variance)
-        known = has_own | (self.precision > 0.0)
-        return np.where(known, height, np.nan), np.where(known, np.sqrt(variance), np.nan)
+
+@shared
+def combined(
+    height: Values, variance: Values, aside_height: Values, aside_precision: Values
+) -> tuple[Values, Values]:
+    """Height and variance of an estimate together with the evidence from aside."""
+    variance = np.maximum(variance, 0.0)
+    share = 1.0 / (1.0 + variance * aside_precision)
+    return share * height + (1.0 - share) * aside_height, share * variance
+
+
+@shared
+def combined_surface(
+    mean: Values, std: Values, prior: Values, aside_height: Values, aside_precision: Values
+) -> tuple[Values, Values]:
+    """Height and standard deviation of a surface together with the evidence from aside [m].
+
+    NaN where there is neither; `prior` is the variance where there is no surface.
+    """
+    has_surface = np.isfinite(std)
+    least = np.maximum(std, LEAST_STD)
+    height, variance = combined(
+        choose(has_surface, mean, 0.0),
+        choose(has_surface, least * least, prior),
+        aside_height,
+        aside_precision,
+    )
+    is_known = has_surface | (aside_precision > 0.0)
+    return choose(is_known, height, np.nan), choose(is_known, np.sqrt(variance), np.nan)
+
+
+@shared
+def shown_by(mean: Values, std: Values, prior: Values) -> tuple[Values, Values]:
+    """Height that a surface shows by its observations, and its standard deviation [m].
+
+    What a surface knows by the prior alone is no evidence: its observations are what is left of it
+    divided by the prior, of variance `prior`. 0 and infinite where nothing is left.
+    """
+    least = np.maximum(std, LEAST_STD)
+    square = least * least
+    precision = 1.0 / square - 1.0 / prior
+    is_known = precision > LEAST_PRECISION
+    safe = choose(is_known, precision, 1.0)
+    return (
+        choose(is_known, mean / (square * safe), 0.0),
+        choose(is_known, 1.0 / np.sqrt(safe), np.inf),
+    )
+
+
+@shared
+def between_knots(r: Values, near: Values, far: Values, a: Values, b: Values) -> Values:
+    """Value at range `r`, linear between `a` at the knot `near` and `b` at `far`."""
+    share = np.minimum(np.maximum((r - near) / (far - near), 0.0), 1.0)
+    return a + share * (b - a)
+
+
+@shared
+def is_low_and_near(r: Values, z: Values, growth: GrowthConfig) -> Values:
+    """Whether candidates at ranges and heights may be seeds [m]."""
+    return (r <= growth.seed_range) & (np.abs(z) <= growth.seed_height_tolerance)
+
+
+@shared
+def stands_on(z: Values, highest: Values, log_sigma_n: Values, growth: GrowthConfig) -> Values:
+    """Whether a seed is higher than the `highest` ground and the noise of two seeds explain."""
+    noise = growth.max_standardised_residual * math.sqrt(2.0) * np.exp(log_sigma_n)
+    return z > highest + noise
 
 
 def looks_aside_in(frame: Frame, config: Config) -> bool:
@@ -78,12 +135,11 @@ def seeds(frame: Frame, theta: FloatArray, config: Config) -> BoolArray:
     """
     candidates, growth = frame.candidates, config.growth
     z = candidates.z - frame.prior_mean
-    seed = (candidates.r <= growth.seed_range) & (np.abs(z) <= growth.seed_height_tolerance)
+    seed: BoolArray = is_low_and_near(candidates.r, z, growth)
     if looks_aside_in(frame, config):
-        limit = growth.max_standardised_residual
-        highest = highest_ground(frame, z, seed, limit * config.observation.slope_std)
-        noise = limit * math.sqrt(2.0) * np.exp(theta[candidates.segment, 1])
-        seed &= z <= highest + noise
+        max_slope = growth.max_standardised_residual * config.observation.slope_std
+        highest = highest_ground(frame, z, seed, max_slope)
+        seed &= ~stands_on(z, highest, theta[candidates.segment, 1], growth)
     return seed
 
 
@@ -114,9 +170,8 @@ def highest_ground(frame: Frame, z: FloatArray, seed: BoolArray, max_slope: floa
     _rise_along(table, max_slope * np.diff(edges))
     _rise_around(table, max_slope * 2.0 * math.pi / n_segments * edges)
     _rise_along(table, max_slope * np.diff(edges))
-    own_bin = candidates.bin
-    near = own_bin < n_bins
-    return np.where(near, table[segment, np.minimum(own_bin, n_bins - 1)], np.inf)
+    near = np.minimum(candidates.bin, n_bins - 1)
+    return np.where(candidates.bin < n_bins, table[segment, near], np.inf)
 
 
 def _rise_along(table: FloatArray, rise: FloatArray) -> None:
@@ -137,64 +192,51 @@ def _rise_around(table: FloatArray, rise: FloatArray) -> None:
 
 
 def evidence_aside(
-    mean: FloatArray,
-    std: FloatArray,
-    prior_variance: FloatArray,
-    knots: FloatArray,
-    slope_std: float,
+    mean: FloatArray, std: FloatArray, prior: FloatArray, knots: FloatArray, slope_std: float
 ) -> Evidence:
     """Evidence at the knots of every segment from the surfaces of the others, (M, K).
 
     On either side the nearest segment that knows: the standard deviation of its evidence grows
-    by `slope_std` for each metre of arc. What a surface knows by the prior alone is no evidence:
-    its observations are what is left of it divided by the prior.
+    by `slope_std` for each metre of arc. See `shown_by` for what a surface shows.
 
     Parameters
     ----------
     mean, std : (M, K) float64
-        Height about the prior mean and standard deviation of the segments' own surfaces [m]; NaN
-        where there is none.
-    prior_variance : (M, K) float64
+        Height about the prior mean and standard deviation of the surface of each segment by
+        itself [m]; NaN where there is none.
+    prior : (M, K) float64
         Variance of the prior [m^2].
     knots : (K,) float64
         Ranges of the knots [m].
     slope_std : float
         Standard deviation of the ground's slope.
     """
-    square = np.maximum(std, LEAST_STD) ** 2
     with np.errstate(invalid='ignore'):
-        precision = 1.0 / square - 1.0 / prior_variance
-        known = precision > LEAST_PRECISION
-    safe = np.where(known, precision, 1.0)
-    height = np.where(known, mean / (square * safe), 0.0)
-    own = np.where(known, 1.0 / np.sqrt(safe), np.inf)
-    step = slope_std * 2.0 * math.pi / len(mean) * knots
-    total, weighted = np.zeros_like(own), np.zeros_like(own)
-    for order in (range(2 * len(own)), range(2 * len(own) - 1, -1, -1)):
+        height, deviation = shown_by(mean, std, prior)
+    n_segments, step = len(mean), slope_std * 2.0 * math.pi / len(mean) * knots
+    total, weighted = np.zeros_like(height), np.zeros_like(height)
+    for order in (range(2 * n_segments), range(2 * n_segments - 1, -1, -1)):
         nearest, nearest_std = np.zeros(len(knots)), np.full(len(knots), np.inf)
         for k, turn in enumerate(order):
-            m = turn % len(own)
+            m = turn % n_segments
             nearest_std = nearest_std + step
             # The first time around finds what the second begins with.
-            if k >= len(own):
+            if k >= n_segments:
                 weight = 1.0 / nearest_std**2
                 total[m] += weight
                 weighted[m] += weight * nearest
-            better = own[m] <= nearest_std
-            nearest = np.where(better, height[m], nearest)
-            nearest_std = np.where(better, own[m], nearest_std)
+            is_better = deviation[m] <= nearest_std
+            nearest = np.where(is_better, height[m], nearest)
+            nearest_std = np.where(is_better, deviation[m], nearest_std)
     return Evidence(weighted / np.where(total > 0.0, total, 1.0), total)
 
 
 def at_candidates(aside: Evidence, candidates: Candidates, knots: FloatArray) -> Evidence:
     """Evidence at the candidates, (C,): linear between the knots about each."""
-    segment, near = candidates.segment, candidates.bin
-    width = knots[near + 1] - knots[near]
-    share = np.clip((candidates.r - knots[near]) / width, 0.0, 1.0)
-
-    def between(table: FloatArray) -> FloatArray:
-        low, high = table[segment, near], table[segment, near + 1]
-        value: FloatArray = low + share * (high - low)
-        return value
-
-    return Evidence(between(aside.height), between(aside.precision))
+    r, segment, near = candidates.r, candidates.segment, candidates.bin
+    far = near + 1
+    height, precision = (
+        between_knots(r, knots[near], knots[far], table[segment, near], table[segment, far])
+        for table in aside
+    )
+    return Evidence(height, precision)

@@ -6,18 +6,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, GroundSurface, IntArray
+from gp_ground_seg.core.frame import (
+    BoolArray,
+    FloatArray,
+    Frame,
+    GroundSurface,
+    IntArray,
+    Values,
+)
 from gp_ground_seg.core.gp.evidence import (
     STEP,
     Evidence,
     at_candidates,
+    combined,
+    combined_surface,
+    contradicts,
     evidence_aside,
     looks_aside_in,
     seeds,
 )
-from gp_ground_seg.core.gp.kernels import paciorek
+from gp_ground_seg.core.gp.kernels import paciorek, prior_variance
 from gp_ground_seg.core.gp.latent import given_log_length_scales, latent_log_length_scales
 from gp_ground_seg.core.gp.linalg import Padded, add_noise, batches, single_threaded_blas
+from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GrowthConfig
 
 
@@ -65,24 +76,24 @@ def estimate_surface(
     else:
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
-    own = SegmentSurfaces.empty(len(z), knot_u.shape)
+    alone = SegmentSurfaces.empty(len(z), knot_u.shape)
     model = _Model(frame, theta, z, np.exp(u), np.exp(knot_u), seeds(frame, theta, config))
     everywhere = np.arange(len(theta))
     looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
-    prior_variance = np.exp(2.0 * theta[:, :1]) + slope_std**2 * knots**2
+    prior = prior_variance(np.exp(theta[:, :1]) ** 2, slope_std, knots)
 
     def aside() -> Evidence:
-        return evidence_aside(own.mean, own.std, prior_variance, knots, slope_std)
+        return evidence_aside(alone.mean, alone.std, prior, knots, slope_std)
 
     if looks_aside:
-        _grow_segments(everywhere[::STEP], model, Evidence(*none), config, own)
+        _grow_segments(everywhere[::STEP], model, Evidence(*none), config, alone)
         beside = at_candidates(aside(), candidates, knots)
-    _grow_segments(everywhere, model, beside if looks_aside else Evidence(*none), config, own)
-    mean, std = own.mean, own.std
+    _grow_segments(everywhere, model, beside if looks_aside else Evidence(*none), config, alone)
+    mean, std = alone.mean, alone.std
     if looks_aside:
-        mean, std = aside().combined_surface(mean, std, prior_variance)
+        mean, std = combined_surface(mean, std, prior, *aside())
         mean[np.isnan(knot_u)] = std[np.isnan(knot_u)] = np.nan
-    return GroundSurface(knots, mean + frame.prior_mean, std, own.inlier), knot_u, u
+    return GroundSurface(knots, mean + frame.prior_mean, std, alone.inlier), knot_u, u
 
 
 class SegmentSurfaces(NamedTuple):
@@ -112,73 +123,79 @@ class _Model(NamedTuple):
     seed: BoolArray  # (C,) candidates that start the inlier set
 
 
-def _fits(
-    z: FloatArray,
-    height: FloatArray,
-    variance: FloatArray,
-    noise: FloatArray,
-    growth: GrowthConfig,
-) -> BoolArray:
+@shared
+def fits(
+    z: Values, height: Values, variance: Values, noise: Values, growth: GrowthConfig
+) -> Values:
     """Whether heights are predicted well enough, and near enough, to join."""
-    residual = (z - height) / np.sqrt(np.maximum(variance, 0.0) + noise)
-    result: BoolArray = (
-        (variance <= growth.max_std**2)
-        & (residual <= growth.max_standardised_residual)
-        & (residual >= -growth.max_standardised_depth)
-    )
-    return result
+    residual = z - height
+    limit = choose(residual > 0.0, growth.max_standardised_residual, growth.max_standardised_depth)
+    is_near = residual * residual <= limit * limit * (variance + noise)
+    return (variance <= growth.max_std * growth.max_std) & is_near
 
 
 def _grow_segments(
-    segments: IntArray, model: _Model, aside: Evidence, config: Config, own: SegmentSurfaces
+    segments: IntArray, model: _Model, aside: Evidence, config: Config, alone: SegmentSurfaces
 ) -> None:
-    """Inliers and surface of `segments`, into `own`; `aside` is the evidence at the candidates."""
-    own.mean[segments] = own.std[segments] = np.nan
+    """Inliers and surface of `segments`, into `alone`; `aside` is the evidence at candidates."""
+    alone.mean[segments] = alone.std[segments] = np.nan
     offsets = model.frame.candidates.offsets
     size = offsets[segments + 1] - offsets[segments]
     for batch in batches(np.concatenate([[0], np.cumsum(size)])):
-        _grow_batch(segments[batch], model, aside, config, own)
+        _grow_batch(segments[batch], model, aside, config, alone)
 
 
 def _grow_batch(
-    segments: IntArray, model: _Model, aside: Evidence, config: Config, own: SegmentSurfaces
+    segments: IntArray, model: _Model, aside: Evidence, config: Config, alone: SegmentSurfaces
 ) -> None:
     frame, theta, slope_std = model.frame, model.theta[segments], config.observation.slope_std
-    layout, knots = Padded.of(segments, frame.candidates.offsets), frame.knots
-    sigma_f, sigma_n = np.exp(theta[:, :2]).T
-    r, own_l = layout.take(frame.candidates.r), layout.take(model.length_scale, 1.0)
-    covariance = paciorek(r, own_l, r, own_l, sigma_f)
-    covariance += slope_std**2 * r[:, :, None] * r[:, None, :]
-    noise = np.exp(2.0 * model.theta[frame.candidates.segment, 1])
-    above = aside.contradicts(model.z, noise, config.growth.max_standardised_residual)
+    layout = Padded.of(segments, frame.candidates.offsets)
+    sill, noise = np.exp(theta[:, :2]).T ** 2
+    places = layout.take(frame.candidates.r), layout.take(model.length_scale, 1.0)
+    noise_of_each = np.exp(2.0 * model.theta[frame.candidates.segment, 1])
+    limit = config.growth.max_standardised_residual
+    above = contradicts(*aside, model.z, noise_of_each, limit)
     batch = _Batch(
-        covariance,
+        _covariance(places, places, sill, slope_std),
         layout.take(model.z),
-        np.broadcast_to(sigma_n[:, None] ** 2, r.shape),
+        np.broadcast_to(noise[:, None], layout.mask.shape),
         layout.mask,
         (model.seed & ~above)[layout.place] & layout.mask,
         (frame.continues_line & ~above)[layout.place] & layout.mask,
         Evidence(layout.take(aside.height), layout.take(aside.precision)),
     )
     chosen = _grow(batch, config.growth)
-    own.inlier[layout.place[layout.mask]] = chosen[layout.mask]
-    has_surface = chosen.any(axis=1)
-    if len(knots) == 0 or not has_surface.any():
+    alone.inlier[layout.place[layout.mask]] = chosen[layout.mask]
+    grown = chosen.any(axis=1)
+    if len(frame.knots) == 0 or not grown.any():
         return
-    kept, chosen, sigma_f = segments[has_surface], chosen[has_surface], sigma_f[has_surface]
+    kept, chosen, sill = segments[grown], chosen[grown], sill[grown]
     is_wanted = np.isfinite(model.knot_length_scale[kept])
     wanted_l = np.where(is_wanted, model.knot_length_scale[kept], 1.0)
-    everywhere = np.broadcast_to(knots, (len(kept), len(knots)))
-    cross = paciorek(r[has_surface], own_l[has_surface], everywhere, wanted_l, sigma_f)
-    cross += slope_std**2 * r[has_surface][:, :, None] * knots
-    mean, variance = _predict(
-        add_noise(covariance[has_surface], batch.noise[has_surface], chosen),
+    at_knots = np.broadcast_to(frame.knots, wanted_l.shape), wanted_l
+    cross = _covariance((places[0][grown], places[1][grown]), at_knots, sill, slope_std)
+    mean, change = _predict(
+        add_noise(batch.covariance[grown], batch.noise[grown], chosen),
         cross * chosen[:, :, None],
-        batch.z[has_surface] * chosen,
+        batch.z[grown] * chosen,
     )
-    variance += sigma_f[:, None] ** 2 + slope_std**2 * knots**2
-    own.mean[kept] = np.where(is_wanted, mean, np.nan)
-    own.std[kept] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+    variance = change + prior_variance(sill[:, None], slope_std, frame.knots)
+    alone.mean[kept] = np.where(is_wanted, mean, np.nan)
+    alone.std[kept] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
+
+
+def _covariance(
+    a: tuple[FloatArray, FloatArray],
+    b: tuple[FloatArray, FloatArray],
+    sill: FloatArray,
+    slope_std: float,
+) -> FloatArray:
+    """Prior covariance of ranges and length-scales (S, A) with others (S, B), (S, A, B)."""
+    r_a, l_a = (values[:, :, None] for values in a)
+    r_b, l_b = (values[:, None, :] for values in b)
+    result: FloatArray = paciorek(r_a, l_a, r_b, l_b, sill[:, None, None])
+    result += slope_std**2 * r_a * r_b
+    return result
 
 
 class _Batch(NamedTuple):
@@ -222,7 +239,7 @@ def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
         following = batch.continues_line[active]
         following[:, 1:] &= chosen[active, :-1]
         following[:, 0] = False
-        joining = _fits(z, *aside.combined(height, variance), noise, growth) | following
+        joining = fits(z, *combined(height, variance, *aside), noise, growth) | following
         joining &= ~chosen[active] & batch.mask[active]
         # Before anything has joined, only evidence from aside decides.
         joining &= chosen[active].any(axis=1, keepdims=True) | (aside.precision > 0.0)

@@ -40,20 +40,21 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
     at_candidates = np.empty(len(candidates.r))
     at_knots = np.full((len(theta), len(knots)), np.nan)
     for segments in batches(candidates.offsets):
-        own = Padded.of(segments, candidates.offsets)
+        layout = Padded.of(segments, candidates.offsets)
         bar = Padded.of(segments, pseudo.offsets)
-        own_r, r_bar = own.take(candidates.r), bar.take(pseudo.r_bar)
-        sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[segments, 2:5]).T
+        r, r_bar = layout.take(candidates.r)[:, :, None], bar.take(pseudo.r_bar)
+        sill_bar, square_l_bar, noise_bar = np.exp(2.0 * theta[segments, 2:5]).T
+        kernel = sill_bar[:, None, None], 0.5 / square_l_bar[:, None, None]
         l_bar = np.where(bar.mask, bar.take(pseudo.log_extent) + theta[segments, 5:], 0.0)
         mean = l_bar.sum(axis=1, keepdims=True) / bar.mask.sum(axis=1, keepdims=True)
-        covariance = squared_exponential(r_bar, r_bar, sigma_f_bar, sigma_l_bar)
-        add_noise(covariance, sigma_n_bar[:, None] ** 2, bar.mask)
+        covariance = squared_exponential(r_bar[:, :, None], r_bar[:, None, :], *kernel)
+        add_noise(covariance, noise_bar[:, None], bar.mask)
         centred = np.where(bar.mask, l_bar - mean, 0.0)
         weight = np.linalg.solve(covariance, centred[:, :, None])
-        cross = squared_exponential(own_r, r_bar, sigma_f_bar, sigma_l_bar)
-        at_candidates[own.place[own.mask]] = ((cross @ weight)[:, :, 0] + mean)[own.mask]
-        wanted = np.broadcast_to(knots, (len(segments), len(knots)))
-        cross = squared_exponential(wanted, r_bar, sigma_f_bar, sigma_l_bar)
+        cross = squared_exponential(r, r_bar[:, None, :], *kernel)
+        found = (cross @ weight)[:, :, 0] + mean
+        at_candidates[layout.place[layout.mask]] = found[layout.mask]
+        cross = squared_exponential(knots[:, None], r_bar[:, None, :], *kernel)
         is_wanted = np.arange(len(knots)) < n_knots[segments, None]
         at_knots[segments] = np.where(is_wanted, (cross @ weight)[:, :, 0] + mean, np.nan)
     bound = MAX_ABS_LOG_LENGTH_SCALE
@@ -75,8 +76,8 @@ def given_log_length_scales(
         u = np.log(of_lines)[frame.lines.line]
     at_knots = np.full((len(n_knots), len(knots)), np.nan)
     for m in np.flatnonzero(n_knots):
-        own, n = slice(candidates.offsets[m], candidates.offsets[m + 1]), n_knots[m]
-        at_knots[m, :n] = np.interp(knots[:n], candidates.r[own], u[own])
+        inside, n = slice(candidates.offsets[m], candidates.offsets[m + 1]), n_knots[m]
+        at_knots[m, :n] = np.interp(knots[:n], candidates.r[inside], u[inside])
     return u, at_knots
 
 

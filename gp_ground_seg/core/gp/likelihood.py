@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray
-from gp_ground_seg.core.gp.kernels import squared_exponential
+from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.gp.linalg import Padded, add_noise, batches, single_threaded_blas
 
@@ -51,54 +51,51 @@ def _add_batch(
     latent_terms: bool,
 ) -> float:
     """Value of some segments; adds to `gradient`. Letters are those of the paper."""
-    own = Padded.of(segments, inliers.offsets)
-    r, z = own.take(inliers.r), own.take(inliers.z)
+    layout = Padded.of(segments, inliers.offsets)
+    r, z = layout.take(inliers.r), layout.take(inliers.z)
     bar = Padded.of(segments, inliers.bar_offsets)
-    u = own.take(inliers.log_length_scale)
+    u = layout.take(inliers.log_length_scale)
     has_latent = bar.mask.any(axis=1, keepdims=True)
     latent = _Latent.of(theta, inliers, bar, r) if has_latent.any() else None
     if latent is not None:
         u = np.where(has_latent, latent.u, u)
 
     sigma_f, sigma_n = np.exp(theta[:2])
-    length_scale = np.where(own.mask, np.exp(u), 1.0)
-    square = length_scale**2
-    inverse_spread = 1.0 / (square[:, :, None] + square[:, None, :])
-    exponent = r[:, :, None] - r[:, None, :]
-    exponent *= exponent
-    exponent *= inverse_spread
-    k = np.exp(-exponent)
-    k *= np.sqrt(inverse_spread * (2.0 * length_scale[:, :, None] * length_scale[:, None, :]))
-    k *= sigma_f**2 * (own.mask[:, :, None] & own.mask[:, None, :])
-    covariance = k + slope_std**2 * r[:, :, None] * r[:, None, :]
-    add_noise(covariance, np.full((1, 1), sigma_n**2), own.mask)
+    length_scale = np.where(layout.mask, np.exp(u), 1.0)
+    r_a, l_a, r_b, l_b = (
+        r[:, :, None],
+        length_scale[:, :, None],
+        r[:, None, :],
+        length_scale[:, None],
+    )
+    k = paciorek(r_a, l_a, r_b, l_b, sigma_f**2)
+    k *= layout.mask[:, :, None] & layout.mask[:, None, :]
+    covariance = add_noise(k + slope_std**2 * r_a * r_b, np.full((1, 1), sigma_n**2), layout.mask)
     factor = np.linalg.cholesky(covariance)
     a_inverse = np.linalg.inv(covariance)
     alpha = (a_inverse @ z[:, :, None])[:, :, 0]
     value = -0.5 * float(
         np.sum(z * alpha)
         + 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
-        + own.mask.sum() * _LOG_2PI
+        + layout.mask.sum() * _LOG_2PI
     )
 
     # G = (alpha alpha^T - A^-1) / 2 is the derivative of the value in A.
     a_inverse *= -0.5
     g = a_inverse
     g += 0.5 * alpha[:, :, None] * alpha[:, None, :]
-    gradient[1] += 2.0 * sigma_n**2 * np.diagonal(g, axis1=1, axis2=2)[own.mask].sum()
+    gradient[1] += 2.0 * sigma_n**2 * np.diagonal(g, axis1=1, axis2=2)[layout.mask].sum()
     g *= k
     row_sum = g.sum(axis=2)
     gradient[0] += 2.0 * row_sum.sum()
     if latent is None:
         return value
     # dk/du_i = k (1/2 - l_i^2 / s (1 - 2 d^2 / s)), s = l_i^2 + l_j^2, in rows and columns.
-    exponent *= -2.0
-    exponent += 1.0
-    g *= exponent
-    g *= inverse_spread
-    g_u = row_sum - 2.0 * square * g.sum(axis=2)
+    inverse_spread = 1.0 / (l_a**2 + l_b**2)
+    g *= (1.0 - 2.0 * (r_a - r_b) ** 2 * inverse_spread) * inverse_spread
+    g_u = row_sum - 2.0 * length_scale**2 * g.sum(axis=2)
     is_bounded = np.abs(u) >= MAX_ABS_LOG_LENGTH_SCALE
-    g_u = np.where(own.mask & has_latent & ~is_bounded, g_u, 0.0)
+    g_u = np.where(layout.mask & has_latent & ~is_bounded, g_u, 0.0)
     return value + latent.add_gradient(gradient, g_u, latent_terms)
 
 
@@ -123,10 +120,11 @@ class _Latent(NamedTuple):
         r_bar = bar.take(inliers.r_bar)
         l_bar = bar.take(inliers.log_extent)
         mean = l_bar.sum(axis=1, keepdims=True) / np.maximum(bar.mask.sum(axis=1), 1)[:, None]
-        scales = np.full(len(r), sigma_f_bar), np.full(len(r), sigma_l_bar)
-        k_bar = squared_exponential(r_bar, r_bar, *scales)
+        kernel = sigma_f_bar**2, 0.5 / sigma_l_bar**2
+        k_bar = squared_exponential(r_bar[:, :, None], r_bar[:, None, :], *kernel)
         k_bar *= bar.mask[:, :, None] & bar.mask[:, None, :]
-        k_star = squared_exponential(r, r_bar, *scales) * bar.mask[:, None, :]
+        k_star = squared_exponential(r[:, :, None], r_bar[:, None, :], *kernel)
+        k_star *= bar.mask[:, None, :]
         b = add_noise(k_bar.copy(), np.full((1, 1), sigma_n_bar**2), bar.mask)
         inverse = np.linalg.inv(b).astype(np.float64, copy=False)
         factor = np.linalg.cholesky(b).astype(np.float64, copy=False)

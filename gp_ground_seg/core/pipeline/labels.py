@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +18,9 @@ from gp_ground_seg.core.frame import (
     Labelled,
     PolarGrid,
     Scan,
+    Values,
 )
+from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
 
 FINEST_UNITS = 2.0**40
@@ -38,78 +39,108 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     height = z - surface.at(grid)[0]
     tile, inside = np.maximum(tiles.tile, 0), grid.inside
     in_face = faces.is_face[tile] & inside
-    near = local_heights(height, grid, in_face, label)
-    tolerance = label.ground_tolerance
+    n_near, squares, n_obstacles = _returns_about(height, grid, in_face, label)
+    roughness = roughness_of(squares, n_near, square_units(len(z), label.obstacle_min_height))
+    band = np.full(len(roughness), label.ground_tolerance)
     if label.rule == 'predictive':
-        band = ground_band(near, config)[np.maximum(grid.cell, 0)]
-        margin = np.minimum(band - height, height + label.obstacle_max_height)
-    else:
-        margin = tolerance - np.abs(height)
-    over_base = np.maximum(height, z - np.where(in_face, tiles.lowest_z[tile], 0.0))
-    # With a limit below zero no return of the tile is ground; the margin stays a distance.
-    limit = np.where(faces.has_occluded_base[tile], -tolerance, tolerance)
-    margin = np.where(in_face, np.minimum(margin, limit - over_base), margin)
+        band = ground_band(n_near, roughness, n_obstacles, label, config.observation.sigma_n)
+    margin: FloatArray = band_margin(
+        height, band[np.maximum(grid.cell, 0)], depth_of_ground(label)
+    )
+    over_lowest = z - np.where(in_face, tiles.lowest_z[tile], 0.0)
+    of_face = face_margin(
+        margin, height, over_lowest, faces.has_occluded_base[tile], label.ground_tolerance
+    )
+    margin[in_face] = of_face[in_face]
     margin[~inside] = np.nan
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
-    roughness = near.roughness.reshape(grid.n_segments, grid.n_bins)
-    return Labelled(result, height, margin, roughness)
+    return Labelled(result, height, margin, roughness.reshape(grid.n_segments, grid.n_bins))
 
 
-class LocalHeights(NamedTuple):
-    """Heights over the surface of the returns in each cell and the eight around it.
+def depth_of_ground(label: LabelConfig) -> float:
+    """Depth below the surface down to which a return is ground [m]."""
+    is_predictive = label.rule == 'predictive'
+    return label.obstacle_max_height if is_predictive else label.ground_tolerance
 
-    Each is (M * n_bins,).
+
+@shared
+def is_near(height: Values, label: LabelConfig) -> Values:
+    """Whether a return so high over the surface [m] tells its roughness."""
+    return (height < label.obstacle_min_height) & (height >= -label.obstacle_min_height)
+
+
+@shared
+def shows_obstacle(height: Values, label: LabelConfig) -> Values:
+    """Whether a return so high over the surface [m] shows an obstacle: higher ones overhang."""
+    return (height >= label.obstacle_min_height) & (height <= label.obstacle_max_height)
+
+
+@shared
+def roughness_of(squares: Values, n_near: Values, units: float) -> Values:
+    """Root mean square height of returns near the surface [m]; 0 where there are none.
+
+    `squares` is the sum of their squared heights in whole units, see `square_units`.
     """
-
-    # Returns within ``label.obstacle_min_height`` of the surface, but for those of faces.
-    n_near: FloatArray
-    roughness: FloatArray  # their root mean square height [m]; 0 where there are none
-    n_obstacles: FloatArray  # returns from that height to ``label.obstacle_max_height``
+    return np.sqrt(squares / (units * np.maximum(n_near, 1.0)))
 
 
-def ground_band(near: LocalHeights, config: Config) -> FloatArray:
-    """Largest height of ground over the surface in each cell, (M * n_bins,) [m].
+@shared
+def ground_band(
+    n_near: Values, roughness: Values, n_obstacles: Values, label: LabelConfig, sigma_n: float
+) -> Values:
+    """Largest height of ground over the surface of a cell [m].
 
     The height of a ground return is normally distributed about the surface, with the local
     roughness and the noise; returns of obstacles are spread evenly over height, as densely as
     those that are too high for ground. Up to the band a return is more likely ground. One more
     obstacle return is counted than there is: that none was seen does not exclude any.
+
+    `n_near` returns near the surface and `n_obstacles` that show obstacles were counted.
     """
-    label = config.label
-    variance = near.roughness**2 + config.observation.sigma_n**2
-    obstacles_per_metre = (near.n_obstacles + 1.0) / (
-        label.obstacle_max_height - label.obstacle_min_height
-    )
-    ground_per_metre = np.maximum(near.n_near, 1.0) / np.sqrt(2.0 * np.pi * variance)
+    depth = label.obstacle_max_height - label.obstacle_min_height
+    variance = roughness * roughness + sigma_n * sigma_n
+    obstacles_per_metre = (n_obstacles + 1.0) / depth
+    ground_per_metre = np.maximum(n_near, 1.0) / np.sqrt(2.0 * np.pi * variance)
     log_ratio = np.log(ground_per_metre / obstacles_per_metre)
     likely = np.sqrt(2.0 * variance * np.maximum(log_ratio, 0.0))
-    result: FloatArray = np.minimum(
-        np.maximum(likely, label.ground_tolerance), label.obstacle_min_height
-    )
-    return result
+    return np.minimum(np.maximum(likely, label.ground_tolerance), label.obstacle_min_height)
 
 
-def local_heights(
+@shared
+def band_margin(height: Values, band: Values, depth: float) -> Values:
+    """Distance of a point to the nearer edge of the band of ground [m], negative outside it."""
+    return np.minimum(band - height, height + depth)
+
+
+@shared
+def face_margin(
+    margin: Values, height: Values, over_lowest: Values, is_occluded: Values, tolerance: float
+) -> Values:
+    """Return what `band_margin` is of a point in a vertical face, `over_lowest` its lowest [m]."""
+    # With a limit below zero no return of the tile is ground; the margin stays a distance.
+    limit = tolerance * (1.0 - 2.0 * is_occluded)
+    return np.minimum(margin, limit - np.maximum(height, over_lowest))
+
+
+def _returns_about(
     height: FloatArray, grid: PolarGrid, in_face: BoolArray, label: LabelConfig
-) -> LocalHeights:
-    """Count the returns about each cell.
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Count returns in each cell and the eight around it, (M * n_bins,) each.
 
+    Those near the surface, their squared heights in whole units, those that show an obstacle.
     `height` (N,) is over the surface [m], NaN where there is none; points `in_face` (N,), of
     vertical faces, are no roughness of the ground.
     """
-    low, high = label.obstacle_min_height, label.obstacle_max_height
-    units = square_units(len(height), low)
 
     def total(counts: BoolArray, weights: FloatArray | None = None) -> FloatArray:
         table = np.bincount(grid.cell[counts], weights, grid.n_segments * grid.n_bins)
         return sum_neighbourhood(table.reshape(grid.n_segments, grid.n_bins)).ravel()
 
-    is_near = (height < low) & (height >= -low) & grid.inside & ~in_face
-    n_near = total(is_near)
-    squares = total(is_near, np.floor(height[is_near] ** 2 * units + 0.5))
-    roughness = np.sqrt(squares / (units * np.maximum(n_near, 1.0)))
-    return LocalHeights(n_near, roughness, total((height >= low) & (height <= high) & grid.inside))
+    near = is_near(height, label) & grid.inside & ~in_face
+    units = square_units(len(height), label.obstacle_min_height)
+    squares = total(near, np.floor(height[near] ** 2 * units + 0.5))
+    return total(near), squares, total(shows_obstacle(height, label) & grid.inside)
 
 
 def square_units(n_points: int, max_height: float) -> float:

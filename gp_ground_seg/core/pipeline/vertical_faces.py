@@ -12,7 +12,8 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.core.frame import OUTSIDE, BoolArray, Faces, FloatArray, IntArray, Scan
+from gp_ground_seg.core.frame import OUTSIDE, Faces, FloatArray, IntArray, Scan, Values
+from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config
 
 MIN_RETURNS = 4
@@ -27,6 +28,10 @@ UNITS_PER_METRE = 2.0**16
 hundred thousand of them, are then exact, so that their order does not matter."""
 
 
+SUMS = 10
+"""Rows of the sums over returns: number, x, y, z, their squares, x y, x z, y z."""
+
+
 def find_faces(scan: Scan, config: Config) -> Faces:
     """Find the tiles that hold a vertical face.
 
@@ -36,44 +41,57 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     """
     tiles, faces, label = scan.tiles, config.faces, config.label
     inside = tiles.tile != OUTSIDE
-    own, points = tiles.tile[inside], scan.xyz[inside].astype(np.float64)
+    tile, points = tiles.tile[inside], scan.xyz[inside].astype(np.float64)
     n_tiles = len(tiles.extremes)
     n_sides = math.isqrt(n_tiles)
     # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
-    for i, place in enumerate(np.divmod(own, n_sides)):
+    for i, place in enumerate(np.divmod(tile, n_sides)):
         origin = place * faces.cell_size - 0.5 * n_sides * faces.cell_size
         points[:, i] -= np.rint(origin * UNITS_PER_METRE) / UNITS_PER_METRE
-    above = points[:, 2] - tiles.lowest_z[own]
+    above = points[:, 2] - tiles.lowest_z[tile]
     points[:, 2] = above
-    points = np.rint(points * UNITS_PER_METRE) / UNITS_PER_METRE
     low = above <= label.obstacle_max_height
     is_tall = np.zeros(n_tiles, dtype=np.bool_)
-    is_tall[own[low & (above > label.obstacle_min_height)]] = True
+    is_tall[tile[low & (above > label.obstacle_min_height)]] = True
 
-    used = low & is_tall[own]
-    tall, row = np.unique(own[used], return_inverse=True)
-    chosen = points[used]
-    count = np.bincount(row, minlength=len(tall)).astype(np.float64)
-    mean = np.empty((len(tall), 3))
-    for i in range(3):
-        mean[:, i] = np.bincount(row, chosen[:, i], minlength=len(tall)) / count
-    centred = chosen - mean[row]
-    scatter = np.empty((len(tall), 3, 3))
-    for i in range(3):
-        for j in range(3):
-            product = centred[:, i] * centred[:, j]
-            scatter[:, i, j] = np.bincount(row, product, minlength=len(tall))
-    is_face = np.zeros(n_tiles, dtype=np.bool_)
-    is_vertical = normal_z(scatter) < faces.max_normal_z
-    is_face[tall] = is_vertical & (count >= MIN_RETURNS)
-    has_occluded_base = np.zeros(n_tiles, dtype=np.bool_)
+    used = low & is_tall[tile]
+    tall, row = np.unique(tile[used], return_inverse=True)
+    chosen = np.rint(points[used] * UNITS_PER_METRE) / UNITS_PER_METRE
     is_foot = above[used] <= FOOT_SHARE * label.obstacle_min_height
-    occluded = is_base_occluded(row, centred, is_foot, len(tall), faces.max_foot_distance)
-    has_occluded_base[tall] = occluded & is_face[tall]
-    return Faces(is_face, has_occluded_base)
+    foot, rest = (_sums(chosen[part], row[part], len(tall)) for part in (is_foot, ~is_foot))
+    result = Faces(*np.zeros((2, n_tiles), dtype=np.bool_))
+    result.is_face[tall] = is_vertical(foot, rest, faces.max_normal_z)
+    is_occluded = is_base_occluded(foot, rest, faces.max_foot_distance)
+    result.has_occluded_base[tall] = is_occluded & result.is_face[tall]
+    return result
 
 
-def normal_z(scatter: FloatArray) -> FloatArray:
+def _sums(xyz: FloatArray, row: IntArray, n_rows: int) -> FloatArray:
+    """Add up the returns (P, 3) of each row, (SUMS, n_rows)."""
+    x, y, z = xyz.T
+    terms = np.ones(len(x)), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z
+    return np.array([np.bincount(row, term, n_rows) for term in terms])
+
+
+@shared
+def is_vertical(foot: FloatArray, rest: FloatArray, max_normal_z: float) -> Values:
+    """Whether the returns of a tile form a vertical face.
+
+    `foot` and `rest` are the sums over its lowest returns and over those above, (SUMS,), or
+    (SUMS, T) of T tiles; coordinates are relative to any point of the tile [m].
+    """
+    n, x, y, z = foot[0] + rest[0], foot[1] + rest[1], foot[2] + rest[2], foot[3] + rest[3]
+    xx = foot[4] + rest[4] - x * x / n
+    yy = foot[5] + rest[5] - y * y / n
+    zz = foot[6] + rest[6] - z * z / n
+    xy = foot[7] + rest[7] - x * y / n
+    xz = foot[8] + rest[8] - x * z / n
+    yz = foot[9] + rest[9] - y * z / n
+    return (n >= MIN_RETURNS) & (normal_z(xx, yy, zz, xy, xz, yz) < max_normal_z)
+
+
+@shared
+def normal_z(xx: Values, yy: Values, zz: Values, xy: Values, xz: Values, yz: Values) -> Values:
     """Vertical part of the unit normal of points with the given scatter, in closed form.
 
     The adjugate of the scatter matrix is the sum of the outer products of its
@@ -82,47 +100,38 @@ def normal_z(scatter: FloatArray) -> FloatArray:
     share of the vertical in its trace is the squared vertical part of the normal.
     Of a pole, both horizontal directions count; of a shapeless cluster, all three.
 
-    `scatter`, (T, 3, 3), holds scatter (or covariance) matrices. Returns (T,): 0 for vertical
-    planes and poles, 1 for level planes, and 1 where there is no scatter, or only along a line.
+    It is 0 for vertical planes and poles, 1 for level planes, and 1 where there is no scatter, or
+    only along a line.
     """
-    xx, yy, zz = scatter[:, 0, 0], scatter[:, 1, 1], scatter[:, 2, 2]
-    xy, xz, yz = scatter[:, 0, 1], scatter[:, 0, 2], scatter[:, 1, 2]
     vertical = np.maximum(xx * yy - xy * xy, 0.0)
     trace = vertical + np.maximum(yy * zz - yz * yz, 0.0) + np.maximum(xx * zz - xz * xz, 0.0)
-    known = trace > FLATNESS * (xx + yy + zz) ** 2
-    result = np.ones(len(scatter))
-    result[known] = np.sqrt(vertical[known] / trace[known])
-    return result
+    size = xx + yy + zz
+    is_known = trace > FLATNESS * size * size
+    return choose(is_known, np.sqrt(vertical / choose(is_known, trace, 1.0)), 1.0)
 
 
-def is_base_occluded(
-    row: IntArray, xyz: FloatArray, is_foot: BoolArray, n_rows: int, max_foot_distance: float
-) -> BoolArray:
-    """Whether the lowest returns of each face are its own, not ground before it.
+@shared
+def is_base_occluded(foot: FloatArray, rest: FloatArray, max_foot_distance: float) -> Values:
+    """Whether the lowest returns of a tile belong to its face, and are not ground before it.
 
-    Ground would lie off the plane of the returns above.
-
-    `row` (P,) is the face of each return, of `n_rows` faces T, `xyz` (P, 3) the returns, relative
-    to any point of their tile [m], `is_foot` (P,) whether they are at the foot of their face.
-    Returns (T,), False where fewer than two returns are above the foot.
+    Ground would lie off the plane of the returns above. Sums are those of `is_vertical`. False
+    where fewer than two returns are above the foot.
     """
-
-    def total(values: FloatArray, chosen: BoolArray) -> FloatArray:
-        return np.bincount(row[chosen], values[chosen], minlength=n_rows).astype(np.float64)
-
-    n_foot, n_above = (np.bincount(row[part], minlength=n_rows) for part in (is_foot, ~is_foot))
-    number = np.maximum(n_above, 1)
-    x = xyz[:, 0] - (total(xyz[:, 0], ~is_foot) / number)[row]
-    y = xyz[:, 1] - (total(xyz[:, 1], ~is_foot) / number)[row]
-    along, across = total(x * x - y * y, ~is_foot), 2.0 * total(x * y, ~is_foot)
-    foot_along, foot_across = total(x * x - y * y, is_foot), 2.0 * total(x * y, is_foot)
+    n_foot, n_rest = foot[0], np.maximum(rest[0], 1.0)
+    x, y = rest[1] / n_rest, rest[2] / n_rest
+    # Scatter of both about the middle of the returns above.
+    xx = rest[4] - n_rest * x * x
+    yy = rest[5] - n_rest * y * y
+    xy = rest[7] - n_rest * x * y
+    foot_xx = foot[4] - 2.0 * x * foot[1] + n_foot * x * x
+    foot_yy = foot[5] - 2.0 * y * foot[2] + n_foot * y * y
+    foot_xy = foot[7] - x * foot[2] - y * foot[1] + n_foot * x * y
     # Mean square along the direction in which the returns above scatter least.
-    size = np.hypot(along, across)
+    size = np.sqrt((xx - yy) * (xx - yy) + 4.0 * xy * xy)
     # Of returns in one place the direction would be rounding: all directions count alike.
-    has_direction = size > FLATNESS * number
-    aligned = (foot_along * along + foot_across * across) / np.where(has_direction, size, 1.0)
-    aligned[~has_direction] = 0.0
-    square = 0.5 * (total(x * x + y * y, is_foot) - aligned)
-    is_in_plane = square <= n_foot * max_foot_distance**2
-    result: BoolArray = is_in_plane & (n_above >= 2) & (max_foot_distance > 0.0)
-    return result
+    has_direction = size > FLATNESS * n_rest
+    along = (foot_xx - foot_yy) * (xx - yy) + 4.0 * foot_xy * xy
+    aligned = choose(has_direction, along / choose(has_direction, size, 1.0), 0.0)
+    square = 0.5 * (foot_xx + foot_yy - aligned)
+    is_in_plane = square <= n_foot * max_foot_distance * max_foot_distance
+    return is_in_plane & (rest[0] >= 2.0) & (max_foot_distance > 0.0)
