@@ -55,8 +55,6 @@ def draw(scan, tmp_path):
 
     def command(*words, segment=('--segment', SEGMENT), name='a.png'):
         assert run('plot', 'segment', scan, *segment, '-o', tmp_path / name, *words) == 0
-        if not name.endswith('.png'):
-            return None
         image = imread(tmp_path / name)[:, :, :3]
         height, width = image.shape[:2]
         inside = image[:, round(0.075 * width) : round(0.775 * width)]
@@ -102,9 +100,9 @@ def test_everything_is_drawn(draw, scan, tmp_path, capsys):
     assert count(lower, colours.PSEUDO_INPUT_COLOUR) > 30
     assert count(lower, colours.SURFACE_COLOUR) > 300
     result = GroundSegmenter().segment(ahead()[0])
-    own = slice(*result.candidates.offsets[SEGMENT : SEGMENT + 2])
+    first, last = result.candidates.offsets[SEGMENT : SEGMENT + 2]
     assert capsys.readouterr().out == (
-        f'segment 90: {own.stop - own.start} candidates, {result.surface.inlier[own].sum()} '
+        f'segment 90: {last - first} candidates, {result.surface.inlier[first:last].sum()} '
         f'inliers, {np.diff(result.pseudo.offsets)[SEGMENT]} pseudo-inputs, '
         f'written to {tmp_path / "a.png"}\n'
     )
@@ -120,28 +118,25 @@ def test_pseudo_inputs_only_where_they_act(draw, model):
     assert count(upper, TRUE_GROUND_COLOUR) == 0
 
 
-def test_azimuth_is_another_way_to_say_segment_and_a_pdf_is_the_same_each_time(draw, tmp_path):
-    for ending, start in (('png', b'\x89PNG'), ('pdf', b'%PDF-')):
-        draw(segment=('--azimuth', 1), name=f'a.{ending}')
-        draw(name=f'b.{ending}')
-        document = (tmp_path / f'a.{ending}').read_bytes()
-        assert document.startswith(start)
-        assert document == (tmp_path / f'b.{ending}').read_bytes()
+def test_azimuth_is_another_way_to_say_segment(draw, tmp_path):
+    draw(segment=('--azimuth', 1), name='a.png')
+    draw(name='b.png')
+    assert (tmp_path / 'a.png').read_bytes() == (tmp_path / 'b.png').read_bytes()
 
 
 def test_what_is_drawn_is_the_result():
     """The curves' data, read back from the axes."""
-    points = hilly_scan()
-    result = GroundSegmenter().segment(points)
+    result = GroundSegmenter().segment(hilly_scan().astype(np.float32))
     above, below = Figure().subplots(2)
     view = SegmentView(result, SEGMENT)
     view.draw_ground(above)
     view.draw_length_scale(below, 40.0, with_pseudo_inputs=True)
 
     drawn = {line.get_label().split(' (')[0]: line for line in above.lines}
-    own = slice(*result.candidates.offsets[SEGMENT : SEGMENT + 2])
-    r, z, inlier = result.candidates.r[own], result.candidates.z[own], result.surface.inlier[own]
-    begins = np.flatnonzero(np.diff(result.lines.line[own])) + 1
+    inside = slice(*result.candidates.offsets[SEGMENT : SEGMENT + 2])
+    r, z = result.candidates.r[inside], result.candidates.z[inside]
+    inlier = result.surface.inlier[inside]
+    begins = np.flatnonzero(np.diff(result.lines.line[inside])) + 1
     assert len(begins) > 0
     np.testing.assert_array_equal(drawn['critical points'].get_xdata(), r[begins])
     np.testing.assert_array_equal(drawn['candidates, inliers'].get_ydata(), z[inlier])
@@ -188,16 +183,6 @@ def test_errors_are_said(scan, tmp_path, monkeypatch, capsys, words, message):
     assert run('plot', 'segment', scan, '--set', 'sensor.height=1.73', *words) == 2
     assert message in error_line(capsys)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_file_is_kept_without_force(scan, draw, tmp_path, capsys):
-    picture = tmp_path / 'a.png'
-    picture.write_text('mine')
-    assert run('plot', 'segment', scan, '--segment', SEGMENT, '-o', picture) == 2
-    assert '--force' in error_line(capsys)
-    assert picture.read_text() == 'mine'
-    draw('--force')
-    assert list(tmp_path.iterdir()) == [picture]
 
 
 @pytest.mark.parametrize('words', [[], ['--segment', '1', '--azimuth', '1']])

@@ -167,7 +167,7 @@ def test_camera_projects_as_a_camera_does():
 
 
 def test_picture_shows_ground_obstacles_and_model(tmp_path):
-    points = hilly_scan(8000)
+    points = hilly_scan(8000).astype(np.float32)
     points[:10] = np.nan
     config = Config()
     found = GroundSegmenter(config).segment(points)

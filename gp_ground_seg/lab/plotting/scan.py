@@ -36,9 +36,6 @@ COLOURS_ABOVE = {
     'right': '#BCC2C8',
     'missed ground': style.BLUE,
     'false ground': style.VERMILION,
-    'same label': '#BCC2C8',
-    'ground in A only': style.BLUE,
-    'ground in B only': style.VERMILION,
 }
 """Colours of the points seen from above."""
 
@@ -219,43 +216,6 @@ def plot_birds_eye(
     panels = [_label_panel(label)]
     if truth is not None:
         panels.append(_error_panel(label, truth))
-    _draw_panels(xyz, panels, path, title)
-    return panels[-1][0]
-
-
-def plot_two_labels(
-    points: npt.ArrayLike,
-    labels: Sequence[Labels],
-    path: str | Path,
-    truth: Labels | None = None,
-    title: str = '',
-) -> None:
-    """Draw what two methods, A and B, say of points (N, >=3) [m] from above, as a PNG.
-
-    A panel for each, with its errors where the true labels are given, and one of where they
-    differ. The file `path` is replaced.
-    """
-    xyz = check_points(points)
-    one, other = labels
-    style.check_lengths(len(xyz), A=one, B=other, truth=truth)
-    own = [
-        _label_panel(label) if truth is None else _error_panel(label, truth) for label in labels
-    ]
-    panels = [(f'{name}: {text}', layers) for name, (text, layers) in zip('AB', own, strict=True)]
-    only_a, only_b = (
-        (a == Label.GROUND) & (b != Label.GROUND) for a, b in ((one, other), (other, one))
-    )
-    layers = {'same label': one == other, 'unknown': (one != other) & ~only_a & ~only_b}
-    layers |= {'ground in A only': only_a, 'ground in B only': only_b}
-    n_a, n_b = (_thousands(int(chosen.sum())) for chosen in (only_a, only_b))
-    panels.append((f'{n_a} ground in A only, {n_b} in B only', layers))
-    _draw_panels(xyz, panels, path, title)
-
-
-def _draw_panels(
-    xyz: FloatArray, panels: Sequence[tuple[str, Layers]], path: str | Path, title: str
-) -> None:
-    """Draw panels side by side."""
     xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
     width = LEFT + SQUARE + RIGHT
     height = BELOW + SQUARE + ABOVE + (LINE if title else 0.0)
@@ -264,10 +224,9 @@ def _draw_panels(
     for k, (panel_title, layers) in enumerate(panels):
         axes = add_axes(figure, k * width + LEFT, BELOW, (SQUARE, SQUARE))
         axes.set_title(panel_title, fontsize=11)
-        axes.set_xlabel('y, to the left [m]')
-        axes.set_ylabel('x, forward [m]')
         _draw_panel(axes, xy, layers)
     save(figure, path)
+    return panels[-1][0]
 
 
 def _label_panel(label: Labels) -> tuple[str, Layers]:
@@ -313,6 +272,8 @@ def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None
     axes.set_aspect('equal')
     axes.set_xlim(EXTENT, -EXTENT)
     axes.set_ylim(-EXTENT, EXTENT)
+    axes.set_xlabel('y, to the left [m]')
+    axes.set_ylabel('x, forward [m]')
     (sensor,) = axes.plot(
         0, 0, marker='^', color='white', markeredgecolor='black', linestyle='none',
         markersize=8, zorder=len(layers) + 1, label='sensor',

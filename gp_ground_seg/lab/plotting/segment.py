@@ -65,11 +65,9 @@ def plot_segment(
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     style.check_lengths(len(z), result=result.label, truth=truth)
     view = SegmentView(result, segment)
-    if max_range is not None and not (max_range > 0.0 and math.isfinite(max_range)):
-        raise ConfigError(f'max_range = {max_range}: must be a positive number of metres')
     inside = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
     r, z = result.grid.r[inside], z[inside]
-    reach = view.reach(r) if max_range is None else max_range
+    reach = view.reach(r, max_range)
     low, high = view.heights_shown(reach, z)
     n_hidden = np.count_nonzero((r > reach) | (z < low) | (z > high))
     figure = new_figure(WIDTH, HEIGHT, DPI)
@@ -122,8 +120,12 @@ class SegmentView:
         model = '' if np.isfinite(self._mean).any() else ': no ground model'
         return f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
 
-    def reach(self, point_r: FloatArray) -> float:
-        """Range that holds all candidates, or all points where there are none [m]."""
+    def reach(self, point_r: FloatArray, max_range: float | None) -> float:
+        """Return `max_range`, else what holds all candidates, or if none all points [m]."""
+        if max_range is not None:
+            if not (max_range > 0.0 and math.isfinite(max_range)):
+                raise ConfigError(f'max_range = {max_range}: must be a positive number of metres')
+            return max_range
         r = self._r if len(self._r) else point_r
         return float(r.max()) + BEYOND if len(r) else float(self._result.grid.edges[-1])
 
