@@ -142,13 +142,13 @@ def load_frames(
         # Shares of whole frames that add up to those wanted.
         share = n_frames * (j + 1) // len(folders) - n_frames * j // len(folders)
         wanted = {k: run_name for run_name, k in runs(inputs.topic or name, len(inputs), share)}
-        for k, one in enumerate(inputs):
+        for k, item in enumerate(inputs):
             if k in wanted:
-                xyz = one.read().xyz
+                xyz = item.read().xyz
                 # With full intensity Patchwork++ drops no point as noise.
                 points = np.ones((len(xyz), 4), dtype=np.float32)
                 points[:, : xyz.shape[1]] = xyz
-                frames.append(BenchFrame(wanted[k], one.name, points))
+                frames.append(BenchFrame(wanted[k], item.name, points))
     if not any(len(frame.points) for frame in frames):
         raise DataError(f'{source}: no point in any of {len(frames)} frames')
     return frames
@@ -157,7 +157,7 @@ def load_frames(
 def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
     """Name and index of frames in runs of `RUN_LENGTH`, spread evenly; all if no more are there.
 
-    Each run has a name of its own: what is temporal must not reach over the hole before it.
+    Each run has another name: learning over time must not reach over the gap before it.
     """
     if n_available <= n_wanted or not n_wanted:
         return [(name, k) for k in range(min(n_available, n_wanted))]

@@ -137,7 +137,7 @@ def _other_config(arguments: argparse.Namespace, config: Config) -> tuple[Config
 def _items(
     arguments: argparse.Namespace,
 ) -> tuple[Any, Callable[[Any], KnownScan]]:
-    """Return labelled frames, or with ``--against`` any clouds, and what reads one of them."""
+    """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
     root = as_path(arguments.root)
     if arguments.against is None or any(root.glob('sequences/*/velodyne')):
         return frames_from_options(arguments), load_kitti
@@ -172,4 +172,4 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
     chosen = None if names is None else [name for name in names.split(',') if name]
     frames = labelled_frames(as_path(arguments.root), chosen, options.scan_layout(arguments))
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
-    return [one for _, group in groups for one in [*group][:: arguments.frame_step or 1]]
+    return [frame for _, group in groups for frame in [*group][:: arguments.frame_step or 1]]

@@ -124,8 +124,8 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
         for score in scores
     ]
     title = (
-        f'{_counted(last)}; RMSE and median of the height under true ground, interval of the RMSE '
-        f'minus that of {last.name}; {interval_note(last)}'
+        f'{_counted(last)}; {_rule(last)}; RMSE and median of the height under true ground, '
+        f'interval of the RMSE minus that of {last.name}; {interval_note(last)}'
     )
     return make_report({'models': Table(rows, title)}, scores, config, changes=MODELS)
 
@@ -169,12 +169,13 @@ def compare_departures(items: Sequence[Any], config: Config, runner: Runner = HE
         interval = interval_text(having, without)
         switch = 'off' if departure.kept else 'on'
         rows.append((score, switch, having.iou - without.iou, interval))
-    rows.sort(key=lambda one: -one[2])
+    rows.sort(key=lambda cells: -cells[2])
     title = (
-        f'{_counted(given)}, and gained with the departure on; {interval_note(given)}; RMSE of '
-        'the height; time relative to the parameters as given, median of the frames'
+        f'{_counted(given)}; {_rule(given)}, and gained with the departure on; '
+        f'{interval_note(given)}; RMSE of the height; time relative to the parameters as given, '
+        'median of the frames'
     )
-    tables = {'departures': Table([row(given), *(row(*one) for one in rows)], title)}
+    tables = {'departures': Table([row(given), *(row(*cells) for cells in rows)], title)}
     changes = {departure.title: departure.changes for departure in DEPARTURES}
     return make_report(tables, scores, config, changes=changes)
 
@@ -247,8 +248,8 @@ def compare_wrong_values(items: Sequence[Any], config: Config, runner: Runner = 
         for learned, fixed in zip(scores[::2], scores[1::2], strict=True)
     ]
     title = (
-        f'{_counted(scores[0])} [%] with hyper-parameters given wrong, as they are and learned '
-        f'from there; {interval_note(scores[0])}; RMSE of the height [cm]'
+        f'{_counted(scores[0])}; IoU [%] with hyper-parameters given wrong, as they are and '
+        f'learned from there; {interval_note(scores[0])}; RMSE of the height [cm]'
     )
     return make_report({'values': Table(rows, title)}, scores, config)
 
@@ -261,6 +262,11 @@ def _worst(score: MethodScore) -> Row:
 
 
 def _counted(score: MethodScore) -> str:
+    names = score.sequences
+    where = names[0] if len(names) == 1 else f'{len(names)} sequences'
+    return f'{len(score.scans)} scans of {where}'
+
+
+def _rule(score: MethodScore) -> str:
     is_exact = 'exact' in score.scans[0].confusions
-    rule = 'by exact labels' if is_exact else 'in the GroundGrid convention'
-    return f'{len(score.scans)} scans of {", ".join(score.sequences)}; IoU {rule}'
+    return 'IoU by exact labels' if is_exact else 'IoU in the GroundGrid convention'

@@ -1,4 +1,4 @@
-"""What an unknown height and tilt of the sensor costs, on labelled and on simulated scans."""
+"""The cost of an unknown height and tilt of the sensor, on labelled and simulated scans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What experiments share: configurations scored over labelled frames or simulated scans."""
+"""The engine of the experiments: configurations scored over labelled frames or simulated scans."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Load = Callable[[Any], KnownScan]
 """Reads or simulates a scan, with its truth."""
 
 OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
-"""What rays hit of objects, by `CLASSES`; crates are boxes too, but no objects."""
+"""Kinds of objects that rays hit, by `CLASSES`; crates are boxes too, but no objects."""
 
 
 class SimulatedFrame(NamedTuple):
@@ -119,11 +119,11 @@ def score_simulated(
     groups = [list(group) for _, group in itertools.groupby(frames, lambda f: f.sequence)]
     parts = runner.run(partial(_score_groups, config, with_peer), groups)
     outcomes = list(itertools.chain(*parts))
-    refused = [one for one in outcomes if isinstance(one, str)]
-    found = [one for one in outcomes if not isinstance(one, str)]
-    if not found:
+    refused = [found for found in outcomes if isinstance(found, str)]
+    scored = [found for found in outcomes if not isinstance(found, str)]
+    if not scored:
         raise PointCloudError('; '.join(refused))
-    return [pool(scores[0].name, scores) for scores in zip(*found, strict=True)], refused
+    return [pool(scores[0].name, scores) for scores in zip(*scored, strict=True)], refused
 
 
 def _score_groups(

@@ -96,8 +96,10 @@ def run_cases(
                     if method is not None and frame.sequence != sequence:
                         method.reset()
                 seconds = [_time(method, frame, clock) for method in order]
-                own, other = seconds[order.index(ours)], seconds[order.index(baseline)]
-                found = FrameTime(frame, own, ours.stages, other, ours.last.fit)
+                times_of = dict(zip(order, seconds, strict=True))
+                found = FrameTime(
+                    frame, times_of[ours], ours.stages, times_of[baseline], ours.last.fit
+                )
                 times[names[j % len(names)]].append(found)
             sequence = frame.sequence
     return times
@@ -118,52 +120,53 @@ def bench_document(
     baseline: str | None,
     data: str,
 ) -> dict[str, Any]:
-    """Everything of a benchmark in JSON's own types; times in ms.
+    """Everything of a benchmark in JSON's types; times in ms.
 
-    Ratios are to the baseline on the same frame; p99 is that of our times over its median.
+    Ratios are to the baseline on the same frame; p99 is that of our times over the median of the
+    baseline.
     """
     times = next(iter(cases.values()))
-    points = [len(one.frame.points) for one in times]
-    peer = [one.baseline for own in cases.values() for one in own]
+    points = [len(entry.frame.points) for entry in times]
+    peer = [entry.baseline for case in cases.values() for entry in case]
     return {
         'data': data,
-        'n_frames': len({(one.frame.sequence, one.frame.index) for one in times}),
+        'n_frames': len({(entry.frame.sequence, entry.frame.index) for entry in times}),
         'n_points': {'median': statistics.median(points), 'max': max(points)},
         'config_changes': changed_parameters(config),
         'environment': environment,
         'baseline': baseline,
         'baseline_ms': _spread(peer) if baseline else None,
-        'cases': [_case(name, own, baseline is not None) for name, own in cases.items()],
+        'cases': [_case(name, case, baseline is not None) for name, case in cases.items()],
     }
 
 
 def _case(name: str, times: Sequence[FrameTime], with_baseline: bool) -> dict[str, Any]:
     # Where a mode skips a stage in some frames it is still timed: close to zero.
-    stages = {stage: [one.stages[stage] for one in times] for stage in times[0].stages}
-    stages['rest'] = [one.seconds - sum(one.stages.values()) for one in times]
-    seconds, last = [one.seconds for one in times], times[-1].fit
+    stages = {stage: [entry.stages[stage] for entry in times] for stage in times[0].stages}
+    stages['rest'] = [entry.seconds - sum(entry.stages.values()) for entry in times]
+    seconds, last = [entry.seconds for entry in times], times[-1].fit
     result = {
         'name': name,
         'mode': last.mode,
         'backend': last.backend,
         'n_threads': last.n_threads,
         'ms': _spread(seconds),
-        'stages_ms': {stage: _ms(statistics.median(own)) for stage, own in stages.items()},
+        'stages_ms': {stage: _ms(statistics.median(values)) for stage, values in stages.items()},
         'frames': [
             {
-                'sequence': one.frame.sequence,
-                'index': one.frame.index,
-                'n_points': len(one.frame.points),
-                'ms': _ms(one.seconds),
-                'baseline_ms': _ms(one.baseline) if with_baseline else None,
+                'sequence': entry.frame.sequence,
+                'index': entry.frame.index,
+                'n_points': len(entry.frame.points),
+                'ms': _ms(entry.seconds),
+                'baseline_ms': _ms(entry.baseline) if with_baseline else None,
             }
-            for one in times
+            for entry in times
         ],
     }
     if with_baseline:
-        median = statistics.median(one.baseline for one in times)
+        median = statistics.median(entry.baseline for entry in times)
         result['ratio'] = {
-            'median': round(statistics.median(one.ratio for one in times), 4),
+            'median': round(statistics.median(entry.ratio for entry in times), 4),
             'p99': round(float(np.percentile(seconds, 99)) / median, 4),
         }
     return result

@@ -144,7 +144,7 @@ MEASURES: tuple[tuple[Column, Measure], ...] = (
     (report.milliseconds('time per frame, mean [ms]'),
      lambda s: (sum(scan.seconds for scan in s.scans), len(s.scans))),
 )  # fmt: skip
-"""What is compared, as it is shown, and as a ratio of sums over scans."""
+"""Measures that are compared: their columns, and each as a ratio of sums over scans."""
 
 
 def difference_table(ours: MethodScore, other: MethodScore) -> Table:

@@ -165,7 +165,7 @@ class ScanScore:
     classes: dict[int, ClassCount] = field(default_factory=dict)
     rings: tuple[RingScore, ...] = ()  # by `metrics.RING_TITLES`, where the truth is known
     objects: ObjectCounts = field(default_factory=dict)
-    pose: SensorPose | None = None  # of our own method
+    pose: SensorPose | None = None  # of our method
     fit: FitReport | None = None
     cluster: str = ''  # as in `KnownScan`
     n_points: int = 0
@@ -282,7 +282,7 @@ def load_kitti(frame: Frame) -> KnownScan:
     entries = read_entries(frame.labels_path, len(points))
     semantic = (entries & 0xFFFF).astype(np.uint16)
     z = points[:, 2].astype(np.float64)
-    truths = {one.key: one.truth(semantic, points[:, 2]) for one in CONVENTIONS}
+    truths = {rule.key: rule.truth(semantic, points[:, 2]) for rule in CONVENTIONS}
     is_ground = truths[GROUNDGRID.key] == Label.GROUND
     objects = labelled_objects(points, entries, is_ground)
     return KnownScan(frame.sequence, frame.index, points, truths, semantic, z, is_ground, objects)
@@ -357,7 +357,7 @@ def _score(scan: KnownScan, result: MethodResult, seconds: float, first: Labels)
     label = result.label
     return ScanScore(
         scan.sequence, scan.index, seconds, result.stages,
-        {key: metrics.count_confusion(label, one) for key, one in scan.truths.items()},
+        {key: metrics.count_confusion(label, truth) for key, truth in scan.truths.items()},
         _height_error(scan, result),
         {} if scan.semantic is None else metrics.count_classes(label, scan.semantic),
         _score_rings(scan, result),

@@ -1,4 +1,4 @@
-"""What counts as ground; labels, probabilities and heights scored against the truth."""
+"""Conventions of ground; labels, probabilities and heights scored against the truth."""
 
 from __future__ import annotations
 
@@ -243,7 +243,7 @@ def class_errors(classes: Mapping[int, ClassCount]) -> list[ClassErrors]:
         missed = n_points - n_ground if truth is Label.GROUND else 0
         false = n_ground if truth is Label.OBSTACLE else 0
         found.append(ClassErrors(number, truth, n_points, n_ground, missed, false))
-    return sorted(found, key=lambda one: (-one.errors, -one.n_points, one.number))
+    return sorted(found, key=lambda entry: (-entry.errors, -entry.n_points, entry.number))
 
 
 def _no_points() -> npt.NDArray[np.int64]:

@@ -82,7 +82,7 @@ def count_objects(
     """Count returns on objects and objects that are called ground.
 
     `points` (N, >=3) are x, y, z [m], `label` (N,) what a method says of them; UNKNOWN is not
-    ground. A return counts in the band of its own horizontal range, an object in that of the
+    ground. A return counts in the band of its horizontal range, an object in that of the
     median of its returns that count. Classes without a return that counts, or would, are left out.
     """
     n = len(points)
@@ -97,20 +97,22 @@ def count_objects(
     kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
     returns = _by_class_and_band(kind, reach, is_ground, n_classes)
 
-    known = (own_id := objects.object_id[counts]) != 0
-    pairs = np.column_stack([kind, own_id])[known]
-    of_object, number, n_own = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
+    known = (object_id := objects.object_id[counts]) != 0
+    pairs = np.column_stack([kind, object_id])[known]
+    of_object, number, n_returns = np.unique(
+        pairs, axis=0, return_inverse=True, return_counts=True
+    )
     number = number.reshape(-1)
-    n_ground = np.bincount(number, is_ground[known], minlength=len(n_own))
-    middle = _medians(reach[known], number, len(n_own))
-    enough = n_own >= MIN_RETURNS
-    lost = 2 * n_ground[enough] > n_own[enough]
+    n_ground = np.bincount(number, is_ground[known], minlength=len(n_returns))
+    middle = _medians(reach[known], number, len(n_returns))
+    enough = n_returns >= MIN_RETURNS
+    lost = 2 * n_ground[enough] > n_returns[enough]
     found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, n_classes)
     bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
     return {
-        name: tuple(ObjectCount(*numbers) for numbers in own.tolist())
-        for name, own in zip(CLASSES, bands, strict=True)
-        if own.any()
+        name: tuple(ObjectCount(*numbers) for numbers in found.tolist())
+        for name, found in zip(CLASSES, bands, strict=True)
+        if found.any()
     }
 
 
@@ -132,7 +134,7 @@ def _medians(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
 def pool_objects(counts: Sequence[ObjectCounts]) -> ObjectCounts:
     """Sum up the counts of several scans."""
     pooled: ObjectCounts = {}
-    for name, bands in (item for one in counts for item in one.items()):
+    for name, bands in (item for of_scan in counts for item in of_scan.items()):
         before = pooled.get(name, (ObjectCount(),) * len(bands))
         pooled[name] = tuple(a + b for a, b in zip(before, bands, strict=True))
     return {name: pooled[name] for name in CLASSES if name in pooled}

@@ -72,7 +72,7 @@ class PatchworkppMethod:
         self._estimator.estimateGround(points)
 
     def result(self) -> MethodResult:
-        """Labels, and the plane of the nearest upright patch: it has no surface of its own."""
+        """Labels, and the plane of the nearest upright patch: it has no other surface."""
         label = np.full(len(self._points), Label.OBSTACLE, dtype=np.uint8)
         label[self._estimator.getGroundIndices()] = Label.GROUND
         centre = np.asarray(self._estimator.getCenters(), dtype=np.float64).reshape(-1, 3)

@@ -27,7 +27,7 @@ WIDTH = 100
 """Columns of the terminal that titles and notes are folded to."""
 
 Cell = str | int | float | None
-"""What a row holds; None and NaN are shown as ``-``."""
+"""Content of a cell; None and NaN are shown as ``-``."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 def evaluation(
     scores: Sequence[MethodScore], config: Config, n_worst: int = 0, n_workers: int = 0
 ) -> Report:
-    """Report of our method with `config`, and of at most one other on the same scans.
+    """Report of our method with `config`, and of at most one other method on the same scans.
 
     Scans without labels have tables of time and of differing labels only.
     """
@@ -185,20 +185,22 @@ def _ring_table(scores: Sequence[MethodScore]) -> Table:
 def _class_table(score: MethodScore) -> Table:
     """Classes by what they count as, and in that by their number of errors."""
     found = metrics.class_errors(score.classes)
-    n_errors, n_points = score.confusion.errors, sum(one.n_points for one in found)
+    n_errors, n_points = score.confusion.errors, sum(entry.n_points for entry in found)
     rows: list[Row] = [
         [
-            (Column('class'), metrics.class_name(one.number)),
-            (Column('counts as', key='counts_as'), COUNTS_AS[one.truth]),
-            (Column('points', '_d'), one.n_points),
-            (percent('of points', 'share_of_points'), one.n_points / n_points),
-            (percent('as ground', 'share_as_ground'), one.n_ground / one.n_points),
-            (percent('missed'), one.missed / one.n_points if one.truth is Label.GROUND else None),
-            (percent('false'), one.false / one.n_points if one.truth is Label.OBSTACLE else None),
+            (Column('class'), metrics.class_name(entry.number)),
+            (Column('counts as', key='counts_as'), COUNTS_AS[entry.truth]),
+            (Column('points', '_d'), entry.n_points),
+            (percent('of points', 'share_of_points'), entry.n_points / n_points),
+            (percent('as ground', 'share_as_ground'), entry.n_ground / entry.n_points),
+            (percent('missed'),
+             entry.missed / entry.n_points if entry.truth is Label.GROUND else None),
+            (percent('false'),
+             entry.false / entry.n_points if entry.truth is Label.OBSTACLE else None),
             (percent('of errors', 'share_of_errors'),
-             None if one.truth is Label.UNKNOWN else metrics.ratio(one.errors, n_errors)),
+             None if entry.truth is Label.UNKNOWN else metrics.ratio(entry.errors, n_errors)),
         ]
-        for one in sorted(found, key=lambda one: list(COUNTS_AS).index(one.truth))
+        for entry in sorted(found, key=lambda entry: list(COUNTS_AS).index(entry.truth))
     ]  # fmt: skip
     title = (
         'Classes (GroundGrid convention): share of all points; of the class, what was labelled '
