@@ -286,8 +286,6 @@ def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
         ('root', ['--format', 'ply'], r'--format: whole data sets give \.label files and bags'),
         ('unfinished', [], r'no metadata\.yaml in it\); bag files in it.*: x_0\.mcap'),
         ('notes.txt', [], r'not a scan or bag; accepted are \.bin'),
-        ('good', ['--topic', '/a'], r'--topic: is for bags'),
-        ('good', ['--drop', '/a'], r'--drop: is for bags'),
         ('good', ['-o', 'x.label'], r'x\.label: must be a folder'),
         ('good', ['-o', 'notes.txt'], r'notes\.txt: is a file, must be a folder'),
     ],
