@@ -54,9 +54,9 @@ test-all: $(VENV)/.dev
 	$(WITH_KITTI) $(BIN)/python -m pytest
 
 browser-test: $(VENV)/.dev
-	@command -v chromium >/dev/null \
-		|| { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -qq -y chromium; } \
-		|| { echo 'Chromium is not installed: sudo apt-get install chromium'; exit 1; }
+	@command -v chromedriver >/dev/null \
+		|| { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -qq -y chromium-driver; } \
+		|| { echo 'Chromium is not installed: sudo apt-get install chromium-driver'; exit 1; }
 	GP_GROUND_SEG_WEB_VIEWER=1 $(BIN)/python -m pytest test/test_browser.py
 
 torture: $(VENV)/.dev

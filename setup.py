@@ -45,6 +45,7 @@ DEV = [
     'ruff>=0.6,<0.18',
     's3fs>=2024.2',
     'scikit-learn>=1.4',
+    'selenium>=4.20',
     'setuptools<80',  # colcon's ament_python build needs `setup.py develop` and `install`
     'twine>=5',
     'types-PyYAML',

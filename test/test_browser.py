@@ -1,30 +1,86 @@
 """Pages in a real browser: they draw, sliders move labels, the console has no error."""
 
+import io
 import os
 import re
+import shutil
 
 import numpy as np
 import pytest
+from cli_runner import run, until_ctrl_c
+from conftest import REPOSITORY
+from matplotlib.image import imread
 
-viser = pytest.importorskip('viser', reason='viser is not installed')
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.lab.viewers.scene import LEGENDS, palette
 
-from browser import CHROMIUM, open_browser  # noqa: E402
-from cli_runner import run, until_ctrl_c  # noqa: E402
-
-from gp_ground_seg.core.parameters.config import Config  # noqa: E402
-from gp_ground_seg.lab.viewers.scene import LEGENDS, palette  # noqa: E402
-
+pytest.importorskip('viser', reason='viser is not installed')
+webdriver = pytest.importorskip('selenium.webdriver', reason='selenium is not installed')
+DRIVER = shutil.which('chromedriver')
 pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed'),
+    pytest.mark.skipif(DRIVER is None, reason='chromedriver is not installed'),
     pytest.mark.slow,
 ]
+SCREENSHOTS = REPOSITORY / 'build' / 'screenshots'
+PATIENCE = 120.0
+"""Time to wait for what has to happen [s]; only a failure takes that long."""
+# WebGL by SwiftShader, on the CPU: there is no GPU, and no sandbox for root.
+FLAGS = (
+    '--headless=new', '--no-sandbox', '--window-size=1400,1000', '--use-angle=swiftshader',
+    '--enable-unsafe-swiftshader',
+)  # fmt: skip
 SHADED = 40  # difference of a shaded colour, from 0 to 255
 
 
+class Page:
+    """A page of the browser that `driver` of Selenium controls."""
+
+    def __init__(self, driver):
+        self.driver = driver
+
+    @property
+    def text(self):
+        """Text of the page."""
+        return self.driver.execute_script('return document.body.innerText')
+
+    def errors(self):
+        """Return the errors in the console since the last call."""
+        log = self.driver.get_log('browser')
+        return [entry['message'] for entry in log if entry['level'] == 'SEVERE']
+
+    def wait_for(self, condition, awaited):
+        """Return the first value of `condition` that is true."""
+        from selenium.webdriver.support.wait import WebDriverWait
+
+        wait = WebDriverWait(self.driver, PATIENCE, 0.1)
+        return wait.until(lambda _: condition(), f'no {awaited}')
+
+    def screenshot(self, name):
+        """Picture of the page, (height, width, 3), from 0 to 255; kept as a file too."""
+        data = self.driver.get_screenshot_as_png()
+        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+        (SCREENSHOTS / name).write_bytes(data)
+        return (255.0 * np.asarray(imread(io.BytesIO(data), format='png'))).round()[..., :3]
+
+    def drag(self, selector, number, pixels):
+        """Drag an element to the right."""
+        element = self.driver.find_elements('css selector', selector)[number]
+        chain = webdriver.ActionChains(self.driver)
+        chain.drag_and_drop_by_offset(element, pixels, 0).perform()
+
+    def click(self, words):
+        """Click the button with these words on it."""
+        self.driver.find_element('xpath', f'//button[contains(., "{words}")]').click()
+
+
 @pytest.fixture
-def page(tmp_path_factory):
-    with open_browser(tmp_path_factory.mktemp('profile')) as page:
-        yield page
+def page():
+    options = webdriver.ChromeOptions()
+    for flag in FLAGS:
+        options.add_argument(flag)
+    options.set_capability('goog:loggingPrefs', {'browser': 'ALL'})
+    with webdriver.Chrome(options, webdriver.ChromeService(DRIVER)) as driver:
+        yield Page(driver)
 
 
 def count(picture, tolerance=2):
@@ -49,11 +105,11 @@ def wait_for_colours(page, name, condition):
 def test_page_of_a_scan_opens_from_disk_and_draws_its_points(sequence, page, tmp_path):
     path = tmp_path / 'scan.html'
     assert run('view', sequence, '--frame', 1, '--html', path, '--quiet') == 0
-    page.open(path.as_uri())
+    page.driver.get(path.as_uri())
     wait_for_colours(page, 'view.png', lambda n: min(n['ground'], n['obstacle']) > 1000)
     text = page.text
     assert '000001.bin' in text and 'p_ground' in text and 'errors' in text
-    assert page.errors == []
+    assert page.errors() == []
 
 
 @pytest.mark.skipif(
@@ -63,13 +119,13 @@ def test_page_of_a_scan_opens_from_disk_and_draws_its_points(sequence, page, tmp
 def test_the_web_viewer_draws_the_scan(sequence, page):
     pytest.importorskip('rerun', reason='rerun is not installed')
     with until_ctrl_c('view', sequence, '--web', '--port', 9590) as process:
-        page.open(f'{process.stdout.readline().strip()}&renderer=webgl')
+        page.driver.get(f'{process.stdout.readline().strip()}&renderer=webgl')
         # Rerun shades its points: the middle of an obstacle is darker than in the legend.
         page.wait_for(
             lambda: count(page.screenshot('web.png'), SHADED)['obstacle'] > 1000, 'obstacles'
         )
     # It asks for fonts and news, which there may be no network for.
-    ours = [text for text in page.errors if 'fetch' not in text and 'load resource' not in text]
+    ours = [text for text in page.errors() if 'fetch' not in text and 'load resource' not in text]
     assert ours == []
 
 
@@ -83,14 +139,13 @@ def tune(sequence, tmp_path_factory):
 
 def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page):
     address, output = tune
-    page.open(address)
+    page.driver.get(address)
     page.wait_for(lambda: re.search(r'^0 changed', page.text, re.MULTILINE), 'first labels')
     before = wait_for_colours(page, 'tune.png', lambda n: min(n['ground'], n['obstacle']) > 1000)
     assert re.search(r'IoU\s+9\d\.\d\d %', page.text)
 
     names = re.findall(r'^([\w.]+) = ', page.text, re.MULTILINE)
-    thumb = page.place('.multi-slider-thumb', names.index('label.ground_tolerance'))
-    page.drag(thumb, (thumb[0] + 60.0, thumb[1]))
+    page.drag('.multi-slider-thumb', names.index('label.ground_tolerance'), 60)
     page.wait_for(lambda: re.search(r'^[1-9][\d,]* changed', page.text, re.MULTILINE), 'change')
     n_ground, n_before = re.search(r'ground\s+([\d,]+)\s+([\d,]+)', page.text).groups()
     assert int(n_ground.replace(',', '')) > int(n_before.replace(',', ''))
@@ -102,4 +157,4 @@ def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page
     page.click('tuned.yaml')
     page.wait_for(lambda: f'written to {output}' in page.text, 'file')
     assert Config.from_yaml(output) == Config().replace(**{'label.ground_tolerance': float(value)})
-    assert page.errors == []
+    assert page.errors() == []
