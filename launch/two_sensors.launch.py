@@ -1,4 +1,4 @@
-"""Two LiDARs, each with a node of its own in its namespace: an example to copy and edit.
+"""Two LiDARs, each with a node in a namespace: an example to copy and edit.
 
 The outputs are /front/ground, /front/obstacles, /rear/ground and /rear/obstacles. A Nav2 costmap
 takes all of them as sources; docs/node.md says when one node on merged clouds is the better way.

@@ -39,8 +39,10 @@ from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS
 PATIENCE = 120.0
 """Time to wait for what has to happen [s]; only a failure takes that long."""
 
-# Other tests run beside this one; nothing of them must be heard here.
-DOMAIN_ID = 1 + os.getpid() % 100
+# Other tests run beside this one, also as workers of pytest-xdist; nothing of them must be heard.
+_WORKER = os.environ.get('PYTEST_XDIST_WORKER', '').removeprefix('gw')
+_SESSION = os.getppid() if _WORKER else os.getpid()
+DOMAIN_ID = 1 + (4 * _SESSION + int(_WORKER or 0)) % 100
 NAMESPACE = f'/test_{os.getpid()}'
 ISOLATION = {
     'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
@@ -62,7 +64,7 @@ def wait_for(condition, what):
 
 @contextlib.contextmanager
 def isolated(**changes):
-    """The environment of our own domain, on this machine only."""
+    """The environment of the domain of these tests, on this machine only."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {**ISOLATION, **changes}.items():
             patch.setenv(name, value)
@@ -184,7 +186,7 @@ def given(values):
 
 
 class Process:
-    """The node in a process of its own, as a user starts it."""
+    """The node in a second process, as a user starts it."""
 
     def __init__(self, *words, folder, start=ENTRY_POINT, command=None, **environment):
         self._log = folder / f'node_{time.monotonic_ns()}.log'
@@ -270,8 +272,8 @@ class Link:
         if self.publisher:
             wait_for(lambda: self.publisher.get_subscription_count() == 1, 'subscription')
         for collector in (self.ground, self.obstacles, self.diagnostics):
-            one = collector.subscription
-            wait_for(lambda s=one: s.get_publisher_count() == 1, f'publisher of {one.topic_name}')
+            s = collector.subscription
+            wait_for(lambda s=s: s.get_publisher_count() == 1, f'publisher of {s.topic_name}')
 
     def segment(self, *messages):
         """Publish clouds; return the outputs of the last one."""

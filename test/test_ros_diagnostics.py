@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -15,10 +16,11 @@ from gp_ground_seg.core.parameters.config import DiagnosticsConfig
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
 import ros_helpers  # noqa: F401  imports type support without its warnings
+from rclpy.duration import Duration
 
 from gp_ground_seg.ros import diagnostics
 from gp_ground_seg.ros.diagnostics import InputFacts, InputTask, ModelTask, ProcessingTask
-from gp_ground_seg.ros.input import JUMP_TOLERANCE, StampWatch
+from gp_ground_seg.ros.input import JUMP_TOLERANCE, TimeJumps
 from gp_ground_seg.ros.status import RATE_WINDOW, Hysteresis, Level, Rate, Status
 
 LIMITS = DiagnosticsConfig(stale_after=2.0, max_latency=0.1)
@@ -44,14 +46,20 @@ def process(statistics, latencies):
 
 @given(st.lists(times))
 def test_a_stamp_far_behind_the_newest_is_a_jump(stamps):
-    watch, newest = StampWatch(), None
+    jumps, expected, newest, node = [], [], None, MagicMock()
+    watch = TimeJumps(node, jumps.append)
     for stamp in stamps:
         behind = 0.0 if newest is None else newest - stamp
         is_jump = behind > JUMP_TOLERANCE
-        assert watch.note(stamp) == (behind if is_jump else 0.0)
+        expected += [behind] * is_jump
+        watch.note(stamp)
         newest = stamp if is_jump or newest is None else max(newest, stamp)
-    watch.reset()
-    assert watch.note(-100.0) == 0.0
+    assert jumps == expected
+    # A jump of the clock is said once, whatever stamps follow it.
+    clock_jumped = node.get_clock().create_jump_callback.call_args.kwargs['post_callback']
+    clock_jumped(SimpleNamespace(delta=Duration(seconds=-3.0)))
+    watch.note(-100.0)
+    assert jumps == [*expected, 3.0]
 
 
 @given(st.lists(st.tuples(times, st.integers(1, 4)), min_size=1))

@@ -13,7 +13,7 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 pytest.importorskip('rosbags', reason='rosbags is not installed')
 
 import ros_helpers as ros
-from bag_samples import START, write_ros2_bag
+from bag_samples import write_ros2_bag
 from cli_runner import run
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -51,35 +51,7 @@ def assert_throttled(lines):
     assert all(later - earlier > 4.9 for earlier, later in itertools.pairwise(times))
 
 
-@pytest.fixture
-def drive(tmp_path):
-    """A bag of 30 clouds of 2011."""
-    assert START < 1_320_000_000 * 10**9
-    write_ros2_bag(tmp_path / 'drive.mcap', 30)
-    return tmp_path / 'drive.mcap'
-
-
-def test_a_bag_of_2011_shows_ok(drive, tmp_path):
-    with ros.linked_process(tmp_path, *WORDS, sends=None) as (node, link):
-        with play(drive, '--rate', '1') as player:
-            status = link.wait_for_status(
-                'input', lambda values, _: int(values['Events since startup']) >= 20
-            )
-            assert player.popen.wait(60.0) == 0, player.log
-        parts = link.ground.wait(30), link.obstacles.wait(30)
-        last = link.wait_for_status('processing', lambda v, _: v['Clouds since startup'] == '30')
-        assert ros.values_of(last)['Dropped since startup'] == '0'
-        statuses = [s for array in link.diagnostics.messages for s in array.status]
-    tasks = ('input', 'processing', 'model', 'output')
-    expected = {(f'{link.node_name[1:]}: {task}', DiagnosticStatus.OK) for task in tasks}
-    assert {(s.name, s.level) for s in statuses} == expected
-    assert float(ros.values_of(status)['Age of last stamp (s)']) > 4e8
-    for messages in parts:
-        times = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]
-        assert [later - earlier for earlier, later in itertools.pairwise(times)] == 29 * [10**8]
-    assert 'WARN' not in node.log
-
-
+@pytest.mark.slow
 def test_a_bag_in_a_loop_with_a_clock_resets_what_was_learned(tmp_path):
     bag = tmp_path / 'drive.mcap'
     write_ros2_bag(bag, 15)
@@ -115,6 +87,7 @@ def test_a_bag_in_a_loop_with_a_clock_resets_what_was_learned(tmp_path):
     assert 'WARN' not in node.log
 
 
+@pytest.mark.slow
 def test_a_bad_cloud_among_good_ones(tmp_path):
     good = to_message(street(500), frame='lidar')
     bad = [to_message(street(500), frame='broken') for _ in range(4)]
@@ -187,7 +160,7 @@ def kitti_bag(folder, kitti):
 
 
 @pytest.mark.usefixtures('node')
-@pytest.mark.parametrize('source', ['simulated', 'kitti'])
+@pytest.mark.parametrize('source', ['simulated', pytest.param('kitti', marks=pytest.mark.slow)])
 def test_frames_to_bag_to_player_to_node_and_back(source, tmp_path, request):
     """Order, header, layout and every byte: the clouds are the selection by the labels.
 
@@ -252,38 +225,6 @@ def test_what_rclpy_raises_does_not_end_the_node(node):
         link.segment(to_message(street(500)))
 
 
-GOOD = [
-    *(('label.ground_tolerance', 0.3), ('grid.n_segments', 90), ('runtime.n_threads', 1)),
-    *(('label.ground_tolerance', 0.2), ('grid.n_segments', 180), ('runtime.n_threads', 2)),
-]
-BAD = [
-    *(('label.ground_tolerance', 99.0), ('grid.n_segments', 'many')),
-    *(('grid.r_max', 1.5), ('no.such_parameter', 1)),
-]
-
-
-@pytest.mark.usefixtures('node')
-def test_a_storm_of_parameters_loses_no_cloud(drive):
-    good, bad = itertools.cycle(GOOD), itertools.cycle(BAD)
-    with ros.linked(sends=None) as link, play(drive, '--rate', '0.6') as player:
-        n_before = len(link.ground.wait(3))
-        n_during = []
-        for k in range(100):
-            name, value = next(bad if k % 5 == 4 else good)
-            result = link.set(name, value)
-            assert result.successful == (k % 5 != 4), result.reason
-            assert result.successful or name in result.reason
-            n_during.append(len(link.ground.messages))
-        # They came while clouds did; on a busy machine most of them come later.
-        assert n_before < n_during[-1]
-        assert n_during[5] < 30
-        assert player.popen.wait(60.0) == 0, player.log
-        assert len(link.ground.wait(30)) == len(link.obstacles.wait(30)) == 30
-        assert all(result.successful for result in link.load(CONFIG.flat()))
-
-
-# Best-effort publishers last: the node is best-effort itself while it knows of one.
-
 # Sends best-effort clouds of 1.9 MB until it is ended; its domain is that of the environment.
 DRIVER = f"""
 import sys, time
@@ -300,6 +241,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_best_effort_driver_with_the_large_segment_profile(node, tmp_path):
     profile = REPOSITORY / 'config' / 'fastdds_large_clouds.xml'
     environment = {'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile)}

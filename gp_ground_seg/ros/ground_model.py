@@ -30,7 +30,7 @@ def ground_model_cloud(cloud: PointCloud2, segmentation: Segmentation) -> PointC
 
     Row m is segment m, counter-clockwise from -x of the level frame; column k is the k-th
     range. The coordinates and std are NaN where there is no model, length_scale in
-    segments without a ground candidate of their own.
+    segments without a ground candidate.
     """
     model = GroundModel.of(segmentation)
     n_segments, n_knots = model.height.shape

@@ -40,16 +40,16 @@ class SequenceGaps:
     """Counts messages that did not arrive, of publishers that number theirs 1, 2, 3 ... each.
 
     They were lost on the way, or overwritten in a full queue while the node was busy. rclpy does
-    not say who has sent a message: a number counts as the next of the publisher whose last one is
-    the nearest below. What this misses for one publisher, it counts for another later. The first
-    message of a publisher may look like a gap, and is not counted.
+    not say who has sent a message: a number counts as the next of the publisher whose last number
+    is the nearest below. Losses that this misses for a publisher are counted for another later.
+    The first message of a publisher may look like a gap, and is not counted.
     """
 
     def __init__(self) -> None:
         self._last: list[int] = []  # of each publisher heard
 
     def reset(self) -> None:
-        """Forget the last numbers: other publishers have their own."""
+        """Forget the last numbers, after the publishers have changed."""
         self._last.clear()
 
     def note(self, number: int | None, n_publishers: int = 1) -> int:
@@ -62,7 +62,7 @@ class SequenceGaps:
         if n_heard < max(1, n_publishers) and below != number - 1:
             self._last.append(number)
             return 0
-        # Where none is near, one of them counts anew.
+        # With no last number near below, that of some publisher starts anew.
         is_next = below is not None and (n_heard == 1 or number - below < NEAR)
         last = below if below is not None else min(self._last)
         self._last[self._last.index(last)] = number
@@ -195,30 +195,14 @@ class CloudSubscription:
         )
 
 
-class StampWatch:
-    """Detects from the stamps of clouds that time has jumped back."""
-
-    _newest: float | None = None
-
-    def reset(self) -> None:
-        """Forget the newest stamp."""
-        self._newest = None
-
-    def note(self, stamp: float) -> float:
-        """Return how far `stamp` lies before the newest one; 0 if that is no jump [s]."""
-        newest = self._newest if self._newest is not None else stamp
-        jump = newest - stamp if newest - stamp > JUMP_TOLERANCE else 0.0
-        self._newest = stamp if jump else max(newest, stamp)
-        return jump
-
-
 class TimeJumps:
     """Calls `on_jump` with how far [s] stamps of clouds, or the clock of `node`, jump back."""
+
+    _newest: float | None = None  # stamp of a cloud [s]
 
     def __init__(self, node: Node, on_jump: Callable[[float], None]) -> None:
         self._node = node
         self._on_jump = on_jump
-        self._stamps = StampWatch()
         threshold = JumpThreshold(
             min_forward=None, min_backward=Duration(seconds=-JUMP_TOLERANCE), on_clock_change=False
         )
@@ -229,12 +213,15 @@ class TimeJumps:
 
     def note(self, stamp: float) -> None:
         """Take the `stamp` of a cloud [s]."""
-        if jump := self._stamps.note(stamp):
-            self._jumped(jump)
+        newest = stamp if self._newest is None else self._newest
+        is_jump = newest - stamp > JUMP_TOLERANCE
+        self._newest = stamp if is_jump else max(newest, stamp)
+        if is_jump:
+            self._jumped(newest - stamp)
 
     def _clock_jumped(self, jump: TimeJump) -> None:
         # The stamps that follow are part of the same jump.
-        self._stamps.reset()
+        self._newest = None
         self._jumped(-1e-9 * jump.delta.nanoseconds)
 
     def _jumped(self, seconds: float) -> None:

@@ -21,6 +21,7 @@ from gp_ground_seg.core.errors import GroundSegError, PointCloudError
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.pipeline.points import single_precision
+from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros import start_stop
@@ -36,7 +37,7 @@ class GroundSegmentationNode(ConfiguredNode):
     """Subscribes to ``points``, publishes ``ground``, ``obstacles`` and /diagnostics.
 
     Each output keeps the header and every field of the input, bit for bit; a finite point
-    is in exactly one of the two clouds, another one in neither. The first clouds are segmented
+    is in exactly one of the two clouds, any other in neither. The first clouds are segmented
     with numpy; the compiled backend, if wanted, is made meanwhile. A changed parameter takes
     effect with the next cloud. Options are those of `rclpy.node.Node`. Raises a ConfigError if
     a given parameter is not accepted.
@@ -78,7 +79,7 @@ class GroundSegmentationNode(ConfiguredNode):
             require_tf2(config.frame)
 
     def apply_config(self, config: Config) -> None:
-        """Use `config` from the next cloud on; its compiled backend once that is there."""
+        """Use `config` from the next cloud on; compiled code as soon as that is made."""
         self._load_backend(config)
         runtime = config.runtime if self._is_compiled else self._segmenter.config.runtime
         self._segmenter.configure(dataclasses.replace(config, runtime=runtime))
@@ -109,7 +110,7 @@ class GroundSegmentationNode(ConfiguredNode):
             self.get_logger().info(f'{CHANGED}, after {self._loader.seconds:.1f} s')
         else:
             backend.close()
-        # Where `runtime` has changed meanwhile, this makes another one.
+        # Where `runtime` has changed meanwhile, this makes another backend.
         self._segmenter.configure(self.config)
 
     def _follow_tf(self, config: Config) -> None:
@@ -135,19 +136,11 @@ class GroundSegmentationNode(ConfiguredNode):
         self._library_log.close()
 
     def _on_cloud(self, cloud: PointCloud2, wait: float, n_lost: int) -> None:
+        """Segment a cloud and publish the result; report a cloud that cannot be segmented."""
         start = time.monotonic()
-        stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
-        fields = [field.name for field in cloud.fields]
-        health = self._diagnostics
-        self._time_jumps.note(stamp)
-        health.input.arrived(start, stamp, cloud.header.frame_id, fields)
-        health.processing.arrived(start, n_lost)
+        self._note_arrival(cloud, start, n_lost)
         try:
-            self._check_size(cloud)
-            # Code for the other precision would have to be compiled at the first start too.
-            points = single_precision(read_xyz(cloud))
-            seen = self._tf.look_up(cloud.header, self.config.frame) if self._tf else ()
-            segmentation = self._segmenter.segment(points, *seen)
+            segmentation = self._segment(cloud)
             segmented = time.monotonic()
             topics = self._outputs.publish(cloud, segmentation, self.config)
         except PointCloudError as error:
@@ -156,18 +149,30 @@ class GroundSegmentationNode(ConfiguredNode):
             # The next cloud may be good.
             self._refuse(cloud, f'{type(error).__name__}: {error}')
         else:
-            end = time.monotonic()
+            end, health = time.monotonic(), self._diagnostics
             stages = {'queue': wait, **segmentation.timings, 'publish': end - segmented}
             health.processing.processed(end - start, stages, segmentation.fit)
             health.model.segmented(segmentation)
             health.output.published(end, topics)
 
-    def _check_size(self, cloud: PointCloud2) -> None:
+    def _note_arrival(self, cloud: PointCloud2, now: float, n_lost: int) -> None:
+        stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
+        fields = [field.name for field in cloud.fields]
+        self._time_jumps.note(stamp)
+        self._diagnostics.input.arrived(now, stamp, cloud.header.frame_id, fields)
+        self._diagnostics.processing.arrived(now, n_lost)
+
+    def _segment(self, cloud: PointCloud2) -> Segmentation:
+        """Return the segmentation of a cloud; raise a PointCloudError if it has none."""
         size, limit = len(cloud.data) / 1e6, self.config.input.max_cloud_size
         if size > limit:
             raise PointCloudError(
                 f'cloud of {size:.1f} MB: must be at most input.max_cloud_size = {limit:g} MB'
             )
+        # Code for the other precision would have to be compiled at the first start too.
+        points = single_precision(read_xyz(cloud))
+        pose = self._tf.look_up(cloud.header, self.config.frame) if self._tf else ()
+        return self._segmenter.segment(points, *pose)
 
     def _on_time_jump(self, seconds: float) -> None:
         self._segmenter.reset()

@@ -1,4 +1,4 @@
-"""What the node publishes of a segmented cloud: one `Output` per topic."""
+"""The output topics: an `Output` for each makes a message from a segmented cloud."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ BAND_COLOUR = (0.75, 0.75, 0.75, 0.35)
 
 
 class Output(NamedTuple):
-    """One output topic, and how its message is made from the input, its result, the parameters."""
+    """A topic, and the function from input, segmentation and parameters to its message."""
 
     topic: str
     message_type: type
@@ -188,6 +188,6 @@ class OutputPublishers:
             self._renamed = renamed
             for field, name in renamed.items():
                 self._logger.warning(
-                    f'the input has a field {field} of its own, which is kept; '
+                    f'the input has a field {field} already, which is kept; '
                     f'in ~/labeled ours is {name}'
                 )

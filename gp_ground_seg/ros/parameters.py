@@ -151,7 +151,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         if result.successful:
             response.results = [result] * len(parameters)
         else:
-            response.results = [self.set_parameters_atomically([one]) for one in parameters]
+            response.results = [self.set_parameters_atomically([p]) for p in parameters]
         return response
 
     def _on_set(self, parameters: list[Parameter]) -> Result:

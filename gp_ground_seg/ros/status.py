@@ -1,4 +1,4 @@
-"""A judged task, its level held for a while, and rates; ``now`` is on a steady clock [s]."""
+"""Status of a task, hysteresis of its level, and rates; ``now`` is on a steady clock [s]."""
 
 from __future__ import annotations
 

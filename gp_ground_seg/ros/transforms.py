@@ -67,13 +67,13 @@ class TfListener:
 
         Raises a PointCloudError if TF does not have them.
         """
-        tilt, origin, own = None, None, header.frame_id
+        tilt, origin, frame_id = None, None, header.frame_id
         if frame.level == 'tf':
-            way = f'from its frame {own!r} to frame.base = {frame.base!r}'
-            tilt = tilt_of(self._transform(frame.base, own, header, way).rotation)
+            way = f'from its frame {frame_id!r} to frame.base = {frame.base!r}'
+            tilt = tilt_of(self._transform(frame.base, frame_id, header, way).rotation)
         if frame.sensor != NO_FRAME:
-            way = f'from frame.sensor = {frame.sensor!r} to its frame {own!r}'
-            place = self._transform(own, frame.sensor, header, way).translation
+            way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
+            place = self._transform(frame_id, frame.sensor, header, way).translation
             origin = place.x, place.y, place.z
             if not np.isfinite(origin).all():
                 raise PointCloudError(f'transform {way}: its translation is {origin}')
