@@ -66,7 +66,7 @@ def measure(clouds, rates, n_frames, ros_args=()):
         for rate in rates:
             before = dropped_by_node(session, arrays)
             with progress(f'{rate:g} Hz')(total=n_frames) as bar:
-                trips = probe.paced(itertools.islice(stamped, n_frames), rate, bar.update)
+                trips = probe.send(itertools.islice(stamped, n_frames), rate, bar.update)
             n_dropped = dropped_by_node(session, arrays) - before
             results.append({**rate_result(rate, trips), 'n_dropped': n_dropped})
         node.check()

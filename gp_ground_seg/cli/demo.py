@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -38,7 +37,6 @@ from gp_ground_seg.ros.probe import (
     Probe,
     probe_session,
     rate_result,
-    restamped,
 )
 from gp_ground_seg.ros.start_stop import needing_ros
 
@@ -53,11 +51,9 @@ EPOCH = 1_700_000_000
 SEED, SPEED = 3, 8.0
 """Of the simulated drive; the second [m/s]."""
 RATE = 10.0
-"""Scans per second [Hz]."""
-MAX_LOAD, COMFORTABLE_LOAD = 0.9, 0.6
-"""Share of the time that the node may need: above the first the rate is lowered."""
-N_TRIALS, TRIAL_TIMEOUT = 5, 60.0
-"""Scans sent one by one to see that, and the longest time one may take [s]."""
+"""Scans per second, at most if --rate is not given [Hz]."""
+PATIENCE = 60.0
+"""Longest time that a scan may take where --rate is not given [s]."""
 
 DESCRIPTION = """\
 Show the node at work without data: simulate a short drive along a street, write it as a bag,
@@ -83,7 +79,7 @@ interrupted
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command."""
     parser = options.new_parser(subparsers, 'demo', DESCRIPTION, EXAMPLES)
-    rate = f'scans per second (default: {RATE:g}, or what this machine can do if that is less)'
+    rate = f'scans per second (default: as fast as the node answers, {RATE:g} at most)'
     options.add(
         parser,
         ('--kitti', 'folder in SemanticKITTI layout', {'metavar': 'ROOT'}),
@@ -174,10 +170,8 @@ class Tally:
         self.picture: tuple[int, npt.NDArray[np.floating], Labels, Labels] | None = None
 
     def add(self, sent: CloudMessage, results: dict[str, CloudMessage]) -> None:
-        """Check a scan that came back, and add it; other clouds are trials."""
-        number = self._numbers.get(point_cloud2.stamp_of(sent))
-        if number is None:
-            return
+        """Check a scan that came back, and add it."""
+        number = self._numbers[point_cloud2.stamp_of(sent)]
         is_exact, label = check_scan(sent, results)
         xyz = read_xyz(sent)
         truth = GROUNDGRID.truth(point_cloud2.read_fields(sent)['label'], xyz[:, 2])
@@ -275,26 +269,9 @@ def _write(drive: Drive, path: Path, session: Session) -> list[tuple[int, int]]:
 
 def _play(path: Path, n_frames: int, wanted: float | None, probe: Probe) -> dict[str, Any]:
     """Send the scans of a bag to the node; return the statistics of `rate_result`."""
-    with BagReader(path) as bag:
-        rate = wanted or sustainable_rate(
-            next(decode_cloud(raw) for _, _, raw in bag.messages([TOPIC])), probe
-        )
-        what = f'playing the bag to the node, {rate:g} scans per second'
-        print(f'[3/3] {what}, and receiving both clouds', flush=True)
-        with options.progress('scans')(total=n_frames) as bar:
-            clouds = (decode_cloud(raw) for _, _, raw in bag.messages([TOPIC]))
-            return rate_result(rate, probe.paced(clouds, rate, bar.update))
-
-
-def sustainable_rate(cloud: CloudMessage, probe: Probe) -> float:
-    """Return the usual rate [Hz], or what this machine can do if that is less."""
-    trials = itertools.islice(restamped([cloud], 1000), N_TRIALS)
-    trips = probe.one_by_one(trials, silence=TRIAL_TIMEOUT)
-    seconds = float(np.median([trip.latency for trip in trips]))
-    if seconds < MAX_LOAD / RATE:
-        return RATE
-    if np.isnan(seconds):
-        raise GroundSegError(f'no answer to a scan within {TRIAL_TIMEOUT:g} s')
-    rate = float(f'{COMFORTABLE_LOAD / seconds:.1g}')
-    print(f'      a scan takes {1e3 * seconds:.0f} ms here and now: playing {rate:g} per second')
-    return rate
+    rate, patience = wanted or RATE, None if wanted else PATIENCE
+    pace = f'{rate:g} scans per second{"" if wanted else " at most"}'
+    print(f'[3/3] playing the bag to the node, {pace}, and receiving both clouds', flush=True)
+    with BagReader(path) as bag, options.progress('scans')(total=n_frames) as bar:
+        clouds = (decode_cloud(raw) for _, _, raw in bag.messages([TOPIC]))
+        return rate_result(rate, probe.send(clouds, rate, bar.update, patience))

@@ -164,28 +164,32 @@ class Probe:
             next_time = time.monotonic() + _PROBE_PERIOD
         self._waiting.clear()
 
-    def paced(
-        self, clouds: Iterable[CloudMessage], rate: float, on_sent: Callable[[], object]
+    def send(
+        self,
+        clouds: Iterable[CloudMessage],
+        rate: float,
+        on_sent: Callable[[], object],
+        patience: float | None = None,
     ) -> list[Trip]:
-        """Send `clouds` at `rate` [Hz], whether or not results come back; return their trips."""
+        """Send `clouds` at `rate` [Hz], whether or not results come back; return their trips.
+
+        With `patience` [s], a cloud is not sent before the last one is back; raises a
+        GroundSegError if that takes longer.
+        """
         trips = []
         due = time.monotonic()
         for cloud in clouds:
             raw = encode_cloud(cloud)
+            if patience is not None and self._wait(patience):
+                raise GroundSegError(f'no answer to a cloud within {patience:g} s')
             while (left := due - time.monotonic()) > 0.0:
                 self._session.spin(left)
             trips.append(self._send(cloud, raw))
             on_sent()
             due += 1.0 / rate
-        self._wait(SILENCE)
-        return trips
-
-    def one_by_one(self, clouds: Iterable[CloudMessage], silence: float = SILENCE) -> list[Trip]:
-        """Send each cloud when the one before is back, or lost; return their trips."""
-        trips = []
-        for cloud in clouds:
-            trips.append(self._send(cloud, encode_cloud(cloud)))
-            self._wait(silence)
+            if patience is not None:
+                due = max(due, time.monotonic())
+        self._wait(patience or SILENCE)
         return trips
 
     def _send(self, cloud: CloudMessage, raw: bytes) -> Trip:
@@ -194,14 +198,15 @@ class Probe:
         self._publisher.publish(raw)
         return trip
 
-    def _wait(self, silence: float) -> None:
-        """Receive until all is back, or nothing for `silence` [s]; the rest is lost then."""
+    def _wait(self, silence: float) -> int:
+        """Receive until all is back, or nothing for `silence` [s]; return how many are lost."""
         n_waiting, last_news = len(self._waiting), time.monotonic()
         while self._waiting and time.monotonic() < last_news + silence:
             self._session.spin(0.02)
             if len(self._waiting) < n_waiting:
                 n_waiting, last_news = len(self._waiting), time.monotonic()
         self._waiting.clear()
+        return n_waiting
 
     def _receive(self, topic: str, raw: bytes, info: dict[str, Any]) -> None:
         cloud, now = point_cloud2.decode_cloud(raw), info.get('received_timestamp')
