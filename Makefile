@@ -57,7 +57,7 @@ browser-test: $(VENV)/.dev
 	@command -v chromedriver >/dev/null \
 		|| { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -qq -y chromium-driver; } \
 		|| { echo 'Chromium is not installed: sudo apt-get install chromium-driver'; exit 1; }
-	GP_GROUND_SEG_WEB_VIEWER=1 $(BIN)/python -m pytest test/test_browser.py
+	$(BIN)/python -m pytest test/test_browser.py
 
 torture: $(VENV)/.dev
 	$(BIN)/python test/torture.py
