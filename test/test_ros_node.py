@@ -187,6 +187,33 @@ def b():
         yield shared
 
 
+def test_bad_clouds_among_good_ones_are_refused_with_one_message(b, capfd):
+    good = to_message(street(500), frame='lidar')
+    bad = [to_message(street(500), frame='broken') for _ in range(3)]
+    bad[0].fields[3].name = 'altitude'
+    bad[1].data, bad[2].point_step = bad[1].data[:-1], 0
+    n_answers = len(b.ground.messages)
+    for cloud in bad:
+        b.publisher.publish(cloud)
+        b.segment(good)
+    assert len(b.ground.messages) == n_answers + 3
+
+    def wait_for_level(level):
+        return b.wait_for_status(
+            'input', lambda v, s: (v['Refused since startup'], s.level) == ('4', level)
+        )
+
+    b.publisher.publish(bad[0])
+    status = wait_for_level(DiagnosticStatus.ERROR)
+    assert 'no field named z' in status.message
+    assert ros.values_of(status)['Frame'] == 'broken'
+    b.segment(good)
+    wait_for_level(DiagnosticStatus.OK)
+    # Throttled: four clouds, one message with topic, frame and reason.
+    said = ros.said_by(capfd, f"cloud on {NAMESPACE}/points in frame 'broken' refused: ")
+    assert said.count('refused') == said.count('no field named z') == 1
+
+
 def test_error_inside_the_library_does_not_end_the_node(b, monkeypatch):
     message = to_message(street(3000))
     with monkeypatch.context() as patch:

@@ -72,6 +72,54 @@ class GroundSegmentationNode(ConfiguredNode):
         self._load_backend(self.config)
         logger.info(f'listening to {self._input.topic} ({self._input.qos_words})')
 
+    def _on_cloud(self, cloud: PointCloud2, wait: float, n_lost: int) -> None:
+        """Segment a cloud and publish the result; report a cloud that cannot be segmented."""
+        start = time.monotonic()
+        self._note_arrival(cloud, start, n_lost)
+        try:
+            segmentation = self._segment(cloud)
+            segmented = time.monotonic()
+            topics = self._outputs.publish(cloud, segmentation, self.config)
+        except PointCloudError as error:
+            self._refuse(cloud, str(error))
+        except Exception as error:
+            # The next cloud may be good.
+            self._refuse(cloud, f'{type(error).__name__}: {error}')
+        else:
+            end, health = time.monotonic(), self._diagnostics
+            stages = {'queue': wait, **segmentation.timings, 'publish': end - segmented}
+            health.processing.processed(end - start, stages, segmentation.fit)
+            health.model.segmented(segmentation)
+            health.output.published(end, topics)
+
+    def _note_arrival(self, cloud: PointCloud2, now: float, n_lost: int) -> None:
+        stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
+        fields = [field.name for field in cloud.fields]
+        self._time_jumps.note(stamp)
+        self._diagnostics.input.arrived(now, stamp, cloud.header.frame_id, fields)
+        self._diagnostics.processing.arrived(now, n_lost)
+
+    def _segment(self, cloud: PointCloud2) -> Segmentation:
+        """Return the segmentation of a cloud; raise a PointCloudError if it has none."""
+        size, limit = len(cloud.data) / 1e6, self.config.input.max_cloud_size
+        if size > limit:
+            raise PointCloudError(
+                f'cloud of {size:.1f} MB: must be at most input.max_cloud_size = {limit:g} MB'
+            )
+        # Code for the other precision would have to be compiled at the first start too.
+        points = single_precision(read_xyz(cloud))
+        pose = self._tf.look_up(cloud.header, self.config.frame) if self._tf else ()
+        return self._segmenter.segment(points, *pose)
+
+    def _refuse(self, cloud: PointCloud2, reason: str) -> None:
+        if not self.context.ok():
+            return  # publishing failed because the process ends
+        self._diagnostics.input.refused(reason)
+        self.get_logger().error(
+            f'cloud on {self._input.topic} in frame {cloud.header.frame_id!r} refused: {reason}',
+            **THROTTLED,
+        )
+
     def check_config(self, config: Config) -> None:
         """Raise a GroundSegError if the backend or TF is asked for and not installed."""
         choose_backend(config.runtime.backend)
@@ -135,59 +183,11 @@ class GroundSegmentationNode(ConfiguredNode):
         self._segmenter.close()
         self._library_log.close()
 
-    def _on_cloud(self, cloud: PointCloud2, wait: float, n_lost: int) -> None:
-        """Segment a cloud and publish the result; report a cloud that cannot be segmented."""
-        start = time.monotonic()
-        self._note_arrival(cloud, start, n_lost)
-        try:
-            segmentation = self._segment(cloud)
-            segmented = time.monotonic()
-            topics = self._outputs.publish(cloud, segmentation, self.config)
-        except PointCloudError as error:
-            self._refuse(cloud, str(error))
-        except Exception as error:
-            # The next cloud may be good.
-            self._refuse(cloud, f'{type(error).__name__}: {error}')
-        else:
-            end, health = time.monotonic(), self._diagnostics
-            stages = {'queue': wait, **segmentation.timings, 'publish': end - segmented}
-            health.processing.processed(end - start, stages, segmentation.fit)
-            health.model.segmented(segmentation)
-            health.output.published(end, topics)
-
-    def _note_arrival(self, cloud: PointCloud2, now: float, n_lost: int) -> None:
-        stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
-        fields = [field.name for field in cloud.fields]
-        self._time_jumps.note(stamp)
-        self._diagnostics.input.arrived(now, stamp, cloud.header.frame_id, fields)
-        self._diagnostics.processing.arrived(now, n_lost)
-
-    def _segment(self, cloud: PointCloud2) -> Segmentation:
-        """Return the segmentation of a cloud; raise a PointCloudError if it has none."""
-        size, limit = len(cloud.data) / 1e6, self.config.input.max_cloud_size
-        if size > limit:
-            raise PointCloudError(
-                f'cloud of {size:.1f} MB: must be at most input.max_cloud_size = {limit:g} MB'
-            )
-        # Code for the other precision would have to be compiled at the first start too.
-        points = single_precision(read_xyz(cloud))
-        pose = self._tf.look_up(cloud.header, self.config.frame) if self._tf else ()
-        return self._segmenter.segment(points, *pose)
-
     def _on_time_jump(self, seconds: float) -> None:
         self._segmenter.reset()
         if self._tf is not None:
             self._tf.time_jumped(seconds)
         self._diagnostics.input.time_jumped()
-
-    def _refuse(self, cloud: PointCloud2, reason: str) -> None:
-        if not self.context.ok():
-            return  # publishing failed because the process ends
-        self._diagnostics.input.refused(reason)
-        self.get_logger().error(
-            f'cloud on {self._input.topic} in frame {cloud.header.frame_id!r} refused: {reason}',
-            **THROTTLED,
-        )
 
     def _state(self) -> tuple[InputFacts, dict[str, int]]:
         clock = self.get_clock()
