@@ -345,7 +345,8 @@ def _time_table(scores: Sequence[MethodScore], n_workers: int) -> Table:
         for score in scores
     ]
     stages = ', '.join(f'{name} {1e3 * s:.1f}' for name, s in scores[0].median_stages.items())
-    beside = f', workers beside one another: {n_workers}' if n_workers else ''
+    words = f'{n_workers} worker' + 's' * (n_workers > 1)
+    beside = f', {words} beside one another' if n_workers else ''
     title = f'Time per frame, reading left out{beside}  [ms]'
     return Table(rows, title, notes=[f'stages: {stages}'])
 
