@@ -19,8 +19,7 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.colours import length_scale_colours
 from gp_ground_seg.lab.plotting import style
 from gp_ground_seg.lab.plotting.style import add_axes, new_figure, save, write_line
-
-Labels = npt.NDArray[np.uint8]
+from gp_ground_seg.lab.scoring.metrics import Labels
 
 COLOURS = {'ground': '#B9BFC6', 'obstacles': style.VERMILION}
 VALUES = {

@@ -16,8 +16,7 @@ from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.lab.plotting import style
 from gp_ground_seg.lab.plotting.style import new_figure, save
-
-Labels = npt.NDArray[np.uint8]
+from gp_ground_seg.lab.scoring.metrics import Labels
 
 DPI = 130
 # Inches: the figure, and the part of it that the two panels leave to the legend.
