@@ -6,6 +6,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import sysconfig
 import xml.etree.ElementTree as ElementTree
 
 import pytest
@@ -13,6 +14,7 @@ from conftest import REPOSITORY
 from test_layout import PACKAGE, ROS, imports, parse
 
 import gp_ground_seg
+from gp_ground_seg.core.errors import install_hint
 from gp_ground_seg.ros.start_stop import ROS_WHEELS
 
 
@@ -140,28 +142,14 @@ def test_what_hints_name_is_what_our_extras_install():
     assert not {name for name in named if not re.search(rf"'{re.escape(name)}[<>=[;']", setup)}
 
 
-HINT = """if True:
-    import sys, sysconfig
-    sys.prefix, folder = {prefix!r}, {folder!r}
-    sysconfig.get_path = lambda name: folder
-    from gp_ground_seg.core.errors import install_hint
-    print(install_hint('rosbags'))
-"""
-
-
-def test_a_hint_says_where_pip_works(tmp_path):
+def test_a_hint_says_where_pip_works(tmp_path, monkeypatch):
     """Debian and Ubuntu mark their Python as theirs (PEP 668); a virtual environment is not."""
-
-    def hint(prefix):
-        code = HINT.format(prefix=prefix, folder=str(tmp_path))
-        done = subprocess.run(
-            [sys.executable, '-c', code], capture_output=True, text=True, check=True
-        )
-        return done.stdout.strip()
-
+    monkeypatch.setattr(sysconfig, 'get_path', lambda _name: str(tmp_path))
+    monkeypatch.setattr(sys, 'prefix', sys.base_prefix)
     here = f'{sys.executable} -m pip install rosbags'
-    assert hint(sys.base_prefix) == here
+    assert install_hint('rosbags') == here
     (tmp_path / 'EXTERNALLY-MANAGED').touch()
     there = 'pip install rosbags, in a virtual environment: see docs/install.md'
-    assert hint(sys.base_prefix) == there
-    assert hint('/elsewhere') == here
+    assert install_hint('rosbags') == there
+    monkeypatch.setattr(sys, 'prefix', '/elsewhere')
+    assert install_hint('rosbags') == here
