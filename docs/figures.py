@@ -152,8 +152,25 @@ def caption(said: str, made: str) -> str:
     return said.replace(f', written to {made}', '').replace(f'picture  {made}  ', '')
 
 
+def run_all(commands: list[str], kitti: str, folder: Path) -> dict[str, str]:
+    """Run commands in a folder, and return what each prints; those that fail are left out."""
+    outputs: dict[str, str] = {}
+    started = time.monotonic()
+    for k, command in enumerate(commands, 1):
+        seconds = time.monotonic() - started
+        print(f'[{k}/{len(commands)}, {seconds:.0f} s] gp-ground-seg {command}', flush=True)
+        try:
+            outputs[command] = run(command, kitti, folder)
+        except subprocess.CalledProcessError as error:
+            print(f'FAILED with exit code {error.returncode}; its figures stay as they are')
+        except KeyboardInterrupt:
+            print('interrupted: what is done is written')
+            break
+    return outputs
+
+
 def main() -> int:
-    """Run the commands, then write pages and pictures."""
+    """Run the commands, then write pages, samples and pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('kitti', metavar=ROOT, help='labelled frames, SemanticKITTI layout')
     parser.add_argument(
@@ -168,39 +185,26 @@ def main() -> int:
     chosen = arguments.part or ['']
     figures = [f for f in every if any(part in f'{f.page} {f.command}' for part in chosen)]
     commands = [c for figure in figures for c in (figure.command, figure.sample) if c is not None]
-    commands = list(dict.fromkeys(commands))
     commit = (describe_environment()['commit'] or 'unknown')[:12]
-    outputs: dict[str | None, str | None] = {None: None}
+    samples = read_samples()
+    samples = {f.sample: samples[f.sample] for f in every if f.sample in samples}
     with tempfile.TemporaryDirectory() as name:
-        folder, started = Path(name), time.monotonic()
+        folder = Path(name)
         (folder / 'docs').symlink_to(REPOSITORY / 'docs')
-        for k, command in enumerate(commands, 1):
-            seconds = time.monotonic() - started
-            print(f'[{k}/{len(commands)}, {seconds:.0f} s] gp-ground-seg {command}', flush=True)
-            try:
-                outputs[command] = run(command, kitti, folder)
-            except subprocess.CalledProcessError as error:
-                print(f'FAILED with exit code {error.returncode}; its figures stay as they are')
-            except KeyboardInterrupt:
-                print('interrupted: what is done is written')
-                break
-        done = [f for f in figures if f.command in outputs and f.sample in outputs]
-        samples = read_samples()
-        for command in samples.keys() - {figure.sample for figure in every}:
-            del samples[command]
+        outputs = run_all(list(dict.fromkeys(commands)), kitti, folder)
+        done = [f for f in figures if {f.command, f.sample} - {None} <= outputs.keys()]
         for figure in done:
             body = body_of(figure, outputs[figure.command], commit)
+            texts[figure.page] = replaced(texts[figure.page], figure, body)
             if figure.sample is not None:
                 samples[figure.sample] = rows_of(kept(figure, outputs[figure.sample]))
-            texts[figure.page] = replaced(texts[figure.page], figure, body)
             if 'picture' in figure.options:
                 made, _, place = figure.options['picture'].partition(' -> ')
                 shutil.copyfile(folder / made, REPOSITORY / place)
     write_samples(samples)
     for page, text in texts.items():
         (REPOSITORY / page).write_text(text, encoding='utf-8')
-    seconds = time.monotonic() - started
-    print(f'{len(done)} of {len(figures)} figures written in {seconds:.0f} s')
+    print(f'{len(done)} of {len(figures)} figures written')
     return 0 if len(done) == len(figures) else 1
 
 

@@ -1,4 +1,4 @@
-"""Regression on real frames: the worth of the defaults must not fall."""
+"""Regression on real frames: scores of the defaults must not fall."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ FLOOR = {'00': 98.5, '01': 98.9, '03': 94.4, '05': 95.1, '08': 97.1, '10': 97.7}
 
 
 def test_iou_on_labelled_frames(kitti):
-    """GroundGrid convention, counted here on its own: no code of evaluation/."""
+    """GroundGrid convention, counted here, with no code of lab/scoring."""
     segmenter = GroundSegmenter()
     counts = {}
     for sequence in list_sequences(kitti):
@@ -40,7 +40,7 @@ def test_iou_on_labelled_frames(kitti):
 def test_no_person_is_lost_and_near_vehicles_are_obstacles(kitti):
     frames = [frame for one in list_sequences(kitti) for frame in list_frames(kitti, one)]
     ours = runner.OurMethod(Config())
-    (score,) = runner.score_methods(frames, runner.load_kitti, [ours])
+    (score,) = runner.score_methods(frames, [ours])
     ours.close()
     for name in ('person', 'cyclist'):
         found = score.objects[name]
