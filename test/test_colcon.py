@@ -15,6 +15,7 @@ pytest.importorskip('colcon_core', reason='colcon is not installed')
 from conftest import REPOSITORY
 from ros_helpers import ISOLATION, NAMESPACE, Process
 
+pytestmark = pytest.mark.slow
 PACKAGE = 'gp_ground_seg'
 EXECUTABLE = 'ground_segmentation_node'
 
