@@ -64,6 +64,8 @@ def everything(path):
         assert document['measures'].pop()['measure'].startswith('time')
     for row in document['rows']:
         row.pop('seconds', None)
+    measures = document.get('measures', [])
+    document['measures'] = [each for each in measures if '[ms]' not in each['measure']]
     return document
 
 
@@ -95,7 +97,7 @@ def assert_same(scheduler, tmp_path, capsys):
 
 @pytest.mark.parametrize('more', [[], PAST, ['--peer', 'patchworkpp']])
 def test_an_evaluation_is_the_same_to_the_last_digit(root, assert_same, more):
-    assert_same('left out, 2 workers beside one another  [ms]', 'evaluate', root, *more)
+    assert_same(', workers beside one another: 2  [ms]', 'evaluate', root, *more)
 
 
 @pytest.mark.parametrize(
