@@ -61,6 +61,9 @@ PRIVATE = ('numba.core', 'numba.np', 'llvmlite')
 
 MAX_LINES, MAX_FILES = 500, 140
 MAX_PARAMETERS, MAX_PARAMETERS_COMPILED = 8, 12
+MAX_BODY, MAX_BODY_COMPILED = 40, 60
+"""Lines of a function, without its docstring."""
+LONG_OUTSIDE_CORE = ('cli/', 'data/', 'lab/', 'ros/')
 
 
 def parse(root):
@@ -164,6 +167,47 @@ def find_long_signatures(trees):
                     yield f'{path}: {node.name} has {n_parameters} parameters'
 
 
+def find_long_functions(trees):
+    """Functions that do not fit on a screen."""
+    for path, tree in trees.items():
+        if path.startswith(LONG_OUTSIDE_CORE):
+            continue
+        limit = MAX_BODY_COMPILED if path.startswith('core/compiled/') else MAX_BODY
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                first = node.body[0 if ast.get_docstring(node) is None else 1 :]
+                length = node.end_lineno - first[0].lineno + 1 if first else 0
+                if length > limit:
+                    yield f'{path}: {node.name} has {length} lines'
+
+
+def is_shared(node):
+    """Whether a statement is a function that both backends use, see `gp_ground_seg.core.jit`."""
+    return any(ast.unparse(mark) == 'shared' for mark in getattr(node, 'decorator_list', []))
+
+
+def find_formulas_that_stand_twice(trees):
+    """Shared functions that stand again elsewhere, or that one of the backends does not use."""
+    places, users = {}, {}
+    for path, tree in trees.items():
+        side = 'compiled' if path.startswith('core/compiled/') else 'plain'
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef):
+                places.setdefault(node.name, []).append((path, is_shared(node)))
+            elif isinstance(node, ast.Import | ast.ImportFrom):
+                continue
+            for part in ast.walk(node):
+                if isinstance(part, ast.Name | ast.Attribute):
+                    name = part.id if isinstance(part, ast.Name) else part.attr
+                    users.setdefault(name, set()).update(
+                        {'plain', 'compiled'} if is_shared(node) else {side}
+                    )
+    for name, found in places.items():
+        *others, path = [path for path, _ in found]
+        if any(shared for _, shared in found) and (others or len(users.get(name, ())) < 2):
+            yield f'{path}: {name} is shared, and also in {others}, or used by one backend only'
+
+
 def find_returned_arrays(trees):
     """Compiled functions called from Python that return more than numbers: see `jit`."""
     for path, tree in trees.items():
@@ -191,6 +235,8 @@ CHECKS = (
     find_foreign_violations,
     find_cycles,
     find_long_signatures,
+    find_long_functions,
+    find_formulas_that_stand_twice,
     find_returned_arrays,
     find_reordered_sums,
 )
@@ -251,6 +297,9 @@ def test_files_are_of_a_size_worth_opening(trees):
             'core/gp/a.py',
             '@jit(entry=True)\ndef f() -> tuple[int, Lines]: ...',
         ),
+        (find_long_functions, 'core/a.py', 'def f():\n    """Add."""' + '\n    x += 1' * 41),
+        (find_formulas_that_stand_twice, 'core/compiled/d.py', '@shared\ndef formula(x): ...'),
+        (find_formulas_that_stand_twice, 'core/gp/d.py', '@shared\ndef other(x): ...'),
         (find_reordered_sums, 'core/gp/a.py', '@jit(fastmath=True)\ndef f(x, y): x[0] += y[0]'),
     ],
 )
@@ -264,6 +313,8 @@ def test_a_violation_is_found_and_only_that(find, path, source):
         'core/compiled/b.py': 'import numba\nfrom gp_ground_seg.core.gp import b\n'
         '@jit(entry=True, fastmath=True)\ndef f(x) -> tuple[int, float]: return x[0], x[1]',
         'data/a.py': 'from gp_ground_seg.data.b import f',
+        'core/compiled/c.py': 'def f(x):\n    """Add."""\n    return c.formula(x)',
+        'core/gp/e.py': '@shared\ndef formula(x): ...\ndef f(x): return formula(x)',
         'lab/plotting/__init__.py': 'from gp_ground_seg.lab.plotting.d import f',
         'lab/plotting/b.py': 'def f():\n    from matplotlib.figure import Figure',
         'lab/plotting/d.py': 'from gp_ground_seg.lab.plotting.e import g',

@@ -1,1 +1,1 @@
-"""What a scan goes through, from points to labels; start with `segmenter`."""
+"""The way of a scan from points to labels; start with `segmenter`."""

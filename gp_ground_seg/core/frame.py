@@ -21,7 +21,7 @@ BoolArray = npt.NDArray[np.bool_]
 PointArray = npt.NDArray[np.floating]
 """Coordinates, in single or double precision."""
 Values = Any
-"""What a shared formula takes and returns: arrays in numpy code, numbers in compiled code."""
+"""Arguments and results of shared formulas: arrays in numpy code, numbers in compiled code."""
 
 OUTSIDE = -1
 """Bin, cell and tile of a point that is beyond the grid."""
@@ -186,7 +186,7 @@ class PseudoInputs(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What the two processes are fitted to."""
+    """Data that the two processes are fitted to."""
 
     candidates: Candidates
     lines: Lines

@@ -1,4 +1,4 @@
-"""What segmenting a scan gives back."""
+"""Result of segmenting a scan."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.frame import (
     Candidates,
     FloatArray,
+    Frame,
     GroundSurface,
     Label,
     Labelled,
@@ -63,7 +64,7 @@ class cached_property(Generic[_Value]):  # noqa: N801 - a decorator
 
 @dataclass(frozen=True)
 class Fitting:
-    """What `FitReport` cannot learn from the results."""
+    """Facts for `FitReport` that are not in the other results."""
 
     mode: str  # ``learning.mode`` of the frame
     # Outcome of the learning, of each segment where each has its own; empty where there was none.
@@ -74,7 +75,7 @@ class Fitting:
 
 @dataclass(frozen=True)
 class FitReport:
-    """What the learning and the inlier growth did.
+    """Outcome of the learning and of the inlier growth.
 
     Attributes
     ----------
@@ -156,7 +157,7 @@ class Segmentation:
         Seconds per stage, and ``total``.
     fitting : Fitting
         How it was fitted; `fit` sums it up.
-    grid, candidates, lines, pseudo, surface
+    grid, frame, surface
         Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
         process's own, which the labels follow from; `corrected` is what users are given.
     theta : (M, 6) float64
@@ -178,15 +179,28 @@ class Segmentation:
     timings: dict[str, float]
     fitting: Fitting
     grid: PolarGrid
-    candidates: Candidates
-    lines: Lines
-    pseudo: PseudoInputs
+    frame: Frame
     surface: GroundSurface
     theta: FloatArray
     log_length_scale: FloatArray
     pose: SensorPose
     tilted_z: FloatArray | None
     slope_std: float
+
+    @property
+    def candidates(self) -> Candidates:
+        """Ground candidates that the lines were found in."""
+        return self.frame.candidates
+
+    @property
+    def lines(self) -> Lines:
+        """Lines through the candidates."""
+        return self.frame.lines
+
+    @property
+    def pseudo(self) -> PseudoInputs:
+        """Pseudo-inputs on the lines."""
+        return self.frame.pseudo
 
     @property
     def label(self) -> npt.NDArray[np.uint8]:
@@ -214,7 +228,7 @@ class Segmentation:
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know of the scan, a line for each; logged by the segmenter."""
+        """Warnings for the user, a line for each; logged by the segmenter."""
         n_ground = np.count_nonzero(self.label == Label.GROUND)
         n_finite = np.count_nonzero(self.label != Label.UNKNOWN)
         if not n_finite:
@@ -224,7 +238,7 @@ class Segmentation:
 
     @cached_property
     def fit(self) -> FitReport:
-        """What the learning and the inlier growth did."""
+        """Outcome of the learning and of the inlier growth."""
         return FitReport.of(self)
 
     @cached_property

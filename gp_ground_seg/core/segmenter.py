@@ -85,61 +85,56 @@ class GroundSegmenter:
             If the array has another shape or type, or z clearly does not point up.
         """
         with self._exclusive():
-            config, backend, timer = self._config, self._backend, StageTimer(self._clock)
-            sensor = config.sensor
+            timer, sensor = StageTimer(self._clock), self._config.sensor
             if tilt is not None:
                 sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
             if origin is not None:
                 x, y, z = origin
                 sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
-
-            # 1. Polar grid: the lowest point of each cell is a ground candidate.
-            # 2. Sensor pose: height and tilt, from a plane through the candidates near the
-            #    sensor; a tilted scan is levelled and sorted again.
-            xyz = take_points(points)
-            scan, pose = self._level(xyz, sensor, timer)
-
-            # 3. Vertical faces: walls, fences, sides of cars.
-            faces = backend.find_faces(scan, config)
-            timer.mark('faces')
-
-            # 4. Lines along each segment, and pseudo-inputs on them. Lowest points of faces
-            #    with occluded base are left out of the candidates.
-            extracted = backend.extract_lines(scan.candidates, faces, config)
-            # Heights are relative to the sensor: the prior mean is the ground below it.
-            frame = Frame(*extracted, scan.grid.edges, prior_mean=-pose.height)
-            timer.mark('lines')
-
-            # 5. Observation process (height over range) and latent process (its log
-            #    length-scale): hyper-parameters theta, in log space, then inliers and surface.
-            theta, learned = self._learn(frame)
-            timer.mark('learning')
-            surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
-            timer.mark('surface')
-
-            # 6. Labels: a point is ground where its height over the surface is more likely of
-            #    ground than of an obstacle.
-            labelled = backend.label_points(scan, faces, surface, config)
-            tilted_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
-            timer.mark('label')
-
-            result = Segmentation(
-                labelled,
-                timer.seconds,
-                Fitting(config.learning.mode, learned, backend.name, backend.n_threads),
-                scan.grid,
-                frame.candidates,
-                frame.lines,
-                frame.pseudo,
-                surface,
-                theta,
-                log_length_scale,
-                pose,
-                tilted_z,
-                config.observation.slope_std,
-            )
+            result = self._segment(take_points(points), sensor, timer)
             self._warn(result.warnings)
             return result
+
+    def _segment(self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer) -> Segmentation:
+        """Do the stages of a scan, one after the other."""
+        config, backend = self._config, self._backend
+        # 1. Polar grid: the lowest point of each cell is a ground candidate.
+        # 2. Sensor pose: height and tilt, from a plane through the candidates near the
+        #    sensor; a tilted scan is levelled and sorted again.
+        scan, pose = self._level(xyz, sensor, timer)
+        # 3. Vertical faces: walls, fences, sides of cars.
+        faces = backend.find_faces(scan, config)
+        timer.mark('faces')
+        # 4. Lines along each segment, and pseudo-inputs on them. Lowest points of faces with
+        #    occluded base are left out. Heights are relative to the sensor: the prior mean is
+        #    the ground below it.
+        extracted = backend.extract_lines(scan.candidates, faces, config)
+        frame = Frame(*extracted, scan.grid.edges, prior_mean=-pose.height)
+        timer.mark('lines')
+        # 5. Observation process (height over range) and latent process (its log length-scale):
+        #    hyper-parameters theta, in log space, then inliers and surface.
+        theta, learned = self._learn(frame)
+        timer.mark('learning')
+        surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
+        timer.mark('surface')
+        # 6. Labels: a point is ground where its height over the surface is more likely of ground
+        #    than of an obstacle.
+        labelled = backend.label_points(scan, faces, surface, config)
+        tilted_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
+        timer.mark('label')
+        return Segmentation(
+            labelled=labelled,
+            timings=timer.seconds,
+            fitting=Fitting(config.learning.mode, learned, backend.name, backend.n_threads),
+            grid=scan.grid,
+            frame=frame,
+            surface=surface,
+            theta=theta,
+            log_length_scale=log_length_scale,
+            pose=pose,
+            tilted_z=tilted_z,
+            slope_std=config.observation.slope_std,
+        )
 
     def estimate_pose(self, points: npt.ArrayLike) -> SensorPose:
         """Estimate height and tilt of the sensor as `segment` does, and no more.

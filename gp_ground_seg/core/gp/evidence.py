@@ -1,4 +1,4 @@
-"""Stage 5a: what the segments beside a segment show of its ground.
+"""Stage 5: evidence of the ground from the segments beside a segment.
 
 Where a car hides the ground of a segment, that segment by itself would take the car for ground.
 Its neighbours see the ground at the same range, lower. Two sources of evidence are used: seeds

@@ -1,4 +1,4 @@
-"""Stage 5b: the observation process: inlier growth, and the surface of every segment."""
+"""Stage 5: the observation process: inlier growth, and the surface of every segment."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class SegmentSurfaces(NamedTuple):
 
 
 class _Model(NamedTuple):
-    """What the segments grow from."""
+    """Values that the segments grow from."""
 
     frame: Frame
     theta: FloatArray  # (M, 6)

@@ -1,4 +1,4 @@
-"""Stage 5a: length-scales, from the latent process or simpler models."""
+"""Stage 5: length-scales, from the latent process or simpler models."""
 
 from __future__ import annotations
 

@@ -282,23 +282,11 @@ def maximise(
     if not free.any() or n_data == 0 or max_evaluations == 0:
         return Learned(theta, -math.inf, 0, 'converged', np.zeros_like(free))
 
-    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
-        """Objective and gradient in the free entries, for each datum."""
-        trial = theta.copy()
-        trial[free] = x
-        value, slope = objective(trial)
-        slope = slope[free]
-        if use_priors:
-            deviation = (x - space.centre[free]) / space.prior_std
-            value -= 0.5 * float(deviation @ deviation)
-            slope = slope - deviation / space.prior_std
-        return value / n_data, slope / n_data
-
+    evaluate = _of_free_entries(objective, space, theta, n_data, use_priors)
     x = theta[free]
     value, gradient = evaluate(x)
     n_evaluations, status, reach = 1, 'budget' if math.isfinite(value) else 'failed', 1.0
-    unit = np.eye(len(x))
-    inverse = unit
+    unit = inverse = np.eye(len(x))
     while status == 'budget':
         held = ((x <= lower) & (gradient < 0.0)) | ((x >= upper) & (gradient > 0.0))
         slope = np.where(held, 0.0, gradient)
@@ -329,3 +317,23 @@ def maximise(
     theta[free] = x
     near_bound = (theta <= space.lower + _AT_BOUND) | (theta >= space.upper - _AT_BOUND)
     return Learned(theta, value * n_data, n_evaluations, status, free & near_bound)
+
+
+def _of_free_entries(
+    objective: Objective, space: ThetaSpace, theta: FloatArray, n_data: int, use_priors: bool
+) -> Objective:
+    """Objective and gradient in the free entries, for each datum; the others are as in `theta`."""
+    free = space.free
+
+    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
+        trial = theta.copy()
+        trial[free] = x
+        value, slope = objective(trial)
+        slope = slope[free]
+        if use_priors:
+            deviation = (x - space.centre[free]) / space.prior_std
+            value -= 0.5 * float(deviation @ deviation)
+            slope = slope - deviation / space.prior_std
+        return value / n_data, slope / n_data
+
+    return evaluate

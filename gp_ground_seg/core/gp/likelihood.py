@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray
+from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray, Values
 from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.gp.linalg import Padded, add_noise, batches, single_threaded_blas
@@ -62,15 +62,11 @@ def _add_batch(
 
     sigma_f, sigma_n = np.exp(theta[:2])
     length_scale = np.where(layout.mask, np.exp(u), 1.0)
-    r_a, l_a, r_b, l_b = (
-        r[:, :, None],
-        length_scale[:, :, None],
-        r[:, None, :],
-        length_scale[:, None],
-    )
-    k = paciorek(r_a, l_a, r_b, l_b, sigma_f**2)
+    a, b = (r[:, :, None], length_scale[:, :, None]), (r[:, None, :], length_scale[:, None, :])
+    k = paciorek(*a, *b, sigma_f**2)
     k *= layout.mask[:, :, None] & layout.mask[:, None, :]
-    covariance = add_noise(k + slope_std**2 * r_a * r_b, np.full((1, 1), sigma_n**2), layout.mask)
+    covariance = k + slope_std**2 * r[:, :, None] * r[:, None, :]
+    add_noise(covariance, np.full((1, 1), sigma_n**2), layout.mask)
     factor = np.linalg.cholesky(covariance)
     a_inverse = np.linalg.inv(covariance)
     alpha = (a_inverse @ z[:, :, None])[:, :, 0]
@@ -81,22 +77,30 @@ def _add_batch(
     )
 
     # G = (alpha alpha^T - A^-1) / 2 is the derivative of the value in A.
-    a_inverse *= -0.5
-    g = a_inverse
-    g += 0.5 * alpha[:, :, None] * alpha[:, None, :]
+    g = 0.5 * (alpha[:, :, None] * alpha[:, None, :] - a_inverse)
     gradient[1] += 2.0 * sigma_n**2 * np.diagonal(g, axis1=1, axis2=2)[layout.mask].sum()
     g *= k
     row_sum = g.sum(axis=2)
     gradient[0] += 2.0 * row_sum.sum()
     if latent is None:
         return value
-    # dk/du_i = k (1/2 - l_i^2 / s (1 - 2 d^2 / s)), s = l_i^2 + l_j^2, in rows and columns.
-    inverse_spread = 1.0 / (l_a**2 + l_b**2)
-    g *= (1.0 - 2.0 * (r_a - r_b) ** 2 * inverse_spread) * inverse_spread
-    g_u = row_sum - 2.0 * length_scale**2 * g.sum(axis=2)
     is_bounded = np.abs(u) >= MAX_ABS_LOG_LENGTH_SCALE
-    g_u = np.where(layout.mask & has_latent & ~is_bounded, g_u, 0.0)
+    is_free = layout.mask & has_latent & ~is_bounded
+    g_u = np.where(is_free, row_sum - _curvature(g, r, length_scale), 0.0)
     return value + latent.add_gradient(gradient, g_u, latent_terms)
+
+
+def _curvature(g: Values, r: FloatArray, length_scale: FloatArray) -> FloatArray:
+    """Part of the derivative in u that depends on the distances; `g` is that in log k.
+
+    dk/du_i = k (1/2 - l_i^2 / s (1 - 2 d^2 / s)), s = l_i^2 + l_j^2, in rows and columns.
+    """
+    square = length_scale**2
+    inverse_spread = 1.0 / (square[:, :, None] + square[:, None, :])
+    distance2 = (r[:, :, None] - r[:, None, :]) ** 2
+    weighted = g * (1.0 - 2.0 * distance2 * inverse_spread) * inverse_spread
+    result: FloatArray = 2.0 * square * weighted.sum(axis=2)
+    return result
 
 
 class _Latent(NamedTuple):

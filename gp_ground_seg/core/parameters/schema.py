@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 ParameterValue = bool | int | float | str
 
 AUTO: Literal['auto'] = 'auto'
-"""What a number may be instead where its declaration says so: estimated from the scan."""
+"""Value instead of a number that is estimated from the scan, where the declaration allows it."""
 ROS_NODE_KEY = '/**'
 NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
@@ -33,7 +33,7 @@ OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """What is declared of one parameter."""
+    """Declaration of one parameter."""
 
     name: str  # dotted, ``group.field``
     type: type  # bool, int, float or str; that of the number where it may be `AUTO`

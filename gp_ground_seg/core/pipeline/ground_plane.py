@@ -1,4 +1,4 @@
-"""Stage 2a: the plane of the ground around the sensor, from the lowest points of one scan."""
+"""Stage 2: the plane of the ground around the sensor, from the lowest points of one scan."""
 
 from __future__ import annotations
 

@@ -63,6 +63,7 @@ def lines_through(
     return lines, pseudo, continues_line
 
 
+@shared
 def trace(
     candidates: Candidates,
     tolerances: LinesConfig,

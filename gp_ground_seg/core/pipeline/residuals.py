@@ -1,4 +1,4 @@
-"""What the returns called ground say of the surface: its bias, and its uncertainty.
+"""Bias and uncertainty of the surface, by the returns called ground.
 
 The process is fitted to the lowest point of each bin, so it lies below the mean of the returns,
 and its standard deviation follows from its hyper-parameters. The returns tell both. About each

@@ -62,7 +62,7 @@ TILT_CONTRADICTION = 0.15
 
 @dataclass(frozen=True)
 class MeasuredPose:
-    """What one scan says of the sensor, whatever was given."""
+    """Height and tilt of the sensor by one scan, whatever was given."""
 
     # of the cloud's origin over the ground plane, along the vertical of the pose used [m]
     height: float
@@ -112,7 +112,7 @@ class SensorPose:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know, a line for each."""
+        """Warnings for the user, a line for each."""
         return (NO_HEIGHT,) if self.is_height_default else ()
 
     @property
@@ -160,47 +160,21 @@ def estimate_pose(
     clearly not up.
     """
     given = given_pose(sensor)
-    origin = given.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
-
-    def look(turn: FloatArray | None, max_tilt: float) -> View | None:
-        own = scan if turn is None else scan_rotated(turn)
-        x, y, z = (origin if turn is None else turn @ origin).tolist()
-        plane = fit_plane(own.candidates, math.tan(max_tilt), (x, y, z))
-        if plane is None:
-            return None
-        is_below = float(plane.below(x, y, z)) >= MIN_CLEARANCE
-        if not is_below and not _is_lower_side(plane, own):
-            return None
-        return View(
-            plane, plane.normal if turn is None else turned_back(plane.normal, turn), is_below
-        )
-
-    view = look(None, MAX_TILT)
-    not_up = None
-    if is_up_axis_doubtful(None if view is None else view.plane):
-        found = find_up_axis(None if view is None else view.plane, look)
-        if found is not None and found.up[2] >= math.cos(UP_MAX_TILT):
-            view = found
-        elif found is not None:
-            not_up = refusal(found, given.rotation)
-            if AUTO in (sensor.roll, sensor.pitch):
-                raise PointCloudError(not_up)
+    view, not_up = _find_ground(scan, sensor, fit_plane, scan_rotated)
     contradictions = () if not_up is None else (not_up,)
     if view is None:
         return dataclasses.replace(given, contradictions=contradictions)
-    plane, own_up = view.plane, view.up
-    tells_height, tells_tilt = view.tells_height, view.tells_tilt
-    up = own_up if given.is_level else turned_back(own_up, given.rotation)
+    plane, tells_height, tells_tilt = view.plane, view.tells_height, view.tells_tilt
+    up = view.up if given.is_level else turned_back(view.up, given.rotation)
     roll, pitch = _levelled(up, sensor)
     levelled = vertical(roll, pitch)
     corrects = tells_tilt and _angle(levelled, vertical(given.roll, given.pitch)) >= CLEAR_TILT
     # Along the vertical of the pose used, not across the plane.
-    along = _product(levelled, up) if corrects else own_up[2]
+    along = _product(levelled, up) if corrects else view.up[2]
     if not corrects:
         roll, pitch = given.roll, given.pitch
     height = rounded(plane.near_height * plane.normal[2] / along)
-    own_roll, own_pitch = angles_of(up)
-    measured = MeasuredPose(height, own_roll, own_pitch, tells_height, tells_tilt, plane)
+    measured = MeasuredPose(height, *angles_of(up), tells_height, tells_tilt, plane)
     estimates_height = sensor.height == AUTO and tells_height
     return SensorPose(
         height=height if estimates_height else given.height,
@@ -210,9 +184,44 @@ def estimate_pose(
         roll_estimated=sensor.roll == AUTO and corrects,
         pitch_estimated=sensor.pitch == AUTO and corrects,
         measured=measured,
-        contradictions=contradictions or _contradictions(sensor, measured, own_up),
+        contradictions=contradictions or _contradictions(sensor, measured, view.up),
         is_height_default=sensor.height == AUTO and not tells_height,
     )
+
+
+def _find_ground(
+    scan: Scan, sensor: SensorConfig, fit_plane: FitPlane, scan_rotated: ScanRotated
+) -> tuple[View | None, str | None]:
+    """Plane of the ground below z, or where z does not seem to be up of the axis that is.
+
+    The second says where the ground is if that axis is too far from z to be levelled.
+    """
+    given = given_pose(sensor)
+    origin = given.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
+
+    def look(turn: FloatArray | None, max_tilt: float) -> View | None:
+        turned = scan if turn is None else scan_rotated(turn)
+        x, y, z = (origin if turn is None else turn @ origin).tolist()
+        plane = fit_plane(turned.candidates, math.tan(max_tilt), (x, y, z))
+        if plane is None:
+            return None
+        is_below = float(plane.below(x, y, z)) >= MIN_CLEARANCE
+        if not is_below and not _is_lower_side(plane, turned):
+            return None
+        up = plane.normal if turn is None else turned_back(plane.normal, turn)
+        return View(plane, up, is_below)
+
+    view = look(None, MAX_TILT)
+    plane_below = None if view is None else view.plane
+    found = find_up_axis(plane_below, look) if is_up_axis_doubtful(plane_below) else None
+    if found is None:
+        return view, None
+    if found.up[2] >= math.cos(UP_MAX_TILT):
+        return found, None
+    not_up = refusal(found, given.rotation)
+    if AUTO in (sensor.roll, sensor.pitch):
+        raise PointCloudError(not_up)
+    return view, not_up
 
 
 def _is_lower_side(plane: GroundPlane, scan: Scan) -> bool:

@@ -1,4 +1,4 @@
-"""Stage 2c: whether a plane is ground, and whether the ground lies along another axis than z."""
+"""Stage 2: whether a plane is ground, and whether the ground lies along another axis than z."""
 
 from __future__ import annotations
 
