@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray
+from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray, Values
+from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import SENSOR_HEIGHTS
 from gp_ground_seg.core.pipeline.tilt import Direction
 
@@ -43,6 +44,13 @@ PENALTY = 1.0
 """Loss of score for each point clearly below the plane: of a street and the roofs of cars,
 or of a floor and tables, the ground is the lower one."""
 
+Plane = tuple[float, float, float]
+"""Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
+NumbersOfPlane = tuple[
+    float, float, float, float, float, float, float, float, float, float, int, int
+]
+"""Fields of a `GroundPlane`."""
+
 N_TRIPLES = 192
 """Planes tried through three cells each."""
 N_LEVEL = 64
@@ -58,13 +66,17 @@ MIN_CELLS = 3
 
 
 class LowestPoints(NamedTuple):
-    """Lowest point of each occupied cell: sectors by rings, rings wider the farther they are."""
+    """Lowest point of each occupied cell: sectors by rings, rings wider the farther they are.
+
+    Compiled code has more entries than cells, see `gp_ground_seg.core.compiled.ground_plane`.
+    """
 
     x: FloatArray  # (C,) [m]
     y: FloatArray  # (C,) [m]
     z: FloatArray  # (C,) along the axis that is taken to be up [m]
     r: FloatArray  # (C,) horizontal range [m]
     tolerance: FloatArray  # (C,) distance to the plane that the point still supports [m]
+    inverse: FloatArray  # (C,) one over the tolerance [1/m]
     sector: IntArray  # (C,) sector of each cell, 0 to `N_SECTORS` - 1
 
 
@@ -90,14 +102,14 @@ def lowest_points(candidates: Candidates) -> LowestPoints:
     segment = np.searchsorted(candidates.offsets, index, side='right') - 1
     cosine, sine = segment_directions(len(candidates.offsets) - 1)
     r = candidates.r[index]
-    return LowestPoints(
-        x=r * cosine[segment],
-        y=r * sine[segment],
-        z=candidates.z[index],
-        r=r,
-        tolerance=TOLERANCE + TOLERANCE_GROWTH * r,
-        sector=cell // N_RINGS,
-    )
+    x, y, tolerance = r * cosine[segment], r * sine[segment], tolerance_at(r)
+    return LowestPoints(x, y, candidates.z[index], r, tolerance, 1.0 / tolerance, cell // N_RINGS)
+
+
+@shared
+def tolerance_at(r: Values) -> Values:
+    """Distance to the plane that a point at range `r` still supports [m]."""
+    return TOLERANCE + TOLERANCE_GROWTH * r
 
 
 def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> IntArray:
@@ -164,56 +176,23 @@ def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> Gr
     steepest plane to look for, as rise per metre; `origin` is where the sensor is [m].
     """
     cells = lowest_points(candidates)
-    if len(cells.z) < MIN_CELLS:
-        return None
-    hypotheses = _hypotheses(cells, max_slope)
-    if len(hypotheses) == 0:
-        return None
-    best = hypotheses[int(np.argmax(_score(hypotheses, cells)))]
-    height, slope_x, slope_y = _refine(best, cells)
-    if not (
-        MIN_HEIGHT <= height <= MAX_HEIGHT
-        and slope_x * slope_x + slope_y * slope_y <= (LOOSER * max_slope) ** 2
-    ):
+    numbers = fit_cells(cells, len(cells.z), max_slope, origin)
+    return GroundPlane(*numbers) if numbers[-1] > 0 else None
+
+
+@shared
+def fit_cells(cells: LowestPoints, n: int, max_slope: float, origin: Direction) -> NumbersOfPlane:
+    """Fit a plane to the first `n` points; its last number is 0 if there is none."""
+    is_found, best = False, (0.0, 0.0, 0.0)
+    if n >= MIN_CELLS:
+        is_found, best = best_hypothesis(cells, n, max_slope)
+    if not is_found:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+    plane = refined(cells, best)
+    if not is_possible(plane, LOOSER * max_slope):
         # The refinement has drifted off to a plane that cannot be the ground.
-        height, slope_x, slope_y = best
-    return _describe(cells, (float(height), float(slope_x), float(slope_y)), origin)
-
-
-def _describe(
-    cells: LowestPoints, plane: tuple[float, float, float], origin: Direction
-) -> GroundPlane | None:
-    """Plane with the evidence for it; None if no point lies on it."""
-    height, slope_x, slope_y = plane
-    x, y, z = origin
-    distance = cells.z - (slope_x * cells.x + slope_y * cells.y - height)
-    on_it = np.abs(distance) <= cells.tolerance
-    n_on_it = int(np.count_nonzero(on_it))
-    if n_on_it == 0:
-        return None
-    r, sector = cells.r[on_it], cells.sector[on_it]
-    away = np.hypot(cells.x[on_it] - x, cells.y[on_it] - y)
-    depression = np.sort(np.arctan2(z - cells.z[on_it], away))
-    near = np.sort(distance[on_it][r < NEAR])
-    few, most = n_on_it // 10, (9 * n_on_it) // 10
-    return GroundPlane(
-        height=height,
-        slope_x=slope_x,
-        slope_y=slope_y,
-        near_height=height - (float(near[len(near) // 2]) if len(near) >= ENOUGH_NEAR else 0.0),
-        support=n_on_it / len(distance),
-        coverage=_n_different(sector) / N_SECTORS,
-        far_coverage=_n_different(sector[r >= FAR]) / _n_different(cells.sector),
-        reach=float(np.sort(r)[most]),
-        spread=float(depression[most] - depression[few]),
-        residual=float(np.sqrt(np.mean(distance[on_it] ** 2))),
-        n_cells=len(distance),
-        n_support=n_on_it,
-    )
-
-
-def _n_different(sector: IntArray) -> int:
-    return int(np.count_nonzero(np.bincount(sector, minlength=N_SECTORS)))
+        plane = best
+    return described(cells, n, plane, origin)
 
 
 def _spread(n: int) -> FloatArray:
@@ -231,64 +210,91 @@ SPREAD = _spread(N_TRIPLES)
 """Which three cells, as shares of their number, (N_TRIPLES, 3)."""
 
 
-def _hypotheses(cells: LowestPoints, max_slope: float) -> FloatArray:
-    """Planes through three points or level through one, (H, 3): height, slope_x, slope_y."""
-    n = len(cells.z)
-    level = np.zeros((min(n, N_LEVEL), 3))
-    level[:, 0] = -cells.z[np.arange(len(level)) * n // len(level)]
-    i, j, k = (SPREAD * n).astype(np.int64).T
-    x1, y1, z1 = (v[j] - v[i] for v in (cells.x, cells.y, cells.z))
-    x2, y2, z2 = (v[k] - v[i] for v in (cells.x, cells.y, cells.z))
+@shared
+def best_hypothesis(cells: LowestPoints, n: int, max_slope: float) -> tuple[bool, Plane]:
+    """First of the planes with the best score, and whether there is one."""
+    found, most, best = False, 0.0, (0.0, 0.0, 0.0)
+    n_level = min(n, N_LEVEL)
+    for t in range(n_level + len(SPREAD)):
+        if t < n_level:
+            plane = (-cells.z[t * n // n_level], 0.0, 0.0)
+        else:
+            i, j, k = SPREAD[t - n_level] * n
+            plane = plane_through(cells, int(i), int(j), int(k))
+        if is_possible(plane, max_slope):
+            score = score_of(plane, cells)
+            if not found or score > most:
+                found, most, best = True, score, plane
+    return found, best
+
+
+@shared
+def plane_through(cells: LowestPoints, i: int, j: int, k: int) -> Plane:
+    """Plane through three points; infinitely high if they are too close to a line."""
+    x1, y1, z1 = cells.x[j] - cells.x[i], cells.y[j] - cells.y[i], cells.z[j] - cells.z[i]
+    x2, y2, z2 = cells.x[k] - cells.x[i], cells.y[k] - cells.y[i], cells.z[k] - cells.z[i]
     area = x1 * y2 - x2 * y1
-    wide = np.flatnonzero(np.abs(area) > MIN_AREA)
-    i, area = i[wide], area[wide]
-    slope_x = (z1[wide] * y2[wide] - z2[wide] * y1[wide]) / area
-    slope_y = (x1[wide] * z2[wide] - x2[wide] * z1[wide]) / area
-    height = slope_x * cells.x[i] + slope_y * cells.y[i] - cells.z[i]
-    found = np.concatenate([level, np.column_stack([height, slope_x, slope_y])])
-    possible = (
-        (found[:, 0] >= MIN_HEIGHT)
-        & (found[:, 0] <= MAX_HEIGHT)
-        & (found[:, 1] * found[:, 1] + found[:, 2] * found[:, 2] <= max_slope * max_slope)
-    )
-    kept: FloatArray = found[possible]
-    return kept
+    if not abs(area) > MIN_AREA:
+        return math.inf, 0.0, 0.0
+    slope_x, slope_y = (z1 * y2 - z2 * y1) / area, (x1 * z2 - x2 * z1) / area
+    return slope_x * cells.x[i] + slope_y * cells.y[i] - cells.z[i], slope_x, slope_y
 
 
-def _score(planes: FloatArray, cells: LowestPoints) -> IntArray:
-    """Support less penalty of each plane, (H,); in whole numbers, which add up in any order."""
-    height, slope_x, slope_y = (column[:, None] for column in planes.T)
-    # Times the inverse, as the twin does it: even the last bit of a score is the same.
-    d = (cells.z - (slope_x * cells.x + slope_y * cells.y - height)) * (1.0 / cells.tolerance)
-    gain = np.where(np.abs(d) < 1.0, RESOLUTION * (1.0 - d * d), 0.0).astype(np.int64)
-    loss = np.where(d < -CLEARLY_BELOW, int(PENALTY * RESOLUTION), 0)
-    total: IntArray = (gain - loss).sum(axis=1)
-    return total
+@shared
+def is_possible(plane: Plane, max_slope: float) -> bool:
+    """Whether a plane can be the ground."""
+    height, slope_x, slope_y = plane
+    steep = slope_x * slope_x + slope_y * slope_y > max_slope * max_slope
+    return MIN_HEIGHT <= height <= MAX_HEIGHT and not steep
 
 
-def _refine(plane: FloatArray, points: LowestPoints) -> tuple[float, float, float]:
+def score_of(plane: Plane, cells: LowestPoints) -> float:
+    """Support less penalty of a plane."""
+    return float(np.sum(gain(cells.x, cells.y, cells.z, cells.inverse, plane)))
+
+
+@shared
+def gain(x: Values, y: Values, z: Values, inverse: Values, plane: Plane) -> Values:
+    """Score of a point; of whole numbers, whose sum is exact in any order."""
+    height, slope_x, slope_y = plane
+    d = (z - (slope_x * x + slope_y * y - height)) * inverse
+    support = np.maximum(RESOLUTION * (1.0 - d * d), 0.0)
+    return np.floor(choose(d < -CLEARLY_BELOW, -PENALTY * RESOLUTION, support))
+
+
+@shared
+def refined(cells: LowestPoints, plane: Plane) -> Plane:
     """Weighted least squares with Tukey's weights of the plane before, again and again."""
-    height, slope_x, slope_y = (float(value) for value in plane)
-    x, y, z, tolerance = points.x, points.y, points.z, points.tolerance
-    columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y, z, x * z, y * z])
     for _ in range(N_REFINEMENTS):
-        d = (z - (slope_x * x + slope_y * y - height)) / tolerance
-        weight = np.maximum(1.0 - 0.5 * d * d, 0.0) ** 2 / tolerance**2
-        w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = (weight * columns).sum(axis=1).tolist()
-        height, slope_x, slope_y = solve_plane(
-            (w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz), (height, slope_x, slope_y)
-        )
-    return height, slope_x, slope_y
+        plane = solve_plane(weighted_moments(cells, plane), plane)
+    return plane
 
 
-def solve_plane(
-    moments: tuple[float, float, float, float, float, float, float, float, float],
-    plane: tuple[float, float, float],
-) -> tuple[float, float, float]:
-    """Plane of least squares: height, slope_x, slope_y; `plane` where it is not determined.
+Moments = tuple[float, float, float, float, float, float, float, float, float]
+"""Weighted sums of 1, x, y, x x, x y, y y, z, x z and y z."""
 
-    `moments` are the weighted sums of 1, x, y, x x, x y, y y, z, x z and y z.
-    """
+
+def weighted_moments(cells: LowestPoints, plane: Plane) -> Moments:
+    """Return the moments of the points with Tukey's weights."""
+    x, y, z = cells.x, cells.y, cells.z
+    weight = tukey_weight(x, y, z, cells.inverse, plane)
+    columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y, z, x * z, y * z])
+    w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = (weight * columns).sum(axis=1).tolist()
+    return w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz
+
+
+@shared
+def tukey_weight(x: Values, y: Values, z: Values, inverse: Values, plane: Plane) -> Values:
+    """Weight of a point by its distance from a plane."""
+    height, slope_x, slope_y = plane
+    d = (z - (slope_x * x + slope_y * y - height)) * inverse
+    root = np.maximum(1.0 - 0.5 * d * d, 0.0) * inverse
+    return root * root
+
+
+@shared
+def solve_plane(moments: Moments, plane: Plane) -> Plane:
+    """Plane of least squares; `plane` where it is not determined."""
     w, wx, wy, wxx, wxy, wyy, wz, wxz, wyz = moments
     height, slope_x, slope_y = plane
     if w <= 0.0:
@@ -302,3 +308,42 @@ def solve_plane(
         slope_y = (cyz * cxx - cxz * cxy) / determinant
     # The points may be too close together to determine the slopes, but not the height.
     return slope_x * mx + slope_y * my - mz, slope_x, slope_y
+
+
+@shared
+def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> NumbersOfPlane:
+    """Fields of the `GroundPlane`; the last is 0 if no point lies on it."""
+    height, slope_x, slope_y = plane
+    ranges, drops, near = np.empty(n), np.empty(n), np.empty(n)
+    n_on_it, n_near, squares = 0, 0, 0.0
+    seen, covered, far = np.zeros((3, N_SECTORS), np.bool_)
+    for c in range(n):
+        sector, r = cells.sector[c], cells.r[c]
+        seen[sector] = True
+        distance = cells.z[c] - (slope_x * cells.x[c] + slope_y * cells.y[c] - height)
+        if not abs(distance) <= cells.tolerance[c]:
+            continue
+        away = math.hypot(cells.x[c] - origin[0], cells.y[c] - origin[1])
+        ranges[n_on_it], drops[n_on_it] = r, math.atan2(origin[2] - cells.z[c], away)
+        n_on_it += 1
+        squares += distance * distance
+        if r < NEAR:
+            near[n_near] = distance
+            n_near += 1
+        covered[sector] = True
+        far[sector] |= r >= FAR
+    if n_on_it == 0:
+        return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+    few, most = n_on_it // 10, (9 * n_on_it) // 10
+    lift = ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
+    spread = ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few)
+    return (
+        height, slope_x, slope_y, height - lift, n_on_it / n, covered.sum() / N_SECTORS,
+        far.sum() / seen.sum(), ranked(ranges[:n_on_it], most), spread,
+        math.sqrt(squares / n_on_it), n, n_on_it,
+    )  # fmt: skip
+
+
+def ranked(values: FloatArray, rank: int) -> float:
+    """Value at `rank` in sorted order."""
+    return float(np.sort(values)[rank])
