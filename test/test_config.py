@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, ConfigError, GroundSegError
+from gp_ground_seg.core.parameters import number_tuples
 from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
 
 SPECS = parameter_specs()
@@ -289,3 +290,12 @@ def test_any_text_is_read_or_refused(tmp_path_factory, text):
         said = str(error)
     assert said.startswith(f'{path}: ')
     assert '\n' not in said
+
+
+def test_compiled_code_reads_numbers_and_never_words():
+    numbers = number_tuples.numbers_of(Config().label)
+    assert numbers.ground_tolerance == Config().label.ground_tolerance
+    assert not hasattr(numbers, 'rule')
+    # A field that is neither is not left out silently.
+    with pytest.raises(TypeError, match=r'SensorConfig\.height: .* must be bool, int, float or'):
+        number_tuples.tuple_type(type(Config().sensor))

@@ -115,8 +115,8 @@ def test_moments_that_determine_no_plane_or_no_slope():
 
 def test_a_refinement_that_leaves_the_ground_is_not_used(monkeypatch):
     candidates = BACKENDS[0].build_grid(cluttered_plane(0, 1.5, 0.0, 0.0), Config()).candidates
-    monkeypatch.setattr(ground_plane, '_refine', lambda *_: (99.0, 0.0, 0.0))
+    monkeypatch.setattr(ground_plane, 'refined', lambda *_: (99.0, 0.0, 0.0))
     assert ground_plane.fit_plane(candidates, 0.5, ORIGIN).height == pytest.approx(1.5, abs=0.1)
     # Nor is a plane that no point lies on.
-    monkeypatch.setattr(ground_plane, '_refine', lambda *_: (19.0, 0.0, 0.0))
+    monkeypatch.setattr(ground_plane, 'refined', lambda *_: (19.0, 0.0, 0.0))
     assert ground_plane.fit_plane(candidates, 0.5, ORIGIN) is None
