@@ -38,6 +38,11 @@ def node(tmp_path_factory):
 @pytest.fixture
 def link(node):
     with ros.linked(sends=None) as link:
+        # The node may still have clouds of the test before.
+        while counts(link) != counts(link):
+            pass
+        for collector in (link.ground, link.obstacles):
+            collector.messages.clear()
         yield link
 
 
