@@ -56,7 +56,7 @@ def test_cell_of_a_point(backend, x, y, n_segments, n_bins, growth):
 
 @given(st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi), st.floats(0.01, 1e3))
 def test_azimuth_key_grows_with_the_angle(one, other, r):
-    first, second = azimuth_key(r * np.cos([one, other]), r * np.sin([one, other]))
+    first, second = azimuth_key(r * np.cos([one, other]), r * np.sin([one, other]), np.float64)
     assert 0.0 <= first <= 4.0
     if one + 1e-9 < other:
         assert first < second

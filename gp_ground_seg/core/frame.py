@@ -66,8 +66,7 @@ class PolarGrid(NamedTuple):
     @property
     def bin(self) -> IntArray:
         """Radial bin of each point, (N,) int64, or `OUTSIDE`."""
-        own = self.cell.astype(np.int64) % self.n_bins
-        return np.where(self.inside, own, OUTSIDE)
+        return np.where(self.inside, self.cell.astype(np.int64) % self.n_bins, OUTSIDE)
 
 
 class Tiles(NamedTuple):

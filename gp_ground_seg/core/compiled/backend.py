@@ -99,21 +99,21 @@ class NumbaBackend:
         places = polar_grid.Places(cell, r, tile)
 
         def copy_and_sort(part: Part) -> None:
-            own = run_of(part, n_points)
-            copy_points(xyz[own], columns[:, own])
+            points = run_of(part, n_points)
+            copy_points(xyz[points], columns[:, points])
             polar_grid.sort_points(part, columns, geometry, places, cells, tiles)
 
         self.workers.run(copy_and_sort, n_parts)
-        room = Candidates.buffers(n_cells, n_segments)
+        buffers = Candidates.buffers(n_cells, n_segments)
         n = polar_grid.merge_parts(
-            n_parts, cells, tiles, geometry.edges, config.lines.min_density_extent, room
+            n_parts, cells, tiles, geometry.edges, config.lines.min_density_extent, buffers
         )
         occupied = tiles.occupied[0, 1 : 1 + tiles.occupied[0, 0]]
         return Scan(
             points_in(columns),
             PolarGrid(cell, r, geometry.edges, n_segments),
             Tiles(tile, tiles.extremes[0, :-1], occupied),
-            room.first(n),
+            buffers.first(n),
         )
 
     def fit_plane(

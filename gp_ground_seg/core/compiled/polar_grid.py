@@ -26,10 +26,12 @@ from gp_ground_seg.core.frame import (
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GridConfig
 from gp_ground_seg.core.pipeline.polar_grid import (
+    azimuth_key,
     bin_edges,
     round_up_to,
     segment_edges,
     tiles_per_side,
+    vertical_density,
 )
 
 BLOCK = 512
@@ -159,15 +161,15 @@ def sort_points(
     range_entry = np.empty(BLOCK, dtype=np.int32)
     key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
     for first in range(points.start, points.stop, BLOCK):
-        own = slice(first, min(first + BLOCK, points.stop))
-        x, y, z = columns[0, own], columns[1, own], columns[2, own]
-        _compute_range(x, y, z, geometry.ranges, r[own], range_entry, cell[own])
-        _compute_azimuth_key(x, y, geometry, cell[own], key, key_entry, tile[own])
-        _look_up(geometry, r[own], range_entry, key, key_entry, cell[own])
-        _widen(z, cell[own], tile[own], extremes, numbers, tile_extremes, occupied)
+        block = slice(first, min(first + BLOCK, points.stop))
+        x, y, z = columns[0, block], columns[1, block], columns[2, block]
+        _compute_range(x, y, z, geometry.ranges, r[block], range_entry, cell[block])
+        _compute_azimuth_key(x, y, geometry, cell[block], key, key_entry, tile[block])
+        _look_up(geometry, r[block], range_entry, key, key_entry, cell[block])
+        _widen(z, cell[block], tile[block], extremes, numbers, tile_extremes, occupied)
     for first in range(points.start, points.stop, BLOCK):
-        own = slice(first, min(first + BLOCK, points.stop))
-        _resolve_lowest(columns[2, own], r[own], cell[own], tile[own], extremes, numbers)
+        block = slice(first, min(first + BLOCK, points.stop))
+        _resolve_lowest(columns[2, block], r[block], cell[block], tile[block], extremes, numbers)
 
 
 @jit()
@@ -203,11 +205,11 @@ def _compute_range(
     start, end, per_metre = ranges.edges[0], ranges.edges[-1], number(ranges.scale)
     for i in range(len(r)):
         finite = (abs(x[i]) < infinity) & (abs(y[i]) < infinity) & (abs(z[i]) < infinity)
-        own_r = math.sqrt(x[i] * x[i] + y[i] * y[i])
-        inside = finite & (own_r < end)
-        r[i] = own_r if finite else nothing
+        r_i = math.sqrt(x[i] * x[i] + y[i] * y[i])
+        inside = finite & (r_i < end)
+        r[i] = r_i if finite else nothing
         cell[i] = 0 if inside else (OUTSIDE if finite else NOT_FINITE)
-        beyond = (own_r - start) * per_metre
+        beyond = (r_i - start) * per_metre
         entry[i] = np.int32(beyond if inside & (beyond > zero) else zero)
 
 
@@ -224,24 +226,21 @@ def _compute_azimuth_key(
 ) -> None:
     """Azimuth key of each point that has a cell, its entry in the table, and the tile."""
     number = x.dtype.type
-    zero, two, four = number(0.0), number(2.0), number(4.0)
+    zero, four = number(0.0), number(4.0)
     half, per_metre = number(geometry.ranges.edges[-1]), number(geometry.tiles_per_metre)
     last, n_sides = number(geometry.n_sides - 1), np.int32(geometry.n_sides)
     per_key = number(geometry.azimuths.scale)
     for i in range(len(cell)):
         inside = cell[i] == 0
-        own_x = x[i] if inside else zero
-        own_y = y[i] if inside else zero
-        size = abs(own_x) + abs(own_y)
-        share = own_y / size if size > zero else zero
-        left = -share if own_y < zero else four - share
-        own_key = two + share if own_x >= zero else left
+        x_i = x[i] if inside else zero
+        y_i = y[i] if inside else zero
+        key_i = azimuth_key(x_i, y_i, number)
         # Exactly 4 is the edge that ends the last segment: that is segment 0 again.
-        own_key = own_key if own_key < four else zero
-        key[i] = own_key
-        entry[i] = np.int32(own_key * per_key)
-        column = np.int32(min((own_x + half) * per_metre, last))
-        row = np.int32(min((own_y + half) * per_metre, last))
+        key_i = key_i if key_i < four else zero
+        key[i] = key_i
+        entry[i] = np.int32(key_i * per_key)
+        column = np.int32(min((x_i + half) * per_metre, last))
+        row = np.int32(min((y_i + half) * per_metre, last))
         tile[i] = column * n_sides + row if inside else OUTSIDE
 
 
@@ -329,9 +328,9 @@ def _resolve_lowest(
         if cell[i] < 0:
             continue
         k = np.uintp(cell[i])
-        own, low = r[i], extremes[k, 1]
-        if own < low or (own == low and tile[i] < numbers[k, 1]):
-            extremes[k, 1], numbers[k, 1] = own, tile[i]
+        r_i, nearest = r[i], extremes[k, 1]
+        if r_i < nearest or (r_i == nearest and tile[i] < numbers[k, 1]):
+            extremes[k, 1], numbers[k, 1] = r_i, tile[i]
 
 
 @jit(entry=True)
@@ -359,21 +358,22 @@ def merge_parts(
             k = m * n_bins + n
             count = 0
             for index in range(n_parts):
-                own = numbers[index, k, 0]
-                if own == 0:
+                number = numbers[index, k, 0]
+                if number == 0:
                     continue
-                own_z, own_r = extremes[index, k, 0], extremes[index, k, 1]
-                own_top, own_tile = extremes[index, k, 2], numbers[index, k, 1]
-                if count == 0 or (own_z, own_r, own_tile) < (low, near, lowest_tile):
-                    low, near, lowest_tile = own_z, own_r, own_tile
-                high = own_top if count == 0 else max(high, own_top)
-                count += own
+                z, r = extremes[index, k, 0], extremes[index, k, 1]
+                top, tile = extremes[index, k, 2], numbers[index, k, 1]
+                if count == 0 or (z, r, tile) < (low, near, lowest_tile):
+                    low, near, lowest_tile = z, r, tile
+                high = top if count == 0 else max(high, top)
+                count += number
             if count == 0:
                 continue
             candidates.z[c], candidates.r[c], candidates.bin[c] = low, near, n
             candidates.tile[c] = lowest_tile
-            extent = max(np.float64(high) - np.float64(low), min_extent)
-            candidates.density[c] = count / ((edges[n + 1] - edges[n]) * extent)
+            candidates.density[c] = vertical_density(
+                count, edges[n + 1] - edges[n], np.float64(low), np.float64(high), min_extent
+            )
             c += 1
     candidates.offsets[len(candidates.offsets) - 1] = c
     return c

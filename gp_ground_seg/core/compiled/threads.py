@@ -71,15 +71,15 @@ class Workers:
         """
         if n_parts > 1 and self._pool is None:
             self._start()
-        own, *others = (Part(number, n_parts) for number in range(n_parts))
+        first, *others = (Part(number, n_parts) for number in range(n_parts))
         if self._pool is None:
-            for part in (own, *others):
+            for part in (first, *others):
                 function(part, *arguments)
             return
         self.is_idle = False
         futures = [self._pool.submit(function, part, *arguments) for part in others]
         try:
-            function(own, *arguments)
+            function(first, *arguments)
         finally:
             # The parts work on arrays that belong to the caller afterwards.
             errors = [future.exception() for future in futures]

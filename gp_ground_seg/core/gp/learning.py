@@ -148,9 +148,9 @@ def learn_frame(
     """
     learning, n_segments = config.learning, len(frame.candidates.offsets) - 1
     by_frame, space = learning.scope == 'frame', theta_space(config)
-    own = every_segment(frame, learning.segment_step if by_frame else 1)
-    n_own = len(own.candidates.offsets) - 1
-    theta = in_rows(first_theta(frame, config), n_own) if before is None else before[:n_own]
+    thin = every_segment(frame, learning.segment_step if by_frame else 1)
+    n_thin = len(thin.candidates.offsets) - 1
+    theta = in_rows(first_theta(frame, config), n_thin) if before is None else before[:n_thin]
     has_latent = bool(space.free[2:].any())
     is_map, slope_std = learning.objective == 'map', config.observation.slope_std
 
@@ -173,14 +173,14 @@ def learn_frame(
     for budget in (first, learning.max_evaluations - first):
         if budget == 0 or (learned and out_of_time()):
             continue
-        surface, _, u = model.estimate_surface(own, theta, config)
-        inliers = take_inliers(own, surface.inlier, u, has_latent)
-        parts = [inliers] if by_frame else [_one_segment(inliers, m) for m in range(n_own)]
+        surface, _, u = model.estimate_surface(thin, theta, config)
+        inliers = take_inliers(thin, surface.inlier, u, has_latent)
+        parts = [inliers] if by_frame else [_one_segment(inliers, m) for m in range(n_thin)]
         earlier = [one.n_evaluations for one in learned] or [0] * len(parts)
         learned = [learn(*one, budget) for one in zip(theta, parts, strict=False)]
         theta = np.array([one.theta for one in learned])
         if by_frame:
-            theta = in_rows(theta[0], n_own)
+            theta = in_rows(theta[0], n_thin)
         learned = [
             one._replace(n_evaluations=one.n_evaluations + n)
             for one, n in zip(learned, earlier, strict=True)
@@ -243,13 +243,13 @@ def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: boo
 
 
 def _one_segment(inliers: Inliers, m: int) -> Inliers:
-    own = slice(inliers.offsets[m], inliers.offsets[m + 1])
+    inside = slice(inliers.offsets[m], inliers.offsets[m + 1])
     bar = slice(inliers.bar_offsets[m], inliers.bar_offsets[m + 1])
     return Inliers(
-        np.array([0, own.stop - own.start]),
-        inliers.r[own],
-        inliers.z[own],
-        inliers.log_length_scale[own],
+        np.array([0, inside.stop - inside.start]),
+        inliers.r[inside],
+        inliers.z[inside],
+        inliers.log_length_scale[inside],
         np.array([0, bar.stop - bar.start]),
         inliers.r_bar[bar],
         inliers.log_extent[bar],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -17,7 +18,9 @@ from gp_ground_seg.core.frame import (
     PolarGrid,
     Scan,
     Tiles,
+    Values,
 )
+from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GridConfig
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 
@@ -54,25 +57,37 @@ def round_up_to(dtype: np.dtype[np.floating], edge: float) -> np.floating:
     return near if near >= edge else np.nextafter(near, dtype.type(np.inf))
 
 
-def azimuth_key(x: PointArray, y: PointArray) -> PointArray:
+@shared
+def azimuth_key(x: Values, y: Values, number: Callable[[float], Values]) -> Values:
     """Map azimuths to numbers in [0, 4] that grow with them, counter-clockwise from -x.
 
     The position on the unit diamond, which needs one division and no arctangent. Points are
     sorted into segments by comparing it with that of the segments' edges.
-    The origin counts as lying on +x.
+    The origin counts as lying on +x. `number` is the type of the coordinates.
     """
+    zero, one, two, four = number(0.0), number(1.0), number(2.0), number(4.0)
     size = np.abs(x) + np.abs(y)
-    two, four = size.dtype.type(2.0), size.dtype.type(4.0)
-    share = np.divide(y, size, out=np.zeros_like(size), where=size > 0.0)
-    left = np.where(y < 0.0, -share, four - share)
-    result: PointArray = np.where(x >= 0.0, two + share, left)
-    return result
+    share = y / choose(size > zero, size, one)
+    left = choose(y < zero, -share, four - share)
+    return choose(x >= zero, two + share, left)
+
+
+@shared
+def vertical_density(
+    number: Values, width: Values, lowest: Values, highest: Values, min_extent: float
+) -> Values:
+    """Points over the area of a bin, its width by its height [points/m^2].
+
+    `min_extent` is the least height [m]: the points of a flat cell are no closer together than
+    the sensor's noise.
+    """
+    return number / (width * np.maximum(highest - lowest, min_extent))
 
 
 def segment_edges(n_segments: int) -> FloatArray:
     """Azimuth keys of the edges of the segments, (M + 1,)."""
     angle = -np.pi + 2.0 * np.pi * np.arange(n_segments + 1) / n_segments
-    edges: FloatArray = azimuth_key(np.cos(angle), np.sin(angle)).astype(np.float64)
+    edges: FloatArray = azimuth_key(np.cos(angle), np.sin(angle), np.float64)
     edges[0], edges[-1] = 0.0, 4.0
     return edges
 
@@ -86,8 +101,9 @@ def build_polar_grid(xyz: PointArray, grid: GridConfig) -> PolarGrid:
     with np.errstate(over='ignore'):  # infinitely far is outside
         r = np.sqrt(x * x + y * y)
     near = r < edges[-1]
-    key = azimuth_key(np.where(near, x, zero), np.where(near, y, zero)).astype(np.float64)
-    segment = np.searchsorted(segment_edges(grid.n_segments), key, side='right') - 1
+    key = azimuth_key(np.where(near, x, zero), np.where(near, y, zero), xyz.dtype.type)
+    segment = np.searchsorted(segment_edges(grid.n_segments), key.astype(np.float64), side='right')
+    segment -= 1
     # Exactly -x is the edge that ends the last segment: that is segment 0 again.
     segment %= grid.n_segments
     # Points nearer than the first edge belong to the first bin.
@@ -113,13 +129,13 @@ def build_tiles(xyz: PointArray, grid: PolarGrid, tile_size: float) -> Tiles:
     tile = np.full(len(xyz), OUTSIDE, dtype=np.int32)
     per_metre = xyz.dtype.type(1.0 / tile_size)
     column, row = ((xyz[inside, :2] + half) * per_metre).astype(np.int64).T
-    own = np.minimum(column, side - 1) * side + np.minimum(row, side - 1)
-    tile[inside] = own
+    place = np.minimum(column, side - 1) * side + np.minimum(row, side - 1)
+    tile[inside] = place
     z = xyz[inside, 2]
     lowest_z = np.full(side * side, np.inf, dtype=xyz.dtype)
     highest_z = np.full(side * side, -np.inf, dtype=xyz.dtype)
-    np.minimum.at(lowest_z, own, z)
-    np.maximum.at(highest_z, own, z)
+    np.minimum.at(lowest_z, place, z)
+    np.maximum.at(highest_z, place, z)
     occupied = np.flatnonzero(highest_z > -np.inf).astype(np.int32)
     return Tiles(tile, np.column_stack([lowest_z, highest_z]), occupied)
 
@@ -166,21 +182,19 @@ def ground_candidates(
     of points over the area of the whole bin, width by height.
 
     For `extremes` and `numbers` see `reduce_cells`; `edges`, (n_bins + 1,), are the ranges of the
-    bin edges [m]. `min_extent` is the least height of a cell in the density [m]: the points of a
-    flat cell are no closer together than the sensor's noise.
+    bin edges [m]. For `min_extent` see `vertical_density`.
     """
     n_bins = len(edges) - 1
     occupied = np.flatnonzero(numbers[:, 0])
-    own_bin = occupied % n_bins
+    bins = occupied % n_bins
     lowest_z, lowest_r, highest_z = extremes[occupied].astype(np.float64).T
-    extent = np.maximum(highest_z - lowest_z, min_extent)
-    count = numbers[occupied, 0]
+    widths = np.diff(edges)[bins]
     per_segment = np.bincount(occupied // n_bins, minlength=len(numbers) // n_bins)
     return Candidates(
         r=lowest_r.copy(),
         z=lowest_z.copy(),
-        bin=own_bin,
-        density=count / (np.diff(edges)[own_bin] * extent),
+        bin=bins,
+        density=vertical_density(numbers[occupied, 0], widths, lowest_z, highest_z, min_extent),
         offsets=np.concatenate([[0], np.cumsum(per_segment)]),
         tile=numbers[occupied, 1],
     )

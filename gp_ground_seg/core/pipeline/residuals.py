@@ -69,20 +69,20 @@ def correct_surface(
     number = np.maximum(n_returns, 1.0)
     correction = np.where(seen, total / number, np.where(has_model, 0.0, np.nan))
 
-    own, tells = surface.std**2, seen & (n_cells >= 2.0)
+    alone, tells = surface.std**2, seen & (n_cells >= 2.0)
     between = np.maximum(squared_means / number - correction**2, 0.0)
-    variance = np.where(tells, between, own)
+    variance = np.where(tells, between, alone)
     noise = np.where(tells, np.maximum(squares - squared_means, 0.0) / number, noise_std**2)
     if seen.any() and unseen.any():
         distance, nearest = _nearest(surface.knots, seen, unseen)
-        own, apart = own[unseen], (slope_std * distance) ** 2
+        alone, apart = alone[unseen], (slope_std * distance) ** 2
         for table in (correction, variance, noise):
             table[unseen] = table[seen][nearest]
         near_mean = surface.mean[seen][nearest]
         difference = near_mean - surface.mean[unseen]
-        weight = own / np.maximum(own + variance[unseen] + apart, np.finfo(float).tiny)
+        weight = alone / np.maximum(alone + variance[unseen] + apart, np.finfo(float).tiny)
         correction[unseen] += weight * difference
-        variance[unseen] = np.maximum(variance[unseen], own) + apart
+        variance[unseen] = np.maximum(variance[unseen], alone) + apart
         variance[unseen] += weight * (1.0 - weight) * difference**2
     mean, std = surface.mean + correction, np.sqrt(variance)
     return CorrectedSurface(surface.knots, correction, mean, std, np.sqrt(variance + noise))
