@@ -210,10 +210,17 @@ def find_formulas_that_stand_twice(trees):
 
 def find_returned_arrays(trees):
     """Compiled functions called from Python that return more than numbers: see `jit`."""
+    entries = {
+        ast.unparse(node.args[0]).split('.')[-1]
+        for tree in trees.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == 'jit(entry=True)'
+    }
     for path, tree in trees.items():
         for node in ast.walk(tree):
-            called = getattr(node, 'decorator_list', [])
-            if any('entry=True' in ast.unparse(decorator) for decorator in called):
+            marks = [ast.unparse(mark) for mark in getattr(node, 'decorator_list', [])]
+            is_entry = any('entry=True' in mark for mark in marks)
+            if is_entry or ('shared' in marks and node.name in entries):
                 names = {n.id for n in ast.walk(node.returns) if isinstance(n, ast.Name)}
                 if names - {'bool', 'int', 'float', 'tuple', 'NumbersOfPlane'}:
                     yield f'{path}: {node.name} returns {ast.unparse(node.returns)}'
@@ -300,6 +307,11 @@ def test_files_are_of_a_size_worth_opening(trees):
         (find_long_functions, 'core/a.py', 'def f():\n    """Add."""' + '\n    x += 1' * 41),
         (find_formulas_that_stand_twice, 'core/compiled/d.py', '@shared\ndef formula(x): ...'),
         (find_formulas_that_stand_twice, 'core/gp/d.py', '@shared\ndef other(x): ...'),
+        (
+            find_returned_arrays,
+            'core/gp/f.py',
+            '@shared\ndef g() -> Lines: ...\nf = jit(entry=True)(h.g)\n@shared\ndef k(): g()',
+        ),
         (find_reordered_sums, 'core/gp/a.py', '@jit(fastmath=True)\ndef f(x, y): x[0] += y[0]'),
     ],
 )
