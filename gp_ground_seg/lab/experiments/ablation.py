@@ -144,25 +144,6 @@ def compare_departures(items: Sequence[Any], config: Config, runner: Runner = HE
     scores = score_variants(items, variants, runner=runner)
     given, *switched = scores
 
-    def row(
-        score: MethodScore,
-        switch: str | None = None,
-        gain: float | None = None,
-        interval: str | None = None,
-    ) -> Row:
-        pairs = zip(score.scans, given.scans, strict=True)
-        time_ratio = statistics.median(scan.seconds / base.seconds for scan, base in pairs)
-        return [
-            (Column('departure'), score.name),
-            (Column('switch'), switch),
-            (percent('IoU [%]', 'iou'), score.iou),
-            (percent('gained [%]', 'worth', '+.2f'), gain),
-            (INTERVAL, interval),
-            *_worst(score),
-            (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
-            (Column('time', '.2f', 'time_ratio'), time_ratio),
-        ]
-
     rows = []
     for departure, score in zip(DEPARTURES, switched, strict=True):
         having, without = (given, score) if departure.kept else (score, given)
@@ -175,9 +156,32 @@ def compare_departures(items: Sequence[Any], config: Config, runner: Runner = HE
         f'{interval_note(given)}; RMSE of the height; time relative to the parameters as given, '
         'median of the frames'
     )
-    tables = {'departures': Table([row(given), *(row(*cells) for cells in rows)], title)}
+    table_rows = [_departure(given, given), *(_departure(given, *cells) for cells in rows)]
+    tables = {'departures': Table(table_rows, title)}
     changes = {departure.title: departure.changes for departure in DEPARTURES}
     return make_report(tables, scores, config, changes=changes)
+
+
+def _departure(
+    given: MethodScore,
+    score: MethodScore,
+    switch: str | None = None,
+    gain: float | None = None,
+    interval: str | None = None,
+) -> Row:
+    """Row of a departure that is switched, beside the parameters as given."""
+    pairs = zip(score.scans, given.scans, strict=True)
+    time_ratio = statistics.median(scan.seconds / base.seconds for scan, base in pairs)
+    return [
+        (Column('departure'), score.name),
+        (Column('switch'), switch),
+        (percent('IoU [%]', 'iou'), score.iou),
+        (percent('gained [%]', 'worth', '+.2f'), gain),
+        (INTERVAL, interval),
+        *_worst(score),
+        (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
+        (Column('time', '.2f', 'time_ratio'), time_ratio),
+    ]
 
 
 def paper_steps() -> dict[str, Config]:
@@ -257,7 +261,10 @@ def compare_wrong_values(items: Sequence[Any], config: Config, runner: Runner = 
 def _worst(score: MethodScore) -> Row:
     """Cells of the sequence with the lowest IoU, if there are several."""
     iou, name = min((score.of(name).iou, name) for name in score.sequences)
-    where: Row = [(percent('worst [%]', 'worst_iou'), iou), (Column('in', '', 'worst_seq'), name)]
+    where: Row = [
+        (percent('worst [%]', 'worst_iou'), iou),
+        (Column('in', '', 'worst_sequence'), name),
+    ]
     return where if len(score.sequences) > 1 else []
 
 

@@ -54,16 +54,7 @@ def score_poses(items: Sequence[Any], config: Config, runner: Runner = HERE) -> 
     rows: list[Row] = []
     worsts: list[float] = []
     for height, turn in mounts:
-        poses = {
-            'given': (height, *map(math.radians, turn)),
-            'level': (height, 0.0, 0.0),
-            'auto': (AUTO, AUTO, AUTO),
-        }
-        variants = {
-            name: config.replace(**dict(zip(NAMES, pose, strict=True)))
-            for name, pose in poses.items()
-        }
-        load = partial(load_mounted, (height, turn))
+        variants, load = _variants(config, (height, turn)), partial(load_mounted, (height, turn))
         name = mount_text(height, turn)
         trials[name] = score_variants(items, variants, load=load, runner=runner)
         worsts.append(_worst(trials[name]))
@@ -127,6 +118,19 @@ def mount_text(height: float, turn: tuple[float, float]) -> str:
     return ' '.join(
         [f'{height:g} m', *(f'{name} {angle:+.0f}°' for name, angle in named if angle)]
     )
+
+
+def _variants(config: Config, mount: Mount) -> dict[str, Config]:
+    """Return parameters with the pose given, taken to be level, and estimated."""
+    height, turn = mount
+    poses = {
+        'given': (height, *map(math.radians, turn)),
+        'level': (height, 0.0, 0.0),
+        'auto': (AUTO, AUTO, AUTO),
+    }
+    return {
+        name: config.replace(**dict(zip(NAMES, pose, strict=True))) for name, pose in poses.items()
+    }
 
 
 def load_mounted(mount: Mount, item: Any) -> KnownScan:

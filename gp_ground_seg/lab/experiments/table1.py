@@ -18,7 +18,7 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.experiments.variants import refuse_changed
 from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
-from gp_ground_seg.lab.scoring.evaluate import load_kitti
+from gp_ground_seg.lab.scoring.evaluate import Points, load_kitti
 from gp_ground_seg.lab.scoring.metrics import height_error
 from gp_ground_seg.lab.scoring.report import Column, Report, Table, changed_parameters
 
@@ -109,14 +109,7 @@ def _rows(
     """Rows of a frame, by title of the column, and a result of the latent model."""
     scan = load_kitti(frame)
     z = scan.points[:, 2].astype(np.float64)
-    seconds: dict[str, list[float]] = {name: [] for name in segmenters}
-    results: dict[str, Segmentation] = {}
-    for k in range(N_REPEATS + 1):
-        for name, segmenter in segmenters.items():
-            segmenter.reset()
-            results[name] = segmenter.segment(scan.points)
-            if k > 0:  # compilation and first allocations are not its speed
-                seconds[name].append(results[name].timings['total'])
+    results, seconds = _run(segmenters, scan.points)
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
     common = results['Z-L']
     candidates = common.candidates
@@ -150,6 +143,21 @@ def _rows(
             }
         )
     return rows, common
+
+
+def _run(
+    segmenters: Mapping[str, GroundSegmenter], points: Points
+) -> tuple[dict[str, Segmentation], dict[str, list[float]]]:
+    """Last result of each segmenter on a scan, and seconds of its runs but the first."""
+    seconds: dict[str, list[float]] = {name: [] for name in segmenters}
+    results: dict[str, Segmentation] = {}
+    for k in range(N_REPEATS + 1):
+        for name, segmenter in segmenters.items():
+            segmenter.reset()
+            results[name] = segmenter.segment(points)
+            if k > 0:  # compilation and first allocations are not its speed
+                seconds[name].append(results[name].timings['total'])
+    return results, seconds
 
 
 def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:

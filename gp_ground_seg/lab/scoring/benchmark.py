@@ -72,10 +72,10 @@ def run_cases(
 ) -> dict[str, list[FrameTime]]:
     """Time every case on every frame, each time beside the baseline on that frame.
 
-    The speed of a machine drifts over seconds; a case and its baseline follow one
-    another, so that their ratio does not. Which of the two goes first, and which case
-    is the first, changes from frame to frame. Each runs once without counting. `frames` are
-    grouped by sequence; `make_baseline` makes the baseline of each case.
+    The speed of a machine drifts over seconds; a case and its baseline follow one another, so
+    that their ratio does not. Which of the two goes first, and which case is the first, changes
+    from frame to frame. Each runs once without counting. `frames` are grouped by sequence;
+    `make_baseline` makes the baseline of each case.
     """
     names = list(cases)
     with ExitStack() as stack:

@@ -123,7 +123,8 @@ def interval_note(score: MethodScore) -> str:
     return f'95 % interval: bootstrap over {len(parts)} {kind}; tie: it holds 0'
 
 
-def _objects(score: MethodScore) -> ObjectCount:
+def counts_of_all(score: MethodScore) -> ObjectCount:
+    """Sum up the objects of all classes in all bands."""
     return sum(itertools.chain(*score.objects.values()), ObjectCount())
 
 
@@ -133,9 +134,9 @@ MEASURES: tuple[tuple[Column, Measure], ...] = (
      lambda s: (s.confusion.tp, s.confusion.tp + s.confusion.fp)),
     (percent('recall [%]'), lambda s: (s.confusion.tp, s.confusion.tp + s.confusion.fn)),
     (percent('returns on objects called ground [%]'),
-     lambda s: (_objects(s).n_ground, _objects(s).n_returns)),
+     lambda s: (counts_of_all(s).n_ground, counts_of_all(s).n_returns)),
     (percent('objects lost [%]'),
-     lambda s: (_objects(s).n_lost, _objects(s).n_objects)),
+     lambda s: (counts_of_all(s).n_lost, counts_of_all(s).n_objects)),
     (report.centimetres('RMSE of the height [cm]'), mse_sums),
     (percent('heights within 1 std, ideally 68.3 [%]'),
      lambda s: (s.height.n_within_1, s.height.n_with_std)),

@@ -16,6 +16,7 @@ from gp_ground_seg.lab.scoring import metrics, report
 from gp_ground_seg.lab.scoring.comparison import (
     INTERVAL,
     Measure,
+    counts_of_all,
     difference_table,
     interval_note,
     interval_text,
@@ -229,14 +230,8 @@ def object_table(scores: Sequence[MethodScore]) -> Table:
                 *((percent('peer', f'{p.name}_share_ground'), c.share_ground) for p, c in peers),
                 *((INTERVAL, interval_text(scores[0], peer, sums)) for peer, _ in peers),
                 (Column('objects', '_d'), ours.n_objects),
-                (Column('lost', '_d'), ours.n_lost if ours.n_objects else None),
-                *(
-                    (
-                        Column('peer lost', '_d', f'{p.name}_lost'),
-                        c.n_lost if c.n_objects else None,
-                    )
-                    for p, c in peers
-                ),
+                (Column('lost', '_d'), _n_lost(ours)),
+                *((Column('peer lost', '_d', f'{p.name}_lost'), _n_lost(c)) for p, c in peers),
             ]
         )
     title = (
@@ -246,15 +241,20 @@ def object_table(scores: Sequence[MethodScore]) -> Table:
     )
     if len(scores) > 1:
         title += f'; peer: {scores[1].title}; {interval_note(scores[0])}'
+    return Table(rows, title, _object_notes([counts_of_all(score) for score in scores]))
+
+
+def _object_notes(counts: Sequence[ObjectCount]) -> list[str]:
+    """Say why objects or returns of each method, ours first, are missing."""
     notes = []
-    if not rows:
+    if not any(count.n_returns or count.n_unknown for count in counts):
         notes = ['no return on an object: no class of objects in the labels']
-    elif not any(found[name][-1].n_objects for found in counts for name in found):
+    elif not any(count.n_objects for count in counts):
         notes = ['no object with enough returns: only classes, if labels have no instances']
-    if n_unknown := sum(bands[-1].n_unknown for bands in counts[0].values()):
+    if n_unknown := counts[0].n_unknown:
         shown = Column('', '_d').show(n_unknown)
         notes.append(f'{shown} returns on objects do not count: no labels of the ground near them')
-    return Table(rows, title, notes=notes)
+    return notes
 
 
 def _n_lost(count: ObjectCount) -> int | None:
