@@ -95,10 +95,9 @@ def run_cases(
                 for method in order:
                     if method is not None and frame.sequence != sequence:
                         method.reset()
-                seconds = [_time(method, frame, clock) for method in order]
-                times_of = dict(zip(order, seconds, strict=True))
+                seconds = {method: _time(method, frame, clock) for method in order}
                 found = FrameTime(
-                    frame, times_of[ours], ours.stages, times_of[baseline], ours.last.fit
+                    frame, seconds[ours], ours.stages, seconds[baseline], ours.last.fit
                 )
                 times[names[j % len(names)]].append(found)
             sequence = frame.sequence
