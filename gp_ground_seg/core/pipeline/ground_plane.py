@@ -316,10 +316,13 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
     height, slope_x, slope_y = plane
     ranges, drops, near = np.empty(n), np.empty(n), np.empty(n)
     n_on_it, n_near, squares = 0, 0, 0.0
-    seen, covered, far = np.zeros((3, N_SECTORS), np.bool_)
+    n_seen = n_covered = n_far = 0
+    last_seen = last_covered = last_far = -1
     for c in range(n):
         sector, r = cells.sector[c], cells.r[c]
-        seen[sector] = True
+        # Cells come sector by sector: one that differs from the last is new.
+        if sector != last_seen:
+            n_seen, last_seen = n_seen + 1, sector
         distance = cells.z[c] - (slope_x * cells.x[c] + slope_y * cells.y[c] - height)
         if not abs(distance) <= cells.tolerance[c]:
             continue
@@ -330,16 +333,18 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
         if r < NEAR:
             near[n_near] = distance
             n_near += 1
-        covered[sector] = True
-        far[sector] |= r >= FAR
+        if sector != last_covered:
+            n_covered, last_covered = n_covered + 1, sector
+        if r >= FAR and sector != last_far:
+            n_far, last_far = n_far + 1, sector
     if n_on_it == 0:
         return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
     few, most = n_on_it // 10, (9 * n_on_it) // 10
     lift = ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
     spread = ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few)
     return (
-        height, slope_x, slope_y, height - lift, n_on_it / n, covered.sum() / N_SECTORS,
-        far.sum() / seen.sum(), ranked(ranges[:n_on_it], most), spread,
+        height, slope_x, slope_y, height - lift, n_on_it / n, n_covered / N_SECTORS,
+        n_far / n_seen, ranked(ranges[:n_on_it], most), spread,
         math.sqrt(squares / n_on_it), n, n_on_it,
     )  # fmt: skip
 
