@@ -7,7 +7,7 @@ KITTI ?= $(abspath $(wildcard ../shared/kitti))
 # Empty, the variable would be a path to the tests.
 WITH_KITTI := $(if $(KITTI),GP_GROUND_SEG_KITTI=$(KITTI))
 
-.PHONY: help demo test test-all browser-test torture bench bench-docs figures docs node-bench colcon lint format generate clean
+.PHONY: help demo test test-all chromium browser-test torture bench bench-docs figures docs node-bench colcon lint format generate clean
 
 help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
@@ -53,10 +53,12 @@ test: $(VENV)/.dev
 test-all: $(VENV)/.dev
 	$(WITH_KITTI) $(BIN)/python -m pytest
 
-browser-test: $(VENV)/.dev
+chromium:
 	@command -v chromedriver >/dev/null \
 		|| { [ "$$(id -u)" = 0 ] && apt-get update -qq && apt-get install -qq -y chromium-driver; } \
 		|| { echo 'Chromium is not installed: sudo apt-get install chromium-driver'; exit 1; }
+
+browser-test: $(VENV)/.dev chromium
 	$(BIN)/python -m pytest test/test_browser.py
 
 torture: $(VENV)/.dev

@@ -63,7 +63,6 @@ MAX_LINES, MAX_FILES = 500, 140
 MAX_PARAMETERS, MAX_PARAMETERS_COMPILED = 8, 12
 MAX_BODY, MAX_BODY_COMPILED = 40, 60
 """Lines of a function, without its docstring."""
-LONG_OUTSIDE_CORE = ('cli/', 'data/', 'lab/', 'ros/')
 
 
 def parse(root):
@@ -170,8 +169,6 @@ def find_long_signatures(trees):
 def find_long_functions(trees):
     """Functions that do not fit on a screen."""
     for path, tree in trees.items():
-        if path.startswith(LONG_OUTSIDE_CORE):
-            continue
         limit = MAX_BODY_COMPILED if path.startswith('core/compiled/') else MAX_BODY
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):

@@ -104,7 +104,7 @@ def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
     n_before = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
     command = next((word for word in words[:n_before] if not word.startswith('-')), None)
-    if command in REMOVED and command not in COMMANDS:
+    if command in REMOVED:
         raise GroundSegError(f'{command}: was removed; {REMOVED[command]}')
     parser = build_parser(command if command in COMMANDS else None)
     arguments = parser.parse_args(words[:n_before])

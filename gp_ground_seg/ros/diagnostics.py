@@ -231,18 +231,22 @@ class ModelTask:
             'Objective per candidate': _digits(fit.objective * per_candidate, '.4f'),
             **{f'theta {name}': f'{value:.4g}' for name, value in fit.theta.items()},
         }
-        level, message = Level.WARN, f'frame quality {quality:.2f}'
-        if scan.pose.contradictions:
-            message = '; '.join(scan.pose.contradictions)
-        elif not fit.n_segments:
-            message = 'no ground found in the newest cloud'
-        elif fit.status == 'failed':
-            message = 'the hyper-parameters could not be learned'
-        elif quality < limits.min_quality:
-            message += f', below {limits.min_quality:g}'
-        else:
-            level = Level.OK
-        return Status('model', level, message, values)
+        return Status('model', *_judge_model(scan, quality, limits), values)
+
+
+def _judge_model(scan: Segmentation, quality: float, limits: DiagnosticsConfig) -> Finding:
+    message = f'frame quality {quality:.2f}'
+    if scan.pose.contradictions:
+        message = '; '.join(scan.pose.contradictions)
+    elif not scan.fit.n_segments:
+        message = 'no ground found in the newest cloud'
+    elif scan.fit.status == 'failed':
+        message = 'the hyper-parameters could not be learned'
+    elif quality < limits.min_quality:
+        message += f', below {limits.min_quality:g}'
+    else:
+        return Level.OK, message
+    return Level.WARN, message
 
 
 def _pose_values(pose: SensorPose) -> dict[str, str]:
