@@ -34,6 +34,7 @@ def need(*modules):
         pytest.skip(f'not installed: {", ".join(missing)}')
 
 
+@pytest.mark.slow
 def test_flake8_with_the_settings_of_ament():
     need(*FLAKE8)
     done = run('-m', 'flake8', f'--config={CONFIG}', *SOURCES)

@@ -117,6 +117,7 @@ def test_numbers_of_pictures_come_out_again(figure, tmp_path, capsys, monkeypatc
     assert f'({said}; commit ' in figure.body, f'{figure.page}: now {said}. {ANEW}'
 
 
+@pytest.mark.slow
 @compiled
 def test_the_picture_of_the_demo_is_that_of_the_demo(tmp_path):
     """The same scan without the node: the labels that came back are those of the library."""

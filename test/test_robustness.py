@@ -95,7 +95,10 @@ def test_an_array_that_changes_meanwhile_does_not_crash():
     'values',
     [
         {'grid.r_max': 400, 'faces.cell_size': 0.16},
-        {'grid.n_segments': 2048, 'grid.n_bins': 1024, 'grid.bin_growth': 1},
+        pytest.param(
+            {'grid.n_segments': 2048, 'grid.n_bins': 1024, 'grid.bin_growth': 1},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 @pytest.mark.parametrize('make', [NumpyBackend, lambda: NumbaBackend(1), lambda: NumbaBackend(2)])

@@ -97,7 +97,7 @@ def assert_same(scheduler, tmp_path, capsys):
 
 @pytest.mark.parametrize('more', [[], PAST, ['--peer', 'patchworkpp']])
 def test_an_evaluation_is_the_same_to_the_last_digit(root, assert_same, more):
-    assert_same(', workers beside one another: 2  [ms]', 'evaluate', root, *more)
+    assert_same(', 2 workers beside one another  [ms]', 'evaluate', root, *more)
 
 
 @pytest.mark.parametrize(

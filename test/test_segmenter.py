@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from unittest.mock import patch
 
 import numpy as np
@@ -174,6 +175,12 @@ def test_the_input_is_not_written_to_and_may_change_afterwards(backend, scan, ti
         same(result, expected)
 
 
+@cache
+def labelled_by_the_loops(*changes):
+    """Scan of few points with these parameters, for each backend in turn."""
+    return segmenter_of(Reference(), **dict(changes)).segment(hilly_scan(700))
+
+
 @pytest.mark.parametrize('model', ['latent', 'line_gradient', 'constant'])
 @pytest.mark.parametrize('scope', ['frame', 'segment'])
 @pytest.mark.parametrize('objective', ['map', 'paper'])
@@ -186,8 +193,8 @@ def test_frames_are_labelled_as_by_the_loops(backend, model, scope, objective):
         'grid.n_segments': 12,
         'grid.n_bins': 60,
     }
-    scan = hilly_scan(700)
-    found, expected = (segmenter_of(b, **changes).segment(scan) for b in (backend, Reference()))
+    found = segmenter_of(backend, **changes).segment(hilly_scan(700))
+    expected = labelled_by_the_loops(*changes.items())
     np.testing.assert_array_equal(found.label, expected.label)
     np.testing.assert_allclose(found.ground_z, expected.ground_z, atol=1e-5)
     np.testing.assert_allclose(found.theta, expected.theta, atol=1e-5)

@@ -25,6 +25,7 @@ from gp_ground_seg.lab.simulation.objects import floating_box, wall
 # Scans of 100,000 points, too many for the compiled twins as plain Python.
 BACKEND = NumbaBackend(2) if JIT_ENABLED else NumpyBackend()
 TILTS = st.floats(-0.2, 0.2)
+SLOW = pytest.mark.slow
 SENSORS = pytest.mark.parametrize('sensor', [HDL_64E, VLP_16, OS1_128], ids=lambda s: s.name)
 
 
@@ -375,7 +376,9 @@ def test_angles_that_are_given_are_accepted():
 
 @SENSORS
 @pytest.mark.parametrize('scene', SCENES)
-@pytest.mark.parametrize('height', [0.4, 1.2, 1.73, 2.5])
+@pytest.mark.parametrize(
+    'height', [0.4, 1.73, pytest.param(1.2, marks=SLOW), pytest.param(2.5, marks=SLOW)]
+)
 def test_simulated_mounts_are_found_and_none_is_refused(sensor, scene, height):
     pose = pose_of(scan_of(scene, sensor, height, seed=3).points)
     assert pose.height_estimated
