@@ -102,7 +102,8 @@ def test_nothing_is_kept_in_the_current_folder(program):
     assert folder.startswith(home)
     assert program.run(NUMBA_CACHE_DIR='here') == NOT_KEPT
     assert 'here is no absolute path' in program.stderr
-    assert sorted(p.name for p in program.folder.iterdir()) == ['home', 'small.py']
+    # Python keeps its own there, where it is let.
+    assert {p.name for p in program.folder.iterdir()} - {'__pycache__'} == {'home', 'small.py'}
 
 
 def code(program):
@@ -151,7 +152,10 @@ def test_damaged_code_is_compiled_again(program, names):
 
 @pytest.mark.parametrize(
     ('where', 'mode', 'reason'),
-    [('.', 0o701, 'others can open'), ('..', 0o777, 'others can write to')],
+    [
+        ('.', 0o701, 'others can open'),
+        pytest.param('..', 0o777, 'others can write to', marks=pytest.mark.slow),
+    ],
 )
 def test_code_is_not_read_from_where_others_can_put_it(program, where, mode, reason):
     *_, folder = program.run()

@@ -87,6 +87,7 @@ finally:
 """
 
 
+@pytest.mark.slow
 def test_an_array_that_changes_meanwhile_does_not_crash():
     subprocess.run([sys.executable, '-c', CHANGING], check=True, timeout=180)
 

@@ -353,5 +353,10 @@ def test_parameters_are_set_from_another_process(b):
         with pytest.raises(DataError, match=r'label\.ground_tolerance = 9\.0: must be a number'):
             set_remotely(name, {'label.ground_tolerance': 9.0})
         assert b.node.config == expected
-        with pytest.raises(DataError, match=f'/nobody: no such node.*{name}'):
-            set_remotely('/nobody', {'label.ground_tolerance': 0.2})
+
+
+@pytest.mark.slow
+def test_parameters_of_a_node_that_is_not_there(b):
+    name = b.node.get_fully_qualified_name()
+    with ros.isolated(), pytest.raises(DataError, match=f'/nobody: no such node.*{name}'):
+        set_remotely('/nobody', {'label.ground_tolerance': 0.2})

@@ -120,8 +120,9 @@ def kitti_bag(folder, kitti):
     return folder / 'drive', '/kitti/velo/pointcloud'
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures('node')
-@pytest.mark.parametrize('source', ['simulated', pytest.param('kitti', marks=pytest.mark.slow)])
+@pytest.mark.parametrize('source', ['simulated', 'kitti'])
 def test_frames_to_bag_to_player_to_node_and_back(source, tmp_path, request):
     """Order, header, layout and every byte: the clouds are the selection by the labels.
 

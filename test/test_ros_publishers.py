@@ -99,7 +99,8 @@ def test_every_cloud_comes_however_the_publishers_change(link):
     send_and_wait(link, LARGE, reliable)
 
 
-@pytest.mark.parametrize('qos', [RELIABLE, pytest.param(BEST_EFFORT, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize('qos', [RELIABLE, BEST_EFFORT])
 def test_losses_of_two_publishers_are_counted(link, qos):
     first = add_publisher(link, RELIABLE, 'reliable')
     used = 'reliable' if qos is RELIABLE else 'best_effort'

@@ -357,6 +357,7 @@ def test_what_a_thread_computes_of_a_result_does_not_hold_up_another_result():
         assert late.result(60.0) == results[0].corrected == 'late'
 
 
+@pytest.mark.slow
 def test_a_process_forked_while_another_thread_segments_segments_and_ends():
     n_points, n_children = fewer(4000, 300), fewer(10, 2)
     done = subprocess.run(

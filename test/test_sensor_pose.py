@@ -377,7 +377,7 @@ def test_angles_that_are_given_are_accepted():
 @SENSORS
 @pytest.mark.parametrize('scene', SCENES)
 @pytest.mark.parametrize(
-    'height', [0.4, 1.73, pytest.param(1.2, marks=SLOW), pytest.param(2.5, marks=SLOW)]
+    'height', [1.73, *(pytest.param(height, marks=SLOW) for height in (0.4, 1.2, 2.5))]
 )
 def test_simulated_mounts_are_found_and_none_is_refused(sensor, scene, height):
     pose = pose_of(scan_of(scene, sensor, height, seed=3).points)

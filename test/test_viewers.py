@@ -219,6 +219,7 @@ def test_the_tuner_draws_the_labels_of_its_parameters(sequence):
         assert int(n_ground.replace(',', '')) < int(n_before.replace(',', ''))
 
 
+@pytest.mark.slow
 def test_the_web_viewer_is_served_here_only_and_ends_with_ctrl_c(sequence):
     rerun()
     port = free_ports()
