@@ -11,7 +11,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 from bag_samples import write_ros2_bag
-from conftest import fewer
+from conftest import fewer, hilly_scan
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.cli import main as cli
@@ -43,6 +43,14 @@ def test_points_at_infinity_are_unknown_under_any_tilt(backend, angles, dtype):
     assert not result.pose.is_level
     assert (result.label[bad] == Label.UNKNOWN).all()
     assert (np.delete(result.label, bad) != Label.UNKNOWN).all()
+
+
+def test_a_return_from_far_above_is_no_overflow(backend):
+    points = hilly_scan(1000)
+    points[::50, 2] = 1e200
+    result = GroundSegmenter(backend=backend).segment(points)
+    assert (result.label[::50] != Label.GROUND).all()
+    assert (result.label == Label.GROUND).mean() > 0.5
 
 
 def test_many_points_in_one_spot_have_a_roughness(backend):

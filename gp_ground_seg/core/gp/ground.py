@@ -239,7 +239,8 @@ def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
         following = batch.continues_line[active]
         following[:, 1:] &= chosen[active, :-1]
         following[:, 0] = False
-        joining = fits(z, *combined(height, variance, *aside), noise, growth) | following
+        with np.errstate(over='ignore'):  # the square of 1e200 m: no fit
+            joining = fits(z, *combined(height, variance, *aside), noise, growth) | following
         joining &= ~chosen[active] & batch.mask[active]
         # Before anything has joined, only evidence from aside decides.
         joining &= chosen[active].any(axis=1, keepdims=True) | (aside.precision > 0.0)
