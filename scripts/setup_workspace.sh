@@ -31,7 +31,7 @@ touch "$venv/COLCON_IGNORE"
 # colcon writes the interpreter that it runs in into the executables.
 cd "$workspace"
 "$venv/bin/python" -m colcon build --packages-up-to gp_ground_seg
-bash -c 'source install/setup.bash && install/gp_ground_seg/lib/gp_ground_seg/core/gp-ground-seg warm-up'
+bash -c 'source install/setup.bash && install/gp_ground_seg/lib/gp_ground_seg/gp-ground-seg warm-up'
 cat <<END
 Done. In each terminal:
   source $workspace/install/setup.bash

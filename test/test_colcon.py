@@ -1,6 +1,7 @@
 """Built and tested by colcon, started as ``ros2 run`` does."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -100,6 +101,12 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
         code, _ = node.stop(signal.SIGINT)
     assert code == 0, node.log
     assert 'Traceback' not in node.log
+
+
+def test_the_script_for_workspaces_runs_what_colcon_installs(workspace):
+    script = (REPOSITORY / 'scripts' / 'setup_workspace.sh').read_text()
+    (command,) = re.findall(r'(install/\S+/gp-ground-seg) warm-up', script)
+    assert os.access(workspace / command, os.X_OK)
 
 
 def test_colcon_test_collects_our_tests(workspace):
