@@ -21,13 +21,13 @@ def double(x):
     return 2.0 * x
 """
 RUN = """
-import json, logging, sys
+import json, logging, os, sys
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format='%(message)s')
 import small
 result = small.double(21.0)
 hits, misses = (sum(c.values()) for c in small.double.stats[1:]) if small.JIT_ENABLED else (0, 0)
 was_kept = small.is_code_kept()
-small.keep_code(warm=True)
+small.keep_code(warm='COLD' not in os.environ)
 folder = small.code_folder()
 print(json.dumps([result, hits, misses, was_kept, str(folder) if folder else None]))
 """
@@ -77,6 +77,13 @@ def test_code_is_compiled_once_and_then_loaded(program):
     assert program.run()[:4] == COMPILED
     assert 'compiling' in program.stderr
     assert program.run()[:4] == LOADED
+    assert program.stderr == ''
+
+
+def test_what_a_command_has_compiled_is_not_announced_again(program):
+    """Only `warm_up` knows that all is there, but nothing is missing after a command."""
+    assert program.run(COLD='1')[:4] == COMPILED
+    assert program.run(COLD='1')[:4] == [42.0, 1, 0, False]
     assert program.stderr == ''
 
 

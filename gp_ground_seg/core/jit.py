@@ -219,8 +219,9 @@ def _delete_damaged(folder: Path) -> None:
     damaged = [name for name, checksum in found.items() if kept.get(name) != checksum]
     for name in damaged:
         (folder / name).unlink()
-    _is_warm = kept.get('warm') is True and not damaged and found.keys() >= kept.keys() - {'warm'}
-    if not _is_warm:
+    is_whole = bool(kept) and not damaged and found.keys() >= kept.keys() - {'warm'}
+    _is_warm = is_whole and kept.get('warm') is True
+    if not is_whole:
         _LOGGER.info('compiling for this processor, which takes 10 to 40 s')
 
 
