@@ -19,7 +19,7 @@ from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_labels, read_points
 from gp_ground_seg.lab.experiments import ablation, scenes, sensor_pose
 from gp_ground_seg.lab.experiments import table1 as paper_table
-from gp_ground_seg.lab.experiments.table1 import CHOICES, VARIANCES, Choice, table1
+from gp_ground_seg.lab.experiments.table1 import CHOICES, VARIANCES, table1
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.simulation import (
     DRIVES,
@@ -40,13 +40,13 @@ def root(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch):
     for name in ('ablation', 'scenes'):
-        experiment = EXPERIMENTS[name]
-        fewer = experiment.simulated._replace(places=(12.0 * (name == 'ablation'),))
-        monkeypatch.setitem(EXPERIMENTS, name, experiment._replace(simulated=fewer))
+        fewer = EXPERIMENTS[name]._replace(places=(12.0 * (name == 'ablation'),))
+        monkeypatch.setitem(EXPERIMENTS, name, fewer)
     monkeypatch.setattr(sensor_pose, 'MOUNTS', sensor_pose.MOUNTS[:2])
-    some = ablation.Departure('near', {'grid.r_max': 15.0}), ablation.DEPARTURES[3]
-    monkeypatch.setattr(ablation, 'DEPARTURES', some)
-    chosen = Choice('00', '000000', (3, 4)), Choice('00', '000001', (5,))
+    monkeypatch.setattr(ablation, 'DEPARTURES', {'near': {'grid.r_max': 15.0}})
+    some = {'a wider gate': {'growth.max_standardised_residual': 3.0}}
+    monkeypatch.setattr(ablation, 'ALTERNATIVES', some)
+    chosen = {('00', '000000'): (3, 4), ('00', '000001'): (5,)}
     monkeypatch.setattr(paper_table, 'CHOICES', chosen)
     monkeypatch.setattr(paper_table, 'N_REPEATS', 1)
 
@@ -235,7 +235,7 @@ def frame(rubble):
 @pytest.fixture(scope='module')
 def measured(rubble):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper_table, 'CHOICES', [Choice('00', '000000', SEGMENTS)])
+        patch.setattr(paper_table, 'CHOICES', {('00', '000000'): SEGMENTS})
         patch.setattr(paper_table, 'N_REPEATS', 1)
         return table1(labelled_frames(rubble), Config()).rows
 

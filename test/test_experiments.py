@@ -24,7 +24,7 @@ from gp_ground_seg.lab.experiments import (
     sensor_pose,
     variants,
 )
-from gp_ground_seg.lab.experiments.ablation import MODELS, Departure
+from gp_ground_seg.lab.experiments.ablation import MODELS
 from gp_ground_seg.lab.experiments.variants import SimulatedFrame, load_simulated
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
@@ -114,16 +114,17 @@ def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
     assert count_confusion(result.label, scan.truths['groundgrid']).iou > 0.9
 
 
-@pytest.mark.parametrize('departure', ablation.DEPARTURES, ids=lambda one: one.title)
-def test_every_switch_of_the_list_is_accepted_and_turns_something(departure):
-    switched = Config().replace(**departure.changes)
-    for name in departure.changes:
+@pytest.mark.parametrize('title', [*ablation.DEPARTURES, *ablation.ALTERNATIVES])
+def test_every_switch_of_the_list_is_accepted_and_turns_something(title):
+    changes = {**ablation.DEPARTURES, **ablation.ALTERNATIVES}[title]
+    switched = Config().replace(**changes)
+    for name in changes:
         assert switched[name] != Config()[name], name
 
 
 def test_worth_is_what_having_it_adds(frames, monkeypatch):
-    departures = [Departure('far grid', NEAR), Departure('near grid', NEAR, kept=False)]
-    monkeypatch.setattr(ablation, 'DEPARTURES', departures)
+    monkeypatch.setattr(ablation, 'DEPARTURES', {'far grid': NEAR})
+    monkeypatch.setattr(ablation, 'ALTERNATIVES', {'near grid': NEAR})
     report = ablation.compare_departures(frames, FAR)
     rows = {row['departure']: row for row in report.tables['departures'].json()}
     given, near = variants.score_variants(frames, {'given': FAR, 'near': FAR.replace(**NEAR)})
@@ -142,7 +143,7 @@ def test_worth_is_what_having_it_adds(frames, monkeypatch):
 
 
 def test_a_switch_that_changes_nothing_is_refused(monkeypatch):
-    monkeypatch.setattr(ablation, 'DEPARTURES', [Departure('far grid', NEAR)])
+    monkeypatch.setattr(ablation, 'DEPARTURES', {'far grid': NEAR})
     with pytest.raises(ConfigError, match="'far grid': its switch changes nothing"):
         ablation.compare_departures([], Config().replace(**NEAR))
 

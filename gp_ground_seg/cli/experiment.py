@@ -32,20 +32,17 @@ SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
 NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
 
 
-class Simulated(NamedTuple):
-    """Scans that an experiment simulates by default."""
+class Experiment(NamedTuple):
+    """A function from scans, parameters and a runner to tables; its docstring is the help.
 
-    sensors: Sequence[str]
+    With `sensors` it simulates scans, by default of these and in these scenes.
+    """
+
+    run: Callable[..., Report]
+    sensors: Sequence[str] = ()
     scenes: Sequence[str] = (*DRIVES,)
     n_seeds: int = 1  # scenes of each kind
     places: Sequence[float] = (0.0,)  # of the sensor in each scene [m]
-
-
-class Experiment(NamedTuple):
-    """A function from scans, parameters and a runner to tables; its docstring is the help."""
-
-    run: Callable[..., Report]
-    simulated: Simulated | None = None
     labelled: bool = True  # whether it takes labelled frames
     is_timed: bool = False  # then it runs in one process
 
@@ -60,41 +57,34 @@ class Experiment(NamedTuple):
         found: list[Option] = []
         if self.labelled:
             optional = (*ROOT[:2], {**ROOT[2], 'nargs': '?'})
-            found += [optional, SIMULATED] if self.simulated else [ROOT]
+            found += [optional, SIMULATED] if self.sensors else [ROOT]
             found += OF_FRAMES
         return [*found, *self.simulated_options, *([NO_PEER] if self.has_peer else [])]
 
     @property
     def simulated_options(self) -> list[Option]:
         """Options of simulated scans."""
-        if self.simulated is None:
+        if not self.sensors:
             return []
+        n_seeds = f'scenes of each kind (default: {self.n_seeds})'
         return [
-            _some_of('--sensors', SENSORS, self.simulated.sensors),
-            _some_of('--scenes', SCENES, self.simulated.scenes),
-            (
-                '--seeds',
-                f'scenes of each kind (default: {self.simulated.n_seeds})',
-                options.NUMBER,
-            ),
-        ]  # fmt: skip
+            _some_of('--sensors', SENSORS, self.sensors),
+            _some_of('--scenes', SCENES, self.scenes),
+            ('--seeds', n_seeds, options.NUMBER),
+        ]
 
 
 EXPERIMENTS = {
     'ablation': Experiment(
-        ablation.compare_models, Simulated(['hdl-64e'], [ablation.SCENE], 10, ablation.PLACES)
+        ablation.compare_models, ['hdl-64e'], [ablation.SCENE], 10, ablation.PLACES
     ),
     'departures': Experiment(ablation.compare_departures),
-    'coverage': Experiment(score_coverage, Simulated(FIVE, n_seeds=2)),
+    'coverage': Experiment(score_coverage, FIVE, n_seeds=2),
     'steps': Experiment(ablation.compare_steps),
     'wrong-values': Experiment(ablation.compare_wrong_values),
-    'scenes': Experiment(
-        score_scenes, Simulated(THREE, n_seeds=3, places=(0.0, 6.0)), labelled=False
-    ),
-    'objects': Experiment(
-        score_objects, Simulated([*SENSORS], CROWDED, n_seeds=2), labelled=False
-    ),
-    'sensor-pose': Experiment(score_poses, Simulated(THREE)),
+    'scenes': Experiment(score_scenes, THREE, n_seeds=3, places=(0.0, 6.0), labelled=False),
+    'objects': Experiment(score_objects, [*SENSORS], CROWDED, n_seeds=2, labelled=False),
+    'sensor-pose': Experiment(score_poses, THREE),
     'table1': Experiment(table1, is_timed=True),
 }
 """Experiments by name. A new one is a row here and its function."""
@@ -154,7 +144,7 @@ def _name(option: Option) -> str:
 
 def _check_source(arguments: argparse.Namespace, experiment: Experiment) -> None:
     """Refuse options that contradict one another."""
-    if not (experiment.labelled and experiment.simulated):
+    if not (experiment.labelled and experiment.sensors):
         return
     if arguments.simulated == (arguments.root is not None):
         raise DataError(f'{arguments.experiment}: give either ROOT or --simulated')
@@ -167,8 +157,11 @@ def _check_source(arguments: argparse.Namespace, experiment: Experiment) -> None
 
 def _scans(arguments: argparse.Namespace, experiment: Experiment) -> Sequence[Any]:
     """Return labelled frames, or scans to simulate."""
-    default = experiment.simulated
-    if default is None or (experiment.labelled and not arguments.simulated):
+    if experiment.labelled and not getattr(arguments, 'simulated', False):
         return frames_from_options(arguments)
-    sensors, scenes = arguments.sensors or default.sensors, arguments.scenes or default.scenes
-    return simulated_frames(sensors, scenes, arguments.seeds or default.n_seeds, default.places)
+    return simulated_frames(
+        arguments.sensors or experiment.sensors,
+        arguments.scenes or experiment.scenes,
+        arguments.seeds or experiment.n_seeds,
+        experiment.places,
+    )

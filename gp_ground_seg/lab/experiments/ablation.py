@@ -5,7 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from contextlib import closing
-from typing import Any, NamedTuple
+from typing import Any
 
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.parameters.config import Config, find_spec
@@ -48,38 +48,33 @@ PLACES = (0.0, 6.0, 12.0)
 """Where the sensor stands on the simulated road [m]; the rubble begins at 14 to 20 m."""
 
 
-class Departure(NamedTuple):
-    """A departure from the paper, or another choice."""
-
-    title: str
-    changes: Changes  # switch it off; where it is not kept, on
-    kept: bool = True  # if the defaults have it
-
-
 _PLAIN_BAND: Changes = {'label.rule': 'tolerance', 'label.ground_tolerance': 0.2}
 
-DEPARTURES: tuple[Departure, ...] = (
-    Departure('latent length-scales (constant instead)', {'length_scale.model': 'constant'}),
-    Departure('learning in every frame', {'learning.mode': 'fixed'}),
-    Departure('objective without the latent terms', {'learning.objective': 'paper'}),
-    Departure('sloping mean', {'observation.slope_std': 0.0}),
-    Departure('segments look aside', {'surface.look_aside': False}),
-    Departure('asymmetric gate of the growth', {'growth.max_standardised_depth': 2.0}),
-    Departure('vertical faces', {'faces.max_normal_z': 0.0}),
-    Departure('vertical faces with occluded base', {'faces.max_foot_distance': 0.0}),
-    Departure('labels by the predictive distribution', _PLAIN_BAND),
-    Departure('bins that widen, 80 of them', {'grid.n_bins': 120, 'grid.bin_growth': 1.0}),
-    Departure('lines end at 0.1 rad', {'lines.slope_tolerance': 0.02}),
-    Departure('length-scales not learned', {'learning.fixed': 'none'}),
-    Departure('lines continued outside the gate', {'growth.max_line_slope': 0.0}),
-    Departure('lines continued past a slope break', {'growth.min_bend_extent': 1000.0}),
-    Departure('learning from every 30th segment', {'learning.segment_step': 1}),
-    Departure('one theta for the frame', {'learning.scope': 'segment'}),
-    Departure('240 segments', {'grid.n_segments': 240}, kept=False),
-    Departure('a wider gate (3)', {'growth.max_standardised_residual': 3.0}, kept=False),
-    Departure('obstacles from 0.3 m on', {'label.obstacle_min_height': 0.3}, kept=False),
-)
-"""Rows of `compare_departures`. A new row here is all that a further one takes."""
+DEPARTURES: dict[str, Changes] = {
+    'latent length-scales (constant instead)': {'length_scale.model': 'constant'},
+    'learning in every frame': {'learning.mode': 'fixed'},
+    'objective without the latent terms': {'learning.objective': 'paper'},
+    'sloping mean': {'observation.slope_std': 0.0},
+    'segments look aside': {'surface.look_aside': False},
+    'asymmetric gate of the growth': {'growth.max_standardised_depth': 2.0},
+    'vertical faces': {'faces.max_normal_z': 0.0},
+    'vertical faces with occluded base': {'faces.max_foot_distance': 0.0},
+    'labels by the predictive distribution': _PLAIN_BAND,
+    'bins that widen, 80 of them': {'grid.n_bins': 120, 'grid.bin_growth': 1.0},
+    'lines end at 0.1 rad': {'lines.slope_tolerance': 0.02},
+    'length-scales not learned': {'learning.fixed': 'none'},
+    'lines continued outside the gate': {'growth.max_line_slope': 0.0},
+    'lines continued past a slope break': {'growth.min_bend_extent': 1000.0},
+    'learning from every 30th segment': {'learning.segment_step': 1},
+    'one theta for the frame': {'learning.scope': 'segment'},
+}
+"""What the defaults have and the paper has not, and the changes that switch it off."""
+ALTERNATIVES: dict[str, Changes] = {
+    '240 segments': {'grid.n_segments': 240},
+    'a wider gate (3)': {'growth.max_standardised_residual': 3.0},
+    'obstacles from 0.3 m on': {'label.obstacle_min_height': 0.3},
+}
+"""Choices that the defaults do not have, and the changes that switch them on."""
 
 STEPS = {
     'vertical faces': ('faces.',),
@@ -136,20 +131,19 @@ def compare_departures(items: Sequence[Any], config: Config, runner: Runner = HE
     They are the rows of gp_ground_seg/lab/experiments/ablation.py; `evaluate --against` measures
     any other change.
     """
-    variants = {'as given': config}
-    for departure in DEPARTURES:
-        variants[departure.title] = config.replace(**departure.changes)
-        if variants[departure.title] == config:
-            raise ConfigError(f'departure {departure.title!r}: its switch changes nothing')
-    scores = score_variants(items, variants, runner=runner)
-    given, *switched = scores
+    changes = {**DEPARTURES, **ALTERNATIVES}
+    variants = {title: config.replace(**changed) for title, changed in changes.items()}
+    for title, variant in variants.items():
+        if variant == config:
+            raise ConfigError(f'departure {title!r}: its switch changes nothing')
+    given, *switched = score_variants(items, {'as given': config, **variants}, runner=runner)
 
     rows = []
-    for departure, score in zip(DEPARTURES, switched, strict=True):
-        having, without = (given, score) if departure.kept else (score, given)
+    for score in switched:
+        is_off = score.name in DEPARTURES
+        having, without = (given, score) if is_off else (score, given)
         interval = interval_text(having, without)
-        switch = 'off' if departure.kept else 'on'
-        rows.append((score, switch, having.iou - without.iou, interval))
+        rows.append((score, 'off' if is_off else 'on', having.iou - without.iou, interval))
     rows.sort(key=lambda cells: -cells[2])
     title = (
         f'{_counted(given)}; {_rule(given)}, and gained with the departure on; '
@@ -158,8 +152,7 @@ def compare_departures(items: Sequence[Any], config: Config, runner: Runner = HE
     )
     table_rows = [_departure(given, given), *(_departure(given, *cells) for cells in rows)]
     tables = {'departures': Table(table_rows, title)}
-    changes = {departure.title: departure.changes for departure in DEPARTURES}
-    return make_report(tables, scores, config, changes=changes)
+    return make_report(tables, [given, *switched], config, changes=changes)
 
 
 def _departure(

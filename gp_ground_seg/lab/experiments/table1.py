@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,17 +28,9 @@ MODELS = {'Z-L': 'latent', 'Z': 'line_gradient'}
 VARIANCES = ('sigma_f^2', 'sigma_n^2', 'sigma_f_bar^2', 'sigma_l_bar^2', 'sigma_n_bar^2')
 """Squares of the first entries of theta: in m^2; those of f_bar and n_bar without unit."""
 
-
-class Choice(NamedTuple):
-    """Segments of a frame."""
-
-    sequence: str
-    frame: str
-    segments: tuple[int, ...]
-
-
-CHOICES = (Choice('10', '000000', (157, 158)), Choice('03', '000006', (147, 148)))
-"""An adjacent pair that climbs a verge and a hill, 3 m over 30 m, and one on uneven ground."""
+CHOICES = {('10', '000000'): (157, 158), ('03', '000006'): (147, 148)}
+"""Segments by sequence and frame: an adjacent pair that climbs a verge and a hill, 3 m over 30 m,
+and one on uneven ground."""
 N_REPEATS = 9
 
 
@@ -51,14 +44,14 @@ def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Rep
     if config.learning.mode == 'fixed':
         raise ConfigError('learning.mode = fixed: the table is of what is learned, leave it out')
     last = config.grid.n_segments - 1
-    for segment in (segment for choice in CHOICES for segment in choice.segments):
+    for segment in itertools.chain(*CHOICES.values()):
         if not 0 <= segment <= last:
             raise ConfigError(f'segment {segment}: must be in [0, {last}]')
     frames = {(frame.sequence, frame.index): frame for frame in items}
-    for choice in CHOICES:
-        if (choice.sequence, choice.frame) not in frames:
-            raise DataError(f'no frame {choice.frame} in sequence {choice.sequence}')
-    ((rows, fit),) = runner.run(partial(_measure, config, frames), CHOICES)
+    for sequence, index in CHOICES:
+        if (sequence, index) not in frames:
+            raise DataError(f'no frame {index} in sequence {sequence}')
+    ((rows, fit),) = runner.run(partial(_measure, config, frames), [*CHOICES])
     names = ['n_PG', 'n_L', *VARIANCES]
     others = [n for n in rows[0] if n not in ('segment', *names) and not n.startswith('inliers')]
     variances = 'Variances learned over the frame by Z-L  [m^2; of f_bar and n_bar without unit]'
@@ -77,7 +70,7 @@ def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Rep
 def _measure(
     config: Config,
     frames: Mapping[tuple[str, str], Frame],
-    choices: Sequence[Choice],
+    choices: Sequence[tuple[str, str]],
     progress: Progress,
 ) -> tuple[list[dict[str, Any]], FitReport]:
     """Rows of the segments chosen, and a fit of the latent model."""
@@ -90,7 +83,7 @@ def _measure(
             )
             segmenters[name] = stack.enter_context(closing(segmenter))
         for choice in progress(choices):
-            found, result = _rows(frames[choice.sequence, choice.frame], choice, segmenters)
+            found, result = _rows(frames[choice], CHOICES[choice], segmenters)
             rows += found
     return rows, result.fit
 
@@ -104,7 +97,7 @@ def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> 
 
 
 def _rows(
-    frame: Frame, choice: Choice, segmenters: dict[str, GroundSegmenter]
+    frame: Frame, segments: Sequence[int], segmenters: dict[str, GroundSegmenter]
 ) -> tuple[list[dict[str, Any]], Segmentation]:
     """Rows of a frame, by title of the column, and a result of the latent model."""
     scan = load_kitti(frame)
@@ -117,7 +110,7 @@ def _rows(
     place = common.grid.r + 1j * common.pose.level(scan.points[:, :3])[:, 2]
     modelled = scan.is_ground & (common.grid.bin != OUTSIDE)
     rows = []
-    for segment in choice.segments:
+    for segment in segments:
         part = slice(*candidates.offsets[segment : segment + 2])
         held_out = modelled & (common.grid.segment == segment)
         held_out &= ~np.isin(place, candidates.r[part] + 1j * candidates.z[part])

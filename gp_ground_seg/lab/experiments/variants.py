@@ -31,8 +31,6 @@ from gp_ground_seg.lab.simulation import PLACES, SCENES, SENSORS, Kind, simulate
 
 Changes = Mapping[str, ParameterValue]
 """Values of parameters, by dotted name."""
-Load = Callable[[Any], KnownScan]
-"""Reads or simulates a scan, with its truth."""
 
 OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
 """Kinds of objects that rays hit, by `CLASSES`; crates are boxes too, but no objects."""
@@ -99,7 +97,7 @@ def score_variants(
     variants: Mapping[str, Config],
     peers: Sequence[Method] = (),
     *,
-    load: Load = load_scan,
+    load: Callable[[Any], KnownScan] = load_scan,
     runner: Runner = HERE,
 ) -> list[MethodScore]:
     """Run variants, then `peers`, once on every scan, alternately, each scan without a past."""
