@@ -2,7 +2,6 @@
 
 import re
 from collections import Counter
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -224,7 +223,7 @@ def test_file_goes_over_preset_and_setting_over_file(tmp_path, capsys):
 @pytest.mark.parametrize('sensor', ['hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360'])
 def test_the_defaults_fit_every_sensor(sensor):
     """Ground IoU on two simulated scenes each, level and sloped."""
-    with closing(GroundSegmenter()) as segmenter:
+    with GroundSegmenter() as segmenter:
         for scene in ('flat', 'slope'):
             both = Counter()
             for seed in (0, 1):

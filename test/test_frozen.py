@@ -6,7 +6,6 @@
 import hashlib
 import json
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ MAX_LABELS_BY_NUMPY = 2
 
 def segmented(folder: Path, **changes: object) -> Iterator[tuple[str, Segmentation]]:
     """Name and result of each frame."""
-    with closing(GroundSegmenter(Config().replace(**changes))) as segmenter:
+    with GroundSegmenter(Config().replace(**changes)) as segmenter:
         for path in sorted(folder.glob('sequences/*/velodyne/*.bin')):
             yield f'{path.parts[-3]}/{path.stem}', segmenter.segment(read_points(path))
 

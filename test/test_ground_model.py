@@ -1,7 +1,6 @@
 """The ground model by itself against the segmentation it came from."""
 
 import dataclasses
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -86,7 +85,7 @@ def test_knots_are_exact(segmented):
 def test_in_a_tilted_frame_heights_are_on_the_surface(tilt):
     points = half_scan()
     turn = rotation(*tilt)
-    with closing(GroundSegmenter(CONFIGS[0])) as segmenter:
+    with GroundSegmenter(CONFIGS[0]) as segmenter:
         level = GroundModel.of(segmenter.segment(points, (0.0, 0.0)))
         found = segmenter.segment(points @ turn, tilt)
     model = GroundModel.of(found)

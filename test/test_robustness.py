@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import tracemalloc
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -208,7 +207,7 @@ def test_a_latent_process_that_swings_far_overflows_nowhere(backend):
         'latent.candidates_per_pseudo_input': 1.0, 'learning.fixed': 'latent',
         'sensor.height': 1.73, 'runtime.backend': backend,
     }  # fmt: skip
-    with closing(GroundSegmenter(Config().replace(**changes))) as segmenter:
+    with GroundSegmenter(Config().replace(**changes)) as segmenter:
         result = segmenter.segment(points)  # warnings are errors
     assert np.nanmax(np.abs(result.log_length_scale)) == MAX_ABS_LOG_LENGTH_SCALE
     ground = result.label == Label.GROUND

@@ -1,7 +1,9 @@
 """The segmenter: properties of its results, history, threads, forks, change of backend."""
 
 import concurrent.futures
+import copy
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -17,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import Reference
 
-from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
+from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.gp.evidence import STEP
@@ -60,7 +62,6 @@ def test_ground_and_boxes_are_told_apart(backend):
     assert (result.p_ground[is_ground] >= 0.5).all() and (result.p_ground[~is_ground] < 0.5).all()
 
 
-@pytest.mark.filterwarnings('ignore:overflow')
 @pytest.mark.parametrize(
     'points',
     [
@@ -154,6 +155,37 @@ def test_layouts_of_the_same_points_give_the_same(backend, scan):
     np.testing.assert_array_equal(base.label, double.label)
     np.testing.assert_allclose(base.ground_z, double.ground_z, rtol=0, atol=5e-6)
     same(double, segmenter.segment(points.tolist()))
+
+
+@pytest.mark.parametrize(
+    ('name', 'values', 'count'),
+    [
+        ('origin', values, 3)
+        for values in [
+            (np.nan, 0, 0), (0, np.inf, 0), (1, 2), (1, 2, 3, 4), 'abc', 5, (0, 0, None),
+            (1j, 0, 0), (True, 0, 0), ([1], 0, 0), (10**400, 0, 0), np.eye(3),
+        ]
+    ]
+    + [('tilt', values, 2) for values in [(np.nan, 0), (0,), (0, 0, 0), (0.1, 'auto'), 0.1]],
+)  # fmt: skip
+def test_tilt_and_origin_are_finite_numbers(name, values, count, scan):
+    with pytest.raises(ConfigError, match=rf'\A{name} = .*: must be {count} finite numbers\Z'):
+        SEGMENTER.segment(scan, **{name: values})
+    taken = np.zeros(count, np.float32)
+    same(SEGMENTER.segment(scan, **{name: taken}), SEGMENTER.segment(scan, **{name: [0] * count}))
+
+
+@pytest.mark.parametrize('attempt', [pickle.dumps, copy.copy, copy.deepcopy])
+def test_a_segmenter_is_closed_by_with_and_is_not_copied(attempt, scan):
+    before = set(threading.enumerate())
+    with sharing(3) as backend, GroundSegmenter(CONFIG, backend=backend) as segmenter:
+        label = segmenter.segment(scan).label
+        with pytest.raises(TypeError, match='cannot be pickled or copied: pass its config'):
+            attempt(segmenter)
+        config = pickle.loads(pickle.dumps(segmenter.config))
+    assert set(threading.enumerate()) <= before
+    with GroundSegmenter(config) as other:
+        np.testing.assert_array_equal(other.segment(scan).label, label)
 
 
 @pytest.mark.parametrize('tilt', [None, (0.05, -0.04)])

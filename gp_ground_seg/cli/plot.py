@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -140,7 +139,7 @@ def run(arguments: argparse.Namespace) -> int:
     truth = None
     if getattr(arguments, 'labels', None) is not None:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
-    with closing(GroundSegmenter(config)) as segmenter:
+    with GroundSegmenter(config) as segmenter:
         result = segmenter.segment(points)
     if arguments.picture == 'scan':
         look = arguments.camera, arguments.colour

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -133,7 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
         _segment_dataset(arguments, config, is_bag)
         return 0
     target = Path(arguments.output or _default_output(source, arguments.format))
-    with closing(GroundSegmenter(config)) as segmenter:
+    with GroundSegmenter(config) as segmenter:
         segment = _segment_bag if gives_bag else _segment_scans
         dataset.print_summary(Outcome.of(segment(target, arguments, segmenter)), target)
     return 0
@@ -168,7 +167,7 @@ def _segment_bags(
     """Segment bags, each into one in the folder `target`."""
     outcomes = []
     for bag in progress(bags):
-        with closing(GroundSegmenter(config)) as segmenter:
+        with GroundSegmenter(config) as segmenter:
             source, path = Path(str(bag.path)), target / bag.name
             outcomes.append(Outcome.of(output.write(source, path, segmenter, force=True)))
     return pool(outcomes)

@@ -7,7 +7,6 @@ import importlib.util
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import closing
 from itertools import islice
 from pathlib import Path
 
@@ -103,7 +102,7 @@ def run_view(arguments: argparse.Namespace) -> int:
     suffix = '.html' if arguments.html else '.rrd'
     if target and Path(target).suffix.lower() != suffix:
         raise DataError(f'{target}: must end in {suffix}')
-    with closing(GroundSegmenter(config)) as segmenter:
+    with GroundSegmenter(config) as segmenter:
         if arguments.html:
             arguments.frame = arguments.frame or 0
             ((_, view, result),) = _frames(inputs, arguments, segmenter)

@@ -6,6 +6,8 @@ values and `offsets`: those of segment m are ``offsets[m]:offsets[m + 1]``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -29,6 +31,17 @@ NOT_FINITE = -2
 """Cell of a point that is not finite."""
 NO_TILE = 2**31 - 1
 """Tile of the lowest point of an empty cell."""
+
+
+@contextmanager
+def usual_errors() -> Iterator[None]:
+    """Have numpy raise nothing within the block or function, whatever the caller has set.
+
+    Small numbers become 0 in most frames. Other faults warn, unless the caller ignores them.
+    """
+    how: Any = {fault: 'ignore' if x == 'ignore' else 'warn' for fault, x in np.geterr().items()}
+    with np.errstate(**{**how, 'under': 'ignore'}):
+        yield
 
 
 class Label(IntEnum):
@@ -219,6 +232,7 @@ class GroundSurface(NamedTuple):
     std: FloatArray  # (M, K) its standard deviation [m]; NaN in the same places
     inlier: BoolArray  # (C,) candidates that the surface rests on
 
+    @usual_errors()
     def at(self, grid: PolarGrid) -> tuple[FloatArray, FloatArray]:
         """Height and standard deviation [m] under each point, two (N,) float64.
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.frame import FloatArray
+from gp_ground_seg.core.frame import FloatArray, usual_errors
 from gp_ground_seg.core.pipeline.tilt import rotation
 from gp_ground_seg.core.result import Segmentation
 
@@ -19,7 +19,7 @@ STEEPEST = 0.1
 """Cosine of the tilt from which on the z axis is taken to meet the ground."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GroundModel:
     """Ground height over range in each angular segment, about the sensor's vertical.
 
@@ -48,6 +48,7 @@ class GroundModel:
     pitch: float = 0.0
 
     @classmethod
+    @usual_errors()
     def of(cls, segmentation: Segmentation) -> GroundModel:
         """Take the corrected surface out of a segmented scan."""
         surface, pose = segmentation.corrected, segmentation.pose
@@ -67,6 +68,7 @@ class GroundModel:
         """Whether z of the scan's frame is up."""
         return self.roll == 0.0 and self.pitch == 0.0
 
+    @usual_errors()
     def knot_points(self, n_std: float = 0.0) -> FloatArray:
         """Place of every knot in the middle of its segment, frame of the scan, (M, K, 3) [m].
 
@@ -94,6 +96,7 @@ class GroundModel:
         return points
 
     @classmethod
+    @usual_errors()
     def from_knot_points(
         cls,
         points: FloatArray,
@@ -145,6 +148,7 @@ class GroundModel:
             )
         return model
 
+    @usual_errors()
     def at(self, x: npt.ArrayLike, y: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Height of the ground along the z axis, and its standard deviation, at any place.
 

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
+import math
 import os
+import textwrap
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from numbers import Real
+from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.backend import Backend, make_backend
-from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan
+from gp_ground_seg.core.errors import ConfigError
+from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_errors
 from gp_ground_seg.core.gp.learning import Learned, given_theta, in_rows, learn_frame
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
@@ -28,7 +34,9 @@ _LOGGER = logging.getLogger('gp_ground_seg')
 class GroundSegmenter:
     """Splits scans into ground and obstacles.
 
-    It may be called from several threads, which then take turns, and in a forked process.
+    It may be called from several threads, which then take turns, and in a forked process. As a
+    context manager it closes itself. It cannot be copied or pickled: another process makes its
+    own from the same `Config`.
 
     Parameters
     ----------
@@ -60,6 +68,7 @@ class GroundSegmenter:
         self._warned: set[str] = set()
         self._lock, self._pid = threading.RLock(), os.getpid()
 
+    @usual_errors()
     def segment(
         self,
         points: npt.ArrayLike,
@@ -83,13 +92,16 @@ class GroundSegmenter:
         ------
         PointCloudError
             If the array has another shape or type, or z clearly does not point up.
+        ConfigError
+            If `tilt` or `origin` has another number of values, or one that is not finite.
         """
         with self._exclusive():
             timer, sensor = StageTimer(self._clock), self._config.sensor
             if tilt is not None:
-                sensor = dataclasses.replace(sensor, roll=tilt[0], pitch=tilt[1])
+                roll, pitch = _finite_numbers('tilt', tilt, 2)
+                sensor = dataclasses.replace(sensor, roll=roll, pitch=pitch)
             if origin is not None:
-                x, y, z = origin
+                x, y, z = _finite_numbers('origin', origin, 3)
                 sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
             result = self._segment(take_points(points), sensor, timer)
             self._warn(result.warnings)
@@ -136,6 +148,7 @@ class GroundSegmenter:
             slope_std=config.observation.slope_std,
         )
 
+    @usual_errors()
     def estimate_pose(self, points: npt.ArrayLike) -> SensorPose:
         """Estimate height and tilt of the sensor as `segment` does, and no more.
 
@@ -181,6 +194,21 @@ class GroundSegmenter:
         """End the worker threads, once the scan at hand is segmented."""
         with self._exclusive():
             self._backend.close()
+
+    def __enter__(self) -> GroundSegmenter:
+        """Return the segmenter itself."""
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        """Call `close`."""
+        self.close()
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse to be pickled or copied: there are a lock, threads and their buffers."""
+        raise TypeError(
+            'a GroundSegmenter cannot be pickled or copied: pass its config, and make a '
+            'GroundSegmenter of that'
+        )
 
     def _warn(self, warnings: tuple[str, ...]) -> None:
         """Log each warning once, until the parameters change: scans come ten times a second."""
@@ -238,6 +266,17 @@ class GroundSegmenter:
         self._theta, learned = learn_frame(frame, before, self._config, self._backend, out_of_time)
         self._frames_since_learning = 0
         return self._theta, learned
+
+
+def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:
+    """Return the `values` of an argument; raise a ConfigError if it has others than `count`."""
+    with contextlib.suppress(TypeError, OverflowError):
+        given = tuple(values)
+        are_numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in given)
+        if are_numbers and len(given) == count and all(map(math.isfinite, given)):
+            return tuple(map(float, given))
+    text = textwrap.shorten(repr(values), 100, placeholder=' ...')
+    raise ConfigError(f'{name} = {text}: must be {count} finite numbers')
 
 
 def warm_up(config: Config | None = None) -> Backend:

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.core.frame import Candidates, FloatArray, PointArray, Scan
+from gp_ground_seg.core.frame import Candidates, FloatArray, PointArray, Scan, usual_errors
 from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
 from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, GroundPlane
@@ -120,10 +120,12 @@ class SensorPose:
         """Matrix (3, 3) from the sensor frame to the level frame."""
         return rotation(self.roll, self.pitch)
 
+    @usual_errors()
     def level(self, xyz: PointArray) -> PointArray:
         """Points (N, 3) of the sensor frame in the level frame; `xyz` itself without tilt."""
         return xyz if self.is_level else rotate(xyz, self.rotation)
 
+    @usual_errors()
     def ground_z(self, z: PointArray, height: FloatArray) -> FloatArray:
         """Height of the surface along the sensor's z axis, sensor frame, (N,) float64 [m].
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import statistics
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -81,7 +81,7 @@ def _measure(
             segmenter = GroundSegmenter(
                 config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
             )
-            segmenters[name] = stack.enter_context(closing(segmenter))
+            segmenters[name] = stack.enter_context(segmenter)
         for choice in progress(choices):
             found, result = _rows(frames[choice], CHOICES[choice], segmenters)
             rows += found

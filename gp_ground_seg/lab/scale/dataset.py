@@ -6,7 +6,6 @@ import hashlib
 import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -97,7 +96,7 @@ def segment_block(
             write(target / scan.name, result)
             yield result
 
-    with closing(GroundSegmenter(config)) as segmenter:
+    with GroundSegmenter(config) as segmenter:
         return Outcome.of(results(segmenter))
 
 
