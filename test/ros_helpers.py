@@ -23,7 +23,7 @@ with warnings.catch_warnings():
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -126,6 +126,9 @@ class Collector:
         return self.messages
 
 
+SETTERS = {
+    SetParameters: 'set_parameters', SetParametersAtomically: 'set_parameters_atomically',
+}  # fmt: skip
 _LAYOUT = {'names': ['intensity', *'xyz'], 'formats': 4 * ['<f4'], 'offsets': [0, 4, 8, 12]}
 POINT = np.dtype({**_LAYOUT, 'itemsize': 64})
 """A point as a driver sends it: x not first, bytes that belong to no field."""
@@ -292,8 +295,12 @@ class Link:
 
     def load(self, values):
         """Results of setting all values at once, in their order, as ``ros2 param load`` does."""
-        request = SetParameters.Request(parameters=parameter_messages(values))
-        return self.call(SetParameters, 'set_parameters', request).results
+        return self.request(SetParameters, parameter_messages(values))
+
+    def request(self, setter, parameters):
+        """Results of a service of `SETTERS` for messages of parameters."""
+        response = self.call(setter, SETTERS[setter], setter.Request(parameters=parameters))
+        return response.results if setter is SetParameters else [response.result]
 
     def call(self, service_type, name, request):
         """Response of a service of the node."""

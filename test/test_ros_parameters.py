@@ -152,8 +152,7 @@ def test_a_number_or_auto_is_taken_and_nothing_else(b, name):
 def test_several_at_once_are_all_taken_or_none(b):
     def set_all(**values):
         messages = ros.parameter_messages({f'grid.{name}': v for name, v in values.items()})
-        request = srv.SetParametersAtomically.Request(parameters=messages)
-        return b.call(srv.SetParametersAtomically, 'set_parameters_atomically', request).result
+        return b.request(srv.SetParametersAtomically, messages)[0]
 
     refused = set_all(n_segments=90, r_min=40.0, r_max=30.0)
     assert not refused.successful
@@ -165,16 +164,13 @@ def test_several_at_once_are_all_taken_or_none(b):
     assert values_of(b) == {**Config().flat(), 'grid.r_min': 1.0, 'grid.r_max': 30.0}
 
 
-@pytest.mark.parametrize('how', ['set_parameters', 'set_parameters_atomically'])
-def test_an_integer_is_taken_for_any_number(b, how):
+@pytest.mark.parametrize('setter', ros.SETTERS)
+def test_an_integer_is_taken_for_any_number(b, setter):
     """As ``ros2 param set`` and rqt_reconfigure send what is typed without a point."""
-    kind = srv.SetParameters if how == 'set_parameters' else srv.SetParametersAtomically
     whole = {spec.name: int(spec.default) for spec in SPECS if str(spec.default).endswith('.0')}
     assert len(whole) > 20
     for name, value in {**whole, 'label.ground_tolerance': 1, 'sensor.height': 2}.items():
-        request = kind.Request(parameters=ros.parameter_messages({name: value}))
-        response = b.call(kind, how, request)
-        result = response.results[0] if how == 'set_parameters' else response.result
+        (result,) = b.request(setter, ros.parameter_messages({name: value}))
         assert result.successful, result.reason
         (found,) = values_of(b, [name]).values()
         assert (type(found), found) == (float, value)

@@ -17,9 +17,10 @@ from bag_samples import write_ros2_bag
 from cli_runner import run
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.msg import ParameterType
 from rclpy.serialization import serialize_message as bytes_of
 from ros_helpers import NAMESPACE, street, to_message
+from rosgraph_msgs.msg import Clock
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.cli.bags import scan_cloud
@@ -173,18 +174,29 @@ def test_clouds_of_two_megabytes_at_10_hz_all_come_back():
 
 
 @pytest.mark.usefixtures('node')
-def test_what_rclpy_raises_does_not_end_the_node(node):
-    """A value of a type that does not exist: nobody answers, and the node goes on."""
+@pytest.mark.parametrize('setter', ros.SETTERS)
+def test_values_of_every_type_are_answered(setter):
+    """Also of those that do not exist, at which rclpy raises, and its callers wait for ever."""
     with ros.linked() as link:
+        (message,) = ros.parameter_messages({'grid.r_max': 50.0})
+        for number in range(256):
+            message.value.type = number
+            (result,) = link.request(setter, [message])
+            assert result.successful == (number == ParameterType.PARAMETER_DOUBLE)
+            wanted = 'must be a number in' if number < 10 else f': {number} is not a valid'
+            assert result.successful or wanted in result.reason
         link.segment(to_message(street(500)))
-        name = f'{link.node_name}/set_parameters'
-        client = link.probe.create_client(SetParameters, name)
-        ros.wait_for(client.service_is_ready, name)
-        for message in ros.parameter_messages({'grid.r_max': 50.0}):
-            message.value.type = 99
-            client.call_async(SetParameters.Request(parameters=[message]))
-        ros.wait_for(lambda: '99' in node.log, 'message about the type')
+
+
+def test_what_rclpy_raises_does_not_end_the_node(node):
+    """A negative time on /clock, for example."""
+    with ros.linked() as link:
+        assert link.set('use_sim_time', True).successful
+        publisher, clock = link.probe.create_publisher(Clock, '/clock', 1), Clock()
+        clock.clock.sec = -5
+        ros.wait_for(lambda: publisher.publish(clock) or 'negative' in node.log, 'message')
         link.segment(to_message(street(500)))
+        assert link.set('use_sim_time', False).successful
 
 
 # Sends best-effort clouds of 1.9 MB until it is ended; its domain is that of the environment.

@@ -44,7 +44,7 @@ PARTS = {
     'damaged compiled code': Part('torture_cache.py', 40, 20),
     'commands killed, interrupted, disk full': Part('torture_writes.py', 40, 20),
     'damaged files': Part('torture_files.py', 600, 200),
-    'hostile clouds over DDS': Part('torture_ros.py', 400, 200),
+    'hostile messages and calls over DDS': Part('torture_ros.py', 400, 200),
 }  # fmt: skip
 
 

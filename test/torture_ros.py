@@ -1,7 +1,8 @@
-"""Hostile clouds over DDS: contradicting layouts, and valid messages with flipped bytes.
+"""Hostile messages over DDS: clouds that contradict themselves or have flipped bytes, parameters
+of every type that a byte can name, and wrong times.
 
-The node refuses what contradicts itself, answers every valid cloud sent in between, and prints no
-traceback. `python test/torture_ros.py FIRST STOP` sends the clouds of a range.
+The node refuses what contradicts itself, answers every call and every valid cloud sent in between,
+and prints no traceback. `python test/torture_ros.py FIRST STOP` sends the cases of a range.
 """
 
 import sys
@@ -10,8 +11,10 @@ from array import array
 from pathlib import Path
 
 import numpy as np
+from rcl_interfaces.msg import Parameter, ParameterValue
 from rclpy.serialization import serialize_message
-from ros_helpers import linked_process, street, to_message
+from ros_helpers import SETTERS, linked_process, street, to_message
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointField
 
 VALID = to_message(street(2000))
@@ -58,17 +61,49 @@ def damaged_message(rng):
     return bytes(data[: rng.integers(1, len(data) + 1)] if rng.random() < 0.1 else data)
 
 
+def hostile_parameter(rng, kind):
+    """Parameter of the type `kind` in [0, 256), whose values fit it or not."""
+    names = 'grid.r_max', 'label.ground_tolerance', 'runtime.backend', 'use_sim_time'
+    return Parameter(
+        name=str(rng.choice([*names, '', 'é' * 3000, '\x1b[2J'])),
+        value=ParameterValue(
+            type=kind,
+            bool_value=bool(rng.random() < 0.5),
+            integer_value=int(rng.choice([-(2**63), 0, 50, 2**63 - 1])),
+            double_value=float(rng.choice([np.nan, np.inf, -1e300, 50.0])),
+            string_value=str(rng.choice(['', 'gpu', '\n', 'é' * 3000])),
+            double_array_value=[50.0] * int(rng.integers(3)),
+        ),
+    )
+
+
+def wrong_time(rng):
+    """Time of a clock, mostly negative or too large."""
+    time = Clock()
+    time.clock.sec = int(rng.choice([-(2**31), -5, -1, 0, 2**31 - 1]))
+    time.clock.nanosec = int(rng.choice([0, 10**9, 2**32 - 1]))
+    return time
+
+
 def main():
-    """Send the clouds of the command line to one node."""
+    """Send the cases of the command line to one node."""
     first, stop = map(int, sys.argv[1:3])
     wrong = []
-    with tempfile.TemporaryDirectory() as folder, linked_process(Path(folder)) as (node, link):
+    simulated = '-p', 'use_sim_time:=true'
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        linked_process(Path(folder), *simulated) as (node, link),
+    ):
         node.wait_until_settled()
+        clock = link.probe.create_publisher(Clock, '/clock', 1)
         for number in range(first, stop):
             print(f'\r{number}', end='', flush=True)
             rng = np.random.default_rng([17, number])
             cloud = hostile_cloud(rng) if rng.random() < 0.5 else damaged_message(rng)
             link.publisher.publish(cloud)
+            clock.publish(wrong_time(rng))
+            for setter in SETTERS:
+                link.request(setter, [hostile_parameter(rng, number % 256)])
             if number % 10 == 9 or number == stop - 1:
                 seen = len(link.ground.messages)
                 link.publish_until(

@@ -17,7 +17,7 @@ from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.core import log
 from gp_ground_seg.core.backend import NumpyBackend, choose_backend
-from gp_ground_seg.core.errors import GroundSegError, PointCloudError
+from gp_ground_seg.core.errors import GroundSegError, PointCloudError, in_one_line
 from gp_ground_seg.core.frame import usual_errors
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
@@ -86,7 +86,7 @@ class GroundSegmentationNode(ConfiguredNode):
             self._refuse(cloud, str(error))
         except Exception as error:
             # The next cloud may be good.
-            self._refuse(cloud, f'{type(error).__name__}: {error}')
+            self._refuse(cloud, f'{type(error).__name__}: {in_one_line(error)}')
         else:
             end, health = time.monotonic(), self._diagnostics
             stages = {'queue': wait, **segmentation.timings, 'publish': end - segmented}
@@ -211,9 +211,10 @@ def _spin(node: GroundSegmentationNode, stop: start_stop.StopRequest) -> None:
         except ExternalShutdownException:
             return
         except Exception as error:
-            # rclpy raises at parameters of an unknown type, and at a negative time on /clock.
+            # Of a callback, or of rclpy itself: at a negative time on /clock, for example.
             if rclpy.ok():
-                node.get_logger().error(f'{type(error).__name__}: {error}', **THROTTLED)
+                reason = f'{type(error).__name__}: {in_one_line(error)}'
+                node.get_logger().error(reason, **THROTTLED)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -7,8 +7,9 @@ from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import SetParametersResult as Result
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -107,11 +108,12 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
         self._parameter_service = ParameterService(self)
-        # It sets the values of a request one by one: see `_on_request`.
-        (setter,) = (s for s in self.services if s.srv_type is SetParameters)
-        self.destroy_service(setter)
-        name, qos = '~/set_parameters', qos_profile_parameters
-        self.create_service(SetParameters, name, self._on_request, qos_profile=qos)
+        # Its setters answer nothing at a value of unknown type, and one sets one by one.
+        ours = {SetParameters: self._on_request, SetParametersAtomically: self._on_atomic_request}
+        for setter in [service for service in self.services if service.srv_type in ours]:
+            kind, name = setter.srv_type, setter.srv_name
+            self.destroy_service(setter)
+            self.create_service(kind, name, ours[kind], qos_profile=qos_profile_parameters)
 
     @property
     def config(self) -> Config:
@@ -146,13 +148,26 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         ``ros2 param load`` sends a whole file: one by one, a value that contradicts another
         still to come would be refused.
         """
-        parameters = [Parameter.from_parameter_msg(message) for message in request.parameters]
-        result = self.set_parameters_atomically(parameters)
+        messages = request.parameters
+        result = self._set_all(messages)
         if result.successful:
-            response.results = [result] * len(parameters)
+            response.results = [result] * len(messages)
         else:
-            response.results = [self.set_parameters_atomically([p]) for p in parameters]
+            response.results = [self._set_all([message]) for message in messages]
         return response
+
+    def _on_atomic_request(self, request: Any, response: Any) -> Any:
+        response.result = self._set_all(request.parameters)
+        return response
+
+    def _set_all(self, messages: Iterable[ParameterMessage]) -> Result:
+        parameters = []
+        for message in messages:
+            try:
+                parameters.append(Parameter.from_parameter_msg(message))
+            except ValueError as error:  # a type that ROS does not have
+                return Result(successful=False, reason=f'{message.name}: {error}')
+        return self.set_parameters_atomically(parameters)
 
     def _on_set(self, parameters: list[Parameter]) -> Result:
         # An exception out of here would end the executor and leave the caller waiting.
