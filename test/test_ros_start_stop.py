@@ -44,7 +44,7 @@ FILES = {
     'sim_time': (HEAD + '    use_sim_time: "yes"\n', 'must be true or false'),
     'null': (HEAD + '    grid:\n', 'No value at line 3'),
     'mixed': (HEAD + '    grid: {n_bins: [1, 2.5]}\n', 'should be of same type'),
-    'bare': ('label: {ground_tolerance: 0.1}\n', 'before ros__parameters at line 1'),
+    'bare': ('label: {ground_tolerance: 0.1}\n', 'the node: gp-ground-seg config dump'),
     'text': ('just words\n', 'no ros__parameters'),
     'syntax': (HEAD + '  label: [ {a\n', 'params file'),
     'tab': ('/**:\n\tros__parameters:\n', 'event near line 1'),
@@ -105,6 +105,18 @@ def test_words_that_nobody_takes_are_refused(capsys, words, complaint):
     with ros.isolated(), pytest.raises(SystemExit, match='2'):
         sys.exit(cli_runner.run(*words.split()))
     assert complaint in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('folder', [None, '/proc/nowhere'])
+def test_logs_that_have_no_folder(folder, monkeypatch):
+    for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR'):
+        monkeypatch.delenv(name, raising=False)
+    if folder:
+        monkeypatch.setenv('HOME', folder)
+    done = run_python(*MODULE)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.endswith(': set ROS_LOG_DIR to a folder that the node may write to')
 
 
 def test_missing_ros_is_said_in_one_line():

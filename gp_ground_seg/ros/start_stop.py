@@ -28,9 +28,10 @@ from gp_ground_seg.core.errors import (
     MissingDependencyError,
     install_hint,
 )
-from gp_ground_seg.core.parameters.schema import read_yaml
+from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
 
 HIGHEST_DOMAIN = 232
+LOG_FOLDER = 'set ROS_LOG_DIR to a folder that the node may write to'
 ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
 
 
@@ -72,6 +73,7 @@ def start_errors() -> Iterator[None]:
             raise
         text = ' '.join(str(error).split())
         kind = type(error).__name__
+        text += f': {LOG_FOLDER}' if text.startswith('failed to initialize logging') else ''
         raise ConfigError(text if kind == 'RCLError' else f'{kind}: {text}') from error
 
 
@@ -80,14 +82,26 @@ def _check_surroundings(words: Sequence[str]) -> None:
     domain = os.environ.get('ROS_DOMAIN_ID', '')
     if domain.isdecimal() and int(domain) > HIGHEST_DOMAIN:
         raise ConfigError(f'ROS_DOMAIN_ID = {domain}: must be an integer in [0, {HIGHEST_DOMAIN}]')
+    if not any(os.environ.get(name) for name in ('ROS_LOG_DIR', 'ROS_HOME', 'HOME')):
+        raise ConfigError(f'no folder for logs, as HOME is not set: {LOG_FOLDER}')
     for path in (path for flag, path in itertools.pairwise(words) if flag == '--params-file'):
         with contextlib.suppress(OSError, yaml.YAMLError, RecursionError):
             try:
                 document = read_yaml(path)
             except (UnicodeDecodeError, ConfigError) as error:
                 raise ConfigError(f'{path}: {error}') from error
-            if not isinstance(document, dict | None):
-                raise ConfigError(f'{path}: no ros__parameters')
+            if document and not _is_of_ros(document):
+                raise ConfigError(
+                    f'{path}: no {ROS_PARAMETERS_KEY}; bare groups are good for --config; for the '
+                    'node: gp-ground-seg config dump --config FILE > ros.yaml'
+                )
+
+
+def _is_of_ros(document: object) -> bool:
+    """Whether parameters of a node are anywhere below, as below nested namespaces."""
+    if not isinstance(document, dict):
+        return False
+    return ROS_PARAMETERS_KEY in document or any(map(_is_of_ros, document.values()))
 
 
 @contextmanager
