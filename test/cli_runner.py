@@ -47,18 +47,24 @@ def stat_words(pid):
     return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
 
 
-def is_running(pid):
-    """Whether a process has not ended, waited for by its parent or not."""
+def parent_of(pid):
+    """Parent of a process; None if it has ended, waited for by its parent or not."""
     try:
-        return stat_words(pid)[0] != 'Z'
+        state, parent = stat_words(pid)[:2]
     except (FileNotFoundError, ProcessLookupError):
-        return False
+        return None
+    return None if state == 'Z' else int(parent)
+
+
+def is_running(pid):
+    """Whether a process has not ended."""
+    return parent_of(pid) is not None
 
 
 def children(pid):
     """Processes that a process has started and that have not ended."""
     found = [int(name) for name in os.listdir('/proc') if name.isdigit()]
-    return [one for one in found if is_running(one) and int(stat_words(one)[1]) == pid]
+    return [one for one in found if parent_of(one) == pid]
 
 
 def error_line(capsys):

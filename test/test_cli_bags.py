@@ -295,14 +295,11 @@ def test_without_ros(tmp_path, capsys, monkeypatch):
     assert "pip install 'ros-jazzy-rclpy[fastrtps]' " in line
 
 
-@pytest.mark.parametrize(
-    'words',
-    ['--rate 0', '--rate -1', '--rate nan'],
-)
-def test_refused_options(words, tmp_path, capsys):
+@pytest.mark.parametrize('rate', ['0', '-1', 'nan'])
+def test_refused_options(rate, tmp_path, capsys):
     with pytest.raises(SystemExit, match='2'):
-        play(tmp_path / 'drive.mcap', *words.split())
-    assert words.split()[0] in capsys.readouterr().err
+        play(tmp_path / 'drive.mcap', '--rate', rate)
+    assert '--rate' in capsys.readouterr().err
 
 
 def test_no_bag(tmp_path, capsys):

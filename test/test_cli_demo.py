@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import importlib
+import math
 import os
 import re
 import signal
@@ -14,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_runner import INTERRUPTED, children, is_running, start
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.demo import Tally, check_scan, numbered_cloud, result_text
@@ -118,6 +121,21 @@ def trips(*latencies):
     """Trips of scans sent every 0.1 s, None = lost."""
     sent = [(1000 + k * 10**8, latency) for k, latency in enumerate(latencies)]
     return [probe.Trip(t, None if late is None else t + round(1e9 * late)) for t, late in sent]
+
+
+@given(st.lists(st.none() | st.floats(0.0, 5.0), min_size=2))
+def test_counts_and_percentiles_of_trips(latencies):
+    result = rate_result(10.0, trips(*latencies))
+    back = [latency for latency in latencies if latency is not None]
+    assert (result['n_sent'], result['n_back']) == (len(latencies), len(back))
+    assert result['n_lost'] == latencies.count(None)
+    assert result['sent'] == pytest.approx(10.0)
+    if back:
+        expected = np.percentile(back, [50, 95, 99, 100])
+        found = [result['p50'], result['p95'], result['p99'], result['worst']]
+        np.testing.assert_allclose(found, expected, atol=1e-8)
+    else:
+        assert math.isnan(result['p50'])
 
 
 def test_counts_and_words():

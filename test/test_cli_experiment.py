@@ -99,16 +99,6 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
         assert document['config_changes']['grid.n_bins'] == 40
 
 
-def test_tables_as_markdown(capsys):
-    words = ['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', 1, '--no-peer', '--markdown']
-    assert run('experiment', 'scenes', *words) == 0
-    _title, table, machine = capsys.readouterr().out.strip().split('\n\n')
-    header, rule, row = table.splitlines()
-    assert header == '| sensor | scene | IoU | RMSE | median | gaps |'
-    assert rule == '| --- | --- | --: | --: | --: | --: |'
-    assert row.startswith('| vlp-16 | kerb | ') and machine.startswith('machine: ')
-
-
 def test_all_sensors_have_the_parameters_given(monkeypatch):
     found = []
 
@@ -302,13 +292,6 @@ def test_theta_is_of_the_whole_frame_and_learned(measured):
 def test_errors_of_the_table_are_said(rubble, words, message, capsys):
     assert run('experiment', 'table1', rubble, *words) == 2
     assert message in error_line(capsys)
-
-
-def test_frames_without_labels(tmp_path, capsys):
-    root = write_streets(tmp_path, s00=2)
-    (root / 'sequences/00/labels/000000.label').unlink()
-    assert run('experiment', 'table1', root) == 2
-    assert 'frames of sequence 00 have no labels' in error_line(capsys)
 
 
 def test_default_segments_of_real_frames(kitti, monkeypatch):

@@ -1,9 +1,7 @@
 """Parameter files: those made from the declarations, presets, checks and comparison."""
 
 import re
-from collections import Counter
 
-import numpy as np
 import pytest
 import yaml
 from cli_runner import run
@@ -12,13 +10,12 @@ from conftest import REPOSITORY, load_script
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label
+from gp_ground_seg import Config, ConfigError
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters import export
 from gp_ground_seg.core.parameters.config import parameter_specs
 from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.presets import PRESETS, find_preset
-from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 GENERATE = 'run: make generate'
 generate = load_script('docs/generate.py')
@@ -218,18 +215,3 @@ def test_file_goes_over_preset_and_setting_over_file(tmp_path, capsys):
     assert 'Preset paper' not in text
     assert run('segment', 'x.bin', '--preset', 'velodyne') == 2
     assert run('config', 'dump', '--set', 'sensor.hight=2.5') == 2
-
-
-@pytest.mark.parametrize('sensor', ['hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360'])
-def test_the_defaults_fit_every_sensor(sensor):
-    """Ground IoU on two simulated scenes each, level and sloped."""
-    with GroundSegmenter() as segmenter:
-        for scene in ('flat', 'slope'):
-            both = Counter()
-            for seed in (0, 1):
-                rng = np.random.default_rng(seed)
-                scan = simulate_scan(SCENES[scene](seed), SENSORS[sensor], rng)
-                found = segmenter.segment(scan.points).label == Label.GROUND
-                both['common'] += int((found & scan.is_ground).sum())
-                both['either'] += int((found | scan.is_ground).sum())
-            assert 100.0 * both['common'] / both['either'] >= 95.0, scene

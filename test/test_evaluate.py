@@ -349,30 +349,6 @@ def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
     assert max(len(line) for line in output.splitlines() if 'every number' not in line) <= 100
 
 
-@pytest.mark.parametrize('option', ['--json', '--per-frame'])
-def test_files_are_not_overwritten_without_force(root, tmp_path, option, monkeypatch, capsys):
-    target = tmp_path / 'mine.csv'
-    target.write_text('mine')
-    with monkeypatch.context() as patched:
-        patched.setattr(runner, 'read_points', None)  # refused before any frame is read
-        assert run('evaluate', root, option, target) == 2
-    assert '--force' in error_line(capsys)
-    assert target.read_text() == 'mine'
-    assert run('evaluate', root, option, target, '--force') == 0
-    assert target.read_bytes() != b'mine'
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_a_run_that_fails_leaves_nothing(tmp_path, capsys):
-    root = write_streets(tmp_path / 'kitti', s00=2)
-    broken = root / 'sequences/00/velodyne/000001.bin'
-    broken.write_bytes(broken.read_bytes()[:-3])
-    (tmp_path / 'out').mkdir()
-    assert run('evaluate', root, '--json', tmp_path / 'out' / 'scores.json') == 2
-    assert '000001.bin' in capsys.readouterr().err
-    assert list((tmp_path / 'out').iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ('words', 'message'),
     [
@@ -381,15 +357,23 @@ def test_a_run_that_fails_leaves_nothing(tmp_path, capsys):
         (['--sequences', '../sequences/00'], 'no sequence ../sequences/00'),
         (['--set', 'label.ground_tolerence=1'], 'label.ground_tolerance'),
         (['--json', '/no/such/folder/x.json'], '/no/such/folder'),
+        (['--json', 'MINE'], '--force replaces it'),
+        (['--per-frame', 'MINE'], '--force replaces it'),
         (
             ['--set', 'sensor.height=0', '--peer', 'patchworkpp'],
             'sensor.height = 0 set sensor.origin_z above 0',
         ),
     ],
 )
-def test_errors_are_said(root, words, message, capsys):
-    assert run('evaluate', root, *words) == 2
+def test_errors_are_said_before_any_frame_is_read(
+    root, tmp_path, words, message, monkeypatch, capsys
+):
+    monkeypatch.setattr(runner, 'read_points', None)
+    mine = tmp_path / 'mine.csv'
+    mine.write_text('mine')
+    assert run('evaluate', root, *(mine if word == 'MINE' else word for word in words)) == 2
     assert message in error_line(capsys)
+    assert mine.read_text() == 'mine'
 
 
 def test_frames_without_a_scored_point_and_a_root_without_sequences(tmp_path, capsys):

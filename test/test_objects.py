@@ -9,14 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cli_runner import run
-from evaluation_samples import HeightRule, street, write_frame
+from evaluation_samples import street, write_frame
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg import GroundSegmenter, Label
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.data.semantic_kitti import labelled_frames, read_points
-from gp_ground_seg.lab.scoring.evaluate import score_methods
+from gp_ground_seg.data.semantic_kitti import read_points
 from gp_ground_seg.lab.scoring.metrics import GROUND_CLASSES
 from gp_ground_seg.lab.scoring.objects import (
     BAND_EDGES,
@@ -32,17 +31,17 @@ from gp_ground_seg.lab.scoring.objects import (
 )
 
 
-def returns(n, x, z=1.0, n_ground=0, kind=0, number=1):
-    """Rows of n returns: x, z, class, object, and whether it is called ground."""
-    return [(x, z, kind, number, k < n_ground) for k in range(n)]
+def returns(n, x, n_ground=0, kind=0):
+    """Rows of n returns of one object: x, class, and whether it is called ground."""
+    return [(x, kind, k < n_ground) for k in range(n)]
 
 
-def count(rows, ground_z=0.0):
-    x, z, kind, number, is_ground = np.array(rows, dtype=float).T
-    points = np.column_stack([x, np.zeros(len(x)), z])
+def count(rows):
+    x, kind, is_ground = np.array(rows, dtype=float).T
+    points = np.column_stack([x, np.zeros(len(x)), np.ones(len(x))])
     label = np.where(is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
-    level = np.full(len(x), ground_z)
-    return count_objects(points, label, Objects(kind.astype(int), number.astype(int), level))
+    objects = Objects(kind.astype(int), np.ones(len(x), dtype=int), np.zeros(len(x)))
+    return count_objects(points, label, objects)
 
 
 def of(counts, name, band):
@@ -50,36 +49,12 @@ def of(counts, name, band):
     return (one.n_returns, one.n_ground, one.n_objects, one.n_lost)
 
 
-def test_an_object_is_lost_when_more_than_half_of_its_returns_are_ground():
-    n = MIN_RETURNS
-    assert of(count(returns(n, 5.0, n_ground=n // 2)), 'vehicle', 0) == (n, n // 2, 1, 0)
-    assert of(count(returns(n, 5.0, n_ground=n // 2 + 1)), 'vehicle', 0) == (n, n // 2 + 1, 1, 1)
-    # Of fewer returns the share counts, but they are no object.
-    assert of(count(returns(n - 1, 5.0, n_ground=n - 1)), 'vehicle', 0) == (n - 1, n - 1, 0, 0)
-
-
-def test_returns_count_from_the_least_height_above_their_ground():
-    assert of(count(returns(20, 5.0, z=MIN_HEIGHT)), 'vehicle', 0) == (20, 0, 1, 0)
-    rows = returns(20, 5.0, z=2.01 + MIN_HEIGHT)
-    rows += returns(20, 5.0, z=1.99 + MIN_HEIGHT, n_ground=20)
-    assert of(count(rows, ground_z=2.0), 'vehicle', 0) == (20, 0, 1, 0)
-    unknown = count(rows, ground_z=math.nan)
-    assert of(unknown, 'vehicle', 0) == (0, 0, 0, 0) and unknown['vehicle'][0].n_unknown == 40
-    assert count(returns(20, math.inf)) == count(returns(20, 5.0, kind=-1)) == {}
-
-
 def test_a_return_is_in_the_band_of_its_range_and_an_object_in_that_of_the_median():
     counts = count(returns(11, 9.99, n_ground=11) + returns(10, 10.0))
     assert of(counts, 'vehicle', 0) == (11, 11, 1, 1)
     assert of(counts, 'vehicle', 1) == (10, 0, 0, 0)
     assert of(count(returns(10, 4000.0)), 'vehicle', 3) == (10, 0, 1, 0)
-
-
-def test_numbers_restart_in_each_class_and_0_is_no_object():
-    rows = returns(10, 5.0) + returns(10, 5.0, kind=1, n_ground=10)
-    counts = count(rows + returns(30, 5.0, number=0, n_ground=30))
-    assert of(counts, 'vehicle', 0) == (40, 30, 1, 0)
-    assert of(counts, 'person', 0) == (10, 10, 1, 1)
+    assert count(returns(20, math.inf)) == count(returns(20, 5.0, kind=-1)) == {}
 
 
 def test_unknown_is_not_ground_and_shares_of_nothing_are_nan():
@@ -301,19 +276,6 @@ def test_the_table_of_objects_is_that_of_the_labels(tmp_path, capsys):
     ours = [scan for scan in document['rows'] if scan['method'] == 'gp_ground_seg']
     own = sum(b['n_ground'] for s in ours for b in s['objects']['vehicle'].values())
     assert own == pytest.approx(row['share_ground'] * row['returns'])
-
-
-def test_a_rule_of_height_loses_what_is_below_it(tmp_path):
-    root = write_cars(tmp_path, '00', '08')
-    frames = labelled_frames(root)
-    for height, n_lost in ((9.0, 4), (-0.5, 4), (-1.2, 0), (-9.0, 0)):
-        (score,) = score_methods(frames, [HeightRule('rule', height)])
-        (found,) = score.objects.values()
-        total = sum(found, ObjectCount())
-        assert (total.n_objects, total.n_lost) == (4, n_lost), height
-        # Cars stand from -1.6 to -0.2 m on a road at -1.73 m.
-        expected = (min(height, -0.2) + 1.43) / 1.23
-        assert total.share_ground == pytest.approx(max(expected, 0.0), abs=0.03)
 
 
 def test_where_nothing_stands_or_nothing_has_a_number_it_is_said(tmp_path, capsys):

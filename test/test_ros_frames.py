@@ -153,10 +153,15 @@ class StandInListener:
         type(self).alive -= 1
 
 
-def test_tilt_by_tf_is_as_good_as_given(monkeypatch):
+@pytest.fixture
+def stand_in(monkeypatch):
     errors = {'TransformException': LookupError, 'ExtrapolationException': IndexError}
     parts = {'Buffer': StandInBuffer, 'TransformListener': StandInListener, **errors}
     monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(**parts))
+
+
+@pytest.mark.usefixtures('stand_in')
+def test_tilt_by_tf_is_as_good_as_given():
     points, turn = turned_street(yaw=1.0)
     by_tf = {**VALUES, 'frame.level': 'tf', 'diagnostics.period': 0.1}
     with bench(*ros.given(by_tf)) as b:
@@ -192,11 +197,9 @@ def test_tilt_by_tf_is_as_good_as_given(monkeypatch):
         assert StandInListener.alive == 1
 
 
-def test_place_of_the_sensor_by_tf(monkeypatch):
+@pytest.mark.usefixtures('stand_in')
+def test_place_of_the_sensor_by_tf():
     """A room in the frame of a vehicle: which of its planes is the floor, the origin tells."""
-    errors = {'TransformException': LookupError, 'ExtrapolationException': IndexError}
-    parts = {'Buffer': StandInBuffer, 'TransformListener': StandInListener, **errors}
-    monkeypatch.setitem(sys.modules, 'tf2_ros', types.SimpleNamespace(**parts))
     sensor = dataclasses.replace(VLP_16, n_columns=600, height=1.2)
     xyz = simulate_scan(ROOM, sensor, np.random.default_rng(0)).points[:, :3]
     points = street(len(xyz))

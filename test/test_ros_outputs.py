@@ -10,7 +10,7 @@ from ros_helpers import said_by, street, to_message, wait_for, xyz_of
 from sensor_msgs.msg import PointCloud2, PointField
 from visualization_msgs.msg import Marker, MarkerArray
 
-from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.data.point_cloud2 import read_columns
 from gp_ground_seg.ros import outputs
@@ -65,22 +65,6 @@ def test_names_are_free_however_often_a_cloud_comes_round():
         assert not set(names.values()) & set(taken)
         assert len(set(names.values())) == len(FIELDS)
         taken += names.values()
-
-
-def test_labelled_points_tell_their_ground_and_how_sure_it_is(b):
-    points = street(6000)
-    found = received(b, '~/labeled', to_message(points))
-    expected = GroundSegmenter(CONFIG).segment(xyz_of(points))
-    names = ['label', 'height', 'ground_z', 'ground_std', 'return_std']
-    label, height, ground_z, ground_std, return_std = (
-        column[0] for column in read_columns(found, names).values()
-    )
-    np.testing.assert_array_equal(return_std, np.float32(expected.return_std))
-    ground = label == Label.GROUND
-    assert ground.sum() > 1000
-    np.testing.assert_allclose(height, points['z'] - ground_z, atol=1e-5)
-    assert (return_std >= ground_std)[ground].all()
-    assert 0.5 < np.mean(np.abs(height[ground]) <= return_std[ground]) < 0.9
 
 
 def test_ground_model_gives_the_height_anywhere(b):

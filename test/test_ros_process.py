@@ -6,7 +6,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
@@ -14,19 +13,11 @@ pytest.importorskip('rosbags', reason='rosbags is not installed')
 
 import ros_helpers as ros
 from bag_samples import write_ros2_bag
-from cli_runner import run
 from conftest import REPOSITORY
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterType
-from rclpy.serialization import serialize_message as bytes_of
 from ros_helpers import NAMESPACE, street, to_message
 from rosgraph_msgs.msg import Clock
-
-from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.cli.bags import scan_cloud
-from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
-from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
-from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_drive
 
 # A busy machine must not look like a fault; everything else may.
 PATIENT = {
@@ -35,13 +26,12 @@ PATIENT = {
     'diagnostics.max_latency': 10.0,
     'diagnostics.max_load': 100.0,
 }
-CONFIG = Config().replace(**PATIENT)
 # Nor be one: a node that cannot run for four seconds at 10 Hz loses nothing.
 WORDS = ros.given({**PATIENT, f'qos_overrides.{NAMESPACE}/points.subscription.depth': 40})
 
 
-def play(bag, *words, topic='/points'):
-    to_node = ('--quiet', '--ros-args', '-r', f'{topic}:={NAMESPACE}/points')
+def play(bag, *words):
+    to_node = ('--quiet', '--ros-args', '-r', f'/points:={NAMESPACE}/points')
     return ros.Process(str(bag), *words, *to_node, folder=bag.parent, start=ros.PLAY)
 
 
@@ -99,60 +89,6 @@ def node(tmp_path_factory):
         # Large clouds of a best-effort driver are warned of.
         warnings = [line for line in process.log.splitlines() if 'WARN' in line]
         assert all('come best-effort' in line for line in warnings)
-
-
-def simulated_bag(folder):
-    """A street, some points of which are not finite."""
-    rng = np.random.default_rng(0)
-    with BagWriter(folder / 'drive.mcap') as bag:
-        bag.add_topic(cloud_topic('/points'))
-        for scan in simulate_drive(SCENES['urban'](5), HDL_64E, 6, 8.0, 5):
-            points = scan.points.astype(np.float32)
-            points[rng.choice(len(points), 100, replace=False), 2] = rng.choice(
-                [np.nan, np.inf, -np.inf], 100
-            )
-            stamp = 1_600_000_000_123_456_789 + round(1e9 * scan.time)
-            bag.write('/points', stamp, encode_cloud(scan_cloud(points, stamp, 'velo_link')))
-    return folder / 'drive.mcap', '/points'
-
-
-def kitti_bag(folder, kitti):
-    assert run('kitti-to-bag', kitti, '--sequence', '08', folder / 'drive') == 0
-    return folder / 'drive', '/kitti/velo/pointcloud'
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures('node')
-@pytest.mark.parametrize('source', ['simulated', 'kitti'])
-def test_frames_to_bag_to_player_to_node_and_back(source, tmp_path, request):
-    """Order, header, layout and every byte: the clouds are the selection by the labels.
-
-    Nothing is wrong with stamps of 2011 either, as in the bag from KITTI.
-    """
-    if source == 'kitti':
-        bag, topic = kitti_bag(tmp_path, request.getfixturevalue('kitti'))
-    else:
-        bag, topic = simulated_bag(tmp_path)
-    with BagReader(bag) as reader:
-        sent = [decode_cloud(raw) for _, _, raw in reader.messages([topic])]
-    with ros.linked(sends=None) as link, play(bag, topic=topic) as player:
-        back = link.ground.wait(len(sent)), link.obstacles.wait(len(sent))
-        assert player.popen.wait(60.0) == 0, player.log
-        status = link.wait_for_status('processing', lambda *_: True)
-        levels = {s.level for array in link.diagnostics.messages for s in array.status}
-    assert levels == {DiagnosticStatus.OK}
-    assert ros.values_of(status)['Dropped since startup'] == '0'
-    segmenter = GroundSegmenter(CONFIG)
-    for cloud, *parts in zip(sent, *back, strict=True):
-        label, finite = segmenter.segment(read_xyz(cloud)).label, np.isfinite(read_xyz(cloud))
-        assert sum(part.width for part in parts) == np.count_nonzero(finite.all(axis=1))
-        for value, part in zip((Label.GROUND, Label.OBSTACLE), parts, strict=True):
-            wanted, found = select_points(cloud, label == value), decode_cloud(bytes_of(part))
-            assert found.width > 0
-            assert bytes(found.data) == bytes(wanted.data)
-            for name in ('header', 'fields', 'point_step', 'height', 'width'):
-                assert getattr(found, name) == getattr(wanted, name)
-    segmenter.close()
 
 
 @pytest.mark.usefixtures('node')
