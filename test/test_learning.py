@@ -111,6 +111,18 @@ def test_the_end_is_level_or_at_a_bound_and_said_to_be(noise_is_possible):
     assert (theta[free] != start[free]).all()
 
 
+def test_printed_objective_runs_to_the_bounds_and_map_does_not():
+    inliers, truth = draw_inliers(7, n_segments=30)
+    space = space_about(truth, factor=1000.0)
+    printed, ours = (
+        np.exp(learn(inliers, space, truth, use_priors)[0].theta - truth)
+        for use_priors in (False, True)
+    )
+    assert printed[2] < 0.05
+    assert (ours > 0.3).all()
+    assert (ours < 3.0).all()
+
+
 @pytest.mark.parametrize('budget', [1, 3, 6])
 def test_budget_is_kept_and_the_best_so_far_is_used(budget):
     inliers, truth = draw_inliers(5, n_segments=20)
