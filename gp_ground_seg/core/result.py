@@ -229,8 +229,9 @@ class Segmentation:
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """Warnings for the user, a line for each; logged by the segmenter."""
-        n_ground = np.count_nonzero(self.label == Label.GROUND)
-        n_finite = np.count_nonzero(self.label != Label.UNKNOWN)
+        # Plain integers: comparing with an enumeration is five times slower.
+        n_ground = np.count_nonzero(self.label == int(Label.GROUND))
+        n_finite = np.count_nonzero(self.label != int(Label.UNKNOWN))
         if not n_finite:
             return ()
         is_lost = n_ground < LEAST_GROUND * n_finite

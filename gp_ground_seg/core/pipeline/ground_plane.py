@@ -258,7 +258,8 @@ def gain(x: Values, y: Values, z: Values, inverse: Values, plane: Plane) -> Valu
     """Score of a point; of whole numbers, whose sum is exact in any order."""
     height, slope_x, slope_y = plane
     d = (z - (slope_x * x + slope_y * y - height)) * inverse
-    support = np.maximum(RESOLUTION * (1.0 - d * d), 0.0)
+    support = RESOLUTION * (1.0 - d * d)
+    support = choose(support > 0.0, support, 0.0)
     return np.floor(choose(d < -CLEARLY_BELOW, -PENALTY * RESOLUTION, support))
 
 
@@ -288,7 +289,8 @@ def tukey_weight(x: Values, y: Values, z: Values, inverse: Values, plane: Plane)
     """Weight of a point by its distance from a plane."""
     height, slope_x, slope_y = plane
     d = (z - (slope_x * x + slope_y * y - height)) * inverse
-    root = np.maximum(1.0 - 0.5 * d * d, 0.0) * inverse
+    root = 1.0 - 0.5 * d * d
+    root = choose(root > 0.0, root, 0.0) * inverse
     return root * root
 
 

@@ -20,7 +20,7 @@ from gp_ground_seg.core.frame import (
     Scan,
     Values,
 )
-from gp_ground_seg.core.jit import shared
+from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
 
 FINEST_UNITS = 2.0**40
@@ -110,7 +110,8 @@ def ground_band(
 @shared
 def band_margin(height: Values, band: Values, depth: float) -> Values:
     """Distance of a point to the nearer edge of the band of ground [m], negative outside it."""
-    return np.minimum(band - height, height + depth)
+    to_upper, to_lower = band - height, height + depth
+    return choose(to_upper < to_lower, to_upper, to_lower)
 
 
 @shared
@@ -120,7 +121,9 @@ def face_margin(
     """Return what `band_margin` is of a point in a vertical face, `over_lowest` its lowest [m]."""
     # With a limit below zero no return of the tile is ground; the margin stays a distance.
     limit = tolerance * (1.0 - 2.0 * is_occluded)
-    return np.minimum(margin, limit - np.maximum(height, over_lowest))
+    in_face = limit - choose(height > over_lowest, height, over_lowest)
+    # Without a surface `margin` is NaN, and stays so.
+    return choose(in_face < margin, in_face, margin)
 
 
 def _returns_about(
