@@ -151,10 +151,10 @@ def decide_faces(
         _add_parts(n_parts, 2 * k, buffers.sums, low)
         _add_parts(n_parts, 2 * k + 1, buffers.sums, high)
         top = max(low[_TOP], high[_TOP])
-        if top > label.obstacle_min_height and is_vertical(low, high, config.max_normal_z):
+        if top > label.obstacle_min_height and is_vertical(low, high, config):
             t = buffers.row_to_tile[k]
             faces.is_face[t] = True
-            faces.has_occluded_base[t] = is_base_occluded(low, high, config.max_foot_distance)
+            faces.has_occluded_base[t] = is_base_occluded(low, high, config)
 
 
 @jit()

@@ -14,7 +14,7 @@ import numpy as np
 
 from gp_ground_seg.core.frame import OUTSIDE, Faces, FloatArray, IntArray, Scan, Values
 from gp_ground_seg.core.jit import choose, shared
-from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.config import Config, FacesConfig
 
 MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
@@ -60,8 +60,8 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     is_foot = above[used] <= FOOT_SHARE * label.obstacle_min_height
     foot, rest = (_sums(chosen[part], row[part], len(tall)) for part in (is_foot, ~is_foot))
     result = Faces(*np.zeros((2, n_tiles), dtype=np.bool_))
-    result.is_face[tall] = is_vertical(foot, rest, faces.max_normal_z)
-    is_occluded = is_base_occluded(foot, rest, faces.max_foot_distance)
+    result.is_face[tall] = is_vertical(foot, rest, faces)
+    is_occluded = is_base_occluded(foot, rest, faces)
     result.has_occluded_base[tall] = is_occluded & result.is_face[tall]
     return result
 
@@ -74,7 +74,7 @@ def _sums(xyz: FloatArray, row: IntArray, n_rows: int) -> FloatArray:
 
 
 @shared
-def is_vertical(foot: FloatArray, rest: FloatArray, max_normal_z: float) -> Values:
+def is_vertical(foot: FloatArray, rest: FloatArray, faces: FacesConfig) -> Values:
     """Whether the returns of a tile form a vertical face.
 
     `foot` and `rest` are the sums over its lowest returns and over those above, (SUMS,), or
@@ -87,7 +87,7 @@ def is_vertical(foot: FloatArray, rest: FloatArray, max_normal_z: float) -> Valu
     xy = foot[7] + rest[7] - x * y / n
     xz = foot[8] + rest[8] - x * z / n
     yz = foot[9] + rest[9] - y * z / n
-    return (n >= MIN_RETURNS) & (normal_z(xx, yy, zz, xy, xz, yz) < max_normal_z)
+    return (n >= MIN_RETURNS) & (normal_z(xx, yy, zz, xy, xz, yz) < faces.max_normal_z)
 
 
 @shared
@@ -111,7 +111,7 @@ def normal_z(xx: Values, yy: Values, zz: Values, xy: Values, xz: Values, yz: Val
 
 
 @shared
-def is_base_occluded(foot: FloatArray, rest: FloatArray, max_foot_distance: float) -> Values:
+def is_base_occluded(foot: FloatArray, rest: FloatArray, faces: FacesConfig) -> Values:
     """Whether the lowest returns of a tile belong to its face, and are not ground before it.
 
     Ground would lie off the plane of the returns above. Sums are those of `is_vertical`. False
@@ -133,5 +133,5 @@ def is_base_occluded(foot: FloatArray, rest: FloatArray, max_foot_distance: floa
     along = (foot_xx - foot_yy) * (xx - yy) + 4.0 * foot_xy * xy
     aligned = choose(has_direction, along / choose(has_direction, size, 1.0), 0.0)
     square = 0.5 * (foot_xx + foot_yy - aligned)
-    is_in_plane = square <= n_foot * max_foot_distance * max_foot_distance
-    return is_in_plane & (rest[0] >= 2.0) & (max_foot_distance > 0.0)
+    limit = faces.max_foot_distance
+    return (square <= n_foot * limit * limit) & (rest[0] >= 2.0) & (limit > 0.0)
