@@ -1,8 +1,8 @@
 """Time per frame: alternation, ratios, record; the command `bench` on real files."""
 
+import dataclasses
 import itertools
 import json
-import math
 import sys
 
 import numpy as np
@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config
 from gp_ground_seg.cli.bench import RUN_LENGTH, bench_text, load_frames, read_record, runs
 from gp_ground_seg.core.errors import DataError, PointCloudError
-from gp_ground_seg.lab.scoring import benchmark
-from gp_ground_seg.lab.scoring.benchmark import FrameTime, bench_cases, bench_document, run_cases
-from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP
+from gp_ground_seg.lab.scoring.benchmark import bench_cases, bench_document, run_cases
+from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, KnownScan, MethodScore
 from gp_ground_seg.lab.scoring.report import describe_environment
 
 QUICK = ('--threads', '1', '--set', 'grid.n_segments=24')
@@ -28,34 +27,22 @@ NUMPY = Config().replace(
 )
 
 
-class Clock:
-    """Every reading is one tick later; the journal gets a ``t`` for each."""
-
-    def __init__(self, journal=None):
-        self.now = 0.0
-        self.journal = [] if journal is None else journal
-
-    def __call__(self):
-        self.now += 1.0
-        self.journal.append('t')
-        return self.now
-
-
 class Ruler(HeightRule):
-    """A baseline that takes seven ticks."""
+    """A baseline that takes seven ticks of the clock."""
 
     def __init__(self, clock):
-        super().__init__('b', -1.5, clock.journal)
+        super().__init__('b', -1.5)
         self._clock = clock
 
     def run(self, points):
         super().run(points)
-        self._clock.now += 7.0
+        for _ in range(7):
+            next(self._clock)
 
 
 def frames_of(*sequences, n_points=300):
     return [
-        benchmark.BenchFrame(name, str(k), with_intensity(hilly_scan(n_points, seed=k)))
+        KnownScan(name, str(k), with_intensity(hilly_scan(n_points, seed=k)), {})
         for name, n in sequences
         for k in range(n)
     ]
@@ -66,51 +53,33 @@ def with_intensity(points):
 
 
 def test_every_case_runs_on_every_frame_beside_its_own_baseline():
-    rulers = []
+    """In which order, and what is forgotten between sequences, test_evaluate.py says."""
+    rulers, clock = [], itertools.count()
 
     def make():
         rulers.append(Ruler(clock))
-        rulers[-1].journal = []
         return rulers[-1]
 
-    clock = Clock()
     frames = frames_of(('a', 3), ('b', 2))
     cases = bench_cases(NUMPY, [1, 2], with_numpy=True)
     assert list(cases) == [
         'theta fixed, 1 thread', 'theta fixed, 2 threads',
         'learning, 1 thread', 'learning, 2 threads', 'learning, numpy',
     ]  # fmt: skip
-    measured = run_cases(frames, cases, make, n_passes=2, clock=clock)
+    measured = run_cases(frames, cases, make, n_passes=2, clock=lambda: next(clock))
     assert list(measured) == list(cases)
-    for ruler, times in zip(rulers, measured.values(), strict=True):
-        assert [one.frame for one in times] == frames * 2
+    for ruler, (ours, baseline) in zip(rulers, measured.values(), strict=True):
+        for score in (ours, baseline):
+            assert [(s.sequence, s.index) for s in score.scans] == [
+                (frame.sequence, frame.index) for frame in frames * 2
+            ]
         # Its reading of the clock, and seven ticks within.
-        assert {one.baseline for one in times} == {8.0}
-        assert all(one.seconds >= 1.0 and one.ratio == one.seconds / 8.0 for one in times)
+        assert {scan.seconds for scan in baseline.scans} == {8}
+        assert {scan.seconds for scan in ours.scans} == {1}
         # Once to warm up, then on each frame; forgotten at each change of sequence.
         assert (ruler.journal.count('b'), ruler.journal.count('Rb')) == (1 + 10, 4)
-    modes = [times[-1].fit.mode for times in measured.values()]
+    modes = [ours.scans[-1].fit.mode for ours, _ in measured.values()]
     assert modes == ['fixed'] * 2 + ['every_frame'] * 3
-
-
-def test_half_of_the_time_the_baseline_goes_first():
-    journal = []
-    clock = Clock(journal)
-    cases = {'only': NUMPY.replace(**{'learning.mode': 'fixed'})}
-    run_cases(frames_of(('a', 4)), cases, lambda: Ruler(clock), clock=clock)
-    warm_up, letters = journal[:7], ''.join(journal[7:]).replace('Rb', '')
-    assert warm_up == ['t'] * 5 + ['b', 't']
-    baseline, ours = 'tbt', 'tt'
-    assert letters == 2 * (baseline + ours + ours + baseline)
-
-
-def test_a_new_sequence_forgets_the_one_before():
-    config = NUMPY.replace(**{'learning.mode': 'first_frame'})
-    frames = frames_of(('a', 2), ('b', 2))
-    measured = run_cases(frames, {'only': config}, clock=Clock())['only']
-    status = [one.fit.status == 'kept' for one in measured]
-    assert status == [False, True, False, True]
-    assert all(math.isnan(one.baseline) for one in measured)
 
 
 @given(st.integers(1, 500), st.integers(1, 100))
@@ -128,12 +97,15 @@ def test_runs_are_spread_and_hold_successive_frames(n_available, n_wanted):
 
 def recorded(ours, peers):
     frames = frames_of(('a', len(ours)), n_points=50)
-    fit = run_cases(frames[:1], {'only': NUMPY})['only'][0].fit
-    times = [
-        FrameTime(frame, a, {'grid': 0.25 * a, 'label': 0.5 * a}, b, fit)
-        for frame, a, b in zip(frames, ours, peers, strict=True)
-    ]
-    return bench_document({'only': times}, NUMPY, describe_environment(), PATCHWORKPP, 'frames')
+    ((score,),) = run_cases(frames, {'only': NUMPY}).values()
+    case = [
+        MethodScore('only', tuple(
+            dataclasses.replace(scan, seconds=a, stages={'grid': 0.25 * a, 'label': 0.5 * a})
+            for scan, a in zip(score.scans, seconds, strict=True)
+        ))
+        for seconds in (ours, peers)
+    ]  # fmt: skip
+    return bench_document({'only': case}, NUMPY, describe_environment(), PATCHWORKPP, 'frames')
 
 
 def test_ratios_pair_each_frame_with_its_baseline():

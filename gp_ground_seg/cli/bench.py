@@ -17,8 +17,8 @@ from gp_ground_seg.data.inputs import holds_bag, list_inputs
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import list_sequences
 from gp_ground_seg.lab.scoring import report
-from gp_ground_seg.lab.scoring.benchmark import BenchFrame, bench_cases, bench_document, run_cases
-from gp_ground_seg.lab.scoring.evaluate import TITLES
+from gp_ground_seg.lab.scoring.benchmark import bench_cases, bench_document, run_cases
+from gp_ground_seg.lab.scoring.evaluate import TITLES, KnownScan
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.scoring.report import Column, Row, Table
 
@@ -60,7 +60,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         options.FORCE,
     )  # fmt: skip
     options.add_config(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, workers=None, scheduler=None)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -98,13 +98,11 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     except MissingDependencyError as error:
         options.note(f'no ratios without the baseline: {error}')
         baseline = None
-    measured = run_cases(
-        frames_from_options(arguments, arguments.frames),
-        bench_cases(config, threads, with_numpy=arguments.numpy),
-        PatchworkppMethod if baseline else None,
-        arguments.passes,
-        progress=options.progress('bench'),
-    )
+    frames = frames_from_options(arguments, arguments.frames)
+    cases = bench_cases(config, threads, with_numpy=arguments.numpy)
+    make_baseline = PatchworkppMethod if baseline else None
+    with options.runner(arguments, 'bench') as runner:
+        measured = run_cases(frames, cases, make_baseline, arguments.passes, runner=runner)
     data = Path(arguments.data).resolve().name
     return bench_document(measured, config, environment, baseline, data)
 
@@ -120,7 +118,7 @@ def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
     return threads
 
 
-def frames_from_options(arguments: argparse.Namespace, n_frames: int) -> list[BenchFrame]:
+def frames_from_options(arguments: argparse.Namespace, n_frames: int) -> list[KnownScan]:
     """Read about `n_frames` frames of the options."""
     source = Path(arguments.data)
     if holds_bag(source):
@@ -130,7 +128,7 @@ def frames_from_options(arguments: argparse.Namespace, n_frames: int) -> list[Be
 
 def load_frames(
     source: Path, n_frames: int, topic: str | None = None, layout: ScanLayout = KITTI
-) -> list[BenchFrame]:
+) -> list[KnownScan]:
     """Read about `n_frames` frames of DATA; DataError if there is no point in any."""
     if topic is None and any(source.glob('sequences/*/velodyne')):
         folders = {name: source / 'sequences' / name for name in list_sequences(source)}
@@ -148,7 +146,7 @@ def load_frames(
                 # With full intensity Patchwork++ drops no point as noise.
                 points = np.ones((len(xyz), 4), dtype=np.float32)
                 points[:, : xyz.shape[1]] = xyz
-                frames.append(BenchFrame(wanted[k], item.name, points))
+                frames.append(KnownScan(wanted[k], item.name, points, {}))
     if not any(len(frame.points) for frame in frames):
         raise DataError(f'{source}: no point in any of {len(frames)} frames')
     return frames

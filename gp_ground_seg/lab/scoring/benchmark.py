@@ -2,49 +2,27 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.result import FitReport
-from gp_ground_seg.lab.scale.cluster import Progress
-from gp_ground_seg.lab.scoring.evaluate import Method, OurMethod
+from gp_ground_seg.lab.scale.cluster import HERE, Runner
+from gp_ground_seg.lab.scoring.evaluate import (
+    KnownScan,
+    Method,
+    MethodScore,
+    OurMethod,
+    score_methods,
+)
 from gp_ground_seg.lab.scoring.report import changed_parameters
 
 MODES = {'fixed': 'theta fixed', 'every_frame': 'learning'}
 """Values of ``learning.mode`` that are timed, and their titles."""
-
-
-@dataclass(frozen=True)
-class BenchFrame:
-    """A cloud in memory, (N, 4) x, y, z [m] and intensity."""
-
-    sequence: str
-    index: str
-    points: npt.NDArray[np.float32]
-
-
-class FrameTime(NamedTuple):
-    """Seconds of one frame, by stage, and of the baseline on it (NaN without one)."""
-
-    frame: BenchFrame
-    seconds: float
-    stages: dict[str, float]
-    baseline: float
-    fit: FitReport
-
-    @property
-    def ratio(self) -> float:
-        """Time over that of the baseline."""
-        return self.seconds / self.baseline
 
 
 def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> dict[str, Config]:
@@ -63,57 +41,37 @@ def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> 
 
 
 def run_cases(
-    frames: Sequence[BenchFrame],
+    scans: Sequence[KnownScan],
     cases: Mapping[str, Config],
     make_baseline: Callable[[], Method] | None = None,
     n_passes: int = 1,
     clock: Callable[[], float] = time.perf_counter,
-    progress: Progress = iter,
-) -> dict[str, list[FrameTime]]:
-    """Time every case on every frame, each time beside the baseline on that frame.
+    runner: Runner = HERE,
+) -> dict[str, list[MethodScore]]:
+    """Time every case on every scan, each time beside a baseline of its own on that scan.
 
     The speed of a machine drifts over seconds; a case and its baseline follow one another, so
-    that their ratio does not. Which of the two goes first, and which case is the first, changes
-    from frame to frame. Each runs once without counting. `frames` are grouped by sequence;
-    `make_baseline` makes the baseline of each case.
+    that their ratio does not. Which of the two goes first changes from scan to scan, as
+    `score_methods` says. `scans` are grouped by sequence. Returns the score of each case, and
+    that of its baseline if there is one.
     """
-    names = list(cases)
+    methods: list[Method] = []
     with ExitStack() as stack:
-        pairs: list[tuple[OurMethod, Method | None]] = []
-        for config in cases.values():
-            ours = stack.enter_context(closing(OurMethod(config)))
-            baseline = make_baseline() if make_baseline else None
-            pairs.append((ours, baseline))
-            for method in (ours, ours, baseline):
-                _time(method, frames[0], clock)
-        times: dict[str, list[FrameTime]] = {name: [] for name in names}
-        sequence = None
-        for k, frame in enumerate(progress([*frames] * n_passes)):
-            for j in range(k, k + len(names)):
-                ours, baseline = pairs[j % len(names)]
-                order = (baseline, ours) if k // len(names) % 2 == 0 else (ours, baseline)
-                for method in order:
-                    if method is not None and frame.sequence != sequence:
-                        method.reset()
-                seconds = {method: _time(method, frame, clock) for method in order}
-                found = FrameTime(
-                    frame, seconds[ours], ours.stages, seconds[baseline], ours.last.fit
-                )
-                times[names[j % len(names)]].append(found)
-            sequence = frame.sequence
-    return times
+        for name, config in cases.items():
+            methods.append(stack.enter_context(closing(OurMethod(config, name))))
+            methods += [make_baseline()] if make_baseline else []
+        items = [*scans] * n_passes
+        scores = score_methods(items, methods, _as_it_is, clock=clock, runner=runner)
+    n = len(methods) // len(cases)
+    return {name: scores[n * k : n * (k + 1)] for k, name in enumerate(cases)}
 
 
-def _time(method: Method | None, frame: BenchFrame, clock: Callable[[], float]) -> float:
-    if method is None:
-        return math.nan
-    start = clock()
-    method.run(frame.points)
-    return clock() - start
+def _as_it_is(scan: KnownScan) -> KnownScan:
+    return scan
 
 
 def bench_document(
-    cases: Mapping[str, Sequence[FrameTime]],
+    cases: Mapping[str, Sequence[MethodScore]],
     config: Config,
     environment: dict[str, Any],
     baseline: str | None,
@@ -121,52 +79,55 @@ def bench_document(
 ) -> dict[str, Any]:
     """Everything of a benchmark in JSON's types; times in ms.
 
-    Ratios are to the baseline on the same frame; p99 is that of our times over the median of the
-    baseline.
+    `cases` are as from `run_cases`. Ratios are to the baseline on the same scan; p99 is that of
+    our times over the median of the baseline.
     """
-    times = next(iter(cases.values()))
-    points = [len(entry.frame.points) for entry in times]
-    peer = [entry.baseline for case in cases.values() for entry in case]
+    (ours, *_), *_ = cases.values()
+    points = [scan.n_points for scan in ours.scans]
+    peer = [scan.seconds for _, *others in cases.values() for one in others for scan in one.scans]
     return {
         'data': data,
-        'n_frames': len({(entry.frame.sequence, entry.frame.index) for entry in times}),
+        'n_frames': len({(scan.sequence, scan.index) for scan in ours.scans}),
         'n_points': {'median': statistics.median(points), 'max': max(points)},
         'config_changes': changed_parameters(config),
         'environment': environment,
         'baseline': baseline,
-        'baseline_ms': _spread(peer) if baseline else None,
-        'cases': [_case(name, case, baseline is not None) for name, case in cases.items()],
+        'baseline_ms': _spread(peer) if peer else None,
+        'cases': [_case(name, *case) for name, case in cases.items()],
     }
 
 
-def _case(name: str, times: Sequence[FrameTime], with_baseline: bool) -> dict[str, Any]:
+def _case(name: str, ours: MethodScore, baseline: MethodScore | None = None) -> dict[str, Any]:
+    scans, fit = ours.scans, ours.scans[-1].fit
+    assert fit is not None
     # Where a mode skips a stage in some frames it is still timed: close to zero.
-    stages = {stage: [entry.stages[stage] for entry in times] for stage in times[0].stages}
-    stages['rest'] = [entry.seconds - sum(entry.stages.values()) for entry in times]
-    seconds, last = [entry.seconds for entry in times], times[-1].fit
+    stages = {stage: [scan.stages[stage] for scan in scans] for stage in scans[0].stages}
+    stages['rest'] = [scan.seconds - sum(scan.stages.values()) for scan in scans]
+    seconds = [scan.seconds for scan in scans]
+    peer = [scan.seconds for scan in baseline.scans] if baseline else []
     result = {
         'name': name,
-        'mode': last.mode,
-        'backend': last.backend,
-        'n_threads': last.n_threads,
+        'mode': fit.mode,
+        'backend': fit.backend,
+        'n_threads': fit.n_threads,
         'ms': _spread(seconds),
         'stages_ms': {stage: _ms(statistics.median(values)) for stage, values in stages.items()},
         'frames': [
             {
-                'sequence': entry.frame.sequence,
-                'index': entry.frame.index,
-                'n_points': len(entry.frame.points),
-                'ms': _ms(entry.seconds),
-                'baseline_ms': _ms(entry.baseline) if with_baseline else None,
+                'sequence': scan.sequence,
+                'index': scan.index,
+                'n_points': scan.n_points,
+                'ms': _ms(scan.seconds),
+                'baseline_ms': _ms(peer[k]) if peer else None,
             }
-            for entry in times
+            for k, scan in enumerate(scans)
         ],
     }
-    if with_baseline:
-        median = statistics.median(entry.baseline for entry in times)
+    if peer:
+        ratios = [a / b for a, b in zip(seconds, peer, strict=True)]
         result['ratio'] = {
-            'median': round(statistics.median(entry.ratio for entry in times), 4),
-            'p99': round(float(np.percentile(seconds, 99)) / median, 4),
+            'median': round(statistics.median(ratios), 4),
+            'p99': round(float(np.percentile(seconds, 99)) / statistics.median(peer), 4),
         }
     return result
 

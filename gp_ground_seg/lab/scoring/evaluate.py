@@ -339,10 +339,10 @@ def _score_block(
                 method.reset()
             start = clock()
             _run(method, scan)
-            seconds[method.name] = clock() - start
+            seconds[method] = clock() - start
         results = [method.result() for method in methods]
         for method, result, found in zip(methods, results, scores, strict=True):
-            found.append(_score(scan, result, seconds[method.name], results[0].label))
+            found.append(_score(scan, result, seconds[method], results[0].label))
     return scores
 
 

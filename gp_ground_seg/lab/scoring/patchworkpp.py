@@ -82,7 +82,8 @@ class PatchworkppMethod:
         if not len(centre):
             return MethodResult(label, np.full(len(label), np.nan))
         xy = self._points[:, :2].astype(np.float64)
-        _, nearest = KDTree(centre[:, :2]).query(xy)
+        xy[~np.isfinite(xy).all(axis=1)] = np.nan
+        _, nearest = KDTree(centre[:, :2]).query(np.nan_to_num(xy))
         centre, normal = centre[nearest], normal[nearest]
         fall = np.sum((xy - centre[:, :2]) * normal[:, :2], axis=1) / normal[:, 2]
         return MethodResult(label, np.asarray(centre[:, 2] - fall + self._origin[2]))
