@@ -2,7 +2,8 @@
 #   docker build -t gp_ground_seg .
 #   docker run --rm --net host --ipc host gp_ground_seg ros2 launch gp_ground_seg \
 #     ground_segmentation.launch.py topic:=/velodyne_points
-FROM ros:jazzy-ros-base
+# By digest: a tag can come to mean another image.
+FROM ros:jazzy-ros-base@sha256:c3706ef0a0aa45413c07803cf433602f543b22e45b4855f6fca955c2d8ecc4e8
 
 # A name of LLVM. Not that of the machine that builds, so that any x86 processor since 2013 loads
 # the code; on ARM, or older ones: --build-arg CPU_NAME=generic.
@@ -17,9 +18,11 @@ RUN apt-get update && rosdep update --rosdistro jazzy \
     && apt-get install -y --no-install-recommends python3-venv \
     && rosdep install --from-paths src --ignore-src -y --dependency-types exec \
     && source /opt/ros/jazzy/setup.bash && src/gp_ground_seg/scripts/setup_workspace.sh \
-    && rm -rf /var/lib/apt/lists/* build log
+    && chown -R 1000:1000 "$NUMBA_CACHE_DIR" && rm -rf /var/lib/apt/lists/* build log
 
 RUN printf '#!/bin/bash\nsource /opt/gp_ground_seg/install/setup.bash\nexec "$@"\n' > /entrypoint.sh \
     && chmod 755 /entrypoint.sh
+# Ubuntu's first user, as is mostly that of the host: Fast DDS shares memory within one user.
+USER 1000:1000
 ENTRYPOINT ["/entrypoint.sh"]
 CMD ["ros2", "launch", "gp_ground_seg", "ground_segmentation.launch.py"]

@@ -122,6 +122,19 @@ def test_no_path_of_one_machine_and_no_data_is_tracked():
     assert not [name for name in files if name.endswith(('.bin', '.label', '.mcap', '.db3'))]
 
 
+def test_what_others_can_change_is_named_by_its_digest():
+    """Tags of actions and images are moved; the container does not run as root."""
+    workflow = (REPOSITORY / '.github/workflows/test.yml').read_text(encoding='utf-8')
+    actions = re.findall(r'uses: (\S+)', workflow)
+    assert actions and all(re.search('@[0-9a-f]{40}$', action) for action in actions)
+    dockerfile = (REPOSITORY / 'Dockerfile').read_text(encoding='utf-8')
+    (image,) = re.findall('^FROM (.*)$', dockerfile, re.MULTILINE)
+    assert re.search('@sha256:[0-9a-f]{64}$', image)
+    devcontainer = (REPOSITORY / '.devcontainer/devcontainer.json').read_text(encoding='utf-8')
+    assert image in workflow and image in devcontainer
+    assert dockerfile.index('USER 1000') < dockerfile.index('ENTRYPOINT')
+
+
 HINTS = ('require', 'install_hint')
 
 

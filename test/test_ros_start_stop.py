@@ -105,12 +105,12 @@ def test_words_that_nobody_takes_are_refused(capsys, words, complaint):
     assert complaint in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('folder', [None, '/proc/nowhere'])
-def test_logs_that_have_no_folder(folder, monkeypatch):
+@pytest.mark.parametrize('given', [{}, {'HOME': '/proc'}, {'ROS_LOG_DIR': '/proc'}])
+def test_logs_that_have_no_folder(given, monkeypatch):
     for name in ('HOME', 'ROS_HOME', 'ROS_LOG_DIR'):
         monkeypatch.delenv(name, raising=False)
-    if folder:
-        monkeypatch.setenv('HOME', folder)
+    for name, folder in given.items():
+        monkeypatch.setenv(name, folder)
     done = run_python(*MODULE)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()

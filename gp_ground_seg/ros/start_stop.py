@@ -73,7 +73,8 @@ def start_errors() -> Iterator[None]:
             raise
         text = ' '.join(str(error).split())
         kind = type(error).__name__
-        text += f': {LOG_FOLDER}' if text.startswith('failed to initialize logging') else ''
+        is_of_log = text.startswith(('failed to initialize logging', 'Failed opening file'))
+        text += f': {LOG_FOLDER}' if is_of_log else ''
         raise ConfigError(text if kind == 'RCLError' else f'{kind}: {text}') from error
 
 
