@@ -23,6 +23,7 @@ from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointClou
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.gp.evidence import STEP
+from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.jit import HAVE_NUMBA, JIT_ENABLED
 
 # Without compilation the twins take a microsecond for each cell and point.
@@ -157,6 +158,28 @@ def test_layouts_of_the_same_points_give_the_same(backend, scan):
     same(double, segmenter.segment(points.tolist()))
 
 
+@pytest.mark.parametrize('tilt', [None, (0.05, -0.04)])
+def test_callers_whose_numpy_raises_get_the_same(backend, scan, tilt):
+    """``np.seterr(all='raise')`` is the caller's; small numbers become 0 in most frames."""
+    scan[::7] = np.nan
+    scan[1], scan[2] = (1e300, -1e300, 1e300), (0.0, 1e-300, -1.73)
+    segmenter = GroundSegmenter(CONFIG, backend=backend)
+    expected = segmenter.segment(scan, tilt)
+    model = GroundModel.of(expected)
+    places = np.concatenate([scan[:100, :2], [[30.0, 5e-324]]]).T
+    heights, knots = model.at(*places), model.knot_points(1.0)
+    with np.errstate(all='raise'):
+        assert segmenter.estimate_pose(scan[:1000]).height > 0.0
+        result = segmenter.segment(scan, tilt)
+        same(result, expected)
+        assert result.fit.n_inliers == expected.fit.n_inliers
+        model = GroundModel.of(result)
+        np.testing.assert_array_equal(model.at(*places), heights)
+        np.testing.assert_array_equal(model.knot_points(1.0), knots)
+        np.testing.assert_array_equal(result.pose.level(scan[8:]), expected.pose.level(scan[8:]))
+        result.surface.at(result.grid)
+
+
 @pytest.mark.parametrize(
     ('name', 'values', 'count'),
     [
@@ -173,6 +196,13 @@ def test_tilt_and_origin_are_finite_numbers(name, values, count, scan):
         SEGMENTER.segment(scan, **{name: values})
     taken = np.zeros(count, np.float32)
     same(SEGMENTER.segment(scan, **{name: taken}), SEGMENTER.segment(scan, **{name: [0] * count}))
+
+
+def test_results_are_equal_to_themselves_and_can_be_copied(scan):
+    for result in (SEGMENTER.segment(scan), GroundModel.of(SEGMENTER.segment(scan))):
+        twin = pickle.loads(pickle.dumps(copy.deepcopy(result)))
+        assert result == result and result != twin
+        assert [result, twin].index(twin) == len({result, twin, result}) - 1 == 1
 
 
 @pytest.mark.parametrize('attempt', [pickle.dumps, copy.copy, copy.deepcopy])

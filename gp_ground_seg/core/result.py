@@ -20,6 +20,7 @@ from gp_ground_seg.core.frame import (
     PolarGrid,
     PseudoInputs,
     at_points,
+    usual_errors,
 )
 from gp_ground_seg.core.gp.learning import THETA_NAMES, Learned
 from gp_ground_seg.core.pipeline.labels import ground_probability
@@ -58,7 +59,8 @@ class cached_property(Generic[_Value]):  # noqa: N801 - a decorator
         if instance is None:
             return self
         # The next access finds the value in the object and does not come here.
-        value = instance.__dict__[self._name] = self._compute(instance)
+        with usual_errors():
+            value = instance.__dict__[self._name] = self._compute(instance)
         return value
 
 
@@ -144,9 +146,11 @@ class FitReport:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Segmentation:
     """A segmented scan; per-point arrays are in input order.
+
+    Two are equal only if they are the same object: compare their arrays.
 
     Attributes
     ----------
