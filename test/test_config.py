@@ -1,5 +1,6 @@
 """The contract of the configuration: what is accepted, what is refused, and how it is said."""
 
+import contextlib
 import copy
 import dataclasses
 import math
@@ -13,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg import Config, ConfigError, GroundSegError
+from gp_ground_seg.cli.options import parse_setting
 from gp_ground_seg.core.parameters import number_tuples
 from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
 
@@ -152,7 +154,7 @@ def test_unknown_names_come_with_the_nearest(name, hint):
         ({'grid.r_max': 500.0, 'faces.cell_size': 0.05}, ['faces.cell_size', '38.4 GB', '2 GB']),
         ({'runtime.n_threads': 64, 'faces.cell_size': 0.1}, ['runtime.n_threads = 64', '2 GB']),
         ({'grid.r_min': np.nextafter(50.0, 0.0), 'grid.r_max': 50.0}, ['first bin', '0.0001 m']),
-        ({'grid.n_bins': 1024, 'grid.bin_growth': 4.0}, ['grid.bin_growth = 4', '1.1e-10 m']),
+        ({'grid.n_bins': 1024, 'grid.bin_growth': 3.0}, ['grid.bin_growth = 3', '1.1e-07 m']),
     ],
 )
 def test_what_cannot_run_is_refused(changes, words):
@@ -236,7 +238,15 @@ def test_numbers_are_read_as_ros_reads_them(from_text, number):
         ('label: {ground_tolerance: [0.1]}', 'must be a number in'),
         ('runtime: {n_threads: 2.0}', 'must be an integer in [0, 64]'),
         ('runtime: {n_threads: yes}', 'must be an integer in [0, 64]'),
-        ('grid: {n_bins: ' + '1' * 100_000 + '}', 'not valid YAML'),
+        ('grid: {n_bins: ' + '1' * 100_000 + '}', 'line 1: a number of 100000 digits'),
+        ('grid: {n_bins: 0x' + 'f' * 200_000 + '}', 'line 1: a number of 200002 digits'),
+        ('grid: {n_bins: !!int x}', 'not valid YAML: invalid literal'),
+        ('grid: {n_bins: !!bool x}', 'not valid YAML'),
+        ('grid: {n_bins: !!timestamp x}', 'not valid YAML'),
+        ('grid: {n_bins: 2011-02-03}', 'grid.n_bins = datetime.date(2011, 2, 3): must be an int'),
+        ('grid: ' + '[' * 3000, 'line 1: more than 20 levels'),
+        ('\n'.join(f'a{k}: 1' for k in range(20_000)), 'more than 500 values'),
+        ('/**: {ros__parameters: {}, a: 1}', 'values beside ros__parameters, which ROS refuses'),
         ('grid: &a {n_bins: 9}\nlabel: *a', 'line 2: aliases (*name) are not accepted'),
         ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
         ('label:\n  # ground_tolerance: 0.1\n', "'label' is a group of parameters"),
@@ -284,6 +294,8 @@ def test_any_text_is_read_or_refused(tmp_path_factory, text):
     path = tmp_path_factory.mktemp('yaml') / 'a.yaml'
     path.write_text(text, encoding='utf-8', errors='replace')
     said = f'{path}: '
+    with contextlib.suppress(ConfigError):
+        parse_setting(f'grid.n_bins={text}')
     try:
         assert Config.from_yaml(path) == Config()
     except ConfigError as error:

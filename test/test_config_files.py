@@ -171,7 +171,7 @@ def test_check_says_everything_at_once(tmp_path, capsys):
     assert 'label.ground_tolerance = 9.0: must be a number in [0.001, 5] m' in lines[1]
     assert "grid.n_segments = 'many'" in lines[2]
     n = len(parameter_specs())
-    assert out.startswith(f'{good}: good for --config; ')
+    assert out.startswith(f'{good}: good for --config, but not for the node, which needs the form')
     assert out.endswith(f'; 2 of {n} parameters given, 2 differ from the defaults\n')
     for text, problem in (
         ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),

@@ -152,7 +152,7 @@ def test_an_interrupt_is_130_whatever_compiled_code_makes_of_it(run, monkeypatch
 @pytest.mark.parametrize(
     ('text', 'words', 'is_taken'),
     [
-        ('label: {ground_tolerance: 0.2}', 'good for --config; for the node: ', True),
+        ('label: {ground_tolerance: 0.2}', 'good for --config, but not for the node', True),
         ('/**: {ros__parameters: {runtime: {n_threads: 1}}}', 'good; 1 of ', True),
         ('ground_segmentation_node: {ros__parameters: {}}', 'good; 0 of ', True),
         ('/other: {ros__parameters: {}}', 'good for a node named /other only; 0 of', False),

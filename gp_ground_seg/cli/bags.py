@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import CloudMessage, cloud_from_columns, encode_cloud
 from gp_ground_seg.data.semantic_kitti import Frame, list_frames, read_labels, read_points
@@ -128,7 +128,8 @@ def run_convert(arguments: argparse.Namespace) -> int:
     n_labelled = sum(frame.labels_path is not None for frame in frames)
     n_frames, n_all = options.count(len(frames), 'frame'), options.count(n_points, 'point')
     seconds = 1e-9 * (stamps[-1] - stamps[0])
-    print(f'{n_frames} ({n_labelled} with labels), {n_all}, {seconds:.1f} s, written to {target}')
+    facts = f'{n_frames} ({n_labelled} with labels), {n_all}, {seconds:.1f} s'
+    print(f'{facts}, written to {shown(target)}')
     return 0
 
 

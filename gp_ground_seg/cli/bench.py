@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import DataError, MissingDependencyError
+from gp_ground_seg.core.errors import DataError, MissingDependencyError, shown
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.inputs import holds_bag, list_inputs
@@ -82,7 +82,7 @@ def read_record(path: str | Path) -> dict[str, Any]:
     """Read what ``--json`` wrote; DataError if it cannot be read or is something else."""
     try:
         document = json.loads(Path(path).read_text(encoding='utf-8'))
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise DataError(f'{path}: cannot be read: {error}') from error
     if not isinstance(document, dict) or not {'cases', 'baseline'} <= set(document):
         raise DataError(f'{path}: not a record of `gp-ground-seg bench --json`')
@@ -146,7 +146,8 @@ def load_frames(
                 # With full intensity Patchwork++ drops no point as noise.
                 points = np.ones((len(xyz), 4), dtype=np.float32)
                 points[:, : xyz.shape[1]] = xyz
-                frames.append(KnownScan(wanted[k], item.name, points, {}))
+                names = shown(wanted[k]), shown(item.name)
+                frames.append(KnownScan(*names, points, {}))
     if not any(len(frame.points) for frame in frames):
         raise DataError(f'{source}: no point in any of {len(frames)} frames')
     return frames

@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from gp_ground_seg.cli import options
+from gp_ground_seg.core.errors import shown
 from gp_ground_seg.core.parameters import export
 from gp_ground_seg.core.parameters.config import Config, parameter_specs
 from gp_ground_seg.core.parameters.presets import find_preset
@@ -71,17 +72,19 @@ def run_check(arguments: argparse.Namespace) -> int:
     for path in arguments.files:
         if problems := export.file_problems(path):
             code = 2
-            print(*(f'{path}: {problem}' for problem in problems), sep='\n', file=sys.stderr)
+            lines = (shown(f'{path}: {problem}') for problem in problems)
+            print(*lines, sep='\n', file=sys.stderr)
             continue
         file = read_parameters(path)
         n_changed = len(export.differences(Config(), Config().replace(**file.values)))
         given = f'{len(file.values)} of {len(parameter_specs())} parameters given'
         use = ''
         if not file.node:
-            use = ' for --config; for the node: gp-ground-seg config dump --config FILE > ros.yaml'
+            use = ' for --config, but not for the node, which needs the form of ROS: '
+            use += 'gp-ground-seg config dump --config FILE > ros.yaml'
         elif not file.is_ours:
-            use = f' for a node named {file.node} only'
-        print(f'{path}: good{use}; {given}, {n_changed} differ from the defaults')
+            use = f' for a node named {shown(file.node)} only'
+        print(f'{shown(path)}: good{use}; {given}, {n_changed} differ from the defaults')
     return code
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.cloud_output import FORMATS
 from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
@@ -113,13 +113,13 @@ def print_summary(found: Outcome, target: AnyPath, n_workers: int = 0) -> None:
     beside = f' in each of {options.count(n_workers, "worker")}' if n_workers else ''
     print(
         f'{options.count(len(seconds), "frame")}, {options.count(found.n_points, "point")}, '
-        f'{share}, {pace}, segmentation only){beside}, written to {target}'
+        f'{share}, {pace}, segmentation only){beside}, written to {shown(target)}'
     )
     if seconds:
         print(_pose_summary(found))
     if found.contradictions:
         n_frames = options.count(len(found.contradictions), 'frame')
-        print(f'{found.contradictions[0]} ({n_frames}: docs/pose.md)')
+        print(f'{shown(found.contradictions[0])} ({n_frames}: docs/pose.md)')
 
 
 def _pose_summary(found: Outcome) -> str:

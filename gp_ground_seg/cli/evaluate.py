@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import ConfigError, DataError
+from gp_ground_seg.core.errors import ConfigError, DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.files import as_path
 from gp_ground_seg.data.inputs import Input, list_inputs
@@ -98,7 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
         changed: list[str] = []
         if arguments.against is not None:
             other, changed = _other_config(arguments, config)
-            method = OurMethod(other, Path(arguments.against).name)
+            method = OurMethod(other, shown(Path(arguments.against).name))
             chosen.append(stack.enter_context(closing(method)))
         elif arguments.peer is not None:
             chosen.append(PatchworkppMethod.of_sensor(config.sensor))
@@ -114,12 +114,12 @@ def run(arguments: argparse.Namespace) -> int:
             results.write_rows(report.rows, parts['per_frame'])
     print(f'{_headline(scores)}\n')
     if changed:
-        print(f'{arguments.against} -> given:', *changed, '', sep='\n')
+        print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
     lines = [results.parameters_line(report.facts['config_changes'])]
     lines.append(results.machine_line(environment, report.fit))
     print(results.written(report.tables.values(), lines, markdown=arguments.markdown))
     for name in parts:
-        print(f'{files[name]}: {getattr(arguments, name)}')
+        print(f'{files[name]}: {shown(getattr(arguments, name))}')
     return 0
 
 
@@ -151,7 +151,7 @@ def _items(
 
 def _load_cloud(sequence: str, item: Input) -> KnownScan:
     """Read a cloud without labels."""
-    return KnownScan(sequence, item.name, item.read().xyz, {})
+    return KnownScan(shown(sequence), shown(item.name), item.read().xyz, {})
 
 
 def _headline(scores: Sequence[MethodScore]) -> str:

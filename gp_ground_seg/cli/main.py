@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import logging
 import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from typing import NoReturn
 
 from gp_ground_seg import __version__
-from gp_ground_seg.core.errors import GroundSegError
+from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
 
 ROS_ARGS = '--ros-args'
 
@@ -66,9 +68,14 @@ def _grouped_commands() -> str:
     return '\n'.join(lines)
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        super().error(shown(message))
+
+
 def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     """Return the parser of one of `COMMANDS`; without one, of all their names."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog='gp-ground-seg',
         description='Split LiDAR scans into ground and obstacles with Gaussian processes.',
         epilog=EXAMPLES,
@@ -157,6 +164,36 @@ def _interruptible() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
+def _prepare_streams() -> None:
+    """Open the null device for standard streams that are closed; escape what they cannot hold.
+
+    `print` to a closed stderr would go to stdout, and the next file opened would be the stream.
+    """
+    for name in ('stdin', 'stdout', 'stderr'):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, 'r' if name == 'stdin' else 'w'))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors='backslashreplace')
+
+
+def _abandon_output() -> None:
+    """Send the rest of standard output nowhere, so that Python does not fail on it at its end."""
+    with suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _run(words: list[str]) -> int:
+    """Run the command; raise what it raises, or what standard output does at its end."""
+    try:
+        with _interruptible():
+            arguments = _parse(words)
+            with _notes(arguments):
+                code: int = arguments.run(arguments)
+    finally:
+        sys.stdout.flush()  # also behind --help, which ends by SystemExit
+    return code
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command of `argv`, by default of the process, and return its exit code.
 
@@ -165,23 +202,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     if '_ARGCOMPLETE' in os.environ:
         _complete()
+    _prepare_streams()
+    code = 2
     try:
-        with _interruptible():
-            arguments = _parse(words)
-            with _notes(arguments):
-                code: int = arguments.run(arguments)
-            sys.stdout.flush()
-        return code
-    except GroundSegError as error:
-        print(f'gp-ground-seg: error: {error}', file=sys.stderr)
-        return 2
-    except MemoryError:
-        print('gp-ground-seg: error: not enough memory for this input', file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print('gp-ground-seg: interrupted', file=sys.stderr)
-        return 130
+        return _run(words)
     except BrokenPipeError:
         # The reader of our output went away (as in `| head`); nothing is wrong here.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _abandon_output()
         return 0
+    except GroundSegError as error:
+        line = f'error: {error}'
+    except OSError as error:
+        _abandon_output()
+        line = f'error: {error.filename or "input or output"}: {reason_of(error)}'
+    except UnicodeError as error:
+        line = f'error: {in_one_line(error)}: a name or text is not UTF-8'
+    except MemoryError:
+        line = 'error: not enough memory for this input'
+    except KeyboardInterrupt:
+        line, code = 'interrupted', 130
+    except RuntimeError as error:
+        # Of `Path.resolve`, before Python 3.13.
+        if not str(error).startswith('Symlink loop'):
+            raise
+        line = f'error: {error}'
+    with suppress(OSError):  # standard error may be full
+        print(f'gp-ground-seg: {shown(line)}', file=sys.stderr)
+    return code

@@ -7,16 +7,15 @@ import logging
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import yaml
 from tqdm import tqdm
 
 from gp_ground_seg.core import log
-from gp_ground_seg.core.errors import ConfigError, DataError
+from gp_ground_seg.core.errors import ConfigError, DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import differences, yaml_scalar
 from gp_ground_seg.core.parameters.presets import PRESETS, find_preset
@@ -200,13 +199,14 @@ def parse_setting(setting: str) -> tuple[str, Any]:
         raise ConfigError(f'--set {setting}: must be NAME=VALUE')
     try:
         return name.strip(), load_yaml(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f'--set {setting}: {text!r} is not a value') from error
+    except ConfigError as error:
+        raise ConfigError(f'--set {name}: {error}') from error
 
 
 def note(message: str) -> None:
     """Print a line on standard error that is neither result nor error."""
-    print(f'gp-ground-seg: note: {message}', file=sys.stderr)
+    with suppress(OSError):  # standard error may be full
+        print(f'gp-ground-seg: note: {shown(message)}', file=sys.stderr)
 
 
 def library_notes(level: int = logging.INFO) -> AbstractContextManager[None]:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
@@ -118,8 +118,8 @@ def _declare_above(parser: argparse.ArgumentParser) -> None:
 
 def _declare_segment(parser: argparse.ArgumentParser) -> None:
     metres, degrees = {'metavar': 'R', 'type': float}, {'metavar': 'DEG', 'type': float}
-    shown = ('--max-range', 'range shown [m] (default: all candidates)', metres)
-    options.add(parser, INPUT, LABELS, shown)
+    extent = ('--max-range', 'range shown [m] (default: all candidates)', metres)
+    options.add(parser, INPUT, LABELS, extent)
     options.add(
         parser.add_mutually_exclusive_group(required=True),
         ('--segment', 'number of the segment', INTEGER),
@@ -150,7 +150,7 @@ def run(arguments: argparse.Namespace) -> int:
         segment, reach = _segment_number(arguments, config), arguments.max_range
         plot_segment(result, config, points, segment, path, truth, title, reach)
         said = _segment_counts(result, segment)
-    print(f'{said}, written to {path}')
+    print(f'{said}, written to {shown(path)}')
     return 0
 
 
@@ -171,7 +171,7 @@ def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]
     scan = options.list_clouds(arguments)[arguments.frame]
     folder = Path(str(scan.path)).resolve().parent
     title = f'{folder.parent.name}/{scan.name}' if folder.name == 'velodyne' else scan.title
-    return scan.read().xyz, title
+    return scan.read().xyz, shown(title)
 
 
 def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]:

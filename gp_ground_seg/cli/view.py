@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import DataError, PointCloudError
+from gp_ground_seg.core.errors import DataError, PointCloudError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import to_yaml
 from gp_ground_seg.core.parameters.schema import NODE_NAME
@@ -110,12 +110,12 @@ def run_view(arguments: argparse.Namespace) -> int:
             write_page(target, scene, view.title, config, arguments.force)
         elif arguments.save:
             with staged_file(target, force=arguments.force) as part:
-                recording = Recording(inputs.path.name)
+                recording = Recording(shown(inputs.path.name))
                 recording.stream.save(part)
                 _record(recording, inputs, arguments, segmenter)
         elif arguments.web:
             with web_viewer(arguments.port) as (server, address, sink):
-                recording = Recording(inputs.path.name)
+                recording = Recording(shown(inputs.path.name))
                 recording.stream.connect_grpc(sink)
                 print(f'{address}\nCtrl-C ends it.', flush=True)
                 _record(recording, inputs, arguments, segmenter)
@@ -124,11 +124,11 @@ def run_view(arguments: argparse.Namespace) -> int:
         elif sys.platform == 'linux' and not {'DISPLAY', 'WAYLAND_DISPLAY'} & os.environ.keys():
             raise DataError('no display here: --web, --save FILE and --html FILE need none')
         else:
-            recording = Recording(inputs.path.name)
+            recording = Recording(shown(inputs.path.name))
             recording.stream.spawn()
             _record(recording, inputs, arguments, segmenter)
     if target:
-        print(f'written to {target}')
+        print(f'written to {shown(target)}')
     return 0
 
 

@@ -34,6 +34,19 @@ def in_one_line(error: Exception) -> str:
     return textwrap.shorten(str(error), 200, placeholder=' ...') or type(error).__name__
 
 
+def shown(text: object) -> str:
+    """Text as it is shown in a terminal: one line, control characters and surrogates escaped.
+
+    Names of files and topics may hold anything: commands to the terminal, line ends, no UTF-8.
+    """
+    return ''.join(c if c.isprintable() else repr(c)[1:-1] for c in str(text))
+
+
+def reason_of(error: OSError) -> str:
+    """Why the operating system refused, without number and name of the file."""
+    return error.strerror or in_one_line(error)
+
+
 def install_hint(packages: str) -> str:
     """Return a command that installs `packages` of PyPI for this interpreter, or where they go.
 

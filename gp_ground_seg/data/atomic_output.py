@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import os
 import tempfile
@@ -9,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.core.errors import DataError, reason_of
 from gp_ground_seg.data.bag_files import is_bag_folder
 
 PARTIAL_MARK = '.partial-'  # part of the hidden names under which unfinished output is kept
@@ -102,6 +103,8 @@ def _staged(
 ) -> Iterator[Path]:
     """Path with the final name, in a hidden folder beside it that goes away in the end."""
     path = Path(target).resolve()
+    if path.is_symlink():
+        raise DataError(f'{target}: {os.strerror(errno.ELOOP)}')
     check(path)
     if not path.parent.is_dir():
         raise DataError(f'{target}: the folder {path.parent} does not exist')
@@ -114,4 +117,7 @@ def _staged(
             check(path)
             place(product, path)
     except OSError as error:
-        raise DataError(f'{target}: cannot be written: {error.strerror or error}') from error
+        name, hidden = error.filename, path.with_name(f'.{path.name}{PARTIAL_MARK}')
+        if isinstance(name, str) and not name.startswith(str(hidden)):
+            raise  # of something that was read
+        raise DataError(f'{target}: cannot be written: {reason_of(error)}') from error

@@ -19,6 +19,7 @@ from gp_ground_seg.core.errors import (
     GroundSegError,
     MissingDependencyError,
     in_one_line,
+    reason_of,
     require,
 )
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
@@ -130,7 +131,7 @@ def read_bytes(path: str | AnyPath, most: int, expected: str = '') -> bytes:
                 # A pipe or a device has the size 0, and may have no end.
                 data = b'' if size > most else file.read(size or most + 1)
     except OSError as error:
-        raise DataError(f'{path}: {error.strerror or error}') from error
+        raise DataError(f'{path}: {reason_of(error)}') from error
     if max(size, len(data)) > most:
         expected = expected or f'accepted are at most {most}'
         raise DataError(f'{path}: {max(size, len(data))} bytes, {expected}')
@@ -152,4 +153,4 @@ def write_file(path: AnyPath, data: bytes) -> None:
         finally:
             partial.unlink(missing_ok=True)
     except OSError as error:
-        raise DataError(f'{path}: cannot be written: {error.strerror or error}') from error
+        raise DataError(f'{path}: cannot be written: {reason_of(error)}') from error

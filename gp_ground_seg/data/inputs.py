@@ -9,7 +9,7 @@ from functools import partial
 from itertools import islice
 from pathlib import Path
 
-from gp_ground_seg.core.errors import DataError, PointCloudError
+from gp_ground_seg.core.errors import DataError, PointCloudError, shown
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.cloud_files import NUSCENES_SUFFIX, SUFFIXES, read_file
@@ -81,7 +81,8 @@ class Inputs:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
                 read = partial(_decode, raw, f'{self.path}: {place}', self._origin)
-                yield Input(f'{k:06d}', f'{self.path.name}[{k}]', self.path, read, 1e-9 * time)
+                title = shown(f'{self.path.name}[{k}]')
+                yield Input(f'{k:06d}', title, self.path, read, 1e-9 * time)
 
     def __getitem__(self, index: int) -> Input:
         """Return one cloud, not read yet; IndexError beyond the last."""
@@ -118,7 +119,8 @@ def list_inputs(
     clashing = {stem for stem, n in Counter(stems).items() if n > 1}
     names = [f.name if stem in clashing else stem for f, stem in zip(files, stems, strict=True)]
     pairs = zip(names, files, strict=True)
-    return Inputs(path, [Input(n, f.name, f, partial(read_file, f, layout)) for n, f in pairs])
+    items = [Input(n, shown(f.name), f, partial(read_file, f, layout)) for n, f in pairs]
+    return Inputs(path, items)
 
 
 def holds_bag(path: Path) -> bool:

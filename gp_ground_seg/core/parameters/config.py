@@ -77,7 +77,7 @@ class GridConfig:
         'horizontal range where the first bin starts; nearer points belong to that bin', 'm')
     r_max: float = basic(120.0, (1.0, 500.0),
         'horizontal range where the last bin ends; beyond it there is no model', 'm')
-    bin_growth: float = advanced(1.5, (1.0, 4.0),
+    bin_growth: float = advanced(1.5, (1.0, 3.0),
         'exponent of the bin edges over range: 1 = equal bins, more = finer bins near the sensor')
 
 

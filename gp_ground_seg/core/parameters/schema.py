@@ -7,6 +7,7 @@ import difflib
 import functools
 import numbers
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import yaml
 
-from gp_ground_seg.core.errors import ConfigError
+from gp_ground_seg.core.errors import ConfigError, in_one_line, reason_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -27,6 +28,9 @@ ROS_NODE_KEY = '/**'
 NODE_NAME = 'ground_segmentation_node'
 ROS_PARAMETERS_KEY = 'ros__parameters'
 MAX_FILE_BYTES = 1 << 18  # twenty times the largest of config/
+MAX_VALUES = 500  # of a file: five times those there are
+MAX_DIGITS = 100  # of an integer; Python cannot print one of more than 4,300
+MAX_DEPTH = 20  # of values in each other: a parameter has five
 OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters that every ROS node has."""
 
@@ -81,7 +85,8 @@ class ParameterSpec:
                     return float(value)
                 if isinstance(value, numbers.Integral):
                     return int(value)
-        raise ConfigError(f'{self.name} = {value!r}: must be {self.accepted}')
+        given = repr(value) if len(repr(value)) <= 100 else f'{repr(value)[:100]} ...'
+        raise ConfigError(f'{self.name} = {given}: must be {self.accepted}')
 
 
 def declare(
@@ -206,25 +211,39 @@ def _nest(flat: Mapping[str, ParameterValue]) -> dict[str, dict[str, ParameterVa
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, without three of its surprises (see `load_yaml`)."""
+    """PyYAML's safe loader, without some of its surprises (see `load_yaml`)."""
+
+    depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes."""
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()  # type: ignore[no-untyped-call]
-            line = event.start_mark.line + 1
+        """Refuse aliases, as ROS does: a kilobyte of them can stand for gigabytes; and depths."""
+        event = self.peek_event()  # type: ignore[no-untyped-call]
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent):
             raise ConfigError(f'line {line}: aliases (*name) are not accepted')
-        return super().compose_node(parent, index)
+        if self.depth == MAX_DEPTH:
+            raise ConfigError(f'line {line}: more than {MAX_DEPTH} levels')
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Refuse a key that is there twice; the last would win silently."""
-        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
-        for key in keys:
-            if keys.count(key) > 1:
+        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        for key, n_times in keys.items():
+            if n_times > 1:
                 raise ConfigError(f'{key}: given twice, from line {node.start_mark.line + 1} on')
         return super().construct_mapping(node, deep)
 
 
+def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
+    if len(node.value) > MAX_DIGITS:
+        raise ConfigError(f'line {node.start_mark.line + 1}: a number of {len(node.value)} digits')
+    return loader.construct_yaml_int(node)
+
+
+_Loader.add_constructor('tag:yaml.org,2002:int', _construct_int)
 _Loader.add_implicit_resolver(
     'tag:yaml.org,2002:float',
     re.compile(r'^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'),
@@ -242,8 +261,16 @@ def read_yaml(path: str | Path) -> object:
 
 
 def load_yaml(text: str) -> object:
-    """Read YAML, with 1e-3 a number as in ROS; an alias or a key given twice: ConfigError."""
-    document: object = yaml.load(text, Loader=_Loader)
+    """Read YAML, with 1e-3 a number as in ROS.
+
+    Raises ConfigError if it is none, has aliases or a key twice, or cannot be of parameters.
+    """
+    try:
+        document: object = yaml.load(text, Loader=_Loader)
+    except ConfigError:
+        raise
+    except Exception as error:  # of many types: 2011-99-99, `!!int x`, `!!bool x`, ...
+        raise ConfigError(f'not valid YAML: {in_one_line(error)}') from error
     return document
 
 
@@ -267,20 +294,17 @@ def read_parameters(path: str | Path) -> ParameterFile:
         for name, value in _flatten(_unwrap_ros(document)):
             if name in values:
                 raise ConfigError(f'{name}: given twice')
+            if len(values) == MAX_VALUES:
+                raise ConfigError(f'more than {MAX_VALUES} values, too many for a parameter file')
             values[name] = value
         node = ''
         if isinstance(document, Mapping) and _is_ros(document):
             (node,) = map(str, document)
         return ParameterFile(values, node)
     except OSError as error:
-        raise ConfigError(error.strerror or str(error)) from error
+        raise ConfigError(reason_of(error)) from error
     except UnicodeDecodeError as error:
         raise ConfigError('not a text file') from error
-    except ConfigError:
-        raise
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        # A ValueError comes from what looks like a date and is none, as in 2011-99-99.
-        raise ConfigError(f'not valid YAML: {" ".join(str(error).split())}') from error
 
 
 def _unwrap_ros(document: object) -> Mapping[str, object]:
@@ -296,6 +320,8 @@ def _unwrap_ros(document: object) -> Mapping[str, object]:
     (node,) = document.values()
     if not isinstance(node, Mapping) or not isinstance(node.get(ROS_PARAMETERS_KEY), Mapping):
         raise ConfigError(f'no mapping {ROS_PARAMETERS_KEY} below the node name')
+    if len(node) > 1:
+        raise ConfigError(f'values beside {ROS_PARAMETERS_KEY}, which ROS refuses')
     # Names that every ROS node has are no parameters of the segmentation.
     return {
         key: value

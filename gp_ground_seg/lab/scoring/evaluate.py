@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.backend import Backend, make_backend
-from gp_ground_seg.core.errors import DataError, PointCloudError
+from gp_ground_seg.core.errors import DataError, PointCloudError, shown
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.core.parameters.config import Config, RuntimeConfig
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
@@ -285,7 +285,8 @@ def load_kitti(frame: Frame) -> KnownScan:
     truths = {rule.key: rule.truth(semantic, points[:, 2]) for rule in CONVENTIONS}
     is_ground = truths[GROUNDGRID.key] == Label.GROUND
     objects = labelled_objects(points, entries, is_ground)
-    return KnownScan(frame.sequence, frame.index, points, truths, semantic, z, is_ground, objects)
+    names = shown(frame.sequence), shown(frame.index)
+    return KnownScan(*names, points, truths, semantic, z, is_ground, objects)
 
 
 def score_methods(
