@@ -10,7 +10,8 @@ PACKAGE = 'gp_ground_seg'
 BAGS = ['rosbags>=0.11.9']
 FORMATS = ['python-neo-lzf>=0.3']
 PLOT = ['matplotlib>=3.6']
-SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']  # 21 MB; s3fs, for s3://, is 36 MB more
+# 21 MB and 15 MB of cryptography, for TLS between workers; s3fs, for s3://, is 36 MB more.
+SCALE = ['cryptography>=42', 'distributed>=2025.1', 'fsspec>=2024.2']
 VISER = ['viser>=1.1']
 VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.

@@ -5,11 +5,16 @@ import json
 import logging
 import os
 import re
+import resource
 import shutil
 import signal
+import stat
 import subprocess
 import sys
+import tempfile
 import time
+import urllib.error
+import urllib.request
 from functools import partial
 from pathlib import Path
 
@@ -25,12 +30,34 @@ from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.scale import cluster
 
-distributed = pytest.importorskip('distributed')
+dask, distributed = pytest.importorskip('dask'), pytest.importorskip('distributed')
 # Dask leaves sockets and event loops to the garbage collector when its processes end.
 pytestmark = pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
 
 PAST = ['--set', 'learning.mode=first_frame']
 N_FRAMES = 600  # of the long sequence
+ATTACK = """
+import asyncio, os, sys, dask, distributed
+from distributed.protocol.pickle import dumps
+
+async def attack(address, security):
+    given = security.get_connection_args('worker') if security else {}
+    async with distributed.rpc(address, connection_args=given) as remote:
+        run = remote.run_function if address.endswith(sys.argv[1]) else remote.run
+        print((await run(function=dumps(os.getpid)))['result'])
+
+if os.getuid() == 0:
+    os.setgroups([]), os.setgid(65534), os.setuid(65534)
+dask.config.set({'distributed.comm.timeouts.connect': '3s'})
+for scheme, security in ('tcp', None), ('tls', distributed.Security.temporary()):
+    for place in sys.argv[1:]:
+        try:
+            asyncio.run(attack(f'{scheme}://{place}', security))
+        except (OSError, ValueError) as error:
+            print(type(error).__name__, file=sys.stderr)
+"""
+"""Prints the process id of a scheduler, and of workers after it: runs code in them without their
+key, as another user if it can become one."""
 
 
 @pytest.fixture(scope='module')
@@ -78,7 +105,7 @@ def labels(folder):
 def finished(folder):
     """Names in the manifest, in its order."""
     lines = (folder / 'manifest.jsonl').read_text().splitlines()
-    return [name for line in lines for name in json.loads(line)['names']]
+    return [name for line in lines for name in json.loads(line)['items']]
 
 
 @pytest.fixture
@@ -154,6 +181,10 @@ def test_only_past_that_counts_keeps_sequences_whole():
     assert depends(mode='every_k') and depends(mode='first_frame') and depends(warm_start=True)
 
 
+def _module_path():
+    return sys.path
+
+
 def _die_once(marker, block, progress):
     if 5 in block and not marker.exists():
         marker.touch()
@@ -182,14 +213,114 @@ def test_a_block_whose_worker_dies_is_computed_again(scheduler, tmp_path, caplog
     assert caplog.messages == ['the surface is odd']
 
 
+def attack(client):
+    """Process ids of the scheduler and workers that run another's code, and what failed."""
+    addresses = [client.scheduler.address, *client.nthreads()]
+    places = [address.split('//')[1] for address in addresses]
+    done = subprocess.run(
+        [sys.executable, '-c', ATTACK, *places], capture_output=True, text=True, check=True
+    )
+    return [int(line) for line in done.stdout.splitlines()], done.stderr.splitlines()
+
+
+def test_workers_of_this_machine_run_the_code_of_this_process_only(
+    scheduler, monkeypatch, tmp_path
+):
+    with distributed.Client(scheduler, set_as_default=False) as client:
+        ran, _ = attack(client)
+        assert ran[0] == os.getpid() and len(ran) > 1
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
+    planted, target = tmp_path / 'dask-scratch-space', tmp_path / 'of_the_user'
+    planted.mkdir()
+    target.write_text('kept')
+    for name in ('global.lock', 'purge.lock'):
+        (planted / name).symlink_to(target)
+    with cluster.open_runner(1, None, cluster._NO_BAR) as runner:
+        info = runner._client.scheduler_info()
+        (worker,) = info['workers'].values()
+        (folder,) = tmp_path.glob('gp_ground_seg-*')
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+        assert worker['local_directory'].startswith(str(folder))
+        ran, failed = attack(runner._client)
+        assert not ran and len(failed) == 4
+        for port in (info['services']['dashboard'], worker['services']['dashboard']):
+            for page in ('', 'health', 'info/main/workers.html', 'metrics'):
+                with pytest.raises(urllib.error.HTTPError, match='404'):
+                    urllib.request.urlopen(f'http://127.0.0.1:{port}/{page}')
+        for path in (sys.path, *runner._client.run(_module_path).values()):
+            assert not any(name.startswith(str(planted)) for name in path)
+        assert sum(runner.run(partial(_die_once, tmp_path), range(3))) == 3
+    assert target.read_text() == 'kept'
+    assert sorted(path.name for path in tmp_path.iterdir()) == [planted.name, target.name]
+
+
+@pytest.mark.parametrize(
+    ('n_workers', 'problem'),
+    [
+        ('2', 'needs 96 open files, the limit is 40'),
+        ('2', 'Dask cannot start here (Nanny failed to start worker process)'),
+        ('99999999999', 'must be 1 to'),
+    ],
+    ids=['few files', 'killed worker', 'many workers'],
+)
+def test_dask_that_cannot_start(n_workers, problem, root, tmp_path):
+    limit = {'preexec_fn': partial(resource.setrlimit, resource.RLIMIT_NOFILE, (40, 40))}
+    command = ('segment', root, '-o', tmp_path / 'out', '--workers', n_workers)
+    with start(*command, **limit if 'files' in problem else {}) as process:
+        if 'Nanny' in problem:
+            deadline, found = time.monotonic() + 60, []
+            while not found:
+                assert process.poll() is None and time.monotonic() < deadline
+                found = [one for one in children(process.pid) if is_worker(one)]
+                time.sleep(0.01)
+            os.kill(found[0], signal.SIGKILL)
+        out, err = process.communicate(timeout=60)
+    (line,) = err.splitlines()
+    assert (out, process.returncode) == ('', 2) and problem in line
+    assert not (tmp_path / 'out').exists()
+
+
+def is_worker(pid):
+    """Whether a process is one that Dask starts."""
+    try:
+        return b'spawn_main' in Path(f'/proc/{pid}/cmdline').read_bytes()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
 @pytest.mark.parametrize(
     ('address', 'problem'),
-    [('tcp://127.0.0.1:1', 'does not answer'), ('somewhere', 'must be tcp://HOST:PORT')],
+    [
+        ('tcp://127.0.0.1:1', 'does not answer'),
+        ('tls://127.0.0.1:1', 'does not answer'),
+        ('somewhere', 'must be tcp://HOST:PORT'),
+    ],
 )
-def test_a_scheduler_that_is_not_there(address, problem, root, monkeypatch, capsys):
+def test_a_scheduler_that_is_not_there(address, problem, root, monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(cluster._CONFIG, 'distributed.comm.timeouts.connect', '200ms')
-    assert run('evaluate', root, '--scheduler', address) == 2
+    command = ['segment', root, '-o', tmp_path / 'out']
+    assert run(*command, '--scheduler', address) == 2
     assert problem in error_line(capsys)
+    assert run(*command) == 0
+
+
+def test_a_scheduler_that_asks_for_a_key(root, tmp_path, capsys):
+    security = distributed.Security.temporary()
+    config = {
+        'distributed.comm.tls.ca-file': security.tls_ca_file,
+        'distributed.comm.tls.client.cert': security.tls_client_cert,
+        'distributed.comm.tls.client.key': security.tls_client_key,
+    }
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address='127.0.0.1:0', security=security,
+        silence_logs=logging.CRITICAL,
+    ) as started:  # fmt: skip
+        command = ['segment', root, '-o', tmp_path, '--scheduler', started.scheduler_address]
+        assert run(*command) == 2
+        assert 'does not answer' in error_line(capsys)
+        with dask.config.set(config):
+            assert run(*command) == 0
+    assert len(labels(tmp_path)) == 12
 
 
 def test_workers_of_other_versions(monkeypatch):
@@ -234,6 +365,11 @@ def test_several_bags_become_one_each(tmp_path, capsys):
     assert '5 frames' in capsys.readouterr().out
     assert run('segment', *bags, '-o', tmp_path / 'out', '--resume') == 0
     assert capsys.readouterr().out == '2 of 2 were finished before\n'
+    bags[1].unlink()
+    write_ros2_bag(bags[1], n_clouds=4)
+    assert run('segment', *bags, '-o', tmp_path / 'out', '--resume') == 0
+    said = '1 of 2 were finished before; done again: 1 with a changed input (b_ground.mcap)'
+    assert capsys.readouterr().out.startswith(f'{said}\n4 frames, ')
     scan = write_streets(tmp_path, s00=1) / 'sequences/00/velodyne/000000.bin'
     assert run('segment', bags[0], scan, '-o', tmp_path / 'out2') == 2
     assert 'is no bag' in error_line(capsys)
@@ -259,6 +395,70 @@ def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, 
     assert run(*command, '--force', *other) == 0
     assert labels(tmp_path / 'out') != before
     assert sorted(finished(tmp_path / 'out')) == sorted(before)
+
+
+def other_folder(source, _out):
+    moved = source.with_name('other')
+    for k, file in enumerate(sorted(source.rglob('*.bin'), reverse=True)):
+        target = moved / sorted(source.rglob('*.bin'))[k].relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(file, target)
+    return moved
+
+
+def change(source, _out):
+    scan = source / 'sequences/08/velodyne/000001.bin'
+    np.fromfile(scan, np.float32)[::-1].tofile(scan)
+
+
+def delete(_source, out):
+    (out / 'sequences/08/predictions/000001.label').unlink()
+
+
+def truncate(_source, out):
+    os.truncate(out / 'sequences/08/predictions/000001.label', 40)
+
+
+def link(_source, out):
+    delete(_source, out)
+    (out / 'sequences/08/predictions/000001.label').symlink_to('nowhere')
+
+
+@pytest.mark.parametrize(
+    ('harm', 'said', 'past'),
+    [
+        (other_folder, '0 of 12 were finished before; done again: 12 from another input', []),
+        (change, '11 of 12 were finished before; done again: 1 with a changed input', PAST),
+        (delete, 'done again: 1 with output missing or of another size', []),
+        (truncate, 'done again: 1 with output missing or of another size', PAST),
+        (link, 'done again: 1 with output missing or of another size', []),
+    ],
+)
+def test_resume_does_again_what_does_not_fit(harm, said, past, root, tmp_path, capsys):
+    source, out, anew = tmp_path / 'root', tmp_path / 'out', tmp_path / 'anew'
+    shutil.copytree(root, source)
+    assert run('segment', source, '-o', out, *past) == 0
+    source = harm(source, out) or source
+    capsys.readouterr()
+    assert run('segment', source, '-o', out, '--resume', *past) == 0
+    assert said in capsys.readouterr().out
+    assert run('segment', source, '-o', anew, *past) == 0
+    assert labels(out) == labels(anew)
+    capsys.readouterr()
+    assert run('segment', source, '-o', out, '--resume', *past) == 0
+    assert capsys.readouterr().out == '12 of 12 were finished before\n'
+
+
+@pytest.mark.parametrize('line', [b'{', b'[' * 100_000, b'{"items": 3}', b'\xff', b'7', b'null'])
+def test_a_manifest_that_is_none(line, root, tmp_path, capsys):
+    (tmp_path / 'manifest.jsonl').write_bytes(line + b'\n')
+    assert run('segment', root, '-o', tmp_path, '--resume') == 2
+    assert error_line(capsys) == f'{tmp_path}/manifest.jsonl: line 1 is none of a manifest'
+    (tmp_path / 'manifest.jsonl').rename(tmp_path / 'of_the_user')
+    (tmp_path / 'manifest.jsonl').symlink_to('of_the_user')
+    assert run('segment', root, '-o', tmp_path, '--force') == 2
+    assert 'manifest.jsonl: ' in error_line(capsys)
+    assert (tmp_path / 'of_the_user').read_bytes() == line + b'\n'
 
 
 @pytest.fixture(scope='module')
@@ -296,6 +496,9 @@ def test_killed_worker_and_client_lose_nothing_and_nothing_is_done_twice(
     os.kill(workers[-1], signal.SIGKILL)
     wait_for_lines(process, out / 'manifest.jsonl', 4)
     workers += children(process.pid)
+    for more in ('--resume', '--force', '--quiet'):
+        assert run(*command, more) == 2
+        assert error_line(capsys) == f'{out}: another run writes to it'
     process.kill()
     _, err = process.communicate()
     assert 'died; computed again: block' in err and 'Traceback' not in err

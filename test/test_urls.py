@@ -1,5 +1,7 @@
 """Data by URL: a store of objects as a server of this machine, and its faults; memory."""
 
+import http.server
+import re
 import socket
 import subprocess
 import sys
@@ -15,6 +17,7 @@ from evaluation_samples import write_streets
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data import files
 from gp_ground_seg.data.files import UrlPath
+from gp_ground_seg.lab.scale.dataset import Manifest, Scan
 
 s3fs, _ = pytest.importorskip('s3fs'), pytest.importorskip('moto')
 # Sessions of aiohttp are left to the garbage collector.
@@ -193,18 +196,124 @@ def test_a_server_that_dies_meanwhile(store, root, monkeypatch, capsys):
         other.wait()
 
 
-def test_an_object_whose_end_does_not_come(monkeypatch):
-    class Cut:
-        def info(self, path):
-            return {'size': 8}
+class Faults(http.server.BaseHTTPRequestHandler):
+    """Announces 8 bytes, and sends what the name of the file says."""
 
-        def cat_file(self, path):
-            return b'four'
+    protocol_version = 'HTTP/1.1'
+    n_sent = 0
 
-    core = pytest.importorskip('fsspec.core')
-    monkeypatch.setattr(core, 'url_to_fs', lambda *a, **k: (Cut(), 'x'))
-    with pytest.raises(DataError, match='s3://drives/x: 4 of 8 bytes came'):
-        UrlPath('s3://drives/x').read(100)
+    def log_message(self, *_words):
+        """Print nothing."""
+
+    def begin(self, name, text):
+        self.send_response(200)
+        self.send_header(name, text)
+        self.end_headers()
+
+    def do_HEAD(self):
+        if 'unannounced' in self.path:
+            self.begin('Transfer-Encoding', 'chunked')
+        elif 'never' not in self.path:
+            self.begin('Content-Length', '8')
+        else:
+            time.sleep(5)
+
+    def do_GET(self):
+        if 'cut' in self.path or 'long' in self.path:
+            self.begin('Content-Length', '8' if 'cut' in self.path else '12')
+            self.wfile.write(b'four' if 'cut' in self.path else b'four' * 3)
+            self.close_connection = True
+            return
+        self.begin('Transfer-Encoding', 'chunked')
+        type(self).n_sent = 0
+        part, n_parts = (b'.' * 65536, 10**6) if 'endless' in self.path else (b'.', 8)
+        try:
+            for _ in range(n_parts):
+                time.sleep(0.5 if 'slow' in self.path else 0)
+                self.wfile.write(b'%x\r\n%s\r\n' % (len(part), part))
+                type(self).n_sent += len(part)
+            self.wfile.write(b'0\r\n\r\n')
+        except OSError:
+            pass
+
+
+@pytest.fixture(scope='module')
+def faults():
+    """Address of a server that does not send what it announces."""
+    pytest.importorskip('aiohttp')
+    with http.server.ThreadingHTTPServer(('127.0.0.1', 0), Faults) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f'http://127.0.0.1:{server.server_port}'
+        server.shutdown()
+
+
+@pytest.mark.parametrize(
+    ('name', 'problem'),
+    [
+        ('cut', 'received 4 of 8 bytes'),
+        ('long', ': more than 8 bytes came'),
+        ('endless', ': more than 8 bytes came'),
+        ('endless_unannounced', ': 1001 bytes, accepted are at most 1000'),
+        ('slow', ': no answer, or not all of it, in time'),
+        ('never', ': no answer, or not all of it, in time'),
+        ('unannounced', None),
+    ],
+)
+def test_a_server_that_sends_something_else(name, problem, faults, monkeypatch):
+    monkeypatch.setattr(files, 'URL_SECONDS', 1.5)
+    url = f'{faults}/{name}.bin'
+    if problem is None:
+        assert files.read_bytes(url, 1000) == b'.' * 8
+        return
+    with pytest.raises(DataError, match=re.escape(url)) as raised:
+        files.read_bytes(url, 1000)
+    assert problem in str(raised.value)
+    assert Faults.n_sent < 1e8
+
+
+@pytest.mark.parametrize('protocol', ['s3', 'memory'])
+def test_resume_by_url(protocol, store, root, tmp_path, capsys):
+    system = store if protocol == 's3' else pytest.importorskip('fsspec').filesystem('memory')
+    source, out = 'drives/a [1]', 'drives/out of [1]'
+    system.put(f'{root}/', f'/{source}/' if protocol == 'memory' else f'{source}/', recursive=True)
+    command = ['segment', f'{protocol}://{source}', '-o', f'{protocol}://{out}']
+    assert run(*command) == 0
+    before = labels(system, out)
+    scans = f'{source}/sequences/00/velodyne'
+    system.pipe_file(f'{scans}/000000.bin', system.cat_file(f'{scans}/000001.bin'))
+    system.rm_file(f'{out}/sequences/08/predictions/000001.label')
+    capsys.readouterr()
+    assert run(*command, '--resume') == 0
+    said = capsys.readouterr().out
+    assert said.startswith('3 of 5 were finished before; done again: 1 with a changed input (')
+    assert '1 with output missing or of another size (sequences/08/predictions/0' in said
+    changed = labels(system, out)
+    assert {name for name in before if before[name] != changed[name]} == {
+        '00/predictions/000000.label'
+    }
+    assert changed.keys() == before.keys()
+
+
+def test_files_of_this_machine_to_a_url(url, store, root, tmp_path, capsys):
+    scan = root / 'sequences/00/velodyne/000000.bin'
+    assert run('segment', scan, '-o', 's3://drives/one') == 0
+    assert run('segment', scan, '-o', tmp_path / '0.label') == 0
+    assert store.cat_file('drives/one/000000.label') == (tmp_path / '0.label').read_bytes()
+
+
+def test_of_two_runs_on_a_url_one_ends(url):
+    scans = [
+        Scan(UrlPath(f'{url}/sequences/00/velodyne/00000{k}.bin'), f'{k}.label', '', list)
+        for k in range(3)
+    ]
+    one, two = (Manifest(UrlPath('s3://drives/both'), '', scans) for _ in range(2))
+    assert one.open(resume=True, force=False) == two.open(resume=True, force=False) == (set(), '')
+    one.begin()
+    two.begin()
+    one.add(['0.label'], [4])
+    with pytest.raises(DataError, match='has changed, another run writes to this folder'):
+        two.add(['1.label'], [4])
+    one.add(['2.label'], [4])
 
 
 def test_a_path_and_a_url_have_the_same_parts():

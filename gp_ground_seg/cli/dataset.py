@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import statistics
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +28,9 @@ _OPTIONS = ('raw', 'topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
 def is_dataset(arguments: argparse.Namespace) -> bool:
     """Whether output is to appear block by block, rather than all of it at the end."""
     asked = (arguments.workers, arguments.scheduler, arguments.resume, arguments.more)
-    return any(asked) or isinstance(as_path(arguments.input), UrlPath) or _is_root(arguments.input)
+    places = (arguments.input, arguments.output or '')
+    is_remote = any(isinstance(as_path(place), UrlPath) for place in places)
+    return any(asked) or is_remote or _is_root(arguments.input)
 
 
 def _is_root(source: str) -> bool:
@@ -86,22 +89,19 @@ def run(
         raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')
     layout = replace(options.scan_layout(arguments), doubts='ignore')
     given = [getattr(arguments, name) for name in _OPTIONS]
-    manifest = Manifest(target, digest(config, layout, given))
-    names = [item.name for item in items]
-    done = manifest.resume() if arguments.resume else None
-    if done is None:
-        done = set()
-        manifest.begin(names, force=arguments.force)
-    n_left = len(items) - len(done.intersection(names))
-    if n_left < len(items):
-        print(f'{len(items) - n_left} of {len(items)} were finished before')
-    if n_left:
-        with options.runner(arguments, 'segment', unit) as runner:
-            found = run_blocks(runner, function, config, items, manifest, done, unit == 'bag')
-            n_workers = runner.n_workers
-        print_summary(found, target, n_workers)
+    with closing(Manifest(target, digest(config, layout, given), items)) as manifest:
+        done, again = manifest.open(resume=arguments.resume, force=arguments.force)
+        if done or again:
+            begun = f'{len(done)} of {len(items)} were finished before'
+            print(f'{begun}; done again: {again}' if again else begun)
+        if len(done) < len(items):
+            with options.runner(arguments, 'segment', unit) as runner:
+                manifest.begin()
+                found = run_blocks(runner, function, config, items, manifest, done, unit == 'bag')
+                n_workers = runner.n_workers
+            print_summary(found, target, n_workers)
     if isinstance(target, Path):
-        sweep(target, names)
+        sweep(target, [item.name for item in items])
 
 
 def print_summary(found: Outcome, target: AnyPath, n_workers: int = 0) -> None:

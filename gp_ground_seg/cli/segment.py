@@ -15,7 +15,7 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bag_output import GROUND_TOPIC, OBSTACLES_TOPIC, BagOutput
 from gp_ground_seg.data.cloud_output import FORMATS, CloudOutput, encode_labels
-from gp_ground_seg.data.files import AnyPath, as_path, write_file
+from gp_ground_seg.data.files import AnyPath, as_path, stamp, write_file
 from gp_ground_seg.data.inputs import holds_bag
 from gp_ground_seg.lab.scale.cluster import Progress
 from gp_ground_seg.lab.scale.dataset import Outcome, Scan, pool, segment_block
@@ -169,12 +169,15 @@ def _segment_bags(
     for bag in progress(bags):
         with GroundSegmenter(config) as segmenter:
             source, path = Path(str(bag.path)), target / bag.name
-            outcomes.append(Outcome.of(output.write(source, path, segmenter, force=True)))
+            outcome = Outcome.of(output.write(source, path, segmenter, force=True))
+            outcomes.append(outcome._replace(sizes=[stamp(path)[0]]))
     return pool(outcomes)
 
 
-def _write_labels(raw: bool, path: AnyPath, result: Segmentation) -> None:
-    write_file(path, encode_labels(result, raw))
+def _write_labels(raw: bool, path: AnyPath, result: Segmentation) -> int:
+    data = encode_labels(result, raw)
+    write_file(path, data)
+    return len(data)
 
 
 def _default_output(source: Path, form: str | None = None) -> Path:

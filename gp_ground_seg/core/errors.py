@@ -29,7 +29,7 @@ class MissingDependencyError(GroundSegError, ImportError):
     """An optional package that this command needs is not installed."""
 
 
-def in_one_line(error: Exception) -> str:
+def in_one_line(error: BaseException) -> str:
     """Text of an error, shortened to one line, or the name of its type if it has none."""
     return textwrap.shorten(str(error), 200, placeholder=' ...') or type(error).__name__
 

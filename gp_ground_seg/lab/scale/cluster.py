@@ -6,12 +6,14 @@ The one module that imports dask and distributed, optional packages.
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 import itertools
 import logging
 import multiprocessing
+import os
 import platform
+import resource
 import signal
+import sys
 import threading
 import uuid
 import warnings
@@ -19,19 +21,20 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from tqdm import tqdm
 
 import gp_ground_seg
 from gp_ground_seg.core import log
-from gp_ground_seg.core.errors import DataError, require
+from gp_ground_seg.core.errors import DataError, in_one_line, require
 from gp_ground_seg.core.parameters.config import Config
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
-_CONFIG = {
+_CONFIG: dict[str, Any] = {
     'distributed.admin.tick.limit': '1h',  # it warns where a process had to wait
     'distributed.comm.timeouts.connect': '10s',
     # A worker that died and takes its time to start anew is not given up.
@@ -40,6 +43,9 @@ _CONFIG = {
     # a quarter of a frame's time.
     'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': None,
     'distributed.worker.profile.enabled': False,  # samples the stack 100 times a second
+    # Pages about the work for everyone on the machine, without a password.
+    'distributed.scheduler.http.routes': [],
+    'distributed.worker.http.routes': [],
 }
 
 _NO_BAR = partial(tqdm, disable=True)
@@ -152,7 +158,7 @@ def _result(future: Any, block: Sequence[Any]) -> tuple[Any, list[tuple[int, str
             f'{block[0]} to {block[-1]}: each worker that computed this block died, as where '
             'memory is short; fewer --workers have more of it each'
         ) from error
-    except (CancelledError, OSError) as error:
+    except (CancelledError, OSError, RuntimeError) as error:  # RuntimeError: no further thread
         if future.status == 'error':  # raised by the function
             raise
         raise DataError(f'the scheduler is lost ({error})') from error
@@ -251,37 +257,85 @@ def open_runner(
 
     Raises DataError if the scheduler does not answer, MissingDependencyError without distributed.
     """
-    if workers is None and scheduler is None:
-        yield Runner(bar)
-        return
     with ExitStack() as stack:
+        client = None
         with _interrupt_kept():
-            cluster = scheduler if workers is None else stack.enter_context(_start(workers))
-            client = stack.enter_context(_connect(cluster))
-        if scheduler is not None or importlib.util.find_spec('bokeh'):
-            _LOGGER.info('dashboard: %s', client.dashboard_link)
+            if scheduler is not None:
+                client = stack.enter_context(_connect(scheduler))
+                _LOGGER.info('dashboard: %s', client.dashboard_link)
+            elif workers is not None:
+                client = stack.enter_context(_start(workers, stack))
         yield Runner(bar, client)
 
 
-def _start(n_workers: int) -> Any:
-    """Start workers of one thread on this machine."""
-    return _distributed().LocalCluster(
-        n_workers=n_workers, threads_per_worker=1, dashboard_address='127.0.0.1:0',
-        silence_logs=logging.CRITICAL,
-    )  # fmt: skip
+def _start(n_workers: int, stack: ExitStack) -> Any:
+    """Start workers of one thread on this machine, for this process alone; return their client.
+
+    They run what reaches their ports, as does the scheduler, and every user of the machine reaches
+    these: TLS with a key of this run keeps others out. Their files are in a private folder, gone
+    afterwards: Dask's own is at a known place in /tmp, where others can plant links, and modules,
+    as Dask imports from there.
+    """
+    distributed = _distributed()
+    require('cryptography', 'cryptography')
+    most = 4 * (os.cpu_count() or 1)
+    if n_workers > most:
+        raise DataError(
+            f'--workers {n_workers}: must be 1 to {most} here, four for each processor'
+        )
+    n_files, needed = resource.getrlimit(resource.RLIMIT_NOFILE)[0], 64 + 16 * n_workers
+    if n_files < needed:  # Dask may wait forever
+        raise DataError(
+            f'--workers {n_workers}: needs {needed} open files, the limit is {n_files} (ulimit -n)'
+        )
+    try:
+        with _silent():
+            folder = stack.enter_context(TemporaryDirectory(prefix='gp_ground_seg-'))
+            config = require('dask.config', 'distributed').set({'temporary-directory': folder})
+            stack.enter_context(config)
+            cluster = distributed.LocalCluster(
+                n_workers=n_workers, threads_per_worker=1,
+                security=distributed.Security.temporary(),
+                dashboard_address='127.0.0.1:0', scheduler_kwargs={'dashboard': False},
+                silence_logs=logging.CRITICAL,
+            )  # fmt: skip
+            return distributed.Client(stack.enter_context(cluster), set_as_default=False)
+    except Exception as error:  # of any type: what was not ready fails again while it is closed
+        first: BaseException = error
+        while before := first.__cause__ or first.__context__:
+            first = before
+        raise DataError(
+            f'--workers {n_workers}: Dask cannot start here ({in_one_line(first)}); '
+            'fewer workers take less memory'
+        ) from error
 
 
-def _connect(cluster: Any) -> Any:
-    if isinstance(cluster, str) and not cluster.startswith(('tcp://', 'tls://')):
-        raise DataError(f'--scheduler {cluster}: must be tcp://HOST:PORT, or tls://')
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Drop what this process and those that it starts in the block print on standard error.
+
+    Dask's event loop and a worker that dies while it starts print tracebacks there.
+    """
+    sys.stderr.flush()
+    with open(os.devnull, 'wb') as nothing, os.fdopen(os.dup(2), 'wb') as before:
+        os.dup2(nothing.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(before.fileno(), 2)
+
+
+def _connect(address: str) -> Any:
+    if not address.startswith(('tcp://', 'tls://')):
+        raise DataError(f'--scheduler {address}: must be tcp://HOST:PORT, or tls://')
     distributed = _distributed()
     with warnings.catch_warnings():
         # Versions are compared by `_compute`, which says in one line what differs.
         warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
         try:
-            return distributed.Client(cluster, set_as_default=False)
+            return distributed.Client(address, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
-            raise DataError(f'--scheduler {cluster}: does not answer ({error})') from error
+            raise DataError(f'--scheduler {address}: does not answer ({error})') from error
 
 
 def _distributed() -> Any:

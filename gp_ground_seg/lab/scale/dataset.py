@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import itertools
 import json
+import logging
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from pathlib import Path, PurePosixPath
+from typing import IO, Any, NamedTuple
 
 import gp_ground_seg
 from gp_ground_seg.core.errors import DataError, PointCloudError
@@ -17,9 +20,10 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
-from gp_ground_seg.data.files import AnyPath, UrlPath, read_bytes, write_file
+from gp_ground_seg.data.files import AnyPath, UrlPath, read_bytes, stamp
 from gp_ground_seg.lab.scale.cluster import Progress, Runner, cut, depends_on_past
 
+_LOGGER = logging.getLogger('gp_ground_seg')
 MANIFEST = 'manifest.jsonl'
 _MAX_MANIFEST_BYTES = 1 << 32
 
@@ -45,11 +49,12 @@ class Outcome(NamedTuple):
     heights: list[float]  # of the sensor, by the scans that show it [m]
     tilts: list[tuple[float, float]]  # roll and pitch, by the scans that show them [rad]
     contradictions: list[str]  # of the scans that contradict a parameter
+    sizes: list[int]  # of the files that were written block by block [bytes]
 
     @classmethod
     def of(cls, results: Iterable[Segmentation]) -> Outcome:
         """Sum up scans, one by one."""
-        found = cls(0, 0, [], [], [], [])
+        found = cls(0, 0, [], [], [], [], [])
         for result in results:
             n_ground = int((result.label == Label.GROUND).sum())
             found = found._replace(
@@ -72,7 +77,7 @@ def pool(outcomes: Iterable[Outcome]) -> Outcome:
 
 
 def segment_block(
-    write: Callable[[AnyPath, Segmentation], None],
+    write: Callable[[AnyPath, Segmentation], int],
     target: AnyPath,
     config: Config,
     scans: Sequence[Scan],
@@ -80,8 +85,9 @@ def segment_block(
 ) -> Outcome:
     """Label scans of one sequence, or of several where none depends on another; write the files.
 
-    `write` takes the path of a file and the `Segmentation`.
+    `write` takes the path of a file and the `Segmentation`, and returns its size [bytes].
     """
+    sizes = []
 
     def results(segmenter: GroundSegmenter) -> Iterator[Segmentation]:
         sequence = None
@@ -93,43 +99,83 @@ def segment_block(
                 result = segmenter.segment(scan.read())
             except PointCloudError as error:
                 raise PointCloudError(f'{scan.path}: {error}') from error
-            write(target / scan.name, result)
+            sizes.append(write(target / scan.name, result))
             yield result
 
     with GroundSegmenter(config) as segmenter:
-        return Outcome.of(results(segmenter))
+        return Outcome.of(results(segmenter))._replace(sizes=sizes)
 
 
 class Manifest:
-    """Names of what is finished, a line for each block, in a file in the output folder.
+    """What is finished: a line for each block, in a file in the output folder.
+
+    It has for each scan the path, size and time of the input, and the size of the output. While it
+    is in use it is locked, and nothing is written to it before `begin`.
 
     Parameters
     ----------
     folder : path or URL
         Output folder.
     configuration : str
-        Digest of all that the output depends on; see `digest`.
+        Digest of all that the output depends on, beside the inputs; see `digest`.
+    scans : sequence of Scan
+        All that are to be labelled.
     """
 
-    def __init__(self, folder: AnyPath, configuration: str) -> None:
+    def __init__(self, folder: AnyPath, configuration: str, scans: Sequence[Scan]) -> None:
         self._path = folder / MANIFEST
         self._run = {'configuration': configuration, 'version': gp_ground_seg.__version__}
+        self._inputs = {scan.name: [_place(scan.path), *stamp(scan.path)] for scan in scans}
         self._text = b''
+        self._file: IO[bytes] | None = None
 
-    def resume(self) -> set[str] | None:
-        """Return what is finished, None if nothing was begun; DataError for other parameters."""
-        if not self._path.exists():
-            return None
+    def open(self, *, resume: bool, force: bool) -> tuple[set[str], str]:
+        """Lock the folder; return names of what is finished, and what is done again and why.
+
+        Raises DataError if another run writes to the folder, with `resume` if it was begun with
+        other parameters, and if it has output but neither `resume` nor `force` is given.
+        """
+        is_begun = self._path.exists()
+        if is_begun and not isinstance(self._path, UrlPath):
+            self._lock(0)
+        sizes = self._output_sizes()
+        if resume and is_begun:
+            return self._compare(self._read(), sizes)
+        if (sizes or is_begun) and not force:
+            name = next(iter(sizes), MANIFEST)
+            place = self._path.parent / name
+            raise DataError(f'{place}: exists already; --resume continues, --force starts anew')
+        return set(), ''
+
+    def _lock(self, flags: int) -> None:
+        """Open the file; the kernel frees its lock with the process, however that ends."""
+        try:
+            # Not by a link that someone else has planted.
+            number = os.open(str(self._path), os.O_RDWR | os.O_NOFOLLOW | flags, 0o666)
+            self._file = os.fdopen(number, 'rb+', buffering=0)
+        except FileExistsError as error:
+            raise DataError(f'{self._path.parent}: another run writes to it') from error
+        except OSError as error:
+            raise DataError(f'{self._path}: {error.strerror}') from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise DataError(f'{self._path.parent}: another run writes to it') from error
+        except OSError:
+            _LOGGER.warning('%s: has no locks, start no other run', self._path.parent)
+
+    def _read(self) -> dict[str, list[Any]]:
+        """Return path, size and time of the input, and size of the output, by name."""
         text = read_bytes(self._path, _MAX_MANIFEST_BYTES)
         # The last line of a run that was killed may be cut off.
         self._text = text[: text.rfind(b'\n') + 1]
-        names: set[str] = set()
+        found: dict[str, list[Any]] = {}
         for number, line in enumerate(self._text.splitlines(), 1):
             try:
                 entry = json.loads(line)
                 known = {key: entry[key] for key in self._run}
-                names.update(entry['names'])
-            except (ValueError, KeyError, TypeError) as error:
+                found.update({name: list(about) for name, about in entry['items'].items()})
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
                 raise DataError(f'{self._path}: line {number} is none of a manifest') from error
             if known != self._run:
                 was, now = (f'{d["configuration"]} of {d["version"]}' for d in (known, self._run))
@@ -137,32 +183,71 @@ class Manifest:
                     f'{self._path}: was begun with the configuration {was}, this is {now}; give '
                     'the parameters of then, or another output folder'
                 )
-        write_file(self._path, self._text)
-        return names
+        return found
 
-    def begin(self, names: Iterable[str], *, force: bool) -> None:
-        """Begin anew; DataError if one of the files `names` exists and `force` is false."""
-        folder = self._path.parent
-        parents = {str(Path(name).parent) for name in names}
-        there = {f'{p}/{f.name}' for p in parents for f in (folder / p).glob('*')}
-        existing = [name for name in names if name in there or f'./{name}' in there]
-        if (existing or self._path.exists()) and not force:
-            name = existing[0] if existing else MANIFEST
-            raise DataError(
-                f'{folder / name}: exists already; --resume continues, --force starts anew'
-            )
-        write_file(self._path, b'')
+    def _compare(self, known: dict[str, list[Any]], sizes: dict[str, int]) -> tuple[set[str], str]:
+        """Return the names of what is as it was, and how many are not, for each reason."""
+        done, again = set[str](), dict[str, list[str]]()
+        for name, given in self._inputs.items():
+            if name not in known:
+                continue
+            *was, size = known[name] or [None]
+            if was[:1] != given[:1]:
+                again.setdefault('from another input', []).append(name)
+            elif was != given:
+                again.setdefault('with a changed input', []).append(name)
+            elif sizes.get(name) != size:
+                again.setdefault('with output missing or of another size', []).append(name)
+            else:
+                done.add(name)
+        said = (f'{len(names)} {reason} ({names[0]})' for reason, names in again.items())
+        return done, ', '.join(said)
 
-    def add(self, names: Sequence[str]) -> None:
-        """Note that a block is finished."""
-        entry = {'block': self._text.count(b'\n'), 'names': list(names), **self._run}
-        line = json.dumps(entry).encode() + b'\n'
-        self._text += line
-        if isinstance(self._path, UrlPath):  # An object cannot be appended to.
+    def _output_sizes(self) -> dict[str, int]:
+        """Return the size of each file to write that is there [bytes]."""
+        # Listings, as each question takes a store of objects 20 ms.
+        folders = {PurePosixPath(name).parent for name in self._inputs}
+        there = {
+            str(f / o.name): o for f in folders for o in (self._path.parent / str(f)).glob('*')
+        }
+        return {name: stamp(there[name])[0] for name in self._inputs if name in there}
+
+    def begin(self) -> None:
+        """Keep the whole lines that were read, none by default; what follows may write output."""
+        if isinstance(self._path, UrlPath):
             self._path.write_bytes(self._text)
             return
-        with self._path.open('ab') as file:
-            file.write(line)
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            if self._file is None:
+                self._lock(os.O_CREAT | os.O_EXCL)
+            assert self._file is not None
+            self._file.truncate(len(self._text))
+            self._file.seek(len(self._text))
+        except OSError as error:
+            raise DataError(f'{self._path}: {error.strerror}') from error
+
+    def add(self, names: Sequence[str], sizes: Sequence[int]) -> None:
+        """Note that a block is finished, with the sizes of its outputs [bytes]."""
+        items = {n: [*self._inputs[n], size] for n, size in zip(names, sizes, strict=True)}
+        entry = {'block': self._text.count(b'\n'), 'items': items, **self._run}
+        line = json.dumps(entry).encode() + b'\n'
+        if self._file is not None:
+            self._file.write(line)
+        elif stamp(self._path)[0] != len(self._text):  # an object has no lock
+            raise DataError(f'{self._path}: has changed, another run writes to this folder')
+        self._text += line
+        if isinstance(self._path, UrlPath):  # an object cannot be appended to
+            self._path.write_bytes(self._text)
+
+    def close(self) -> None:
+        """Free the lock."""
+        if self._file is not None:
+            self._file.close()
+
+
+def _place(path: AnyPath) -> str:
+    return str(path) if isinstance(path, UrlPath) else os.path.realpath(path)
 
 
 def run_blocks(
@@ -190,7 +275,7 @@ def run_blocks(
         blocks = cut(left, None, runner.n_workers)
     found = []
     for k, outcome in runner.map_blocks(partial(function, config), blocks):
-        manifest.add([item.name for item in blocks[k]])
+        manifest.add([item.name for item in blocks[k]], outcome.sizes)
         found.append(outcome)
     return pool(found)
 
