@@ -44,8 +44,8 @@ FILES = {
     'mixed': (HEAD + '    grid: {n_bins: [1, 2.5]}\n', 'should be of same type'),
     'bare': ('label: {ground_tolerance: 0.1}\n', 'the node: gp-ground-seg config dump'),
     'text': ('just words\n', 'no ros__parameters'),
-    'syntax': (HEAD + '  label: [ {a\n', 'params file'),
-    'tab': ('/**:\n\tros__parameters:\n', 'event near line 1'),
+    'syntax': (HEAD + '  label: [ {a\n', 'not valid YAML'),
+    'tab': ('/**:\n\tros__parameters:\n', 'not valid YAML'),
     'twice': (HEAD + '    grid: {n_bins: 40}\n    grid: {n_bins: 50}\n', 'grid: given twice'),
     'binary': (b'\xff\xfe\x00\x80', 'utf-8'),
 }

@@ -170,7 +170,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         return self.set_parameters_atomically(parameters)
 
     def _on_set(self, parameters: list[Parameter]) -> Result:
-        # An exception out of here would end the executor and leave the caller waiting.
+        # An exception out of here would leave the caller waiting.
         reason = ''
         try:
             self.check_config(changed(self._config, parameters))

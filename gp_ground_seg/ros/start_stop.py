@@ -20,8 +20,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import yaml
-
 from gp_ground_seg.core.errors import (
     ConfigError,
     GroundSegError,
@@ -86,16 +84,17 @@ def _check_surroundings(words: Sequence[str]) -> None:
     if not any(os.environ.get(name) for name in ('ROS_LOG_DIR', 'ROS_HOME', 'HOME')):
         raise ConfigError(f'no folder for logs, as HOME is not set: {LOG_FOLDER}')
     for path in (path for flag, path in itertools.pairwise(words) if flag == '--params-file'):
-        with contextlib.suppress(OSError, yaml.YAMLError, RecursionError):
-            try:
-                document = read_yaml(path)
-            except (UnicodeDecodeError, ConfigError) as error:
-                raise ConfigError(f'{path}: {error}') from error
-            if document and not _is_of_ros(document):
-                raise ConfigError(
-                    f'{path}: no {ROS_PARAMETERS_KEY}; bare groups are good for --config; for the '
-                    'node: gp-ground-seg config dump --config FILE > ros.yaml'
-                )
+        try:
+            document = read_yaml(path)
+        except OSError:
+            continue  # rcl says it
+        except (UnicodeDecodeError, ConfigError) as error:
+            raise ConfigError(f'{path}: {error}') from error
+        if document and not _is_of_ros(document):
+            raise ConfigError(
+                f'{path}: no {ROS_PARAMETERS_KEY}; bare groups are good for --config; for the '
+                'node: gp-ground-seg config dump --config FILE > ros.yaml'
+            )
 
 
 def _is_of_ros(document: object) -> bool:
