@@ -72,9 +72,10 @@ WORDS = {
 @pytest.mark.parametrize('name', FILES)
 def test_bad_file(tmp_path, capfd, name):
     text, hint = FILES[name]
-    path = tmp_path / 'bad.yaml'
+    path = tmp_path / 'b\x1b[2Ja\nd.yaml'
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    assert hint in ros.start_error(capfd, '--params-file', str(path))
+    line = ros.start_error(capfd, '--params-file', str(path))
+    assert hint in line and line.isprintable()
 
 
 @pytest.mark.parametrize('name', WORDS)

@@ -7,7 +7,7 @@ import sys
 import time
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint
+from gp_ground_seg.core.errors import GroundSegError, MissingDependencyError, install_hint, shown
 from gp_ground_seg.ros.start_stop import run_node
 
 NODE_EXAMPLES = """\
@@ -42,7 +42,7 @@ def main() -> int:
     try:
         return run_node(sys.argv[1:])
     except GroundSegError as error:
-        print(f'ground_segmentation_node: error: {error}', file=sys.stderr)
+        print(f'ground_segmentation_node: error: {shown(error)}', file=sys.stderr)
         return 2
 
 

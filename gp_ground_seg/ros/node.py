@@ -17,7 +17,7 @@ from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.core import log
 from gp_ground_seg.core.backend import NumpyBackend, choose_backend
-from gp_ground_seg.core.errors import GroundSegError, PointCloudError, in_one_line
+from gp_ground_seg.core.errors import GroundSegError, PointCloudError, in_one_line, shown
 from gp_ground_seg.core.frame import usual_errors
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
@@ -116,6 +116,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def _refuse(self, cloud: PointCloud2, reason: str) -> None:
         if not self.context.ok():
             return  # publishing failed because the process ends
+        reason = shown(reason)  # it may hold names of frames and fields
         self._diagnostics.input.refused(reason)
         self.get_logger().error(
             f'cloud on {self._input.topic} in frame {cloud.header.frame_id!r} refused: {reason}',
@@ -213,7 +214,7 @@ def _spin(node: GroundSegmentationNode, stop: start_stop.StopRequest) -> None:
         except Exception as error:
             # Of a callback, or of rclpy itself: at a negative time on /clock, for example.
             if rclpy.ok():
-                reason = f'{type(error).__name__}: {in_one_line(error)}'
+                reason = f'{type(error).__name__}: {shown(in_one_line(error))}'
                 node.get_logger().error(reason, **THROTTLED)
 
 
@@ -229,7 +230,7 @@ def main(args: Sequence[str] | None = None) -> int:
                 node = GroundSegmentationNode()
             _spin(node, stop)
         except GroundSegError as error:
-            sys.stderr.write(f'{NODE_NAME}: error: {error}\n')
+            sys.stderr.write(f'{NODE_NAME}: error: {shown(error)}\n')
             return 2
         finally:
             if node is not None:
