@@ -140,22 +140,18 @@ def test_results_do_not_depend_on_where_the_arrays_lie():
 
 
 def test_with_one_length_scale_it_is_scikit_learns_regression(backend):
-    """Posterior and log marginal likelihood of the stationary case, by another's code."""
+    """Log marginal likelihood of the stationary case, by another's code; its posterior is that
+    of the joint Gaussian in test_ground.py."""
     gaussian_process = pytest.importorskip('sklearn.gaussian_process')
     kernels = gaussian_process.kernels
     rng = np.random.default_rng(4)
-    r, r_star = np.sort(rng.uniform(2, 40, 25)), np.linspace(0, 50, 30)
+    r = np.sort(rng.uniform(2, 40, 25))
     z = 0.2 * np.sin(0.3 * r) + rng.normal(0, 0.05, 25)
     sigma_f, sigma_n, length = 0.4, 0.05, 3.0
     kernel = kernels.ConstantKernel(sigma_f**2) * kernels.RBF(length)
     theirs = gaussian_process.GaussianProcessRegressor(kernel, alpha=sigma_n**2, optimizer=None)
     theirs.fit(r[:, None], z)
-    their_mean, their_std = theirs.predict(r_star[:, None], return_std=True)
-    at = r_star, np.full(30, length)
-    mean, variance = reference.posterior(r, z, np.full(25, length), *at, sigma_f, sigma_n)
-    np.testing.assert_allclose(mean, their_mean, atol=1e-10)
-    np.testing.assert_allclose(np.sqrt(variance), their_std, atol=1e-7)
-    # The objective of that one segment, its latent process constant.
+    # One segment, its latent process constant.
     theta = np.log([sigma_f, sigma_n, 0.9, 2.0, 0.3, length])
     bars = np.array([0, 3]), np.array([5.0, 15.0, 30.0]), np.zeros(3)
     inliers = Inliers(np.array([0, 25]), r, z, np.zeros(25), *bars)

@@ -92,14 +92,6 @@ def test_two_estimates_of_unseen_ground_that_differ_make_it_uncertain():
     assert (inside < 2.5).all()
 
 
-def test_without_a_ground_return_the_surface_is_that_of_the_process():
-    surface = flat()
-    found = correct([], [], surface)
-    np.testing.assert_array_equal(found.mean, surface.mean)
-    np.testing.assert_allclose(found.std, surface.std)
-    np.testing.assert_allclose(found.return_std, np.hypot(0.03, 0.02))
-
-
 def test_nothing_is_computed_before_it_is_asked_for(monkeypatch):
     def asked(*_):
         raise AssertionError('asked for')

@@ -122,9 +122,6 @@ def test_number_of_threads():
             with patch.object(os, 'sched_getaffinity', lambda pid, n=n_cores: set(range(n))):
                 assert Workers(0).n_threads == expected
         assert Workers(7).n_threads == 7
-        # Small clouds are not split.
-        assert Workers(7).n_parts(threads.MIN_POINTS_TO_SPLIT) == 7
-        assert Workers(7).n_parts(threads.MIN_POINTS_TO_SPLIT - 1) == 1
     with patch.object(threads, 'JIT_ENABLED', False):
         assert Workers(7).n_threads == 1
 
