@@ -40,20 +40,13 @@ def received(b, topic, message):
     return answer
 
 
-def test_names_that_the_input_has_already_stay_its_own(b, capfd):
-    points = street(500)
-    message = to_message(points)
+def test_names_that_the_input_has_already_are_said_once(b, capfd):
+    message = to_message(street(500))
     message.fields[0].name = 'label'
     capfd.readouterr()
-    found = received(b, '~/labeled', message)
-    received(b, '~/labeled', message)
-    names = [field.name for field in found.fields]
-    own = [field.name for field in message.fields]
-    assert names == [*own, 'gp_label', *FIELDS[1:]]
-    columns = read_columns(found, ['gp_label', 'label'])
-    expected = GroundSegmenter(CONFIG).segment(xyz_of(points))
-    np.testing.assert_array_equal(columns['gp_label'][0], expected.label)
-    np.testing.assert_array_equal(columns['label'][0], points['intensity'])
+    for _ in range(2):
+        found = received(b, '~/labeled', message)
+        assert [field.name for field in found.fields][-6:] == ['gp_label', *FIELDS[1:]]
     assert said_by(capfd, 'in ~/labeled ours is gp_label').count('gp_label') == 1
 
 
