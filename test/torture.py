@@ -44,6 +44,8 @@ PARTS = {
     'damaged compiled code': Part('torture_cache.py', 40, 20),
     'commands killed, interrupted, disk full': Part('torture_writes.py', 40, 20),
     'damaged files': Part('torture_files.py', 600, 200),
+    'files of another user': Part('torture_permissions.py', 118, 118),
+    'bombs': Part('torture_bombs.py', 85, 17),
     'hostile messages and calls over DDS': Part('torture_ros.py', 400, 200),
 }  # fmt: skip
 

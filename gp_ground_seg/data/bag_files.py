@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.core.errors import DataError, GroundSegError, in_one_line
+from gp_ground_seg.core.errors import DataError, MissingDependencyError, in_one_line
 
 POINT_CLOUD2 = 'sensor_msgs/msg/PointCloud2'
 UNKNOWN_TYPE_HASH = 'RIHS01_' + 64 * '0'  # what rosbag2 itself stores is no valid hash
@@ -58,6 +58,12 @@ def storage_of(path: Path) -> str:
         return 'ros1'
     files = path.glob('*.db3*') if path.is_dir() else [path]
     return 'sqlite3' if any('.db3' in file.suffixes for file in files) else 'mcap'
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a bag, all files of a folder together."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files)
 
 
 def is_bag_folder(path: Path) -> bool:
@@ -131,7 +137,7 @@ def reading(path: Path) -> Iterator[None]:
     """Raise errors of parsing a bag as `DataError` with its path."""
     try:
         yield
-    except GroundSegError:
+    except (DataError, MissingDependencyError):
         raise
     except Exception as error:  # Of many types: struct, apsw, lz4, asserts, ...
         said = in_one_line(error)

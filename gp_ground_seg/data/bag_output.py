@@ -70,7 +70,7 @@ class BagOutput:
                     if name != topic:
                         continue
                     try:
-                        cloud = decode_cloud(raw)
+                        cloud = decode_cloud(raw, bag.size)
                         result = segmenter.segment(read_xyz(cloud))
                     except PointCloudError as error:
                         place = f'message {n_done} of topic {topic}, recorded at {time} ns'

@@ -9,12 +9,28 @@ import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError, in_one_line
-from gp_ground_seg.data.clouds import Cloud, Columns, cloud_of, gather, name_columns, scatter
-from gp_ground_seg.data.files import MAX_SCAN_BYTES, AnyPath, read_bytes
+from gp_ground_seg.data.clouds import (
+    Cloud,
+    Columns,
+    Fields,
+    cloud_of,
+    count_numbers,
+    gather,
+    name_columns,
+    scatter,
+)
+from gp_ground_seg.data.files import (
+    MAX_SCAN_BYTES,
+    AnyPath,
+    check_points,
+    check_unpacked,
+    read_bytes,
+)
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, check_scan, four_columns, read_scan
@@ -23,19 +39,18 @@ NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
 TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N,)
 
 
-def _read_numpy(data: bytes) -> Cloud:
+def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     """Read a table x, y, z, intensity, ..., a structured array, or arrays by name."""
     found = np.load(io.BytesIO(data), allow_pickle=False)
     if isinstance(found, np.ndarray):
-        return _named_cloud({TABLE: found})
-    size = sum(entry.file_size for entry in found.zip.infolist())
-    if size > MAX_SCAN_BYTES:
-        raise PointCloudError(f'{size} bytes unpacked, accepted are at most {MAX_SCAN_BYTES}')
-    return _named_cloud(dict(found))
+        return _fields_of({TABLE: found})
+    check_unpacked(sum(entry.file_size for entry in found.zip.infolist()), len(data))
+    check_points(0, len(found.files), 0)
+    return _fields_of(dict(found))
 
 
-def _named_cloud(arrays: Columns) -> Cloud:
-    """Cloud of the fields and the table; arrays of another length become its header."""
+def _fields_of(arrays: Columns) -> tuple[Fields, Columns]:
+    """Put the fields and the table together; arrays of another length are what is beside them."""
     table = arrays.pop(TABLE, None)
     if table is not None and table.dtype.names is None:
         if table.ndim != 2 or table.shape[1] < 3:
@@ -44,7 +59,7 @@ def _named_cloud(arrays: Columns) -> Cloud:
     columns = {**({} if table is None else scatter(table.ravel())), **arrays}
     shape = columns['x'].shape if 'x' in columns else ()
     fields = {name: v for name, v in columns.items() if shape and v.shape[:1] == shape}
-    return cloud_of(gather(fields), {name: v for name, v in columns.items() if name not in fields})
+    return gather(fields), {name: v for name, v in columns.items() if name not in fields}
 
 
 def _encode_npy(cloud: Cloud) -> bytes:
@@ -67,7 +82,8 @@ def encode_arrays(arrays: Columns) -> bytes:
     return file.getvalue()
 
 
-_READERS: dict[str, Callable[[bytes], Cloud]] = {
+# Each returns the points, and what the file has beside them.
+_READERS: dict[str, Callable[[bytes], tuple[Fields, Any]]] = {
     '.pcd': read_pcd,
     '.ply': read_ply,
     '.npy': _read_numpy,
@@ -95,7 +111,9 @@ def read_file(path: AnyPath, layout: ScanLayout = KITTI) -> Cloud:
     else:
         data = read_bytes(path, MAX_SCAN_BYTES)
         with _named(path, 'cannot be read'), np.errstate(all='ignore'):
-            cloud = _READERS[suffix](data)
+            fields, header = _READERS[suffix](data)
+            check_points(len(fields), count_numbers(fields.dtype), len(data))
+            cloud = cloud_of(fields, header)
     cloud = cloud.about(layout.origin)
     check_scan(path, cloud.xyz[:, :3], layout)
     return cloud

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.data.files import check_points
 
 Fields = npt.NDArray[np.void]
 Columns = dict[str, npt.NDArray[Any]]
@@ -73,7 +75,8 @@ def cloud_of(fields: Fields, header: Any = None) -> Cloud:
 
 
 def name_columns(table: npt.NDArray[Any]) -> Fields:
-    """Structured array (N,) of a table (N, columns)."""
+    """Structured array (N,) of a table (N, columns); PointCloudError for too many columns."""
+    check_points(0, table.shape[1], 0)
     names = [*COLUMNS, *(f'column_{k}' for k in range(5, table.shape[1] + 1))]
     return gather({name: table[:, k] for k, name in enumerate(names[: table.shape[1]])})
 
@@ -91,6 +94,11 @@ def gather(columns: Mapping[str, npt.NDArray[Any]]) -> Fields:
 def scatter(fields: Fields) -> Columns:
     """Columns of a structured array by name."""
     return {name: fields[name] for name in fields.dtype.names or ()}
+
+
+def count_numbers(dtype: np.dtype[Any]) -> int:
+    """Count the numbers of a point, where a field may have several."""
+    return sum(math.prod(dtype[name].shape) for name in dtype.names or ())
 
 
 def in_types(
@@ -120,8 +128,7 @@ def in_types(
 def read_table(data: bytes, dtype: np.dtype[Any], n_points: int, is_text: bool) -> Fields:
     """Read the points behind a header; PointCloudError if there are fewer than it says."""
     # In a text each number takes two bytes, except the last.
-    n_numbers = sum(int(np.prod(dtype[name].shape)) for name in dtype.names or ())
-    needed = n_points * (2 * n_numbers if is_text else dtype.itemsize) - is_text
+    needed = n_points * (2 * count_numbers(dtype) if is_text else dtype.itemsize) - is_text
     if needed > len(data):
         raise PointCloudError(
             f'{len(data)} bytes behind the header, which says {n_points} points '

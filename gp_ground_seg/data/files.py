@@ -21,6 +21,7 @@ from gp_ground_seg.core.errors import (
     DataError,
     GroundSegError,
     MissingDependencyError,
+    PointCloudError,
     in_one_line,
     reason_of,
     require,
@@ -33,6 +34,9 @@ URL_SECONDS = 60.0
 _BYTES_IN_TIME = 1 << 24
 # By these names file systems give the version or the time of a file, the surest first.
 _TIMES = ('ETag', 'etag', 'LastModified', 'last_modified', 'Last-Modified', 'mtime', 'created')
+MAX_UNPACKED_BYTES = 1 << 27  # of packed data, unless these are at least half of it
+MAX_POINTS = 1 << 22  # of a cloud, unless its file has 12 bytes for each: x, y, z
+MAX_NUMBERS = 1000  # of a point
 
 
 @dataclass(frozen=True)
@@ -174,6 +178,25 @@ def _body(system: Any, path: str, most: int, seconds: float) -> bytes:
         except NotImplementedError:  # a system without streams
             pass
     return bytes(system.cat_file(path, 0, most + 1, **limit))
+
+
+def check_unpacked(size: int, packed: int) -> None:
+    """Raise PointCloudError if `packed` bytes become more than are accepted (1 kB may be 1 GB)."""
+    most = max(MAX_UNPACKED_BYTES, 2 * packed)
+    if size > most:
+        raise PointCloudError(f'{packed} bytes unpack to {size}, accepted are at most {most}')
+
+
+def check_points(n_points: int, n_numbers: int, packed: int) -> None:
+    """Raise PointCloudError if a cloud is larger than accepted in a file of `packed` bytes.
+
+    Each of its points, which may be none, has `n_numbers` numbers.
+    """
+    most = max(MAX_POINTS, packed // 12)
+    if n_points > most:
+        raise PointCloudError(f'{n_points} points, accepted are at most {most} in {packed} bytes')
+    if n_numbers > MAX_NUMBERS:
+        raise PointCloudError(f'{n_numbers} numbers per point, accepted are at most {MAX_NUMBERS}')
 
 
 AnyPath = Path | UrlPath

@@ -80,7 +80,7 @@ class Inputs:
         with BagReader(str(self.path)) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
-                read = partial(_decode, raw, f'{self.path}: {place}', self._origin)
+                read = partial(_decode, raw, f'{self.path}: {place}', bag.size, self._origin)
                 title = shown(f'{self.path.name}[{k}]')
                 yield Input(f'{k:06d}', title, self.path, read, 1e-9 * time)
 
@@ -164,9 +164,11 @@ def _stem(path: AnyPath) -> str:
     return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
 
 
-def _decode(raw: bytes, place: str, origin: tuple[float, float, float] | None) -> Cloud:
+def _decode(
+    raw: bytes, place: str, packed: int, origin: tuple[float, float, float] | None
+) -> Cloud:
     try:
-        message = decode_cloud(raw)
+        message = decode_cloud(raw, packed)
         return Cloud(read_fields(message), read_xyz(message)).about(origin)
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError, require
-from gp_ground_seg.data.clouds import Cloud, Fields, cloud_of, gather, in_types, read_table
-from gp_ground_seg.data.files import MAX_SCAN_BYTES
+from gp_ground_seg.data.clouds import Cloud, Fields, gather, in_types, read_table
+from gp_ground_seg.data.files import check_unpacked
 
 _END = re.compile(rb'^DATA[ \t]+(\w+)[ \t]*\r?\n', re.MULTILINE)
 _MAX_HEADER_BYTES = 1 << 16
@@ -32,7 +32,7 @@ class PcdHeader(NamedTuple):
     viewpoint: str = '0 0 0 1 0 0 0'
 
 
-def read_pcd(data: bytes) -> Cloud:
+def read_pcd(data: bytes) -> tuple[Fields, PcdHeader]:
     """Read a file; PointCloudError if it cannot be one."""
     end = _END.search(data[:_MAX_HEADER_BYTES])
     if end is None:
@@ -66,17 +66,16 @@ def read_pcd(data: bytes) -> Cloud:
     else:
         raise PointCloudError(f'DATA {form.decode()}: must be ascii, binary or binary_compressed')
     viewpoint = ' '.join(entries.get('VIEWPOINT', PcdHeader().viewpoint.split()))
-    return cloud_of(fields, PcdHeader(width, height, viewpoint))
+    return fields, PcdHeader(width, height, viewpoint)
 
 
 def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields:
     """Read a body: its size, that unpacked, and field after field without padding."""
     packed, size = struct.unpack_from('<II', data)
     needed = n_points * dtype.itemsize
-    if size != needed or size > MAX_SCAN_BYTES:
-        raise PointCloudError(
-            f'body of {size} bytes, its header says {needed} (at most {MAX_SCAN_BYTES})'
-        )
+    if size != needed:
+        raise PointCloudError(f'body of {size} bytes, its header says {needed}')
+    check_unpacked(size, len(data))
     # LZF knows no empty text.
     body = require('lzf', 'python-neo-lzf').decompress(data[8 : 8 + packed], size) if size else b''
     columns, start = {}, 0

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.data.clouds import Cloud, cloud_of, in_types, read_table
+from gp_ground_seg.data.clouds import Cloud, Fields, in_types, read_table
 
 _END = re.compile(rb'^end_header[ \t]*\r?\n', re.MULTILINE)
 _MAX_HEADER_BYTES = 1 << 16
@@ -33,7 +33,7 @@ class PlyHeader(NamedTuple):
     remarks: tuple[str, ...] = ()
 
 
-def read_ply(data: bytes) -> Cloud:
+def read_ply(data: bytes) -> tuple[Fields, PlyHeader]:
     """Read the vertices of a file; PointCloudError if it cannot be one."""
     end = _END.search(data[:_MAX_HEADER_BYTES])
     if end is None or not data.startswith(b'ply'):
@@ -58,7 +58,7 @@ def read_ply(data: bytes) -> Cloud:
     if elements[:1] != ['vertex'] or n_points < 0:
         raise PointCloudError(f'elements {elements}: must begin with the vertices')
     fields = read_table(data[end.end() :], np.dtype(types), n_points, kind == 'ascii')
-    return cloud_of(fields.astype(fields.dtype.newbyteorder('=')), PlyHeader(tuple(remarks)))
+    return fields.astype(fields.dtype.newbyteorder('=')), PlyHeader(tuple(remarks))
 
 
 def encode_ply(cloud: Cloud) -> bytes:

@@ -19,6 +19,7 @@ from numpy.lib.recfunctions import repack_fields
 from gp_ground_seg.core.errors import PointCloudError, in_one_line
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import jazzy_types
+from gp_ground_seg.data.files import check_points
 
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 _DATATYPE_NAMES = {datatype: np.dtype(code).name.upper() for datatype, code in _CODES.items()}
@@ -268,14 +269,19 @@ def _new_header(stamp: tuple[int, int], frame_id: str) -> Any:
     return types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](*stamp), frame_id)
 
 
-def decode_cloud(raw: bytes | memoryview) -> CloudMessage:
-    """Message of rosbags from its CDR bytes; PointCloudError if they are no PointCloud2."""
+def decode_cloud(raw: bytes | memoryview, packed: int | None = None) -> CloudMessage:
+    """Message of rosbags from its CDR bytes, which were `packed` bytes in a file.
+
+    Raises PointCloudError if they are no PointCloud2, or one larger than accepted.
+    """
     types = jazzy_types()
     try:
         cloud: CloudMessage = types.deserialize_cdr(raw, POINT_CLOUD2)
     except Exception as error:  # Its kind depends on where parsing went astray.
         said = f'{len(raw)} bytes that are no {POINT_CLOUD2}: {in_one_line(error)}'
         raise PointCloudError(said) from error
+    n_numbers = sum(max(field.count, 1) for field in cloud.fields)
+    check_points(cloud.height * cloud.width, n_numbers, len(raw) if packed is None else packed)
     return cloud
 
 

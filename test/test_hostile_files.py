@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import torture_bombs
 import torture_permissions
 from bag_samples import scan, write_ros2_bag
 from cli_runner import error_line, run
@@ -26,6 +27,19 @@ def test_what_another_user_locks_is_refused(step):
     with torture_permissions.world() as place:
         wrong = [torture_permissions.run_case(number, place) for number in numbers]
     assert [line for line in wrong if line] == []
+
+
+@pytest.mark.parametrize(
+    'name',
+    [
+        name if name.startswith('columns') else pytest.param(name, marks=pytest.mark.slow)
+        for name in torture_bombs.MAKERS
+    ],
+)
+def test_what_unpacks_to_gigabytes_is_refused_before_it_does(tmp_path, name):
+    pytest.importorskip('lzf', reason='needs the extra formats')
+    number = list(torture_bombs.MAKERS).index(name)
+    assert torture_bombs.run_case(number, tmp_path) is None
 
 
 def test_a_text_is_shown_in_one_line():
