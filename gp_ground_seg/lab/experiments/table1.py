@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import statistics
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from typing import Any
 
@@ -15,11 +14,10 @@ from gp_ground_seg.core.errors import ConfigError, DataError
 from gp_ground_seg.core.frame import OUTSIDE
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import FitReport, Segmentation
-from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import Frame
 from gp_ground_seg.lab.experiments.variants import refuse_changed
 from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
-from gp_ground_seg.lab.scoring.evaluate import Points, load_kitti
+from gp_ground_seg.lab.scoring.evaluate import OurMethod, as_it_is, load_kitti, score_methods
 from gp_ground_seg.lab.scoring.metrics import height_error
 from gp_ground_seg.lab.scoring.report import Column, Report, Table, changed_parameters
 
@@ -76,16 +74,13 @@ def _measure(
     """Rows of the segments chosen, and a fit of the latent model."""
     rows: list[dict[str, Any]] = []
     with ExitStack() as stack:
-        segmenters = {}
+        methods = []
         for name, model in MODELS.items():
-            segmenter = GroundSegmenter(
-                config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
-            )
-            segmenters[name] = stack.enter_context(segmenter)
+            variant = config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
+            methods.append(stack.enter_context(closing(OurMethod(variant, name))))
         for choice in progress(choices):
-            found, result = _rows(frames[choice], CHOICES[choice], segmenters)
-            rows += found
-    return rows, result.fit
+            rows += _rows(frames[choice], CHOICES[choice], methods)
+    return rows, methods[0].last.fit
 
 
 def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> Table:
@@ -97,12 +92,13 @@ def _table(rows: Sequence[dict[str, Any]], names: Sequence[str], title: str) -> 
 
 
 def _rows(
-    frame: Frame, segments: Sequence[int], segmenters: dict[str, GroundSegmenter]
-) -> tuple[list[dict[str, Any]], Segmentation]:
-    """Rows of a frame, by title of the column, and a result of the latent model."""
+    frame: Frame, segments: Sequence[int], methods: Sequence[OurMethod]
+) -> list[dict[str, Any]]:
+    """Rows of a frame, by title of the column."""
     scan = load_kitti(frame)
     z = scan.points[:, 2].astype(np.float64)
-    results, seconds = _run(segmenters, scan.points)
+    scores = score_methods([scan] * N_REPEATS, methods, as_it_is, each_alone=True)
+    results = {method.name: method.last for method in methods}
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
     common = results['Z-L']
     candidates = common.candidates
@@ -132,25 +128,10 @@ def _rows(
                     ).smse
                     for name, result in results.items()
                 },
-                **{f't {name} [s]': statistics.median(times) for name, times in seconds.items()},
+                **{f't {score.name} [s]': score.seconds() for score in scores},
             }
         )
-    return rows, common
-
-
-def _run(
-    segmenters: Mapping[str, GroundSegmenter], points: Points
-) -> tuple[dict[str, Segmentation], dict[str, list[float]]]:
-    """Last result of each segmenter on a scan, and seconds of its runs but the first."""
-    seconds: dict[str, list[float]] = {name: [] for name in segmenters}
-    results: dict[str, Segmentation] = {}
-    for k in range(N_REPEATS + 1):
-        for name, segmenter in segmenters.items():
-            segmenter.reset()
-            results[name] = segmenter.segment(points)
-            if k > 0:  # compilation and first allocations are not its speed
-                seconds[name].append(results[name].timings['total'])
-    return results, seconds
+    return rows
 
 
 def _in_sample(result: Segmentation, segment: int) -> tuple[int, float]:

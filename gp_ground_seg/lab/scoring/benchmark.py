@@ -17,6 +17,7 @@ from gp_ground_seg.lab.scoring.evaluate import (
     Method,
     MethodScore,
     OurMethod,
+    as_it_is,
     score_methods,
 )
 from gp_ground_seg.lab.scoring.report import changed_parameters
@@ -61,13 +62,9 @@ def run_cases(
             methods.append(stack.enter_context(closing(OurMethod(config, name))))
             methods += [make_baseline()] if make_baseline else []
         items = [*scans] * n_passes
-        scores = score_methods(items, methods, _as_it_is, clock=clock, runner=runner)
+        scores = score_methods(items, methods, as_it_is, clock=clock, runner=runner)
     n = len(methods) // len(cases)
     return {name: scores[n * k : n * (k + 1)] for k, name in enumerate(cases)}
-
-
-def _as_it_is(scan: KnownScan) -> KnownScan:
-    return scan
 
 
 def bench_document(
