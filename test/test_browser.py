@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 from cli_runner import run, until_ctrl_c
-from conftest import REPOSITORY
+from conftest import REPOSITORY, simulated
 from matplotlib.image import imread
 
 from gp_ground_seg.core.parameters.config import Config
@@ -153,3 +153,24 @@ def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page
     page.wait_for(lambda: f'written to {output}' in page.text, 'file')
     assert Config.from_yaml(output) == Config().replace(**{'label.ground_tolerance': float(value)})
     assert page.errors() == []
+
+
+SCRIPT = """<iframe srcdoc="<img src=x onerror='parent.ran=1'>">"""
+
+
+def test_names_and_headers_of_files_are_no_script(page, tmp_path):
+    (tmp_path / SCRIPT).mkdir()
+    scan, other, html = (tmp_path / SCRIPT / name for name in ('a.npy', f'{SCRIPT}.npy', 'a.html'))
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({SCRIPT}), }}".ljust(200)
+    scan.write_bytes(b'\x93NUMPY\x01\x00\xc8\x00' + header.encode())
+    np.save(other, simulated('flat').points)
+    assert run('view', other, '--html', html, '--quiet') == 0
+    with until_ctrl_c('tune', scan, '--output', tmp_path / 'tuned.yaml') as process:
+        for address in (process.stdout.readline().strip(), html.as_uri()):
+            page.driver.get(address)
+            page.wait_for(lambda: SCRIPT in page.text, 'name')
+            # A frame would have loaded before the page shows what comes later.
+            page.screenshot('script.png')
+            assert page.driver.find_elements('css selector', 'iframe') == []
+            assert page.driver.execute_script('return window.ran') is None
+            assert page.errors() == []

@@ -207,7 +207,7 @@ def free_ports():
 def test_the_tuner_draws_the_labels_of_its_parameters(sequence):
     pytest.importorskip('viser', reason='viser is not installed')
     name = 'label.ground_tolerance'
-    with open_server(0) as server:
+    with open_server(0) as (server, _):
         tuner = Tuner(server, list_inputs(sequence), Config(), [name])
         assert tuner.config == Config()
         for tolerance, changed in ((Config()[name], '0 changed: 0 now ground'), (0.01, 'changed')):

@@ -186,12 +186,12 @@ def run_tune(arguments: argparse.Namespace) -> int:
         set_remotely(arguments.node, {name: values[name] for name in arguments.parameters})
         return f'{arguments.node} uses them'
 
-    with open_server(arguments.port) as server:
+    with open_server(arguments.port) as (server, address):
         shown = arguments.parameters, arguments.labels, arguments.frame or 0
         tuner = Tuner(server, inputs, config, *shown)
         tuner.add_button(f'write {output.name}', write)
         if importlib.util.find_spec('rclpy'):
             tuner.add_button(f'apply to {arguments.node}', apply)
-        print(f'http://{server.get_host()}:{server.get_port()}\nCtrl-C ends it.', flush=True)
+        print(f'{address}\nCtrl-C ends it.', flush=True)
         tuner.run()
     return 0

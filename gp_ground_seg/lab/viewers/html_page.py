@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+import dataclasses
 import html
 import io
-from collections.abc import Iterable, Iterator
+import logging
+import re
+import secrets
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -12,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from gp_ground_seg.core.errors import DataError, require
+from gp_ground_seg.core.log import LOGGER
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.colours import length_scale_colours
@@ -29,20 +35,85 @@ _BOX = (
 
 
 @contextmanager
-def open_server(port: int) -> Iterator[Any]:
-    """Yield viser's server on this machine; 0 is any free port. It prints nothing."""
-    viser = require('viser', 'viser')
+def open_server(port: int) -> Iterator[tuple[Any, str]]:
+    """Yield viser's server on this machine, and the address of its page; port 0 is any free one.
+
+    Who does not know the address gets no answer. It prints nothing.
+    """
+    viser, token = require('viser', 'viser'), secrets.token_urlsafe()
     try:
-        with redirect_stdout(io.StringIO()):
+        with redirect_stdout(io.StringIO()), _guarded(token):
             server = viser.ViserServer(host=HOST, port=port, verbose=False)
     except OSError as error:
         raise DataError(f'--port {port}: {error.strerror}') from error
     server.initial_camera.position, server.initial_camera.look_at = CAMERA, TARGET
     try:
-        yield server
+        yield server, f'http://{HOST}:{server.get_port()}/{token}'
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
+
+
+@contextmanager
+def _guarded(token: str) -> Iterator[None]:
+    """Let the server of websockets that viser starts in the block answer only to the token.
+
+    viser has no hook for this. Hence `websockets.asyncio.server.serve`, which it calls, is another
+    one meanwhile; if a later viser does not call it, nothing is served.
+    """
+    module, is_guarded = require('websockets.asyncio.server', 'viser'), False
+    serve, silent = module.serve, LOGGER.getChild('websockets')
+    silent.setLevel(logging.CRITICAL)  # it logs tracebacks of connections, as errors
+
+    def ignore(error: object) -> None:
+        LOGGER.warning('the page: ignored what cannot be read (%s)', type(error).__name__)
+
+    def guarded(
+        handle: Callable[[Any], Any], host: str, port: int,
+        process_request: Callable[[Any, Any], Any], **options: Any,
+    ) -> Any:  # fmt: skip
+        nonlocal is_guarded
+        is_guarded = True
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _loop, context: ignore(context.get('exception')))
+
+        def process(connection: Any, request: Any) -> Any:
+            if not _is_admitted(request, token):
+                return connection.respond(403, 'Open the address that gp-ground-seg printed.\n')
+            path = request.path.removeprefix(f'/{token}')
+            return process_request(connection, dataclasses.replace(request, path=path))
+
+        async def handle_any(connection: Any) -> None:
+            try:
+                await handle(connection)
+            except Exception as error:  # of a page that sends anything
+                ignore(error)
+
+        options |= {'process_request': process, 'logger': silent}
+        return serve(handle_any, host, port, **options)
+
+    module.serve = guarded
+    try:
+        yield
+    finally:
+        module.serve = serve
+    if not is_guarded:
+        raise DataError('this version of viser cannot be kept to this user: install viser 1.1')
+
+
+def _is_admitted(request: Any, token: str) -> bool:
+    """Whether a request has the token, asks for this machine, and is of no other page.
+
+    Another Host is a foreign page whose name leads here, which is its own origin to a browser.
+    """
+    hosts, origins = (request.headers.get_all(name) for name in ('Host', 'Origin'))
+    given = request.path[1:].partition('?')[0].partition('/')[0]
+    return (
+        len(hosts) == 1
+        and re.fullmatch(rf'({re.escape(HOST)}|localhost)(:\d+)?', hosts[0]) is not None
+        and origins in ([], [f'http://{hosts[0]}'])
+        and secrets.compare_digest(given.encode(errors='replace'), token.encode())
+    )
 
 
 def draw_points(server: Any, name: str, cloud: Cloud, visible: bool = True) -> Any:
@@ -64,7 +135,7 @@ def _draw_surface(server: Any, mesh: Mesh) -> None:
 
 def write_page(path: str | Path, scene: Scene, title: str, config: Config, force: bool) -> None:
     """Write a page that holds everything, and opens from disk."""
-    with staged_file(path, force=force) as part, open_server(0) as server:
+    with staged_file(path, force=force) as part, open_server(0) as (server, _):
         for name, cloud in scene.clouds.items():
             draw_points(server, name, cloud, visible=name in SHOWN)
         _draw_surface(server, scene.surface)
@@ -73,9 +144,19 @@ def write_page(path: str | Path, scene: Scene, title: str, config: Config, force
             side='double', cast_shadow=False, visible=False,
         )  # fmt: skip
         head, body, rest = server.get_scene_serializer().as_html().rpartition('</body>')
-        words = f'<b>{html.escape(title)}</b><br>{legend([*scene.clouds, "surface"], config)}'
+        words = f'<b>{text(title)}</b><br>{legend([*scene.clouds, "surface"], config)}'
         words += '<br>The button at the top right shows and hides them, and the 2-sigma band.'
         part.write_text(f'{head}<div style="{_BOX}">{words}</div>{body}{rest}', 'utf-8')
+
+
+def text(words: object) -> str:
+    """Return HTML that shows `words` as they are: names and messages may come from a file."""
+    return html.escape(str(words))
+
+
+def box(content: str) -> str:
+    """Return HTML `content` in the small type of viser's controls."""
+    return f'<div style="font-size:12px;padding:4px 12px">{content}</div>'
 
 
 def legend(names: Iterable[str], config: Config) -> str:

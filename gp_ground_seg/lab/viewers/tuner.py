@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.core.frame import Label
+from gp_ground_seg.core.log import LOGGER
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.export import is_logarithmic
 from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec, ParameterValue
@@ -18,10 +19,11 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Inputs
 from gp_ground_seg.lab.scoring.metrics import Labels
-from gp_ground_seg.lab.viewers.html_page import draw_points, legend
+from gp_ground_seg.lab.viewers.html_page import box, draw_points, legend, text
 from gp_ground_seg.lab.viewers.scene import Cloud, point_colours, read_view
 
 N_STEPS = 400  # of a slider
+COLOURS = ('changes', 'class', 'height', 'p_ground', 'errors')
 _NO_LABELS = ('frame', 'input', 'runtime', 'diagnostics')
 
 
@@ -65,12 +67,14 @@ class Tuner:
         # Sharing would send the scan through a server of viser's makers.
         gui.configure_theme(control_width='large', show_share_button=False, show_logo=False)
         gui.set_panel_label(inputs.path.name)
-        self._table, self._legend = gui.add_markdown('segmenting ...'), gui.add_html('')
-        self._frame = gui.add_slider('frame', 0, max(last, 1), 1, frame, visible=last > 0)
-        colours = ('changes', 'class', 'height', 'p_ground', 'errors')
-        self._colours = gui.add_dropdown('colours', colours)
-        for handle in (self._frame, self._colours):
+        self._said = gui.add_html(box('segmenting ...'))
+        self._table, self._legend = gui.add_markdown(''), gui.add_html('')
+        number = gui.add_slider('frame', 0, max(last, 1), 1, frame, visible=last > 0)
+        name = gui.add_dropdown('colours', COLOURS)
+        for handle in (number, name):
             handle.on_update(lambda _event: self._changed.set())
+        self._frame = _reader('frame', number, {k: k for k in range(len(inputs))})
+        self._colours = _reader('colours', name, {colours: colours for colours in COLOURS})
         self._controls = {name: self._add_control(find_spec(name)) for name in names}
         self.add_button('compare with these values', self._compare)
 
@@ -81,24 +85,18 @@ class Tuner:
 
     def add_button(self, title: str, action: Callable[[Config], str]) -> None:
         """Add a button; `action` is given the parameters, and returns what to say."""
-        button, said = self._server.gui.add_button(title), self._server.gui.add_markdown('')
-
-        def click(_event: object) -> None:
-            try:
-                said.content = action(self.config)
-            except GroundSegError as error:
-                said.content = f'**{error}**'
-
-        button.on_click(click)
+        button, said = self._server.gui.add_button(title), self._server.gui.add_html('')
+        button.on_click(lambda _event: _tell(said, lambda: action(self.config)))
 
     def run(self) -> None:
         """Segment for ever whenever something has changed; the newest values count."""
         while self._changed.wait():
             self._changed.clear()
-            try:
-                self.show(int(self._frame.value), self._colours.value, self.config)
-            except GroundSegError as error:
-                self._table.content = f'**{error}**'
+            _tell(self._said, self._update)
+
+    def _update(self) -> str:
+        self.show(self._frame(), self._colours(), self.config)
+        return ''
 
     def _compare(self, config: Config) -> str:
         self._reference = config
@@ -110,11 +108,12 @@ class Tuner:
         gui, now = self._server.gui, self._start[spec.name]
         hint = f'{spec.description} ({spec.accepted})'
         if spec.type in (bool, str):
-            options = spec.choices or (False, True)
-            words = [str(option).lower() for option in options]
-            shown = gui.add_dropdown(spec.name, words, initial_value=str(now).lower(), hint=hint)
+            words = {str(option).lower(): option for option in spec.choices or (False, True)}
+            shown = gui.add_dropdown(
+                spec.name, list(words), initial_value=str(now).lower(), hint=hint
+            )
             shown.on_update(lambda _event: self._changed.set())
-            return lambda: options[words.index(shown.value)]
+            return _reader(spec.name, shown, words)
 
         def title(value: ParameterValue) -> str:
             return f'{spec.name} = {value} {"" if value == AUTO else spec.unit}'.rstrip()
@@ -126,13 +125,14 @@ class Tuner:
             title(now), 0, last, 1, (values.index(now),), hint=hint,
             marks=((0, str(values[0])), (last, str(values[-1]))),
         )  # fmt: skip
+        read = _reader(spec.name, slider, {(k,): value for k, value in enumerate(values)})
 
         def move(_event: object) -> None:
-            slider.label = title(values[slider.value[0]])
+            slider.label = title(read())
             self._changed.set()
 
         slider.on_update(move)
-        return lambda: values[slider.value[0]]
+        return read
 
     def _segment(self, number: int, config: Config) -> Segmentation:
         self._segmenter.configure(config)
@@ -164,6 +164,34 @@ class Tuner:
             self._legend.content = f'<div style="font-size:12px;padding:4px 12px">{words}</div>'
             scores = view.scores(result.label), old_scores
             self._table.content = _table(result, before, scores)
+
+
+def _tell(place: Any, action: Callable[[], str]) -> None:
+    """Show at a place of the page what `action` says, or why it failed: the page lives on."""
+    try:
+        words = action()
+    except Exception as error:
+        words = str(error) if isinstance(error, GroundSegError) else repr(error)
+    place.content = box(text(words)) if words else ''
+
+
+def _reader(name: str, control: Any, choices: Mapping[Any, Any]) -> Callable[[], Any]:
+    """Return what reads a control; what the page sent and is no choice is taken back."""
+    last = control.value
+
+    def read() -> Any:
+        nonlocal last
+        sent = control.value
+        try:
+            choice = choices[sent]
+        except (KeyError, TypeError):
+            LOGGER.warning('%s: taken back what the page sent, %.60r', name, sent)
+            control.value = last
+            return choices[last]
+        last = sent
+        return choice
+
+    return read
 
 
 def _table(result: Segmentation, before: Labels, scores: Sequence[dict[str, float]]) -> str:
