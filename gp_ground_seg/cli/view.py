@@ -20,7 +20,7 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import staged_file
 from gp_ground_seg.data.inputs import Inputs
 from gp_ground_seg.lab.viewers.html_page import open_server, write_page
-from gp_ground_seg.lab.viewers.rerun_view import Recording, web_viewer
+from gp_ground_seg.lab.viewers.rerun_view import Recording, open_viewer, web_viewer
 from gp_ground_seg.lab.viewers.scene import View, make_scene, read_view
 from gp_ground_seg.lab.viewers.tuner import Tuner, tunable
 
@@ -125,7 +125,7 @@ def run_view(arguments: argparse.Namespace) -> int:
             raise DataError('no display here: --web, --save FILE and --html FILE need none')
         else:
             recording = Recording(shown(inputs.path.name))
-            recording.stream.spawn()
+            recording.stream.connect_grpc(open_viewer())
             _record(recording, inputs, arguments, segmenter)
     if target:
         print(f'written to {shown(target)}')

@@ -88,27 +88,54 @@ def _blueprint(rrb: Any, names: list[str]) -> Any:
     )
 
 
-@contextmanager
-def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
-    """Serve Rerun's web viewer; yield its process, the page's address, and where to send frames.
+def _start(words: str, *ports: int) -> subprocess.Popen[bytes]:
+    """Start Rerun, and return once it listens at these ports, of this machine only.
 
-    They arrive at the next port. rerun's function for this listens on every network.
+    rerun's functions for this listen on every network.
     """
-    require('rerun', 'rerun-sdk')
-    ports = port, port + 1
-    if any(map(_is_listening, ports)):
-        raise DataError(f'--port {port}: it or the next one is in use; choose another')
-    words = f'--serve-web --bind {HOST} --web-viewer-port {port} --port {port + 1}'
     server = subprocess.Popen(
-        [sys.executable, '-m', 'rerun', *words.split()], start_new_session=True,
+        [sys.executable, '-m', 'rerun', '--bind', HOST, *words.split()], start_new_session=True,
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
         # A stream that finds nobody gives up after a while.
         while not all(map(_is_listening, ports)):
             if server.poll() is not None:
-                raise DataError("Rerun's web viewer does not start: try `rerun --serve-web`")
+                raise DataError(f'Rerun does not start: try `rerun {words}`')
             time.sleep(0.1)
+    except BaseException:
+        _stop(server)
+        raise
+    return server
+
+
+def _stop(server: subprocess.Popen[bytes]) -> None:
+    # The process is a wrapper of the one that serves.
+    with suppress(ProcessLookupError):
+        os.killpg(server.pid, signal.SIGTERM)
+    server.wait()
+
+
+def open_viewer() -> str:
+    """Open Rerun's viewer, which stays open, and return where to send frames."""
+    with socket.create_server((HOST, 0)) as free:
+        port = free.getsockname()[1]
+    _start(f'--port {port} --expect-data-soon', port)
+    return f'rerun+http://{HOST}:{port}/proxy'
+
+
+@contextmanager
+def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
+    """Serve Rerun's web viewer; yield its process, the page's address, and where to send frames.
+
+    They arrive at the next port.
+    """
+    require('rerun', 'rerun-sdk')
+    ports = port, port + 1
+    if any(map(_is_listening, ports)):
+        raise DataError(f'--port {port}: it or the next one is in use; choose another')
+    server = _start(f'--serve-web --web-viewer-port {port} --port {port + 1}', *ports)
+    try:
         source = f'rerun%2Bhttp%3A%2F%2F{HOST}%3A{port + 1}%2Fproxy'
         yield (
             server,
@@ -116,10 +143,7 @@ def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
             f'rerun+http://{HOST}:{port + 1}/proxy',
         )
     finally:
-        # The process is a wrapper of the one that serves.
-        with suppress(ProcessLookupError):
-            os.killpg(server.pid, signal.SIGTERM)
-        server.wait()
+        _stop(server)
 
 
 def _is_listening(port: int) -> bool:
