@@ -38,7 +38,7 @@ def until_ctrl_c(*words, **options):
             said = process.communicate()[1]
     assert process.returncode in INTERRUPTED
     *notes, last = said.splitlines()
-    assert last == 'gp-ground-seg: interrupted'
+    assert last == 'gp-ground-seg: interrupted', said
     assert all(line.startswith('gp-ground-seg: note: ') for line in notes), said
 
 

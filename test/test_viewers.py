@@ -14,8 +14,10 @@ from cli_runner import error_line, run, until_ctrl_c
 from conftest import ROAD, simulated
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
+from gp_ground_seg.lab.viewers import html_page
 from gp_ground_seg.lab.viewers.html_page import open_server
 from gp_ground_seg.lab.viewers.scene import View, make_scene, palette, point_colours, read_view
 from gp_ground_seg.lab.viewers.tuner import Tuner, slider_values, tunable
@@ -217,6 +219,12 @@ def test_the_tuner_draws_the_labels_of_its_parameters(sequence):
             r'ground \| ([\d,]+) \| ([\d,]+)', tuner._table.content
         ).groups()
         assert int(n_ground.replace(',', '')) < int(n_before.replace(',', ''))
+
+
+def test_a_server_that_cannot_be_guarded_is_refused():
+    pytest.importorskip('viser', reason='viser is not installed')
+    with pytest.raises(DataError, match='install viser'), html_page._guarded('token'):
+        pass  # as a later viser might do: another function serves
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import http.client
 import re
 import socket
 import struct
+import sys
 import tempfile
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -162,16 +163,24 @@ def attack(rng, address):
     return None
 
 
-if __name__ == '__main__':
-    with tempfile.TemporaryDirectory() as root, served(Path(root)) as page_address:
+def main():
+    """Attack one page by the cases of the command line."""
+    with tempfile.TemporaryDirectory() as folder, served(Path(folder)) as address:
 
         def run_case(number):
-            """Attack; the page must answer after every tenth case."""
-            rng = np.random.default_rng([23, number])
-            wrong = attack(rng, page_address)
+            wrong = attack(np.random.default_rng([23, number]), address)
             if number % 10 == 9:
-                with Page(page_address) as page:
+                with Page(address) as page:
                     page.move()
             return wrong
 
-        run_cases(run_case)
+        try:
+            run_cases(run_case)
+        except SystemExit as end:
+            code = end.code
+    # Behind the block, whose end looks for tracebacks.
+    sys.exit(code)
+
+
+if __name__ == '__main__':
+    main()

@@ -9,6 +9,7 @@ import io
 import logging
 import re
 import secrets
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
@@ -50,6 +51,8 @@ def open_server(port: int) -> Iterator[tuple[Any, str]]:
     try:
         yield server, f'http://{HOST}:{server.get_port()}/{token}'
     finally:
+        # A click may still be at work, and set what nobody sees any more.
+        warnings.filterwarnings('ignore', category=UserWarning, module='viser')
         with redirect_stdout(io.StringIO()):
             server.stop()
 
