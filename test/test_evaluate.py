@@ -62,24 +62,18 @@ def test_labelled_frames_of_all_and_of_some(tmp_path):
     assert [f.sequence for f in labelled_frames(tmp_path, names)] == ['08', '00', '00']
 
 
-def test_frames_without_labels_are_named(tmp_path):
-    write_streets(tmp_path, s00=1, s11=1)
-    write_frame(tmp_path, '11', 5, street()[0])
-    with pytest.raises(DataError, match='frames of sequence 11 have no labels, as 000005'):
-        labelled_frames(tmp_path)
-    assert len(labelled_frames(tmp_path, ['00'])) == 1
-
-
-def test_sequences_without_labels_are_left_out_unless_named(tmp_path, caplog):
+def test_frames_without_labels_are_named_and_sequences_without_any_left_out(tmp_path, caplog):
     caplog.set_level(logging.INFO)
-    write_frame(tmp_path, '11', 0, street()[0])
+    write_frame(tmp_path, '11', 5, street()[0])
     with pytest.raises(DataError, match='no sequence has labels, of 11'):
         labelled_frames(tmp_path)
     write_streets(tmp_path, s00=2)
     assert [frame.sequence for frame in labelled_frames(tmp_path)] == ['00', '00']
     assert caplog.messages == ['sequences without labels left out: 11']
-    with pytest.raises(DataError, match='frames of sequence 11 have no labels'):
-        labelled_frames(tmp_path, ['11'])
+    write_streets(tmp_path, s11=1)
+    for names in (None, ['11']):
+        with pytest.raises(DataError, match='frames of sequence 11 have no labels, as 000005'):
+            labelled_frames(tmp_path, names)
 
 
 @pytest.mark.parametrize('each_alone', [False, True])

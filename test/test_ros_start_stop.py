@@ -14,9 +14,7 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 import cli_runner
 import ros_helpers as ros
 from cli_runner import children, is_running, stat_words
-from rcl_interfaces.srv import GetParameters
 from ros_helpers import IN_NAMESPACE, MODULE, NAMESPACE, Process, wait_for
-from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.ros.start_stop import ROS_WHEELS, ros_session, stop_on_signals
@@ -125,45 +123,19 @@ def test_missing_ros_is_said_in_one_line():
     assert f'pip install {ROS_WHEELS}' in line
 
 
-@pytest.mark.slow
-def test_two_nodes_side_by_side_read_their_parts_of_one_file(tmp_path):
-    """Each has its own parameters and topics; the second is told to be quiet."""
+@pytest.mark.parametrize(('name', 'tolerance'), [('front', 0.3), ('rear', 0.4)])
+def test_two_nodes_read_their_parts_of_one_file(tmp_path, name, tolerance):
     path = tmp_path / 'both.yaml'
     path.write_text(
         f'/**:\n  ros__parameters:\n    learning: {{mode: fixed}}\n'
         f'{NAMESPACE}/front:\n  ros__parameters:\n    label: {{ground_tolerance: 0.3}}\n'
         f'{NAMESPACE}/rear:\n  ros__parameters:\n    label: {{ground_tolerance: 0.4}}\n'
     )
-    common = (*IN_NAMESPACE, '--params-file', str(path))
-    front = (*common, '-r', '__node:=front', '-r', 'points:=front/points')
-    rear = (*common, '-r', '__node:=rear', '-r', 'ground:=floor', '-p', 'grid.nbins:=5')
-    with (
-        Process(*front, folder=tmp_path) as one,
-        Process(*rear, '--log-level', 'warn', folder=tmp_path, start=MODULE) as other,
-        ros.isolated_context() as context,
-    ):
-        one.wait_until_ready()
-        assert 'label.ground_tolerance: 0.3 m' in one.log
-        assert f'listening to {NAMESPACE}/front/points' in one.log
-        link = ros.Link(context)
-        floor = ros.Collector(link.probe, PointCloud2, 'floor')
-        to_front = link.probe.create_publisher(PointCloud2, 'front/points', ros.RELIABLE)
-        with ros.spinning(context, link.probe):
-            request = GetParameters.Request(names=['label.ground_tolerance', 'learning.mode'])
-            for name, tolerance in (('front', 0.3), ('rear', 0.4)):
-                link.node_name = f'{NAMESPACE}/{name}'
-                values = link.call(GetParameters, 'get_parameters', request).values
-                assert (values[0].double_value, values[1].string_value) == (tolerance, 'fixed')
-            points = ros.street(1000)
-            link.publish_until(ros.to_message(points, frame='r'), lambda: floor.messages, 'floor')
-            link.publisher, heard = to_front, link.ground.messages
-            link.publish_until(ros.to_message(points, frame='f'), lambda: heard, 'ground')
-            assert {message.header.frame_id for message in floor.messages} == {'r'}
-            assert {message.header.frame_id for message in heard} == {'f'}
-        # Quiet but for what is wrong, and that names what was meant.
-        (line,) = other.log.splitlines()
-        assert 'grid.nbins' in line
-        assert 'did you mean grid.n_bins?' in line
+    words = '-r', f'__ns:={NAMESPACE}', '-r', f'__node:={name}', '-r', f'points:={name}/points'
+    with ros.started_node('--params-file', str(path), *words) as node:
+        assert node.config.label.ground_tolerance == tolerance
+        assert node.config.learning.mode == 'fixed'
+        assert node.resolve_topic_name('points') == f'{NAMESPACE}/{name}/points'
 
 
 @pytest.mark.slow

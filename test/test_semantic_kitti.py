@@ -97,6 +97,7 @@ def test_times_belong_to_the_numbers_of_the_files(tmp_path):
         (b'0.0\nnow\n0.2\n', 'now'),
         (b'0.0\nnan\n0.2\n', 'nan'),
         (b'0.0 0.2 0.1', '0.1'),
+        (b'0.0 0.1 0.1', '0.1 s of frame 000002: times must increase'),
         (b'\xff\xfe', r'times\.txt'),
         (None, r'times\.txt'),
     ],
