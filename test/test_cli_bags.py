@@ -250,6 +250,8 @@ def test_loop_until_interrupted(tmp_path):
     assert int(numbers[0]) >= 7
     stamps = [stamp_of(decode_cloud(raw)) for raw in listener.clouds['/points']]
     assert stamps == list(itertools.islice(itertools.cycle(stamps[:3]), len(stamps)))
+    # In each round the clock of the bag begins again.
+    assert (np.diff(listener.clock) < 0).sum() >= 2
     # A period between the last of a round and the first of the next, as between the others.
     steps = np.diff(listener.times['/points'])
     assert steps.min() > 0.5 * PERIOD / 2 - 1e6 * float(numbers[4])

@@ -57,7 +57,7 @@ MODEL_KEYS = (
 )
 
 
-def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch):
+def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch, capfd):
     points, resets, reset = street(3000), [], GroundSegmenter.reset
     monkeypatch.setattr(GroundSegmenter, 'reset', lambda s: [resets.append(1), reset(s)])
     limits = '-p', 'diagnostics.stale_after:=3.0', '-p', 'diagnostics.max_latency:=10.0'
@@ -83,6 +83,9 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch):
             'output': wait_for_counter('output', f'{NAMESPACE}/ground since startup', '6'),
         }
         assert resets == [1, 1]
+        # Throttled: two jumps, one message.
+        said = ros.said_by(capfd, 'time jumped back by 2.0 s: what earlier clouds taught')
+        assert said.count('time jumped back') == 1
         assert b.set('diagnostics.max_latency', 0.001).successful
         b.wait_for_status('processing', lambda _, s: s.level == DiagnosticStatus.WARN)
         node_name = b.node_name
