@@ -43,6 +43,7 @@ PARTS = {
     'threads, processes, signals, limits': Part('torture_processes.py', 110, 11),
     'damaged compiled code': Part('torture_cache.py', 40, 20),
     'commands killed, interrupted, disk full': Part('torture_writes.py', 40, 20),
+    'data sets that change, two runs at once': Part('torture_resume.py', 120, 40),
     'damaged files': Part('torture_files.py', 600, 200),
     'files of another user': Part('torture_permissions.py', 118, 118),
     'bombs': Part('torture_bombs.py', 85, 17),

@@ -18,7 +18,7 @@ from gp_ground_seg.data.cloud_output import FORMATS
 from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
-from gp_ground_seg.lab.scale.cluster import Progress
+from gp_ground_seg.lab.scale.cluster import Progress, depends_on_past
 from gp_ground_seg.lab.scale.dataset import Manifest, Outcome, Scan, digest, run_blocks, sweep
 
 # Options that the output depends on, beside the parameters and the layout of scans.
@@ -89,7 +89,9 @@ def run(
         raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')
     layout = replace(options.scan_layout(arguments), doubts='ignore')
     given = [getattr(arguments, name) for name in _OPTIONS]
-    with closing(Manifest(target, digest(config, layout, given), items)) as manifest:
+    by_sequence = unit == 'bag' or depends_on_past(config)
+    manifest = Manifest(target, digest(config, layout, given), items, by_sequence=by_sequence)
+    with closing(manifest):
         done, again = manifest.open(resume=arguments.resume, force=arguments.force)
         if done or again:
             begun = f'{len(done)} of {len(items)} were finished before'
@@ -97,7 +99,7 @@ def run(
         if len(done) < len(items):
             with options.runner(arguments, 'segment', unit) as runner:
                 manifest.begin()
-                found = run_blocks(runner, function, config, items, manifest, done, unit == 'bag')
+                found = run_blocks(runner, function, config, items, manifest, done, by_sequence)
                 n_workers = runner.n_workers
             print_summary(found, target, n_workers)
     if isinstance(target, Path):

@@ -240,8 +240,6 @@ def stamp(path: AnyPath) -> tuple[int, str]:
         parts = [part.stat() for part in (path, *path.rglob('*'))]
     except FileNotFoundError:
         return -1, ''
-    except OSError as error:
-        raise DataError(f'{path}: {error.strerror or error}') from error
     files = [part for part in parts if not stat.S_ISDIR(part.st_mode)]
     return sum(f.st_size for f in files), str(max(part.st_mtime_ns for part in parts))
 

@@ -21,7 +21,7 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
 from gp_ground_seg.data.files import AnyPath, UrlPath, read_bytes, stamp
-from gp_ground_seg.lab.scale.cluster import Progress, Runner, cut, depends_on_past
+from gp_ground_seg.lab.scale.cluster import Progress, Runner, cut
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 MANIFEST = 'manifest.jsonl'
@@ -120,12 +120,26 @@ class Manifest:
         Digest of all that the output depends on, beside the inputs; see `digest`.
     scans : sequence of Scan
         All that are to be labelled.
+    by_sequence : bool
+        Whether labels depend on the other scans of the sequence.
     """
 
-    def __init__(self, folder: AnyPath, configuration: str, scans: Sequence[Scan]) -> None:
+    def __init__(
+        self,
+        folder: AnyPath,
+        configuration: str,
+        scans: Sequence[Scan],
+        *,
+        by_sequence: bool = False,
+    ) -> None:
         self._path = folder / MANIFEST
         self._run = {'configuration': configuration, 'version': gp_ground_seg.__version__}
         self._inputs = {scan.name: [_place(scan.path), *stamp(scan.path)] for scan in scans}
+        if by_sequence:
+            for block in cut(scans, lambda scan: scan.sequence):
+                names = [scan.name for scan in block]
+                for name in names:
+                    self._inputs[name].append(hashlib.sha256(repr(names).encode()).hexdigest())
         self._text = b''
         self._file: IO[bytes] | None = None
 
@@ -155,8 +169,6 @@ class Manifest:
             self._file = os.fdopen(number, 'rb+', buffering=0)
         except FileExistsError as error:
             raise DataError(f'{self._path.parent}: another run writes to it') from error
-        except OSError as error:
-            raise DataError(f'{self._path}: {error.strerror}') from error
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -217,15 +229,12 @@ class Manifest:
         if isinstance(self._path, UrlPath):
             self._path.write_bytes(self._text)
             return
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            if self._file is None:
-                self._lock(os.O_CREAT | os.O_EXCL)
-            assert self._file is not None
-            self._file.truncate(len(self._text))
-            self._file.seek(len(self._text))
-        except OSError as error:
-            raise DataError(f'{self._path}: {error.strerror}') from error
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        if self._file is None:
+            self._lock(os.O_CREAT | os.O_EXCL)
+        assert self._file is not None
+        self._file.truncate(len(self._text))
+        self._file.seek(len(self._text))
 
     def add(self, names: Sequence[str], sizes: Sequence[int]) -> None:
         """Note that a block is finished, with the sizes of its outputs [bytes]."""
@@ -257,17 +266,17 @@ def run_blocks(
     items: Sequence[Scan],
     manifest: Manifest,
     done: set[str],
-    by_sequence: bool = False,
+    by_sequence: bool,
 ) -> Outcome:
     """Compute the items whose names are not `done`, and add each block to the manifest.
 
-    With `by_sequence`, or where the labels of a scan depend on the scans before it, a block is a
-    whole sequence, computed again from its first scan if it is not finished.
+    With `by_sequence` a block is a whole sequence, computed again from its first scan if it is not
+    finished: the labels of a scan may depend on the scans before it.
     """
     left = [item for item in items if item.name not in done]
     if runner.n_workers:
         config = config.replace(**{'runtime.n_threads': 1})
-    if by_sequence or depends_on_past(config):
+    if by_sequence:
         unfinished = {item.sequence for item in left}
         again = [item for item in items if item.sequence in unfinished]
         blocks = cut(again, lambda item: item.sequence)
