@@ -54,8 +54,8 @@ Nothing is overwritten without --force. Output has a hidden name (.NAME.partial-
 it is complete.
 
 With a KITTI_ROOT, several bags, a URL, --workers or --resume, each file appears when it is
-complete, and OUT/manifest.jsonl has a line for each block of files. --resume skips these
-files. The labels are the same (docs/datasets.md).
+complete, and OUT/manifest.jsonl has a line for each block of files. --resume skips those
+whose input and output are as they were. The labels are the same (docs/datasets.md).
 """
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
