@@ -46,6 +46,7 @@ PARTS = {
     'data sets that change, two runs at once': Part('torture_resume.py', 120, 40),
     'damaged files': Part('torture_files.py', 600, 200),
     'files of another user': Part('torture_permissions.py', 118, 118),
+    'wrong commands': Part('torture_commands.py', 1000, 250),
     'bombs': Part('torture_bombs.py', 85, 17),
     'servers': Part('torture_servers.py', 200, 100),
     'hostile messages and calls over DDS': Part('torture_ros.py', 400, 200),

@@ -168,8 +168,8 @@ def world():
             yield folder
         finally:
             os.chdir(before)
-            for path in folder.iterdir():
-                path.chmod(0o755)
+            for name in ('unlisted', 'closed', 'unwritable'):
+                (folder / name).chmod(0o755)
 
 
 if __name__ == '__main__':
