@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torture_bombs
+import torture_commands
 import torture_permissions
 from bag_samples import scan, write_ros2_bag
 from cli_runner import error_line, run
@@ -32,7 +33,7 @@ def test_what_another_user_locks_is_refused(step):
 @pytest.mark.parametrize(
     'name',
     [
-        name if name.startswith('columns') else pytest.param(name, marks=pytest.mark.slow)
+        name if name == 'columns.npy' else pytest.param(name, marks=pytest.mark.slow)
         for name in torture_bombs.MAKERS
     ],
 )
@@ -40,6 +41,16 @@ def test_what_unpacks_to_gigabytes_is_refused_before_it_does(tmp_path, name):
     pytest.importorskip('lzf', reason='needs the extra formats')
     number = list(torture_bombs.MAKERS).index(name)
     assert torture_bombs.run_case(number, tmp_path) is None
+
+
+@pytest.mark.parametrize('first', [0, pytest.param(40, marks=pytest.mark.slow)])
+def test_wrong_commands_are_one_line_and_change_nothing(first):
+    pytest.importorskip('rclpy', reason='ROS is not installed')
+    stop = 40 if first == 0 else 300
+    with torture_permissions.world() as place:
+        torture_commands.make_hostile(place)
+        wrong = [torture_commands.run_case(number, place) for number in range(first, stop)]
+    assert [line for line in wrong if line] == []
 
 
 def test_a_text_is_shown_in_one_line():
@@ -115,6 +126,7 @@ def in_shell(words, cwd):
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.slow
 def test_streams_that_are_closed_or_full(tmp_path):
     full = 'No space left on device\n'
     (tmp_path / 'a.yaml').write_text('grid: {n_bins: 77}')
