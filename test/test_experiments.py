@@ -22,7 +22,6 @@ from gp_ground_seg.lab.experiments import (
     variants,
 )
 from gp_ground_seg.lab.experiments.ablation import MODELS
-from gp_ground_seg.lab.experiments.variants import SimulatedFrame, load_simulated
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
 from gp_ground_seg.lab.scoring.metrics import Confusion, count_confusion, height_error
@@ -151,35 +150,6 @@ def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):
     assert sum(one['n_points_all'] for one in report.rows) == row['points']
 
 
-def test_scene_scores_follow_their_definitions():
-    config = Config().replace(**{'grid.n_segments': 120})
-    frames = variants.simulated_frames(['vlp-16'], ['kerb'], 2, (6.0,))
-    report = scenes.score_scenes(frames, config)
-    (row,) = report.tables['scenes'].json()
-    total, its_total = Confusion(), Confusion()
-    errors, its_errors = [], []
-    segmenter, method = GroundSegmenter(config), PatchworkppMethod(SENSORS['vlp-16'].height)
-    for seed in (0, 1):
-        scan = load_simulated(SimulatedFrame('vlp-16', 'kerb', seed, 6.0))
-        ground, z = scan.is_ground, scan.ground_z
-        segmenter.reset()
-        result = segmenter.segment(scan.points)
-        total += count_confusion(result.label, scan.truths['exact'])
-        errors.append((result.ground_z - z)[ground])
-        method.reset()
-        method.run(scan.points)
-        its = method.result()
-        its_total += count_confusion(its.label, scan.truths['exact'])
-        its_errors.append(height_error(z[ground], its.ground_z[ground]))
-    assert (row['sensor'], row['scene']) == ('vlp-16', 'kerb')
-    assert (row['iou'], row['peer_iou']) == (total.iou, its_total.iou)
-    assert row['rmse'] == pytest.approx(np.sqrt(np.nanmean(np.concatenate(errors) ** 2)))
-    missing = np.isnan(np.concatenate(errors)).mean()
-    assert row['share_without_model'] == pytest.approx(missing)
-    medians = [error.median_absolute for error in its_errors]
-    assert row['peer_median_absolute'] == pytest.approx(np.median(medians))
-
-
 def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
     frames = variants.simulated_frames(['vlp-16'], ['kerb', 'hedge'], 1, (0.0, 6.0))
     places = [(frame.scene, frame.x) for frame in frames]
@@ -231,18 +201,26 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
         scenes.score_objects(frames[1:], FIXED, with_peer=False)
 
 
-def test_behind_is_said():
-    def score(*ious):
-        error = height_error(np.zeros(1), np.zeros(1))
+def test_scenes_by_hand_and_behind_is_said():
+    """Scores are those of each scan as `test_lost_objects_follow_their_definitions` has them."""
+
+    def score(*ious, error):
+        height = height_error(np.zeros(4), np.array([error, error, -3.0 * error, np.nan]))
         return MethodScore('x', tuple(
             ScanScore(f'vlp-16 {name}', '', 0.1, confusions={'e': Confusion(iou, 100 - iou)},
-                      height=error)
+                      height=height)
             for name, iou in zip(('flat', 'ramp', 'kerb'), ious, strict=True)
         ))  # fmt: skip
 
-    scores = score(90, 80, 70), score(89, 81, 70)
-    (note,) = scenes.scene_table(scores).notes
+    table = scenes.scene_table([score(90, 80, 70, error=0.1), score(89, 81, 70, error=0.2)])
+    (note,) = table.notes
     assert note == 'ahead of x on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
+    row = table.json()[0]
+    assert (row['sensor'], row['scene'], row['interval']) == ('vlp-16', 'flat', None)
+    found = [row[name] for name in ('iou', 'peer_iou', 'difference', 'share_without_model')]
+    assert found == pytest.approx([0.9, 0.89, 0.01, 0.25])
+    found = [row[f'{who}{name}'] for name in ('rmse', 'median_absolute') for who in ('', 'peer_')]
+    assert found == pytest.approx([*(np.sqrt(11 / 3) * np.array([0.1, 0.2])), 0.1, 0.2])
 
 
 @pytest.fixture(scope='module')
