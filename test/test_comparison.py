@@ -51,15 +51,6 @@ def test_interval_is_that_of_all_draws_weighted_alike():
     assert found.is_tie
 
 
-def test_interval_of_many_clusters_is_that_of_a_mean():
-    """Points alike in each cluster: the difference is a mean, and the mean is nearly normal."""
-    gains = np.random.default_rng(1).integers(0, 21, 200)
-    found = difference_interval(sequences_of(*(50 + gains)), sequences_of(*[50] * 200))
-    mean, half = gains.mean() / 100, 1.96 * gains.std() / 100 / np.sqrt(200)
-    assert found == pytest.approx((mean - half, mean + half), abs=0.0005)
-    assert not found.is_tie
-
-
 def test_large_clusters_weigh_more_and_scans_of_a_sequence_are_drawn_together():
     """Pooled, as the IoU is: not a mean of ratios; ten equal scans are not ten observations."""
 
