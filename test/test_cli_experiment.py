@@ -11,13 +11,12 @@ from conftest import REPOSITORY
 from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.cli.experiment import EXPERIMENTS
+from gp_ground_seg.cli.experiment import EXPERIMENTS, THREE
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_labels, read_points
-from gp_ground_seg.lab.experiments import ablation, scenes, sensor_pose
+from gp_ground_seg.lab.experiments import ablation, sensor_pose
 from gp_ground_seg.lab.experiments import table1 as paper_table
 from gp_ground_seg.lab.experiments.table1 import CHOICES, VARIANCES, table1
 from gp_ground_seg.lab.scoring import evaluate as runner
@@ -99,35 +98,32 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
         assert document['config_changes']['grid.n_bins'] == 40
 
 
-def test_all_sensors_have_the_parameters_given(monkeypatch):
-    found = []
-
-    def note(frames, config, *_, with_peer):
-        found.append(([*dict.fromkeys(frame.sensor for frame in frames)], config))
-        assert {frame.scene for frame in frames} == set(DRIVES)  # those of the page
-        raise DataError('enough')
-
-    monkeypatch.setattr(scenes, 'score_simulated', note)
-    sensors = ['mid-360', 'hdl-64e']
-    for extra, config in (([], Config()), (['--preset', 'paper'], PRESETS['paper'].config)):
-        assert run('experiment', 'scenes', '--sensors', ','.join(sensors), *extra) == 2
-        assert found.pop() == (sensors, config)
-
-
-def test_simulated_poses_have_their_own_options(monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ('words', 'sensors', 'scenes', 'n_seeds'),
+    [
+        (['scenes', '--sensors', 'mid-360,hdl-64e'], ['mid-360', 'hdl-64e'], DRIVES, 3),
+        (['sensor-pose', '--simulated', '--seeds', '2', '--scenes', 'flat,kerb'],
+         THREE, ['flat', 'kerb'], 2),
+    ],
+)  # fmt: skip
+def test_scans_and_parameters_are_those_of_the_options(
+    words, sensors, scenes, n_seeds, monkeypatch, capsys
+):
     found = []
 
     def note(frames, config, *_):
         """Note the scans."""
-        found.append((len(frames), {frame.scene for frame in frames}, config.grid.n_bins))
+        found.append((frames, config))
         raise DataError('enough')
 
-    chosen = EXPERIMENTS['sensor-pose']._replace(run=note)
-    monkeypatch.setitem(EXPERIMENTS, 'sensor-pose', chosen)
-    words = ['--simulated', '--seeds', 2, '--scenes', 'flat,kerb', *SMALL]
-    assert run('experiment', 'sensor-pose', *words) == 2
+    monkeypatch.setitem(EXPERIMENTS, words[0], EXPERIMENTS[words[0]]._replace(run=note))
+    assert run('experiment', *words, *SMALL) == 2
     assert error_line(capsys) == 'enough'
-    assert found == [(2 * 2 * 3, {'flat', 'kerb'}, 40)]
+    ((frames, config),) = found
+    assert config == Config().replace(**{'grid.n_bins': 40})
+    assert list(dict.fromkeys(frame.sensor for frame in frames)) == list(sensors)
+    assert {frame.scene for frame in frames} == set(scenes)
+    assert len(frames) == len(sensors) * len(scenes) * n_seeds
 
 
 @pytest.mark.parametrize(
