@@ -240,7 +240,7 @@ def test_what_is_wrong_is_said(scans, words, says, tmp_path, capsys):
 
 
 def test_a_broken_cloud_of_a_bag_is_named(tmp_path, monkeypatch):
-    def refuse(_):
+    def refuse(*_):
         raise PointCloudError('no field x')
 
     monkeypatch.setattr('gp_ground_seg.data.inputs.decode_cloud', refuse)
