@@ -5,6 +5,7 @@ The one module that imports dask and distributed, optional packages.
 
 from __future__ import annotations
 
+import copy
 import importlib.metadata
 import itertools
 import logging
@@ -341,7 +342,8 @@ def _connect(address: str) -> Any:
 def _distributed() -> Any:
     """Import distributed; it says nothing but by way of what we do."""
     distributed = require('distributed', 'distributed')
-    require('dask.config', 'distributed').set(_CONFIG)
+    # A copy, as Dask adds to the lists that it is given.
+    require('dask.config', 'distributed').set(copy.deepcopy(_CONFIG))
     for name in ('distributed', 'distributed.client'):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     return distributed
