@@ -187,8 +187,8 @@ def run_tune(arguments: argparse.Namespace) -> int:
         return f'{arguments.node} uses them'
 
     with open_server(arguments.port) as (server, address):
-        shown = arguments.parameters, arguments.labels, arguments.frame or 0
-        tuner = Tuner(server, inputs, config, *shown)
+        begin = arguments.parameters, arguments.labels, arguments.frame or 0
+        tuner = Tuner(server, inputs, config, *begin)
         tuner.add_button(f'write {output.name}', write)
         if importlib.util.find_spec('rclpy'):
             tuner.add_button(f'apply to {arguments.node}', apply)

@@ -18,7 +18,6 @@ from sensor_msgs.msg import PointCloud2
 from gp_ground_seg.core import log
 from gp_ground_seg.core.backend import NumpyBackend, choose_backend
 from gp_ground_seg.core.errors import GroundSegError, PointCloudError, in_one_line, shown
-from gp_ground_seg.core.frame import usual_errors
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.pipeline.points import single_precision
@@ -73,7 +72,6 @@ class GroundSegmentationNode(ConfiguredNode):
         self._load_backend(self.config)
         logger.info(f'listening to {self._input.topic} ({self._input.qos_words})')
 
-    @usual_errors()
     def _on_cloud(self, cloud: PointCloud2, wait: float, n_lost: int) -> None:
         """Segment a cloud and publish the result; report a cloud that cannot be segmented."""
         start = time.monotonic()
