@@ -145,7 +145,7 @@ def _unpack(new: Callable[[], Any], data: bytes, *_: object) -> bytes:
 
 @functools.cache
 def _limit_rosbags() -> Callable[[bytes], bytes]:
-    """Make rosbags unpack chunks up to our limit; return what unpacks a message.
+    """Make rosbags unpack chunks up to our limit in this process; return what unpacks a message.
 
     By itself it unpacks whatever a chunk holds: 13 kB of bz2 become 6.4 GB.
     """
@@ -186,9 +186,9 @@ class BagReader(AbstractContextManager['BagReader']):
         self.storage = storage_of(self.path)  # ``ros1``, ``mcap`` or ``sqlite3``
         self._converters: dict[int, Callable[[bytes], Any]] = {}
         self._unpack: Callable[[bytes], Any] = bytes
-        unpack = _limit_rosbags()
         with ExitStack() as stack:
             with reading(self.path):
+                unpack = _limit_rosbags()
                 check_is_bag(self.path)
                 self.size = size_of(self.path)
                 rosbag: Any = rosbag1 if self.storage == 'ros1' else rosbag2
