@@ -1,0 +1,221 @@
+"""Data sets that are segmented block by block: what is kept, and what is done again."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import time
+
+import numpy as np
+import pytest
+from bag_samples import write_ros2_bag
+from cli_runner import INTERRUPTED, children, error_line, is_running, run, start
+from evaluation_samples import label_files, write_streets, write_two_drives
+
+pytest.importorskip('distributed')
+# Dask leaves sockets and event loops to the garbage collector when its processes end.
+pytestmark = pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
+
+PAST = ['--set', 'learning.mode=first_frame']
+N_FRAMES = 600  # of the long sequence
+
+
+@pytest.fixture(scope='module')
+def root(tmp_path_factory):
+    return write_two_drives(tmp_path_factory.mktemp('root'))
+
+
+def finished(folder):
+    """Names in the manifest, in its order."""
+    lines = (folder / 'manifest.jsonl').read_text().splitlines()
+    return [name for line in lines for name in json.loads(line)['items']]
+
+
+def test_several_bags_become_one_each(tmp_path, capsys):
+    names = ['a', 'b']
+    for k, name in enumerate(names):
+        write_ros2_bag(tmp_path / f'{name}.mcap', n_clouds=2 + k)
+        assert run('segment', tmp_path / f'{name}.mcap', '--quiet') == 0
+    bags = [tmp_path / f'{name}.mcap' for name in names]
+    assert run('segment', *bags, '-o', tmp_path / 'out') == 0
+    for name in names:
+        file = f'{name}_ground.mcap'
+        assert (tmp_path / 'out' / file).read_bytes() == (tmp_path / file).read_bytes()
+    assert '5 frames' in capsys.readouterr().out
+    assert run('segment', *bags, '-o', tmp_path / 'out', '--resume') == 0
+    assert capsys.readouterr().out == '2 of 2 were finished before\n'
+    bags[1].unlink()
+    write_ros2_bag(bags[1], n_clouds=4)
+    assert run('segment', *bags, '-o', tmp_path / 'out', '--resume') == 0
+    said = '1 of 2 were finished before; done again: 1 with a changed input (b_ground.mcap)'
+    assert capsys.readouterr().out.startswith(f'{said}\n4 frames, ')
+    scan = write_streets(tmp_path, s00=1) / 'sequences/00/velodyne/000000.bin'
+    assert run('segment', bags[0], scan, '-o', tmp_path / 'out2') == 2
+    assert 'is no bag' in error_line(capsys)
+
+
+def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, capsys):
+    command = ['segment', root, '-o', tmp_path / 'out']
+    assert run(*command, '--resume') == 0  # nothing was begun yet
+    capsys.readouterr()
+    assert run(*command) == 2
+    assert 'exists already; --resume continues, --force starts anew' in error_line(capsys)
+    other = ['--set', 'label.ground_tolerance=0.2']
+    before = label_files(tmp_path / 'out')
+    assert run(*command, '--resume', *other) == 2
+    first = json.loads((tmp_path / 'out/manifest.jsonl').read_text().splitlines()[0])
+    was, now = re.findall(r'\b[0-9a-f]{12}\b', error_line(capsys))
+    assert was == first['configuration'] != now
+    for more in (['--raw'], ['--columns', '5', '--force']):
+        assert run(*command, '--resume', *more) == 2
+        assert was in error_line(capsys)
+    assert run(*command, '--resume', '--force', '--set', 'runtime.n_threads=1') == 0
+    assert label_files(tmp_path / 'out') == before
+    assert run(*command, '--force', *other) == 0
+    assert label_files(tmp_path / 'out') != before
+    assert sorted(finished(tmp_path / 'out')) == sorted(before)
+
+
+def other_folder(source, _out):
+    moved = source.with_name('other')
+    for k, file in enumerate(sorted(source.rglob('*.bin'), reverse=True)):
+        target = moved / sorted(source.rglob('*.bin'))[k].relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(file, target)
+    return moved
+
+
+def change(source, _out):
+    scan = source / 'sequences/08/velodyne/000001.bin'
+    np.fromfile(scan, np.float32)[::-1].tofile(scan)
+
+
+def delete(_source, out):
+    (out / 'sequences/08/predictions/000001.label').unlink()
+
+
+def truncate(_source, out):
+    os.truncate(out / 'sequences/08/predictions/000001.label', 40)
+
+
+def remove_scan(source, out):
+    (source / 'sequences/08/velodyne/000000.bin').unlink()
+    (out / 'sequences/08/predictions/000000.label').unlink()
+
+
+def link(_source, out):
+    delete(_source, out)
+    (out / 'sequences/08/predictions/000001.label').symlink_to('nowhere')
+
+
+@pytest.mark.parametrize(
+    ('harm', 'said', 'past'),
+    [
+        (other_folder, '0 of 12 were finished before; done again: 12 from another input', []),
+        (change, '11 of 12 were finished before; done again: 1 with a changed input', PAST),
+        (remove_scan, '7 of 11 were finished before; done again: 4 with a changed input', PAST),
+        (delete, 'done again: 1 with output missing or of another size', []),
+        (truncate, 'done again: 1 with output missing or of another size', PAST),
+        (link, 'done again: 1 with output missing or of another size', []),
+    ],
+)
+def test_resume_does_again_what_does_not_fit(harm, said, past, root, tmp_path, capsys):
+    source, out, anew = tmp_path / 'root', tmp_path / 'out', tmp_path / 'anew'
+    shutil.copytree(root, source)
+    assert run('segment', source, '-o', out, *past) == 0
+    source = harm(source, out) or source
+    capsys.readouterr()
+    assert run('segment', source, '-o', out, '--resume', *past) == 0
+    assert said in capsys.readouterr().out
+    assert run('segment', source, '-o', anew, *past) == 0
+    assert label_files(out) == label_files(anew)
+    capsys.readouterr()
+    assert run('segment', source, '-o', out, '--resume', *past) == 0
+    n = len(label_files(anew))
+    assert capsys.readouterr().out == f'{n} of {n} were finished before\n'
+
+
+@pytest.mark.parametrize('line', [b'{', b'[' * 100_000, b'{"items": 3}', b'\xff', b'7', b'null'])
+def test_a_manifest_that_is_none(line, root, tmp_path, capsys):
+    (tmp_path / 'manifest.jsonl').write_bytes(line + b'\n')
+    assert run('segment', root, '-o', tmp_path, '--resume') == 2
+    assert error_line(capsys) == f'{tmp_path}/manifest.jsonl: line 1 is none of a manifest'
+    (tmp_path / 'manifest.jsonl').rename(tmp_path / 'of_the_user')
+    (tmp_path / 'manifest.jsonl').symlink_to('of_the_user')
+    assert run('segment', root, '-o', tmp_path, '--force') == 2
+    assert 'manifest.jsonl: ' in error_line(capsys)
+    assert (tmp_path / 'of_the_user').read_bytes() == line + b'\n'
+
+
+@pytest.fixture(scope='module')
+def long_root(tmp_path_factory):
+    """A sequence of many frames, of few files."""
+    folder = write_streets(tmp_path_factory.mktemp('long'), s00=2)
+    scans = folder / 'sequences/00/velodyne'
+    for k in range(2, N_FRAMES):
+        (scans / f'{k:06d}.bin').hardlink_to(scans / f'{k % 2:06d}.bin')
+    return folder
+
+
+def wait_for_lines(process, manifest, n):
+    deadline = time.monotonic() + 120
+    while not (manifest.exists() and manifest.read_bytes().count(b'\n') >= n):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def assert_gone(pids):
+    deadline = time.monotonic() + 30
+    while any(map(is_running, pids)):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+@pytest.mark.slow
+def test_killed_worker_and_client_lose_nothing_and_nothing_is_done_twice(
+    long_root, tmp_path, capsys
+):
+    out, command = tmp_path / 'out', ['segment', long_root, '-o', tmp_path / 'out']
+    process = start(*command, '--workers', '2')
+    wait_for_lines(process, out / 'manifest.jsonl', 1)
+    workers = children(process.pid)
+    os.kill(workers[-1], signal.SIGKILL)
+    wait_for_lines(process, out / 'manifest.jsonl', 4)
+    workers += children(process.pid)
+    for more in ('--resume', '--force', '--quiet'):
+        assert run(*command, more) == 2
+        assert error_line(capsys) == f'{out}: another run writes to it'
+    process.kill()
+    _, err = process.communicate()
+    assert 'died; computed again: block' in err and 'Traceback' not in err
+    assert_gone(workers)
+    before = finished(out)
+    assert 0 < len(before) < N_FRAMES
+    times = {name: (out / name).stat().st_mtime_ns for name in before}
+    with (out / 'manifest.jsonl').open('a') as file:
+        file.write('{"block": 7, "na')  # as a line that was being written
+    (out / 'sequences/00/predictions/.000999.label.partial-0').touch()
+    assert run(*command, '--resume') == 0
+    assert f'{len(before)} of {N_FRAMES} were finished before' in capsys.readouterr().out
+    assert sorted(finished(out)) == [
+        f'sequences/00/predictions/{k:06d}.label' for k in range(N_FRAMES)
+    ]
+    assert {name: (out / name).stat().st_mtime_ns for name in before} == times
+    found = label_files(out)
+    assert len(found) == N_FRAMES == len(list((out / 'sequences/00/predictions').iterdir()))
+    assert len(set(found.values())) == 2
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_all_processes_with_one_line(long_root, tmp_path):
+    process = start(
+        'segment', long_root, '-o', tmp_path / 'out', '--workers', '2', start_new_session=True
+    )
+    wait_for_lines(process, tmp_path / 'out/manifest.jsonl', 1)
+    workers = children(process.pid)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (out, err) == ('', 'gp-ground-seg: interrupted\n')
+    assert process.returncode in INTERRUPTED
+    assert_gone(workers)
