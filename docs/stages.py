@@ -15,7 +15,7 @@ from gp_ground_seg.lab.scoring.evaluate import TITLES
 
 DOCS = Path(__file__).resolve().parent
 STAGE_COLOURS = (
-    style.BLUE, style.SKY, style.GREEN, style.ORANGE, style.VERMILION, style.PINK, '#B4BAC0',
+    style.BLUE, style.SKY, style.GREEN, style.ORANGE, style.VERMILION, '#CC79A7', '#B4BAC0',
     style.VIOLET,
 )  # fmt: skip
 REFERENCE_COLOUR = '#3B4046'

@@ -141,9 +141,9 @@ def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page
 
     names = re.findall(r'^([\w.]+) = ', page.text, re.MULTILINE)
     page.drag('.multi-slider-thumb', names.index('label.ground_tolerance'), 60)
-    page.wait_for(lambda: re.search(r'^[1-9][\d,]* changed', page.text, re.MULTILINE), 'change')
-    n_ground, n_before = re.search(r'ground\s+([\d,]+)\s+([\d,]+)', page.text).groups()
-    assert int(n_ground.replace(',', '')) > int(n_before.replace(',', ''))
+    page.wait_for(lambda: re.search(r'^[1-9][\d ]* changed', page.text, re.MULTILINE), 'change')
+    n_ground, n_before = re.search(r'ground\t([\d ]+)\t([\d ]+)', page.text).groups()
+    assert int(n_ground.replace(' ', '')) > int(n_before.replace(' ', ''))
     (value,) = re.findall(r'label.ground_tolerance = ([\d.]+) m', page.text)
     wait_for_colours(
         page, 'tune_moved.png', lambda n: n['now ground'] > before['now ground'] + 100

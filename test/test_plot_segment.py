@@ -16,12 +16,12 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.parameters.config import GridConfig
 from gp_ground_seg.core.pipeline.polar_grid import build_polar_grid
+from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.lab.plotting import segment as colours
 from gp_ground_seg.lab.plotting.segment import SegmentView, line_ends, plot_segment, segment_at
 
 SEGMENT = 90
-ROAD, BUILDING, UNLABELLED = 40, 50, 0
-TRUE_GROUND_COLOUR = colours.TRUTH_COLOURS['true ground'][1]
+ROAD, BUILDING = 40, 50
 
 
 def ahead(n_points=1500, seed=0):
@@ -44,7 +44,7 @@ def scan(tmp_path_factory):
     points, wall = ahead()
     points.tofile(path)
     semantic = np.where(wall, BUILDING, ROAD).astype('<u4')
-    semantic[:40] = UNLABELLED
+    semantic[np.flatnonzero(wall)[:40]] = ROAD  # missed ground
     semantic.tofile(path.with_suffix('.label'))
     return path
 
@@ -94,8 +94,8 @@ def test_line_ends_by_hand(slope, ends):
 
 def test_everything_is_drawn(draw, scan, tmp_path, capsys):
     upper, lower = draw('--labels', scan.with_suffix('.label'))
-    truths = [colour for _, colour in colours.TRUTH_COLOURS.values()]
-    for colour in (*truths, colours.INLIER_COLOUR, colours.SURFACE_COLOUR):
+    drawn = [COLOURS['ground'], COLOURS['obstacle'], COLOURS['missed ground']]
+    for colour in (*drawn, colours.CANDIDATE_COLOUR, colours.SURFACE_COLOUR):
         assert count(upper, colour) > 10, colour
     assert count(lower, colours.PSEUDO_INPUT_COLOUR) > 30
     assert count(lower, colours.SURFACE_COLOUR) > 300
@@ -113,9 +113,9 @@ def test_pseudo_inputs_only_where_they_act(draw, model):
     upper, lower = draw('--set', f'length_scale.model={model}')
     assert count(lower, colours.PSEUDO_INPUT_COLOUR) == 0
     assert count(lower, colours.SURFACE_COLOUR) > 300
-    # Without labels the truth is not coloured.
-    assert count(upper, colours.POINT_COLOUR) > 100
-    assert count(upper, TRUE_GROUND_COLOUR) == 0
+    # Without labels no errors are known.
+    assert count(upper, COLOURS['ground']) > 100
+    assert count(upper, COLOURS['missed ground']) == 0
 
 
 def test_azimuth_is_another_way_to_say_segment(draw, tmp_path):
@@ -140,7 +140,7 @@ def test_what_is_drawn_is_the_result():
     assert len(begins) > 0
     np.testing.assert_array_equal(drawn['critical points'].get_xdata(), r[begins])
     np.testing.assert_array_equal(drawn['candidates, inliers'].get_ydata(), z[inlier])
-    np.testing.assert_array_equal(drawn['ground'].get_ydata(), result.surface.mean[SEGMENT])
+    np.testing.assert_array_equal(drawn['surface'].get_ydata(), result.surface.mean[SEGMENT])
 
     length_scale, pseudo = below.lines
     np.testing.assert_array_equal(

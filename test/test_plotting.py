@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from cli_runner import error_line, run
 from conftest import hilly_scan
-from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
 from gp_ground_seg.data import colours as colours_
+from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.lab.plotting import scan, style
 from gp_ground_seg.lab.plotting.scan import (
     CAMERA,
@@ -25,7 +25,6 @@ from gp_ground_seg.lab.plotting.scan import (
     plot_scan_view,
     project,
 )
-from gp_ground_seg.lab.plotting.scan import COLOURS_ABOVE as COLOURS
 
 
 def inches(*lengths):
@@ -91,15 +90,15 @@ def test_labels_and_errors_are_where_the_points_are(tmp_path):
 def test_counts_are_in_the_titles():
     label = np.array([0, 1, 1, 2, 2, 2], dtype=np.uint8)
     truth = np.array([1, 1, 2, 1, 2, 0], dtype=np.uint8)
-    titles = [scan._label_panel(label)[0], scan._label_panel(label[1:])[0]]
+    titles = [scan.label_panel(label)[0], scan.label_panel(label[1:])[0]]
     assert titles == [
         '6 points: 2 ground, 3 obstacle, 1 unknown',
         '5 points: 2 ground, 3 obstacle',
     ]
-    errors, layers = scan._error_panel(label, truth)
+    errors, layers = scan.error_panel(label, truth)
     assert errors == '1 false ground, 2 missed ground, IoU 25.00 %'
     np.testing.assert_array_equal(sum(drawn.astype(int) for drawn in layers.values()), 1)
-    assert scan._error_panel(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
+    assert scan.error_panel(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
 
 
 @pytest.mark.parametrize('points', [np.zeros((0, 3)), np.full((3, 4), np.nan), np.zeros((1, 3))])
@@ -171,8 +170,8 @@ def test_picture_shows_ground_obstacles_and_model(tmp_path):
     points[:10] = np.nan
     config = Config()
     found = GroundSegmenter(config).segment(points)
-    for title, height in (('title with $ and _', 840), ('', 792)):
-        plot_scan_view(points, found, config, tmp_path / 'scan.png', title)
+    for title, height, surface in (('title with $ and _', 840, True), ('', 792, False)):
+        plot_scan_view(points, found, config, tmp_path / 'scan.png', title, surface=surface)
         picture = imread(tmp_path / 'scan.png')
         assert picture.shape[:2] == (height, 1440)
         colours = (picture[60:650, ..., :3] * 255).round().astype(int).reshape(-1, 3)
@@ -181,8 +180,10 @@ def test_picture_shows_ground_obstacles_and_model(tmp_path):
         foot = (picture[-72:, :720, :3] * 255).round().astype(int).reshape(-1, 3)
         for wanted in ((185, 191, 198), (213, 94, 0)):
             assert (foot == wanted).all(axis=1).sum() > 50
-        # Bluish or yellowish lines: neither grey nor orange.
-        assert (colours[:, 2] - colours[:, 0] > 60).sum() > 300
+        assert (colours == (185, 191, 198)).all(axis=1).sum() > 400 or surface
+        # Bluish lines: neither grey nor orange.
+        n_bluish = (colours[:, 2] - colours[:, 0] > 60).sum()
+        assert n_bluish > 300 if surface else n_bluish == 0
     with pytest.raises(PointCloudError, match=r'label of shape \(8000,\) for 7999 points'):
         plot_scan_view(points[1:], found, config, tmp_path / 'scan.png')
 
@@ -228,10 +229,9 @@ def test_points_are_coloured_by_height_and_probability(
     assert run('plot', 'scan', drawn, '--colour', colour, '-o', tmp_path / 'a.png') == 0
     pixels = imread(tmp_path / 'a.png')[60:700, ..., :3]
     assert close_to(pixels, style.VERMILION).sum() == 0
-    shades = colormaps['viridis']
-    assert close_to(pixels, shades(float(of_ground))[:3], 0.05).sum() > 2000
-    for share in of_wall:
-        assert close_to(pixels, shades(float(share))[:3], 0.05).sum() > 20
+    for shares, least in (((of_ground,), 2000), (of_wall, 20)):
+        for shade in colours_.ramp_colours(np.array(shares, dtype=float), 0.0, 1.0):
+            assert close_to(pixels, shade, 0.05).sum() > least
 
 
 def test_pdf_and_svg_hold_points_as_pixels_and_are_the_same_each_time(drawn, tmp_path):

@@ -10,6 +10,7 @@ from conftest import REPOSITORY
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
+from gp_ground_seg.data.colours import COLOURS, HEIGHTS
 
 NODE = '/ground_segmentation_node'
 OPTIONAL = {f'{NODE}/{name}' for name in ('labeled', 'ground_model', 'markers')}
@@ -74,6 +75,21 @@ def test_fields_and_namespaces_are_those_of_the_messages():
     displays = yaml.safe_load(text)['Visualization Manager']['Displays']
     (namespaces,) = (one['Namespaces'] for one in displays if 'Namespaces' in one)
     assert set(namespaces) == {marker.ns for marker in made['~/markers'].markers if marker.ns}
+
+
+def test_colours_are_those_of_the_pictures():
+    rviz = (REPOSITORY / 'config' / 'ground_segmentation.rviz').read_text(encoding='utf-8')
+    foxglove = (REPOSITORY / 'config' / 'foxglove_layout.json').read_text(encoding='utf-8')
+    displays = yaml.safe_load(rviz)['Visualization Manager']['Displays']
+    topics = json.loads(foxglove)['configById']['3D!ground']['topics']
+    for topic, name in (('/ground', 'ground'), ('/obstacles', 'obstacle')):
+        (shown,) = (one for one in displays if one.get('Topic', {}).get('Value') == topic)
+        assert [*map(int, shown['Color'].split(';'))] == [*bytes.fromhex(COLOURS[name][1:])]
+        assert topics[topic]['flatColor'] == f'{COLOURS[name].lower()}ff'
+    (heights,) = (one for one in displays if one.get('Channel Name') == 'height')
+    assert (heights['Min Intensity'], heights['Max Intensity']) == HEIGHTS
+    labeled = topics[f'{NODE}/labeled']
+    assert (labeled['minValue'], labeled['maxValue']) == HEIGHTS
 
 
 def snippets(page):

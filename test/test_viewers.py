@@ -216,9 +216,9 @@ def test_the_tuner_draws_the_labels_of_its_parameters(sequence):
             tuner.show(0, 'changes', Config().replace(**{name: tolerance}))
             assert changed in tuner._table.content
         n_ground, n_before = re.search(
-            r'ground \| ([\d,]+) \| ([\d,]+)', tuner._table.content
+            r'ground \| ([\d ]+) \| ([\d ]+)', tuner._table.content
         ).groups()
-        assert int(n_ground.replace(',', '')) < int(n_before.replace(',', ''))
+        assert int(n_ground.replace(' ', '')) < int(n_before.replace(' ', ''))
 
 
 def test_a_server_that_cannot_be_guarded_is_refused():

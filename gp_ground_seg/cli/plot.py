@@ -29,8 +29,8 @@ from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 SCAN = """\
-Draw a scan as RViz would show the node's topics: ground, obstacles, and the ground
-model, with profiles of twice its standard deviation, coloured by length-scale.
+Draw a scan in perspective: ground grey, obstacles orange. --surface adds the ground model,
+coloured by length-scale, with profiles of twice its standard deviation.
 """
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
@@ -109,6 +109,7 @@ def _declare_scan(parser: argparse.ArgumentParser) -> None:
          'from ahead [deg], upwards [deg], away [m] (default: 196,24,32)', camera),
         ('--colour', 'colour points by class, or by the height over the ground or the '
          'probability of ground', {'choices': ('class', *VALUES), 'default': 'class'}),
+        ('--surface', 'draw the estimated ground as well', options.FLAG),
     )  # fmt: skip
 
 
@@ -143,7 +144,8 @@ def run(arguments: argparse.Namespace) -> int:
         result = segmenter.segment(points)
     if arguments.picture == 'scan':
         look = arguments.camera, arguments.colour
-        said = plot_scan_view(points, result, config, path, title, *look)
+        is_drawn = arguments.surface
+        said = plot_scan_view(points, result, config, path, title, *look, surface=is_drawn)
     elif arguments.picture == 'above':
         said = plot_birds_eye(points, result.label, path, truth, title)
     else:

@@ -1,4 +1,4 @@
-"""Colours of the length-scale, the same in pictures, viewers and RViz."""
+"""The one colour code of pictures, viewers, RViz and Foxglove."""
 
 from __future__ import annotations
 
@@ -8,8 +8,20 @@ import numpy as np
 
 from gp_ground_seg.core.frame import FloatArray
 
+COLOURS = {
+    'ground': '#B9BFC6',
+    'obstacle': '#D55E00',
+    'unknown': '#E3E6E9',
+    'not scored': '#E3E6E9',
+    'right': '#BCC2C8',
+    'missed ground': '#0072B2',
+    'false ground': '#AA3377',
+}
+"""Colours of points by their label, and by what it is against the truth."""
+HEIGHTS = (-0.5, 3.0)
+"""Heights over the ground [m] from which to which `ramp_colours` go."""
 UNKNOWN = (0.5, 0.5, 0.5)
-"""Colour of a length-scale that is not known."""
+"""Colour of a value that is not known."""
 
 # Lightness rises evenly from one to the next, and hue only goes from blue to yellow: that
 # is told apart with any of the common colour vision deficiencies, and in print.
@@ -19,15 +31,25 @@ _RAMP = np.array(
 )  # fmt: skip
 
 
-def length_scale_colours(length_scale: FloatArray, low: float, high: float) -> FloatArray:
-    """Return colours from dark blue (rough ground) to pale yellow (smooth), on a log scale.
+def ramp_colours(values: FloatArray, low: float, high: float) -> FloatArray:
+    """Return colours from dark blue at `low` to pale yellow at `high`, low < high.
 
-    The ramp goes from `low` to `high` [m], 0 < low < high; values beyond take the colour of
-    the end, and NaN that of `UNKNOWN`. Returns red, green and blue in [0, 1], (..., 3).
+    Values beyond take the colour of the end, and NaN that of `UNKNOWN`. Returns red, green and
+    blue in [0, 1], (..., 3).
     """
-    known = np.isfinite(length_scale) & (length_scale > 0.0)
-    value = np.log(np.where(known, length_scale, low) / low) / math.log(high / low)
+    known = np.isfinite(values)
+    share = (np.where(known, values, low) - low) / (high - low)
     stops = np.linspace(0.0, 1.0, len(_RAMP))
-    colours = np.stack([np.interp(value, stops, channel) for channel in _RAMP.T], axis=-1)
+    colours = np.stack([np.interp(share, stops, channel) for channel in _RAMP.T], axis=-1)
     colours[~known] = UNKNOWN
     return colours
+
+
+def length_scale_colours(length_scale: FloatArray, low: float, high: float) -> FloatArray:
+    """Return `ramp_colours` on a log scale, dark blue on rough ground and yellow on smooth.
+
+    Infinite length-scales [m] and those that are not positive are not known. 0 < `low` < `high`.
+    """
+    known = np.isfinite(length_scale) & (length_scale > 0.0)
+    log = np.log(np.where(known, length_scale, 1.0))
+    return ramp_colours(np.where(known, log, np.nan), math.log(low), math.log(high))

@@ -10,33 +10,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gp_ground_seg.core.errors import require
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import check_points, finite_points
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.data.colours import length_scale_colours
+from gp_ground_seg.data.colours import COLOURS, HEIGHTS, length_scale_colours, ramp_colours
 from gp_ground_seg.lab.plotting import style
 from gp_ground_seg.lab.plotting.style import add_axes, new_figure, save, write_line
 from gp_ground_seg.lab.scoring.metrics import Labels
+from gp_ground_seg.lab.scoring.report import in_thousands
 
-COLOURS = {'ground': '#B9BFC6', 'obstacles': style.VERMILION}
 VALUES = {
-    'height': ('height over the ground [m]', -0.5, 3.0),
+    'height': ('height over the ground [m]', *HEIGHTS),
     'p_ground': ('probability of ground', 0.0, 1.0),
 }
 """Attributes of `Segmentation` that points can be coloured by: title and ends of the scale."""
-COLOURS_ABOVE = {
-    'ground': '#E3B968',
-    'obstacle': '#1B4F72',
-    'unknown': style.PINK,
-    'not scored': '#E3E6E9',
-    'right': '#BCC2C8',
-    'missed ground': style.BLUE,
-    'false ground': style.VERMILION,
-}
-"""Colours of the points seen from above."""
 
 # In perspective. Size of the scene, of the title above it and of the legend below it [inch].
 WIDTH, HEIGHT, TITLE, FOOT = 12.0, 6.0, 0.4, 0.6
@@ -56,7 +45,7 @@ SQUARE, LEFT, RIGHT, BELOW, ABOVE, LINE = 6.2, 0.8, 0.2, 0.95, 0.4, 0.4
 
 Place = tuple[float, float, float]
 Layers = dict[str, BoolArray]
-"""Which points, (N,), are drawn in each of `COLOURS_ABOVE`, lowest first."""
+"""Which points, (N,), are drawn in each of `COLOURS`, lowest first."""
 
 
 def plot_scan_view(
@@ -67,13 +56,15 @@ def plot_scan_view(
     title: str = '',
     camera: Place = CAMERA,
     colour: str = 'class',
+    *,
+    surface: bool = False,
 ) -> str:
     """Draw a scan in perspective, replacing the file `path`; return numbers of points.
 
-    Ground and obstacles of `points`, (N, >=3) [m], and the ground model coloured by length-scale,
-    with profiles of two standard deviations: what the node's topics show in RViz. Ground less
-    certain than ``label.ground_tolerance`` is not drawn. In a PDF or SVG points are pixels.
-    `camera` is in the sensor frame [m]; `colour` is ``class`` or of `VALUES`.
+    Ground and obstacles of `points`, (N, >=3) [m]; with `surface` the ground model too, coloured
+    by length-scale, with profiles of two standard deviations, where it is at least as certain as
+    ``label.ground_tolerance``. In a PDF or SVG points are pixels. `camera` is in the sensor frame
+    [m]; `colour` is ``class`` or of `VALUES`.
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=segmentation.label)
@@ -81,14 +72,16 @@ def plot_scan_view(
     write_line(figure, title, 0.5, 0.5 * TITLE, fontsize=14)
     axes = add_axes(figure, 0.0, FOOT, (WIDTH, HEIGHT))
     _draw_points(axes, xyz, segmentation, camera, colour)
-    _draw_surface(axes, GroundModel.of(segmentation), config, camera, is_plain=colour in VALUES)
+    if surface:
+        model = GroundModel.of(segmentation)
+        _draw_surface(axes, model, config, camera, is_plain=colour in VALUES)
     axes.set_axis_off()
     axes.set_aspect('equal')
     axes.set_xlim(-0.5, 0.5)
     axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
-    _draw_legend(figure, config, colour)
+    _draw_legend(figure, config, colour, surface)
     save(figure, path)
-    return _label_panel(segmentation.label)[0]
+    return label_panel(segmentation.label)[0]
 
 
 def camera_at(azimuth: float, elevation: float, distance: float) -> Place:
@@ -123,17 +116,15 @@ def _draw_points(
 ) -> None:
     """Draw far points first, and the ground below all obstacles."""
     place, depth = project(xyz, camera)
-    labels_and_layers = ((Label.GROUND, 1), (Label.OBSTACLE, 4))
-    for class_colour, (value, layer) in zip(COLOURS.values(), labels_and_layers, strict=True):
+    for value, layer in ((Label.GROUND, 1), (Label.OBSTACLE, 4)):
         chosen = np.flatnonzero((segmentation.label == value) & (depth > CLOSEST))
         chosen = chosen[np.argsort(-depth[chosen])]
-        look: dict[str, Any] = {'c': class_colour, 'zorder': layer}
+        look: dict[str, Any] = {'c': COLOURS[value.name.lower()], 'zorder': layer}
         if colour in VALUES:
-            _, low, high = VALUES[colour]
-            look = {'c': getattr(segmentation, colour)[chosen], 'vmin': low, 'vmax': high}
-            look |= {'cmap': style.value_colours(), 'plotnonfinite': True, 'zorder': 4}
+            values = getattr(segmentation, colour)[chosen]
+            look = {'c': ramp_colours(values, *VALUES[colour][1:]), 'zorder': 4}
         axes.scatter(
-            *place[chosen].T, s=np.clip(40.0 / depth[chosen], 0.4, 4.0), linewidths=0.0,
+            *place[chosen].T, s=np.clip(60.0 / depth[chosen], 1.0, 5.0), linewidths=0.0,
             rasterized=True, **look,
         )  # fmt: skip
 
@@ -172,30 +163,31 @@ def _draw_surface(
     add(piece, along, LineCollection, linewidths=1.3, zorder=3)
 
 
-def _draw_legend(figure: Any, config: Config, colour: str) -> None:
+def _draw_legend(figure: Any, config: Config, colour: str, surface: bool) -> None:
     """Draw the legend below the scene."""
-    bar = add_axes(figure, 0.66 * WIDTH, 0.26, (0.3 * WIDTH, 0.14))
-    bar.set_yticks([])
     if colour in VALUES:
         title, low, high = VALUES[colour]
-        ramp, extent = np.linspace(0.0, 1.0, 200)[None], (low, high, 0.0, 1.0)
-        bar.imshow(ramp, extent=extent, aspect='auto', cmap=style.value_colours())
-        bar.set_title(f'{title}; grey points: no model', fontsize=9.5, loc='left', pad=3.0)
+        colours = ramp_colours(np.linspace(low, high, 200), low, high)
+        _draw_ramp(figure, f'{title}; mid-grey: no model', colours, (low, high))
         return
-    dots = style.legend_dots(COLOURS, 7)
+    dots = style.legend_dots({name: COLOURS[name] for name in ('ground', 'obstacle')}, 7)
     figure.legend(handles=dots, loc='lower left', fontsize=11, frameon=False, ncols=2)
-    low, high = config.length_scale.min, config.length_scale.max
-    colours = length_scale_colours(np.geomspace(low, high, 200), low, high)
-    # matplotlib takes an array of colours since 3.7, Ubuntu 24.04 has 3.6.
-    listed = require('matplotlib.colors', 'matplotlib').ListedColormap(colours)
-    bar.pcolormesh(np.geomspace(low, high, 201), [0.0, 1.0], np.arange(200)[None], cmap=listed)
-    bar.set_xscale('log')
-    bar.set_title(
-        'length-scale of the ground [m]; ribbons: 2 sigma', fontsize=9.5, loc='left', pad=3.0
-    )
-    ticks = [tick for tick in (0.1, 0.3, 1, 3, 10, 30, 100, 300) if low <= tick <= high]
-    bar.set_xticks(ticks, labels=[f'{tick:g}' for tick in ticks])
-    bar.minorticks_off()
+    if surface:
+        low, high = config.length_scale.min, config.length_scale.max
+        colours = length_scale_colours(np.geomspace(low, high, 200), low, high)
+        title = 'length-scale of the ground [m]; bands: ± 2 std'
+        bar = _draw_ramp(figure, title, colours, (math.log10(low), math.log10(high)))
+        ticks = [tick for tick in (0.1, 0.3, 1, 3, 10, 30, 100, 300) if low <= tick <= high]
+        bar.set_xticks(np.log10(ticks), labels=[f'{tick:g}' for tick in ticks])
+
+
+def _draw_ramp(figure: Any, title: str, colours: FloatArray, ends: tuple[float, float]) -> Any:
+    """Draw colours, (n, 3), over an axis below the scene, and return it."""
+    bar = add_axes(figure, 0.66 * WIDTH, 0.26, (0.3 * WIDTH, 0.14))
+    bar.imshow(colours[None], extent=(*ends, 0.0, 1.0), aspect='auto')
+    bar.set_yticks([])
+    bar.set_title(title, fontsize=9.5, loc='left', pad=3.0)
+    return bar
 
 
 def plot_birds_eye(
@@ -212,9 +204,9 @@ def plot_birds_eye(
     """
     xyz = check_points(points)
     style.check_lengths(len(xyz), label=label, truth=truth)
-    panels = [_label_panel(label)]
+    panels = [label_panel(label)]
     if truth is not None:
-        panels.append(_error_panel(label, truth))
+        panels.append(error_panel(label, truth))
     xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
     width = LEFT + SQUARE + RIGHT
     height = BELOW + SQUARE + ABOVE + (LINE if title else 0.0)
@@ -228,16 +220,16 @@ def plot_birds_eye(
     return panels[-1][0]
 
 
-def _label_panel(label: Labels) -> tuple[str, Layers]:
+def label_panel(label: Labels) -> tuple[str, Layers]:
     """Return title and layers of the given labels."""
     shown = (Label.GROUND, Label.OBSTACLE, Label.UNKNOWN)
     layers = {value.name.lower(): label == value for value in shown}
     numbers = {name: int(chosen.sum()) for name, chosen in layers.items()}
-    named = [f'{_thousands(n)} {name}' for name, n in numbers.items() if n or name != 'unknown']
-    return f'{_thousands(len(label))} points: {", ".join(named)}', layers
+    named = [f'{in_thousands(n)} {name}' for name, n in numbers.items() if n or name != 'unknown']
+    return f'{in_thousands(len(label))} points: {", ".join(named)}', layers
 
 
-def _error_panel(label: Labels, truth: Labels) -> tuple[str, Layers]:
+def error_panel(label: Labels, truth: Labels) -> tuple[str, Layers]:
     """Return title and layers of the errors; each point is in one."""
     given, ground, obstacle = label == Label.GROUND, truth == Label.GROUND, truth == Label.OBSTACLE
     hit, missed, false = ground & given, ground & ~given, obstacle & given
@@ -250,11 +242,10 @@ def _error_panel(label: Labels, truth: Labels) -> tuple[str, Layers]:
     n_hit, n_missed, n_false = (int(part.sum()) for part in (hit, missed, false))
     n_union = n_hit + n_missed + n_false
     iou = f', IoU {100.0 * n_hit / n_union:.2f} %' if n_union else ''
-    return f'{_thousands(n_false)} false ground, {_thousands(n_missed)} missed ground{iou}', layers
-
-
-def _thousands(number: int) -> str:
-    return f'{number:,}'.replace(',', ' ')
+    return (
+        f'{in_thousands(n_false)} false ground, {in_thousands(n_missed)} missed ground{iou}',
+        layers,
+    )
 
 
 def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None:
@@ -264,8 +255,8 @@ def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None
     for depth, (name, chosen) in enumerate(layers.items()):
         x, y = xy[chosen & inside].T
         if len(x):
-            shown[name] = colour = COLOURS_ABOVE[name]
-            size = 3.0 if colour in (style.BLUE, style.VERMILION) else 1.0
+            shown[name] = colour = COLOURS[name]
+            size = 3.0 if name in ('missed ground', 'false ground') else 1.0
             axes.scatter(y, x, s=size, c=colour, linewidths=0.0, zorder=depth, rasterized=True)
     _draw_rings(axes, len(layers))
     axes.set_aspect('equal')

@@ -10,11 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import ConfigError
-from gp_ground_seg.core.frame import OUTSIDE, FloatArray, Label
+from gp_ground_seg.core.frame import OUTSIDE, FloatArray
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.lab.plotting import style
+from gp_ground_seg.lab.plotting.scan import Layers, error_panel, label_panel
 from gp_ground_seg.lab.plotting.style import new_figure, save
 from gp_ground_seg.lab.scoring.metrics import Labels
 
@@ -22,17 +24,9 @@ DPI = 130
 # Inches: the figure, and the part of it that the two panels leave to the legend.
 WIDTH, HEIGHT, LEGEND = 12.2, 7.6, 2.6
 
-# The truth is light, so that what is estimated stands out.
-POINT_COLOUR = '#B4BAC0'
-TRUTH_COLOURS = {
-    'not scored': (Label.UNKNOWN, POINT_COLOUR),
-    'true obstacle': (Label.OBSTACLE, '#A9C4DA'),
-    'true ground': (Label.GROUND, '#E8CF9A'),
-}
 CANDIDATE_COLOUR = '#56636E'
-INLIER_COLOUR = style.BLUE
 LINE_COLOUR = style.GREEN
-SURFACE_COLOUR = style.VERMILION
+SURFACE_COLOUR = '#111111'
 PSEUDO_INPUT_COLOUR = style.VIOLET
 
 # Metres kept free below and above the ground, and beyond the last candidate; and the distance
@@ -75,7 +69,10 @@ def plot_segment(
     name = f'{title}, {view.name}' if title else view.name
     name = f'{name}; {n_hidden} points outside'
     above.set_title(name, fontsize=12, loc='left', parse_math=False)
-    view.draw_points(above, r, z, None if truth is None else truth[inside])
+    kinds = label_panel(result.label[inside])[1]
+    if truth is not None:
+        kinds |= error_panel(result.label[inside], truth[inside])[1]
+    view.draw_points(above, r, z, kinds)
     view.draw_ground(above)
     above.set_xlim(0.0, reach)
     above.set_ylim(low, high)
@@ -128,27 +125,24 @@ class SegmentView:
         r = self._r if len(self._r) else point_r
         return float(r.max()) + BEYOND if len(r) else float(self._result.grid.edges[-1])
 
-    def draw_points(self, axes: Any, r: FloatArray, z: FloatArray, truth: Labels | None) -> None:
-        """Draw points over range, coloured by their true label if that is known."""
-        groups = {'points': (POINT_COLOUR, np.ones(len(r), dtype=np.bool_))}
-        if truth is not None:
-            groups = {
-                f'points, {name}': (colour, truth == label)
-                for name, (label, colour) in TRUTH_COLOURS.items()
-            }
-        for name, (colour, chosen) in groups.items():
-            look = {'color': colour, 'label': f'{name} ({np.count_nonzero(chosen)})'}
+    def draw_points(self, axes: Any, r: FloatArray, z: FloatArray, kinds: Layers) -> None:
+        """Draw points over range by label, and errors on them."""
+        for name in ('ground', 'obstacle', 'missed ground', 'false ground'):
+            if name not in kinds:
+                continue
+            chosen = kinds[name]
+            look = {'color': COLOURS[name], 'label': f'{name} ({np.count_nonzero(chosen)})'}
             axes.plot(r[chosen], z[chosen], 'o', ms=3.6, mew=0, zorder=2, **look)
 
     def draw_ground(self, axes: Any) -> None:
         """Draw ground, lines and candidates over range."""
         low, high = self._mean - 2.0 * self._std, self._mean + 2.0 * self._std
-        look = {'linewidth': 0.0, 'color': SURFACE_COLOUR, 'alpha': 0.2, 'zorder': 3}
-        axes.fill_between(self._knots, low, high, label='ground ± 2 std', **look)
+        look = {'linewidth': 0.0, 'color': SURFACE_COLOUR, 'alpha': 0.15, 'zorder': 3}
+        axes.fill_between(self._knots, low, high, label='surface ± 2 std', **look)
         self._draw_lines(axes)
-        axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='ground')
+        axes.plot(self._knots, self._mean, color=SURFACE_COLOUR, lw=1.8, zorder=5, label='surface')
         hollow = {'mfc': 'white', 'mec': CANDIDATE_COLOUR, 'mew': 1.1, 'ms': 5.5, 'zorder': 6}
-        full = {'color': INLIER_COLOUR, 'mew': 0.0, 'ms': 5, 'zorder': 7}
+        full = {'color': CANDIDATE_COLOUR, 'mew': 0.0, 'ms': 5.5, 'zorder': 7}
         groups = (('rejected', ~self._inlier, hollow), ('inliers', self._inlier, full))
         for name, chosen, look in groups:
             label = f'candidates, {name} ({np.count_nonzero(chosen)})'

@@ -8,13 +8,12 @@ from typing import Any
 
 from gp_ground_seg.core.errors import PointCloudError, require
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.data.colours import UNKNOWN
 
 DPI = 120
 
 # Okabe and Ito's palette and one violet: told apart with any colour vision.
-BLUE, SKY, GREEN, ORANGE, VERMILION, PINK, VIOLET = (
-    '#0072B2', '#56B4E9', '#009E73', '#E69F00', '#D55E00', '#CC79A7', '#7A4FA3',
+BLUE, SKY, GREEN, ORANGE, VERMILION, VIOLET = (
+    '#0072B2', '#56B4E9', '#009E73', '#E69F00', '#D55E00', '#7A4FA3',
 )  # fmt: skip
 
 
@@ -57,13 +56,6 @@ def save(figure: Any, path: str | Path) -> None:
     metadata = {'pdf': {'CreationDate': None}, 'svg': {'Date': None}}.get(kind, {})
     with staged_file(path, force=True) as part, rc_context({'svg.hashsalt': 'gp_ground_seg'}):
         figure.savefig(part, format=kind, metadata=metadata)
-
-
-def value_colours() -> Any:
-    """Return the colours of a range of values; NaN has that of `UNKNOWN`."""
-    from matplotlib import colormaps
-
-    return colormaps['viridis'].with_extremes(bad=UNKNOWN)
 
 
 def check_lengths(n_points: int, **values: Any) -> None:

@@ -21,7 +21,7 @@ from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.core.log import LOGGER
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.atomic_output import staged_file
-from gp_ground_seg.data.colours import length_scale_colours
+from gp_ground_seg.data.colours import ramp_colours
 from gp_ground_seg.lab.plotting.scan import CAMERA, TARGET
 from gp_ground_seg.lab.viewers.scene import LEGENDS, RAMPS, Cloud, Mesh, Scene
 
@@ -167,7 +167,7 @@ def legend(names: Iterable[str], config: Config) -> str:
     limits = config.length_scale
     ramps = {**RAMPS, 'surface': (limits.min, limits.max)}
     units = {'height': ' [m]', 'surface': ', length-scale [m]'}
-    samples = length_scale_colours(np.geomspace(1.0, 10.0, 6), 1.0, 10.0)
+    samples = ramp_colours(np.linspace(0.0, 1.0, 6), 0.0, 1.0)
     stops = ','.join('rgb({:.0%} {:.0%} {:.0%})'.format(*rgb) for rgb in samples)
     bar = f'<span style="background:linear-gradient(90deg,{stops})">{"&emsp;" * 5}</span>'
     lines = []

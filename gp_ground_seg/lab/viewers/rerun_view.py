@@ -26,14 +26,14 @@ NEED_LABELS = ('IoU', 'lost')
 ABOUT = f"""\
 The eyes in the tree on the left show and hide:
 
-- **class**: ground grey, obstacles vermilion
+- **class**: ground grey, obstacles orange
 - **height** over the ground: {RAMPS['height'][0]:g} m dark blue, {RAMPS['height'][1]:g} m yellow
 - **p_ground**, probability of ground: 0 dark blue, 1 yellow
-- **errors**, with labels: missed ground blue, false ground vermilion
+- **errors**, with labels: missed ground blue, false ground purple
 - **surface** of the ground: rough dark blue, smooth yellow (length-scale)
 - **band**: two standard deviations below it and above
 - **faces**: returns in tiles with a vertical face
-- **candidates** of the ground: inliers blue, outliers black
+- **candidates** of the ground: inliers green, outliers black
 """
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,25 +13,24 @@ from gp_ground_seg.core.frame import OUTSIDE, FloatArray, Label
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.data.colours import length_scale_colours
+from gp_ground_seg.data.colours import COLOURS, length_scale_colours, ramp_colours
 from gp_ground_seg.data.inputs import Input
 from gp_ground_seg.data.semantic_kitti import read_entries
-from gp_ground_seg.lab.plotting.scan import COLOURS, COLOURS_ABOVE, N_STD, VALUES
-from gp_ground_seg.lab.plotting.style import BLUE, PINK, VIOLET
+from gp_ground_seg.lab.plotting.scan import N_STD, VALUES
+from gp_ground_seg.lab.plotting.style import GREEN, VIOLET
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_confusion
 from gp_ground_seg.lab.scoring.objects import Objects, count_objects, labelled_objects
 
 Colours = npt.NDArray[np.uint8]
 BLACK = '#111111'
 LEGENDS = {
-    'class': {'unknown': PINK, 'ground': COLOURS['ground'], 'obstacle': COLOURS['obstacles']},
-    'changes': {'now ground': BLUE, 'now obstacle': BLACK},
+    'class': {name: COLOURS[name] for name in ('unknown', 'ground', 'obstacle')},
+    'changes': {'now ground': GREEN, 'now obstacle': BLACK},
     'errors': {
-        name: COLOURS_ABOVE[name]
-        for name in ('not scored', 'right', 'missed ground', 'false ground')
+        name: COLOURS[name] for name in ('not scored', 'right', 'missed ground', 'false ground')
     },
     'faces': {'in a tile with a vertical face': VIOLET},
-    'candidates': {'outlier': BLACK, 'inlier': BLUE},
+    'candidates': {'outlier': BLACK, 'inlier': GREEN},
 }
 RAMPS = {name: (low, high) for name, (_, low, high) in VALUES.items()}
 """Ends of the ramp from dark blue to yellow of the height over the ground [m], and of p_ground."""
@@ -125,10 +123,7 @@ def point_colours(name: str, result: Segmentation, other: Labels | None = None) 
     """
     is_ground = result.label == Label.GROUND
     if name in RAMPS:
-        low, high = RAMPS[name]
-        # The ramp of the length-scales is even in the logarithm.
-        values = np.exp(np.clip(getattr(result, name).astype(np.float64), low, high))
-        return _bytes(length_scale_colours(values, math.exp(low), math.exp(high)))
+        return _bytes(ramp_colours(getattr(result, name), *RAMPS[name]))
     if name == 'errors' and other is not None:
         kind = np.where(is_ground == (other == Label.GROUND), 1, np.where(is_ground, 3, 2))
         kind[other == Label.UNKNOWN] = 0

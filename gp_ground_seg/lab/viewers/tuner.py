@@ -19,6 +19,7 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Inputs
 from gp_ground_seg.lab.scoring.metrics import Labels
+from gp_ground_seg.lab.scoring.report import in_thousands
 from gp_ground_seg.lab.viewers.html_page import box, draw_points, legend, text
 from gp_ground_seg.lab.viewers.scene import Cloud, point_colours, read_view
 
@@ -198,7 +199,7 @@ def _table(result: Segmentation, before: Labels, scores: Sequence[dict[str, floa
     """Numbers of a result and of labels before, and how many labels have changed."""
     both = result.label, before
     rows = {
-        word: [f'{np.count_nonzero(label == value):,}' for label in both]
+        word: [in_thousands(np.count_nonzero(label == value)) for label in both]
         for word, value in (('ground', Label.GROUND), ('obstacle', Label.OBSTACLE))
     }
     if scores[0]:
@@ -206,9 +207,10 @@ def _table(result: Segmentation, before: Labels, scores: Sequence[dict[str, floa
         rows['objects lost'] = [f'{score["lost"]} of {score["objects"]}' for score in scores]
     rows['time'] = [f'{1e3 * result.timings["total"]:.0f} ms', '']
     is_ground = (result.label == Label.GROUND)[result.label != before]
-    n_ground, n_changed = np.count_nonzero(is_ground), len(is_ground)
+    numbers = len(is_ground), int(is_ground.sum()), int((~is_ground).sum())
+    n_changed, n_ground, n_obstacle = map(in_thousands, numbers)
     return '\n'.join(
         ['| | now | before |', '|---|--:|--:|',
          *(f'| {word} | {now} | {then} |' for word, (now, then) in rows.items()), '',
-         f'{n_changed:,} changed: {n_ground:,} now ground, {n_changed - n_ground:,} now obstacle']
+         f'{n_changed} changed: {n_ground} now ground, {n_obstacle} now obstacle']
     )  # fmt: skip
