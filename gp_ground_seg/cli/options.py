@@ -24,7 +24,6 @@ from gp_ground_seg.data.atomic_output import leftovers, staged_file
 from gp_ground_seg.data.inputs import Inputs, list_inputs
 from gp_ground_seg.data.scan_layout import DTYPES, KITTI, MIN_COLUMNS, ScanLayout
 from gp_ground_seg.lab.scale.cluster import Runner, open_runner
-from gp_ground_seg.lab.scoring.report import in_thousands
 
 DEFAULT_PRESET = 'default'
 FLAG = {'action': 'store_true'}
@@ -234,7 +233,7 @@ def note_leftovers(target: Path) -> None:
 
 def count(number: int, noun: str) -> str:
     """Return number and noun, as in ``1 frame``, ``2 000 frames``."""
-    return f'{in_thousands(number)} {noun}{"" if number == 1 else "s"}'
+    return f'{log.in_thousands(number)} {noun}{"" if number == 1 else "s"}'
 
 
 def progress(title: str, *, quiet: bool = False, unit: str = 'frame') -> partial[tqdm[Any]]:

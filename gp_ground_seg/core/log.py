@@ -5,11 +5,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import SupportsInt
 
 LOGGER = logging.getLogger('gp_ground_seg')
 """Of the whole library."""
 Receive = Callable[[int, str], object]
 """Takes the severity of a message, as in `logging`, and its text."""
+
+
+def in_thousands(number: SupportsInt) -> str:
+    """Return a whole number as in ``180 385``."""
+    return f'{int(number):_}'.replace('_', ' ')
 
 
 class _Handler(logging.Handler):

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.core.ground_model import GroundModel
+from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.points import check_points, finite_points
 from gp_ground_seg.core.result import Segmentation
@@ -19,7 +20,6 @@ from gp_ground_seg.data.colours import COLOURS, HEIGHTS, length_scale_colours, r
 from gp_ground_seg.lab.plotting import style
 from gp_ground_seg.lab.plotting.style import add_axes, new_figure, save, write_line
 from gp_ground_seg.lab.scoring.metrics import Labels
-from gp_ground_seg.lab.scoring.report import in_thousands
 
 VALUES = {
     'height': ('height over the ground [m]', *HEIGHTS),

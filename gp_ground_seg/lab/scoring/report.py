@@ -15,7 +15,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, SupportsInt
+from typing import Any, NamedTuple
 
 import gp_ground_seg
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, install_hint
@@ -51,11 +51,6 @@ class Column:
         if value is None or math.isnan(value):
             return '-'
         return format(self.scale * value, self.format).replace('_', ' ')
-
-
-def in_thousands(number: SupportsInt) -> str:
-    """Return a whole number as in ``180 385``."""
-    return f'{int(number):_}'.replace('_', ' ')
 
 
 def percent(title: str, key: str = '', form: str = '.2f') -> Column:

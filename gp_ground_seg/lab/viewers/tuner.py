@@ -11,7 +11,7 @@ import numpy as np
 
 from gp_ground_seg.core.errors import GroundSegError
 from gp_ground_seg.core.frame import Label
-from gp_ground_seg.core.log import LOGGER
+from gp_ground_seg.core.log import LOGGER, in_thousands
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.export import is_logarithmic
 from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec, ParameterValue
@@ -19,7 +19,6 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Inputs
 from gp_ground_seg.lab.scoring.metrics import Labels
-from gp_ground_seg.lab.scoring.report import in_thousands
 from gp_ground_seg.lab.viewers.html_page import box, draw_points, legend, text
 from gp_ground_seg.lab.viewers.scene import Cloud, point_colours, read_view
 
