@@ -47,11 +47,12 @@ $(VENV)/.docs: setup.py $(VENV)/.dev
 demo: $(VENV)/.ros
 	$(BIN)/gp-ground-seg demo --force $(if $(KITTI_ROOT),--kitti $(KITTI_ROOT))
 
+# A test that hangs fails after so many seconds, with a traceback; the slowest runs `make test`.
 test: $(VENV)/.dev
-	$(WITH_KITTI) $(BIN)/python -m pytest -m 'not slow'
+	$(WITH_KITTI) $(BIN)/python -m pytest --timeout=300 -m 'not slow'
 
 test-all: $(VENV)/.dev
-	$(WITH_KITTI) $(BIN)/python -m pytest
+	$(WITH_KITTI) $(BIN)/python -m pytest --timeout=1500
 
 chromium:
 	@command -v chromedriver >/dev/null \

@@ -43,6 +43,7 @@ DEV = [
     'pyarrow>=14',
     'pypatchworkpp>=1.4',
     'pypcd4>=1.1',
+    'pytest-timeout>=2.3',
     'ruff>=0.6,<0.18',
     's3fs>=2024.2',
     'scikit-learn>=1.4',

@@ -26,10 +26,13 @@ def try_it() -> str:
 
 
 def run(script: str, folder: Path) -> str:
-    done = subprocess.run(
-        ['bash', '-e', '-c', script], cwd=folder, env=newcomer(), stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=3000,
-    )  # fmt: skip
+    try:
+        done = subprocess.run(
+            ['bash', '-e', '-c', script], cwd=folder, env=newcomer(), stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=1200,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired as late:
+        pytest.fail(f'{script}\nhas not ended in {late.timeout:.0f} s, and printed:\n{late.output}')
     assert done.returncode == 0, done.stdout
     assert 'Traceback' not in done.stdout, done.stdout
     return done.stdout
