@@ -104,7 +104,8 @@ def fewer(n: int, n_plain: int) -> int:
 def sharing(n_threads: int) -> Iterator[NumbaBackend]:
     """Backend that splits even the smallest clouds, in threads also without compiled code."""
     threads = 'gp_ground_seg.core.compiled.threads'
-    with patch(f'{threads}.MIN_POINTS_TO_SPLIT', 1), patch(f'{threads}.JIT_ENABLED', True):
+    one = {'MIN_POINTS_TO_SPLIT': 1, 'MIN_SEGMENTS_TO_SPLIT': 1, 'JIT_ENABLED': True}
+    with patch.multiple(threads, **one):
         backend = NumbaBackend(n_threads)
         yield backend
         backend.close()

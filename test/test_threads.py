@@ -126,6 +126,11 @@ def test_number_of_threads():
         assert Workers(7).n_threads == 1
 
 
+def test_few_segments_are_not_split(workers):
+    """Learning looks at 45 segments again and again; a hand-over costs as much as 10 of them."""
+    assert [workers.n_segment_parts(n) for n in (1, 45, 180)] == [1, 1, 3]
+
+
 def test_points_of_small_clouds_are_not_split_and_threads_end_and_start_again():
     with patch.object(threads, 'JIT_ENABLED', True):
         backend = NumbaBackend(3)

@@ -161,7 +161,7 @@ class NumbaBackend:
         values, gradients = np.empty(n_segments), np.empty((n_segments, len(theta)))
         self.workers.run(
             likelihood.log_likelihood,
-            self.workers.n_threads,
+            self.workers.n_segment_parts(n_segments),
             theta,
             inliers,
             slope_std,
@@ -181,6 +181,7 @@ class NumbaBackend:
         take, knots, slope_std = self._buffers.take, frame.knots, config.observation.slope_std
         observation, growth = numbers_of(config.observation), numbers_of(config.growth)
         shape, n_candidates = (len(theta), len(knots)), len(frame.candidates.r)
+        n_parts = self.workers.n_segment_parts(len(theta))
         u, knot_u = self._log_length_scales(frame, theta, config)
         alone = ground.SegmentSurfaces(
             u,
@@ -195,7 +196,7 @@ class NumbaBackend:
         evidence.find_seeds(frame, theta, growth, max_slope, shown[0], alone.seed)
 
         def grow(aside: FloatArray, step: int) -> None:
-            grow_surfaces = ground.grow_surfaces, self.n_threads, frame, theta, observation
+            grow_surfaces = ground.grow_surfaces, n_parts, frame, theta, observation
             self.workers.run(*grow_surfaces, growth, aside, step, alone)
 
         def find_evidence() -> None:
@@ -222,7 +223,8 @@ class NumbaBackend:
             return given_log_length_scales(frame, config.length_scale)
         u = self._buffers.take('u', (len(frame.candidates.r),), np.float64)
         knot_u = np.empty((len(theta), len(frame.knots)))
-        self.workers.run(latent_.latent_log_length_scales, self.n_threads, frame, theta, u, knot_u)
+        n_parts = self.workers.n_segment_parts(len(theta))
+        self.workers.run(latent_.latent_log_length_scales, n_parts, frame, theta, u, knot_u)
         return u, knot_u
 
     def label_points(

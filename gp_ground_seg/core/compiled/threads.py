@@ -13,6 +13,8 @@ from gp_ground_seg.core.parameters.config import DEFAULT_MAX_THREADS
 
 MIN_POINTS_TO_SPLIT = 4096
 """Points below which sharing out costs more than it saves."""
+MIN_SEGMENTS_TO_SPLIT = 64
+"""The same for segments: to wake a thread and wait for it takes as long as several of them."""
 
 
 class Part(NamedTuple):
@@ -60,6 +62,10 @@ class Workers:
     def n_parts(self, n_points: int) -> int:
         """Return the number of parts that so many points are split into."""
         return self.n_threads if n_points >= MIN_POINTS_TO_SPLIT else 1
+
+    def n_segment_parts(self, n_segments: int) -> int:
+        """Return the number of parts that so many segments are split into."""
+        return self.n_threads if n_segments >= MIN_SEGMENTS_TO_SPLIT else 1
 
     def run(self, function: Callable[..., None], n_parts: int, *arguments: Any) -> None:
         """Call ``function(part, *arguments)`` for each part; return when all are done.
