@@ -19,9 +19,18 @@ import ros_helpers  # noqa: F401  imports type support without its warnings
 from rclpy.duration import Duration
 
 from gp_ground_seg.ros import diagnostics
-from gp_ground_seg.ros.diagnostics import InputFacts, InputTask, ModelTask, ProcessingTask
+from gp_ground_seg.ros.diagnostics import (
+    RATE_WINDOW,
+    Hysteresis,
+    InputFacts,
+    InputTask,
+    Level,
+    ModelTask,
+    ProcessingTask,
+    Rate,
+    Status,
+)  # fmt: skip
 from gp_ground_seg.ros.input import JUMP_TOLERANCE, TimeJumps
-from gp_ground_seg.ros.status import RATE_WINDOW, Hysteresis, Level, Rate, Status
 
 LIMITS = DiagnosticsConfig(stale_after=2.0, max_latency=0.1)
 FACTS = InputFacts('/points', 'reliable, keep_last 5, volatile', n_publishers=1, ros_time=1000.5)

@@ -1,6 +1,7 @@
 """The node in this process: what goes in, what comes out, what it says of itself."""
 
 import pytest
+import yaml
 
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
@@ -28,6 +29,21 @@ def test_reliability_asked_for_is_kept(reliability):
         b.wait_for_status('input', lambda v, _: v['Publishers'] == '2')
         b.publish_until(message, lambda: len(b.diagnostics.messages) > 15, 'a second of clouds')
         assert b.node._input.qos_words == f'{reliability}, keep_last 9, volatile'
+        # A reliable reader gets nothing from the second publisher, and says so.
+        status = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.STALE)
+        said = 'qos_overrides asks for reliable, and a publisher offers best effort'
+        assert (said in status.message) == (reliability == 'reliable')
+
+
+def test_what_is_dumped_pins_no_reliability(tmp_path):
+    with ros.started_node('-r', f'__ns:={NAMESPACE}') as node:
+        values = {name: p.value for name, p in node.get_parameters_by_prefix('').items()}
+    assert f'qos_overrides.{NAMESPACE}/points.subscription.reliability' in values
+    path = tmp_path / 'dumped.yaml'
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+    with ros.bench('--params-file', str(path)) as b:
+        b.publisher = b.probe.create_publisher(PointCloud2, 'points', ros.BEST_EFFORT)
+        b.publish_until(to_message(street(1000)), lambda: b.ground.messages, 'answer')
 
 
 # Names are part of the interface: dashboards read tasks, keys and their order.
@@ -91,7 +107,7 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch, ca
         node_name = b.node_name
 
     for status in tasks.values():
-        assert (status.level, status.hardware_id) == (DiagnosticStatus.OK, 'none')
+        assert (status.level, status.hardware_id) == (DiagnosticStatus.OK, node_name)
     keys = {task: [entry.key for entry in status.values] for task, status in tasks.items()}
     assert keys['input'] == INPUT_KEYS.split('; ')
     assert sorted(keys['processing']) == sorted([*PROCESSING_KEYS.split('; '), *TIMES])

@@ -88,7 +88,7 @@ def n_ground(points, config):
     return int((label == Label.GROUND).sum())
 
 
-def test_a_change_takes_effect_with_the_next_cloud(b):
+def test_a_change_takes_effect_with_the_next_cloud(b, capfd):
     points = street(5000)
     message = to_message(points)
     assert b.segment(message)[0].width == n_ground(points, Config())
@@ -101,6 +101,7 @@ def test_a_change_takes_effect_with_the_next_cloud(b):
         before = b.node.config
         assert b.set(name, value).successful
         assert b.node.config == before.replace(**{name: value})
+        ros.said_by(capfd, f'{name}: {before[name]} -> {value}\n')
         assert b.segment(message)[0].width == n_ground(points, b.node.config)
     narrow = Config().replace(**{'label.ground_tolerance': 0.01})
     assert n_ground(points, Config()) != n_ground(points, narrow)

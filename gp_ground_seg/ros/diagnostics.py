@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -17,11 +18,70 @@ from gp_ground_seg.core.parameters.config import DiagnosticsConfig
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import FitReport, Segmentation
 from gp_ground_seg.ros.input import STEADY_CLOCK
-from gp_ground_seg.ros.status import Hysteresis, Level, Rate, Status
 
+RATE_WINDOW = 10.0  # time over which rates are taken [s]
 CLOUD_WINDOW = 100  # clouds over which percentiles are taken
 MIN_RATE_SPAN = 1.0  # shortest time from which the load is computed [s]: a burst is no rate
+Level = IntEnum('Level', 'OK WARN ERROR STALE', start=0)
+"""Severity, with the values of ``diagnostic_msgs/DiagnosticStatus``."""
 Finding = tuple[Level, str]
+
+
+class Status(NamedTuple):
+    """One judged task: name, level, one line of text, and the values behind it."""
+
+    task: str
+    level: Level
+    message: str
+    values: dict[str, str]
+
+
+class Hysteresis:
+    """Holds the worst level of the latest time, so that a passing fault can be seen.
+
+    STALE ends with the first cloud: it is held as a warning.
+    """
+
+    def __init__(self) -> None:
+        # Levels fall from old to new: a status that is older and no worse than another goes.
+        self._held: deque[tuple[float, Status]] = deque()
+
+    def hold(self, now: float, found: Status, recover_after: float) -> Status:
+        """Return `found` with the worst level and message of the last `recover_after` [s]."""
+        while self._held and now - self._held[0][0] > recover_after:
+            self._held.popleft()
+        level = Level.WARN if found.level == Level.STALE else found.level
+        while self._held and self._held[-1][1].level <= level:
+            self._held.pop()
+        if level > Level.OK:
+            self._held.append((now, found._replace(level=level)))
+        since, worst = self._held[0] if self._held else (now, found)
+        if found.level == Level.STALE or worst.level <= found.level:
+            return found
+        message = f'{found.message}; {now - since:.1f} s ago: {worst.message}'
+        return found._replace(level=worst.level, message=message)
+
+
+class Rate:
+    """Events in all, and in the last `RATE_WINDOW` seconds."""
+
+    def __init__(self) -> None:
+        self.n_total = 0
+        self._events: deque[tuple[float, int]] = deque()
+
+    def count(self, now: float, n: int = 1) -> None:
+        """Count `n` events."""
+        self.n_total += n
+        self._events.append((now, n))
+
+    def window(self, now: float) -> tuple[int, float, float | None]:
+        """Return events in the window, the time they span [s], their rate [Hz] if they do."""
+        while self._events and now - self._events[0][0] > RATE_WINDOW:
+            self._events.popleft()
+        n_events = sum(n for _, n in self._events)
+        span = self._events[-1][0] - self._events[0][0] if self._events else 0.0
+        # The first event opens the span over which the others are counted.
+        return n_events, span, (n_events - self._events[0][1]) / span if span > 0.0 else None
 
 
 class InputFacts(NamedTuple):
@@ -98,12 +158,13 @@ class InputTask:
         n_received, n_refused = self._n_recent, self._n_refused_recent
         if silence > limits.stale_after:
             source = f'publishers: {facts.n_publishers}' if facts.n_publishers else 'nobody sends'
-            return Level.STALE, f'no cloud on {facts.topic} for {silence:.1f} s ({source})'
-        if n_received == 0:
-            return Level.OK, f'waiting for the first cloud on {facts.topic}'
+            why = f'; {facts.fault}' if facts.fault else ''
+            return Level.STALE, f'no cloud on {facts.topic} for {silence:.1f} s ({source}){why}'
         # A stamp may be of any age: a recording is played at any time.
         if n_refused == 0:
-            return (Level.WARN, facts.fault) if facts.fault else (Level.OK, 'receiving')
+            waiting = f'waiting for the first cloud on {facts.topic}'
+            found = Level.OK, 'receiving' if n_received else waiting
+            return (Level.WARN, facts.fault) if facts.fault else found
         share = 'every cloud' if n_refused == n_received else f'{n_refused} of {n_received} clouds'
         is_error = n_refused > min(limits.max_refused_ratio * n_received, n_received - 1)
         return Level.ERROR if is_error else Level.WARN, f'{share} refused: {self._last_error}'
@@ -324,7 +385,7 @@ class Diagnostics:
     def _publish(self) -> None:
         array = DiagnosticArray()
         array.header.stamp = self._node.get_clock().now().to_msg()
-        node_name = self._node.get_fully_qualified_name().lstrip('/')
+        node_name = self._node.get_fully_qualified_name()
         try:
             statuses = self.report(time.monotonic())
         except Exception as error:
@@ -332,7 +393,8 @@ class Diagnostics:
             statuses = [Status('diagnostics', Level.ERROR, f'{type(error).__name__}: {error}', {})]
         for status in statuses:
             message = DiagnosticStatus(level=bytes([status.level]), message=status.message)
-            message.name, message.hardware_id = f'{node_name}: {status.task}', 'none'
+            message.name = f'{node_name.lstrip("/")}: {status.task}'
+            message.hardware_id = node_name
             message.values = [KeyValue(key=k, value=v) for k, v in status.values.items()]
             array.status.append(message)
         self._publisher.publish(array)

@@ -23,6 +23,9 @@ QOS_OVERRIDES = 'qos_overrides.'
 LARGE_CLOUD = 500_000  # size up to which stock Fast DDS loses no best-effort cloud [bytes]
 NEAR = 1000  # gap in the numbers of several publishers up to which it counts as a loss
 JUMP_TOLERANCE = 0.5  # stamps of several sensors on one topic may be that much out of order [s]
+NOTHING_ARRIVES = (
+    'qos_overrides asks for reliable, and a publisher offers best effort: nothing arrives from it'
+)
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)  # the clock of a node may stand or jump
 THROTTLED = {'throttle_duration_sec': 5.0, 'throttle_time_source_type': STEADY_CLOCK}
 """Options of log messages that may come with every cloud."""
@@ -119,6 +122,9 @@ class CloudSubscription:
     @property
     def fault(self) -> str:
         """What is wrong with the way clouds are received; empty if nothing."""
+        is_refused = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
+        if self._is_pinned and self._reliability == ReliabilityPolicy.RELIABLE and is_refused:
+            return NOTHING_ARRIVES
         if not self._large_size:
             return ''
         return (
@@ -157,10 +163,7 @@ class CloudSubscription:
 
     def _on_incompatible(self, _event: object) -> None:
         if self._is_pinned:
-            self._node.get_logger().error(
-                f'a publisher of {self.topic} does not offer what qos_overrides asks for '
-                f'({self.qos_words}): nothing will arrive from it'
-            )
+            self._node.get_logger().error(f'on {self.topic}, {NOTHING_ARRIVES}')
         self._review_soon.trigger()
 
     def _look_at_publishers(self) -> bool:

@@ -186,7 +186,10 @@ class ConfiguredNode(Node):  # type: ignore[misc]
             config = changed(self._config, parameters)
             if config != self._config:
                 self.apply_config(config)
-                self._config = config
+                before, self._config = self._config, config
+                for name, value in config.flat().items():
+                    if value != before[name]:
+                        self.get_logger().info(f'{name}: {before[name]} -> {value}')
         except Exception as error:
             reason = f'{type(error).__name__}: {error}'
             self.get_logger().error(f'parameters could not be applied: {reason}')
