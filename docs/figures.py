@@ -112,12 +112,13 @@ def rows_of(output: str) -> list[str]:
 
 
 def kept(figure: Figure, output: str) -> str:
-    """Return the tables of an output that a figure keeps, and the last line, on the run."""
+    """Return the tables of an output that a figure keeps, and the lines on the machine."""
     if 'keep' not in figure.options:
         return output
     titles, parts = tuple(figure.options['keep'].split('; ')), output.split('\n\n')
     tables = [f'{a}\n\n{b}' for a, b in pairwise(parts) if a.startswith(titles)]
-    return '\n\n'.join([*tables, parts[-1]])
+    machine = [part for part in parts if part.startswith('machine: ')]
+    return '\n\n'.join([*tables, *machine])
 
 
 def body_of(figure: Figure, output: str, commit: str) -> str:

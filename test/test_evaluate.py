@@ -273,8 +273,13 @@ def test_tables_hold_the_sums_of_the_frames(root, evaluated, capfd):
         assert row['difference_to_patchworkpp'] == ours.iou - its.iou
         shown = f'{100 * ours.iou:.2f}  {100 * its.iou:15.2f}  {100 * (ours.iou - its.iou):+10.2f}'
         assert any(line.startswith(name) and line.endswith(shown) for line in lines)
-    headline = f'IoU {100 * document["groundgrid"][-1]["iou"]:.2f} %, Patchwork++ '
-    assert output.startswith(headline)
+    *_, sums, theirs, last = lines
+    assert sums == '3 frames of 2 sequences; GroundGrid convention; median time of a frame'
+    assert theirs.startswith('Patchwork++: IoU ')
+    ours = document['groundgrid'][-1]
+    names = {'IoU': 'iou', 'precision': 'precision', 'recall': 'recall'}
+    ratios = ', '.join(f'{name} {100 * ours[key]:.2f} %' for name, key in names.items())
+    assert last.startswith(f'gp_ground_seg: {ratios}, ') and last.endswith(' ms')
     times = {row['method']: row for row in document['times']}
     seconds = [f['seconds'] for f in frames if f['method'] == 'patchworkpp']
     assert times['Patchwork++']['median'] == pytest.approx(np.median(seconds))

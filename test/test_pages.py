@@ -246,8 +246,8 @@ def test_a_command_is_run_in_a_folder_of_its_own(tmp_path):
 
 def test_only_the_tables_that_a_figure_keeps():
     (figure,) = figures.find_figures('a.md', PAGE.replace('sample:', 'keep: B; C\nsample:'))
-    parts = ['headline', 'A is', '| a |', 'a note', 'B is', '| b |', 'C', '| c |', 'machine: x']
-    assert figures.kept(figure, '\n\n'.join(parts)) == '\n\n'.join(parts[4:])
+    parts = ['A is', '| a |', 'a note', 'B is', '| b |', 'C', '| c |', 'machine: x', 'result']
+    assert figures.kept(figure, '\n\n'.join(parts)) == '\n\n'.join(parts[3:-1])
 
 
 def test_a_figure_is_replaced_and_nothing_else():

@@ -19,7 +19,6 @@ from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
 from gp_ground_seg.lab.scoring import report as results
 from gp_ground_seg.lab.scoring import tables
 from gp_ground_seg.lab.scoring.evaluate import (
-    OURS,
     PATCHWORKPP,
     KnownScan,
     Method,
@@ -28,6 +27,7 @@ from gp_ground_seg.lab.scoring.evaluate import (
     load_kitti,
     score_methods,
 )
+from gp_ground_seg.lab.scoring.objects import ObjectCount
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 
 DESCRIPTION = """\
@@ -35,7 +35,7 @@ Segment labelled frames and score the labels in both conventions of the field: p
 recall, F1, accuracy, IoU, time per frame. Count vehicles, persons and cyclists that are
 lost: the share of their returns from 0.3 m above the local ground that is labelled ground,
 and the objects with more than half of these returns labelled ground. Objects are the
-instances of the labels (their upper 16 bits).
+instances of the labels (their upper 16 bits). The last line is the result.
 
 With --against another parameter file or preset, or with --peer Patchwork++, runs in turns on
 the same frames. Each difference has a bootstrap interval over the sequences, or over blocks of
@@ -112,7 +112,6 @@ def run(arguments: argparse.Namespace) -> int:
             report.write(parts['json'], environment)
         if 'per_frame' in parts:
             results.write_rows(report.rows, parts['per_frame'])
-    print(f'{_headline(scores)}\n')
     if changed:
         print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
     lines = [results.parameters_line(report.facts['config_changes'])]
@@ -120,6 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
     print(results.written(report.tables.values(), lines, markdown=arguments.markdown))
     for name in parts:
         print(f'{files[name]}: {shown(getattr(arguments, name))}')
+    print('', *_result_lines(scores), sep='\n')
     return 0
 
 
@@ -154,16 +154,23 @@ def _load_cloud(sequence: str, item: Input) -> KnownScan:
     return KnownScan(shown(sequence), shown(item.name), item.read().xyz, {})
 
 
-def _headline(scores: Sequence[MethodScore]) -> str:
-    ious = [f'{score.title} {100.0 * score.iou:.2f} %' for score in scores]
-    times = [f'{score.title} {1e3 * score.seconds():.1f} ms' for score in scores]
-    iou, seconds = (', '.join(words).removeprefix(OURS).strip() for words in (ious, times))
-    frames, sequences = len(scores[0].scans), len(scores[0].sequences)
-    pooled = f'{options.count(frames, "frame")} of {options.count(sequences, "sequence")}'
-    first = f'IoU {iou}  (GroundGrid convention, {pooled})'
-    if not scores[0].has_labels:
-        first = f'IoU not available, no labels of the ground  ({options.count(frames, "frame")})'
-    return f'{first}\n{seconds} per frame  (median)'
+def _result_lines(scores: Sequence[MethodScore]) -> list[str]:
+    """Return a line for each method on all its scans, ours the last."""
+    ours, lines = scores[0], []
+    for score in reversed(scores):
+        words = [] if ours.has_labels else ['no labels of the ground']
+        if ours.has_labels:
+            found = score.confusion
+            ratios = {'IoU': found.iou, 'precision': found.precision, 'recall': found.recall}
+            words += [f'{name} {100.0 * ratio:.2f} %' for name, ratio in ratios.items()]
+        bands = itertools.chain(*score.objects.values())
+        if (objects := sum(bands, ObjectCount())).n_objects:
+            words.append(f'{objects.n_lost} of {objects.n_objects} objects lost')
+        words.append(f'{1e3 * score.seconds():.1f} ms')
+        lines.append(results.fold(f'{score.title}: {", ".join(words)}'))
+    pooled = f'{options.count(len(ours.scans), "frame")} of '
+    pooled += options.count(len(ours.sequences), 'sequence')
+    return [f'{pooled}; GroundGrid convention; median time of a frame', *lines]
 
 
 def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:

@@ -13,6 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from difflib import get_close_matches
 from typing import NoReturn
 
 from gp_ground_seg import __version__
@@ -113,6 +114,10 @@ def _parse(words: list[str]) -> argparse.Namespace:
     command = next((word for word in words[:n_before] if not word.startswith('-')), None)
     if command in REMOVED:
         raise GroundSegError(f'{command}: was removed; {REMOVED[command]}')
+    if command not in (None, *COMMANDS):
+        close = get_close_matches(command or '', COMMANDS, 1)
+        hint = f'did you mean {close[0]}?' if close else '--help lists them'
+        raise GroundSegError(f'{command}: no such command; {hint}')
     parser = build_parser(command if command in COMMANDS else None)
     arguments = parser.parse_args(words[:n_before])
     arguments.ros_args = words[n_before:]

@@ -23,47 +23,22 @@ from gp_ground_seg.lab.scale.dataset import Outcome, Scan, pool, segment_block
 DESCRIPTION = """\
 Split scans into ground and obstacles.
 
-INPUT is one of:
-  scan.bin             float32 x, y, z, intensity, as in KITTI; --columns and --dtype for others
-  .pcd .ply .npy .npz, and .pcd.bin of nuScenes
-  folder               of such files, or a sequence with velodyne/ in it
-  drive.bag            a ROS 1 bag
-  drive.mcap, .db3     a single-file rosbag2
-  folder               of a rosbag2 (with metadata.yaml)
-  KITTI_ROOT           with sequences/00/velodyne/ and so on in it; several bags; s3://...
+INPUT is a scan (.bin .pcd .ply .npy .npz .xyz .txt .csv), a folder or sequence of scans, a bag
+(.bag .mcap .db3, or a rosbag2 folder), several bags, or a KITTI_ROOT. docs/datasets.md has more
+on formats, and on whole data sets.
 
-The output of a .bin scan is a .label file as in SemanticKITTI, one uint32 per point in
-the order of the input: 40 (road) = ground, 99 (other-object) = obstacle, 0 (unlabelled) =
-unknown (the point is not finite). With --raw: 1, 2 and 0.
+A .bin scan gives a .label file: 40 = ground, 99 = obstacle, 0 = not finite, as in SemanticKITTI.
+Other scans keep their format and get label (1 ground, 2 obstacle, 0 not finite), height,
+ground_z, ground_std and p_ground. A bag gives a rosbag2 with all its messages, and ground and
+obstacles after each cloud.
 
-The output of other formats has the same format; the name of OUT or --format chooses another
-one. It has every field of the input, and label (0 unknown, 1 ground, 2 obstacle), height,
-ground_z, ground_std [m], p_ground (docs/datasets.md).
-
-The output of a bag is a rosbag2 with all messages of the input, and after each point cloud
-its ground and its obstacles: every field of every point bit for bit, the same header, the
-same recorded time. Unknown points are in neither. Messages of ROS 1 are converted to ROS 2.
-
-At the end it prints height and tilt of the sensor over the frames that show enough ground,
-median and standard deviation. With level ground they can be set as parameters (docs/pose.md).
-
-A file whose coordinates can be no scan (another layout, millimetres, a map) is refused.
---force reads it anyway.
-
-Nothing is overwritten without --force. Output has a hidden name (.NAME.partial-...) until
-it is complete.
-
-With a KITTI_ROOT, several bags, a URL, --workers or --resume, each file appears when it is
-complete, and OUT/manifest.jsonl has a line for each block of files. --resume skips those
-whose input and output are as they were. The labels are the same (docs/datasets.md).
+At the end it prints height and tilt of the sensor, to check or to set (docs/pose.md).
 """
 EXAMPLES = """\
   gp-ground-seg segment 000000.bin -o 000000.label
   gp-ground-seg segment KITTI_ROOT/sequences/00 -o labels
   gp-ground-seg segment scan.pcd -o scan.npz --surface
-  gp-ground-seg segment drive.mcap --format ply --split     files for each cloud
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
-  gp-ground-seg segment drive.bag -o out --topic /velodyne_points --format sqlite3
   gp-ground-seg segment KITTI_ROOT -o OUT --workers 8 --resume
   gp-ground-seg segment s3://bucket/kitti -o s3://bucket/labels --scheduler tcp://host:8786
 """
@@ -75,6 +50,7 @@ FOR_SCANS = ('raw', 'split', 'surface', 'origin')
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the commands."""
     parser = options.new_parser(subparsers, 'segment', DESCRIPTION, EXAMPLES)
+    parser.usage = '%(prog)s INPUT [BAG ...] [-o OUT] [options]'
     options.add(
         parser,
         ('input', 'scan, folder of scans, bag, or a root or URL', {'metavar': 'INPUT'}),
