@@ -114,6 +114,7 @@ def test_a_folder_of_several_formats(tmp_path, expected, capsys):
     POINTS.tofile(folder / 'a.bin')
     np.hstack([POINTS, POINTS[:, :1]]).tofile(folder / 'b.pcd.bin')
     np.save(folder / 'a.npy', POINTS)
+    (folder / 'times.txt').write_text('0.0\n0.1\n')  # no scan
     assert [one.name for one in list_inputs(folder)] == ['a.bin', 'a.npy', 'b']
     assert run('segment', folder, '-o', tmp_path / 'own', '--quiet') == 0
     own = sorted(path.name for path in (tmp_path / 'own').iterdir())

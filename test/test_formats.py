@@ -239,6 +239,30 @@ def test_arrays_of_every_kind(tmp_path):
     assert found.dtype.names == ('x', 'y', 'z', 'intensity', 'column_5', 'ring')
 
 
+@pytest.mark.parametrize(
+    ('name', 'text', 'names'),
+    [
+        ('a.xyz', '1 2 -1.7\n3 4 -1.6\n', 'x y z'),
+        ('a.txt', '// X Y Z I\n1\t2\t-1.7\t9\r\n3\t4\t-1.6\t8\r\n', 'x y z intensity'),
+        ('a.csv', '\ufeff"X";"Y";"Z";"Ring Id"\n1;2;-1.7;0\n3;4;-1.6;nan\n', 'x y z Ring_Id'),
+        ('a.csv', '\n# made by hand\ntime,x,y,z\n0,1,2,-1.7\n0,3,4,-1.6\n', 'time x y z'),
+    ],
+)
+def test_texts_of_numbers(tmp_path, name, text, names):
+    cloud = reread(tmp_path / name, text.encode())
+    assert [field.replace(' ', '_') for field in cloud.fields.dtype.names] == names.split()
+    np.testing.assert_array_equal(cloud.xyz, [[1, 2, -1.7], [3, 4, -1.6]])
+
+
+@pytest.mark.parametrize('name', ['xyzi', 'arr_0'])
+def test_the_only_table_of_an_npz_is_the_points(tmp_path, name):
+    table = np.random.default_rng(1).normal(size=(9, 4))
+    np.savez(tmp_path / 'a.npz', **{name: table, 'ring': np.arange(9), 'pose': np.eye(3)[0]})
+    fields = read_file(tmp_path / 'a.npz').fields
+    assert_fields(fields, name_columns(table))
+    assert fields.dtype.names == ('x', 'y', 'z', 'intensity', 'ring')
+
+
 # Files that are damaged, or lie.
 
 
@@ -297,7 +321,14 @@ LIES = {
         npy_bytes(XYZ).replace(b'(4, 3)', b'(9999999999, 3)'), r'cannot be read as \.npy \('
     ),
     'flat.npy': (npy_bytes(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
-    'names.npz': (zip_of(a=npy_bytes(XYZ)), 'no field x of one number per point'),
+    'names.npz': (zip_of(a=npy_bytes(XYZ), b=npy_bytes(XYZ)), r'arrays a \(4, 3\), b \(4, 3\):'),
+    'flat.npz': (zip_of(a=npy_bytes(np.arange(9.0))), r'arrays a \(9,\): must be x, y, z, or one'),
+    'two.xyz': (b'1 2\n3 4\n', r'array of shape \(2, 2\): must be \(N, 3\)'),
+    'other.csv': (b'range,angle,z\n1,2,3\n', 'no field x of one number per point; fields: range'),
+    'ragged.txt': (b'1 2 3\n4 5\n', 'the number of columns changed'),
+    'none.txt': (b'# nothing\n', 'no line of numbers in it'),
+    'bytes.txt': (b'\xff\xfe\x00', 'UnicodeDecodeError'),
+    'long.xyz': (b'1 1 1\n' * 5_000_000, '5000000 points, accepted are at most'),
     'sizes.pcd': (padded_pcd().replace(b'WIDTH 2', b'WIDTH 9'), '4 points, which is not width 9'),
     'many.pcd': (
         padded_pcd().replace(b'WIDTH 2', b'WIDTH 4000000').replace(b'POINTS 4', b'POINTS 8000000'),

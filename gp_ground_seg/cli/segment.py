@@ -27,7 +27,7 @@ INPUT is a scan (.bin .pcd .ply .npy .npz .xyz .txt .csv), a folder or sequence 
 (.bag .mcap .db3, or a rosbag2 folder), several bags, or a KITTI_ROOT. docs/datasets.md has more
 on formats, and on whole data sets.
 
-A .bin scan gives a .label file: 40 = ground, 99 = obstacle, 0 = not finite, as in SemanticKITTI.
+A .bin or text gives a .label file: 40 = ground, 99 = obstacle, 0 = not finite (SemanticKITTI).
 Other scans keep their format and get label (1 ground, 2 obstacle, 0 not finite), height,
 ground_z, ground_std and p_ground. A bag gives a rosbag2 with all its messages, and ground and
 obstacles after each cloud.

@@ -1,11 +1,13 @@
 """Point clouds in files, their format known by the suffix; those of numpy are read here.
 
-``.npy`` is one table or structured array, ``.npz`` has an array for each field.
+``.npy`` is one table or structured array, ``.npz`` has an array for each field, or one table.
+``.xyz``, ``.txt`` and ``.csv`` have a line for each point, and may have one with the names before.
 """
 
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,6 +17,7 @@ import numpy as np
 
 from gp_ground_seg.core.errors import DataError, GroundSegError, PointCloudError, in_one_line
 from gp_ground_seg.data.clouds import (
+    COLUMNS,
     Cloud,
     Columns,
     Fields,
@@ -37,6 +40,7 @@ from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, check_scan, four_c
 
 NUSCENES_SUFFIX, NUSCENES_COLUMNS = '.pcd.bin', 5
 TABLE = 'points'  # array of an .npz that is a table (N, >= 3), beside fields (N,)
+COMMENTS = ('#', '//')  # begin lines of a text that are no points
 
 
 def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
@@ -51,7 +55,7 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
 
 def _fields_of(arrays: Columns) -> tuple[Fields, Columns]:
     """Put the fields and the table together; arrays of another length are what is beside them."""
-    table = arrays.pop(TABLE, None)
+    table = arrays.pop(_table_name(arrays), None)
     if table is not None and table.dtype.names is None:
         if table.ndim != 2 or table.shape[1] < 3:
             raise PointCloudError(f'array of shape {table.shape}: must be (N, 3) or wider')
@@ -60,6 +64,46 @@ def _fields_of(arrays: Columns) -> tuple[Fields, Columns]:
     shape = columns['x'].shape if 'x' in columns else ()
     fields = {name: v for name, v in columns.items() if shape and v.shape[:1] == shape}
     return gather(fields), {name: v for name, v in columns.items() if name not in fields}
+
+
+def _table_name(arrays: Columns) -> str:
+    """Name of the table: `TABLE`, or, where no array is x, the only one that can be a table."""
+    if {TABLE, 'x'} & arrays.keys():
+        return TABLE
+    tables = [name for name, v in arrays.items() if v.dtype.names or v.shape[1:] >= (3,)]
+    if len(tables) != 1:
+        found = ', '.join(f'{name} {v.shape}' for name, v in arrays.items()) or 'none'
+        found = textwrap.shorten(found, 200, placeholder=' ...')
+        raise PointCloudError(f'arrays {found}: must be x, y, z, or one array (N, 3) or wider')
+    return tables[0]
+
+
+def _read_text(data: bytes) -> tuple[Fields, None]:
+    """Read lines of x, y, z, ..., between them spaces, commas or semicolons; names may be first."""
+    text = data.decode('utf-8-sig')
+    lines = (line.strip() for line in io.StringIO(text))
+    first = next((line for line in lines if line and not line.startswith(COMMENTS)), '')
+    delimiter = next((mark for mark in ',;' if mark in first), None)
+    words = [word.strip(' "') for word in first.split(delimiter)]
+    check_points(text.count('\n'), len(words), len(data))
+    if not first:
+        raise PointCloudError('no line of numbers in it')
+    before = 0 if all(map(_is_number, words)) else text.partition(first)[0].count('\n') + 1
+    table = np.loadtxt(
+        io.StringIO(text), delimiter=delimiter, comments=COMMENTS, skiprows=before, ndmin=2
+    )
+    if not before:
+        return _fields_of({TABLE: table})[0], None
+    names = [word.lower() if word.lower() in COLUMNS else word for word in words]
+    return gather(dict(zip(names, table.T, strict=True))), None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _encode_npy(cloud: Cloud) -> bytes:
@@ -88,10 +132,13 @@ _READERS: dict[str, Callable[[bytes], tuple[Fields, Any]]] = {
     '.ply': read_ply,
     '.npy': _read_numpy,
     '.npz': _read_numpy,
+    '.xyz': _read_text,
+    '.txt': _read_text,
+    '.csv': _read_text,
 }
 _ENCODERS = {'.pcd': encode_pcd, '.ply': encode_ply, '.npy': _encode_npy, '.npz': _encode_npz}
 SUFFIXES = ('.bin', *_READERS)
-WRITABLE = tuple(_READERS)
+WRITABLE = tuple(_ENCODERS)
 
 
 def read_file(path: AnyPath, layout: ScanLayout = KITTI) -> Cloud:

@@ -125,15 +125,15 @@ def list_inputs(
 
 def holds_bag(path: Path) -> bool:
     """Whether `path` is a bag, or a folder that has bag files and no scans in it."""
-    if path.is_dir() and not any(is_cloud_file(child) for child in path.iterdir()):
+    if path.is_dir() and not any(map(_is_scan, path.iterdir())):
         # `BagReader` says what is missing there.
         return is_bag(path) or any(child.suffix in BAG_SUFFIXES for child in path.iterdir())
     return is_bag(path)
 
 
-def is_cloud_file(path: AnyPath) -> bool:
-    """Whether the name is that of a point cloud."""
-    return path.suffix.lower() in SUFFIXES
+def _is_scan(path: AnyPath) -> bool:
+    """Whether a file of a folder is taken for a scan; a text may be of times or a calibration."""
+    return path.suffix.lower() in SUFFIXES and path.suffix.lower() not in ('.txt', '.csv')
 
 
 def _find_files(source: AnyPath) -> Sequence[AnyPath]:
@@ -141,7 +141,7 @@ def _find_files(source: AnyPath) -> Sequence[AnyPath]:
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
     if not source.is_dir():
-        if not is_cloud_file(source):
+        if source.suffix.lower() not in SUFFIXES:
             raise DataError(
                 f'{source}: not a scan or bag; accepted are {accepted}, .bag, .mcap and .db3 '
                 'files, folders of scans and rosbag2 folders'
@@ -149,7 +149,7 @@ def _find_files(source: AnyPath) -> Sequence[AnyPath]:
         return [source]
     for name in _SCAN_FOLDERS:
         folder = source / name
-        if files := sorted((file for file in folder.glob('*') if is_cloud_file(file)), key=str):
+        if files := sorted((file for file in folder.glob('*') if _is_scan(file)), key=str):
             return files
     drives = sorted({str(path.parent) for pattern in _DRIVES for path in source.glob(pattern)})
     hint = ''
