@@ -9,6 +9,7 @@ with a segment's own which candidates join.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -183,12 +184,17 @@ def _rise_along(table: FloatArray, rise: FloatArray) -> None:
 
 
 def _rise_around(table: FloatArray, rise: FloatArray) -> None:
-    n = len(table)
-    # Twice around, as the segments form a ring.
-    for m in range(1, 2 * n):
-        np.minimum(table[m % n], table[(m - 1) % n] + rise, out=table[m % n])
-    for m in range(2 * n - 2, -1, -1):
-        np.minimum(table[m % n], table[(m + 1) % n] + rise, out=table[m % n])
+    for reach in _reaches(len(table)):
+        for shift in (reach, -reach):
+            np.minimum(table, np.roll(table, shift, axis=0) + reach * rise, out=table)
+
+
+def _reaches(n_segments: int) -> Iterator[int]:
+    """Segments that values move on by, in turn, to have come to all of the ring: 1, 2, 4, ..."""
+    reach = 1
+    while reach < n_segments:
+        yield reach
+        reach *= 2
 
 
 def evidence_aside(
@@ -213,22 +219,30 @@ def evidence_aside(
     """
     with np.errstate(invalid='ignore'):
         height, deviation = shown_by(mean, std, prior)
-    n_segments, step = len(mean), slope_std * 2.0 * math.pi / len(mean) * knots
+    step = slope_std * 2.0 * math.pi / len(mean) * knots
     total, weighted = np.zeros_like(height), np.zeros_like(height)
-    for order in (range(2 * n_segments), range(2 * n_segments - 1, -1, -1)):
-        nearest, nearest_std = np.zeros(len(knots)), np.full(len(knots), np.inf)
-        for k, turn in enumerate(order):
-            m = turn % n_segments
-            nearest_std = nearest_std + step
-            # The first time around finds what the second begins with.
-            if k >= n_segments:
-                weight = 1.0 / nearest_std**2
-                total[m] += weight
-                weighted[m] += weight * nearest
-            is_better = deviation[m] <= nearest_std
-            nearest = np.where(is_better, height[m], nearest)
-            nearest_std = np.where(is_better, deviation[m], nearest_std)
+    for side in (1, -1):
+        nearest, nearest_std = _of_nearest(height, deviation, step, side)
+        weight = 1.0 / nearest_std**2
+        total += weight
+        weighted += weight * nearest
     return Evidence(weighted / np.where(total > 0.0, total, 1.0), total)
+
+
+def _of_nearest(
+    height: FloatArray, deviation: FloatArray, step: FloatArray, side: int
+) -> tuple[FloatArray, FloatArray]:
+    """Height and standard deviation (M, K) by the nearest segment before each, or after it.
+
+    `side` is 1 or -1; the standard deviation grows by `step` (K,) for each segment on the way.
+    """
+    height, deviation = np.roll(height, side, axis=0), np.roll(deviation, side, axis=0) + step
+    for reach in _reaches(len(height)):
+        farther = np.roll(deviation, side * reach, axis=0) + reach * step
+        is_better = farther < deviation
+        height = np.where(is_better, np.roll(height, side * reach, axis=0), height)
+        deviation = np.where(is_better, farther, deviation)
+    return height, deviation
 
 
 def at_candidates(aside: Evidence, candidates: Candidates, knots: FloatArray) -> Evidence:
