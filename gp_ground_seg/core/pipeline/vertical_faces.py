@@ -40,35 +40,46 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     ``label.obstacle_max_height`` above the lowest may overhang, and are left out.
     """
     tiles, faces, label = scan.tiles, config.faces, config.label
-    inside = tiles.tile != OUTSIDE
-    tile, points = tiles.tile[inside], scan.xyz[inside].astype(np.float64)
     n_tiles = len(tiles.extremes)
-    n_sides = math.isqrt(n_tiles)
+    lowest_z, highest_z = tiles.extremes[tiles.occupied].astype(np.float64).T
+    # Most returns are in tiles where nothing stands, and are left out.
+    is_tall = highest_z - lowest_z > label.obstacle_min_height
+    tall, lowest_z = tiles.occupied[is_tall], lowest_z[is_tall]
+    row_of_tile = np.full(n_tiles, OUTSIDE)
+    row_of_tile[tall] = np.arange(len(tall))
+    row = np.where(tiles.tile != OUTSIDE, row_of_tile[tiles.tile], OUTSIDE)
+    used = np.flatnonzero(row != OUTSIDE)
+    above = scan.xyz[used, 2].astype(np.float64) - lowest_z[row[used]]
+    low = np.flatnonzero(above <= label.obstacle_max_height)
+    used, above = used[low], above[low]
+    row = row[used]
     # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
-    for i, place in enumerate(np.divmod(tile, n_sides)):
-        origin = place * faces.cell_size - 0.5 * n_sides * faces.cell_size
-        points[:, i] -= np.rint(origin * UNITS_PER_METRE) / UNITS_PER_METRE
-    above = points[:, 2] - tiles.lowest_z[tile]
-    points[:, 2] = above
-    low = above <= label.obstacle_max_height
-    is_tall = np.zeros(n_tiles, dtype=np.bool_)
-    is_tall[tile[low & (above > label.obstacle_min_height)]] = True
-
-    used = low & is_tall[tile]
-    tall, row = np.unique(tile[used], return_inverse=True)
-    chosen = np.rint(points[used] * UNITS_PER_METRE) / UNITS_PER_METRE
-    is_foot = above[used] <= FOOT_SHARE * label.obstacle_min_height
-    foot, rest = (_sums(chosen[part], row[part], len(tall)) for part in (is_foot, ~is_foot))
+    n_sides = math.isqrt(n_tiles)
+    x, y = (
+        scan.xyz[used, i] - _rounded(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
+        for i, place in enumerate(np.divmod(tall, n_sides))
+    )
+    # Rows of the foot first, then those of the rest.
+    is_rest = above > FOOT_SHARE * label.obstacle_min_height
+    sums = _sums(x, y, above, row + len(tall) * is_rest, 2 * len(tall))
+    foot, rest = sums[:, : len(tall)], sums[:, len(tall) :]
+    reaches = np.zeros(len(tall), dtype=np.bool_)
+    reaches[row[above > label.obstacle_min_height]] = True
     result = Faces(*np.zeros((2, n_tiles), dtype=np.bool_))
-    result.is_face[tall] = is_vertical(foot, rest, faces)
-    is_occluded = is_base_occluded(foot, rest, faces)
-    result.has_occluded_base[tall] = is_occluded & result.is_face[tall]
+    result.is_face[tall] = reaches & is_vertical(foot, rest, faces)
+    result.has_occluded_base[tall] = result.is_face[tall] & is_base_occluded(foot, rest, faces)
     return result
 
 
-def _sums(xyz: FloatArray, row: IntArray, n_rows: int) -> FloatArray:
-    """Add up the returns (P, 3) of each row, (SUMS, n_rows)."""
-    x, y, z = xyz.T
+def _rounded(values: FloatArray) -> FloatArray:
+    """Round to units of `UNITS_PER_METRE`."""
+    result: FloatArray = np.rint(values * UNITS_PER_METRE) / UNITS_PER_METRE
+    return result
+
+
+def _sums(x: FloatArray, y: FloatArray, z: FloatArray, row: IntArray, n_rows: int) -> FloatArray:
+    """Add up the returns (P,) of each row, (SUMS, n_rows)."""
+    x, y, z = map(_rounded, (x, y, z))
     terms = np.ones(len(x)), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z
     return np.array([np.bincount(row, term, n_rows) for term in terms])
 
