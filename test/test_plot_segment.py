@@ -15,7 +15,7 @@ from matplotlib.image import imread
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.parameters.config import GridConfig
-from gp_ground_seg.core.pipeline.polar_grid import build_polar_grid
+from gp_ground_seg.core.pipeline.polar_grid import build_polar_grid, grid_geometry
 from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.lab.plotting import segment as colours
 from gp_ground_seg.lab.plotting.segment import SegmentView, line_ends, plot_segment, segment_at
@@ -71,7 +71,8 @@ def count(pixels, colour):
 @given(azimuth=st.floats(-10.0, 10.0), n_segments=st.integers(4, 400))
 def test_segment_at_is_that_of_the_grid(azimuth, n_segments):
     xyz = np.array([[10.0 * math.cos(azimuth), 10.0 * math.sin(azimuth), 0.0]])
-    grid = build_polar_grid(xyz, GridConfig(n_segments=n_segments))
+    geometry = grid_geometry(GridConfig(n_segments=n_segments), 0.5, xyz.dtype)
+    grid = build_polar_grid(xyz, geometry)
     # On the edge between two segments rounding decides.
     position = (azimuth / math.tau + 0.5) * n_segments
     if abs(position - round(position)) > 1e-9:

@@ -10,10 +10,9 @@ from reference import Reference, place_of
 from gp_ground_seg import Config
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
-from gp_ground_seg.core.compiled.polar_grid import grid_geometry
 from gp_ground_seg.core.frame import OUTSIDE
 from gp_ground_seg.core.parameters.config import GridConfig
-from gp_ground_seg.core.pipeline.polar_grid import azimuth_key, bin_edges
+from gp_ground_seg.core.pipeline.polar_grid import azimuth_key, bin_edges, grid_geometry
 
 PLACE = st.floats(-120, 120)
 

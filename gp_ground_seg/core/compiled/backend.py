@@ -44,6 +44,7 @@ from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
 from gp_ground_seg.core.pipeline.labels import depth_of_ground, square_units
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
+from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
 from gp_ground_seg.core.pipeline.tilt import Direction
 
 
@@ -84,7 +85,7 @@ class NumbaBackend:
         if self._pid != os.getpid() or not self.workers.is_idle:
             self._renew()
         n_points, dtype, take = len(xyz), xyz.dtype, self._buffers.take
-        geometry = polar_grid.grid_geometry(config.grid, config.faces.cell_size, dtype)
+        geometry = grid_geometry(config.grid, config.faces.cell_size, dtype)
         n_parts = self.workers.n_parts(n_points)
         n_segments, n_cells = config.grid.n_segments, config.grid.n_segments * config.grid.n_bins
         n_tiles = geometry.n_sides**2

@@ -7,7 +7,6 @@ to the first table of the tiles.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,95 +23,15 @@ from gp_ground_seg.core.frame import (
     PointArray,
 )
 from gp_ground_seg.core.jit import jit
-from gp_ground_seg.core.parameters.config import GridConfig
 from gp_ground_seg.core.pipeline.polar_grid import (
+    BinLookup,
+    GridGeometry,
     azimuth_key,
-    bin_edges,
-    round_up_to,
-    segment_edges,
-    tiles_per_side,
     vertical_density,
 )
 
 BLOCK = 512
 """Points sorted at a time, so that their intermediate values stay in the nearest cache."""
-LARGEST_TABLE = 2**15
-EARLY = 0.02
-"""Offset of the entries of a table towards smaller values, in entries: more than the error of
-single precision in the largest table."""
-
-
-class BinLookup(NamedTuple):
-    """Edges of bins, and a table that gives the bin of a value without a search.
-
-    Attributes
-    ----------
-    edges : (n + 1,) float32 or float64
-        Edges rounded up to the precision of the values (see `round_up_to`).
-    bins : (T,) int32
-        Bin of the values from ``edges[0] + k / scale`` on, a little early.
-    ends : (T,) float32 or float64
-        Where that bin ends.
-    scale : float
-        Entries per unit.
-    is_coarse : bool
-        Whether more than one edge may lie in an entry.
-    """
-
-    edges: PointArray
-    bins: CellArray
-    ends: PointArray
-    scale: float
-    is_coarse: bool
-
-    @classmethod
-    def of(cls, edges: FloatArray, fineness: int, dtype: np.dtype[np.floating]) -> BinLookup:
-        """Table for values of type `dtype` in the bins between `edges` (n + 1,).
-
-        The narrowest bin has `fineness` entries, as far as `LARGEST_TABLE` allows.
-        """
-        extent, narrowest = float(edges[-1] - edges[0]), float(np.diff(edges).min())
-        scale = min(fineness / narrowest, LARGEST_TABLE / extent)
-        # A little early, so that rounding never gives an entry too far.
-        starts = edges[0] + (np.arange(int(extent * scale) + 2) - EARLY) / scale
-        bins = np.clip(np.searchsorted(edges, starts, side='right') - 1, 0, len(edges) - 2)
-        rounded = np.array([round_up_to(dtype, edge) for edge in edges], dtype=dtype)
-        is_coarse = narrowest * scale < 1.0 + 2.0 * EARLY
-        return cls(rounded, bins.astype(np.int32), rounded[bins + 1], scale, is_coarse)
-
-
-class GridGeometry(NamedTuple):
-    """Where the edges of cells and tiles lie.
-
-    Attributes
-    ----------
-    ranges, azimuths : BinLookup
-        Bins over range [m], segments over azimuth key.
-    edges : (n_bins + 1,) float64
-        Exact ranges of the bin edges [m].
-    tiles_per_metre : float
-        One over the side of a tile [1/m].
-    n_sides : int
-        Tiles along a side of the square.
-    """
-
-    ranges: BinLookup
-    azimuths: BinLookup
-    edges: FloatArray
-    tiles_per_metre: float
-    n_sides: int
-
-
-@lru_cache(maxsize=4)
-def grid_geometry(
-    grid: GridConfig, tile_size: float, dtype: np.dtype[np.floating]
-) -> GridGeometry:
-    """Geometry for points of type `dtype`."""
-    edges = bin_edges(grid)
-    ranges = BinLookup.of(edges, 4, dtype)
-    azimuths = BinLookup.of(segment_edges(grid.n_segments), 8, dtype)
-    n_sides = tiles_per_side(grid.r_max, tile_size)
-    return GridGeometry(ranges, azimuths, edges, 1.0 / tile_size, n_sides)
 
 
 class CellTable(NamedTuple):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +24,12 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GridConfig
-from gp_ground_seg.core.pipeline.points import copy_points, points_in
+from gp_ground_seg.core.pipeline.points import copy_points, finite_points, points_in
+
+LARGEST_TABLE = 2**15
+EARLY = 0.02
+"""Offset of the entries of a table towards smaller values, in entries: more than the error of
+single precision in the largest table."""
 
 
 def build_scan(xyz: PointArray, config: Config) -> Scan:
@@ -33,8 +40,9 @@ def build_scan(xyz: PointArray, config: Config) -> Scan:
     columns = np.empty((3, len(xyz)), dtype=xyz.dtype)
     copy_points(xyz, columns)
     xyz = points_in(columns)
-    grid = build_polar_grid(xyz, config.grid)
-    tiles = build_tiles(xyz, grid, config.faces.cell_size)
+    geometry = grid_geometry(config.grid, config.faces.cell_size, xyz.dtype)
+    grid = build_polar_grid(xyz, geometry)
+    tiles = build_tiles(xyz, grid, geometry)
     extremes, numbers = reduce_cells(grid, xyz[:, 2], tiles.tile)
     candidates = ground_candidates(extremes, numbers, grid.edges, config.lines.min_density_extent)
     return Scan(xyz, grid, tiles, candidates)
@@ -92,52 +100,133 @@ def segment_edges(n_segments: int) -> FloatArray:
     return edges
 
 
-def build_polar_grid(xyz: PointArray, grid: GridConfig) -> PolarGrid:
-    """Sort points into segments and bins (paper, section II); parameters as `build_scan`."""
+class BinLookup(NamedTuple):
+    """Edges of bins, and a table that gives the bin of a value without a search.
+
+    Attributes
+    ----------
+    edges : (n + 1,) float32 or float64
+        Edges rounded up to the precision of the values (see `round_up_to`).
+    bins : (T,) int32
+        Bin of the values from ``edges[0] + k / scale`` on, a little early.
+    ends : (T,) float32 or float64
+        Where that bin ends.
+    scale : float
+        Entries per unit.
+    is_coarse : bool
+        Whether more than one edge may lie in an entry.
+    """
+
+    edges: PointArray
+    bins: CellArray
+    ends: PointArray
+    scale: float
+    is_coarse: bool
+
+    @classmethod
+    def of(cls, edges: FloatArray, fineness: int, dtype: np.dtype[np.floating]) -> BinLookup:
+        """Table for values of type `dtype` in the bins between `edges` (n + 1,).
+
+        The narrowest bin has `fineness` entries, as far as `LARGEST_TABLE` allows.
+        """
+        extent, narrowest = float(edges[-1] - edges[0]), float(np.diff(edges).min())
+        scale = min(fineness / narrowest, LARGEST_TABLE / extent)
+        # A little early, so that rounding never gives an entry too far.
+        starts = edges[0] + (np.arange(int(extent * scale) + 2) - EARLY) / scale
+        bins = np.clip(np.searchsorted(edges, starts, side='right') - 1, 0, len(edges) - 2)
+        rounded = np.array([round_up_to(dtype, edge) for edge in edges], dtype=dtype)
+        is_coarse = narrowest * scale < 1.0 + 2.0 * EARLY
+        return cls(rounded, bins.astype(np.int32), rounded[bins + 1], scale, is_coarse)
+
+    def find(self, values: PointArray) -> CellArray:
+        """Bin of each of the values (N,), (N,) int32; they are less than the last edge.
+
+        Those below the first edge are in bin 0.
+        """
+        if self.is_coarse:
+            found = np.searchsorted(self.edges, values, side='right') - 1
+            return np.maximum(found, 0).astype(np.int32)
+        beyond = np.maximum(values - self.edges[0], 0.0)
+        entry = (beyond * values.dtype.type(self.scale)).astype(np.int32)
+        result: CellArray = self.bins[entry]
+        result += values >= self.ends[entry]
+        return result
+
+
+class GridGeometry(NamedTuple):
+    """Where the edges of cells and tiles lie.
+
+    Attributes
+    ----------
+    ranges, azimuths : BinLookup
+        Bins over range [m], segments over azimuth key.
+    edges : (n_bins + 1,) float64
+        Exact ranges of the bin edges [m].
+    tiles_per_metre : float
+        One over the side of a tile [1/m].
+    n_sides : int
+        Tiles along a side of the square, which holds the polar grid.
+    """
+
+    ranges: BinLookup
+    azimuths: BinLookup
+    edges: FloatArray
+    tiles_per_metre: float
+    n_sides: int
+
+
+@lru_cache(maxsize=4)
+def grid_geometry(
+    grid: GridConfig, tile_size: float, dtype: np.dtype[np.floating]
+) -> GridGeometry:
+    """Geometry for points of type `dtype`."""
     edges = bin_edges(grid)
-    finite = np.isfinite(xyz[:, 0]) & np.isfinite(xyz[:, 1]) & np.isfinite(xyz[:, 2])
-    zero, nothing = xyz.dtype.type(0.0), xyz.dtype.type(np.nan)
+    ranges = BinLookup.of(edges, 4, dtype)
+    azimuths = BinLookup.of(segment_edges(grid.n_segments), 8, dtype)
+    n_sides = math.ceil(2.0 * grid.r_max / tile_size)
+    return GridGeometry(ranges, azimuths, edges, 1.0 / tile_size, n_sides)
+
+
+def build_polar_grid(xyz: PointArray, geometry: GridGeometry) -> PolarGrid:
+    """Sort points (N, 3) into segments and bins (paper, section II)."""
+    ranges, azimuths = geometry.ranges, geometry.azimuths
+    n_segments, n_bins = len(azimuths.edges) - 1, len(ranges.edges) - 1
+    finite = finite_points(xyz)
+    zero, four, nothing = map(xyz.dtype.type, (0.0, 4.0, np.nan))
     x, y = np.where(finite, xyz[:, 0], zero), np.where(finite, xyz[:, 1], zero)
     with np.errstate(over='ignore'):  # infinitely far is outside
         r = np.sqrt(x * x + y * y)
-    near = r < edges[-1]
+    near = r < ranges.edges[-1]
     key = azimuth_key(np.where(near, x, zero), np.where(near, y, zero), xyz.dtype.type)
-    segment = np.searchsorted(segment_edges(grid.n_segments), key.astype(np.float64), side='right')
-    segment -= 1
-    # Exactly -x is the edge that ends the last segment: that is segment 0 again.
-    segment %= grid.n_segments
-    # Points nearer than the first edge belong to the first bin.
-    index = np.maximum(np.searchsorted(edges, r.astype(np.float64), side='right') - 1, 0)
-    cell = np.where(index < grid.n_bins, segment * grid.n_bins + index, OUTSIDE)
-    cell = np.where(finite, cell, NOT_FINITE).astype(np.int32)
-    return PolarGrid(cell, np.where(finite, r, nothing), edges, grid.n_segments)
+    # Exactly 4 is the edge that ends the last segment: that is segment 0 again.
+    segment = azimuths.find(np.where(key < four, key, zero))
+    cell = segment * n_bins + ranges.find(np.where(near, r, zero))
+    cell = np.where(near, cell, OUTSIDE).astype(np.int32)
+    cell[~finite] = NOT_FINITE
+    return PolarGrid(cell, np.where(finite, r, nothing), geometry.edges, n_segments)
 
 
-def tiles_per_side(r_max: float, tile_size: float) -> int:
-    """Tiles along a side of the square that holds the polar grid."""
-    return math.ceil(2.0 * r_max / tile_size)
-
-
-def build_tiles(xyz: PointArray, grid: PolarGrid, tile_size: float) -> Tiles:
-    """Sort points into square tiles.
-
-    Points (N, 3) outside the cells of `grid` belong to no tile; `tile_size` is their side [m].
-    """
-    half = round_up_to(xyz.dtype, grid.edges[-1])
-    side = tiles_per_side(float(grid.edges[-1]), tile_size)
-    inside = grid.inside
+def build_tiles(xyz: PointArray, grid: PolarGrid, geometry: GridGeometry) -> Tiles:
+    """Sort points (N, 3) into square tiles; those outside the cells of `grid` belong to none."""
+    half, side = geometry.ranges.edges[-1], geometry.n_sides
+    per_metre = xyz.dtype.type(geometry.tiles_per_metre)
+    # Places instead of a mask: it is used five times.
+    inside = np.flatnonzero(grid.inside)
     tile = np.full(len(xyz), OUTSIDE, dtype=np.int32)
-    per_metre = xyz.dtype.type(1.0 / tile_size)
-    column, row = ((xyz[inside, :2] + half) * per_metre).astype(np.int64).T
-    place = np.minimum(column, side - 1) * side + np.minimum(row, side - 1)
+    column, row = (
+        np.minimum(((xyz[inside, i] + half) * per_metre).astype(np.int32), side - 1)
+        for i in range(2)
+    )
+    place = column * side + row
     tile[inside] = place
     z = xyz[inside, 2]
-    lowest_z = np.full(side * side, np.inf, dtype=xyz.dtype)
-    highest_z = np.full(side * side, -np.inf, dtype=xyz.dtype)
+    extremes = np.empty((2, side * side), dtype=xyz.dtype)
+    lowest_z, highest_z = extremes
+    lowest_z[:], highest_z[:] = np.inf, -np.inf
     np.minimum.at(lowest_z, place, z)
     np.maximum.at(highest_z, place, z)
     occupied = np.flatnonzero(highest_z > -np.inf).astype(np.int32)
-    return Tiles(tile, np.column_stack([lowest_z, highest_z]), occupied)
+    return Tiles(tile, extremes.T, occupied)
 
 
 def reduce_cells(grid: PolarGrid, z: PointArray, tile: CellArray) -> tuple[PointArray, CellArray]:
@@ -153,7 +242,7 @@ def reduce_cells(grid: PolarGrid, z: PointArray, tile: CellArray) -> tuple[Point
     numbers, (M * n_bins, 2): number of points; tile of the lowest point, or `NO_TILE`.
     """
     size = grid.n_segments * grid.n_bins
-    inside = grid.inside
+    inside = np.flatnonzero(grid.inside)
     cell = grid.cell[inside]
     z_inside, r_inside = z[inside], grid.r[inside]
     lowest_z, lowest_r = np.full((2, size), np.inf, dtype=z.dtype)

@@ -56,7 +56,8 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     # Relative to a point of the tile: about the sensor, rounding would exceed the scatter.
     n_sides = math.isqrt(n_tiles)
     x, y = (
-        scan.xyz[used, i] - _rounded(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
+        scan.xyz[used, i]
+        - _rounded(place * faces.cell_size - 0.5 * n_sides * faces.cell_size)[row]
         for i, place in enumerate(np.divmod(tall, n_sides))
     )
     # Rows of the foot first, then those of the rest.
