@@ -89,8 +89,17 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
     return n
 
 
-@compiled_form(ground_plane.score_of, fastmath=True)
-def score_of(plane: Plane, cells: LowestPoints) -> float:
+@compiled_form(ground_plane.scores_of)
+def scores_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
+    """Support less penalty of planes (P, 3), (P,)."""
+    scores = np.empty(len(planes))
+    for p in range(len(planes)):
+        scores[p] = _score_of((planes[p, 0], planes[p, 1], planes[p, 2]), cells)
+    return scores
+
+
+@jit(fastmath=True)
+def _score_of(plane: Plane, cells: LowestPoints) -> float:
     """Support less penalty of a plane; a loop that adds in any order."""
     x, y, z, inverse = cells.x, cells.y, cells.z, cells.inverse
     total = 0.0

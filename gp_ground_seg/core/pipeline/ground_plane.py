@@ -213,19 +213,21 @@ SPREAD = _spread(N_TRIPLES)
 @shared
 def best_hypothesis(cells: LowestPoints, n: int, max_slope: float) -> tuple[bool, Plane]:
     """First of the planes with the best score, and whether there is one."""
-    found, most, best = False, 0.0, (0.0, 0.0, 0.0)
-    n_level = min(n, N_LEVEL)
-    for t in range(n_level + len(SPREAD)):
+    n_level, n_planes = min(n, N_LEVEL), 0
+    planes = np.empty((n_level + len(SPREAD), 3))
+    for t in range(len(planes)):
         if t < n_level:
             plane = (-cells.z[t * n // n_level], 0.0, 0.0)
         else:
             i, j, k = SPREAD[t - n_level] * n
             plane = plane_through(cells, int(i), int(j), int(k))
         if is_possible(plane, max_slope):
-            score = score_of(plane, cells)
-            if not found or score > most:
-                found, most, best = True, score, plane
-    return found, best
+            planes[n_planes, 0], planes[n_planes, 1], planes[n_planes, 2] = plane
+            n_planes += 1
+    if n_planes == 0:
+        return False, (0.0, 0.0, 0.0)
+    height, slope_x, slope_y = planes[np.argmax(scores_of(planes[:n_planes], cells))]
+    return True, (height, slope_x, slope_y)
 
 
 @shared
@@ -248,9 +250,12 @@ def is_possible(plane: Plane, max_slope: float) -> bool:
     return MIN_HEIGHT <= height <= MAX_HEIGHT and not steep
 
 
-def score_of(plane: Plane, cells: LowestPoints) -> float:
-    """Support less penalty of a plane."""
-    return float(np.sum(gain(cells.x, cells.y, cells.z, cells.inverse, plane)))
+def scores_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
+    """Support less penalty of planes (P, 3), (P,)."""
+    height, slope_x, slope_y = planes.T[:, :, None]
+    plane = height, slope_x, slope_y
+    scores: FloatArray = gain(cells.x, cells.y, cells.z, cells.inverse, plane).sum(axis=1)
+    return scores
 
 
 @shared

@@ -64,14 +64,14 @@ def lines_through(
 
 def _trace_lists(candidates: Candidates, *arguments: Any) -> tuple[int, int]:
     """Do what `trace` does, in lists: plain Python reads and writes them faster than arrays."""
-    *groups, lines, pseudo, continues_line = arguments
-    arrays = *lines, *pseudo, continues_line
+    arrays = *arguments[-3], *arguments[-2], arguments[-1]
     lists: Any = [array.tolist() for array in arrays]
-    inputs: Any = Candidates(*(column.tolist() for column in candidates))
-    numbers = trace(inputs, *groups, Lines(*lists[:3]), PseudoInputs(*lists[3:6]), lists[6])
+    results: Any = Lines(*lists[:3]), PseudoInputs(*lists[3:6]), lists[6]
+    inputs: Any = (column.tolist() for column in candidates)
+    counts = trace(Candidates(*inputs), *arguments[:-3], *results)
     for array, values in zip(arrays, lists, strict=True):
         array[:] = values
-    return numbers
+    return counts
 
 
 @shared
