@@ -46,6 +46,33 @@ def test_what_is_dumped_pins_no_reliability(tmp_path):
         b.publish_until(to_message(street(1000)), lambda: b.ground.messages, 'answer')
 
 
+def test_a_lazy_node_listens_only_while_somebody_listens_to_it():
+    message = to_message(street(1000))
+    with ros.bench('-p', 'input.lazy:=true', '-p', 'diagnostics.stale_after:=0.5', *OFTEN) as b:
+
+        def wait_until_listening(n):
+            ros.wait_for(lambda: b.publisher.get_subscription_count() == n, f'{n} subscriptions')
+
+        b.segment(message)
+        for collector in (b.ground, b.obstacles):
+            b.in_executor(b.probe.destroy_subscription, collector.subscription)
+        wait_until_listening(0)
+        status = b.wait_for_status(
+            'input', lambda v, s: s.level == DiagnosticStatus.OK and v['Publishers'] == '1'
+            and float(v['Time since last cloud (s)']) > 2.0
+        )  # fmt: skip
+        assert 'no output has a subscriber (input.lazy)' in status.message
+        for is_lazy in (False, True):
+            assert b.set('input.lazy', is_lazy).successful
+            wait_until_listening(1 - is_lazy)
+        # What nobody wanted is not lost.
+        for _ in range(5):
+            b.publisher.publish(message)
+        labelled = ros.Collector(b.probe, PointCloud2, f'{b.node_name}/labeled')
+        b.publish_until(message, lambda: labelled.messages, 'answer')
+        b.wait_for_status('processing', lambda v, _: v['Dropped since startup'] == '0')
+
+
 # Names are part of the interface: dashboards read tasks, keys and their order.
 STAGES = (
     'queue', 'grid', 'pose', 'faces', 'lines', 'learning', 'surface', 'label', 'total', 'publish',

@@ -112,7 +112,7 @@ def test_best_effort_driver_with_the_large_segment_profile(node, tmp_path):
         assert driver.popen.poll() is None
         # Fast DDS only warns about a profile that it cannot read, and goes on without.
         assert 'XML' not in driver.log
-    assert 'subscribing best_effort' in node.log
+    assert 'points (best_effort' in node.log
 
 
 @pytest.mark.usefixtures('node')

@@ -93,13 +93,14 @@ class InputFacts(NamedTuple):
     ros_time: float  # by the clock of the node [s]
     is_simulated: bool = False  # that clock
     fault: str = ''  # of the way clouds are received
+    idle: str = ''  # why none are wanted
 
 
 class InputTask:
     """Clouds that arrived, and those that were refused."""
 
     def __init__(self, now: float) -> None:
-        self._last_arrival = now
+        self._last_arrival = self._listening_since = now
         self._arrivals = Rate()
         self._n_refused = self._n_time_jumps = 0
         # Clouds of the newest reporting period that had any.
@@ -132,6 +133,8 @@ class InputTask:
     def report(self, now: float, facts: InputFacts, limits: DiagnosticsConfig) -> Status:
         """Judge the time since the last report."""
         self._is_reported = True
+        if facts.idle:
+            self._listening_since = now
         n_events, span, rate = self._arrivals.window(now)
         age = None if self._stamp is None else facts.ros_time - self._stamp
         values = {
@@ -154,8 +157,10 @@ class InputTask:
         return Status('input', *self._judge(now, facts, limits), values)
 
     def _judge(self, now: float, facts: InputFacts, limits: DiagnosticsConfig) -> Finding:
-        silence = now - self._last_arrival
+        silence = now - max(self._last_arrival, self._listening_since)
         n_received, n_refused = self._n_recent, self._n_refused_recent
+        if facts.idle:
+            return Level.OK, f'not listening to {facts.topic}: {facts.idle}'
         if silence > limits.stale_after:
             source = f'publishers: {facts.n_publishers}' if facts.n_publishers else 'nobody sends'
             why = f'; {facts.fault}' if facts.fault else ''

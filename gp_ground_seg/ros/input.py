@@ -79,14 +79,20 @@ class CloudSubscription:
     gets nothing from a best-effort LiDAR driver. ROS decides between them when a subscription with
     `ReliabilityPolicy.BEST_AVAILABLE` is made: it is made anew when the publishers change. A
     reliability given in ``qos_overrides`` is kept for any publisher. `callback` takes a cloud, its
-    wait in this process [s] and the number of clouds lost before it.
+    wait in this process [s] and the number of clouds lost before it. `why_idle` says why no
+    clouds are wanted: while it says something, there is no subscription.
     """
 
     def __init__(
-        self, node: Node, topic: str, callback: Callable[[PointCloud2, float, int], None]
+        self,
+        node: Node,
+        topic: str,
+        callback: Callable[[PointCloud2, float, int], None],
+        why_idle: Callable[[], str],
     ) -> None:
         self._node = node
         self._callback = callback
+        self._why_idle = why_idle
         self._gaps = SequenceGaps()
         self._offered: dict[bytes, ReliabilityPolicy] = {}
         self._large_size = 0
@@ -94,8 +100,9 @@ class CloudSubscription:
         self.topic: str = node.resolve_topic_name(topic)
         # The executor still uses a subscription within its own event; a guard condition runs
         # after all that became ready with it.
-        self._review_soon = node.create_guard_condition(self._review)
+        self._review_soon = node.create_guard_condition(self.review)
         self._look_at_publishers()
+        self.idle = why_idle()
         self._reliability = self._wanted_reliability()
         self._profile = QoSProfile(depth=INPUT_DEPTH, reliability=ReliabilityPolicy.BEST_AVAILABLE)
         self._create(QoSOverridingOptions.with_default_policies())
@@ -103,6 +110,9 @@ class CloudSubscription:
         self._is_pinned = self._profile.reliability != ReliabilityPolicy.BEST_AVAILABLE
         if self._is_pinned:
             self._reliability = self._profile.reliability
+        if self.idle:
+            # The parameters of its QoS are declared.
+            self._end()
         # The event can come before the publisher is listed, and there is no event for the end
         # of the last best-effort publisher: they are looked at every second too.
         node.create_timer(1.0, self._review_soon.trigger, clock=STEADY_CLOCK)
@@ -113,6 +123,12 @@ class CloudSubscription:
         history, durability = self._profile.history, self._profile.durability
         words = f'{self._reliability.name}, {history.name} {self._profile.depth}'
         return f'{words}, {durability.name}'.lower()
+
+    @property
+    def words(self) -> str:
+        """What it does, for the log."""
+        why = f'not listening to {self.topic}: {self.idle}'
+        return why if self.idle else f'listening to {self.topic} ({self.qos_words})'
 
     @property
     def n_publishers(self) -> int:
@@ -134,7 +150,7 @@ class CloudSubscription:
         )
 
     def _create(self, overrides: QoSOverridingOptions | None = None) -> None:
-        self._subscription = self._node.create_subscription(
+        self._subscription: Any = self._node.create_subscription(
             PointCloud2,
             self._unresolved_topic,
             self._receive,
@@ -142,6 +158,11 @@ class CloudSubscription:
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible),
             qos_overriding_options=overrides,
         )
+
+    def _end(self) -> None:
+        self._node.destroy_subscription(self._subscription)
+        self._subscription = None
+        self._gaps.reset()
 
     def _receive(self, cloud: PointCloud2, info: dict[str, Any]) -> None:
         if not self._offered:
@@ -185,17 +206,20 @@ class CloudSubscription:
         is_any = ReliabilityPolicy.BEST_EFFORT in self._offered.values()
         return ReliabilityPolicy.BEST_EFFORT if is_any else ReliabilityPolicy.RELIABLE
 
-    def _review(self) -> None:
+    def review(self) -> None:
+        """Subscribe as the publishers offer, or not at all, as clouds are wanted now."""
         self._look_at_publishers()
-        wanted = self._wanted_reliability()
-        if self._is_pinned or wanted == self._reliability:
+        wanted = self._reliability if self._is_pinned else self._wanted_reliability()
+        self.idle = self._why_idle()
+        is_listening = self._subscription is not None
+        if is_listening != bool(self.idle) and wanted == self._reliability:
             return
+        if is_listening:
+            self._end()
         self._reliability, self._large_size = wanted, 0
-        self._node.destroy_subscription(self._subscription)
-        self._create()
-        self._node.get_logger().info(
-            f'subscribing {self.qos_words} to {self.topic}, as its publishers offer'
-        )
+        if not self.idle:
+            self._create()
+        self._node.get_logger().info(self.words)
 
 
 class TimeJumps:

@@ -64,13 +64,13 @@ class GroundSegmentationNode(ConfiguredNode):
         logger.info(describe(self.config, self.get_fully_qualified_name()))
         with start_stop.start_errors():
             self._outputs = OutputPublishers(self)
-            self._input = CloudSubscription(self, 'points', self._on_cloud)
+            self._input = CloudSubscription(self, 'points', self._on_cloud, self._why_idle)
         self._follow_tf(self.config)
         self._time_jumps = TimeJumps(self, self._on_time_jump)
         self._diagnostics = Diagnostics(self, self._state, self.config.diagnostics)
         self.warn_of_unused_parameters()
         self._load_backend(self.config)
-        logger.info(f'listening to {self._input.topic} ({self._input.qos_words})')
+        logger.info(self._input.words)
 
     def _on_cloud(self, cloud: PointCloud2, wait: float, n_lost: int) -> None:
         """Segment a cloud and publish the result; report a cloud that cannot be segmented."""
@@ -91,6 +91,11 @@ class GroundSegmentationNode(ConfiguredNode):
             health.processing.processed(end - start, stages, segmentation.fit)
             health.model.segmented(segmentation)
             health.output.published(end, topics)
+
+    def _why_idle(self) -> str:
+        """Why no clouds are wanted now; empty if they are."""
+        is_heard = not self.config.input.lazy or any(self._outputs.n_subscribers().values())
+        return '' if is_heard else 'no output has a subscriber (input.lazy)'
 
     def _note_arrival(self, cloud: PointCloud2, now: float, n_lost: int) -> None:
         stamp = cloud.header.stamp.sec + 1e-9 * cloud.header.stamp.nanosec
@@ -195,8 +200,9 @@ class GroundSegmentationNode(ConfiguredNode):
         source, now = self._input, 1e-9 * clock.now().nanoseconds
         is_simulated = clock.ros_time_is_active
         facts = InputFacts(
-            source.topic, source.qos_words, source.n_publishers, now, is_simulated, source.fault
-        )
+            source.topic, source.qos_words, source.n_publishers, now, is_simulated, source.fault,
+            source.idle,
+        )  # fmt: skip
         return facts, self._outputs.n_subscribers()
 
 
