@@ -100,6 +100,7 @@ setup(
         'console_scripts': [
             'gp-ground-seg = gp_ground_seg.cli.main:main',
             'ground_segmentation_node = gp_ground_seg.cli.node:main',
+            'ground_segmentation_lifecycle_node = gp_ground_seg.cli.node:main_managed',
         ],
     },
 )

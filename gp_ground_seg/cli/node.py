@@ -37,13 +37,18 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run_warm_up)
 
 
-def main() -> int:
+def main(*, is_managed: bool = False) -> int:
     """Entry point ``ground_segmentation_node``; says what is missing where there is no ROS."""
     try:
-        return run_node(sys.argv[1:])
+        return run_node(sys.argv[1:], is_managed=is_managed)
     except GroundSegError as error:
         print(f'ground_segmentation_node: error: {shown(error)}', file=sys.stderr)
         return 2
+
+
+def main_managed() -> int:
+    """Entry point ``ground_segmentation_lifecycle_node``."""
+    return main(is_managed=True)
 
 
 def run_warm_up(_arguments: argparse.Namespace) -> int:

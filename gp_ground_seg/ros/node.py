@@ -7,7 +7,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -47,17 +47,24 @@ class GroundSegmentationNode(ConfiguredNode):
         super().__init__(NODE_NAME, **options)
         self._library_log = ExitStack()
         self._library_log.enter_context(log.passed_to(self._pass_on))
-        self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
-        self._is_compiled = False
         self._tf: TfListener | None = None
         # A guard condition runs in the executor, between two callbacks.
         self._loaded = self.create_guard_condition(self._change_backend)
-        self._loader = BackendLoader(self._loaded.trigger)
+        self._make_segmenter()
         try:
             self._start()
         except BaseException:
             self.destroy_node()
             raise
+
+    def _make_segmenter(self) -> None:
+        self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
+        self._is_compiled = False
+        self._loader = BackendLoader(self._loaded.trigger)
+
+    def _free_segmenter(self) -> None:
+        self._loader.close()
+        self._segmenter.close()
 
     def _start(self) -> None:
         logger = self.get_logger()
@@ -154,6 +161,8 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _change_backend(self) -> None:
         """Use the compiled backend from the next cloud on, if the parameters still say so."""
+        if not self._loader.is_ready:
+            return
         backend = self._loader.take_backend()
         if backend is None:
             self.get_logger().warning(f'{STAYS}: {self._loader.error}')
@@ -185,8 +194,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._loader.stop()
         # The network before the threads: they may end late.
         super().destroy_node()
-        self._loader.close()
-        self._segmenter.close()
+        self._free_segmenter()
         self._library_log.close()
 
     def _on_time_jump(self, seconds: float) -> None:
@@ -222,7 +230,12 @@ def _spin(node: GroundSegmentationNode, stop: start_stop.StopRequest) -> None:
                 node.get_logger().error(reason, **THROTTLED)
 
 
-def main(args: Sequence[str] | None = None) -> int:
+def main(
+    args: Sequence[str] | None = None,
+    make_node: Callable[[start_stop.StopRequest], GroundSegmentationNode] = (
+        lambda _stop: GroundSegmentationNode()
+    ),
+) -> int:
     """Run the node until a signal or a shutdown; return 0, or 2 for an error at start."""
     words = [NODE_NAME, *(sys.argv[1:] if args is None else args)]
     node = None
@@ -231,7 +244,7 @@ def main(args: Sequence[str] | None = None) -> int:
             # Both outputs at once are more than stock Fast DDS sends without loss.
             with start_stop.large_cloud_transport():
                 start_stop.initialize(words)
-                node = GroundSegmentationNode()
+                node = make_node(stop)
             _spin(node, stop)
         except GroundSegError as error:
             sys.stderr.write(f'{NODE_NAME}: error: {shown(error)}\n')

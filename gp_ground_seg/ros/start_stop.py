@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib
 import itertools
 import os
 import shutil
@@ -138,13 +139,14 @@ def child_command(code: str) -> list[str]:
     return [sys.executable, '-c', _CHILD.format(path=path, code=code)]
 
 
-def run_node(words: Sequence[str]) -> int:
-    """Run the node until a signal; return its exit code, or raise where there is no ROS."""
+def run_node(words: Sequence[str], *, is_managed: bool = False) -> int:
+    """Run a node until a signal; return its exit code, or raise where there is no ROS."""
     # Importing ROS takes most of a second; a signal within it is obeyed as well.
     with stop_on_signals() as stop:
         with needing_ros('the node'):
-            from gp_ground_seg.ros.node import main
-        return 0 if stop.made else main(words)
+            name = 'managed' if is_managed else 'node'
+            module = importlib.import_module(f'gp_ground_seg.ros.{name}')
+        return 0 if stop.made else module.main(words)
 
 
 _PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'

@@ -31,6 +31,8 @@ class BackendLoader:
 
     error = ''
     seconds = 0.0
+    is_ready = False
+    """Whether `take_backend` has a result that was not taken yet."""
     _backend: Backend | None = None
     _is_stopped = False
     _compiler: subprocess.Popen[bytes] | None = None
@@ -57,7 +59,7 @@ class BackendLoader:
 
     def take_backend(self) -> Backend | None:
         """Return the backend, once; None if it cannot be made, and `error` says why."""
-        backend, self._backend = self._backend, None
+        backend, self._backend, self.is_ready = self._backend, None, False
         return backend
 
     def stop(self) -> None:
@@ -95,7 +97,7 @@ class BackendLoader:
         self.seconds = time.monotonic() - start
         with self._lock:
             if not self._is_stopped:
-                self._backend = backend
+                self._backend, self.is_ready = backend, True
                 self._on_done()
             elif backend is not None:
                 backend.close()

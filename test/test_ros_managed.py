@@ -1,0 +1,95 @@
+"""The managed node, driven by the services that ``ros2 lifecycle`` and Nav2's manager call."""
+
+import contextlib
+import signal
+
+import pytest
+
+pytest.importorskip('rclpy', reason='ROS is not installed')
+
+import ros_helpers as ros
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from ros_helpers import street, to_message, wait_for
+
+from gp_ground_seg.core.backend import choose_backend
+from gp_ground_seg.core.jit import HAVE_NUMBA
+from gp_ground_seg.ros.warm_up import FOLLOWS
+
+START = (
+    '-c', 'import sys; from gp_ground_seg.cli.node import main_managed; sys.exit(main_managed())',
+)  # fmt: skip
+OFTEN = '-p', 'diagnostics.period:=0.1', '-p', 'diagnostics.stale_after:=0.5'
+
+
+@contextlib.contextmanager
+def managed_node(folder, **environment):
+    """The process of a node, and a `Link` to it, which is not subscribed to yet."""
+    words = *ros.IN_NAMESPACE, *OFTEN
+    with (
+        ros.Process(*words, folder=folder, start=START, **environment) as process,
+        ros.isolated_context() as context,
+    ):
+        process.wait_until_ready('not listening to')
+        link = ros.Link(context)
+        with ros.spinning(context, link.probe):
+            yield process, link
+
+
+def change(link, transition):
+    """Whether the node has made the transition, and its state after it."""
+    request = ChangeState.Request(transition=Transition(id=transition))
+    is_done = link.call(ChangeState, 'change_state', request).success
+    return is_done, link.call(GetState, 'get_state', GetState.Request()).current_state.id
+
+
+def wait_for_subscriptions(link, n):
+    wait_for(lambda: link.publisher.get_subscription_count() == n, f'{n} subscriptions')
+
+
+def test_the_transitions_compile_listen_and_free(tmp_path):
+    message = to_message(street(3000))
+    with managed_node(tmp_path) as (process, link):
+        status = link.wait_for_status('input', lambda v, _: v['Publishers'] == '1')
+        assert 'not listening to' in status.message and status.level == b'\0'
+        assert link.set('label.ground_tolerance', 0.12).successful
+        assert FOLLOWS not in process.log
+        for n_clouds in (1, 3):
+            configured = change(link, Transition.TRANSITION_CONFIGURE)
+            assert configured == (True, State.PRIMARY_STATE_INACTIVE)
+            for k in range(2):
+                wait_for_subscriptions(link, 0)
+                active = change(link, Transition.TRANSITION_ACTIVATE)
+                assert active == (True, State.PRIMARY_STATE_ACTIVE)
+                link.wait_until_connected()
+                assert sum(cloud.width for cloud in link.segment(message)) == 3000
+                n = str(n_clouds + k)
+                status = link.wait_for_status(
+                    'processing', lambda v, _, n=n: v['Clouds since startup'] == n
+                )
+                # The first cloud, too.
+                assert ros.values_of(status)['Backend'] == choose_backend('auto')
+                stopped = change(link, Transition.TRANSITION_DEACTIVATE)
+                assert stopped == (True, State.PRIMARY_STATE_INACTIVE)
+            clean = change(link, Transition.TRANSITION_CLEANUP)
+            assert clean == (True, State.PRIMARY_STATE_UNCONFIGURED)
+        end = change(link, Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+        assert end == (True, State.PRIMARY_STATE_FINALIZED)
+        assert process.stop(signal.SIGINT)[0] == 0
+        assert 'Traceback' not in process.log and 'ERROR' not in process.log
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
+def test_a_signal_ends_the_wait_for_compiled_code(tmp_path):
+    cache = tmp_path / 'cache'
+    cache.mkdir(mode=0o700)
+    with managed_node(tmp_path, NUMBA_CACHE_DIR=str(cache)) as (process, link):
+        client = link.probe.create_client(ChangeState, f'{link.node_name}/change_state')
+        wait_for(client.service_is_ready, 'service')
+        client.call_async(
+            ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
+        )
+        process.wait_until_ready('compiling for this processor')
+        code, seconds = process.stop(signal.SIGTERM)
+        assert code == 0 and seconds < 10.0
