@@ -2,13 +2,15 @@
 
 The outputs are /front/ground, /front/obstacles, /rear/ground and /rear/obstacles. A Nav2 costmap
 takes all of them as sources; docs/node.md says when one node on merged clouds is the better way.
+Arguments of ground_segmentation.launch.py that are not set here hold for both nodes.
 """
 
 from pathlib import Path
 
 from launch import LaunchDescription
-from launch.actions import GroupAction, IncludeLaunchDescription
+from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
 
 NODE = Path(__file__).with_name('ground_segmentation.launch.py')
 
@@ -20,16 +22,16 @@ SENSORS = {
 
 def generate_launch_description():
     """Return one group per sensor, so that the arguments of one are not those of the other."""
-    return LaunchDescription(
-        [
-            GroupAction(
-                [
-                    IncludeLaunchDescription(
-                        PythonLaunchDescriptionSource(str(NODE)),
-                        launch_arguments={'namespace': name, **arguments}.items(),
-                    )
-                ]
-            )
-            for name, arguments in SENSORS.items()
-        ]
-    )
+    description = LaunchDescription()
+    for sensor, arguments in SENSORS.items():
+        # front_topic, front_params, rear_topic, rear_params
+        for name, value in arguments.items():
+            description.add_action(DeclareLaunchArgument(f'{sensor}_{name}', default_value=value))
+        # A bag is played once: beside this file.
+        given = {name: LaunchConfiguration(f'{sensor}_{name}') for name in arguments}
+        node = IncludeLaunchDescription(
+            PythonLaunchDescriptionSource(str(NODE)),
+            launch_arguments={'namespace': sensor, 'bag': '', **given}.items(),
+        )
+        description.add_action(GroupAction([node]))
+    return description

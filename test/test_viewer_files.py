@@ -35,9 +35,9 @@ def test_rviz_shows_every_topic():
         is_markers = display['Topic']['Value'].endswith('markers')
         kind = 'MarkerArray' if is_markers else 'PointCloud2'
         assert display['Class'] == f'rviz_default_plugins/{kind}'
-    # What costs the node something is off until it is wanted, but for the markers.
-    off = {display['Topic']['Value'] for display in shown if not display['Enabled']}
-    assert off == {f'{NODE}/labeled', f'{NODE}/ground_model'}
+    # What costs the node something is off until it is wanted.
+    on = {display['Topic']['Value'] for display in shown if display['Enabled']}
+    assert on == {'/ground', '/obstacles'}
 
 
 def test_foxglove_shows_every_topic():
