@@ -131,7 +131,20 @@ AT128 = SensorModel(
     'at128', _beams((12.5, -12.9, 128)), 1200, 1.0, 200.0, 0.02, 1.9,
     sector=math.radians(120.0),
 )  # fmt: skip
+# A Pandar64's beams are densest about the horizon.
+PANDAR64 = replace(
+    HDL_64E, name='pandar64', n_columns=1800, height=2.06,
+    elevations=_beams((15.0, 3.0, 5), (2.0, -6.0, 49), (-7.0, -14.0, 8), (-19.0, -25.0, 2)),
+)  # fmt: skip
 QT64 = SensorModel('qt64-tilted', _beams((52.1, -52.1, 64)), 600, 0.2, 60.0, 0.02, 1.2)
+
+
+def _without_rings(sensor: SensorModel) -> tuple[float, ...]:
+    """Elevations without every fourth beam, and without three of the steep ones."""
+    n = len(sensor.elevations)
+    return tuple(up for k, up in enumerate(sensor.elevations) if k % 4 and not n - 18 < k < n - 14)
+
+
 SENSORS = {
     sensor.name: sensor
     for sensor in (
@@ -139,12 +152,17 @@ SENSORS = {
         replace(HDL_64E, name='hdl-64e-vehicle', origin=(0.0, 0.0, HDL_64E.height)),
         VLP_32C,
         replace(VLP_32C, name='vlp-32c-pair', origin=(1.35, 0.0, 1.9), others=(_UPSIDE_DOWN,)),
+        replace(VLP_32C, name='vlp-32c-31', elevations=VLP_32C.elevations[:-1]),
+        PANDAR64,
+        # Every fourth ring is missing, and three beside one another.
+        replace(HDL_64E, name='hdl-64e-gaps', elevations=_without_rings(HDL_64E)),
         AT128,
         replace(QT64, roll=math.radians(35.0), pitch=math.radians(10.0)),
         replace(VLP_16, name='vlp-16-low', height=0.15, min_range=0.1),
     )
 }  # fmt: skip
-"""LiDARs and their mounts by name; ``-vehicle`` and ``-pair``: clouds with z = 0 on the ground."""
+"""LiDARs and their mounts by name; ``-vehicle`` and ``-pair``: clouds with z = 0 on the ground;
+``vlp-32c-31``: without its steepest beam, which the roof of a car may hide."""
 
 
 @dataclass(frozen=True)
@@ -234,15 +252,19 @@ def _mirror(
     kind: KindArray,
     draw: FloatArray,
 ) -> None:
-    """Move hits on wet road, in place, to the mirror images of solids, farther along the ray."""
+    """Move hits on wet road, in place, to the mirror images of solids, farther along the ray.
+
+    In deep water rays that are mirrored into the sky have no return.
+    """
     ray = np.flatnonzero((kind == Kind.TERRAIN) & np.isfinite(distance))
     foot = origin[ray] + distance[ray, None] * direction[ray]
-    reflectivity = np.zeros(len(ray))
+    reflectivity, is_deep = np.zeros(len(ray)), np.zeros(len(ray), dtype=np.bool_)
     for patch in scene.wet_patches:
         wet = np.hypot(foot[:, 0] - patch.x, foot[:, 1] - patch.y) <= patch.radius
         reflectivity[wet] = np.maximum(reflectivity[wet], patch.reflectivity)
+        is_deep |= wet & patch.is_deep
     mirrored = draw[ray] < reflectivity
-    ray, foot = ray[mirrored], foot[mirrored]
+    ray, foot, is_deep = ray[mirrored], foot[mirrored], is_deep[mirrored]
 
     slope = scene.terrain.gradient(foot[:, :2])
     normal = np.column_stack([-slope, np.ones(len(slope))])
@@ -250,6 +272,7 @@ def _mirror(
     across = np.sum(direction[ray] * normal, axis=1, keepdims=True)
     onward, _ = nearest_solid(scene.solids, foot, direction[ray] - 2.0 * across * normal)
     found = np.isfinite(onward)
+    distance[ray[is_deep & ~found]] = np.inf
     ray, total = ray[found], distance[ray[found]] + onward[found]
     image = origin[ray] + total[:, None] * direction[ray]
     deep = image[:, 2] < scene.terrain.height(image[:, 0], image[:, 1]) - REFLECTION_MIN_DEPTH
