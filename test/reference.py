@@ -272,8 +272,7 @@ def estimate_surface(frame, theta, config):
 def unlifted(frame, z, seed, sigma_n, config):
     """Seeds that do not stand higher over another seed than noise and prior slope explain."""
     candidates, n = frame.candidates, len(frame.candidates.offsets) - 1
-    slope = config.growth.max_standardised_residual * config.observation.slope_std
-    noise = config.growth.max_standardised_residual * math.sqrt(2) * sigma_n
+    slope, noise = 2 * config.observation.slope_std, 2 * math.sqrt(2) * sigma_n
     kept, segment, r = seed.copy(), candidates.segment, frame.knots[candidates.bin]
     for i in np.flatnonzero(seed):
         lowest = math.inf
@@ -302,34 +301,49 @@ def grow(frame, theta, config, m, z, seed, evidence):
     shown, weight = np.zeros((2, len(r)))
     if evidence.any():
         shown, weight = (np.interp(r, frame.knots, row) for row in evidence[:, m])
-    limit = growth.max_standardised_residual
-    is_above = [
-        w > 0 and height - s > limit * math.sqrt(1 / w + sigma_n**2)
+    is_above = np.array([
+        w > 0 and height - s > 2 * math.sqrt(1 / w + sigma_n**2)
         for height, s, w in zip(z, shown, weight, strict=True)
-    ]
+    ], bool)  # fmt: skip
+    in_face, continues = frame.in_face[own], frame.continues_line[own] & ~is_above
+    noise = np.full(len(r), sigma_n)
     chosen = np.zeros(len(r), dtype=bool)
-    joining = seed & ~np.array(is_above)
+    joining, in_doubt = seed & ~is_above, seed & in_face
+    height, variance = np.zeros(len(r)), sigma_f**2 + slope_std**2 * r**2
     while True:
-        chosen |= joining
-        height, variance = np.zeros(len(r)), sigma_f**2 + slope_std**2 * r**2
-        if chosen.any():
-            data = r[chosen], z[chosen], np.exp(u[chosen])
-            height, variance = posterior(*data, r, np.exp(u), sigma_f, sigma_n, slope_std)
         precision = 1 / np.maximum(variance, 1e-12) + weight
         height = (height / np.maximum(variance, 1e-12) + shown * weight) / precision
-        residual = (z - height) / np.sqrt(1 / precision + sigma_n**2)
-        joining = (1 / precision <= growth.max_std**2) & (residual <= limit)
-        joining &= residual >= -growth.max_standardised_depth
-        joining &= chosen.any() | (weight > 0)
-        joining[1:] |= frame.continues_line[own][1:] & chosen[:-1] & ~np.array(is_above[1:], bool)
-        joining &= ~chosen
+        if chosen.any() or not joining.any():
+            residual = (z - height) / np.sqrt(1 / precision + sigma_n**2)
+            in_doubt = (1 / precision <= growth.max_std**2) & ~chosen
+            in_doubt &= residual <= growth.max_standardised_residual
+            in_doubt &= residual >= -growth.max_standardised_depth
+            in_doubt &= chosen.any() | (weight > 0)
+            follows = np.append(False, continues[1:] & chosen[:-1]) & ~chosen
+            joining, in_doubt = in_doubt | follows, in_doubt & ~follows
+        for i in np.flatnonzero(joining & in_doubt & (config.label.rule == 'predictive')):
+            noise[i] = doubtful_noise(z[i] - height[i], 1 / precision[i], sigma_n, in_face[i])
         if not joining.any():
             break
+        chosen |= joining
+        data = r[chosen], z[chosen], np.exp(u[chosen])
+        height, variance = posterior(*data, r, np.exp(u), sigma_f, noise[chosen], slope_std)
     if not chosen.any():
         return chosen, u, u_star, [], []
-    at = frame.knots[: len(u_star)], np.exp(u_star), sigma_f, sigma_n, slope_std
+    at = frame.knots[: len(u_star)], np.exp(u_star), sigma_f, noise[chosen], slope_std
     height, variance = posterior(r[chosen], z[chosen], np.exp(u[chosen]), *at)
     return chosen, u, u_star, height, np.sqrt(variance)
+
+
+def doubtful_noise(residual, variance, sigma_n, in_face):
+    """Deviation of the noise with which the variance shrinks by the probability of ground."""
+    if residual <= 0.0:
+        return sigma_n
+    spread = variance + sigma_n**2
+    ground = norm.pdf(residual, scale=math.sqrt(spread))
+    probability = ground / (ground + (4.0 if in_face else 0.25))
+    left = variance - probability * variance**2 / spread
+    return math.sqrt(1 / (1 / left - 1 / variance))
 
 
 def evidence_beside(own, theta, knots, slope_std, n):
@@ -518,4 +532,6 @@ class Reference(NumpyBackend):
         shows_ground = np.array([not faces.has_occluded_base[t] for t in candidates.tile], bool)
         kept = candidates.where(shows_ground)
         lines = extract_lines(kept, config.lines)
-        return kept, lines, pseudo_inputs(kept, lines, config), continues_line(kept, lines, config)
+        in_face = np.array([faces.is_face[t] for t in kept.tile], bool)
+        continues = continues_line(kept, lines, config)
+        return kept, lines, pseudo_inputs(kept, lines, config), continues, in_face

@@ -185,7 +185,7 @@ def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame(step):
     found = GroundSegmenter(config.replace(**{'learning.mode': 'fixed'})).segment(hilly_scan(900))
     continues = np.zeros(len(found.candidates.r), dtype=bool)
     edges = found.surface.knots
-    frame = Frame(found.candidates, found.lines, found.pseudo, continues, edges, -1.73)
+    frame = Frame(found.candidates, found.lines, found.pseudo, continues, continues, edges, -1.73)
     own = every_segment(frame, step)
     kept = np.isin(frame.candidates.segment, np.arange(0, config.grid.n_segments, step))
     theta = in_rows(given_theta(config), config.grid.n_segments)

@@ -58,7 +58,7 @@ class Backend(Protocol):
 
     def extract_lines(
         self, candidates: Candidates, faces: Faces, config: Config
-    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
+    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
         """See `gp_ground_seg.core.pipeline.lines.find_lines`."""
 
     def log_likelihood(

@@ -35,7 +35,7 @@ from gp_ground_seg.core.frame import (
     Scan,
     Tiles,
 )
-from gp_ground_seg.core.gp.evidence import STEP, looks_aside_in
+from gp_ground_seg.core.gp.evidence import CLEARLY, STEP, looks_aside_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config
@@ -148,11 +148,11 @@ class NumbaBackend:
 
     def extract_lines(
         self, candidates: Candidates, faces: Faces, config: Config
-    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
-        """Candidates that show ground, lines, pseudo-inputs, candidates that continue a line."""
+    ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
+        """Candidates that show ground, lines, pseudo-inputs; which continue lines, which stand."""
         buffers = Candidates.buffers(len(candidates.r), len(candidates.offsets) - 1)
         kept = buffers.first(lines.keep_visible(candidates, faces.has_occluded_base, buffers))
-        return kept, *lines_through(kept, config, lines.trace)
+        return kept, *lines_through(kept, config, lines.trace), faces.is_face[kept.tile]
 
     def log_likelihood(
         self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
@@ -192,13 +192,14 @@ class NumbaBackend:
             *take('surfaces', (2, *shape), np.float64),
         )
         looks_aside = looks_aside_in(frame, config)
-        max_slope = growth.max_standardised_residual * slope_std if looks_aside else -1.0
+        doubts = config.label.rule == 'predictive'
+        max_slope = CLEARLY * slope_std if looks_aside else -1.0
         shown, beside = take('aside', (2, 2, *shape), np.float64)
         evidence.find_seeds(frame, theta, growth, max_slope, shown[0], alone.seed)
 
         def grow(aside: FloatArray, step: int) -> None:
             grow_surfaces = ground.grow_surfaces, n_parts, frame, theta, observation
-            self.workers.run(*grow_surfaces, growth, aside, step, alone)
+            self.workers.run(*grow_surfaces, growth, doubts, aside, step, alone)
 
         def find_evidence() -> None:
             evidence.find_evidence(alone.mean, alone.std, theta, knots, slope_std, shown, beside)

@@ -17,7 +17,7 @@ from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.compiled.threads import Part
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
-from gp_ground_seg.core.gp.ground import fits
+from gp_ground_seg.core.gp.ground import fits, noise_in_doubt
 from gp_ground_seg.core.gp.kernels import exp_neg, paciorek
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
@@ -58,8 +58,8 @@ class _Columns(NamedTuple):
         Ranges and length-scales [m].
     height, variance : (size,) float64
         Prediction about the prior mean [m], and its variance [m^2].
-    z : (size,) float64
-        Heights of the candidates about the prior mean [m].
+    z, noise : (size,) float64
+        Heights of the candidates about the prior mean [m], and variances of their noise [m^2].
     aside_height, aside_precision : (size,) float64
         Evidence at the candidates.
     above : (n,) bool
@@ -75,6 +75,7 @@ class _Columns(NamedTuple):
     height: FloatArray
     variance: FloatArray
     z: FloatArray
+    noise: FloatArray
     aside_height: FloatArray
     aside_precision: FloatArray
     above: BoolArray
@@ -89,20 +90,22 @@ def grow_surfaces(
     theta: FloatArray,
     observation: ObservationConfig,
     growth: GrowthConfig,
+    doubts: bool,
     aside: FloatArray,
     step: int,
     alone: SegmentSurfaces,
 ) -> None:
     """Inliers and surface of one of `step` segments of a part, into `alone`.
 
-    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none.
+    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none. With
+    `doubts` a candidate that joins in doubt shows less, see `noise_in_doubt`.
     """
     offsets, mean, std = frame.candidates.offsets, alone.mean, alone.std
     most = 0
     for m in range(part.number * step, len(mean), part.n_parts * step):
         most = max(most, offsets[m + 1] - offsets[m])
     width = (most + len(frame.knots) + LANES - 1) & -LANES
-    table = np.empty((7, width))
+    table = np.empty((8, width))
     # One by one, so that the compiler knows them to be contiguous.
     columns = _Columns(
         table[0],
@@ -112,6 +115,7 @@ def grow_surfaces(
         table[4],
         table[5],
         table[6],
+        table[7],
         np.zeros(most, np.bool_),
         np.empty(most, np.int64),
         np.empty((most, width)),
@@ -121,7 +125,7 @@ def grow_surfaces(
         sill, noise = math.exp(theta[m, 0]) ** 2, math.exp(theta[m, 1]) ** 2
         for j in range(len(frame.knots)):
             mean[m, j] = std[m, j] = np.nan
-        n, n_new, has_aside = _begin(frame, m, noise, growth, aside, alone, columns)
+        n, n_new, has_aside = _begin(frame, m, noise, aside, alone, columns)
         if n_new == 0 and not has_aside:
             continue
         n_knots = 0
@@ -130,7 +134,9 @@ def grow_surfaces(
             n_knots += 1
         size = (n + n_knots + LANES - 1) & -LANES
         _lay_out(frame, m, n_knots, size, sill, slope, alone, columns)
-        n_inliers = _grow(frame, m, size, n_new, sill, slope, noise, growth, alone, columns)
+        n_inliers = _grow(
+            frame, m, size, n_new, sill, slope, noise, growth, doubts, alone, columns
+        )
         if n_inliers == 0:
             continue
         for j in range(n_knots):
@@ -143,7 +149,6 @@ def _begin(
     frame: Frame,
     m: int,
     noise: float,
-    growth: GrowthConfig,
     aside: FloatArray,
     alone: SegmentSurfaces,
     columns: _Columns,
@@ -154,12 +159,11 @@ def _begin(
     """
     candidates, knots = frame.candidates, frame.knots
     first, stop = candidates.offsets[m], candidates.offsets[m + 1]
-    limit = growth.max_standardised_residual
     n_new, has_aside = 0, False
     for i in range(stop - first):
         c = first + i
         z = candidates.z[c] - frame.prior_mean
-        columns.z[i] = z
+        columns.z[i], columns.noise[i] = z, noise
         height = precision = 0.0
         if aside.shape[1] > 0:
             j, r = candidates.bin[c], candidates.r[c]
@@ -167,7 +171,7 @@ def _begin(
             height = between_knots(r, knots[j], knots[j + 1], heights[j], heights[j + 1])
             precision = between_knots(r, knots[j], knots[j + 1], precisions[j], precisions[j + 1])
         columns.aside_height[i], columns.aside_precision[i] = height, precision
-        columns.above[i] = contradicts(height, precision, z, noise, limit)
+        columns.above[i] = contradicts(height, precision, z, noise)
         has_aside |= precision > 0.0
         alone.inlier[c] = False
         if alone.seed[c] and not columns.above[i]:
@@ -215,13 +219,22 @@ def _grow(
     slope: float,
     noise: float,
     growth: GrowthConfig,
+    doubts: bool,
     alone: SegmentSurfaces,
     columns: _Columns,
 ) -> int:
     """Let the new ones join, and those that then fit, until none does; return the number."""
     first, stop = frame.candidates.offsets[m], frame.candidates.offsets[m + 1]
-    inlier, continues_line = alone.inlier[first:stop], frame.continues_line[first:stop]
+    inlier, in_face = alone.inlier[first:stop], frame.in_face[first:stop]
+    continues_line = frame.continues_line[first:stop]
     n_inliers = done = 0
+    for a in range(n_new):
+        i = columns.new[a]
+        if doubts and in_face[i]:
+            height, variance = combined(
+                0.0, columns.variance[i], columns.aside_height[i], columns.aside_precision[i]
+            )
+            columns.noise[i] = noise_in_doubt(columns.z[i], height, variance, noise, True)
     while n_new > 0 or n_inliers == 0:
         for a in range(n_new):
             i = columns.new[a]
@@ -229,7 +242,7 @@ def _grow(
             while done < len(inlier) and inlier[done]:
                 done += 1
             # The columns before are not needed any more.
-            _observe(i, n_inliers, min(i, done) & -LANES, size, sill, slope, noise, columns)
+            _observe(i, n_inliers, min(i, done) & -LANES, size, sill, slope, columns)
             n_inliers += 1
         n_new = 0
         for i in range(done, len(inlier)):
@@ -243,6 +256,10 @@ def _grow(
                     columns.height[i], columns.variance[i], columns.aside_height[i], precision
                 )
                 follows = fits(columns.z[i], height, variance, noise, growth)
+                if follows and doubts:
+                    columns.noise[i] = noise_in_doubt(
+                        columns.z[i], height, variance, noise, in_face[i]
+                    )
             if follows:
                 columns.new[n_new] = i
                 n_new += 1
@@ -259,7 +276,6 @@ def _observe(
     size: int,
     sill: float,
     slope: float,
-    noise: float,
     columns: _Columns,
 ) -> None:
     """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
@@ -287,7 +303,7 @@ def _observe(
             row[j] -= w_0 * row_0[j]
         k += 1
     height, variance = columns.height, columns.variance
-    scale = 1.0 / math.sqrt(variance[i] + noise)
+    scale = 1.0 / math.sqrt(variance[i] + columns.noise[i])
     innovation = (columns.z[i] - height[i]) * scale
     for j in range(start, end):
         value = row[j] * scale

@@ -20,6 +20,9 @@ from gp_ground_seg.core.parameters.config import Config, GrowthConfig
 
 STEP = 4
 """One of how many segments shows its ground to those beside it: neighbours see much the same."""
+CLEARLY = 2.0
+"""Standard deviations over the evidence, or over other seeds, from which on a candidate stands on
+something, and is neither a seed nor joins by a line."""
 LEAST_STD = 1e-3
 """Standard deviation of a surface below which it counts as that [m]."""
 LEAST_PRECISION = 1e-3
@@ -42,16 +45,14 @@ class Evidence(NamedTuple):
 
 
 @shared
-def contradicts(
-    height: Values, precision: Values, z: Values, noise: Values, limit: float
-) -> Values:
-    """Whether heights `z` [m] with variances `noise` stand above the evidence.
+def contradicts(height: Values, precision: Values, z: Values, noise: Values) -> Values:
+    """Whether heights `z` [m] with variances `noise` stand clearly above the evidence.
 
-    By more than `limit` standard deviations; the first two are the evidence.
+    The first two are the evidence.
     """
     is_known = precision > 0.0
     spread = np.sqrt(1.0 / choose(is_known, precision, 1.0) + noise)
-    return is_known & (z - height > limit * spread)
+    return is_known & (z - height > CLEARLY * spread)
 
 
 @shared
@@ -118,7 +119,7 @@ def is_low_and_near(r: Values, z: Values, growth: GrowthConfig) -> Values:
 @shared
 def stands_on(z: Values, highest: Values, log_sigma_n: Values, growth: GrowthConfig) -> Values:
     """Whether a seed is higher than the `highest` ground and the noise of two seeds explain."""
-    noise = growth.max_standardised_residual * math.sqrt(2.0) * np.exp(log_sigma_n)
+    noise = CLEARLY * math.sqrt(2.0) * np.exp(log_sigma_n)
     return z > highest + noise
 
 
@@ -138,7 +139,7 @@ def seeds(frame: Frame, theta: FloatArray, config: Config) -> BoolArray:
     z = candidates.z - frame.prior_mean
     seed: BoolArray = is_low_and_near(candidates.r, z, growth)
     if looks_aside_in(frame, config):
-        max_slope = growth.max_standardised_residual * config.observation.slope_std
+        max_slope = CLEARLY * config.observation.slope_std
         highest = highest_ground(frame, z, seed, max_slope)
         seed &= ~stands_on(z, highest, theta[candidates.segment, 1], growth)
     return seed

@@ -96,6 +96,14 @@ def estimate_surface(
     return GroundSurface(knots, mean + frame.prior_mean, std, alone.inlier), knot_u, u
 
 
+OBSTACLE_DEPTH = 1.0
+"""Height over which the lowest returns of obstacles are spread [m]."""
+ODDS, ODDS_IN_FACE = 0.25, 4.0
+"""Obstacles for each ground among the candidates, and among those in vertical faces."""
+MOST_DOUBT = 30.0
+"""Logarithm of odds that are as good as infinite."""
+
+
 class SegmentSurfaces(NamedTuple):
     """The surface of each segment by itself."""
 
@@ -134,6 +142,24 @@ def fits(
     return (variance <= growth.max_std * growth.max_std) & is_near
 
 
+@shared
+def noise_in_doubt(
+    z: Values, height: Values, variance: Values, noise: Values, in_face: Values
+) -> Values:
+    """Variance of the noise of a candidate that joins, which may be an obstacle [m^2].
+
+    As for the labels, ground and obstacle are compared: the heights of the one are distributed by
+    the prediction, those of the other evenly over `OBSTACLE_DEPTH`. With this noise the variance
+    of the prediction shrinks by the probability of ground times what certain ground would take
+    from it: a candidate in doubt shows little (probabilistic data association). Obstacles stand
+    above the ground, so there is no doubt below.
+    """
+    residual, spread = z - height, variance + noise
+    odds = choose(in_face, ODDS_IN_FACE, ODDS) * np.sqrt(2.0 * np.pi * spread) / OBSTACLE_DEPTH
+    doubt = odds * np.exp(np.minimum(0.5 * residual * residual / spread, MOST_DOUBT))
+    return noise + choose(residual > 0.0, doubt * spread, 0.0)
+
+
 def _grow_segments(
     segments: IntArray, model: _Model, aside: Evidence, config: Config, alone: SegmentSurfaces
 ) -> None:
@@ -153,18 +179,18 @@ def _grow_batch(
     sill, noise = np.exp(theta[:, :2]).T ** 2
     places = layout.take(frame.candidates.r), layout.take(model.length_scale, 1.0)
     noise_of_each = np.exp(2.0 * model.theta[frame.candidates.segment, 1])
-    limit = config.growth.max_standardised_residual
-    above = contradicts(*aside, model.z, noise_of_each, limit)
+    above = contradicts(*aside, model.z, noise_of_each)
     batch = _Batch(
         _covariance(places, places, sill, slope_std),
         layout.take(model.z),
-        np.broadcast_to(noise[:, None], layout.mask.shape),
+        np.repeat(noise[:, None], layout.mask.shape[1], axis=1),
         layout.mask,
         (model.seed & ~above)[layout.place] & layout.mask,
         (frame.continues_line & ~above)[layout.place] & layout.mask,
+        frame.in_face[layout.place],
         Evidence(layout.take(aside.height), layout.take(aside.precision)),
     )
-    chosen = _grow(batch, config.growth)
+    chosen = _grow(batch, config.growth, doubts=config.label.rule == 'predictive')
     alone.inlier[layout.place[layout.mask]] = chosen[layout.mask]
     grown = chosen.any(axis=1)
     if len(frame.knots) == 0 or not grown.any():
@@ -203,10 +229,11 @@ class _Batch(NamedTuple):
 
     covariance: FloatArray  # (S, n, n) prior
     z: FloatArray  # (S, n) about the prior mean
-    noise: FloatArray  # (S, n) variance
+    noise: FloatArray  # (S, n) variance; grows where a candidate joins in doubt
     mask: BoolArray  # (S, n)
     seed: BoolArray  # (S, n)
     continues_line: BoolArray  # (S, n)
+    in_face: BoolArray  # (S, n)
     aside: Evidence  # (S, n)
 
 
@@ -219,8 +246,9 @@ def _predict(
     return mean, -np.einsum('sik,sik->sk', cross, solution[:, :, :-1])
 
 
-def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
-    """Inliers of each segment, (S, n).
+@np.errstate(over='ignore')  # the square of 1e200 m: no fit
+def _grow(batch: _Batch, growth: GrowthConfig, *, doubts: bool) -> BoolArray:
+    """Inliers of each segment, (S, n); with `doubts` their noise is set, see `noise_in_doubt`.
 
     Candidates that join in a round are conditioned on at once: the covariance of all
     candidates given the inliers shrinks by one product, and nothing is factored twice.
@@ -229,6 +257,12 @@ def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
     # Segments that still grow, and their state.
     active, joining = np.arange(len(chosen)), batch.seed
     covariance, height = batch.covariance, np.zeros(joining.shape)
+    if doubts:
+        prior = np.diagonal(covariance, axis1=1, axis2=2)
+        doubtful = noise_in_doubt(
+            batch.z, *combined(height, prior, *batch.aside), batch.noise, True
+        )
+        batch.noise[:] = np.where(joining & batch.in_face, doubtful, batch.noise)
     while len(active):
         chosen[active] |= joining
         z, noise = batch.z[active], batch.noise[active]
@@ -239,11 +273,14 @@ def _grow(batch: _Batch, growth: GrowthConfig) -> BoolArray:
         following = batch.continues_line[active]
         following[:, 1:] &= chosen[active, :-1]
         following[:, 0] = False
-        with np.errstate(over='ignore'):  # the square of 1e200 m: no fit
-            joining = fits(z, *combined(height, variance, *aside), noise, growth) | following
+        predicted = combined(height, variance, *aside)
+        joining = fits(z, *predicted, noise, growth) | following
         joining &= ~chosen[active] & batch.mask[active]
         # Before anything has joined, only evidence from aside decides.
         joining &= chosen[active].any(axis=1, keepdims=True) | (aside.precision > 0.0)
+        if doubts:
+            doubtful = noise_in_doubt(z, *predicted, noise, batch.in_face[active])
+            batch.noise[active] = np.where(joining & ~following, doubtful, noise)
         grows = joining.any(axis=1)
         active, joining = active[grows], joining[grows]
         covariance, height = covariance[grows], height[grows]

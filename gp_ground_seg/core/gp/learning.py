@@ -220,6 +220,7 @@ def every_segment(frame: Frame, step: int) -> Frame:
         lines=frame.lines._replace(line=frame.lines.line[kept]),
         pseudo=PseudoInputs(pseudo.r_bar[kept_bar], pseudo.log_extent[kept_bar], bar_offsets),
         continues_line=frame.continues_line[kept],
+        in_face=frame.in_face[kept],
     )
 
 

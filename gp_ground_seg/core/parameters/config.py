@@ -157,11 +157,11 @@ class GrowthConfig:
         'largest height of a seed above or below the expected ground', 'm')
     max_std: float = advanced(0.35, (0.001, 10.0),
         'predictive standard deviation above which a candidate is not decided yet', 'm')
-    max_standardised_residual: float = advanced(2.0, (0.1, 50.0),
+    max_standardised_residual: float = advanced(3.0, (0.1, 50.0),
         'residual over predictive standard deviation above which a candidate is an outlier')
-    max_standardised_depth: float = advanced(7.0, (0.1, 200.0),
+    max_standardised_depth: float = advanced(5.0, (0.1, 200.0),
         'the same for a candidate below the prediction; obstacles lie only above')
-    max_line_slope: float = advanced(1.0, (0.0, 10.0),
+    max_line_slope: float = advanced(0.2, (0.0, 10.0),
         'maximum slope of a line whose candidates may join because they continue its inliers')
     min_line_size: int = advanced(4, (2, 10000), 'minimum number of candidates of such a line')
     min_bend_extent: float = advanced(10.0, (0.1, 1000.0),

@@ -35,14 +35,14 @@ MIN_BREAK_CANDIDATES = 3
 
 def find_lines(
     candidates: Candidates, faces: Faces, config: Config
-) -> tuple[Candidates, Lines, PseudoInputs, BoolArray]:
+) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
     """Lines through the candidates that show ground, and what follows from the lines.
 
-    The lowest point of a face with occluded base is no candidate. Returns the candidates kept;
-    see `lines_through` for the others.
+    The lowest point of a face with occluded base is no candidate. Returns the candidates kept
+    and, last, which of them are in faces; see `lines_through` for the others.
     """
     kept = candidates.where(~faces.has_occluded_base[candidates.tile])
-    return kept, *lines_through(kept, config, _trace_lists)
+    return kept, *lines_through(kept, config, _trace_lists), faces.is_face[kept.tile]
 
 
 def lines_through(
