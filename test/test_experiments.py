@@ -265,7 +265,26 @@ def test_poses_of_simulated_scans(monkeypatch):
         assert max(abs(row['low']), abs(row['high'])) < 0.06
         is_turned = 'roll' in row['mount']
         assert row['levelled'] == is_turned
-        assert not is_turned or row['auto'] > row['level']
+        assert not is_turned or row['auto'] > row['level'] - 0.001
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('sensor', 'scene', 'n_seeds', 'largest'),
+    [
+        ('vlp-32c', 'urban', 8, 0.001),
+        ('vlp-32c-31', 'urban', 8, 0.001),
+        ('vlp-32c', 'traffic_jam', 2, 0.001),
+        ('vlp-32c-31', 'traffic_jam', 2, 0.001),
+        ('pandar64', 'rail', 6, 0.001),
+    ],
+)
+def test_nothing_near_is_taken_for_ground(sensor, scene, n_seeds, largest):
+    """Before candidates joined in doubt it was 0.3 to 1.2 %, and 17 % in the scene rail."""
+    frames = variants.simulated_frames([sensor], [scene], n_seeds, (0.0,))
+    report = scenes.score_objects(frames, Config(), with_peer=False)
+    (row,) = report.tables['vehicles'].json()
+    assert row['0-10 m'] <= largest, row
 
 
 @pytest.mark.parametrize(

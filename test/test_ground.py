@@ -6,10 +6,12 @@ import reference
 from conftest import fewer, hilly_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 from gp_ground_seg import Config
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.frame import Frame
+from gp_ground_seg.core.gp.ground import ODDS, ODDS_IN_FACE, noise_in_doubt
 from gp_ground_seg.core.gp.learning import given_theta, in_rows
 
 
@@ -207,3 +209,15 @@ def test_what_stands_over_the_ground_beside_it_starts_nothing(backend):
     assert surface.inlier[~on_car].all()
     _, alone, _ = ring_of_ground(backend, 0.4)
     assert alone.inlier.all()
+
+
+@given(st.floats(0.01, 1.0), st.floats(1e-3, 0.35), st.floats(1e-3, 0.2), st.booleans())
+def test_what_joins_in_doubt_shows_as_much_as_it_is_likely_ground(residual, std, noise, in_face):
+    variance, noise = std**2, noise**2
+    found = noise_in_doubt(residual, 0.0, variance, noise, in_face)
+    density = norm.pdf(residual, scale=np.sqrt(variance + noise))
+    likely = density / (density + (ODDS_IN_FACE if in_face else ODDS))
+    taken, certain = (variance**2 / (variance + n) for n in (found, noise))
+    assert taken == pytest.approx(likely * certain, rel=1e-6, abs=1e-12)
+    # Obstacles stand above the ground.
+    assert noise_in_doubt(-residual, 0.0, variance, noise, in_face) == noise

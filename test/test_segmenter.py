@@ -134,8 +134,9 @@ def test_rotating_by_segments_shifts_the_surface(backend, scan):
     angle = STEP * 2 * np.pi / CONFIG.grid.n_segments
     c, s = np.cos(angle), np.sin(angle)
     turned = scan @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T
-    # The segments that are learned from are fixed; here all are.
-    segmenter = segmenter_of(backend, **{'sensor.height': 1.73, 'learning.segment_step': 1})
+    # The segments that are learned from are fixed, here all are, and so are the tiles of faces.
+    fixed = {'learning.segment_step': 1, 'faces.max_normal_z': 0.0}
+    segmenter = segmenter_of(backend, **{'sensor.height': 1.73, **fixed})
     a, b = segmenter.segment(scan), segmenter.segment(turned)
     np.testing.assert_allclose(b.surface.mean, np.roll(a.surface.mean, STEP, axis=0), atol=1e-6)
 

@@ -18,6 +18,7 @@ from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.core.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
 from gp_ground_seg.core.pipeline.tilt import angles_of, rotate, rotation
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
+from gp_ground_seg.lab import simulation
 from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan
 from gp_ground_seg.lab.simulation import scenes as landforms
 from gp_ground_seg.lab.simulation.objects import floating_box, wall
@@ -378,6 +379,14 @@ def test_simulated_mounts_are_found_and_none_is_refused(sensor, scene, height):
     if scene in ('flat', 'urban', 'ditch', 'crest'):
         assert pose.height == pytest.approx(height, abs=0.1)
         assert pose.is_level
+
+
+@pytest.mark.parametrize('n_missing', [2, 3])
+def test_roofs_that_hide_the_ground_do_not_turn_z_over(n_missing):
+    """Without the steepest beams; these roofs are above the sensor if z is down."""
+    whole = simulation.SENSORS['vlp-32c']
+    sparse = dataclasses.replace(whole, elevations=whole.elevations[:-n_missing])
+    assert pose_of(scan_of('car_park', sparse, whole.height, seed=1).points).is_level
 
 
 @pytest.mark.parametrize('gradient', [0.15, 0.3, 0.45])

@@ -207,7 +207,11 @@ def _find_ground(
         plane = fit_plane(turned.candidates, math.tan(max_tilt), (x, y, z))
         if plane is None:
             return None
-        is_below = float(plane.below(x, y, z)) >= MIN_CLEARANCE
+        clearance = float(plane.below(x, y, z))
+        # No ground is above the sensor: roofs of cars, of whose ground little is seen, are.
+        if turn is not None and clearance < -MIN_CLEARANCE:
+            return None
+        is_below = clearance >= MIN_CLEARANCE
         if not is_below and not _is_lower_side(plane, turned):
             return None
         up = plane.normal if turn is None else turned_back(plane.normal, turn)
