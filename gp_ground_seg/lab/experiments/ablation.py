@@ -56,7 +56,10 @@ DEPARTURES: dict[str, Changes] = {
     'objective without the latent terms': {'learning.objective': 'paper'},
     'sloping mean': {'observation.slope_std': 0.0},
     'segments look aside': {'surface.look_aside': False},
-    'asymmetric gate of the growth': {'growth.max_standardised_depth': 3.0},
+    'asymmetric gate of the growth': {
+        'growth.max_standardised_residual': 2.0,
+        'growth.max_standardised_depth': 2.0,
+    },
     'vertical faces': {'faces.max_normal_z': 0.0},
     'vertical faces with occluded base': {'faces.max_foot_distance': 0.0},
     'labels by the predictive distribution': _PLAIN_BAND,
