@@ -124,11 +124,14 @@ def grow_line(backend, z, r=None, continues=(), slope_std=0.05, **bounds):
 
 
 def test_growth_follows_ground_and_leaves_obstacles_out(backend):
-    z = np.zeros(20)
-    z[8:11] = 1.2
-    inlier, knots, mean, _ = grow_line(backend, z)
+    for height in 0.6, 0.8, 1.0, 1.2:
+        z = np.zeros(20)
+        z[8:11] = height
+        inlier, knots, mean, _ = grow_line(backend, z)
+        # What is within the gate joins in doubt, and lifts nothing.
+        assert set(inlier) >= {*range(8), *range(11, 20)}
+        assert np.max(np.abs(mean[knots < 20])) < 0.02
     assert inlier == [*range(8), *range(11, 20)]
-    assert np.max(np.abs(mean[knots < 20])) < 0.02
 
 
 def test_without_a_seed_there_is_no_model(backend):
