@@ -221,6 +221,7 @@ def test_scenes_by_hand_and_behind_is_said():
     assert found == pytest.approx([0.9, 0.89, 0.01, 0.25])
     found = [row[f'{who}{name}'] for name in ('rmse', 'median_absolute') for who in ('', 'peer_')]
     assert found == pytest.approx([*(np.sqrt(11 / 3) * np.array([0.1, 0.2])), 0.1, 0.2])
+    assert [row[name] for name in ('vehicles', 'lost_vehicles', 'peer_lost_persons')] == [0, 0, 0]
 
 
 @pytest.fixture(scope='module')

@@ -185,7 +185,14 @@ def slope_at_16_m(rise, step=0.0):
 
 @pytest.mark.parametrize(
     ('rise', 'step', 'at_break'),
-    [(0.12, 0, True), (0.18, 0, True), (0.3, 0, False), (-0.12, 0, True), (0.05, 0.6, False), (0.05, 1.5, False)],
+    [
+        (0.12, 0, True),
+        (0.18, 0, True),
+        (0.3, 0, False),
+        (-0.12, 0, True),
+        (0.05, 0.6, False),
+        (0.05, 1.5, False),
+    ],
 )
 def test_a_slope_starts_at_a_break_and_a_step_does_not(backend, rise, step, at_break):
     assert breaks(backend, *slope_at_16_m(rise, step)) == ([0, 6, 9], [False, at_break])

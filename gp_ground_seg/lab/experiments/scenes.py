@@ -23,6 +23,11 @@ BANDS = {'0-10 m': slice(0, 1), '10-20 m': slice(1, 2), '> 20 m': slice(2, None)
 """Bands of range of the columns, as parts of `scoring.objects.BAND_TITLES`."""
 COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
 """Classes of `scoring.objects.CLASSES` by column."""
+LOST = (
+    f'vehicles, persons and cyclists with at least {MIN_RETURNS} returns from {MIN_HEIGHT:g} m '
+    'above the exact ground, and how many are lost: more than half of these returns called ground'
+)
+"""Title of the columns of `_lost_objects`."""
 
 
 def score_scenes(
@@ -74,6 +79,17 @@ def _of_each(column: Column, values: Sequence[float | int]) -> Row:
     return list(zip(columns[: len(values)], values, strict=True))
 
 
+def _lost_objects(parts: Sequence[MethodScore]) -> Row:
+    """Cells of the objects, and of how many are lost by ours and by the peer, if there is one."""
+    row: Row = []
+    for title, classes in COUNTED.items():
+        bands = [[score.objects.get(kind, ()) for kind in classes] for score in parts]
+        counts = [sum(itertools.chain(*found), ObjectCount()) for found in bands]
+        row.append((Column(title, '_d'), counts[0].n_objects))
+        row += _of_each(Column('lost', '_d', f'lost_{title}'), [c.n_lost for c in counts])
+    return row
+
+
 def scene_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> Table:
     """One row for each sensor and scene; a note says where the peer is ahead in IoU."""
     rows: list[Row] = []
@@ -86,6 +102,7 @@ def scene_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> T
         medians = [score.height.median_absolute for score in parts]
         row += _of_each(centimetres('median', 'median_absolute'), medians)
         row.append((percent('gaps', 'share_without_model'), share))
+        row += _lost_objects(parts)
         if len(parts) > 1:
             difference, interval = parts[0].iou - parts[1].iou, interval_text(parts[0], parts[1])
             row += [(percent('ahead', 'difference', '+.2f'), difference), (INTERVAL, interval)]
@@ -97,7 +114,8 @@ def scene_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> T
     n_scans = len(scores[0].of(scores[0].sequences[0]).scans)
     title = (
         f'{n_scans} simulated scans per row; IoU against exact labels [%], every point counts; '
-        'height of the surface under true ground [cm]; gaps: share of it without a model [%]'
+        'height of the surface under true ground [cm]; gaps: share of it without a model [%]; '
+        + LOST
     )
     notes = [*refused]
     if len(scores) > 1:
@@ -121,19 +139,14 @@ def lost_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> Ta
         row += _of_each(percent('IoU', 'iou'), [score.iou for score in parts])
         if parts[0].iou < parts[-1].iou:
             behind.append(name)
-        for title, classes in COUNTED.items():
-            bands = [[score.objects.get(kind, ()) for kind in classes] for score in parts]
-            counts = [sum(itertools.chain(*found), ObjectCount()) for found in bands]
-            row.append((Column(title, '_d'), counts[0].n_objects))
-            row += _of_each(Column('lost', '_d', f'lost_{title}'), [c.n_lost for c in counts])
-            if counts[0].n_lost:
-                lost.append(f'{name} {counts[0].n_lost} of {counts[0].n_objects} {title}')
+        objects = _lost_objects(parts)
+        row += objects
+        counts = {column.key or column.title: value for column, value in objects}
+        for title in COUNTED:
+            if counts[f'lost_{title}']:
+                lost.append(f'{name} {counts[f"lost_{title}"]} of {counts[title]} {title}')
         rows.append(row)
-    title = (
-        'IoU of the ground against exact labels [%]; vehicles, persons and cyclists with at least '
-        f'{MIN_RETURNS} returns from {MIN_HEIGHT:g} m above the exact ground, and how many are '
-        'lost: more than half of these returns called ground'
-    )
+    title = f'IoU of the ground against exact labels [%]; {LOST}'
     notes = [*refused, f'objects lost: {", ".join(lost) or "none"}']
     if len(scores) > 1:
         peer = scores[1].title
