@@ -40,8 +40,8 @@ CORE = {
 
 # Packages that only some places import: folders or files, below the package.
 ROS = (
-    'rclpy ament_index_python builtin_interfaces diagnostic_msgs geometry_msgs rcl_interfaces '
-    'rosgraph_msgs sensor_msgs sensor_msgs_py std_msgs tf2_ros visualization_msgs'
+    'rclpy ament_index_python builtin_interfaces diagnostic_msgs geometry_msgs nav_msgs '
+    'rcl_interfaces rosgraph_msgs sensor_msgs sensor_msgs_py std_msgs tf2_ros visualization_msgs'
 )
 ONLY_IN = {
     **dict.fromkeys(ROS.split(), ('ros/',)),

@@ -32,7 +32,9 @@ def run(script: str, folder: Path) -> str:
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=1200,
         )  # fmt: skip
     except subprocess.TimeoutExpired as late:
-        pytest.fail(f'{script}\nhas not ended in {late.timeout:.0f} s, and printed:\n{late.output}')
+        pytest.fail(
+            f'{script}\nhas not ended in {late.timeout:.0f} s, and printed:\n{late.output}'
+        )
     assert done.returncode == 0, done.stdout
     assert 'Traceback' not in done.stdout, done.stdout
     return done.stdout

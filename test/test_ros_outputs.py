@@ -6,19 +6,25 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS is not installed')
 
 import ros_helpers as ros
+from nav_msgs.msg import OccupancyGrid
 from ros_helpers import said_by, street, to_message, wait_for, xyz_of
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 from visualization_msgs.msg import Marker, MarkerArray
 
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.data.point_cloud2 import read_columns
+from gp_ground_seg.data import costmap
+from gp_ground_seg.data.costmap import SegmentedCloud
+from gp_ground_seg.data.point_cloud2 import read_columns, read_xyz
 from gp_ground_seg.ros import outputs
 from gp_ground_seg.ros.ground_model import read_ground_model
 from gp_ground_seg.ros.outputs import LABELLED_FIELDS as FIELDS
 from gp_ground_seg.ros.outputs import labelled_names
 
-OPTIONAL = {'~/labeled': PointCloud2, '~/ground_model': PointCloud2, '~/markers': MarkerArray}
+OPTIONAL = {
+    '~/labeled': PointCloud2, '~/ground_model': PointCloud2, '~/markers': MarkerArray,
+    '~/scan': LaserScan, '~/occupancy': OccupancyGrid,
+}  # fmt: skip
 CONFIG = Config().replace(**{'learning.mode': 'fixed'})
 
 
@@ -112,6 +118,78 @@ def test_markers_without_a_model_are_taken_away(b):
     answer = received(b, '~/markers', to_message(street(0)))
     assert [marker.action for marker in answer.markers] == [Marker.DELETE] * 2
     assert not any(marker.points for marker in answer.markers)
+
+
+REDUCED = {
+    'output.min_height': 0.3, 'output.max_height': 1.2, 'output.max_range': 20.0,
+    'output.ground_voxel': 0.5, 'output.obstacle_voxel': 0.2, 'output.cell_size': 0.25,
+    'output.grid_size': 30.0,
+}  # fmt: skip
+
+
+@pytest.fixture
+def reduced(b):
+    """Segmented cloud under `REDUCED`, which the node has from now on, and its message."""
+    before = {name: value for name, value in b.node.config.flat().items() if name in REDUCED}
+    assert all(result.successful for result in b.load(REDUCED))
+    message = to_message(street(8000, n_invalid=50), stamp=(17, 23), frame='velo_link')
+    config = CONFIG.replace(**REDUCED)
+    result = GroundSegmenter(config).segment(read_xyz(message))
+    yield message, SegmentedCloud(message, result, config)
+    assert all(result.successful for result in b.load(before))
+
+
+def test_clouds_are_reduced_to_heights_range_and_voxels(b, reduced):
+    message, expected = reduced
+    height, r = expected.segmentation.labelled.height, expected.segmentation.grid.r
+    for part, chosen, voxel in zip(
+        b.segment(message), (expected.is_ground, expected.is_obstacle), (0.5, 0.2), strict=True
+    ):
+        kept = expected.thinned(chosen, voxel)
+        rows = ros.rows_of(message)
+        assert ros.rows_of(part) == [rows[k] for k in np.flatnonzero(kept)]
+        assert part.header == message.header
+        assert 100 < part.width < chosen.sum()
+        assert r[kept].max() <= 20.0
+    heights = height[expected.is_obstacle]
+    assert not (heights < 0.3).any() and not (heights > 1.2).any() and len(heights) > 300
+
+
+def test_scan_is_what_a_costmap_takes(b, reduced):
+    message, expected = reduced
+    found = received(b, '~/scan', message)
+    assert found.header == message.header
+    ranges = np.array(found.ranges, np.float32)
+    places = (
+        expected.places(expected.is_obstacle),
+        expected.places(expected.segmentation.label != Label.UNKNOWN),
+    )
+    np.testing.assert_array_equal(ranges, costmap.scan_ranges(*places))
+    assert found.range_min == 0.0 and found.range_max == 20.0
+    assert len(ranges) * found.angle_increment == pytest.approx(2.0 * np.pi)
+    # As laser_geometry places them: each on an obstacle.
+    hit = np.isfinite(ranges)
+    angle = found.angle_min + found.angle_increment * np.flatnonzero(hit)
+    x, y = ranges[hit] * np.cos(angle), ranges[hit] * np.sin(angle)
+    apart = np.hypot(*(a[:, None] - p for a, p in zip((x, y), places[0], strict=True)))
+    assert hit.sum() > 300 and apart.min(axis=1).max() < 0.1
+
+
+def test_occupancy_is_what_a_costmap_takes(b, reduced):
+    message, expected = reduced
+    found = received(b, '~/occupancy', message)
+    assert found.header == message.header and found.info.map_load_time == message.header.stamp
+    info = found.info
+    assert (info.width, info.height, info.resolution) == (120, 120, 0.25)
+    assert (info.origin.position.x, info.origin.position.y) == (-15.0, -15.0)
+    assert info.origin.orientation.w == 1.0
+    cells = np.array(found.data, np.int8).reshape(120, 120)
+    assert set(np.unique(cells)) == {-1, 0, 100}
+    for chosen, value in ((expected.is_obstacle, 100), (expected.is_ground, 0)):
+        column, row = (np.floor((p + 15.0) / 0.25).astype(int) for p in expected.places(chosen))
+        inside = (abs(column - 59.5) < 60) & (abs(row - 59.5) < 60)
+        at = cells[row[inside], column[inside]]
+        assert np.isin(at, (value, 100)).all() and (at == value).mean() > 0.9
 
 
 def test_nothing_is_built_that_nobody_subscribes_to(b, monkeypatch):

@@ -233,7 +233,7 @@ def dump(b):
 def test_any_configuration_can_be_loaded_over_any_other_in_any_order(shared, config, order):
     # Hundreds of threads made and ended for nothing; TF may not be installed.
     plain = {'runtime.n_threads': 1, 'runtime.backend': 'auto'}
-    plain |= {'frame.level': 'sensor', 'frame.sensor': 'none'}
+    plain |= {'frame.level': 'sensor', 'frame.sensor': 'none', 'output.frame': 'none'}
     config = config.replace(**plain)
     values = {name: config[name] for name in order}
     assert all(result.successful for result in shared.load(values))

@@ -11,9 +11,12 @@ from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.data.colours import COLOURS, HEIGHTS
+from gp_ground_seg.data.costmap import SegmentedCloud
 
 NODE = '/ground_segmentation_node'
-OPTIONAL = {f'{NODE}/{name}' for name in ('labeled', 'ground_model', 'markers')}
+KINDS = {'markers': 'MarkerArray', 'scan': 'LaserScan', 'occupancy': 'Map'}
+"""Displays of RViz that show no points."""
+OPTIONAL = {f'{NODE}/{name}' for name in ('labeled', 'ground_model', *KINDS)}
 TOPICS = {'/ground', '/obstacles', *OPTIONAL}
 
 
@@ -32,8 +35,7 @@ def test_rviz_shows_every_topic():
     assert {display['Topic']['Value'] for display in shown} == TOPICS
     for display in shown:
         assert display['Topic']['Reliability Policy'] == 'Reliable'
-        is_markers = display['Topic']['Value'].endswith('markers')
-        kind = 'MarkerArray' if is_markers else 'PointCloud2'
+        kind = KINDS.get(display['Topic']['Value'].split('/')[-1], 'PointCloud2')
         assert display['Class'] == f'rviz_default_plugins/{kind}'
     # What costs the node something is off until it is wanted.
     on = {display['Topic']['Value'] for display in shown if display['Enabled']}
@@ -66,7 +68,8 @@ def test_fields_and_namespaces_are_those_of_the_messages():
     points = ros.street(3000)
     cloud = ros.to_message(points)
     result = GroundSegmenter(backend=NumpyBackend()).segment(ros.xyz_of(points))
-    made = {o.topic: o.build(cloud, result, Config()) for o in outputs.OUTPUTS}
+    segmented = SegmentedCloud(cloud, result, Config())
+    made = {o.topic: o.build(segmented) for o in outputs.OUTPUTS}
     shown = set(colour_fields())
     assert (f'{NODE}/labeled', 'label') in shown and len(shown) >= 3
     for topic, field in shown:
@@ -97,20 +100,30 @@ def snippets(page):
     return text, [yaml.safe_load(one) for one in re.findall(r'```yaml\n(.*?)```', text, re.DOTALL)]
 
 
-def test_nav2_snippets_are_yaml_and_fit_the_command_above_them():
-    text, found = snippets('nav2.md')
-    costmaps = [one['local_costmap']['local_costmap']['ros__parameters'] for one in found]
-    assert len(costmaps) == 2
-    for costmap in costmaps:
-        assert set(costmap['plugins']) <= set(costmap)
-        layer = costmap['obstacle_layer']
-        for source in layer['observation_sources'].split():
-            assert f'-r {source}:={layer[source]["topic"]}' in text
-        marking = {name for name in ('obstacles', 'ground') if layer[name]['marking']}
-        assert marking == {'obstacles'}
-    consistency = costmaps[1]['ground_consistency_layer']
+def test_nav2_snippets_are_yaml_and_fit_the_command_and_the_messages():
+    outputs = pytest.importorskip('gp_ground_seg.ros.outputs', reason='ROS is not installed')
+    text, (costmap, *others) = snippets('nav2.md')
+    layers = costmap['local_costmap']['local_costmap']['ros__parameters']
+    assert set(layers['plugins']) <= set(layers)
+    for other in others:
+        layers |= other
+    kinds = {o.topic.removeprefix('~/'): o.message_type.__name__ for o in outputs.OUTPUTS}
+    names = {name: f'~/{name}' if name == 'scan' else name for name in kinds}
+    for name in ('obstacle_layer', 'voxel_layer', 'stvl_layer'):
+        sources = {
+            source: layers[name][source] for source in layers[name]['observation_sources'].split()
+        }
+        assert any(source['marking'] for source in sources.values())
+        for output, source in sources.items():
+            assert source['data_type'] == kinds[output]
+            assert f'-r {names[output]}:={source["topic"]}' in text.replace("'", '')
+            assert source['min_obstacle_height'] < -10.0 or not source['marking']
+            assert not (output == 'ground' and source['marking'])
+    consistency = layers['ground_consistency_layer']
     assert f'-r ground:={consistency["ground_points_topic"]}' in text
     assert f'-r obstacles:={consistency["nonground_points_topic"]}' in text
+    given = dict(re.findall(r'-p ([\w.]+):=(\S+)', text))
+    assert Config().replace(**{name: float(value) for name, value in given.items()})
 
 
 def test_the_aggregator_of_the_diagnostics_finds_our_statuses():

@@ -175,7 +175,8 @@ class GroundSegmenter:
         with self._exclusive():
             if config.runtime != self._config.runtime:
                 self.use_backend(make_backend(config.runtime))
-            if dataclasses.replace(config, diagnostics=self._config.diagnostics) != self._config:
+            before = {name: getattr(self._config, name) for name in ('output', 'diagnostics')}
+            if dataclasses.replace(config, **before) != self._config:
                 self.reset()
             self._config = config
             self._warned.clear()

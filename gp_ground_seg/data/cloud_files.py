@@ -79,7 +79,7 @@ def _table_name(arrays: Columns) -> str:
 
 
 def _read_text(data: bytes) -> tuple[Fields, None]:
-    """Read lines of x, y, z, ..., between them spaces, commas or semicolons; names may be first."""
+    """Read lines of x, y, z, ..., split by spaces, commas or semicolons; names may be first."""
     text = data.decode('utf-8-sig')
     lines = (line.strip() for line in io.StringIO(text))
     first = next((line for line in lines if line and not line.startswith(COMMENTS)), '')

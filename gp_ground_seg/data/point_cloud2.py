@@ -8,6 +8,7 @@ Source: sensor_msgs/msg/PointCloud2.msg, sensor_msgs/msg/PointField.msg.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from typing import Any, Protocol, TypeVar
@@ -89,6 +90,17 @@ def read_fields(cloud: CloudMessage) -> npt.NDArray[np.void]:
         raise PointCloudError(f'point cloud: fields: {in_one_line(error)}') from error
     points = _view(cloud, dtype).reshape(-1)
     return points.astype(repack_fields(dtype.newbyteorder('=')))
+
+
+def write_xyz(cloud: CloudMessage, xyz: npt.NDArray[np.floating]) -> None:
+    """Put coordinates, (height * width, 3), in place of those of every point.
+
+    The data must be writable. Raises PointCloudError as `read_xyz` does.
+    """
+    if cloud.height * cloud.width:
+        with np.errstate(over='ignore'):
+            for column, values in zip(_views(cloud, 'xyz', _FLOATS).values(), xyz.T, strict=True):
+                column[...] = values.reshape(column.shape)
 
 
 def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
@@ -222,6 +234,13 @@ def select_points(
     kept.row_step = kept.width * cloud.point_step
     kept.is_dense = bool(np.isfinite(read_xyz(kept)).all())
     return kept
+
+
+def message_data(values: npt.NDArray[Any], typecode: str = 'B') -> array[Any]:
+    """Return the bytes of an array as the one type that rclpy takes without a look at each."""
+    data = array(typecode)
+    data.frombytes(np.ascontiguousarray(values).data.cast('B') if values.size else b'')
+    return data
 
 
 def stamp_of(cloud: CloudMessage) -> tuple[int, int]:

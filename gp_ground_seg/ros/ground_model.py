@@ -16,8 +16,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.data.point_cloud2 import read_columns
-from gp_ground_seg.ros.messages import message_data
+from gp_ground_seg.data.point_cloud2 import message_data, read_columns
 
 FIELDS = ('x', 'y', 'z', 'std', 'length_scale', 'range', 'roll', 'pitch')
 """Fields of the cloud, all float32 [m, rad]. The last three locate a place in the grid: the

@@ -18,6 +18,7 @@ from sensor_msgs.msg import PointCloud2
 from gp_ground_seg.core.errors import ConfigError
 
 INPUT_DEPTH = 5  # clouds that may wait to be processed: half a second of a LiDAR at 10 Hz
+OUTPUT_DEPTH = 20  # clouds kept: Fast DDS may send a lost fragment again after 0.7 s only
 MAX_DEPTH = 10_000
 QOS_OVERRIDES = 'qos_overrides.'
 LARGE_CLOUD = 500_000  # size up to which stock Fast DDS loses no best-effort cloud [bytes]
@@ -220,6 +221,11 @@ class CloudSubscription:
         if not self.idle:
             self._create()
         self._node.get_logger().info(self.words)
+
+
+def cloud_profile(depth: int = OUTPUT_DEPTH) -> QoSProfile:
+    """Return the default of a topic on which clouds are sent: reliable, volatile, the newest."""
+    return QoSProfile(depth=depth)
 
 
 class TimeJumps:

@@ -23,6 +23,7 @@ from gp_ground_seg.core.parameters.schema import NODE_NAME
 from gp_ground_seg.core.pipeline.points import single_precision
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
+from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros import start_stop
 from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
@@ -80,13 +81,29 @@ class GroundSegmentationNode(ConfiguredNode):
         logger.info(self._input.words)
 
     def _on_cloud(self, cloud: PointCloud2, wait: float, n_lost: int) -> None:
+        """Process a cloud, once TF has the transforms that it needs."""
+        arrival = time.monotonic()
+        self._note_arrival(cloud, arrival, n_lost)
+
+        def process_late() -> None:
+            if not self._why_idle():
+                self._process(cloud, wait + time.monotonic() - arrival)
+
+        if self._tf is None:
+            self._process(cloud, wait)
+        else:
+            self._tf.when_known(cloud.header, self.config, process_late)
+
+    def _process(self, cloud: PointCloud2, wait: float) -> None:
         """Segment a cloud and publish the result; report a cloud that cannot be segmented."""
         start = time.monotonic()
-        self._note_arrival(cloud, start, n_lost)
         try:
             segmentation = self._segment(cloud)
-            segmented = time.monotonic()
-            topics = self._outputs.publish(cloud, segmentation, self.config)
+            segmented, frame = time.monotonic(), self.config.output.frame
+            placement = self._tf.placement(cloud.header, frame) if self._tf else None
+            topics = self._outputs.publish(
+                SegmentedCloud(cloud, segmentation, self.config, placement)
+            )
         except PointCloudError as error:
             self._refuse(cloud, str(error))
         except Exception as error:
@@ -120,7 +137,7 @@ class GroundSegmentationNode(ConfiguredNode):
             )
         # Code for the other precision would have to be compiled at the first start too.
         points = single_precision(read_xyz(cloud))
-        pose = self._tf.look_up(cloud.header, self.config.frame) if self._tf else ()
+        pose = self._tf.look_up(cloud.header, self.config) if self._tf else ()
         return self._segmenter.segment(points, *pose)
 
     def _refuse(self, cloud: PointCloud2, reason: str) -> None:
@@ -136,8 +153,8 @@ class GroundSegmentationNode(ConfiguredNode):
     def check_config(self, config: Config) -> None:
         """Raise a GroundSegError if the backend or TF is asked for and not installed."""
         choose_backend(config.runtime.backend)
-        if is_tf_used(config.frame):
-            require_tf2(config.frame)
+        if is_tf_used(config):
+            require_tf2(config)
 
     def apply_config(self, config: Config) -> None:
         """Use `config` from the next cloud on; compiled code as soon as that is made."""
@@ -178,8 +195,8 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _follow_tf(self, config: Config) -> None:
         """Listen to TF while the parameters ask for it."""
-        if is_tf_used(config.frame):
-            self._tf = self._tf or TfListener(self, config.frame)
+        if is_tf_used(config):
+            self._tf = self._tf or TfListener(self, config)
         elif self._tf is not None:
             self._tf.close()
             self._tf = None

@@ -2,26 +2,42 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Point
+from nav_msgs.msg import OccupancyGrid
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import PointCloud2, PointField
-from std_msgs.msg import ColorRGBA
+from sensor_msgs.msg import LaserScan, PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
-from gp_ground_seg.core.frame import FloatArray, IntArray, Label
+from gp_ground_seg.core.frame import NOT_FINITE, BoolArray, FloatArray, IntArray
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.pipeline.tilt import rotate
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.colours import length_scale_colours
-from gp_ground_seg.data.point_cloud2 import append_columns, read_xyz
+from gp_ground_seg.data.costmap import (
+    DIRECTIONS,
+    SegmentedCloud,
+    occupancy,
+    reach_of_model,
+    scan_ranges,
+)
+from gp_ground_seg.data.point_cloud2 import (
+    append_columns,
+    message_data,
+    read_xyz,
+    select_points,
+    write_xyz,
+)
 from gp_ground_seg.ros.ground_model import ground_model_cloud
-from gp_ground_seg.ros.messages import cloud_profile, message_data, select_points
+from gp_ground_seg.ros.input import cloud_profile
 
 LABELLED_FIELDS = ('label', 'height', 'ground_z', 'ground_std', 'return_std', 'p_ground')
 """Fields of ``~/labeled``: uint8 `Label`, then float32, [m] but for the probability."""
@@ -34,11 +50,11 @@ BAND_COLOUR = (0.75, 0.75, 0.75, 0.35)
 
 
 class Output(NamedTuple):
-    """A topic, and the function from input, segmentation and parameters to its message."""
+    """A topic, and the function that makes its message."""
 
     topic: str
     message_type: type
-    build: Callable[[PointCloud2, Segmentation, Config], Any]
+    build: Callable[[SegmentedCloud], Any]
     is_optional: bool  # built only while it has a subscriber
 
 
@@ -138,17 +154,79 @@ def _colours(rgb: FloatArray) -> list[ColorRGBA]:
     return [shared[key] for key in keys]
 
 
-def _points_with(label: Label) -> Callable[[PointCloud2, Segmentation, Config], PointCloud2]:
-    return lambda cloud, segmentation, _config: select_points(cloud, segmentation.label == label)
+def _selected(segmented: SegmentedCloud, chosen: BoolArray, voxel: float) -> PointCloud2:
+    """Return the `chosen` points, thinned to one in each `voxel` [m], in the output frame."""
+    message = select_points(segmented.cloud, segmented.thinned(chosen, voxel), message_data)
+    if segmented.placement is not None:
+        rotation, translation = segmented.placement
+        message.header = _header(segmented)
+        xyz = rotate(read_xyz(message).astype(np.float64), rotation)
+        write_xyz(message, xyz + translation)
+    return message
 
 
-LABELLED = Output('~/labeled', PointCloud2, lambda c, s, _: labelled_cloud(c, s), True)
+def _header(segmented: SegmentedCloud) -> Header:
+    return Header(stamp=segmented.cloud.header.stamp, frame_id=segmented.frame_id)
+
+
+def scan(segmented: SegmentedCloud) -> LaserScan:
+    """Return the nearest obstacle in each direction about the origin of the output frame.
+
+    Infinite where the direction has returns and no obstacle, NaN where it has no return.
+    """
+    (x, y), config, step = segmented.offset, segmented.config, 2.0 * math.pi / DIRECTIONS
+    message = LaserScan(header=_header(segmented), angle_increment=step)
+    message.angle_min, message.angle_max = 0.5 * step - math.pi, math.pi - 0.5 * step
+    message.range_max = (config.output.max_range or config.grid.r_max) + math.hypot(x, y)
+    seen = segmented.is_obstacle, segmented.segmentation.grid.cell != NOT_FINITE
+    moved = [(px + x, py + y) for px, py in map(segmented.places, seen)]
+    message.ranges = message_data(scan_ranges(*moved), 'f')
+    return message
+
+
+def occupancy_grid(segmented: SegmentedCloud) -> OccupancyGrid:
+    """Return the cells about the sensor, in the output frame: free, occupied or unknown."""
+    output, ground_std = segmented.config.output, segmented.config.label.ground_tolerance
+    ground, obstacles = map(segmented.places, (segmented.is_ground, segmented.is_obstacle))
+    reach = reach_of_model(segmented.segmentation.surface, segmented.heading, ground_std)
+    cells = occupancy(ground, obstacles, reach, output.cell_size, output.grid_size)
+    message = OccupancyGrid(header=_header(segmented))
+    info, (x, y) = message.info, segmented.offset
+    info.map_load_time, info.resolution = message.header.stamp, output.cell_size
+    info.height, info.width = cells.shape
+    half = 0.5 * info.width * output.cell_size
+    info.origin.position.x, info.origin.position.y = x - half, y - half
+    info.origin.orientation.w = 1.0
+    message.data = message_data(cells, 'b')
+    return message
+
+
+LABELLED = Output(
+    '~/labeled', PointCloud2, lambda s: labelled_cloud(s.cloud, s.segmentation), True
+)
 OUTPUTS = (
-    Output('ground', PointCloud2, _points_with(Label.GROUND), False),
-    Output('obstacles', PointCloud2, _points_with(Label.OBSTACLE), False),
+    Output(
+        'ground',
+        PointCloud2,
+        lambda s: _selected(s, s.is_ground, s.config.output.ground_voxel),
+        False,
+    ),
+    Output(
+        'obstacles',
+        PointCloud2,
+        lambda s: _selected(s, s.is_obstacle, s.config.output.obstacle_voxel),
+        False,
+    ),
     LABELLED,
-    Output('~/ground_model', PointCloud2, lambda c, s, _: ground_model_cloud(c, s), True),
-    Output('~/markers', MarkerArray, markers, True),
+    Output(
+        '~/ground_model',
+        PointCloud2,
+        lambda s: ground_model_cloud(s.cloud, s.segmentation),
+        True,
+    ),
+    Output('~/markers', MarkerArray, lambda s: markers(s.cloud, s.segmentation, s.config), True),
+    Output('~/scan', LaserScan, scan, True),
+    Output('~/occupancy', OccupancyGrid, occupancy_grid, True),
 )
 
 
@@ -168,16 +246,16 @@ class OutputPublishers:
         """Return the number of subscribers of each topic."""
         return {p.topic_name: p.get_subscription_count() for _, p in self._publishers}
 
-    def publish(self, cloud: PointCloud2, segmentation: Segmentation, config: Config) -> list[str]:
+    def publish(self, segmented: SegmentedCloud) -> list[str]:
         """Publish all outputs of a cloud, or none if one cannot be built; return their topics."""
         messages = [
-            (output, publisher, output.build(cloud, segmentation, config))
+            (output, publisher, output.build(segmented))
             for output, publisher in self._publishers
             if not output.is_optional or publisher.get_subscription_count() > 0
         ]
         for output, publisher, message in messages:
             if output is LABELLED:
-                self._warn_of_renamed(cloud)
+                self._warn_of_renamed(segmented.cloud)
             publisher.publish(message)
         return [publisher.topic_name for _, publisher, _ in messages]
 

@@ -14,7 +14,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg.data.bags import BagReader
-from gp_ground_seg.ros.messages import cloud_profile
+from gp_ground_seg.ros.input import cloud_profile
 
 DEPTH = 100  # clouds kept until acknowledged: with stock Fast DDS that can take 3 s
 LATE = 0.02  # a cloud that is sent more than this after its time is late [s]

@@ -132,7 +132,7 @@ class Probe:
     ) -> None:
         from sensor_msgs.msg import PointCloud2
 
-        from gp_ground_seg.ros.messages import cloud_profile
+        from gp_ground_seg.ros.input import cloud_profile
 
         self.n_stray = 0
         self._session = session

@@ -1,8 +1,11 @@
-"""Tilt and place of the sensor by TF."""
+"""Tilt and place of the sensor, and the frame of the outputs, by TF at the stamp of each cloud."""
 
 from __future__ import annotations
 
 import importlib
+import time
+from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,18 +15,25 @@ from rclpy.time import Time
 from std_msgs.msg import Header
 
 from gp_ground_seg.core.errors import MissingDependencyError, PointCloudError
-from gp_ground_seg.core.parameters.config import NO_FRAME, FrameConfig
+from gp_ground_seg.core.frame import FloatArray
+from gp_ground_seg.core.parameters.config import NO_FRAME, Config
 from gp_ground_seg.core.pipeline.tilt import angles_of
+from gp_ground_seg.data.costmap import Placement
+from gp_ground_seg.ros.input import STEADY_CLOCK
 
 KEPT_JUMP = 1.0  # jump back up to which transforms are kept: a late stamp, no other run [s]
+MAX_WAIT = 0.2  # time that a cloud waits for the transforms of its stamp [s]
+REVIEW_PERIOD = 0.005  # time between two looks at whether they have come [s]
 
 
-def require_tf2(frame: FrameConfig) -> Any:
+def require_tf2(config: Config) -> Any:
     """Return the module tf2_ros; raise a MissingDependencyError if it is not installed."""
     asked, instead = 'frame.level = tf', 'frame.level = sensor with sensor.roll and sensor.pitch'
-    if frame.level != 'tf':
-        asked = f'frame.sensor = {frame.sensor}'
+    if config.frame.sensor != NO_FRAME:
+        asked = f'frame.sensor = {config.frame.sensor}'
         instead = 'frame.sensor = none with sensor.origin_x, origin_y and origin_z'
+    elif config.frame.level != 'tf':
+        asked, instead = f'output.frame = {config.output.frame}', 'output.frame = none'
     try:
         return importlib.import_module('tf2_ros')
     except ImportError as error:
@@ -33,59 +43,131 @@ def require_tf2(frame: FrameConfig) -> Any:
         ) from error
 
 
-def tilt_of(rotation: Quaternion) -> tuple[float, float]:
-    """Return roll and pitch [rad] of a sensor frame that `rotation` turns into a level one."""
+def rotation_of(rotation: Quaternion) -> FloatArray:
+    """Matrix (3, 3) of a quaternion; raise a PointCloudError if its length is not 1."""
     x, y, z, w = rotation.x, rotation.y, rotation.z, rotation.w
     square = x * x + y * y + z * z + w * w
     if not abs(square - 1.0) < 1e-3:
         given = f'({x:g}, {y:g}, {z:g}, {w:g}) of length {square**0.5:g}'
         raise PointCloudError(f'quaternion {given}: must be 1')
-    # Third row of its matrix: the level frame's z axis in the sensor frame.
-    up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), square - 2.0 * (x * x + y * y)])
-    return angles_of(up / np.linalg.norm(up))
+    matrix: FloatArray = np.array(
+        [
+            [square - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), square - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), square - 2.0 * (x * x + y * y)],
+        ]
+    )
+    matrix /= square
+    return matrix
 
 
-def is_tf_used(frame: FrameConfig) -> bool:
-    """Return whether the tilt or the place of the sensor comes from TF."""
-    return frame.level == 'tf' or frame.sensor != NO_FRAME
+def tilt_of(rotation: Quaternion) -> tuple[float, float]:
+    """Return roll and pitch [rad] of a sensor frame that `rotation` turns into a level one."""
+    # The level frame's z axis in the sensor frame.
+    return angles_of(rotation_of(rotation)[2])
+
+
+def is_tf_used(config: Config) -> bool:
+    """Return whether tilt or place of the sensor, or the frame of the outputs, needs TF."""
+    frame = config.frame
+    return frame.level == 'tf' or {frame.sensor, config.output.frame} != {NO_FRAME}
 
 
 class TfListener:
-    """Listens to TF in the executor of `node`, for what `frame` asks."""
+    """Listens to TF in the executor of `node`, for what `config` asks."""
 
-    def __init__(self, node: Node, frame: FrameConfig) -> None:
-        self._tf2_ros = require_tf2(frame)
+    def __init__(self, node: Node, config: Config) -> None:
+        self._tf2_ros = require_tf2(config)
         # Without the node: given one, the buffer clears itself at jumps of the node's clock,
         # and in some releases raises an error there that ends the executor. See `time_jumped`.
         self._buffer = self._tf2_ros.Buffer()
         self._listener = self._tf2_ros.TransformListener(self._buffer, node, spin_thread=False)
+        self._waiting: deque[tuple[float, Header, Config, Callable[[], None]]] = deque()
+        self._node = node
+        self._timer = node.create_timer(REVIEW_PERIOD, self._review, clock=STEADY_CLOCK)
+        self._timer.cancel()
+
+    def when_known(self, header: Header, config: Config, use: Callable[[], None]) -> None:
+        """Call `use` as soon as all transforms of a cloud are known, or after `MAX_WAIT`.
+
+        Clouds keep their order. TF comes to the same executor: it cannot be waited for here.
+        """
+        self._waiting.append((time.monotonic() + MAX_WAIT, header, config, use))
+        self._review()
+
+    def _review(self) -> None:
+        while self._waiting:
+            deadline, header, config, use = self._waiting[0]
+            if time.monotonic() < deadline and not self._is_known(header, config):
+                self._timer.reset()
+                return
+            self._waiting.popleft()
+            use()
+        self._timer.cancel()
+
+    def _is_known(self, header: Header, config: Config) -> bool:
+        wanted = {config.frame.sensor, config.output.frame}
+        if config.frame.level == 'tf':
+            wanted.add(config.frame.base)
+        try:
+            for frame in wanted - {NO_FRAME, header.frame_id}:
+                self._exact(frame, header.frame_id, header)
+        except self._tf2_ros.TransformException:
+            return False
+        except ValueError:
+            return True  # no such time: the cloud is refused with the reason
+        return True
 
     def look_up(
-        self, header: Header, frame: FrameConfig
+        self, header: Header, config: Config
     ) -> tuple[tuple[float, float] | None, tuple[float, float, float] | None]:
         """Return tilt [rad] and place [m] of the sensor in a cloud; None for what is not asked.
 
-        Raises a PointCloudError if TF does not have them.
+        Those of the stamp, or the newest if TF does not reach it. Raises a PointCloudError if TF
+        does not have them.
         """
-        tilt, origin, frame_id = None, None, header.frame_id
+        tilt, origin, frame_id, frame = None, None, header.frame_id, config.frame
         if frame.level == 'tf':
             way = f'from its frame {frame_id!r} to frame.base = {frame.base!r}'
-            tilt = tilt_of(self._transform(frame.base, frame_id, header, way).rotation)
+            tilt = tilt_of(self._newest(frame.base, frame_id, header, way).rotation)
         if frame.sensor != NO_FRAME:
             way = f'from frame.sensor = {frame.sensor!r} to its frame {frame_id!r}'
-            place = self._transform(frame_id, frame.sensor, header, way).translation
+            place = self._newest(frame_id, frame.sensor, header, way).translation
             origin = place.x, place.y, place.z
             if not np.isfinite(origin).all():
                 raise PointCloudError(f'transform {way}: its translation is {origin}')
         return tilt, origin
 
-    def _transform(self, target: str, source: str, header: Header, way: str) -> Any:
+    def placement(self, header: Header, frame: str) -> Placement | None:
+        """Return where the `frame` of the outputs is at the stamp of a cloud.
+
+        None if it is that of the cloud. Raises a PointCloudError if TF does not have it.
+        """
+        if frame in (NO_FRAME, header.frame_id):
+            return None
+        way = f'from its frame {header.frame_id!r} to output.frame = {frame!r}'
+        try:
+            found = self._exact(frame, header.frame_id, header)
+        except self._tf2_ros.TransformException as error:
+            raise PointCloudError(
+                f'no transform {way} at its stamp within {MAX_WAIT:g} s: {error}'
+            ) from error
+        move = found.translation
+        translation = np.array([move.x, move.y, move.z])
+        if not np.isfinite(translation).all():
+            raise PointCloudError(f'transform {way}: its translation is {translation}')
+        return Placement(rotation_of(found.rotation), translation)
+
+    def _exact(self, target: str, source: str, header: Header) -> Any:
+        stamp = Time.from_msg(header.stamp)
+        return self._buffer.lookup_transform(target, source, stamp).transform
+
+    def _newest(self, target: str, source: str, header: Header, way: str) -> Any:
         try:
             try:
-                stamp = Time.from_msg(header.stamp)
-                return self._buffer.lookup_transform(target, source, stamp).transform
+                return self._exact(target, source, header)
             except self._tf2_ros.ExtrapolationException:
-                # The newest: a sensor is fixed to its vehicle, and waiting would delay the cloud.
+                # The newest: a sensor is fixed to its vehicle.
                 return self._buffer.lookup_transform(target, source, Time()).transform
         except self._tf2_ros.TransformException as error:
             raise PointCloudError(f'no transform {way}: {error}') from error
@@ -96,5 +178,7 @@ class TfListener:
             self._buffer.clear()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop listening; clouds that wait are dropped."""
+        self._waiting.clear()
+        self._node.destroy_timer(self._timer)
         self._listener.unregister()

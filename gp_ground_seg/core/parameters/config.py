@@ -23,6 +23,8 @@ from gp_ground_seg.core.parameters.schema import (
 NO_FRAME = 'none'
 SENSOR_HEIGHTS = -5.0, 20.0
 """Lowest and highest origin of a cloud over the ground near it [m]."""
+ANY_HEIGHT = 100.0
+"""``output.max_height`` that means no limit [m]; ``output.min_height`` has it with a minus."""
 
 # Default, accepted values, description, unit, symbol in the paper. `basic` are those that are
 # set for a robot: its sensor and frames, the range and height of what is ground to it, its CPU.
@@ -67,6 +69,25 @@ class InputConfig:
         'size of the data of a cloud above which it is refused', 'MB')
     lazy: bool = advanced(False, (),
         'subscribe to clouds only while an output has a subscriber; looked at every second')
+
+
+@dataclass(frozen=True)
+class OutputConfig:
+    """The clouds ground and obstacles, scan and occupancy; the node only."""
+
+    frame: str = advanced(NO_FRAME, (),
+        'their frame, by TF at the stamp of the cloud; none = that of the cloud')
+    min_height: float = advanced(-ANY_HEIGHT, (-ANY_HEIGHT, ANY_HEIGHT),
+        'least height over the ground of an obstacle; -100 = any', 'm')
+    max_height: float = advanced(ANY_HEIGHT, (-ANY_HEIGHT, ANY_HEIGHT),
+        'greatest height over the ground of an obstacle; 100 = any', 'm')
+    max_range: float = advanced(0.0, (0.0, 500.0),
+        'greatest horizontal range; 0 = any', 'm')
+    ground_voxel: float = advanced(0.0, (0.0, 10.0),
+        'side of the cubes whose first point ground has; 0 = every point', 'm')
+    obstacle_voxel: float = advanced(0.0, (0.0, 10.0), 'the same for obstacles', 'm')
+    cell_size: float = advanced(0.1, (0.05, 5.0), 'side of a cell of occupancy', 'm')
+    grid_size: float = advanced(40.0, (1.0, 100.0), 'side of the square of occupancy', 'm')
 
 
 @dataclass(frozen=True)
@@ -273,6 +294,7 @@ _ASCENDING = (
     ('grid.r_min', 'grid.r_max'),
     ('length_scale.min', 'length_scale.max'),
     ('label.obstacle_min_height', 'label.obstacle_max_height'),
+    ('output.min_height', 'output.max_height'),
 )
 """Pairs of which the first must be below the second."""
 NARROWEST_BIN = 1e-4
@@ -291,6 +313,7 @@ class Config(ParameterGroups):
     sensor: SensorConfig = SensorConfig()
     frame: FrameConfig = FrameConfig()
     input: InputConfig = InputConfig()
+    output: OutputConfig = OutputConfig()
     grid: GridConfig = GridConfig()
     lines: LinesConfig = LinesConfig()
     length_scale: LengthScaleConfig = LengthScaleConfig()

@@ -24,7 +24,7 @@ from gp_ground_seg.lab.viewers.scene import Cloud, point_colours, read_view
 
 N_STEPS = 400  # of a slider
 COLOURS = ('changes', 'class', 'height', 'p_ground', 'errors')
-_NO_LABELS = ('frame', 'input', 'runtime', 'diagnostics')
+_NO_LABELS = ('frame', 'input', 'output', 'runtime', 'diagnostics')
 
 
 def tunable() -> list[ParameterSpec]:

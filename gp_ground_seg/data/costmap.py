@@ -1,0 +1,263 @@
+"""What a costmap takes of a segmented scan: fewer points, the nearest obstacles, a grid of cells.
+
+Places are two arrays x and y, (n,) each, in the plane of the map [m]; directions are `DIRECTIONS`
+equal sectors, counter-clockwise from -x.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.frame import (
+    BoolArray,
+    FloatArray,
+    GroundSurface,
+    IntArray,
+    Label,
+    PointArray,
+)
+from gp_ground_seg.core.parameters.config import ANY_HEIGHT, Config
+from gp_ground_seg.core.pipeline.sensor_pose import LEAST_COSINE
+from gp_ground_seg.core.result import Segmentation, cached_property
+from gp_ground_seg.data.point_cloud2 import read_xyz
+
+DIRECTIONS = 720
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+"""Values of cells, those of ``nav_msgs/OccupancyGrid``."""
+SMALLEST_VOXEL = 1e-3  # below it every point is kept: no sensor is that precise [m]
+
+_VOXELS = 1 << 20  # of an axis on each side of 0; points beyond belong to the last
+_SLOT_BITS = 18
+_ODD = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: spreads keys that differ little
+
+Ranges = npt.NDArray[np.float32]
+Places = tuple[PointArray, PointArray]
+
+
+class Placement(NamedTuple):
+    """Where the frame of the outputs is: it has the point p of the cloud at R p + t."""
+
+    rotation: FloatArray  # R, (3, 3)
+    translation: FloatArray  # t, (3,) [m]
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentedCloud:
+    """A cloud with its labels, and what of it is published under the parameters ``output``.
+
+    Attributes
+    ----------
+    cloud : CloudMessage
+        The input.
+    segmentation : Segmentation
+        Its labels.
+    config : Config
+        Parameters.
+    placement : Placement or None
+        Where ``output.frame`` is; None if it is the frame of the cloud.
+    """
+
+    cloud: Any
+    segmentation: Segmentation
+    config: Config
+    placement: Placement | None = None
+
+    @cached_property
+    def points(self) -> PointArray:
+        """Coordinates of all points in the frame of the cloud, (N, 3) [m]."""
+        return read_xyz(self.cloud)
+
+    @property
+    def frame_id(self) -> str:
+        """Frame of what is published."""
+        return (
+            str(self.cloud.header.frame_id) if self.placement is None else self.config.output.frame
+        )
+
+    @cached_property
+    def is_ground(self) -> BoolArray:
+        """Ground points within the range, (N,) bool."""
+        return self._within_range(self.segmentation.label == Label.GROUND)
+
+    @cached_property
+    def is_obstacle(self) -> BoolArray:
+        """Obstacle points within the range and between the heights, (N,) bool.
+
+        Heights are over the surface that the labels follow from. A point without a height, where
+        there is no model, may stand in the way: it is one of them.
+        """
+        chosen = self._within_range(self.segmentation.label == Label.OBSTACLE)
+        output, height = self.config.output, self.segmentation.labelled.height
+        if output.min_height > -ANY_HEIGHT:
+            chosen &= ~(height < output.min_height)
+        if output.max_height < ANY_HEIGHT:
+            chosen &= ~(height > output.max_height)
+        return chosen
+
+    def _within_range(self, chosen: BoolArray) -> BoolArray:
+        limit = self.config.output.max_range
+        return chosen & (self.segmentation.grid.r <= limit) if limit > 0.0 else chosen
+
+    def thinned(self, chosen: BoolArray, voxel: float) -> BoolArray:
+        """Those of the `chosen`, (N,) bool, that are the first in their cube of `voxel` [m]."""
+        if voxel < SMALLEST_VOXEL:
+            return chosen
+        kept = np.zeros_like(chosen)
+        index = np.flatnonzero(chosen)
+        kept[index[first_of_voxels(self.points[index], voxel)]] = True
+        return kept
+
+    @property
+    def offset(self) -> tuple[float, float]:
+        """Where the origin of the cloud is in the plane of the output frame [m]."""
+        x, y = (0.0, 0.0) if self.placement is None else self.placement.translation[:2].tolist()
+        return x, y
+
+    def places(self, chosen: BoolArray) -> Places:
+        """Places of the `chosen` points, (N,) bool, in the output frame, seen from `offset`.
+
+        Without an output frame, where verticals through them meet z = 0 of the cloud.
+        """
+        index = np.flatnonzero(chosen)
+        x, y, z = (values.take(index) for values in self.points.T)
+        with np.errstate(over='ignore', invalid='ignore'):
+            x, y = (a * x + b * y + c * z for a, b, c in self._to_plane().tolist())
+        return x, y
+
+    def _to_plane(self) -> FloatArray:
+        """Matrix (2, 3) from the cloud to the plane of the map."""
+        if self.placement is not None:
+            return self.placement.rotation[:2]
+        x, y, z = self.segmentation.pose.rotation[2].tolist()
+        if abs(z) < LEAST_COSINE:
+            raise PointCloudError(
+                'the z axis of the cloud is level, so its plane is no map: output.frame must be a '
+                'level frame while somebody listens to scan or occupancy'
+            )
+        return np.array([[1.0, 0.0, -x / z], [0.0, 1.0, -y / z]])
+
+    @property
+    def heading(self) -> FloatArray:
+        """Matrix (2, 2) from directions of the map to those of the level frame of the surface."""
+        turn = self.segmentation.pose.rotation
+        if self.placement is not None:
+            turn = turn @ self.placement.rotation.T
+        return turn[:2, :2]
+
+
+@np.errstate(over='ignore')
+def first_of_voxels(xyz: PointArray, size: float) -> BoolArray:
+    """Which points (N, 3) are the first in their cube of `size` [m], (N,) bool.
+
+    Points must be finite. A size below `SMALLEST_VOXEL` keeps every point.
+    """
+    if size < SMALLEST_VOXEL:
+        return np.ones(len(xyz), dtype=np.bool_)
+    key = np.zeros(len(xyz), dtype=np.int64)
+    for values in xyz.T:
+        place = np.floor(np.clip(values / size, -_VOXELS, _VOXELS - 1))
+        key = key << 21 | (place.astype(np.int64) + _VOXELS)
+    # A sort would take ten times as long as this hash table: each pass finds the first point of
+    # every slot, and only points of other voxels in the same slot remain.
+    is_first = np.zeros(len(xyz), dtype=np.bool_)
+    rest, factor = np.flatnonzero(np.append(True, key[1:] != key[:-1])[: len(key)]), _ODD
+    key = key[rest]
+    table = np.empty(1 << _SLOT_BITS, dtype=np.int32)
+    while len(rest):
+        mixed = key.view(np.uint64) * np.uint64(factor)
+        slot = (mixed >> np.uint64(64 - _SLOT_BITS)).astype(np.int64)
+        # Of equal indices the last one counts.
+        table[slot[::-1]] = np.arange(len(rest) - 1, -1, -1)
+        first = table[slot]
+        is_first[rest[first]] = True
+        others = np.flatnonzero(key[first] != key)
+        rest, key = rest[others], key[others]
+        factor = factor * _ODD % (1 << 64)
+    return is_first
+
+
+@np.errstate(invalid='ignore')
+def direction_of(x: PointArray, y: PointArray) -> IntArray:
+    """Direction of each place seen from the origin, (n,) int64."""
+    turn = np.arctan2(y, x) / (2.0 * math.pi) + 0.5
+    direction: IntArray = (turn * DIRECTIONS).astype(np.int64) % DIRECTIONS
+    return direction
+
+
+@np.errstate(over='ignore')
+def ranges_of(x: PointArray, y: PointArray) -> tuple[Ranges, Ranges]:
+    """Range of the nearest and of the farthest place in each direction [m], (DIRECTIONS,) each.
+
+    Infinite and minus infinite where there is none.
+    """
+    direction, r = direction_of(x, y), np.sqrt(x * x + y * y).astype(np.float32, copy=False)
+    nearest = np.full(DIRECTIONS, np.inf, dtype=np.float32)
+    farthest = -nearest
+    np.minimum.at(nearest, direction, r)
+    np.maximum.at(farthest, direction, r)
+    return nearest, farthest
+
+
+def scan_ranges(obstacles: Places, returns: Places) -> Ranges:
+    """Range of the nearest of the `obstacles` in each direction [m], (DIRECTIONS,).
+
+    Infinite where there are other `returns` only, NaN where there is no return at all.
+    """
+    ranges, _ = ranges_of(*obstacles)
+    is_seen = np.zeros(DIRECTIONS, dtype=np.bool_)
+    is_seen[direction_of(*returns)] = True
+    ranges[~is_seen] = np.nan
+    return ranges
+
+
+def reach_of_model(surface: GroundSurface, heading: FloatArray, tolerance: float) -> Ranges:
+    """Range up to which the ground is known to within `tolerance` [m], (DIRECTIONS,) [m].
+
+    `heading` (2, 2) turns directions of the map into those of the level frame of `surface`.
+    """
+    is_known = np.logical_and.accumulate(surface.std <= tolerance, axis=1)
+    reach = np.append(0.0, surface.knots)[is_known.sum(axis=1)]
+    middle = (np.arange(DIRECTIONS) + 0.5) * (2.0 * math.pi / DIRECTIONS) - math.pi
+    x, y = heading @ np.stack([np.cos(middle), np.sin(middle)])
+    n_segments = len(reach)
+    turn = np.arctan2(y, x) / (2.0 * math.pi) + 0.5
+    segment = (turn * n_segments).astype(np.int64) % n_segments
+    return np.asarray(reach[segment], dtype=np.float32)
+
+
+@np.errstate(over='ignore')
+def occupancy(
+    ground: Places, obstacles: Places, reach: Ranges, cell_size: float, grid_size: float
+) -> npt.NDArray[np.int8]:
+    """Cells of a square about the sensor, which is the origin of the places: (n, n) by y, x.
+
+    A cell with an obstacle is `OCCUPIED`. One with a ground return is `FREE`, and so is one
+    between the nearest and the farthest ground return of its direction, before the nearest
+    obstacle and within `reach`, (DIRECTIONS,) [m]. All others are `UNKNOWN`.
+    """
+    n_cells = math.ceil(grid_size / cell_size - 1e-6)
+    state = np.full((n_cells, n_cells), UNKNOWN, dtype=np.int8)
+    direction, r = _cell_centres(n_cells, cell_size)
+    nearest, farthest = ranges_of(*ground)
+    until = np.minimum(np.minimum(farthest, ranges_of(*obstacles)[0]), reach)
+    state[(r >= nearest[direction]) & (r <= until[direction])] = FREE
+    for places, value in ((ground, FREE), (obstacles, OCCUPIED)):
+        x, y = (along / cell_size + 0.5 * n_cells for along in places)
+        inside = np.flatnonzero((x >= 0.0) & (x < n_cells) & (y >= 0.0) & (y < n_cells))
+        state[y[inside].astype(np.int64), x[inside].astype(np.int64)] = value
+    return state
+
+
+@lru_cache(maxsize=2)
+def _cell_centres(n_cells: int, cell_size: float) -> tuple[npt.NDArray[np.int16], Ranges]:
+    """Direction and range [m] of the middle of every cell from that of the grid, (n, n) each."""
+    along = (np.arange(n_cells) + 0.5 * (1 - n_cells)) * cell_size
+    x, y = np.broadcast_arrays(along, along[:, None])
+    return direction_of(x, y).astype(np.int16), np.hypot(x, y).astype(np.float32)

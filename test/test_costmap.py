@@ -1,0 +1,205 @@
+"""What a costmap takes, against plain loops and the exact obstacles of simulated streets."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.core.errors import PointCloudError
+from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.data import costmap
+from gp_ground_seg.data.costmap import DIRECTIONS, FREE, OCCUPIED, UNKNOWN, Placement
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan
+
+BAND = {'output.min_height': 0.2, 'output.max_height': 2.0}
+
+
+class Segmented(costmap.SegmentedCloud):
+    """Of points instead of a message."""
+
+    points = property(lambda self: self.cloud)
+
+
+def street(sensor='hdl-64e', seed=0, scene='urban', **values):
+    """Simulated scan, and what is published of it."""
+    scan = simulate_scan(SCENES[scene](seed), SENSORS[sensor], np.random.default_rng(seed))
+    config = Config().replace(**{**BAND, **values})
+    xyz = scan.points[:, :3]
+    return scan, Segmented(xyz, GroundSegmenter(config).segment(xyz), config)
+
+
+def occupancy_of(segmented):
+    output = segmented.config.output
+    surface, std = segmented.segmentation.surface, segmented.config.label.ground_tolerance
+    reach = costmap.reach_of_model(surface, segmented.heading, std)
+    places = map(segmented.places, (segmented.is_ground, segmented.is_obstacle))
+    return costmap.occupancy(*places, reach, output.cell_size, output.grid_size)
+
+
+@given(
+    st.integers(0, 400), st.sampled_from([0.01, 0.1, 0.7, 5.0]), st.integers(0, 2**32 - 1),
+    st.sampled_from([np.float32, np.float64]),
+)  # fmt: skip
+def test_the_first_point_of_each_voxel_is_kept(n_points, size, seed, dtype):
+    rng = np.random.default_rng(seed)
+    xyz = rng.normal(0.0, rng.choice([0.05, 1.0, 30.0]), (n_points, 3)).astype(dtype)
+    seen, expected = set(), []
+    for point in xyz:
+        voxel = tuple(np.floor(point / size))
+        expected.append(voxel not in seen)
+        seen.add(voxel)
+    assert costmap.first_of_voxels(xyz, size).tolist() == expected
+
+
+def test_far_points_share_the_last_voxel_and_none_is_lost_without_a_size():
+    xyz = np.array([[3e38, 0.0, 0.0], [2e38, 0.0, 0.0], [-2e38, 0.0, 0.0]], np.float32)
+    assert costmap.first_of_voxels(xyz, 0.1).tolist() == [True, False, True]
+    assert costmap.first_of_voxels(xyz, 0.0).all()
+
+
+def direction_by_hand(x, y):
+    return int((math.atan2(y, x) + math.pi) // (2.0 * math.pi / DIRECTIONS)) % DIRECTIONS
+
+
+def test_ranges_are_those_of_the_nearest_obstacle():
+    rng = np.random.default_rng(0)
+    obstacles, ground = rng.normal(0.0, 5.0, (2, 300)), rng.normal(0.0, 5.0, (2, 300))
+    expected = np.full(DIRECTIONS, np.nan)
+    for x, y in np.hstack([obstacles, ground]).T:
+        expected[direction_by_hand(x, y)] = np.inf
+    for x, y in obstacles.T:
+        direction = direction_by_hand(x, y)
+        expected[direction] = min(expected[direction], math.hypot(x, y))
+    returns = tuple(np.hstack([obstacles, ground]))
+    np.testing.assert_allclose(costmap.scan_ranges(tuple(obstacles), returns), expected, rtol=1e-6)
+    assert np.isnan(expected).any() and np.isinf(expected).any()
+
+
+def test_cells_are_free_where_ground_was_seen_and_before_obstacles():
+    """One ray of returns along x: ground at 3 and 9 m, an obstacle at 6 m."""
+    ground = np.array([3.05, 9.05, 0.0]), np.array([0.02, 0.02, 4.0])
+    obstacles = np.array([6.05]), np.array([0.02])
+    reach = np.full(DIRECTIONS, 100.0, np.float32)
+
+    def row(reach, obstacles=obstacles):
+        state = costmap.occupancy(ground, obstacles, reach, 0.1, 20.0)
+        assert state.shape == (200, 200)
+        assert state[140, 100] == FREE  # (0, 4)
+        return state[100, 100:]  # cells of y from 0 to 0.1, x from 0 on
+
+    state = row(reach)
+    # No direction has its middle in the row's nearest cells: (x, 0.05) is in that of y > 0.0044 x.
+    assert (state[:30] == UNKNOWN).all()
+    assert state[60] == OCCUPIED and state[90] == FREE
+    assert (state[91:] == UNKNOWN).all() and (state[61:90] == UNKNOWN).all()
+    beyond = row(reach, (np.empty(0), np.empty(0)))
+    assert (beyond[30:] == UNKNOWN).sum() < (state[30:] == UNKNOWN).sum()
+    assert (row(0.0 * reach)[31:60] == UNKNOWN).all()
+
+
+def test_places_beyond_the_grid_or_beyond_all_numbers_are_no_cells():
+    far = np.array([3e38, -20.01, 19.99], np.float32), np.zeros(3, np.float32)
+    state = costmap.occupancy(far, far, np.zeros(DIRECTIONS, np.float32), 0.1, 40.0)
+    assert (state != UNKNOWN).sum() == 1
+
+
+@pytest.mark.parametrize('scene', ['urban', 'car_park'])
+@pytest.mark.parametrize('sensor', ['hdl-64e', 'os1-128'])
+@pytest.mark.parametrize('seed', [0, 7])
+def test_nothing_that_stands_is_missing_and_ground_is_no_obstacle(scene, sensor, seed):
+    """Of the simulated street, within the grid: things of 0.3 to 2 m over its exact ground."""
+    scan, segmented = street(sensor, seed, scene)
+    state = occupancy_of(segmented)
+    xyz = segmented.points.astype(np.float64)
+    height, r = xyz[:, 2] - scan.ground_z, np.hypot(xyz[:, 0], xyz[:, 1])
+    near = (r < 19.8) & (scan.kind != Kind.REFLECTION)
+    stands = near & ~scan.is_ground & (height >= 0.3) & (height < 2.0)
+    cell = tuple(np.floor(xyz[:, [1, 0]] / 0.1).astype(int).T + 200)
+
+    def cells_of(chosen):
+        count = np.zeros(state.shape, int)
+        np.add.at(count, tuple(axis[chosen] for axis in cell), 1)
+        return count
+
+    n_returns = cells_of(stands)
+    missing = (n_returns > 0) & (state != OCCUPIED)
+    assert missing.sum() <= 0.002 * np.count_nonzero(n_returns)
+    things, n_things = ndimage.label(n_returns > 0, np.ones((3, 3)))
+    numbers = np.arange(1, n_things + 1)
+    found = ndimage.maximum(state, things, numbers) == OCCUPIED
+    assert n_things > 10
+    assert found[ndimage.sum(n_returns, things, numbers) >= 3].all()
+    # What is ground and nothing else.
+    is_free = (cells_of(near & scan.is_ground) > 0) & (cells_of(~scan.is_ground & (r < 20.0)) == 0)
+    assert is_free.sum() > 5000
+    assert np.count_nonzero(is_free & (state == OCCUPIED)) <= 0.01 * is_free.sum()
+    # The same of the scan: no thing is nearer than it says, and ground stops few directions.
+    direction = costmap.direction_of(xyz[:, 0], xyz[:, 1])
+    truth = np.full((2, DIRECTIONS), np.inf)
+    np.minimum.at(truth[0], direction[stands], r[stands])
+    np.minimum.at(truth[1], direction[~scan.is_ground], r[~scan.is_ground])
+    scanned = costmap.scan_ranges(
+        segmented.places(segmented.is_obstacle), tuple(segmented.points.T[:2])
+    )
+    assert np.isfinite(scanned[np.isfinite(truth[0])]).mean() >= 0.998
+    assert (scanned[np.isfinite(truth[0])] <= truth[0][np.isfinite(truth[0])] + 0.1).mean() > 0.99
+    # But for kerbs, 0.15 m high, and ground at the foot of walls, where there is no model.
+    assert (scanned < np.minimum(truth[1], 20.0) - 0.1).sum() <= 0.05 * DIRECTIONS
+
+
+def test_heights_and_range_choose_and_unknown_heights_stay():
+    _, every = street(**{'output.min_height': -100.0, 'output.max_height': 100.0})
+    label, height = every.segmentation.label, every.segmentation.labelled.height
+    np.testing.assert_array_equal(every.is_obstacle, label == Label.OBSTACLE)
+    np.testing.assert_array_equal(every.is_ground, label == Label.GROUND)
+    _, some = street(**{'output.max_range': 30.0})
+    is_near = np.hypot(*some.points.T[:2]) <= 30.0
+    kept = (label == Label.OBSTACLE) & ((height >= 0.2) & (height <= 2.0) | np.isnan(height))
+    np.testing.assert_array_equal(some.is_obstacle, kept & is_near)
+    np.testing.assert_array_equal(some.is_ground, (label == Label.GROUND) & is_near)
+    assert np.isnan(height[some.is_obstacle]).any()
+    thin = some.thinned(some.is_obstacle, 0.3)
+    expected = costmap.first_of_voxels(some.points[some.is_obstacle], 0.3)
+    np.testing.assert_array_equal(thin[some.is_obstacle], expected)
+    assert not thin[~some.is_obstacle].any() and thin.sum() < 0.8 * some.is_obstacle.sum()
+
+
+@pytest.mark.parametrize('yaw', [0.0, 2.0])
+def test_a_map_is_upright_whatever_the_tilt_of_the_cloud(yaw):
+    """Verticals through the points meet z = 0 of the cloud; an output frame is taken as level."""
+    _, level = street()
+    tilt = {'sensor.roll': 0.2, 'sensor.pitch': -0.3}
+    config, matrix = level.config.replace(**tilt), rotation(0.2, -0.3)
+    xyz = level.points @ matrix.astype(np.float32)
+    segmentation = GroundSegmenter(config).segment(xyz)
+    every = np.ones(len(xyz), bool)
+    tilted = Segmented(xyz, segmentation, config)
+    x, y = tilted.places(every)
+    upright = np.stack([x, y, 0.0 * x], axis=-1) @ matrix.T
+    np.testing.assert_allclose(upright[:, :2], level.points[:, :2], atol=1e-3)
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    placed = Segmented(
+        xyz, segmentation, config, Placement(turn @ matrix, np.array([3.0, 4.0, 5.0]))
+    )
+    x, y = placed.places(every)
+    np.testing.assert_allclose(np.stack([x, y]), turn[:2, :2] @ level.points[:, :2].T, atol=1e-3)
+    np.testing.assert_allclose(placed.heading, turn[:2, :2].T, atol=1e-12)
+    assert placed.offset == (3.0, 4.0)
+    # The same cells, turned; the corners of the square see other parts of the street.
+    known, found = occupancy_of(level), occupancy_of(placed)
+    for value in (FREE, OCCUPIED):
+        assert (found == value).sum() == pytest.approx((known == value).sum(), rel=0.2)
+
+
+def test_a_plane_on_edge_is_no_map():
+    config = Config().replace(**{'sensor.roll': 1.55, 'sensor.pitch': 0.0})
+    _, level = street()
+    xyz = level.points @ rotation(1.55, 0.0).astype(np.float32)
+    segmented = Segmented(xyz, GroundSegmenter(config).segment(xyz), config)
+    with pytest.raises(PointCloudError, match=r'output\.frame must be a level frame'):
+        segmented.places(segmented.is_obstacle)
