@@ -22,16 +22,16 @@ SENSORS = {
 
 def generate_launch_description():
     """Return one group per sensor, so that the arguments of one are not those of the other."""
-    description = LaunchDescription()
+    actions = []
     for sensor, arguments in SENSORS.items():
         # front_topic, front_params, rear_topic, rear_params
         for name, value in arguments.items():
-            description.add_action(DeclareLaunchArgument(f'{sensor}_{name}', default_value=value))
+            actions.append(DeclareLaunchArgument(f'{sensor}_{name}', default_value=value))
         # A bag is played once: beside this file.
         given = {name: LaunchConfiguration(f'{sensor}_{name}') for name in arguments}
         node = IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(NODE)),
             launch_arguments={'namespace': sensor, 'bag': '', **given}.items(),
         )
-        description.add_action(GroupAction([node]))
-    return description
+        actions.append(GroupAction([node]))
+    return LaunchDescription(actions)

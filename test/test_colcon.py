@@ -88,7 +88,8 @@ def test_the_installed_node_runs_as_ros2_run_starts_it(workspace, tmp_path):
     prefix = workspace / 'install' / PACKAGE
     executable = prefix / 'lib' / PACKAGE / EXECUTABLE
     assert os.access(executable, os.X_OK)
-    assert os.access(executable.with_name('gp-ground-seg'), os.X_OK)
+    for other in ('gp-ground-seg', 'ground_segmentation_lifecycle_node'):
+        assert os.access(executable.with_name(other), os.X_OK)
     words = [
         '--ros-args', '-r', f'__ns:={NAMESPACE}', '-p', 'learning.mode:=fixed',
         '--params-file', prefix / 'share' / PACKAGE / 'config' / 'paper.yaml',

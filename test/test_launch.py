@@ -103,9 +103,11 @@ def test_launch_ends_with_the_node_and_its_code(ros2_launch):
 STAND_IN = {
     'launch': ['LaunchDescription'],
     'launch.actions': [
-        'DeclareLaunchArgument', 'ExecuteProcess', 'LogInfo', 'OpaqueFunction', 'Shutdown',
-        'TimerAction',
+        'DeclareLaunchArgument', 'ExecuteProcess', 'GroupAction', 'IncludeLaunchDescription',
+        'LogInfo', 'OpaqueFunction', 'Shutdown', 'TimerAction',
     ],
+    'launch.launch_description_sources': ['PythonLaunchDescriptionSource'],
+    'launch.substitutions': ['LaunchConfiguration'],
     'launch_ros.actions': ['Node'],
 }  # fmt: skip
 
@@ -123,19 +125,20 @@ def actions(monkeypatch, tmp_path):
     index.mkdir(parents=True)
     (index / 'gp_ground_seg').touch()
     (tmp_path / 'share' / 'gp_ground_seg').symlink_to(REPOSITORY)
-    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
     for module, names in STAND_IN.items():
         monkeypatch.setitem(sys.modules, module, ModuleType(module))
         for name in names:
             setattr(sys.modules[module], name, type(name, (Recorded,), {}))
 
     def actions(*words):
-        script = load_script('launch/ground_segmentation.launch.py')
-        given = dict(word.split(':=', 1) for word in words)
-        values = {name: default for name, default, _ in script.ARGUMENTS} | given
-        context = SimpleNamespace(launch_configurations=values)
-        *_, function = script.generate_launch_description().args[0]
-        found = function.options['function'](context)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+            script = load_script('launch/ground_segmentation.launch.py')
+            given = dict(word.split(':=', 1) for word in words)
+            values = {name: default for name, default, _ in script.ARGUMENTS} | given
+            context = SimpleNamespace(launch_configurations=values)
+            *_, function = script.generate_launch_description().args[0]
+            found = function.options['function'](context)
         return [(type(action).__name__, action.options) for action in found]
 
     actions.index = index
@@ -226,3 +229,14 @@ def test_rviz_follows_the_topics_and_a_bag_gives_the_time(actions):
         ('/ground', '/free'), ('/obstacles', '/front/obstacles'),
         *((f'{plain}/{name}', f'/front/cutter/{name}') for name in optional),
     ]  # fmt: skip
+
+
+def test_two_sensors_have_topics_and_parameters_as_arguments(actions):
+    description = load_script('launch/two_sensors.launch.py').generate_launch_description()
+    *front, group, _, _, _ = description.args[0]
+    assert {one.args[0]: one.options['default_value'] for one in front} == {
+        'front_topic': '/lidar_front/points', 'front_params': '{sensor.height: 1.2}'
+    }  # fmt: skip
+    (node,) = group.args[0]
+    given = dict(node.options['launch_arguments'])
+    assert (given['namespace'], given['topic'].args) == ('front', ('front_topic',))
