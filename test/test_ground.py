@@ -110,6 +110,25 @@ def test_noise_free_candidates_are_interpolated_with_no_uncertainty(backend):
     np.testing.assert_allclose(surface.std[m, :-1], 0.0, atol=1e-4)
 
 
+def test_rounding_beside_little_noise_is_no_fault(backend):
+    config = config_of('constant', slope_std=2.0).replace(
+        **{
+            'length_scale.constant': 30.0,
+            'observation.sigma_f': 10.0,
+            'grid.r_max': 500.0,
+            'faces.cell_size': 1.0,
+        }
+    )
+    r = np.arange(3.0, 499.0)
+    frame = frame_of(np.column_stack([r, 0.01 * r, np.full_like(r, -1.73)]), config)
+    theta = theta_of(config)
+    theta[:, 1] = np.log(1e-5)
+    surface, *_ = backend.estimate_surface(frame, theta, config)
+    m = frame.candidates.segment[0]
+    assert surface.inlier.all()
+    np.testing.assert_allclose(surface.mean[m], -1.73, atol=1e-3)
+
+
 def grow_line(backend, z, r=None, continues=(), slope_std=0.05, **bounds):
     """Inliers, knots, mean and std of one segment; up to 5.5 m low candidates are seeds."""
     r = np.arange(3.0, 3.0 + len(z)) if r is None else np.asarray(r, dtype=float)

@@ -17,7 +17,7 @@ from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.compiled.threads import Part
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
-from gp_ground_seg.core.gp.ground import fits, noise_in_doubt
+from gp_ground_seg.core.gp.ground import fits, noise_in_doubt, observed_noise
 from gp_ground_seg.core.gp.kernels import exp_neg, paciorek
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
@@ -303,7 +303,8 @@ def _observe(
             row[j] -= w_0 * row_0[j]
         k += 1
     height, variance = columns.height, columns.variance
-    scale = 1.0 / math.sqrt(variance[i] + columns.noise[i])
+    noise = observed_noise(columns.noise[i], sill + slope * r_i * r_i)
+    scale = 1.0 / math.sqrt(variance[i] + noise)
     innovation = (columns.z[i] - height[i]) * scale
     for j in range(start, end):
         value = row[j] * scale

@@ -77,7 +77,15 @@ def estimate_surface(
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
     alone = SegmentSurfaces.empty(len(z), knot_u.shape)
-    model = _Model(frame, theta, z, np.exp(u), np.exp(knot_u), seeds(frame, theta, config))
+    model = _Model(
+        frame,
+        theta,
+        z,
+        np.exp(u),
+        np.exp(knot_u),
+        seeds(frame, theta, config),
+        frame.continues_line,
+    )
     everywhere = np.arange(len(theta))
     looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
     prior = prior_variance(np.exp(theta[:, :1]) ** 2, slope_std, knots)
@@ -102,6 +110,10 @@ ODDS, ODDS_IN_FACE = 0.25, 4.0
 """Obstacles for each ground among the candidates, and among those in vertical faces."""
 MOST_DOUBT = 30.0
 """Logarithm of odds that are as good as infinite."""
+
+
+ROUNDING = 1e-12
+"""Least noise of what is observed, in parts of the prior variance."""
 
 
 class SegmentSurfaces(NamedTuple):
@@ -129,6 +141,7 @@ class _Model(NamedTuple):
     length_scale: FloatArray  # (C,) at the candidates [m]
     knot_length_scale: FloatArray  # (M, K) at the knots [m]
     seed: BoolArray  # (C,) candidates that start the inlier set
+    continues_line: BoolArray  # (C,) candidates that join if the one before them has joined
 
 
 @shared
@@ -140,6 +153,15 @@ def fits(
     limit = choose(residual > 0.0, growth.max_standardised_residual, growth.max_standardised_depth)
     is_near = residual * residual <= limit * limit * (variance + noise)
     return (variance <= growth.max_std * growth.max_std) & is_near
+
+
+@shared
+def observed_noise(noise: Values, prior: Values) -> Values:
+    """Variance of the noise, or of the rounding of the covariance where that is larger [m^2].
+
+    Else the variance of an observation may be negative; `prior` is the variance before any.
+    """
+    return np.maximum(noise, ROUNDING * prior)
 
 
 @shared
@@ -165,7 +187,11 @@ def _grow_segments(
 ) -> None:
     """Inliers and surface of `segments`, into `alone`; `aside` is the evidence at candidates."""
     alone.mean[segments] = alone.std[segments] = np.nan
-    offsets = model.frame.candidates.offsets
+    offsets, segment = model.frame.candidates.offsets, model.frame.candidates.segment
+    is_below = ~contradicts(*aside, model.z, np.exp(2.0 * model.theta[segment, 1]))
+    model = model._replace(
+        seed=model.seed & is_below, continues_line=model.continues_line & is_below
+    )
     size = offsets[segments + 1] - offsets[segments]
     for batch in batches(np.concatenate([[0], np.cumsum(size)])):
         _grow_batch(segments[batch], model, aside, config, alone)
@@ -176,58 +202,43 @@ def _grow_batch(
 ) -> None:
     frame, theta, slope_std = model.frame, model.theta[segments], config.observation.slope_std
     layout = Padded.of(segments, frame.candidates.offsets)
-    sill, noise = np.exp(theta[:, :2]).T ** 2
-    places = layout.take(frame.candidates.r), layout.take(model.length_scale, 1.0)
-    noise_of_each = np.exp(2.0 * model.theta[frame.candidates.segment, 1])
-    above = contradicts(*aside, model.z, noise_of_each)
+    sill, noise = np.exp(theta[:, :2]).T[:, :, None] ** 2
+    is_wanted = np.isfinite(model.knot_length_scale[segments])
+    n_knots = int(is_wanted.sum(axis=1).max())
+    is_wanted = is_wanted[:, :n_knots]
+    knots = np.broadcast_to(frame.knots[:n_knots], is_wanted.shape)
+    knot_l = np.where(is_wanted, model.knot_length_scale[segments, :n_knots], 1.0)
     batch = _Batch(
-        _covariance(places, places, sill, slope_std),
+        np.concatenate([layout.take(frame.candidates.r), knots], axis=1),
+        np.concatenate([layout.take(model.length_scale, 1.0), knot_l], axis=1),
+        sill,
+        slope_std,
         layout.take(model.z),
-        np.repeat(noise[:, None], layout.mask.shape[1], axis=1),
+        np.repeat(noise, layout.mask.shape[1], axis=1),
         layout.mask,
-        (model.seed & ~above)[layout.place] & layout.mask,
-        (frame.continues_line & ~above)[layout.place] & layout.mask,
+        model.seed[layout.place] & layout.mask,
+        model.continues_line[layout.place] & layout.mask,
         frame.in_face[layout.place],
         Evidence(layout.take(aside.height), layout.take(aside.precision)),
     )
-    chosen = _grow(batch, config.growth, doubts=config.label.rule == 'predictive')
-    alone.inlier[layout.place[layout.mask]] = chosen[layout.mask]
-    grown = chosen.any(axis=1)
-    if len(frame.knots) == 0 or not grown.any():
-        return
-    kept, chosen, sill = segments[grown], chosen[grown], sill[grown]
-    is_wanted = np.isfinite(model.knot_length_scale[kept])
-    wanted_l = np.where(is_wanted, model.knot_length_scale[kept], 1.0)
-    at_knots = np.broadcast_to(frame.knots, wanted_l.shape), wanted_l
-    cross = _covariance((places[0][grown], places[1][grown]), at_knots, sill, slope_std)
-    mean, change = _predict(
-        add_noise(batch.covariance[grown], batch.noise[grown], chosen),
-        cross * chosen[:, :, None],
-        batch.z[grown] * chosen,
+    chosen, height, variance = _grow(
+        batch, config.growth, doubts=config.label.rule == 'predictive'
     )
-    variance = change + prior_variance(sill[:, None], slope_std, frame.knots)
-    alone.mean[kept] = np.where(is_wanted, mean, np.nan)
-    alone.std[kept] = np.where(is_wanted, np.sqrt(np.maximum(variance, 0.0)), np.nan)
-
-
-def _covariance(
-    a: tuple[FloatArray, FloatArray],
-    b: tuple[FloatArray, FloatArray],
-    sill: FloatArray,
-    slope_std: float,
-) -> FloatArray:
-    """Prior covariance of ranges and length-scales (S, A) with others (S, B), (S, A, B)."""
-    r_a, l_a = (values[:, :, None] for values in a)
-    r_b, l_b = (values[:, None, :] for values in b)
-    result: FloatArray = paciorek(r_a, l_a, r_b, l_b, sill[:, None, None])
-    result += slope_std**2 * r_a * r_b
-    return result
+    alone.inlier[layout.place[layout.mask]] = chosen[layout.mask]
+    is_known = is_wanted & chosen.any(axis=1, keepdims=True)
+    n = chosen.shape[1]
+    std = np.sqrt(np.maximum(variance[:, n:], 0.0))
+    alone.mean[segments, :n_knots] = np.where(is_known, height[:, n:], np.nan)
+    alone.std[segments, :n_knots] = np.where(is_known, std, np.nan)
 
 
 class _Batch(NamedTuple):
-    """Candidates of S segments, padded to n."""
+    """Candidates of S segments, padded to n, and the knots behind them: N places in all."""
 
-    covariance: FloatArray  # (S, n, n) prior
+    r: FloatArray  # (S, N)
+    length_scale: FloatArray  # (S, N)
+    sill: FloatArray  # (S, 1)
+    slope_std: float
     z: FloatArray  # (S, n) about the prior mean
     noise: FloatArray  # (S, n) variance; grows where a candidate joins in doubt
     mask: BoolArray  # (S, n)
@@ -237,43 +248,37 @@ class _Batch(NamedTuple):
     aside: Evidence  # (S, n)
 
 
-def _predict(
-    covariance: FloatArray, cross: FloatArray, z: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Posterior mean, and the (negative) change of the prior variance by the data."""
-    solution = np.linalg.solve(covariance, np.concatenate([cross, z[:, :, None]], axis=2))
-    mean = np.matmul(z[:, None, :], solution[:, :, :-1])[:, 0]
-    return mean, -np.einsum('sik,sik->sk', cross, solution[:, :, :-1])
-
-
 @np.errstate(over='ignore')  # the square of 1e200 m: no fit
-def _grow(batch: _Batch, growth: GrowthConfig, *, doubts: bool) -> BoolArray:
-    """Inliers of each segment, (S, n); with `doubts` their noise is set, see `noise_in_doubt`.
+def _grow(
+    batch: _Batch, growth: GrowthConfig, *, doubts: bool
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    """Inliers of each segment, (S, n), and height and variance at all places, (S, N).
 
-    Candidates that join in a round are conditioned on at once: the covariance of all
-    candidates given the inliers shrinks by one product, and nothing is factored twice.
+    With `doubts` the noise of the inliers is set, see `noise_in_doubt`. Candidates that join in a
+    round are conditioned on at once: their rows of ``L^-1 K(inliers, all places)`` are appended to
+    those of the rounds before, and nothing is factored twice.
     """
+    n_segments, n = batch.seed.shape
     chosen = np.zeros_like(batch.seed)
-    # Segments that still grow, and their state.
-    active, joining = np.arange(len(chosen)), batch.seed
-    covariance, height = batch.covariance, np.zeros(joining.shape)
+    height, variance = np.zeros_like(batch.r), prior_variance(batch.sill, batch.slope_std, batch.r)
+    # Segments that still grow, and the whitened rows of their inliers.
+    active, joining = np.arange(n_segments), batch.seed
+    whitened = np.empty((n_segments, 0, variance.shape[1]))
     if doubts:
-        prior = np.diagonal(covariance, axis1=1, axis2=2)
         doubtful = noise_in_doubt(
-            batch.z, *combined(height, prior, *batch.aside), batch.noise, True
+            batch.z, *combined(0.0, variance[:, :n], *batch.aside), batch.noise, True
         )
         batch.noise[:] = np.where(joining & batch.in_face, doubtful, batch.noise)
     while len(active):
         chosen[active] |= joining
-        z, noise = batch.z[active], batch.noise[active]
         if joining.any():
-            height, covariance = _condition(covariance, height, z, noise, joining)
-        variance = np.diagonal(covariance, axis1=1, axis2=2)
+            whitened = _condition(batch, active, joining, whitened, height, variance)
+        z, noise = batch.z[active], batch.noise[active]
         aside = Evidence(*(values[active] for values in batch.aside))
         following = batch.continues_line[active]
         following[:, 1:] &= chosen[active, :-1]
         following[:, 0] = False
-        predicted = combined(height, variance, *aside)
+        predicted = combined(height[active, :n], variance[active, :n], *aside)
         joining = fits(z, *predicted, noise, growth) | following
         joining &= ~chosen[active] & batch.mask[active]
         # Before anything has joined, only evidence from aside decides.
@@ -282,24 +287,47 @@ def _grow(batch: _Batch, growth: GrowthConfig, *, doubts: bool) -> BoolArray:
             doubtful = noise_in_doubt(z, *predicted, noise, batch.in_face[active])
             batch.noise[active] = np.where(joining & ~following, doubtful, noise)
         grows = joining.any(axis=1)
-        active, joining = active[grows], joining[grows]
-        covariance, height = covariance[grows], height[grows]
-    return chosen
+        active, joining, whitened = active[grows], joining[grows], whitened[grows]
+    return chosen, height, variance
+
+
+def _prior_rows(batch: _Batch, segment: IntArray, place: IntArray) -> FloatArray:
+    """Prior covariance of places (P,), of segments (P,), with all places, (P, N)."""
+    r, length_scale = batch.r[segment], batch.length_scale[segment]
+    own_r, own_l = batch.r[segment, place][:, None], batch.length_scale[segment, place][:, None]
+    rows: FloatArray = paciorek(own_r, own_l, r, length_scale, batch.sill[segment])
+    rows += batch.slope_std**2 * own_r * r
+    return rows
 
 
 def _condition(
-    covariance: FloatArray, height: FloatArray, z: FloatArray, noise: FloatArray, new: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Height and covariance of the candidates after observing those that are `new`."""
+    batch: _Batch,
+    active: IntArray,
+    new: BoolArray,
+    whitened: FloatArray,
+    height: FloatArray,
+    variance: FloatArray,
+) -> FloatArray:
+    """Change height and variance of segments by observing those that are `new`.
+
+    Returns their rows, (A, m + n_new, N), behind those `whitened`, (A, m, N).
+    """
     # Places of the new ones, first in each row; the rest is padding.
-    n_new = int(new.sum(axis=1).max())
+    n_new, segment = int(new.sum(axis=1).max()), active[:, None]
     place = np.argsort(~new, axis=1, kind='stable')[:, :n_new]
     is_new = np.take_along_axis(new, place, axis=1)
-    rows = np.take_along_axis(covariance, place[:, :, None], axis=1) * is_new[:, :, None]
+    which, rank = np.nonzero(is_new)
+    rows = np.zeros((*place.shape, batch.r.shape[1]))
+    rows[which, rank] = _prior_rows(batch, active[which], place[which, rank])
+    rows -= np.matmul(whitened[np.arange(len(new))[:, None], :, place], whitened)
+    rows *= is_new[:, :, None]
     within = np.take_along_axis(rows, place[:, None, :], axis=2)
-    add_noise(within, np.take_along_axis(noise, place, axis=1), is_new)
-    innovation = np.take_along_axis(z - height, place, axis=1) * is_new
-    gain = np.linalg.solve(within, np.concatenate([rows, innovation[:, :, None]], axis=2))
-    columns = np.swapaxes(rows, 1, 2)
-    height = height + np.matmul(columns, gain[:, :, -1:])[:, :, 0]
-    return height, covariance - np.matmul(columns, gain[:, :, :-1])
+    prior = prior_variance(batch.sill[active], batch.slope_std, batch.r[segment, place])
+    add_noise(within, observed_noise(batch.noise[segment, place], prior), is_new)
+    unit = np.linalg.inv(np.linalg.cholesky(within))
+    rows = np.matmul(unit, rows)
+    innovation = (batch.z[segment, place] - height[segment, place]) * is_new
+    innovation = np.matmul(unit, innovation[:, :, None])
+    height[active] += np.matmul(innovation.swapaxes(1, 2), rows)[:, 0]
+    variance[active] -= np.einsum('sij,sij->sj', rows, rows)
+    return np.concatenate([whitened, rows], axis=1)
