@@ -19,6 +19,7 @@ from gp_ground_seg.core.frame import (
     PolarGrid,
     Scan,
     Values,
+    at_points,
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
@@ -36,7 +37,7 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
     z = scan.xyz[:, 2].astype(np.float64)
-    height = z - surface.at(grid)[0]
+    height = z - at_points(surface.knots, surface.mean, grid)
     tile, inside = np.maximum(tiles.tile, 0), grid.inside
     in_face = faces.is_face[tile] & inside
     n_near, squares, n_obstacles = _returns_about(height, grid, in_face, label)
