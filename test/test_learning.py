@@ -5,7 +5,7 @@ import pytest
 import reference
 from conftest import fewer, hilly_scan
 
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import Frame, Inliers
@@ -162,6 +162,31 @@ def test_space_follows_the_configuration(changes, n_free):
     assert space.centre[5] == 0.0
 
 
+@pytest.mark.parametrize(
+    ('changes', 'least'),
+    [
+        ({}, [0.35, 0.05]),
+        ({'growth.max_std': 0.2, 'label.ground_tolerance': 0.3}, [0.2, 0.15]),
+        ({'growth.max_std': 10.0, 'label.ground_tolerance': 0.03}, [0.45, 0.015]),
+        # A tight prior wins.
+        ({'observation.sigma_n': 0.01, 'learning.prior_std': 0.02}, [0.33154, 0.011052]),
+        ({'learning.objective': 'paper'}, [0.3 * np.exp(-5.0), 0.05 * np.exp(-5.0)]),
+    ],
+)
+def test_what_is_learned_is_not_below_what_gate_and_labels_take(changes, least):
+    space = theta_space(Config().replace(**changes))
+    np.testing.assert_allclose(np.exp(space.lower[:2]), least, rtol=1e-4)
+    assert (space.lower <= space.upper).all()
+
+
+def test_flat_ground_without_noise_is_ground_and_keeps_a_noise():
+    azimuth, r = np.meshgrid(np.linspace(-3.1, 3.1, 300), np.geomspace(2.5, 60.0, 40))
+    xyz = [r * np.cos(azimuth), r * np.sin(azimuth), np.full_like(r, -1.73)]
+    found = GroundSegmenter(backend=MODEL).segment(np.stack(xyz, axis=-1).reshape(-1, 3))
+    assert found.fit.theta['sigma_n'] == pytest.approx(0.05)
+    assert (found.label == Label.GROUND).all()
+
+
 N_POINTS = fewer(4000, 400)
 
 
@@ -245,6 +270,7 @@ def test_a_warm_start_needs_fewer_evaluations_on_the_same_scan():
 
 def test_learning_ends_when_its_time_is_up():
     ticks = iter(range(10_000))
-    config = Config().replace(**{'learning.max_time': 1.0, 'learning.max_evaluations': 200})
+    changes = {'learning.max_time': 1.0, 'learning.max_evaluations': 200, 'learning.fixed': 'none'}
+    config = Config().replace(**changes)
     segmenter = GroundSegmenter(config, clock=lambda: 0.4 * next(ticks), backend=MODEL)
     assert segmenter.segment(hilly_scan(N_POINTS)).fit.n_evaluations == 3

@@ -69,8 +69,15 @@ def given_theta(config: Config) -> FloatArray:
 
 
 def theta_space(config: Config) -> ThetaSpace:
-    """Bounds, priors and free entries by the configuration."""
-    learning, centre = config.learning, given_theta(config)
+    """Bounds, priors and free entries by the configuration.
+
+    Inliers are survivors of the gate, so what is learned from them is too small, lets fewer join,
+    and confirms itself. Two lower bounds end this. With a sigma_f below ``growth.max_std`` the
+    prior alone would decide candidates where nothing is seen. With a sigma_n below half of
+    ``label.ground_tolerance`` the gate would refuse what is ground in any case. The objective as
+    printed has neither.
+    """
+    learning, centre, growth = config.learning, given_theta(config), config.growth
     width = WIDEST * learning.prior_std
     free = np.ones(len(centre), dtype=np.bool_)
     if config.length_scale.model != 'latent' or learning.fixed == 'length_scales':
@@ -79,7 +86,12 @@ def theta_space(config: Config) -> ThetaSpace:
         free[2:5] = False
     elif learning.fixed == 'sigma_f_bar':
         free[2] = False
-    return ThetaSpace(centre, centre - width, centre + width, free, learning.prior_std)
+    lower, upper = centre - width, centre + width
+    if learning.objective == 'map':
+        least_f = min(growth.max_std, growth.seed_height_tolerance)
+        least = np.log([least_f, 0.5 * config.label.ground_tolerance])
+        lower[:2] = np.minimum(np.maximum(lower[:2], least), upper[:2])
+    return ThetaSpace(centre, lower, upper, free, learning.prior_std)
 
 
 def first_theta(frame: Frame, config: Config) -> FloatArray:
