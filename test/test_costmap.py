@@ -102,9 +102,10 @@ def test_cells_are_free_where_ground_was_seen_and_before_obstacles():
 
 
 def test_places_beyond_the_grid_or_beyond_all_numbers_are_no_cells():
-    far = np.array([3e38, -20.01, 19.99], np.float32), np.zeros(3, np.float32)
+    far = np.array([3e38, -20.01, np.nan, np.inf, 19.99], np.float32), np.zeros(5, np.float32)
     state = costmap.occupancy(far, far, np.zeros(DIRECTIONS, np.float32), 0.1, 40.0)
     assert (state != UNKNOWN).sum() == 1
+    assert np.nanmin(costmap.scan_ranges(far, far)) == np.float32(19.99)
 
 
 @pytest.mark.parametrize('scene', ['urban', 'car_park'])

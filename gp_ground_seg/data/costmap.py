@@ -19,7 +19,6 @@ from gp_ground_seg.core.frame import (
     BoolArray,
     FloatArray,
     GroundSurface,
-    IntArray,
     Label,
     PointArray,
 )
@@ -35,6 +34,7 @@ SMALLEST_VOXEL = 1e-3  # below it every point is kept: no sensor is that precise
 
 _VOXELS = 1 << 20  # of an axis on each side of 0; points beyond belong to the last
 _SLOT_BITS = 18
+_ROWS = 32  # rows of cells at a time: their arrays stay in the cache
 _ODD = 0x9E3779B97F4A7C15  # 2**64 over the golden ratio: spreads keys that differ little
 
 Ranges = npt.NDArray[np.float32]
@@ -183,15 +183,18 @@ def first_of_voxels(xyz: PointArray, size: float) -> BoolArray:
     return is_first
 
 
-@np.errstate(invalid='ignore')
-def direction_of(x: PointArray, y: PointArray) -> IntArray:
-    """Direction of each place seen from the origin, (n,) int64."""
-    turn = np.arctan2(y, x) / (2.0 * math.pi) + 0.5
-    direction: IntArray = (turn * DIRECTIONS).astype(np.int64) % DIRECTIONS
-    return direction
+def direction_of(x: PointArray, y: PointArray) -> npt.NDArray[np.int16]:
+    """Direction of each place seen from the origin, (n,) int16; any of one that is not finite."""
+    # In place, and small: new memory takes longer than the arithmetic.
+    turn = np.arctan2(y, x)
+    turn *= DIRECTIONS / (2.0 * math.pi)
+    turn += 0.5 * DIRECTIONS
+    # These two, unlike clip, make a number of NaN.
+    np.fmin(np.fmax(turn, 0.0, out=turn), DIRECTIONS - 1.0, out=turn)
+    return turn.astype(np.int16)
 
 
-@np.errstate(over='ignore')
+@np.errstate(over='ignore', invalid='ignore')
 def ranges_of(x: PointArray, y: PointArray) -> tuple[Ranges, Ranges]:
     """Range of the nearest and of the farthest place in each direction [m], (DIRECTIONS,) each.
 
@@ -200,8 +203,8 @@ def ranges_of(x: PointArray, y: PointArray) -> tuple[Ranges, Ranges]:
     direction, r = direction_of(x, y), np.sqrt(x * x + y * y).astype(np.float32, copy=False)
     nearest = np.full(DIRECTIONS, np.inf, dtype=np.float32)
     farthest = -nearest
-    np.minimum.at(nearest, direction, r)
-    np.maximum.at(farthest, direction, r)
+    np.fmin.at(nearest, direction, r)
+    np.fmax.at(farthest, direction, r)
     return nearest, farthest
 
 
@@ -247,12 +250,21 @@ def occupancy(
     direction, r = _cell_centres(n_cells, cell_size)
     nearest, farthest = ranges_of(*ground)
     until = np.minimum(np.minimum(farthest, ranges_of(*obstacles)[0]), reach)
-    state[(r >= nearest[direction]) & (r <= until[direction])] = FREE
+    for rows in range(0, n_cells, _ROWS):
+        part = slice(rows, rows + _ROWS)
+        towards = direction[part]
+        is_passed = r[part] >= nearest.take(towards)
+        is_passed &= r[part] <= until.take(towards)
+        state[part][is_passed] = FREE
+    # Places beyond the square fall into a border of one cell.
+    bordered = np.pad(state, 1)
     for places, value in ((ground, FREE), (obstacles, OCCUPIED)):
-        x, y = (along / cell_size + 0.5 * n_cells for along in places)
-        inside = np.flatnonzero((x >= 0.0) & (x < n_cells) & (y >= 0.0) & (y < n_cells))
-        state[y[inside].astype(np.int64), x[inside].astype(np.int64)] = value
-    return state
+        column, row = (
+            np.fmin(np.fmax(along / cell_size + (0.5 * n_cells + 1.0), 0.0), n_cells + 1.0)
+            for along in places
+        )
+        bordered[row.astype(np.int32), column.astype(np.int32)] = value
+    return np.ascontiguousarray(bordered[1:-1, 1:-1])
 
 
 @lru_cache(maxsize=2)
@@ -260,4 +272,4 @@ def _cell_centres(n_cells: int, cell_size: float) -> tuple[npt.NDArray[np.int16]
     """Direction and range [m] of the middle of every cell from that of the grid, (n, n) each."""
     along = (np.arange(n_cells) + 0.5 * (1 - n_cells)) * cell_size
     x, y = np.broadcast_arrays(along, along[:, None])
-    return direction_of(x, y).astype(np.int16), np.hypot(x, y).astype(np.float32)
+    return direction_of(x, y), np.hypot(x, y).astype(np.float32)
