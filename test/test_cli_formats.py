@@ -203,6 +203,7 @@ def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
         (['wide.npy', '-o', 'x.ply'], 'field t: PLY has no type uint64'),
         (['far.npy', '-o', 'x.pcd'], 'm (millimetres? a scan is in'),
         (['none.npy', '-o', 'x.pcd'], 'none of 200 points is finite; --force'),
+        (['empty.npy', '-o', 'x.pcd'], 'no points in it; --force'),
     ],
 )  # fmt: skip
 def test_refused(tmp_path, monkeypatch, capsys, words, message):
@@ -217,6 +218,7 @@ def test_refused(tmp_path, monkeypatch, capsys, words, message):
     )
     np.save('far.npy', 1000.0 * POINTS)
     np.save('none.npy', np.full((200, 3), np.nan))
+    np.save('empty.npy', np.zeros((0, 3)))
     write_bag(tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
     assert run('segment', *words) == 2

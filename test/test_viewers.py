@@ -240,13 +240,23 @@ def test_the_web_viewer_is_served_here_only_and_ends_with_ctrl_c(sequence):
     assert listening(port) == listening(port + 1) == set()
 
 
-def test_a_port_in_use_is_one_line(sequence, capsys):
-    rerun()
+def test_the_next_free_port_is_taken_and_said(caplog):
     port = free_ports()
+    assert html_page.free_port(port, 2) == port and not caplog.messages
     with socket.create_server(('127.0.0.1', port + 1)):
-        assert run('view', sequence, '--web', '--port', port, '--quiet') == 2
-    expected = f'--port {port}: it or the next one is in use; choose another'
-    assert error_line(capsys) == expected
+        assert html_page.free_port(port) == port
+        found = html_page.free_port(port, 2)
+    assert found >= port + 2
+    assert caplog.messages == [f'port {port} is in use: {found} instead']
+    with pytest.raises(DataError, match=r'--port 65536: no free port there'):
+        html_page.free_port(65536)
+
+
+def test_a_page_beside_another_one(sequence):
+    pytest.importorskip('viser', reason='viser is not installed')
+    port = free_ports()
+    with open_server(port) as (_, first), open_server(port) as (_, second):
+        assert f':{port}/' in first and f':{port}/' not in second
 
 
 def listening(port):

@@ -76,7 +76,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--per-frame', 'write the numbers of each frame (.csv, .parquet)', {'metavar': 'FILE'}),
         ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
         ('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
-        ('--peer', 'compare with this method', {'choices': [PATCHWORKPP]}),
+        (
+            '--peer',
+            'compare with this method (pip install pypatchworkpp)',
+            {'choices': [PATCHWORKPP]},
+        ),
         options.MARKDOWN,
         options.TO_JSON,
         options.FORCE,

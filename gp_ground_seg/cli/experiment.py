@@ -29,7 +29,11 @@ EXAMPLES = """\
   gp-ground-seg experiment NAME --help          describes one of them
 """
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
-NO_PEER = ('--no-peer', 'leave Patchwork++ out', options.FLAG)
+NO_PEER = (
+    '--no-peer',
+    'leave Patchwork++ out, which needs pip install pypatchworkpp',
+    options.FLAG,
+)
 
 
 class Experiment(NamedTuple):

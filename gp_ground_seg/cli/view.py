@@ -66,7 +66,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
             ('input', 'scan, folder of scans, sequence or bag', {'metavar': 'INPUT'}),
             ('--labels', 'SemanticKITTI labels of a scan (default: those beside it)', file),
             ('--frame', 'number of one frame, from 0', {'metavar': 'N', 'type': int}),
-            ('--port', 'of the page (default: %(default)s)', {**number, 'default': 9090}),
+            (
+                '--port',
+                'of the page, or the next free one (default: %(default)s)',
+                {**number, 'default': 9090},
+            ),
             *options.CLOUDS,
             options.FORCE,
             options.QUIET,

@@ -114,6 +114,7 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
         options = _options(fastmath)
         if part:
             options['inline'] = 'always'
+        _announce_compiling()
         if not entry:
             inner: _Function = numba.njit(**options)(function)
             return inner
@@ -122,6 +123,28 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
         return compiled
 
     return decorate
+
+
+@functools.cache
+def _announce_compiling() -> None:
+    """Log when numba begins to compile, rather than to load what is kept."""
+    from numba.core import event
+
+    class Announcer(event.Listener):  # type: ignore[misc]  # numba has no types
+        def on_start(self, _event: object) -> None:
+            _log_compiling()
+
+        def on_end(self, _event: object) -> None:
+            pass
+
+    event.register('numba:compile', Announcer())
+
+
+@functools.cache
+def _log_compiling() -> None:
+    # Where nothing can be kept, that was said.
+    if code_folder() is not None:
+        _LOGGER.info('compiling for this processor, which takes 10 to 40 s')
 
 
 def _njit_kept(function: Callable[..., Any], options: dict[str, Any]) -> Any:
@@ -222,8 +245,6 @@ def _delete_damaged(folder: Path) -> None:
         (folder / name).unlink()
     is_whole = bool(kept) and not damaged and found.keys() >= kept.keys() - {'warm'}
     _is_warm = is_whole and kept.get('warm') is True
-    if not is_whole:
-        _LOGGER.info('compiling for this processor, which takes 10 to 40 s')
 
 
 def keep_code(*, warm: bool = False) -> None:

@@ -98,11 +98,9 @@ def check_scan(path: str | AnyPath, xyz: npt.NDArray[np.floating], layout: ScanL
 
 def find_objection(xyz: npt.NDArray[np.floating]) -> str:
     """Return why points (N, 3) can be no scan, or ''."""
-    if not len(xyz):
-        return ''
     finite = xyz[np.isfinite(xyz).all(axis=1)]
     if not len(finite):
-        return f'none of {len(xyz)} points is finite'
+        return f'none of {len(xyz)} points is finite' if len(xyz) else 'no points in it'
     if len(xyz) < _MIN_POINTS:
         return ''
     # Some drivers put rays without a return at the origin.

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import errno
 import html
 import io
 import logging
 import re
 import secrets
+import socket
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,26 @@ _BOX = (
 )
 
 
+def free_port(port: int, n_ports: int = 1) -> int:
+    """Return the first from `port` on that is free with those behind it, `n_ports` in all.
+
+    If it is another one, it is logged. Raises DataError if there is none among a hundred.
+    """
+    for found in range(port, min(port + 100, 65537 - n_ports)):
+        try:
+            with ExitStack() as stack:
+                for k in range(n_ports):
+                    stack.enter_context(socket.create_server((HOST, found + k)))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise DataError(f'--port {found}: {error.strerror}') from error
+            continue
+        if found != port:
+            LOGGER.warning('port %d is in use: %d instead', port, found)
+        return found
+    raise DataError(f'--port {port}: no free port there; choose another, at most 65535')
+
+
 @contextmanager
 def open_server(port: int) -> Iterator[tuple[Any, str]]:
     """Yield viser's server on this machine, and the address of its page; port 0 is any free one.
@@ -42,6 +64,7 @@ def open_server(port: int) -> Iterator[tuple[Any, str]]:
     Who does not know the address gets no answer. It prints nothing.
     """
     viser, token = require('viser', 'viser'), secrets.token_urlsafe()
+    port = port and free_port(port)
     try:
         with redirect_stdout(io.StringIO()), _guarded(token):
             server = viser.ViserServer(host=HOST, port=port, verbose=False)

@@ -15,9 +15,9 @@ from typing import Any
 from gp_ground_seg.core.errors import DataError, require
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.lab.plotting.scan import CAMERA, TARGET
+from gp_ground_seg.lab.viewers.html_page import HOST, free_port
 from gp_ground_seg.lab.viewers.scene import RAMPS, Mesh, Scene
 
-HOST = '127.0.0.1'
 HIDDEN = ('height', 'p_ground', 'errors', 'faces', 'candidates', 'band')
 """Clouds and meshes that are hidden at first."""
 SERIES = {'IoU': 'IoU [%]', 'lost': 'objects lost', 'theta': 'theta', 'latency': 'latency [ms]'}
@@ -131,10 +131,8 @@ def web_viewer(port: int) -> Iterator[tuple[subprocess.Popen[bytes], str, str]]:
     They arrive at the next port.
     """
     require('rerun', 'rerun-sdk')
-    ports = port, port + 1
-    if any(map(_is_listening, ports)):
-        raise DataError(f'--port {port}: it or the next one is in use; choose another')
-    server = _start(f'--serve-web --web-viewer-port {port} --port {port + 1}', *ports)
+    port = free_port(port, 2)
+    server = _start(f'--serve-web --web-viewer-port {port} --port {port + 1}', port, port + 1)
     try:
         source = f'rerun%2Bhttp%3A%2F%2F{HOST}%3A{port + 1}%2Fproxy'
         yield (
