@@ -32,8 +32,8 @@ $(VENV)/.python:
 	@touch $@
 
 $(VENV)/.ros: setup.py $(VENV)/.python
-	@echo 'Installing gp_ground_seg and ROS 2 Jazzy wheels into $(VENV) (about 600 MB, a minute or two) ...'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros]'
+	@echo 'Installing gp_ground_seg, numba, matplotlib and ROS 2 Jazzy from PyPI into $(VENV) (about 600 MB) ...'
+	@$(BIN)/python scripts/install_with_progress.py 600 -e '.[ros]'
 	@touch $@
 
 $(VENV)/.dev: setup.py $(VENV)/.ros

@@ -149,6 +149,15 @@ def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page
         page, 'tune_moved.png', lambda n: n['now ground'] > before['now ground'] + 100
     )
 
+    # A value that the slider does not have, typed; the slider follows.
+    (typed,) = (
+        one for one in page.driver.find_elements('css selector', 'input')
+        if one.get_property('value') == value
+    )  # fmt: skip
+    typed.send_keys('1')
+    value += '1'
+    page.wait_for(lambda: f'label.ground_tolerance = {value} m' in page.text, 'typed value')
+
     page.click('tuned.yaml')
     page.wait_for(lambda: f'written to {output}' in page.text, 'file')
     assert Config.from_yaml(output) == Config().replace(**{'label.ground_tolerance': float(value)})

@@ -47,7 +47,8 @@ def test_the_commands_of_readme_work_one_after_the_other(tmp_path):
     assert 'ground' in run(try_it(), clone)
     assert picture.stat().st_size > 10_000
     said = run('make demo', clone)
-    assert 'IoU' in said
+    assert 'IoU' in said and 'from PyPI into .venv-dev (about 600 MB)' in said
+    assert re.search(r'\d+ of 600 MB, \d+ s left', said) or 'unpacking ...' in said
     said = run('make test', clone)
     assert re.search(r'\d+ passed', said)
     # What worked at first still does.

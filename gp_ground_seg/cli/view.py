@@ -27,7 +27,7 @@ from gp_ground_seg.lab.viewers.tuner import Tuner, tunable
 VIEW = """\
 Look at segmented scans in Rerun: points by class, height or probability, the surface with
 its 2-sigma band and length-scales, vertical faces, candidates and inliers; over the frames
-IoU and objects lost (with labels, as SemanticKITTI has them), theta and latency.
+IoU and objects lost (with labels, as SemanticKITTI has them) and latency; theta is recorded.
 
 INPUT is what `segment` takes. --web serves to this machine only, until Ctrl-C.
 """
@@ -40,9 +40,9 @@ VIEW_EXAMPLES = """\
 needs the packages rerun-sdk, and viser for --html (docs/install.md)
 """
 TUNE = """\
-Show a scan in the browser, with sliders for the parameters. Labels follow at once, and points
-that change their class have a colour. With labels of SemanticKITTI, IoU and objects lost are
-shown too. Buttons write the parameters as YAML and, with ROS, set them in a running node. The
+Show a scan in the browser, with sliders and boxes for the parameters. Labels follow at once,
+and points that change their class have a colour. With labels of SemanticKITTI, IoU and objects
+lost are shown too. Buttons write the parameters as YAML and, with ROS, set them in a running node. The
 page is served to this machine only. Ctrl-C stops it.
 """
 TUNE_EXAMPLES = """\

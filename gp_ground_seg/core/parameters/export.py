@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -113,8 +112,3 @@ def differences(
         for spec in parameter_specs()
         if first[spec.name] != second[spec.name]
     ]
-
-
-def is_logarithmic(spec: ParameterSpec) -> bool:
-    """Whether the accepted numbers span two decades: sliders and searches go in factors there."""
-    return (spec.maximum or 0.0) >= 100.0 * (spec.minimum or math.inf) > 0.0

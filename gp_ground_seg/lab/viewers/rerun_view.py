@@ -20,8 +20,8 @@ from gp_ground_seg.lab.viewers.scene import RAMPS, Mesh, Scene
 
 HIDDEN = ('height', 'p_ground', 'errors', 'faces', 'candidates', 'band')
 """Clouds and meshes that are hidden at first."""
-SERIES = {'IoU': 'IoU [%]', 'lost': 'objects lost', 'theta': 'theta', 'latency': 'latency [ms]'}
-"""Numbers that are drawn over the frames, and their titles."""
+SERIES = {'IoU': 'IoU [%]', 'lost': 'objects lost', 'latency': 'latency [ms]'}
+"""Numbers that are drawn over the frames, and their titles; theta is recorded too."""
 NEED_LABELS = ('IoU', 'lost')
 ABOUT = f"""\
 The eyes in the tree on the left show and hide:

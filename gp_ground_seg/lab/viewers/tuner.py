@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from gp_ground_seg.core.errors import GroundSegError
+from gp_ground_seg.core.errors import ConfigError, GroundSegError
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.log import LOGGER, in_thousands
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
-from gp_ground_seg.core.parameters.export import is_logarithmic
-from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec, ParameterValue
+from gp_ground_seg.core.parameters.schema import AUTO, ParameterSpec, ParameterValue, load_yaml
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Inputs
@@ -24,6 +23,7 @@ from gp_ground_seg.lab.viewers.scene import Cloud, point_colours, read_view
 
 N_STEPS = 400  # of a slider
 COLOURS = ('changes', 'class', 'height', 'p_ground', 'errors')
+_USUAL = {'sensor.height': (0.2, 4.0), 'sensor.roll': (-0.3, 0.3), 'sensor.pitch': (-0.3, 0.3)}
 _NO_LABELS = ('frame', 'input', 'output', 'runtime', 'diagnostics')
 
 
@@ -32,16 +32,22 @@ def tunable() -> list[ParameterSpec]:
     return [spec for spec in parameter_specs() if spec.name.split('.')[0] not in _NO_LABELS]
 
 
-def slider_values(spec: ParameterSpec, now: ParameterValue) -> list[ParameterValue]:
-    """Values that the slider of a number goes through, `AUTO` and `now` among them."""
+def slider_values(spec: ParameterSpec, now: ParameterValue) -> list[Any]:
+    """Numbers that the slider of a parameter goes through, `now` among them unless it is `AUTO`.
+
+    They are those that people use, not all that are accepted: a fifth to five times the default.
+    """
     low, high = spec.minimum, spec.maximum
     assert low is not None and high is not None
-    is_log = is_logarithmic(spec)
+    if spec.name in _USUAL:
+        low, high = _USUAL[spec.name]
+    elif spec.default != AUTO and float(spec.default) > 0.0:
+        low, high = max(low, 0.2 * float(spec.default)), min(high, 5.0 * float(spec.default))
+    is_log = low > 0.0 and high >= 10.0 * low
     steps = (np.geomspace if is_log else np.linspace)(low, high, N_STEPS + 1)
-    short = [float(f'{step:.{2 if is_log else 3}g}') for step in steps[1:-1]]
-    numbers = {spec.type(value) for value in (low, *short, high)}
+    numbers = {spec.type(float(f'{step:.3g}')) for step in steps}
     numbers |= {value for value in (now, spec.default) if value != AUTO}
-    return [*([AUTO] if spec.auto else []), *sorted(numbers)]
+    return sorted(value for value in numbers if spec.minimum <= value <= spec.maximum)
 
 
 class Tuner:
@@ -114,25 +120,54 @@ class Tuner:
             )
             shown.on_update(lambda _event: self._changed.set())
             return _reader(spec.name, shown, words)
+        return self._add_number(spec, hint)
+
+    def _add_number(self, spec: ParameterSpec, hint: str) -> Callable[[], Any]:
+        """Add a slider and a box that follow each other."""
+        gui, now = self._server.gui, self._start[spec.name]
 
         def title(value: ParameterValue) -> str:
             return f'{spec.name} = {value} {"" if value == AUTO else spec.unit}'.rstrip()
 
         # A slider of viser goes in even steps: this one over positions in `values`.
-        values = slider_values(spec, now)
+        values, chosen = slider_values(spec, now), now
         last = len(values) - 1
+
+        def place(value: ParameterValue) -> tuple[int]:
+            number = 0.5 * (values[0] + values[-1]) if value == AUTO else float(value)
+            return (int(np.argmin(np.abs(np.array(values, dtype=float) - number))),)
+
         slider = gui.add_multi_slider(
-            title(now), 0, last, 1, (values.index(now),), hint=hint,
+            title(now), 0, last, 1, place(now), hint=hint,
             marks=((0, str(values[0])), (last, str(values[-1]))),
         )  # fmt: skip
+        typed = gui.add_text('or type', str(now), hint=hint)
         read = _reader(spec.name, slider, {(k,): value for k, value in enumerate(values)})
 
-        def move(_event: object) -> None:
-            slider.label = title(read())
+        def take(value: ParameterValue) -> None:
+            nonlocal chosen
+            chosen, slider.label = value, title(value)
             self._changed.set()
 
+        def move(event: Any) -> None:
+            if event.client_id is not None:  # else it follows the box
+                take(read())
+                typed.value = str(chosen)
+
+        def read_box(event: Any) -> None:
+            if event.client_id is None:
+                return
+            try:
+                value = spec.check(load_yaml(str(typed.value)))
+            except ConfigError as error:  # also while a number is being typed
+                self._said.content = box(text(error))
+                return
+            slider.value = place(value)
+            take(value)
+
         slider.on_update(move)
-        return read
+        typed.on_update(read_box)
+        return lambda: chosen
 
     def _segment(self, number: int, config: Config) -> Segmentation:
         self._segmenter.configure(config)
