@@ -42,8 +42,8 @@ needs the packages rerun-sdk, and viser for --html (docs/install.md)
 TUNE = """\
 Show a scan in the browser, with sliders and boxes for the parameters. Labels follow at once,
 and points that change their class have a colour. With labels of SemanticKITTI, IoU and objects
-lost are shown too. Buttons write the parameters as YAML and, with ROS, set them in a running node. The
-page is served to this machine only. Ctrl-C stops it.
+lost are shown too. Buttons write the parameters as YAML and, with ROS, set them in a running
+node. The page is served to this machine only. Ctrl-C stops it.
 """
 TUNE_EXAMPLES = """\
   gp-ground-seg tune 000000.bin
