@@ -140,7 +140,7 @@ def test_a_slider_changes_labels_and_colours_and_a_button_writes_them(tune, page
     assert re.search(r'IoU\s+9\d\.\d\d %', page.text)
 
     names = re.findall(r'^([\w.]+) = ', page.text, re.MULTILINE)
-    page.drag('.multi-slider-thumb', names.index('label.ground_tolerance'), 60)
+    page.drag('.multi-slider-thumb', names.index('label.ground_tolerance'), 120)
     page.wait_for(lambda: re.search(r'^[1-9][\d ]* changed', page.text, re.MULTILINE), 'change')
     n_ground, n_before = re.search(r'ground\t([\d ]+)\t([\d ]+)', page.text).groups()
     assert int(n_ground.replace(' ', '')) > int(n_before.replace(' ', ''))
