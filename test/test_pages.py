@@ -1,16 +1,21 @@
 """The pages hold: samples of their tables and the numbers of their pictures, computed again."""
 
 import json
+import os
 import re
+import shlex
+import subprocess
+import sys
 
 import pytest
 import yaml
 from cli_runner import run
 from conftest import REPOSITORY, find_kitti, load_script
+from evaluation_samples import write_streets
 
 from gp_ground_seg import GroundSegmenter, __version__
 from gp_ground_seg.cli import demo
-from gp_ground_seg.cli.main import COMMANDS
+from gp_ground_seg.cli.main import COMMANDS, build_parser
 from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.lab.plotting.scan import plot_birds_eye
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
@@ -225,6 +230,47 @@ def test_the_page_of_the_commands_has_all_of_them():
     text = (REPOSITORY / 'docs' / 'cli.md').read_text(encoding='utf-8')
     words = [found.split()[0] for found in re.findall(r'^<!-- help: (.*) -->$', text, re.M)]
     assert set(words) == set(COMMANDS)
+
+
+def commands_of(page):
+    """Blocks of shell commands of a page."""
+    text = (REPOSITORY / page).read_text(encoding='utf-8')
+    return re.findall(r'^```sh\n(.*?)^```', text, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize('page', figures.PAGES)
+def test_commands_of_the_pages_are_taken_by_their_parsers(page):
+    for line in ''.join(commands_of(page)).splitlines():
+        _, mark, rest = re.split(r'  +#| > | &$| --ros-args', line)[0].partition('gp-ground-seg ')
+        # What comes before is `ros2 run`; `pip install` names the package.
+        if mark and 'pip ' not in line:
+            words = shlex.split(rest)
+            assert build_parser(words[0]).parse_args(words).run, line
+
+
+IN_TUTORIAL = [block for block in commands_of('docs/tutorial_kitti.md') if 'KITTI' in block]
+
+
+@compiled
+@pytest.mark.slow
+@pytest.mark.parametrize('block', IN_TUTORIAL, ids=lambda block: block.split()[1])
+def test_commands_of_the_tutorial_run_as_they_stand(block, tmp_path):
+    root = write_streets(tmp_path / 'KITTI', s00=2)
+    (root / 'sequences/00/times.txt').write_text('0.0\n0.1\n')
+    isolation = {}
+    if ' node ' in block:
+        isolation = pytest.importorskip('ros_helpers', reason='ROS is not installed').ISOLATION
+    program = tmp_path / 'gp-ground-seg'
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m gp_ground_seg "$@"\n')
+    program.chmod(0o755)
+    path = f'{tmp_path}:{os.environ["PATH"]}'
+    done = subprocess.run(
+        ['bash', '-e', '-c', f'{block}\nwait\n'], cwd=tmp_path, check=False, timeout=300,
+        env={**os.environ, **isolation, 'PATH': path}, text=True, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert 'Traceback' not in done.stdout, done.stdout
 
 
 PAGE = """\
