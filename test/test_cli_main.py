@@ -9,14 +9,12 @@ import shlex
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 from cli_runner import error_line
 
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.options import library_notes
-from gp_ground_seg.core.jit import JIT_ENABLED
 
 HEAVY = {'numba', 'scipy', 'matplotlib', 'rosbags', 'rclpy'}
 
@@ -48,34 +46,6 @@ def test_the_help_groups_the_commands(capsys):
 def test_a_misspelt_command_is_one_line(word, hint, capsys):
     assert cli.main([word, 'scan.bin']) == 2
     assert error_line(capsys) == f'{word}: no such command; {hint}'
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not JIT_ENABLED, reason='nothing is compiled')
-def test_compiling_is_announced_when_it_begins(tmp_path):
-    """Not before a wrong input is named, and not for the numpy backend."""
-    points = np.random.default_rng(0).uniform((-9, -9, -1.8), (9, 9, -1.7), (500, 3))
-    np.save(tmp_path / 'a.npy', points)
-    command = [
-        sys.executable,
-        '-m',
-        'gp_ground_seg',
-        'segment',
-        '-o',
-        tmp_path / 'b.npy',
-        '--force',
-    ]
-    for words, is_announced in (
-        (['no.npy'], False),
-        ([tmp_path / 'a.npy', '--set', 'runtime.backend=numpy'], False),
-        ([tmp_path / 'a.npy'], True),
-        ([tmp_path / 'a.npy'], False),
-    ):
-        done = subprocess.run(
-            [*command, *words], capture_output=True, text=True, check=False,
-            env={**os.environ, 'NUMBA_CACHE_DIR': str(tmp_path / 'cache')},
-        )  # fmt: skip
-        assert ('note: compiling' in done.stderr) is is_announced, done.stderr
 
 
 @pytest.mark.parametrize('name', sorted(cli.REMOVED.keys() - cli.COMMANDS.keys()))

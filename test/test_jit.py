@@ -24,7 +24,7 @@ RUN = """
 import json, logging, os, sys
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format='%(message)s')
 import small
-result = small.double(21.0)
+result = None if 'IDLE' in os.environ else small.double(21.0)
 hits, misses = (sum(c.values()) for c in small.double.stats[1:]) if small.JIT_ENABLED else (0, 0)
 was_kept = small.is_code_kept()
 small.keep_code(warm='COLD' not in os.environ)
@@ -77,6 +77,11 @@ def test_code_is_compiled_once_and_then_loaded(program):
     assert program.run()[:4] == COMPILED
     assert 'compiling' in program.stderr
     assert program.run()[:4] == LOADED
+    assert program.stderr == ''
+
+
+def test_nothing_is_announced_before_it_compiles(program):
+    program.run(IDLE='1')
     assert program.stderr == ''
 
 
