@@ -14,7 +14,9 @@ import pytest
 from gp_ground_seg.core import jit as jit_module
 
 MODULE = """
-from gp_ground_seg.core.jit import JIT_ENABLED, code_folder, is_code_kept, jit, keep_code
+from gp_ground_seg.core.jit import (
+    JIT_ENABLED, announce_compiling, code_folder, is_code_kept, jit, keep_code,
+)
 
 @jit(entry=True)
 def double(x):
@@ -24,6 +26,8 @@ RUN = """
 import json, logging, os, sys
 logging.basicConfig(level=logging.INFO, stream=sys.stderr, format='%(message)s')
 import small
+if 'IDLE' not in os.environ:
+    small.announce_compiling()
 result = None if 'IDLE' in os.environ else small.double(21.0)
 hits, misses = (sum(c.values()) for c in small.double.stats[1:]) if small.JIT_ENABLED else (0, 0)
 was_kept = small.is_code_kept()

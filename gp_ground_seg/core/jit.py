@@ -34,7 +34,7 @@ _CORE = Path(__file__).parent
 _entry_points: list[Any] = []
 _shared: list[Callable[..., Any]] = []
 _KEPT = 'kept.json'
-_is_warm = False
+_is_warm = _is_missing = False
 _n_ready = _n_kept = 0
 
 
@@ -114,7 +114,6 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
         options = _options(fastmath)
         if part:
             options['inline'] = 'always'
-        _announce_compiling()
         if not entry:
             inner: _Function = numba.njit(**options)(function)
             return inner
@@ -126,24 +125,9 @@ def jit(*, fastmath: bool = False, entry: bool = False, part: bool = False) -> _
 
 
 @functools.cache
-def _announce_compiling() -> None:
-    """Log when numba begins to compile, rather than to load what is kept."""
-    from numba.core import event
-
-    class Announcer(event.Listener):  # type: ignore[misc]  # numba has no types
-        def on_start(self, _event: object) -> None:
-            _log_compiling()
-
-        def on_end(self, _event: object) -> None:
-            pass
-
-    event.register('numba:compile', Announcer())
-
-
-@functools.cache
-def _log_compiling() -> None:
-    # Where nothing can be kept, that was said.
-    if code_folder() is not None:
+def announce_compiling() -> None:
+    """Log once, where code is about to run that is not kept on disk, that it is compiled."""
+    if _is_missing:
         _LOGGER.info('compiling for this processor, which takes 10 to 40 s')
 
 
@@ -238,13 +222,13 @@ def _read_kept(folder: Path) -> dict[str, Any]:
 
 def _delete_damaged(folder: Path) -> None:
     """Delete the files that do not fit their checksum; numba compiles again what they held."""
-    global _is_warm
+    global _is_warm, _is_missing
     kept, found = _read_kept(folder), _checksums(folder)
     damaged = [name for name, checksum in found.items() if kept.get(name) != checksum]
     for name in damaged:
         (folder / name).unlink()
     is_whole = bool(kept) and not damaged and found.keys() >= kept.keys() - {'warm'}
-    _is_warm = is_whole and kept.get('warm') is True
+    _is_warm, _is_missing = is_whole and kept.get('warm') is True, not is_whole
 
 
 def keep_code(*, warm: bool = False) -> None:

@@ -37,7 +37,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.gp.evidence import CLEARLY, STEP, looks_aside_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
-from gp_ground_seg.core.jit import keep_code
+from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
@@ -82,6 +82,7 @@ class NumbaBackend:
 
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:
         """Sort points into cells and tiles; lowest point of each cell."""
+        announce_compiling()
         if self._pid != os.getpid() or not self.workers.is_idle:
             self._renew()
         n_points, dtype, take = len(xyz), xyz.dtype, self._buffers.take

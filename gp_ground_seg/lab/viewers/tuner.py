@@ -50,6 +50,12 @@ def slider_values(spec: ParameterSpec, now: ParameterValue) -> list[Any]:
     return sorted(value for value in numbers if spec.minimum <= value <= spec.maximum)
 
 
+def _place(values: Sequence[Any], value: ParameterValue) -> tuple[int]:
+    """Position of a slider at the nearest of its values, in the middle for `AUTO`."""
+    number = 0.5 * (values[0] + values[-1]) if value == AUTO else float(value)
+    return (int(np.argmin(np.abs(np.array(values, dtype=float) - number))),)
+
+
 class Tuner:
     """The page of a viser server: `run` keeps its labels up to date with its controls.
 
@@ -133,12 +139,8 @@ class Tuner:
         values, chosen = slider_values(spec, now), now
         last = len(values) - 1
 
-        def place(value: ParameterValue) -> tuple[int]:
-            number = 0.5 * (values[0] + values[-1]) if value == AUTO else float(value)
-            return (int(np.argmin(np.abs(np.array(values, dtype=float) - number))),)
-
         slider = gui.add_multi_slider(
-            title(now), 0, last, 1, place(now), hint=hint,
+            title(now), 0, last, 1, _place(values, now), hint=hint,
             marks=((0, str(values[0])), (last, str(values[-1]))),
         )  # fmt: skip
         typed = gui.add_text('or type', str(now), hint=hint)
@@ -162,7 +164,7 @@ class Tuner:
             except ConfigError as error:  # also while a number is being typed
                 self._said.content = box(text(error))
                 return
-            slider.value = place(value)
+            slider.value = _place(values, value)
             take(value)
 
         slider.on_update(move)
