@@ -455,7 +455,7 @@ def label_points(scan, faces, surface, config):
         if is_face[i]:
             limit = label.ground_tolerance * (-1.0 if is_occluded[i] else 1.0)
             lowest = float(scan.tiles.lowest_z[scan.tiles.tile[i]])
-            margin[i] = min(margin[i], limit - max(height[i], float(scan.xyz[i, 2]) - lowest))
+            margin[i] = min(margin[i], limit - (float(scan.xyz[i, 2]) - lowest))
         if margin[i] >= 0.0:
             result[i] = Label.GROUND
     return Labelled(result, height, margin, roughness)

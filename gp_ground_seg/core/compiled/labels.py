@@ -165,7 +165,7 @@ def label_part(
         t = np.uintp(tile[i] if n >= 0 else 0)
         if faces.is_face[t]:
             over_lowest = np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0])
-            margin = face_margin(margin, h, over_lowest, faces.has_occluded_base[t], tolerance)
+            margin = face_margin(margin, over_lowest, faces.has_occluded_base[t], tolerance)
         margins[i] = margin
         otherwise = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
         label[i] = _GROUND if margin >= 0.0 else otherwise

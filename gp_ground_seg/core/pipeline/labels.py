@@ -49,9 +49,8 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
         height, band[np.maximum(grid.cell, 0)], depth_of_ground(label)
     )
     over_lowest = z - np.where(in_face, tiles.lowest_z[tile], 0.0)
-    of_face = face_margin(
-        margin, height, over_lowest, faces.has_occluded_base[tile], label.ground_tolerance
-    )
+    is_occluded = faces.has_occluded_base[tile]
+    of_face = face_margin(margin, over_lowest, is_occluded, label.ground_tolerance)
     margin[in_face] = of_face[in_face]
     margin[~inside] = np.nan
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
@@ -117,12 +116,11 @@ def band_margin(height: Values, band: Values, depth: float) -> Values:
 
 @shared
 def face_margin(
-    margin: Values, height: Values, over_lowest: Values, is_occluded: Values, tolerance: float
+    margin: Values, over_lowest: Values, is_occluded: Values, tolerance: float
 ) -> Values:
     """Return what `band_margin` is of a point in a vertical face, `over_lowest` its lowest [m]."""
     # With a limit below zero no return of the tile is ground; the margin stays a distance.
-    limit = tolerance * (1.0 - 2.0 * is_occluded)
-    in_face = limit - choose(height > over_lowest, height, over_lowest)
+    in_face = tolerance * (1.0 - 2.0 * is_occluded) - over_lowest
     # Without a surface `margin` is NaN, and stays so.
     return choose(in_face < margin, in_face, margin)
 
