@@ -148,7 +148,7 @@ def _is_critical(start, new, r, z, density, lines):
 
 def pseudo_inputs(candidates, lines, config):
     """One pseudo-input in the middle of each of equal shares of a line's candidates."""
-    r_bar, guesses, places = [], [], []
+    r_bar, guesses, places, kinds = [], [], [], []
     limits, per = config.length_scale, config.latent.candidates_per_pseudo_input
     for q in range(len(lines.slope)):
         first, stop = lines.start[q], lines.start[q + 1]
@@ -159,8 +159,22 @@ def pseudo_inputs(candidates, lines, config):
             r_bar.append(candidates.r[place])
             guesses.append(math.log(min(max(extent, limits.min), limits.max)))
             places.append(place)
+            kinds.append(line_class(lines.slope[q], guesses[-1], limits))
     offsets = np.array([sum(p < o for p in places) for o in candidates.offsets], np.int64)
-    return PseudoInputs(np.array(r_bar, float), np.array(guesses, float), offsets)
+    if config.learning.length_scale == 'factor':
+        kinds = [0] * len(kinds)
+    else:
+        edges = np.linspace(math.log(limits.min), math.log(limits.max), 7)
+        guesses = [edges[2 * (kind // 3) + 1] for kind in kinds]
+    kinds = np.array(kinds, np.int64)
+    return PseudoInputs(np.array(r_bar, float), np.array(guesses, float), offsets, kinds)
+
+
+def line_class(slope, log_extent, limits):
+    """Short, middle and long lines, three times; of each those that fall, are flat, rise."""
+    edges = np.linspace(math.log(limits.min), math.log(limits.max), 4)[1:3]
+    rises, falls = slope > limits.flat_gradient, slope < -limits.flat_gradient
+    return 3 * sum(log_extent >= edge for edge in edges) + (2 if rises else 0 if falls else 1)
 
 
 def continues_line(candidates, lines, config):
@@ -224,7 +238,7 @@ def log_length_scales(frame, theta, config, m):
     r = frame.candidates.r[own]
     knots = frame.knots[: frame.candidates.bin[own][-1] + 2]
     if config.length_scale.model == 'latent':
-        l_bar = theta[m, 5] + frame.pseudo.log_extent[bar]
+        l_bar = theta[m, 5 + frame.pseudo.kind[bar]] + frame.pseudo.log_extent[bar]
         both = np.concatenate([r, knots])
         u = log_length_scale(frame.pseudo.r_bar[bar], l_bar, both, *np.exp(theta[m, 2:5]))
         return u[: len(r)], u[len(r) :]
@@ -401,7 +415,7 @@ def _log_likelihood(theta, inliers, slope_std, latent_terms):
             continue
         try:
             if len(r_bar):
-                l_bar = theta[5] + inliers.log_extent[bar]
+                l_bar = theta[5 + inliers.kind[bar]] + inliers.log_extent[bar]
                 u = log_length_scale(r_bar, l_bar, r, *latent)
             if len(r_bar) and latent_terms:
                 # Density at its mean: the quadratic term, which the paper leaves out, is zero.

@@ -54,6 +54,7 @@ CASES = {
     'ablation': (['ROOT', '--frame-step', '2', *SMALL], 'models', 7 * 3),
     'ablation --simulated': (['--seeds', '1', *SMALL], 'models', 7),
     'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
+    'pseudo-inputs': (['ROOT', '--frame-step', '3', *SMALL], 'pseudo_inputs', 7 * 2),
     'wrong-values': (['ROOT', '--frame-step', '3', *SMALL], 'values', 26 * 2),
     'departures': (['ROOT', *SMALL], 'departures', 3 * 4),
     'coverage': (['ROOT', *SMALL], 'sequence', 4),
@@ -72,6 +73,7 @@ CASES = {
         ['ROOT', '--sequences', '08', '--set', 'learning.mode=fixed'], 'poses', 2 * 3,
     ),
     'table1': (['ROOT'], 'errors', 3),
+    'table1 --preset': (['paper', 'ROOT', '--set', 'learning.max_evaluations=4'], 'errors', 3),
 }  # fmt: skip
 
 
@@ -300,3 +302,14 @@ def test_default_segments_of_real_frames(kitti, monkeypatch):
         for name in ('Z-L', 'Z'):
             assert 0.0 < row[f'held out {name}'] < 0.5
             assert 0.0 < row[f'in sample {name}'] < 0.5
+
+
+def test_the_trade_off_is_drawn(root, tmp_path, capsys):
+    path = tmp_path / 'a.png'
+    words = 'experiment', 'pseudo-inputs', root, '--frame-step', '3', *SMALL, '--plot', path
+    assert run(*words) == 0
+    assert f'written to {path}' in capsys.readouterr().out
+    before = path.read_bytes()
+    assert run(*words) == 2
+    assert '--force' in error_line(capsys)
+    assert path.read_bytes() == before

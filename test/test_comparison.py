@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+import scipy.stats
 from cli_runner import error_line, run
 from evaluation_samples import street, write_streets
 
@@ -18,6 +19,7 @@ from gp_ground_seg.lab.scoring.comparison import (
     interval_note,
     interval_text,
     mse_sums,
+    without_one_table,
 )
 from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
 from gp_ground_seg.lab.scoring.metrics import Confusion, height_error
@@ -50,6 +52,18 @@ def test_interval_is_that_of_all_draws_weighted_alike():
     # A draw is of 1 of 27: the ends lie in the lowest and in the highest.
     assert found == pytest.approx((min(difference), max(difference)))
     assert found.is_tie
+
+
+def test_one_sequence_left_out_after_the_other():
+    ours, theirs = (90, 70, 50, 60), (80, 71, 20, 55)
+    table = without_one_table(sequences_of(*ours), sequences_of(*theirs))
+    without = [(sum(ours) - a - sum(theirs) + b) / 300 for a, b in zip(ours, theirs, strict=True)]
+    found = [row['difference'] for row in table.json()]
+    assert found == pytest.approx([*without, (sum(ours) - sum(theirs)) / 400])
+    # As by pseudo-values, whose mean is that of all, as the sequences are equally large.
+    pseudo = 4 * found[-1] - 3 * np.array(without)
+    low, high = scipy.stats.t.interval(0.95, 3, pseudo.mean(), scipy.stats.sem(pseudo))
+    assert table.title.endswith(f'{100 * low:+.2f} to {100 * high:+.2f} tie')
 
 
 def test_large_clusters_weigh_more_and_scans_of_a_sequence_are_drawn_together():

@@ -18,6 +18,8 @@ from gp_ground_seg.core.gp.learning import (
     theta_space,
 )
 from gp_ground_seg.core.jit import JIT_ENABLED
+from gp_ground_seg.core.parameters.presets import PRESETS
+from gp_ground_seg.core.pipeline.lines import class_middles
 
 MODEL = NumbaBackend(1) if JIT_ENABLED else NumpyBackend()
 
@@ -37,8 +39,9 @@ def draw_inliers(seed, n_segments=120, n=50, sigma_f=0.3, sigma_n=0.05):
         z.append(np.linalg.cholesky(a) @ rng.standard_normal(n))
     number = np.arange(n_segments + 1)
     bars = number * len(r_bar), np.tile(r_bar, n_segments), np.tile(log_extent, n_segments)
+    kind = np.zeros(len(bars[1]), np.int64)
     inliers = Inliers(
-        number * n, np.concatenate(r), np.concatenate(z), np.zeros(n_segments * n), *bars
+        number * n, np.concatenate(r), np.concatenate(z), np.zeros(n_segments * n), *bars, kind
     )
     return inliers, truth
 
@@ -274,3 +277,18 @@ def test_learning_ends_when_its_time_is_up():
     config = Config().replace(**changes)
     segmenter = GroundSegmenter(config, clock=lambda: 0.4 * next(ticks), backend=MODEL)
     assert segmenter.segment(hilly_scan(N_POINTS)).fit.n_evaluations == 3
+
+
+def test_the_preset_paper_learns_until_no_more_join():
+    """Nine classes of lines share their length-scales, which stay between their limits."""
+    config = PRESETS['paper'].config
+    result = GroundSegmenter(config, backend=MODEL).segment(hilly_scan(4 * N_POINTS))
+    assert result.fit.status == 'converged'
+    assert 20 < result.fit.n_evaluations < config.learning.max_evaluations
+    assert len(result.fit.theta) == 14
+    l_bar = np.exp(class_middles(config.length_scale) + result.theta[0, 5:])
+    assert (l_bar > config.length_scale.min - 1e-9).all()
+    assert (l_bar < config.length_scale.max + 1e-9).all()
+    assert (result.theta == result.theta[0]).all()
+    used = np.unique(result.pseudo.kind)
+    assert len(used) > 3 and (result.theta[0, 5 + used] != 0.0).all()

@@ -12,7 +12,9 @@ from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.parameters.config import RuntimeConfig
 
-TYPICAL = np.log([0.3, 0.05, 0.9, 3.0, 0.25, 0.8])
+# With a factor for each class of lines.
+FACTORS = np.array([0.8, 0.5, 1.3, 1.0, 0.7, 2.0, 0.9, 1.1, 0.6])
+TYPICAL = np.log([0.3, 0.05, 0.9, 3.0, 0.25, *FACTORS])
 
 
 def scaled(*factors):
@@ -30,8 +32,8 @@ THETAS = {
     'long latent': scaled(1, 1, 1, 18),
     'stiff latent': scaled(1, 1, 1 / 18, 1, 18),
     'loose latent': scaled(1, 1, 4, 1, 1 / 10),
-    'short length-scales': scaled(1, 1, 1, 1, 1, 1 / 10),
-    'long length-scales': scaled(1, 1, 1, 1, 1, 10),
+    'short length-scales': scaled(1, 1, 1, 1, 1, *[1 / 10] * 9),
+    'long length-scales': scaled(1, 1, 1, 1, 1, *[10] * 9),
 }
 
 
@@ -54,6 +56,7 @@ def random_inliers(seed, bars='all', n_segments=6):
         np.concatenate([[0], np.cumsum(bar_counts)]),
         r_bar,
         rng.choice(np.log([1.5, 3.0, 6.0, 10.0]), len(r_bar)),
+        rng.integers(0, 9, len(r_bar)),
     )
 
 
@@ -114,7 +117,7 @@ def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
 def test_beyond_the_bound_of_length_scales_nothing_depends_on_the_latent_process(backend):
     inliers = random_inliers(5)
     beyond = TYPICAL.copy()
-    beyond[5] = MAX_ABS_LOG_LENGTH_SCALE + 10.0
+    beyond[5:] = MAX_ABS_LOG_LENGTH_SCALE + 10.0
     assert not backend.log_likelihood(beyond, inliers, 0.05, False)[1][2:].any()
 
 
@@ -129,7 +132,8 @@ def test_results_do_not_depend_on_where_the_arrays_lie():
         in_one[place:], bars_in_one[place:] = n, n_bar
         r, r_bar = (np.sort(rng.uniform(3, 20, size)) for size in (n, n_bar))
         z, log_extent = rng.normal(0, 0.5, n), rng.choice([0.0, 0.5, 1.2], n_bar)
-        inliers = Inliers(in_one, r, z, np.zeros(n), bars_in_one, r_bar, log_extent)
+        kind = rng.integers(0, 9, n_bar)
+        inliers = Inliers(in_one, r, z, np.zeros(n), bars_in_one, r_bar, log_extent, kind)
         results = set()
         for n_threads in (1, 4):
             backend = make_backend(RuntimeConfig(n_threads, 'numba'))
@@ -153,7 +157,7 @@ def test_with_one_length_scale_it_is_scikit_learns_regression(backend):
     theirs.fit(r[:, None], z)
     # One segment, its latent process constant.
     theta = np.log([sigma_f, sigma_n, 0.9, 2.0, 0.3, length])
-    bars = np.array([0, 3]), np.array([5.0, 15.0, 30.0]), np.zeros(3)
+    bars = np.array([0, 3]), np.array([5.0, 15.0, 30.0]), np.zeros(3), np.zeros(3, np.int64)
     inliers = Inliers(np.array([0, 25]), r, z, np.zeros(25), *bars)
     value, gradient = backend.log_likelihood(theta, inliers, 0.0, False)
     their_value, their_gradient = theirs.log_marginal_likelihood(

@@ -92,8 +92,13 @@ def draw_faces(seed):
 
 
 @settings(max_examples=fewer(100, 20))
-@given(st.integers(0, 10_000), st.sampled_from([1.0, 2.5, 3.0, 10.0]), st.floats(0.2, 5.0))
-def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_ratio):
+@given(
+    st.integers(0, 10_000),
+    st.sampled_from([1.0, 2.5, 3.0, 10.0]),
+    st.floats(0.2, 5.0),
+    st.sampled_from(['factor', 'classes']),
+)
+def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_ratio, shared):
     candidates, faces = draw_candidates(seed), draw_faces(seed)
     config = Config().replace(
         **{
@@ -101,6 +106,7 @@ def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_rat
             'lines.error_ratio': error_ratio,
             'growth.min_bend_extent': 3.0,
             'latent.candidates_per_pseudo_input': per,
+            'learning.length_scale': shared,
         }
     )
     found = backend.extract_lines(candidates, faces, config)
@@ -118,15 +124,19 @@ def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_rat
 def test_the_candidates_drawn_hold_every_case():
     """Slope breaks, and lines that do and do not continue, in the test above."""
     at_break = continued = alone = 0
-    config = Config().replace(**{'lines.max_gap': 6.0, 'growth.min_bend_extent': 3.0})
+    kinds = set()
+    changes = {'growth.min_bend_extent': 3.0, 'learning.length_scale': 'classes'}
+    config = Config().replace(**{'lines.max_gap': 6.0, **changes})
     for seed in range(40):
-        _, lines, _, continues, _ = Reference().extract_lines(
+        _, lines, pseudo, continues, _ = Reference().extract_lines(
             draw_candidates(seed), NO_FACES, config
         )
         at_break += continues[lines.start[:-1]].sum()
         continued += (continues[1:] & (lines.line[1:] == lines.line[:-1])).sum()
         alone += (~continues).sum()
+        kinds |= {*pseudo.kind}
     assert min(at_break, continued, alone) > 20
+    assert kinds == {*range(9)}
 
 
 KINK = np.arange(3.0, 23.0)

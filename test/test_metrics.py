@@ -196,6 +196,20 @@ def test_height_error_of_nothing(error):
     assert all(math.isnan(getattr(error, name)) for name in names)
 
 
+def test_a_few_returns_far_below_the_ground_do_not_decide_the_density():
+    """Of a frame, however few points its parts by range have."""
+    frame = np.random.default_rng(0).normal(0.0, 0.05, 8000)
+    frame[-7:] = -6.5
+    truth, std, far = np.zeros(8000), np.full(8000, 0.05), slice(7990, 8000)
+    whole = metrics.height_error(truth, frame, std)
+    expected = -np.mean(scipy.stats.norm.logpdf(frame[:-7], 0.0, 0.05))
+    assert whole.nlpd == pytest.approx(expected, abs=0.01)
+    assert whole.rmse > 0.1
+    limit = metrics.largest_nlpd(metrics.negative_log_density(frame, std))
+    assert metrics.height_error(truth[far], frame[far], std[far], limit).nlpd < 0.0
+    assert metrics.height_error(truth[far], frame[far], std[far]).nlpd > 1000.0
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(2, 30), st.integers(2, 5000))
 def test_pooled_height_errors_are_those_of_all_points(seed, n, m):
     rng = np.random.default_rng(seed)
@@ -212,7 +226,10 @@ def test_pooled_height_errors_are_those_of_all_points(seed, n, m):
     assert pooled.bias == pytest.approx(e.mean())
     assert pooled.within_1 == np.mean(np.abs(e) <= s)
     assert pooled.within_2 == np.mean(np.abs(e) <= 2.0 * s)
-    assert pooled.nlpd == pytest.approx(-np.mean(scipy.stats.norm.logpdf(e, 0.0, s)))
+    # Of each part the worst 0.1 % do not count.
+    nlpd = -scipy.stats.norm.logpdf(error, 0.0, std)
+    best = [np.sort(nlpd[k][known[k]])[: known[k].sum() - known[k].sum() // 1000] for k in parts]
+    assert pooled.nlpd == pytest.approx(np.mean(np.concatenate(best)))
     spread = sum(known[k].sum() * np.var(truth[k][known[k]]) for k in parts)
     if spread > 1e-6:
         assert pooled.smse == pytest.approx((e**2).sum() / spread, rel=1e-6)

@@ -125,6 +125,19 @@ def test_azimuth_is_another_way_to_say_segment(draw, tmp_path):
     assert (tmp_path / 'a.png').read_bytes() == (tmp_path / 'b.png').read_bytes()
 
 
+def test_segments_side_by_side(scan, tmp_path, capsys):
+    """The wall ahead is in the first of the two only; both have the same axes."""
+    path = tmp_path / 'pair.png'
+    assert run('plot', 'segment', scan, '--segment', f'{SEGMENT},91', '-o', path) == 0
+    said = capsys.readouterr().out
+    assert said.startswith('segment 90: ') and '; segment 91: 0 candidates' in said
+    image = imread(path)[:, :, :3]
+    left, right = image[:, : 9 * image.shape[1] // 20], image[:, 9 * image.shape[1] // 20 :]
+    assert count(left, colours.SURFACE_COLOUR) > 1000 > count(right, colours.SURFACE_COLOUR)
+    with pytest.raises(SystemExit, match='2'):
+        run('plot', 'segment', scan, '--segment', '90;91', '-o', path, '--force')
+
+
 def test_what_is_drawn_is_the_result():
     """The curves' data, read back from the axes."""
     result = GroundSegmenter().segment(hilly_scan().astype(np.float32))
@@ -150,7 +163,7 @@ def test_what_is_drawn_is_the_result():
     first, last = result.pseudo.offsets[SEGMENT : SEGMENT + 2]
     np.testing.assert_array_equal(pseudo.get_xdata(), result.pseudo.r_bar[first:last])
     values = np.exp(result.pseudo.log_extent[first:last])
-    values *= result.fit.theta['length_scale_factor']
+    values *= result.fit.theta['length_scale_factor']  # one for all
     np.testing.assert_allclose(pseudo.get_ydata(), values)
     # The curve follows the pseudo-inputs: it stays among them and near each.
     at_pseudo = np.interp(pseudo.get_xdata(), length_scale.get_xdata(), length_scale.get_ydata())
@@ -162,7 +175,7 @@ def test_what_is_drawn_is_the_result():
 def test_segments_with_nothing_to_see(tmp_path, points):
     result, path = GroundSegmenter().segment(points), tmp_path / 'a.png'
     for truth in (result.label, None):
-        plot_segment(result, Config(), points, SEGMENT, path, truth, title=r'$\none _ %')
+        plot_segment(result, Config(), points, [SEGMENT], path, truth, title=r'$\none _ %')
         assert imread(path).ndim == 3
 
 
@@ -196,6 +209,6 @@ def test_shapes_have_to_fit(tmp_path):
     points = ahead()[0]
     result = GroundSegmenter().segment(points)
     with pytest.raises(PointCloudError, match=r'result of shape \(1500,\) for 9 points'):
-        plot_segment(result, Config(), points[:9], 0, tmp_path / 'a.png')
+        plot_segment(result, Config(), points[:9], [0], tmp_path / 'a.png')
     with pytest.raises(PointCloudError, match=r'truth of shape \(9,\)'):
-        plot_segment(result, Config(), points, 0, tmp_path / 'a.png', np.zeros(9, np.uint8))
+        plot_segment(result, Config(), points, [0], tmp_path / 'a.png', np.zeros(9, np.uint8))

@@ -252,6 +252,8 @@ def test_frames_are_labelled_as_by_the_loops(backend, model, scope, objective):
         'length_scale.model': model,
         'learning.scope': scope,
         'learning.objective': objective,
+        'learning.length_scale': 'classes' if objective == 'paper' else 'factor',
+        'learning.fixed': 'none' if objective == 'paper' else 'length_scales',
         'learning.max_evaluations': 3,
         'grid.n_segments': 12,
         'grid.n_bins': 60,

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
-from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.cli.plot import ENDINGS, picture_path
+from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.lab.experiments import ablation
 from gp_ground_seg.lab.experiments.coverage import score_coverage
 from gp_ground_seg.lab.experiments.scenes import CROWDED, score_objects, score_scenes
@@ -29,6 +30,7 @@ EXAMPLES = """\
   gp-ground-seg experiment NAME --help          describes one of them
 """
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
+PLOT = ('--plot', f'draw it ({ENDINGS})', {'metavar': 'FILE'})
 NO_PEER = (
     '--no-peer',
     'leave Patchwork++ out, which needs pip install pypatchworkpp',
@@ -56,14 +58,20 @@ class Experiment(NamedTuple):
         return 'with_peer' in inspect.signature(self.run).parameters
 
     @property
+    def has_plot(self) -> bool:
+        """Whether it draws a picture."""
+        return 'plot' in inspect.signature(self.run).parameters
+
+    @property
     def options(self) -> list[Option]:
-        """Options of its scans, and ``--no-peer``."""
+        """Options of its scans, ``--no-peer`` and ``--plot``."""
         found: list[Option] = []
         if self.labelled:
             optional = (*ROOT[:2], {**ROOT[2], 'nargs': '?'})
             found += [optional, SIMULATED] if self.sensors else [ROOT]
             found += OF_FRAMES
-        return [*found, *self.simulated_options, *([NO_PEER] if self.has_peer else [])]
+        more = [NO_PEER] * self.has_peer + [PLOT] * self.has_plot
+        return [*found, *self.simulated_options, *more]
 
     @property
     def simulated_options(self) -> list[Option]:
@@ -85,6 +93,7 @@ EXPERIMENTS = {
     'departures': Experiment(ablation.compare_departures),
     'coverage': Experiment(score_coverage, FIVE, n_seeds=2),
     'steps': Experiment(ablation.compare_steps),
+    'pseudo-inputs': Experiment(ablation.compare_pseudo_inputs, is_timed=True),
     'wrong-values': Experiment(ablation.compare_wrong_values),
     'scenes': Experiment(score_scenes, THREE, n_seeds=3, places=(0.0, 6.0), labelled=False),
     'objects': Experiment(score_objects, [*SENSORS], CROWDED, n_seeds=2, labelled=False),
@@ -125,12 +134,14 @@ def run(arguments: argparse.Namespace) -> int:
     experiment = EXPERIMENTS[arguments.experiment]
     _check_source(arguments, experiment)
     config = options.read_config(arguments)
-    peer = {'with_peer': not arguments.no_peer} if experiment.has_peer else {}
+    more: dict[str, Any] = {'with_peer': not arguments.no_peer} if experiment.has_peer else {}
+    packages = ['pypatchworkpp'] if any(more.values()) else []
+    if experiment.has_plot and arguments.plot is not None:
+        more['plot'] = picture_path(arguments.plot, force=arguments.force)
     with options.staged_options(arguments, 'json') as parts:
         with options.runner(arguments, arguments.experiment) as runner:
-            report = experiment.run(_scans(arguments, experiment), config, runner, **peer)
+            report = experiment.run(_scans(arguments, experiment), config, runner, **more)
             n_workers = runner.n_workers
-        packages = ['pypatchworkpp'] if any(peer.values()) else []
         environment = describe_environment(*packages)
         environment['n_workers'] = n_workers
         if 'json' in parts:
@@ -138,6 +149,8 @@ def run(arguments: argparse.Namespace) -> int:
             report.facts.update(experiment=arguments.experiment, options=given)
             report.write(parts['json'], environment)
     lines = [machine_line(environment, report.fit)]
+    if 'plot' in more:
+        lines.insert(0, f'time and error of the table, written to {shown(more["plot"])}')
     print(written(report.tables.values(), lines, markdown=arguments.markdown))
     return 0
 

@@ -48,15 +48,16 @@ ABOVE_EXAMPLES = """\
 """
 
 SEGMENT = """\
-The paper's Figure 1 for any scan and segment: points, ground candidates, the lines
-through them with their critical points, the inliers, and the estimated ground with
-twice its standard deviation; below it the length-scale and its pseudo-inputs.
+The paper's Figure 1 for any scan and segment, or two side by side: points, ground
+candidates, the lines through them with their critical points, the inliers, and the
+estimated ground with twice its standard deviation; below it the length-scale and its
+pseudo-inputs.
 """
 SEGMENT_EXAMPLES = """\
   gp-ground-seg plot segment 000000.bin --segment 157 -o segment.png
   gp-ground-seg plot segment 000000.bin --azimuth 0 -o ahead.pdf
   gp-ground-seg plot segment velodyne/000000.bin --labels labels/000000.label \\
-      --segment 157 -o segment.png
+      --segment 157,158 -o pair.png
 
 Segments are numbered counter-clockwise from straight behind.
 """
@@ -123,19 +124,16 @@ def _declare_segment(parser: argparse.ArgumentParser) -> None:
     options.add(parser, INPUT, LABELS, extent)
     options.add(
         parser.add_mutually_exclusive_group(required=True),
-        ('--segment', 'number of the segment', INTEGER),
+        ('--segment', 'number of the segment, or of several side by side',
+         {'metavar': 'N[,N]', 'type': _integers}),
         ('--azimuth', 'the segment in this direction, 90 = left', degrees),
-    )
+    )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Segment the scan and draw it."""
     config = options.read_config(arguments)
-    path = Path(arguments.output)
-    if path.suffix.lower() not in KINDS:
-        raise DataError(f'{path}: must end in {ENDINGS}')
-    if path.exists() and not arguments.force:
-        raise DataError(f'{path}: exists already; --force replaces it')
+    path = picture_path(arguments.output, force=arguments.force)
     points, title = _read(arguments) if arguments.input is not None else _simulate(arguments)
     truth = None
     if getattr(arguments, 'labels', None) is not None:
@@ -149,11 +147,26 @@ def run(arguments: argparse.Namespace) -> int:
     elif arguments.picture == 'above':
         said = plot_birds_eye(points, result.label, path, truth, title)
     else:
-        segment, reach = _segment_number(arguments, config), arguments.max_range
-        plot_segment(result, config, points, segment, path, truth, title, reach)
-        said = _segment_counts(result, segment)
+        segments, reach = _segment_numbers(arguments, config), arguments.max_range
+        plot_segment(result, config, points, segments, path, truth, title, reach)
+        said = '; '.join(_segment_counts(result, segment) for segment in segments)
     print(f'{said}, written to {shown(path)}')
     return 0
+
+
+def picture_path(name: str, *, force: bool) -> Path:
+    """Return the path of a picture to write; DataError if it cannot be one, or is there."""
+    path = Path(name)
+    if path.suffix.lower() not in KINDS:
+        raise DataError(f'{path}: must end in {ENDINGS}')
+    if path.exists() and not force:
+        raise DataError(f'{path}: exists already; --force replaces it')
+    return path
+
+
+def _integers(text: str) -> list[int]:
+    """Read numbers of segments."""
+    return [int(word) for word in text.split(',')]
 
 
 def _camera(text: str) -> Place:
@@ -186,12 +199,13 @@ def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], 
     return points, f'simulated {arguments.sensor}: {arguments.simulate}'
 
 
-def _segment_number(arguments: argparse.Namespace, config: Config) -> int:
+def _segment_numbers(arguments: argparse.Namespace, config: Config) -> list[int]:
     if arguments.azimuth is None:
-        return int(arguments.segment)
+        chosen: list[int] = arguments.segment
+        return chosen
     if not math.isfinite(arguments.azimuth):
         raise DataError(f'--azimuth {arguments.azimuth}: must be a number of degrees')
-    return segment_at(math.radians(arguments.azimuth), config.grid.n_segments)
+    return [segment_at(math.radians(arguments.azimuth), config.grid.n_segments)]
 
 
 def _segment_counts(result: Segmentation, segment: int) -> str:

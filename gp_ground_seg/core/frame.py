@@ -195,6 +195,8 @@ class PseudoInputs(NamedTuple):
     r_bar: FloatArray  # (P,) ranges [m], increasing in each segment
     log_extent: FloatArray  # (P,) log extent of the line of each, first guess of L-bar [log m]
     offsets: IntArray  # (M + 1,) pseudo-inputs of segment m are ``offsets[m]:offsets[m + 1]``
+    # (P,) class of the line of each; those of a class share an entry of L-bar, ``theta[5 + kind]``
+    kind: IntArray
 
 
 class Frame(NamedTuple):
@@ -221,6 +223,7 @@ class Inliers(NamedTuple):
     bar_offsets: IntArray  # (M + 1,) pseudo-inputs of segment m; all zero without a latent process
     r_bar: FloatArray  # (P,) ranges of the pseudo-inputs [m]
     log_extent: FloatArray  # (P,) their first guesses of the log length-scale [log m]
+    kind: IntArray  # (P,) class of each
 
 
 class GroundSurface(NamedTuple):

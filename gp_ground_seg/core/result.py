@@ -22,7 +22,7 @@ from gp_ground_seg.core.frame import (
     at_points,
     usual_errors,
 )
-from gp_ground_seg.core.gp.learning import THETA_NAMES, Learned
+from gp_ground_seg.core.gp.learning import Learned, theta_names
 from gp_ground_seg.core.pipeline.labels import ground_probability
 from gp_ground_seg.core.pipeline.residuals import CorrectedSurface, correct_surface
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
@@ -91,7 +91,8 @@ class FitReport:
         Objective per inlier at the end; NaN when nothing was learned.
     theta : dict of str to float
         Hyper-parameters used: sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m],
-        sigma_n_bar, and the factor on the length-scales that the lines suggest. Means
+        sigma_n_bar, and the factor on the length-scales that the lines suggest, or one for
+        each class of lines. Means
         of the logarithms where each segment has its own.
     at_bound : tuple of str
         Those that ended at a bound.
@@ -124,7 +125,7 @@ class FitReport:
     def of(cls, frame: Segmentation) -> FitReport:
         """Sum up one frame."""
         learned = frame.fitting.learned
-        values = np.exp(frame.theta.mean(axis=0))
+        values, names = np.exp(frame.theta.mean(axis=0)), theta_names(frame.theta.shape[1])
         statuses = {one.status for one in learned}
         at_bound = np.any([one.at_bound for one in learned], axis=0) if learned else []
         n_inliers = int(frame.surface.inlier.sum())
@@ -134,8 +135,8 @@ class FitReport:
             status=next((s for s in ('failed', 'budget', 'converged') if s in statuses), 'kept'),
             n_evaluations=sum(one.n_evaluations for one in learned),
             objective=total / n_inliers if learned and n_inliers else float('nan'),
-            theta={name: float(value) for name, value in zip(THETA_NAMES, values, strict=True)},
-            at_bound=tuple(n for n, hit in zip(THETA_NAMES, at_bound, strict=False) if hit),
+            theta={name: float(value) for name, value in zip(names, values, strict=True)},
+            at_bound=tuple(n for n, hit in zip(names, at_bound, strict=False) if hit),
             n_segments=int(np.isfinite(frame.surface.mean[:, 0]).sum()),
             n_candidates=len(frame.candidates.r),
             n_inliers=n_inliers,
@@ -164,8 +165,9 @@ class Segmentation:
     grid, frame, surface
         Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
         process's own, which the labels follow from; `corrected` is what users are given.
-    theta : (M, 6) float64
-        Logarithms of the hyper-parameters of each segment, named by `THETA_NAMES`.
+    theta : (M, T) float64
+        Logarithms of the hyper-parameters of each segment, named by
+        `gp_ground_seg.core.gp.learning.theta_names`.
     log_length_scale : (M, knots) float64
         Log length-scale at the knots of the surface [log m]; NaN in segments
         without candidates.

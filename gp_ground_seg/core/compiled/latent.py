@@ -53,7 +53,7 @@ def latent_log_length_scales(
         for i in range(n + n_wanted, size):
             wanted[i] = 0.0
         for i in range(size):
-            value[i] = mean + theta[m, 5]
+            value[i] = mean
         # Pseudo-inputs in the outer loop, so that the inner loop runs along a row.
         for j in range(p):
             centre, scaled = centres[j], weight[j] * variance
@@ -83,12 +83,13 @@ def _weigh(
     sharpness = 0.5 * math.exp(-2.0 * theta[3])
     mean = 0.0
     for i in range(p):
-        mean += pseudo.log_extent[first + i] / p
+        weight[i] = pseudo.log_extent[first + i] + theta[5 + pseudo.kind[first + i]]
+        mean += weight[i] / p
     end = (p + LANES - 1) & -LANES
     for i in range(end):
         centres[i] = pseudo.r_bar[first + i] if i < p else 0.0
     for i in range(p):
-        weight[i] = pseudo.log_extent[first + i] - mean
+        weight[i] -= mean
         row, centre = matrix[i], centres[i]
         for j in range(i & -LANES, end):
             row[j] = squared_exponential(centre, centres[j], variance, sharpness)

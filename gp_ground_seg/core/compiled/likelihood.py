@@ -9,7 +9,7 @@ import numpy as np
 
 from gp_ground_seg.core.compiled.numerics import factorise, invert, invert_triangle
 from gp_ground_seg.core.compiled.threads import Part
-from gp_ground_seg.core.frame import FloatArray, Inliers
+from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray
 from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 from gp_ground_seg.core.jit import jit
@@ -59,8 +59,10 @@ def log_likelihood(
             np.empty((n, p)),
             np.zeros(p),
         )
-        log_extent = inliers.log_extent[bar_first : bar_first + p]
-        if p > 0 and not _predict_log_length_scales(theta, log_extent, r, latent, u):
+        l_bar, kind = np.empty(p), inliers.kind[bar_first : bar_first + p]
+        for i in range(p):
+            l_bar[i] = inliers.log_extent[bar_first + i] + theta[5 + kind[i]]
+        if p > 0 and not _predict_log_length_scales(theta, l_bar, r, latent, u):
             values[m] = -np.inf
             continue
         k, factor, whitened = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
@@ -72,12 +74,12 @@ def log_likelihood(
             g_u, inverse = np.zeros(n), np.empty((n, n))
             invert(factor, n, whitened, inverse)
             values[m] = _of_observations(theta, r, z, u, k, factor, inverse, gradient, g_u)
-            values[m] += _of_latent_process(theta, latent_terms, r, latent, g_u, gradient)
+            values[m] += _of_latent_process(theta, latent_terms, r, kind, latent, g_u, gradient)
 
 
 @jit(part=True)
 def _predict_log_length_scales(
-    theta: FloatArray, log_extent: FloatArray, r: FloatArray, latent: _Latent, u: FloatArray
+    theta: FloatArray, l_bar: FloatArray, r: FloatArray, latent: _Latent, u: FloatArray
 ) -> bool:
     """Set the arrays of `latent`, and `u`; False if B is not positive definite."""
     r_bar, n, p = latent.r_bar, len(r), len(latent.r_bar)
@@ -85,7 +87,7 @@ def _predict_log_length_scales(
     sharpness = 0.5 / math.exp(theta[3]) ** 2
     mean = 0.0
     for i in range(p):
-        mean += log_extent[i] / p
+        mean += l_bar[i] / p
         centre, row, factor_row = r_bar[i], latent.k_bar[i], latent.factor[i]
         for j in range(p):
             row[j] = factor_row[j] = squared_exponential(centre, r_bar[j], variance, sharpness)
@@ -95,9 +97,9 @@ def _predict_log_length_scales(
     invert(latent.factor, p, np.empty((p, p)), latent.inverse)
     for i in range(p):
         for j in range(p):
-            latent.beta[i] += latent.inverse[i, j] * (log_extent[j] - mean)
+            latent.beta[i] += latent.inverse[i, j] * (l_bar[j] - mean)
     for i in range(n):
-        value, centre, row = mean + theta[5], r[i], latent.k_star[i]
+        value, centre, row = mean, r[i], latent.k_star[i]
         for j in range(p):
             row[j] = squared_exponential(centre, r_bar[j], variance, sharpness)
             value += row[j] * latent.beta[j]
@@ -223,6 +225,7 @@ def _of_latent_process(
     theta: FloatArray,
     latent_terms: bool,
     r: FloatArray,
+    kind: IntArray,
     latent: _Latent,
     g_u: FloatArray,
     gradient: FloatArray,
@@ -230,9 +233,9 @@ def _of_latent_process(
     """Propagate the gradient in u to theta; return the latent terms of the value."""
     r_bar, beta, n, p = latent.r_bar, latent.beta, len(r), len(latent.r_bar)
     weight, raised = np.zeros(p), np.zeros(p)
-    value = g_sigma_f_bar = g_sigma_l_bar = g_noise_bar = 0.0
+    value = g_sigma_f_bar = g_sigma_l_bar = g_noise_bar = rest = 0.0
     for i in range(n):
-        gradient[5] += g_u[i]
+        rest += g_u[i] / p
         g_i, r_i, row = g_u[i], r[i], latent.k_star[i]
         for j in range(p):
             raised[j] += row[j] * g_i
@@ -254,6 +257,11 @@ def _of_latent_process(
             g_sigma_f_bar += adjoint * row[j]
             g_sigma_l_bar += adjoint * row[j] * d * d
         g_noise_bar -= weight[i] * beta[i] + share * inverse_row[i]
+        gradient[5 + kind[i]] += weight[i]
+        rest -= weight[i] / p
+    # u is the mean of L-bar and what the process makes of the differences from it.
+    for i in range(p):
+        gradient[5 + kind[i]] += rest
     gradient[2] = 2.0 * g_sigma_f_bar
     gradient[3] = g_sigma_l_bar / math.exp(theta[3]) ** 2
     gradient[4] = 2.0 * math.exp(theta[4]) ** 2 * g_noise_bar

@@ -56,7 +56,7 @@ def estimate_surface(
     ----------
     frame : Frame
         Candidates, lines, pseudo-inputs, knots.
-    theta : (M, 6) float64
+    theta : (M, T) float64
         Hyper-parameters of each segment (see `gp_ground_seg.core.gp.learning`).
     config : Config
         Model of the length-scale, prior slope, gates.
@@ -136,7 +136,7 @@ class _Model(NamedTuple):
     """Values that the segments grow from."""
 
     frame: Frame
-    theta: FloatArray  # (M, 6)
+    theta: FloatArray  # (M, T)
     z: FloatArray  # (C,) about the prior mean [m]
     length_scale: FloatArray  # (C,) at the candidates [m]
     knot_length_scale: FloatArray  # (M, K) at the knots [m]

@@ -30,7 +30,7 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
     The pseudo-inputs are centred on their mean, so that equal ones give that very value
     everywhere.
 
-    `theta`, (M, 6), are the hyper-parameters of each segment (see
+    `theta`, (M, T), are the hyper-parameters of each segment (see
     `gp_ground_seg.core.gp.learning`).
     Returns log length-scales at the candidates, (C,), and at the knots, (M, K) [log m]; NaN there
     behind the bin of the last candidate.
@@ -45,7 +45,8 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
         r, r_bar = layout.take(candidates.r)[:, :, None], bar.take(pseudo.r_bar)
         sill_bar, square_l_bar, noise_bar = np.exp(2.0 * theta[segments, 2:5]).T
         kernel = sill_bar[:, None, None], 0.5 / square_l_bar[:, None, None]
-        l_bar = np.where(bar.mask, bar.take(pseudo.log_extent) + theta[segments, 5:], 0.0)
+        factor = np.take_along_axis(theta[segments, 5:], pseudo.kind[bar.place], axis=1)
+        l_bar = np.where(bar.mask, bar.take(pseudo.log_extent) + factor, 0.0)
         mean = l_bar.sum(axis=1, keepdims=True) / bar.mask.sum(axis=1, keepdims=True)
         covariance = squared_exponential(r_bar[:, :, None], r_bar[:, None, :], *kernel)
         add_noise(covariance, noise_bar[:, None], bar.mask)

@@ -1,8 +1,9 @@
 """Stage 5: hyper-parameters by maximum a posteriori over the whole frame (paper, section III-E).
 
 Theta is a vector of logarithms: sigma_f, sigma_n, sigma_f_bar, sigma_l_bar, sigma_n_bar, then a
-factor on the length-scales that the lines suggest. A frame has one row of it per segment; learned
-over the whole frame, the rows are equal.
+factor on the length-scales that the lines suggest, or with ``learning.length_scale = classes`` one
+for each class of lines. A frame has one row of it per segment; learned over the whole frame, the
+rows are equal.
 """
 
 from __future__ import annotations
@@ -24,10 +25,12 @@ from gp_ground_seg.core.frame import (
     PseudoInputs,
 )
 from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.pipeline.lines import N_CLASSES, class_middles
 
 THETA_NAMES = (
     'sigma_f', 'sigma_n', 'sigma_f_bar', 'sigma_l_bar', 'sigma_n_bar', 'length_scale_factor'
 )  # fmt: skip
+"""Entries of theta; with classes the last one is there for each, numbered."""
 Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 
 WIDEST = 5.0
@@ -47,15 +50,22 @@ _SHRINK = 0.3
 class ThetaSpace(NamedTuple):
     """Bounds and priors of the hyper-parameters, all in log space."""
 
-    centre: FloatArray  # (6,) values given by the configuration; centres of the priors
-    lower: FloatArray  # (6,) bounds
+    centre: FloatArray  # (T,) values given by the configuration; centres of the priors
+    lower: FloatArray  # (T,) bounds
     upper: FloatArray
-    free: BoolArray  # (6,) entries that are learned
+    free: BoolArray  # (T,) entries that are learned
     prior_std: float  # standard deviation of the priors
 
 
+def theta_names(n: int) -> tuple[str, ...]:
+    """Names of the `n` entries of theta."""
+    *names, factor = THETA_NAMES
+    numbered = (f'{factor}_{k}' for k in range(1, N_CLASSES + 1))
+    return THETA_NAMES if n == len(THETA_NAMES) else (*names, *numbered)
+
+
 def given_theta(config: Config) -> FloatArray:
-    """Values given by the configuration, (6,), in log space."""
+    """Values given by the configuration, (T,), in log space; T is 6, with classes 14."""
     observation, latent = config.observation, config.latent
     values = (
         observation.sigma_f,
@@ -63,9 +73,9 @@ def given_theta(config: Config) -> FloatArray:
         latent.sigma_f_bar,
         latent.sigma_l_bar,
         latent.sigma_n_bar,
-        1.0,
     )
-    return np.log(values)
+    n_factors = N_CLASSES if config.learning.length_scale == 'classes' else 1
+    return np.append(np.log(values), np.zeros(n_factors))
 
 
 def theta_space(config: Config) -> ThetaSpace:
@@ -91,11 +101,15 @@ def theta_space(config: Config) -> ThetaSpace:
         least_f = min(growth.max_std, growth.seed_height_tolerance)
         least = np.log([least_f, 0.5 * config.label.ground_tolerance])
         lower[:2] = np.minimum(np.maximum(lower[:2], least), upper[:2])
+    if learning.length_scale == 'classes':
+        limits = config.length_scale
+        lower[5:] = math.log(limits.min) - class_middles(limits)
+        upper[5:] = math.log(limits.max) - class_middles(limits)
     return ThetaSpace(centre, lower, upper, free, learning.prior_std)
 
 
 def first_theta(frame: Frame, config: Config) -> FloatArray:
-    """Where learning begins, (6,), in log space: what the lines show, else the given values.
+    """Where learning begins, (T,), in log space: what the lines show, else the given values.
 
     sigma_f is the root mean square height, over the prior mean, of the near candidates on lines
     that may be ground. sigma_n follows from the differences between candidates and the line
@@ -124,11 +138,11 @@ def first_theta(frame: Frame, config: Config) -> FloatArray:
 class Learned(NamedTuple):
     """Outcome of one learning."""
 
-    theta: FloatArray  # (6,) best hyper-parameters evaluated, log space
+    theta: FloatArray  # (T,) best hyper-parameters evaluated, log space
     objective: float  # there, with the priors if any
     n_evaluations: int  # of objective and gradient
     status: str  # ``converged``, ``budget`` or ``failed`` (no finite objective found)
-    at_bound: BoolArray  # (6,) free entries that ended at a bound
+    at_bound: BoolArray  # (T,) free entries that ended at a bound
 
 
 class Model(Protocol):
@@ -152,10 +166,12 @@ def learn_frame(
     model: Model,
     out_of_time: Callable[[], bool],
 ) -> tuple[FloatArray, list[Learned]]:
-    """Learn theta on the inliers that grow under it, then again on those under what was learned.
+    """Learn theta on the inliers that grow under it, then on those under what was learned, ...
 
-    `before`, (M, 6), is where to begin, if not at `first_theta`; for `out_of_time` see `maximise`.
-    Returns the hyper-parameters of each segment, (M, 6), and one outcome for the frame, or one
+    It ends when the inliers of a later round are no more than before, or when
+    ``learning.max_evaluations`` are spent, of which the first round has half. `before`, (M, T),
+    is where to begin, if not at `first_theta`; for `out_of_time` see `maximise`.
+    Returns the hyper-parameters of each segment, (M, T), and one outcome for the frame, or one
     for each segment.
     """
     learning, n_segments = config.learning, len(frame.candidates.offsets) - 1
@@ -181,22 +197,22 @@ def learn_frame(
         )
 
     learned: list[Learned] = []
-    first = learning.max_evaluations // 2
-    for budget in (first, learning.max_evaluations - first):
-        if budget == 0 or (learned and out_of_time()):
-            continue
+    numbers: list[int] = []
+    budget = max(learning.max_evaluations // 2, 1)
+    while budget > 0 and not (learned and out_of_time()):
         surface, _, u = model.estimate_surface(thin, theta, config)
+        numbers.append(int(surface.inlier.sum()))
+        if len(numbers) > 2 and numbers[-1] <= numbers[-2]:
+            break
         inliers = take_inliers(thin, surface.inlier, u, has_latent)
         parts = [inliers] if by_frame else [_one_segment(inliers, m) for m in range(n_thin)]
         earlier = [one.n_evaluations for one in learned] or [0] * len(parts)
         learned = [learn(*one, budget) for one in zip(theta, parts, strict=False)]
         theta = np.array([one.theta for one in learned])
-        if by_frame:
-            theta = in_rows(theta[0], n_thin)
-        learned = [
-            one._replace(n_evaluations=one.n_evaluations + n)
-            for one, n in zip(learned, earlier, strict=True)
-        ]
+        theta = in_rows(theta[0], n_thin) if by_frame else theta
+        spent = [one.n_evaluations + n for one, n in zip(learned, earlier, strict=True)]
+        learned = [one._replace(n_evaluations=n) for one, n in zip(learned, spent, strict=True)]
+        budget = learning.max_evaluations - max(spent)
     return in_rows(theta[0], n_segments) if by_frame else theta, learned
 
 
@@ -230,7 +246,12 @@ def every_segment(frame: Frame, step: int) -> Frame:
             candidates.tile[kept],
         ),
         lines=frame.lines._replace(line=frame.lines.line[kept]),
-        pseudo=PseudoInputs(pseudo.r_bar[kept_bar], pseudo.log_extent[kept_bar], bar_offsets),
+        pseudo=PseudoInputs(
+            pseudo.r_bar[kept_bar],
+            pseudo.log_extent[kept_bar],
+            bar_offsets,
+            pseudo.kind[kept_bar],
+        ),
         continues_line=frame.continues_line[kept],
         in_face=frame.in_face[kept],
     )
@@ -252,6 +273,7 @@ def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: boo
         bar_offsets=pseudo.offsets if has_latent else np.zeros_like(candidates.offsets),
         r_bar=pseudo.r_bar,
         log_extent=pseudo.log_extent,
+        kind=pseudo.kind,
     )
 
 
@@ -266,6 +288,7 @@ def _one_segment(inliers: Inliers, m: int) -> Inliers:
         np.array([0, bar.stop - bar.start]),
         inliers.r_bar[bar],
         inliers.log_extent[bar],
+        inliers.kind[bar],
     )
 
 

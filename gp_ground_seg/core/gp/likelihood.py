@@ -21,15 +21,15 @@ def log_likelihood(
 ) -> tuple[float, FloatArray]:
     """Log marginal likelihood of a frame and its gradient (paper, eqs. 19 and 20).
 
-    `theta`, (6,), holds the logarithms of sigma_f, sigma_n [m], sigma_f_bar [log m],
-    sigma_l_bar [m], sigma_n_bar [log m], and of the factor on the length-scales of the lines.
+    `theta`, (T,), holds the logarithms of sigma_f, sigma_n [m], sigma_f_bar [log m],
+    sigma_l_bar [m], sigma_n_bar [log m], and of the factors on the length-scales of the lines.
     `slope_std` is the prior standard deviation of the mean line's slope: the line through the
     sensor's base is marginalised, which adds ``slope_std^2 r r'`` to the kernel (Rasmussen and
     Williams 2006, section 2.7). With `latent_terms` the terms of the latent process,
     ``-1/2 log|B_m|``, are in: the objective is the printed one, which has no upper bound.
 
     Returns the value, ``-inf`` where a covariance is not positive definite, and its gradient in
-    `theta`, (6,).
+    `theta`, (T,).
     """
     value, gradient = 0.0, np.zeros(len(theta))
     try:
@@ -110,6 +110,7 @@ class _Latent(NamedTuple):
     sigma_l_bar: float
     sigma_n_bar: float
     bar: Padded
+    kind: IntArray  # (S, p) entry of L-bar of each pseudo-input
     k_bar: FloatArray  # (S, p, p) without noise
     k_star: FloatArray  # (S, n, p)
     distance2: FloatArray  # (S, p, p)
@@ -122,7 +123,8 @@ class _Latent(NamedTuple):
     def of(cls, theta: FloatArray, inliers: Inliers, bar: Padded, r: FloatArray) -> _Latent:
         sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[2:5])
         r_bar = bar.take(inliers.r_bar)
-        l_bar = bar.take(inliers.log_extent)
+        kind = inliers.kind[bar.place]
+        l_bar = np.where(bar.mask, bar.take(inliers.log_extent) + theta[5 + kind], 0.0)
         mean = l_bar.sum(axis=1, keepdims=True) / np.maximum(bar.mask.sum(axis=1), 1)[:, None]
         kernel = sigma_f_bar**2, 0.5 / sigma_l_bar**2
         k_bar = squared_exponential(r_bar[:, :, None], r_bar[:, None, :], *kernel)
@@ -133,12 +135,13 @@ class _Latent(NamedTuple):
         inverse = np.linalg.inv(b).astype(np.float64, copy=False)
         factor = np.linalg.cholesky(b).astype(np.float64, copy=False)
         beta: FloatArray = (inverse @ np.where(bar.mask, l_bar - mean, 0.0)[:, :, None])[:, :, 0]
-        u = mean + theta[5] + (k_star @ beta[:, :, None])[:, :, 0]
+        u = mean + (k_star @ beta[:, :, None])[:, :, 0]
         return cls(
             u=np.clip(u, -MAX_ABS_LOG_LENGTH_SCALE, MAX_ABS_LOG_LENGTH_SCALE),
             sigma_l_bar=sigma_l_bar,
             sigma_n_bar=sigma_n_bar,
             bar=bar,
+            kind=kind,
             k_bar=k_bar,
             k_star=k_star,
             distance2=(r_bar[:, :, None] - r_bar[:, None, :]) ** 2,
@@ -152,7 +155,10 @@ class _Latent(NamedTuple):
         """Propagate the derivatives in u to theta; return the latent terms of the value."""
         bar, beta = self.bar, self.beta
         weight = (self.inverse @ (g_u[:, None, :] @ self.k_star).swapaxes(1, 2))[:, :, 0]
-        gradient[5] += g_u.sum()
+        # u is the mean of L-bar and what the process makes of the differences from it.
+        share = (g_u.sum(axis=1) - weight.sum(axis=1)) / np.maximum(bar.mask.sum(axis=1), 1)
+        g_l_bar = (weight + share[:, None])[bar.mask]
+        gradient[5:] += np.bincount(self.kind[bar.mask], g_l_bar, minlength=len(gradient) - 5)
 
         # Adjoints of k_star and of B: every derivative is contracted with them.
         star = g_u[:, :, None] * self.k_star * beta[:, None, :]

@@ -254,6 +254,9 @@ class LearningConfig:
         'labels then depend on the speed of the machine', 's')
     prior_std: float = advanced(1.0, (0.01, 10.0),
         'standard deviation of the log-normal priors about the values given here')
+    length_scale: str = advanced('factor', ('factor', 'classes'),
+        'what the segments share of L_bar: one factor on the lengths of lines, or a value for '
+        'each of nine classes of lines', symbol='L_bar')
     fixed: str = advanced('length_scales', ('none', 'sigma_f_bar', 'latent', 'length_scales'),
         'hyper-parameters that are not learned')
 

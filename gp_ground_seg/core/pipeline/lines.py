@@ -16,6 +16,7 @@ from gp_ground_seg.core.frame import (
     Candidates,
     Faces,
     FloatArray,
+    IntArray,
     Lines,
     PseudoInputs,
 )
@@ -31,6 +32,8 @@ from gp_ground_seg.core.parameters.number_tuples import numbers_of
 
 MIN_BREAK_CANDIDATES = 3
 """Candidates that a line after a slope break needs: through two there is always one."""
+N_CLASSES = 9
+"""Classes of lines that share a length-scale."""
 
 
 def find_lines(
@@ -51,14 +54,19 @@ def lines_through(
     """Lines, pseudo-inputs, and which candidates continue a line, by `trace`, compiled or not."""
     n = len(candidates.r)
     lines = Lines(np.empty(n, np.int64), np.empty(n), np.empty(n + 1, np.int64))
-    pseudo = PseudoInputs(np.empty(n), np.empty(n), np.empty(len(candidates.offsets), np.int64))
+    offsets = np.empty(len(candidates.offsets), np.int64)
+    pseudo = PseudoInputs(np.empty(n), np.empty(n), offsets, np.empty(n, np.int64))
     continues_line = np.empty(n, np.bool_)
     groups = config.lines, config.growth, config.latent, config.length_scale
     n_lines, n_pseudo = trace_lines(
         candidates, *map(numbers_of, groups), lines, pseudo, continues_line
     )
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
-    pseudo = PseudoInputs(pseudo.r_bar[:n_pseudo], pseudo.log_extent[:n_pseudo], pseudo.offsets)
+    r_bar, log_extent, offsets, line = pseudo
+    line = line[:n_pseudo]
+    pseudo = PseudoInputs(r_bar[:n_pseudo], log_extent[:n_pseudo], offsets, np.zeros_like(line))
+    if config.learning.length_scale == 'classes':
+        pseudo = shared_by_class(line, lines, pseudo, config.length_scale)
     return lines, pseudo, continues_line
 
 
@@ -66,12 +74,41 @@ def _trace_lists(candidates: Candidates, *arguments: Any) -> tuple[int, int]:
     """Do what `trace` does, in lists: plain Python reads and writes them faster than arrays."""
     arrays = *arguments[-3], *arguments[-2], arguments[-1]
     lists: Any = [array.tolist() for array in arrays]
-    results: Any = Lines(*lists[:3]), PseudoInputs(*lists[3:6]), lists[6]
+    results: Any = Lines(*lists[:3]), PseudoInputs(*lists[3:7]), lists[7]
     inputs: Any = (column.tolist() for column in candidates)
     counts = trace(Candidates(*inputs), *arguments[:-3], *results)
     for array, values in zip(arrays, lists, strict=True):
         array[:] = values
     return counts
+
+
+def class_middles(limits: LengthScaleConfig) -> FloatArray:
+    """Log length in the middle of each class of lines, (N_CLASSES,) [log m].
+
+    The three classes of length are equally wide on a log scale between ``length_scale.min`` and
+    ``length_scale.max``; each has three of slope.
+    """
+    edges = np.linspace(math.log(limits.min), math.log(limits.max), 7)
+    return np.repeat(edges[1::2], N_CLASSES // 3).astype(np.float64)
+
+
+def shared_by_class(
+    line: IntArray, lines: Lines, pseudo: PseudoInputs, limits: LengthScaleConfig
+) -> PseudoInputs:
+    """Pseudo-inputs of which those on lines of one class share the first guess.
+
+    "All segments share L-bar" (paper, section III-E), though each has other lines. The classes
+    are those of `class_middles`, and by slope: the line falls, is flat up to
+    ``length_scale.flat_gradient``, or rises. `line` (P,) is that of each pseudo-input.
+    """
+    slope, share = lines.slope[line], pseudo.log_extent - math.log(limits.min)
+    by_length = (3.0 * share / math.log(limits.max / limits.min)).astype(np.int64)
+    # A line of one point has no slope: it is flat.
+    by_slope = (
+        1 + (slope > limits.flat_gradient) - (slope < -limits.flat_gradient).astype(np.int64)
+    )
+    kind = 3 * np.minimum(by_length, 2) + by_slope
+    return pseudo._replace(log_extent=class_middles(limits)[kind], kind=kind)
 
 
 @shared
@@ -233,6 +270,7 @@ def select_pseudo_inputs(
             # The middle of each of `number` equal shares of the line's candidates.
             pseudo.r_bar[p] = r[first + (size * (2 * rank + 1)) // (2 * number)]
             pseudo.log_extent[p] = log_extent
+            pseudo.kind[p] = q  # the line, until `lines_through` puts its class there
             p += 1
     for k in range(m, len(pseudo.offsets)):
         pseudo.offsets[k] = p

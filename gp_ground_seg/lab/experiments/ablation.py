@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 from collections.abc import Sequence
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.core.errors import ConfigError
@@ -12,6 +13,7 @@ from gp_ground_seg.core.parameters.config import Config, find_spec
 from gp_ground_seg.core.parameters.presets import find_preset
 from gp_ground_seg.lab.experiments.interpolation import interpolation_method
 from gp_ground_seg.lab.experiments.variants import Changes, refuse_changed, score_variants
+from gp_ground_seg.lab.plotting.segment import plot_trade_off
 from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.comparison import INTERVAL, interval_note, interval_text, mse_sums
 from gp_ground_seg.lab.scoring.evaluate import Method, MethodScore
@@ -23,6 +25,7 @@ from gp_ground_seg.lab.scoring.report import (
     Table,
     centimetres,
     changed_parameters,
+    milliseconds,
     percent,
 )
 from gp_ground_seg.lab.scoring.tables import make_report
@@ -89,6 +92,8 @@ STEPS = {
 }
 """Steps from the preset ``paper`` to the defaults: beginnings of the names that change."""
 
+CANDIDATES_PER_PSEUDO_INPUT = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
+"""Candidates of a line for each pseudo-input; with the last, most lines have one."""
 FACTORS = (0.1, 1 / 3, 3.0, 10.0)
 GIVEN = {
     'sigma_f': ('observation.sigma_f',),
@@ -105,7 +110,7 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     beside them a surface that is interpolated between lowest points. On labelled frames, or on a
     simulated smooth road that ends in rubble, by exact labels and heights.
     """
-    refuse_changed(config, {name for changes in MODELS.values() for name in changes})
+    refuse_changed(config, (), *MODELS.values())
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     with closing(interpolation_method(config)) as plain:
         scores = score_variants(items, variants, [plain], runner=runner)
@@ -220,6 +225,50 @@ def compare_steps(
         f'the last of them; {interval_note(scores[0])}; RMSE of the height under labelled ground'
     )
     return make_report({'steps': Table(rows, title)}, scores, config)
+
+
+def compare_pseudo_inputs(
+    items: Sequence[Any], config: Config, runner: Runner = HERE, plot: Path | None = None
+) -> Report:
+    """Sweep the number of pseudo-inputs: time against precision, the trade-off of Table I.
+
+    All length-scales are learned.
+    """
+    refuse_changed(config, ['latent.candidates_per_pseudo_input'], _LATENT)
+    names = {f'{n:g}': n for n in CANDIDATES_PER_PSEUDO_INPUT}
+    variants = {
+        name: config.replace(**_LATENT, **{'latent.candidates_per_pseudo_input': n})
+        for name, n in names.items()
+    }
+    scores = score_variants(items, variants, runner=runner)
+    most = scores[0]
+    rows: list[Row] = []
+    for score in scores:
+        fits = [scan.fit for scan in score.scans if scan.fit is not None]
+        learning = statistics.median(scan.stages['learning'] for scan in score.scans)
+        n_evaluations = statistics.median(fit.n_evaluations for fit in fits)
+        rows.append(
+            [
+                (Column('candidates for each', key='candidates_per_pseudo_input'), score.name),
+                (Column('pseudo-inputs per segment', '.1f', 'n_pseudo_inputs'),
+                 statistics.fmean(f.n_pseudo_inputs / f.n_segments for f in fits)),
+                (Column('evaluations', '.0f', 'n_evaluations'), n_evaluations),
+                (milliseconds('learning [ms]', 'learning'), learning),
+                (milliseconds('one evaluation [ms]', 'evaluation'), learning / n_evaluations),
+                (milliseconds('frame [ms]', 'seconds'), score.seconds()),
+                (percent('IoU [%]', 'iou'), score.iou),
+                (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
+                (INTERVAL, interval_text(score, most, mse_sums) if score is not most else None),
+            ]
+        )  # fmt: skip
+    title = (
+        f'{_counted(most)}; medians of evaluations and times; RMSE of the height under labelled '
+        f'ground, interval of it minus that of the first row; {interval_note(most)}'
+    )
+    table = Table(rows, title)
+    if plot is not None:
+        plot_trade_off(table.json(), plot)
+    return make_report({'pseudo_inputs': table}, scores, config)
 
 
 def compare_wrong_values(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:

@@ -9,7 +9,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.experiments.variants import SimulatedFrame, score_variants
 from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.evaluate import ALL, OURS, RingScore
-from gp_ground_seg.lab.scoring.metrics import RING_TITLES
+from gp_ground_seg.lab.scoring.metrics import RING_TITLES, TRIMMED
 from gp_ground_seg.lab.scoring.report import Column, Report, Row, Table, centimetres, percent
 from gp_ground_seg.lab.scoring.tables import make_report
 
@@ -55,7 +55,8 @@ def _table(name: str, parts: Mapping[str, RingScore], what: str) -> Table:
         )
     title = (
         f'ground_z and {what}, by {name}: points within 1 and 2 standard deviations [%] (68.3 and '
-        '95.4 of a normal distribution), mean negative log predictive density, bias and RMSE '
-        '[cm]; expected calibration error of p_ground'
+        '95.4 of a normal distribution), mean negative log predictive density without the '
+        f'worst {TRIMMED:.1%} of each frame, bias and RMSE [cm]; expected calibration error of '
+        'p_ground'
     )
     return Table(rows, title, n_sums=1)

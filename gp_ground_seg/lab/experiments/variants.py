@@ -85,10 +85,14 @@ def peer_of(sensor: str) -> PatchworkppMethod:
     return PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
 
 
-def refuse_changed(config: Config, names: Iterable[str]) -> None:
-    """Raise ConfigError if `config` changes what an experiment compares."""
-    for name in sorted(names):
-        if config[name] != find_spec(name).default:
+def refuse_changed(config: Config, names: Iterable[str], *variants: Changes) -> None:
+    """Raise ConfigError if `config` changes what an experiment compares, or sets in `variants`.
+
+    A value that one of the variants has itself is no contradiction, as those of preset ``paper``.
+    """
+    for name in sorted({*names, *itertools.chain(*variants)}):
+        values = [find_spec(name).default, *(v[name] for v in variants if name in v)]
+        if config[name] not in values:
             raise ConfigError(f'{name} = {config[name]}: the experiment sets it, leave it out')
 
 

@@ -1,8 +1,9 @@
-"""One segment from the side: candidates, lines, surface, length-scale (the paper's Figure 1)."""
+"""The paper's figures: segments from the side (Figure 1), and the trade-off of Table I."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,8 @@ from gp_ground_seg.lab.plotting.style import new_figure, save
 from gp_ground_seg.lab.scoring.metrics import Labels
 
 DPI = 130
-# Inches: the figure, and the part of it that the two panels leave to the legend.
-WIDTH, HEIGHT, LEGEND = 12.2, 7.6, 2.6
+# Inches: the panels of one segment, those of each of several, and the legend beside them.
+WIDTH, WIDTH_OF_SEVERAL, HEIGHT, LEGEND = 9.6, 7.2, 7.6, 2.6
 
 CANDIDATE_COLOUR = '#56636E'
 LINE_COLOUR = style.GREEN
@@ -43,13 +44,13 @@ def plot_segment(
     result: Segmentation,
     config: Config,
     points: npt.ArrayLike,
-    segment: int,
+    segments: Sequence[int],
     path: str | Path,
     truth: Labels | None = None,
     title: str = '',
     max_range: float | None = None,
 ) -> None:
-    """Draw a segment from the side; below it the length-scale and its pseudo-inputs.
+    """Draw segments from the side, side by side; below each the length-scale and pseudo-inputs.
 
     `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
     labels, UNKNOWN where a point does not count; `max_range` [m] is by default a little more than
@@ -57,37 +58,59 @@ def plot_segment(
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     style.check_lengths(len(z), result=result.label, truth=truth)
-    view = SegmentView(result, segment)
-    inside = (result.grid.segment == segment) & (result.grid.bin != OUTSIDE)
-    r, z = result.grid.r[inside], z[inside]
-    reach = view.reach(r, max_range)
-    low, high = view.heights_shown(reach, z)
-    n_hidden = np.count_nonzero((r > reach) | (z < low) | (z > high))
-    figure = new_figure(WIDTH, HEIGHT, DPI)
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
-    figure.subplots_adjust(0.065, 0.075, 1.0 - LEGEND / WIDTH, 0.93, hspace=0.08)
-    name = f'{title}, {view.name}' if title else view.name
-    name = f'{name}; {n_hidden} points outside'
-    above.set_title(name, fontsize=12, loc='left', parse_math=False)
-    kinds = label_panel(result.label[inside])[1]
-    if truth is not None:
-        kinds |= error_panel(result.label[inside], truth[inside])[1]
-    view.draw_points(above, r, z, kinds)
-    view.draw_ground(above)
-    above.set_xlim(0.0, reach)
-    above.set_ylim(low, high)
-    view.draw_length_scale(below, reach, with_pseudo_inputs=config.length_scale.model == 'latent')
-    for axes in (above, below):
-        _finish(axes)
+    views = [SegmentView(result, segment) for segment in segments]
+    inside = [
+        (result.grid.segment == segment) & (result.grid.bin != OUTSIDE) for segment in segments
+    ]
+    points_of = [(result.grid.r[part], z[part]) for part in inside]
+    reach = max(v.reach(r, max_range) for v, (r, _) in zip(views, points_of, strict=True))
+    shown = [v.heights_shown(reach, z) for v, (_, z) in zip(views, points_of, strict=True)]
+    low, high = min(low for low, _ in shown), max(high for _, high in shown)
+    figure, panels = _panels(len(views))
+    scales, with_pseudo_inputs = [], config.length_scale.model == 'latent'
+    for view, (r, z), part, (above, below) in zip(views, points_of, inside, panels.T, strict=True):
+        n_hidden = np.count_nonzero((r > reach) | (z < low) | (z > high))
+        name = f'{title}, {view.name}' if title else view.name
+        name = f'{name}; {n_hidden} points outside'
+        above.set_title(name, fontsize=12, loc='left', parse_math=False)
+        kinds = label_panel(result.label[part])[1]
+        if truth is not None:
+            kinds |= error_panel(result.label[part], truth[part])[1]
+        view.draw_points(above, r, z, kinds)
+        view.draw_ground(above)
+        view.draw_length_scale(below, reach, with_pseudo_inputs=with_pseudo_inputs)
+        scales.append(below.get_ylim())
+        title = ''
+    panels[0, 0].set_xlim(0.0, reach)
+    panels[0, 0].set_ylim(low, high)
+    panels[1, 0].set_ylim(min(low for low, _ in scales), max(high for _, high in scales))
+    for axes in panels.flat:
+        _finish(axes, has_legend=axes in panels[:, -1], with_counts=len(views) == 1)
     figure.align_ylabels()
     save(figure, path)
 
 
-def _finish(axes: Any) -> None:
-    """Draw the grid of a panel, and its legend beside it."""
+def _panels(n: int) -> tuple[Any, Any]:
+    """Return a figure and its panels, (2, n), with the same axes in each row."""
+    width = LEGEND + (WIDTH if n == 1 else n * WIDTH_OF_SEVERAL)
+    figure = new_figure(width, HEIGHT, DPI)
+    shared = {'sharex': True, 'sharey': 'row', 'squeeze': False}
+    panels = figure.subplots(2, n, height_ratios=(2.6, 1.0), **shared)
+    edge = 0.065 * (WIDTH + LEGEND) / width
+    figure.subplots_adjust(edge, 0.075, 1.0 - LEGEND / width, 0.93, hspace=0.08, wspace=0.04)
+    return figure, panels
+
+
+def _finish(axes: Any, *, has_legend: bool, with_counts: bool) -> None:
+    """Draw the grid of a panel, and beside the last one the legend, with its counts."""
     axes.grid(color='#E9ECEE', linewidth=0.7)
     axes.set_axisbelow(True)
+    axes.label_outer()
+    if not has_legend:
+        return
+    handles, labels = axes.get_legend_handles_labels()
     axes.legend(
+        handles, labels if with_counts else [label.split(' (')[0] for label in labels],
         loc='upper left', bbox_to_anchor=(1.01, 1.01), frameon=False, fontsize=10,
         borderaxespad=0.0, labelspacing=0.8, markerscale=1.3,
     )  # fmt: skip
@@ -186,8 +209,8 @@ class SegmentView:
         first, last = result.pseudo.offsets[self._segment : self._segment + 2]
         if with_pseudo_inputs and last > first:
             r_bar = result.pseudo.r_bar[first:last]
-            factor = np.exp(result.theta[self._segment, -1])
-            l_bar = factor * np.exp(result.pseudo.log_extent[first:last])
+            shared = result.theta[self._segment, 5 + result.pseudo.kind[first:last]]
+            l_bar = np.exp(result.pseudo.log_extent[first:last] + shared)
             look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0}
             axes.plot(r_bar, l_bar, 's', label=f'pseudo-inputs ({last - first})', **look)
             shown = np.concatenate([shown, l_bar[r_bar <= reach]])
@@ -210,3 +233,20 @@ def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, F
     along = (r - r.mean()) * math.cos(angle) + (z - z.mean()) * math.sin(angle)
     ends = np.array([along.min(), along.max()])
     return r.mean() + ends * math.cos(angle), z.mean() + ends * math.sin(angle)
+
+
+def plot_trade_off(rows: Sequence[Mapping[str, Any]], path: str | Path) -> None:
+    """Draw time and RMSE over the number of pseudo-inputs, by the rows of the sweep."""
+    figure = new_figure(7.0, 4.4, DPI)
+    axes, number = figure.subplots(), [row['n_pseudo_inputs'] for row in rows]
+    figure.subplots_adjust(0.12, 0.13, 0.88, 0.95)
+    sides = (
+        (axes, LINE_COLOUR, 'o-', 1e3, 'seconds', 'time per frame [ms]'),
+        (axes.twinx(), SURFACE_COLOUR, 's-', 100.0, 'rmse', 'RMSE of the height [cm]'),
+    )
+    for side, colour, form, scale, key, title in sides:
+        side.plot(number, [scale * row[key] for row in rows], form, color=colour)
+        side.set_ylabel(title, color=colour)
+    axes.set_xlabel('pseudo-inputs per segment')
+    axes.grid(color='#E9ECEE', linewidth=0.7)
+    save(figure, path)

@@ -360,13 +360,13 @@ def _run(method: Method, scan: KnownScan) -> None:
 
 
 def _score(scan: KnownScan, result: MethodResult, seconds: float, first: Labels) -> ScanScore:
-    label = result.label
+    label, max_nlpd = result.label, _max_nlpd(scan, result)
     return ScanScore(
         scan.sequence, scan.index, seconds, result.stages,
         {key: metrics.count_confusion(label, truth) for key, truth in scan.truths.items()},
-        _height_error(scan, result),
+        _height_error(scan, result, slice(None), max_nlpd),
         {} if scan.semantic is None else metrics.count_classes(label, scan.semantic),
-        _score_rings(scan, result),
+        _score_rings(scan, result, max_nlpd),
         {} if scan.objects is None else count_objects(scan.points, label, scan.objects),
         result.pose, result.fit, scan.cluster or scan.sequence,
         len(label), int((label != first).sum()),
@@ -374,7 +374,7 @@ def _score(scan: KnownScan, result: MethodResult, seconds: float, first: Labels)
 
 
 def _height_error(
-    scan: KnownScan, result: MethodResult, inside: BoolArray | slice = slice(None)
+    scan: KnownScan, result: MethodResult, inside: BoolArray | slice, max_nlpd: float
 ) -> HeightError:
     """Error of the surface under the ground points `inside` a part of the scan."""
     if scan.ground_z is None or scan.is_ground is None:
@@ -385,10 +385,20 @@ def _height_error(
         scan.ground_z[inside][ground],
         result.ground_z[inside][ground],
         None if std is None else std[inside][ground],
+        max_nlpd,
     )
 
 
-def _score_rings(scan: KnownScan, result: MethodResult) -> tuple[RingScore, ...]:
+def _max_nlpd(scan: KnownScan, result: MethodResult) -> float:
+    """Largest NLPD that counts in a scan."""
+    std = getattr(result, scan.std)
+    if scan.ground_z is None or scan.is_ground is None or std is None:
+        return math.inf
+    error = (result.ground_z - scan.ground_z)[scan.is_ground]
+    return metrics.largest_nlpd(metrics.negative_log_density(error, std[scan.is_ground]))
+
+
+def _score_rings(scan: KnownScan, result: MethodResult, max_nlpd: float) -> tuple[RingScore, ...]:
     truth = next(iter(scan.truths.values()), None)
     if truth is None:
         return ()
@@ -399,5 +409,6 @@ def _score_rings(scan: KnownScan, result: MethodResult) -> tuple[RingScore, ...]
         inside, calibration = ring == k, Calibration()
         if result.p_ground is not None:
             calibration = metrics.count_calibration(result.p_ground[inside], truth[inside])
-        found.append(RingScore(confusion, _height_error(scan, result, inside), calibration))
+        height = _height_error(scan, result, inside, max_nlpd)
+        found.append(RingScore(confusion, height, calibration))
     return tuple(found)

@@ -316,6 +316,9 @@ def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Cali
 FINEST_STD = 1e-3
 """Least standard deviation in the predictive density [m]: no sensor resolves a millimetre, and the
 density of a handful of returns that happen to agree would outweigh all others."""
+TRIMMED = 1e-3
+"""Share of the points of a frame that the mean negative log density leaves out, those with the
+lowest density: five returns that lie metres below the ground would decide it."""
 
 
 @dataclass(frozen=True)
@@ -333,7 +336,9 @@ class HeightError(Sums):
     n_with_std: int = 0  # points whose standard deviation is known
     n_within_1: int = 0  # of these the ones with an error of at most one standard deviation
     n_within_2: int = 0
-    sum_nlpd: float = 0.0  # of these, negative logs of the predictive density per metre
+    # Negative logs of the predictive density per metre, but for the worst `TRIMMED` of a frame
+    sum_nlpd: float = 0.0
+    n_nlpd: int = 0
     medians: tuple[float, ...] = ()  # median absolute error of each frame [m]
 
     @property
@@ -368,25 +373,30 @@ class HeightError(Sums):
 
     @property
     def nlpd(self) -> float:
-        """Mean negative log predictive density (Rasmussen and Williams, 2006, section 2.5)."""
-        return ratio(self.sum_nlpd, self.n_with_std)
+        """Mean negative log predictive density (Rasmussen and Williams, 2006, section 2.5).
+
+        The worst `TRIMMED` of each frame is left out.
+        """
+        return ratio(self.sum_nlpd, self.n_nlpd)
 
 
 def height_error(
     truth: npt.NDArray[np.floating],
     estimate: npt.NDArray[np.floating],
     std: npt.NDArray[np.floating] | None = None,
+    max_nlpd: float | None = None,
 ) -> HeightError:
     """Compare true with estimated heights of the ground, (n,) [m]; NaN where there is no model.
 
-    `std` are the standard deviations of the differences, (n,) [m], if there are any.
+    `std` are the standard deviations of the differences, (n,) [m], if there are any. `max_nlpd` is
+    that of the frame, if these points are a part of it.
     """
     known = np.isfinite(estimate)
     y = truth[known].astype(np.float64)
     error = estimate[known] - y
     spread = np.full(len(y), np.nan) if std is None else std[known]
-    fine = np.maximum(spread, FINEST_STD)
-    nlpd = 0.5 * np.log(2.0 * np.pi * fine**2) + 0.5 * (error / fine) ** 2
+    nlpd = negative_log_density(error, spread)
+    counts = nlpd <= (largest_nlpd(nlpd) if max_nlpd is None else max_nlpd)
     return HeightError(
         n_points=len(y),
         n_without_model=len(truth) - len(y),
@@ -397,6 +407,20 @@ def height_error(
         n_with_std=int(np.isfinite(spread).sum()),
         n_within_1=int((np.abs(error) <= spread).sum()),
         n_within_2=int((np.abs(error) <= 2.0 * spread).sum()),
-        sum_nlpd=float(nlpd[np.isfinite(spread)].sum()),
+        sum_nlpd=float(nlpd[counts].sum()),
+        n_nlpd=int(counts.sum()),
         medians=(float(np.median(np.abs(error))),) if len(y) else (),
     )
+
+
+def negative_log_density(error: FloatArray, std: FloatArray) -> FloatArray:
+    """Negative log of the normal density of errors, (n,) [m]; NaN where `std` is."""
+    fine = np.maximum(std, FINEST_STD)
+    result: FloatArray = 0.5 * np.log(2.0 * np.pi * fine**2) + 0.5 * (error / fine) ** 2
+    return result
+
+
+def largest_nlpd(nlpd: FloatArray) -> float:
+    """Return the largest one that is not among the worst `TRIMMED` of a frame, (n,)."""
+    known = np.sort(nlpd[~np.isnan(nlpd)])
+    return float(known[-1 - int(TRIMMED * len(known))]) if len(known) else math.inf

@@ -20,6 +20,7 @@ from gp_ground_seg.lab.scoring.comparison import (
     difference_table,
     interval_note,
     interval_text,
+    without_one_table,
 )
 from gp_ground_seg.lab.scoring.evaluate import ALL, MethodScore
 from gp_ground_seg.lab.scoring.metrics import Confusion
@@ -44,6 +45,8 @@ def evaluation(
     for other in others:
         if ours.has_labels:
             tables['differences'] = _iou_differences(ours, other)
+        if ours.has_labels and len(ours.sequences) > 2:
+            tables['without_one'] = without_one_table(ours, other)
         tables['measures'] = difference_table(ours, other)
     if ours.has_labels:
         tables['rings'] = _ring_table(scores)
@@ -100,7 +103,8 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
             }
         if scan.fit is not None and scan.pose is not None:
             pose = scan.pose
-            row |= {'status': scan.fit.status, 'n_segments': scan.fit.n_segments}
+            row |= {'status': scan.fit.status, 'n_evaluations': scan.fit.n_evaluations}
+            row |= {'n_segments': scan.fit.n_segments}
             row |= {'sensor_height': pose.height, 'sensor_height_estimated': pose.height_estimated}
             row |= {'sensor_roll': pose.roll, 'sensor_pitch': pose.pitch}
         rows.append(row)
@@ -348,7 +352,20 @@ def _time_table(scores: Sequence[MethodScore], n_workers: int) -> Table:
     words = f'{n_workers} worker' + 's' * (n_workers > 1)
     beside = f', {words} beside one another' if n_workers else ''
     title = f'Time per frame, reading left out{beside}  [ms]'
-    return Table(rows, title, notes=[f'stages: {stages}'])
+    return Table(rows, title, notes=[f'stages: {stages}', *_learning_note(scores[0])])
+
+
+def _learning_note(score: MethodScore) -> list[str]:
+    """Say how many evaluations the learning took, and whether it has converged."""
+    fits = [scan.fit for scan in score.scans if scan.fit is not None and scan.fit.n_evaluations]
+    if not fits:
+        return []
+    n_converged = sum(fit.status == 'converged' for fit in fits)
+    numbers = [fit.n_evaluations for fit in fits]
+    return [
+        f'learning: {statistics.median(numbers):.0f} evaluations (median), at most '
+        f'{max(numbers)}; {n_converged} of {len(fits)} frames converged'
+    ]
 
 
 def reliability_rows(score: MethodScore) -> list[dict[str, Any]]:
