@@ -149,9 +149,9 @@ def run(arguments: argparse.Namespace) -> int:
             report.facts.update(experiment=arguments.experiment, options=given)
             report.write(parts['json'], environment)
     lines = [machine_line(environment, report.fit)]
-    if 'plot' in more:
-        lines.insert(0, f'time and error of the table, written to {shown(more["plot"])}')
     print(written(report.tables.values(), lines, markdown=arguments.markdown))
+    if 'plot' in more:
+        print(f'time and error of the table, written to {shown(more["plot"])}')
     return 0
 
 

@@ -110,7 +110,7 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     beside them a surface that is interpolated between lowest points. On labelled frames, or on a
     simulated smooth road that ends in rubble, by exact labels and heights.
     """
-    refuse_changed(config, (), *MODELS.values())
+    refuse_changed(config, {name for changes in MODELS.values() for name in changes}, _LATENT)
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
     with closing(interpolation_method(config)) as plain:
         scores = score_variants(items, variants, [plain], runner=runner)
@@ -234,7 +234,7 @@ def compare_pseudo_inputs(
 
     All length-scales are learned.
     """
-    refuse_changed(config, ['latent.candidates_per_pseudo_input'], _LATENT)
+    refuse_changed(config, ['latent.candidates_per_pseudo_input', *_LATENT], _LATENT)
     names = {f'{n:g}': n for n in CANDIDATES_PER_PSEUDO_INPUT}
     variants = {
         name: config.replace(**_LATENT, **{'latent.candidates_per_pseudo_input': n})
@@ -249,20 +249,20 @@ def compare_pseudo_inputs(
         n_evaluations = statistics.median(fit.n_evaluations for fit in fits)
         rows.append(
             [
-                (Column('candidates for each', key='candidates_per_pseudo_input'), score.name),
-                (Column('pseudo-inputs per segment', '.1f', 'n_pseudo_inputs'),
+                (Column('candidates', key='candidates_per_pseudo_input'), score.name),
+                (Column('n_L', '.1f', 'n_pseudo_inputs'),
                  statistics.fmean(f.n_pseudo_inputs / f.n_segments for f in fits)),
                 (Column('evaluations', '.0f', 'n_evaluations'), n_evaluations),
-                (milliseconds('learning [ms]', 'learning'), learning),
-                (milliseconds('one evaluation [ms]', 'evaluation'), learning / n_evaluations),
-                (milliseconds('frame [ms]', 'seconds'), score.seconds()),
+                (milliseconds('learning', 'learning'), learning),
+                (milliseconds('frame', 'seconds'), score.seconds()),
                 (percent('IoU [%]', 'iou'), score.iou),
                 (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
                 (INTERVAL, interval_text(score, most, mse_sums) if score is not most else None),
             ]
         )  # fmt: skip
     title = (
-        f'{_counted(most)}; medians of evaluations and times; RMSE of the height under labelled '
+        f'{_counted(most)}; candidates of a line for each pseudo-input; n_L: pseudo-inputs of a '
+        'segment, mean; medians of evaluations and times [ms]; RMSE of the height under labelled '
         f'ground, interval of it minus that of the first row; {interval_note(most)}'
     )
     table = Table(rows, title)

@@ -38,7 +38,7 @@ def table1(items: Sequence[Frame], config: Config, runner: Runner = HERE) -> Rep
     Each method runs on each frame of `CHOICES` once without counting, then `N_REPEATS` times,
     alternately.
     """
-    refuse_changed(config, ['length_scale.model'], {'learning.fixed': 'none'})
+    refuse_changed(config, ['length_scale.model', 'learning.fixed'], {'learning.fixed': 'none'})
     if config.learning.mode == 'fixed':
         raise ConfigError('learning.mode = fixed: the table is of what is learned, leave it out')
     last = config.grid.n_segments - 1

@@ -86,11 +86,11 @@ def peer_of(sensor: str) -> PatchworkppMethod:
 
 
 def refuse_changed(config: Config, names: Iterable[str], *variants: Changes) -> None:
-    """Raise ConfigError if `config` changes what an experiment compares, or sets in `variants`.
+    """Raise ConfigError if `config` changes what an experiment compares.
 
-    A value that one of the variants has itself is no contradiction, as those of preset ``paper``.
+    A value that one of `variants` has itself contradicts nothing, as in the preset ``paper``.
     """
-    for name in sorted({*names, *itertools.chain(*variants)}):
+    for name in sorted(names):
         values = [find_spec(name).default, *(v[name] for v in variants if name in v)]
         if config[name] not in values:
             raise ConfigError(f'{name} = {config[name]}: the experiment sets it, leave it out')
