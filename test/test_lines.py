@@ -107,6 +107,7 @@ def test_lines_and_pseudo_inputs_are_the_reference(backend, seed, per, error_rat
             'growth.min_bend_extent': 3.0,
             'latent.candidates_per_pseudo_input': per,
             'learning.length_scale': shared,
+            'length_scale.max': 8.0,
         }
     )
     found = backend.extract_lines(candidates, faces, config)
@@ -126,7 +127,8 @@ def test_the_candidates_drawn_hold_every_case():
     at_break = continued = alone = 0
     kinds = set()
     changes = {'growth.min_bend_extent': 3.0, 'learning.length_scale': 'classes'}
-    config = Config().replace(**{'lines.max_gap': 6.0, **changes})
+    changes |= {'lines.max_gap': 6.0, 'length_scale.max': 8.0}
+    config = Config().replace(**changes)
     for seed in range(40):
         _, lines, pseudo, continues, _ = Reference().extract_lines(
             draw_candidates(seed), NO_FACES, config

@@ -133,7 +133,8 @@ def test_segments_side_by_side(scan, tmp_path, capsys):
     assert said.startswith('segment 90: ') and '; segment 91: 0 candidates' in said
     image = imread(path)[:, :, :3]
     left, right = image[:, : 9 * image.shape[1] // 20], image[:, 9 * image.shape[1] // 20 :]
-    assert count(left, colours.SURFACE_COLOUR) > 1000 > count(right, colours.SURFACE_COLOUR)
+    violet = colours.PSEUDO_INPUT_COLOUR
+    assert count(left, violet) > 30 > count(right, violet)
     with pytest.raises(SystemExit, match='2'):
         run('plot', 'segment', scan, '--segment', '90;91', '-o', path, '--force')
 
