@@ -82,12 +82,11 @@ def theta_space(config: Config) -> ThetaSpace:
     """Bounds, priors and free entries by the configuration.
 
     Inliers are survivors of the gate, so what is learned from them is too small, lets fewer join,
-    and confirms itself. Two lower bounds end this. With a sigma_f below ``growth.max_std`` the
-    prior alone would decide candidates where nothing is seen. With a sigma_n below half of
-    ``label.ground_tolerance`` the gate would refuse what is ground in any case. The objective as
-    printed has neither.
+    and confirms itself. A lower bound of sigma_n ends this: half of ``label.ground_tolerance``,
+    below which the gate would refuse what is ground in any case. A bound of sigma_f as well made
+    cars ground where little is seen. The objective as printed has none.
     """
-    learning, centre, growth = config.learning, given_theta(config), config.growth
+    learning, centre = config.learning, given_theta(config)
     width = WIDEST * learning.prior_std
     free = np.ones(len(centre), dtype=np.bool_)
     if config.length_scale.model != 'latent' or learning.fixed == 'length_scales':
@@ -98,9 +97,8 @@ def theta_space(config: Config) -> ThetaSpace:
         free[2] = False
     lower, upper = centre - width, centre + width
     if learning.objective == 'map':
-        least_f = min(growth.max_std, growth.seed_height_tolerance)
-        least = np.log([least_f, 0.5 * config.label.ground_tolerance])
-        lower[:2] = np.minimum(np.maximum(lower[:2], least), upper[:2])
+        least = math.log(0.5 * config.label.ground_tolerance)
+        lower[1] = min(max(lower[1], least), upper[1])
     if learning.length_scale == 'classes':
         limits = config.length_scale
         lower[5:] = math.log(limits.min) - class_middles(limits)
