@@ -127,7 +127,7 @@ def test_number_of_threads():
 
 
 def test_few_segments_are_not_split(workers):
-    """Learning looks at 45 segments again and again; a hand-over costs as much as 10 of them."""
+    """Learning looks at 6 segments again and again; a hand-over takes longer than they do."""
     assert [workers.n_segment_parts(n) for n in (1, 45, 180)] == [1, 1, 3]
 
 
