@@ -17,13 +17,14 @@ import pytest
 from cli_runner import error_line, run, start
 
 from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.pipeline.tilt import rotation
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
 SUMMARY = re.compile(
-    r'(\d+) frames?, (\d+) points?, (\d+\.\d)% ground, \d+\.\d ms (?:per frame \(median|for the '
+    r'(\d+) frames?, ([\d ]+) points?, (\d+\.\d)% ground, \d+\.\d ms (?:per frame \(median|for the '
     r'first frame \(with loading code), segmentation only\), written to (.*)\n'
     r'measured in \d+ frames?: sensor.height=.*\n'
 )
@@ -91,7 +92,7 @@ def test_bag_gets_ground_and_obstacles(segmenter, tmp_path, capsys, name):
     assert segment(source, '--quiet') == 0
     said = capsys.readouterr()
     n_frames, n_points, share, written_to = SUMMARY.fullmatch(said.out).groups()
-    assert (int(n_frames), int(n_points)) == (3, 3 * 1801)
+    assert (n_frames, n_points) == ('3', in_thousands(3 * 1801))
     assert 80 < float(share) < 84
     assert written_to == str(tmp_path / expected)
     assert said.err == ''
@@ -239,7 +240,7 @@ def test_scans_give_label_files(segmenter, tmp_path, capsys, monkeypatch, scans,
         assert set(written) == {0, 40, 99}
     said = capsys.readouterr()
     n_frames, n_points, _, written_to = SUMMARY.fullmatch(said.out).groups()
-    assert (int(n_frames), int(n_points)) == (n_scans, n_scans * 1801)
+    assert (n_frames, n_points) == (str(n_scans), in_thousands(n_scans * 1801))
     assert Path(written_to) == out
     assert said.err == ''
     assert hidden(out.parent) == hidden(out) == []
@@ -255,6 +256,14 @@ def test_raw_labels_into_one_file_and_settings_are_used(segmenter, tmp_path):
     assert segment(scan, *words, '--force', '--set', 'label.ground_tolerance=0.001') == 0
     narrow = np.fromfile(tmp_path / 'one.label', dtype='<u4')
     assert np.count_nonzero(narrow == 1) < np.count_nonzero(written == 1)
+
+
+def test_a_scan_of_text_gives_arrays_beside_it(tmp_path):
+    points = np.fromfile(write_scans(tmp_path / 'velodyne') / '000000.bin', '<f4').reshape(-1, 4)
+    np.savetxt(tmp_path / 'scan.csv', points, delimiter=',')
+    assert segment(tmp_path / 'scan.csv', '--quiet') == 0
+    with np.load(tmp_path / 'scan_ground.npz') as arrays:
+        assert len(arrays['label']) == len(points)
 
 
 def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
@@ -285,9 +294,9 @@ def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
         ('empty', [], r'empty: no \.bin, \.pcd.* file in it, and not a rosbag2 folder$'),
         ('root', ['--format', 'ply'], r'--format: whole data sets give \.label files and bags'),
         ('unfinished', [], r'no metadata\.yaml in it\); bag files in it.*: x_0\.mcap'),
-        ('notes.txt', [], r'not a scan or bag; accepted are \.bin'),
+        ('notes.md', [], r'not a scan or bag; accepted are \.bin'),
         ('good', ['-o', 'x.label'], r'x\.label: must be a folder'),
-        ('good', ['-o', 'notes.txt'], r'notes\.txt: is a file, must be a folder'),
+        ('good', ['-o', 'notes.md'], r'notes\.md: is a file, must be a folder'),
     ],
 )
 def test_refused_for_scans(tmp_path, capsys, monkeypatch, given, words, message):
@@ -298,7 +307,7 @@ def test_refused_for_scans(tmp_path, capsys, monkeypatch, given, words, message)
     for folder in ('empty', 'unfinished'):
         Path(folder).mkdir()
     Path('unfinished/x_0.mcap').write_bytes(b'')
-    Path('notes.txt').write_text('mine')
+    Path('notes.md').write_text('mine')
     before = sorted(Path().rglob('*'))
     assert segment(given, *words) == 2
     assert re.search(message, error_line(capsys))

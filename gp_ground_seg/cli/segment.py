@@ -14,6 +14,7 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bag_output import GROUND_TOPIC, OBSTACLES_TOPIC, BagOutput
+from gp_ground_seg.data.cloud_files import SUFFIXES, WRITABLE
 from gp_ground_seg.data.cloud_output import FORMATS, CloudOutput, encode_labels
 from gp_ground_seg.data.files import AnyPath, as_path, stamp, write_file
 from gp_ground_seg.data.inputs import holds_bag
@@ -157,11 +158,13 @@ def _write_labels(raw: bool, path: AnyPath, result: Segmentation) -> int:
 
 
 def _default_output(source: Path, form: str | None = None) -> Path:
-    """Beside the input: a file for a single-file rosbag2, else a folder."""
+    """Beside the input: a file of the same format where it can be written, else a folder."""
     named = source if source.name not in ('', '..') else source.resolve()
     if named.is_dir():
         return named.with_name(f'{named.name}_ground')
     suffix = '' if named.suffix in ('.bag', '.bin') else named.suffix
+    if suffix in SUFFIXES and suffix not in WRITABLE:
+        suffix = '.npz'
     if form in FORMATS:
         suffix = '' if named.suffix in BAG_SUFFIXES else f'.{form}'
     return named.with_name(f'{named.stem}_ground{suffix}')
