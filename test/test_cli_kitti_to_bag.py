@@ -53,7 +53,7 @@ def test_sequence_as_bag(tmp_path, capsys, name, storage):
     out = tmp_path / name
     assert convert(tmp_path / 'kitti', '--sequence', '04', out) == 0
     assert capsys.readouterr() == (
-        f'5 frames (5 with labels), {5 * 1801} points, 0.4 s, written to {out}\n', '',
+        f'5 frames (5 with labels), 9 005 points, 0.4 s, written to {out}\n', '',
     )  # fmt: skip
     assert out.is_file() == ('.' in name)
     with BagReader(out) as bag:

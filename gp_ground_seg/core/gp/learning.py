@@ -79,13 +79,7 @@ def given_theta(config: Config) -> FloatArray:
 
 
 def theta_space(config: Config) -> ThetaSpace:
-    """Bounds, priors and free entries by the configuration.
-
-    Inliers are survivors of the gate, so what is learned from them is too small, lets fewer join,
-    and confirms itself. A lower bound of sigma_n ends this: half of ``label.ground_tolerance``,
-    below which the gate would refuse what is ground in any case. A bound of sigma_f as well made
-    cars ground where little is seen. The objective as printed has none.
-    """
+    """Bounds, priors and free entries by the configuration."""
     learning, centre = config.learning, given_theta(config)
     width = WIDEST * learning.prior_std
     free = np.ones(len(centre), dtype=np.bool_)
@@ -96,9 +90,6 @@ def theta_space(config: Config) -> ThetaSpace:
     elif learning.fixed == 'sigma_f_bar':
         free[2] = False
     lower, upper = centre - width, centre + width
-    if learning.objective == 'map':
-        least = math.log(0.5 * config.label.ground_tolerance)
-        lower[1] = min(max(lower[1], least), upper[1])
     if learning.length_scale == 'classes':
         limits = config.length_scale
         lower[5:] = math.log(limits.min) - class_middles(limits)

@@ -37,13 +37,14 @@ def score_scenes(
     *,
     with_peer: bool = True,
 ) -> Report:
-    """Score simulated scans by exact labels and heights, beside Patchwork++.
+    """Score simulated scans by exact labels and heights, and count objects lost.
 
-    Patchwork++ has its published parameters and the true height of the sensor. All sensors have
-    one set of parameters.
+    Patchwork++ beside it has its published parameters and the true height of the sensor. All
+    sensors have one set of parameters.
     """
     scores, refused = score_simulated(frames, config, runner, with_peer=with_peer)
-    return make_report({'scenes': scene_table(scores, refused)}, scores, config)
+    tables = {'scenes': scene_table(scores, refused), 'objects': lost_table(scores)}
+    return make_report(tables, scores, config)
 
 
 def score_objects(
@@ -102,7 +103,6 @@ def scene_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> T
         medians = [score.height.median_absolute for score in parts]
         row += _of_each(centimetres('median', 'median_absolute'), medians)
         row.append((percent('gaps', 'share_without_model'), share))
-        row += _lost_objects(parts)
         if len(parts) > 1:
             difference, interval = parts[0].iou - parts[1].iou, interval_text(parts[0], parts[1])
             row += [(percent('ahead', 'difference', '+.2f'), difference), (INTERVAL, interval)]
@@ -114,8 +114,7 @@ def scene_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> T
     n_scans = len(scores[0].of(scores[0].sequences[0]).scans)
     title = (
         f'{n_scans} simulated scans per row; IoU against exact labels [%], every point counts; '
-        'height of the surface under true ground [cm]; gaps: share of it without a model [%]; '
-        + LOST
+        'height of the surface under true ground [cm]; gaps: share of it without a model [%]'
     )
     notes = [*refused]
     if len(scores) > 1:
