@@ -212,7 +212,8 @@ def test_scenes_by_hand_and_behind_is_said():
             for name, iou in zip(('flat', 'ramp', 'kerb'), ious, strict=True)
         ))  # fmt: skip
 
-    table = scenes.scene_table([score(90, 80, 70, error=0.1), score(89, 81, 70, error=0.2)])
+    scores = [score(90, 80, 70, error=0.1), score(89, 81, 70, error=0.2)]
+    table = scenes.scene_table(scores)
     (note,) = table.notes
     assert note == 'ahead of x on 1 of 3 rows; behind on vlp-16 ramp, vlp-16 kerb'
     row = table.json()[0]
@@ -221,6 +222,7 @@ def test_scenes_by_hand_and_behind_is_said():
     assert found == pytest.approx([0.9, 0.89, 0.01, 0.25])
     found = [row[f'{who}{name}'] for name in ('rmse', 'median_absolute') for who in ('', 'peer_')]
     assert found == pytest.approx([*(np.sqrt(11 / 3) * np.array([0.1, 0.2])), 0.1, 0.2])
+    row = scenes.lost_table(scores).json()[0]
     assert [row[name] for name in ('vehicles', 'lost_vehicles', 'peer_lost_persons')] == [0, 0, 0]
 
 

@@ -38,7 +38,6 @@ GOOD = {
     'mostly NaN': lambda p: missing(p, 0.9, np.nan),
     'mostly zero': lambda p: missing(p, 0.9, 0.0),
     'few points': lambda p: p[:: len(p) // 450],
-    'no point': lambda p: p[:0],
     'one point': lambda p: np.repeat(p[:1], len(p), axis=0),
     'flat': lambda p: p * np.float32([1, 1, 0, 1]),
 }
@@ -55,6 +54,7 @@ WRONG = {
         '100% of the coordinates',
     ),
     'NaN': (lambda p: np.full_like(p, np.nan), 'points is finite'),
+    'no point': (lambda p: p[:0], 'no points in it'),
     'zeros': (np.zeros_like, 'all points are at the origin'),
 }  # fmt: skip
 
