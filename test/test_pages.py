@@ -150,18 +150,10 @@ def test_numbers_of_the_readme_are_those_of_the_pages():
     """Scores are those of docs/accuracy.md, times those that `make bench-docs` measured."""
     expected = []
     page = 'docs/accuracy.md'
-    ours, theirs = (
-        {row[0]: row for row in table_below(page, title)}
-        for title in ('GroundGrid convention: ', 'Patchwork convention: ')
-    )
-    gains = {row[0]: row for row in table_below(page, 'IoU minus that of ')}
-    far = next(row for row in table_below(page, 'Horizontal range') if row[0] == '40-50 m')
-    for iou, peer, gain in (
-        (*ours['all'][6:8], gains['all, GroundGrid convention']),
-        (*theirs['all'][6:8], gains['all, Patchwork convention']),
-        (*far[6:8], gains['40-50 m']),
-    ):
-        expected.append([f'{iou} %', f'{peer} %', f'{gain[1]} ({gain[2]})'])
+    gains = {row[0]: row[1:] for row in table_below(page, 'IoU minus that of ')}
+    for points in ('all, GroundGrid convention', 'all, Patchwork convention', '40-50 m'):
+        iou, peer, gain, interval = gains[points]
+        expected.append([f'{iou} %', f'{peer} %', f'{gain} ({interval})'])
     lost = {row[0]: row[6:9] for row in table_below(page, 'Objects: ') if row[1] == 'all'}
     cars, others = (
         [sum(int(lost[kind][k]) for kind in kinds) for k in range(3)]

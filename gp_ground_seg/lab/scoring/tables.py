@@ -156,9 +156,15 @@ def _iou_differences(ours: MethodScore, peer: MethodScore) -> Table:
     rows: list[Row] = []
     for title, sums in cases.items():
         iou, other = (metrics.ratio(*sums(score)) for score in (ours, peer))
-        difference = percent('difference', form='+.2f')
-        interval = interval_text(ours, peer, sums)
-        rows.append([(Column('points'), title), (difference, iou - other), (INTERVAL, interval)])
+        rows.append(
+            [
+                (Column('points'), title),
+                (percent('IoU', 'iou'), iou),
+                (percent(f'{peer.title} IoU', 'peer_iou'), other),
+                (percent('difference', form='+.2f'), iou - other),
+                (INTERVAL, interval_text(ours, peer, sums)),
+            ]
+        )
     return Table(rows, f'IoU minus that of {peer.title}  [%]; {interval_note(ours)}')
 
 
