@@ -24,8 +24,8 @@ from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz
 from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
 SUMMARY = re.compile(
-    r'(\d+) frames?, ([\d ]+) points?, (\d+\.\d)% ground, \d+\.\d ms (?:per frame \(median|for the '
-    r'first frame \(with loading code), segmentation only\), written to (.*)\n'
+    r'(\d+) frames?, ([\d ]+) points?, (\d+\.\d)% ground, \d+\.\d ms (?:per frame \(median|for '
+    r'the first frame \(with loading code), segmentation only\), written to (.*)\n'
     r'measured in \d+ frames?: sensor.height=.*\n'
 )
 
