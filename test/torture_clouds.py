@@ -61,7 +61,8 @@ def random_cloud(rng):
 
 def random_config(rng):
     """Some parameters anywhere in their declared ranges; those that contradict are drawn again."""
-    specs = [s for s in parameter_specs() if s.name.split('.')[0] not in ('runtime', 'frame')]
+    others = ('runtime', 'frame', 'input', 'output', 'diagnostics')
+    specs = [s for s in parameter_specs() if s.name.split('.')[0] not in others]
     while True:
         changes = {}
         for index in rng.choice(len(specs), rng.choice([0, 1, 3, 10, 40]), replace=False):
