@@ -149,7 +149,7 @@ def test_nothing_that_stands_is_missing_and_ground_is_no_obstacle(scene, sensor,
     assert np.isfinite(scanned[np.isfinite(truth[0])]).mean() >= 0.998
     assert (scanned[np.isfinite(truth[0])] <= truth[0][np.isfinite(truth[0])] + 0.1).mean() > 0.99
     # But for kerbs, 0.15 m high, and ground at the foot of walls, where there is no model.
-    assert (scanned < np.minimum(truth[1], 20.0) - 0.1).sum() <= 0.06 * DIRECTIONS
+    assert (scanned < np.minimum(truth[1], 20.0) - 0.1).sum() <= 0.05 * DIRECTIONS
 
 
 def test_heights_and_range_choose_and_unknown_heights_stay():
