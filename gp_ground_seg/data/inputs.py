@@ -22,6 +22,9 @@ from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 _SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')
 _DRIVES = ('sequences/*/velodyne', 'data_3d_raw/*/velodyne_points', '*/velodyne_points')
 
+# In a folder, a text may be of times or a calibration.
+_IN_FOLDERS = tuple(suffix for suffix in SUFFIXES if suffix not in ('.txt', '.csv'))
+
 
 @dataclass(frozen=True)
 class Input:
@@ -132,8 +135,8 @@ def holds_bag(path: Path) -> bool:
 
 
 def _is_scan(path: AnyPath) -> bool:
-    """Whether a file of a folder is taken for a scan; a text may be of times or a calibration."""
-    return path.suffix.lower() in SUFFIXES and path.suffix.lower() not in ('.txt', '.csv')
+    """Whether a file of a folder is taken for a scan."""
+    return path.suffix.lower() in _IN_FOLDERS
 
 
 def _find_files(source: AnyPath) -> Sequence[AnyPath]:
@@ -156,6 +159,7 @@ def _find_files(source: AnyPath) -> Sequence[AnyPath]:
     if drives:
         names = ', '.join(Path(drive).name for drive in drives)
         hint = f'; give one of its sequences ({names}), as in {drives[0]}'
+    accepted = ', '.join(_IN_FOLDERS)
     raise DataError(f'{source}: no {accepted} file in it, and not a rosbag2 folder{hint}')
 
 
