@@ -13,7 +13,7 @@ help:
 	@echo 'make demo      a synthetic drive through the node: score, rate and a picture'
 	@echo 'make test      the tests, but those marked slow (KITTI=PATH adds labelled frames)'
 	@echo 'make test-all  all tests'
-	@echo 'make browser-test  pages of view and tune in a headless Chromium, which root gets by apt'
+	@echo 'make browser-test  the page of tune in a headless Chromium, which root gets by apt'
 	@echo 'make torture   adversarial clouds, files and uses (TORTURE_SCALE=100 for a night)'
 	@echo 'make bench     time per frame by stage, beside Patchwork++ (needs KITTI=PATH)'
 	@echo 'make bench-docs  the same, into docs/performance.json and its picture'

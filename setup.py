@@ -13,7 +13,6 @@ PLOT = ['matplotlib>=3.6']
 # 21 MB and 15 MB of cryptography, for TLS between workers; s3fs, for s3://, is 36 MB more.
 SCALE = ['cryptography>=42', 'distributed>=2025.1', 'fsspec>=2024.2']
 VISER = ['viser>=1.1']
-VIEW = ['rerun-sdk>=0.41; python_version >= "3.11"', *VISER]
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
     'ros-jazzy-rclpy[fastrtps]>=7.1,<8',
@@ -28,7 +27,7 @@ DEV = [
     *TEST,
     *FORMATS,
     *SCALE,
-    *VIEW,
+    *VISER,
     'argcomplete>=3.1',
     'codespell[toml]>=2.3',
     'colcon-common-extensions',
@@ -91,7 +90,6 @@ setup(
         'complete': ['argcomplete>=3.1'],
         'ros': ROS + BAGS + PLOT,
         'test': TEST,
-        'view': VIEW,
         'docs': DOCS,
         'dev': DEV,
     },

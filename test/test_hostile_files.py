@@ -74,7 +74,6 @@ def test_any_name_is_read_written_and_shown_escaped(tmp_path, monkeypatch, capsy
         ['segment', f'{name}.mcap', '-o', f'{name}_ground.mcap'],
         ['segment', root, '-o', f'{name}_out'],
         ['plot', 'above', f'{name}.bin', '-o', f'{name}.svg'],
-        ['view', f'{name}.bin', '--html', f'{name}.html'],
         ['evaluate', root, '--per-frame', f'{name}.csv', '--json', f'{name}.json'],
         ['evaluate', f'{name}.mcap', '--against', f'{name}.yaml'],
         ['config', 'check', f'{name}.yaml'],

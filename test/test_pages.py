@@ -84,8 +84,7 @@ def test_every_figure_is_as_it_was_written():
 NO_FIGURES = {
     'images/performance.png',  # by `make bench-docs`
     'images/street.png',  # a figure of README.md
-    'images/view.png',  # screenshots, of what test_browser.py looks at
-    'images/tune.png',
+    'images/tune.png',  # a screenshot, of what test_browser.py looks at
 }
 
 

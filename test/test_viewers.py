@@ -1,16 +1,11 @@
-"""Scenes, recordings for Rerun, sliders; and what the commands refuse."""
+"""Colours, scores, sliders and the server of `tune`, and what it refuses."""
 
-import functools
 import re
-import socket
 import sys
-import urllib.request
-from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_samples import write_ros2_bag
-from cli_runner import error_line, run, until_ctrl_c
+from cli_runner import error_line, run
 from conftest import ROAD, simulated
 
 from gp_ground_seg import Config, GroundSegmenter, Label
@@ -19,22 +14,16 @@ from gp_ground_seg.core.parameters.config import find_spec
 from gp_ground_seg.data.inputs import list_inputs
 from gp_ground_seg.lab.viewers import html_page
 from gp_ground_seg.lab.viewers.html_page import open_server
-from gp_ground_seg.lab.viewers.scene import View, make_scene, palette, point_colours, read_view
+from gp_ground_seg.lab.viewers.scene import palette, point_colours, read_view
 from gp_ground_seg.lab.viewers.tuner import Tuner, slider_values, tunable
 
 CAR = 10 | 7 << 16  # class of SemanticKITTI, and an instance of it
-PATIENCE = 60.0
-
-
-def segment(points):
-    segmenter = GroundSegmenter()
-    return segmenter.segment(points), segmenter
 
 
 def test_colours_are_those_of_the_legends():
     points = simulated('urban').points.copy()
     points[0, 0] = np.nan
-    result, _ = segment(points)
+    result = GroundSegmenter().segment(points)
     label, n = result.label, len(points)
     by_class = point_colours('class', result)
     assert np.array_equal(by_class, palette('class')[label])
@@ -61,43 +50,6 @@ def test_colours_are_those_of_the_legends():
     known = np.flatnonzero(np.isfinite(result.height))
     order = known[np.argsort(result.height[known])]
     assert (np.diff(lightness[order]) >= -2.0).all() and np.ptp(lightness[order]) > 200.0
-
-
-def test_a_tilted_scan_is_drawn_level_and_the_mesh_lies_under_its_ground():
-    tilt = 0.3
-    cosine, sine = np.cos(tilt), np.sin(tilt)
-    turned = simulated('flat').points[:, :3] @ [[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]]
-    turned = turned.astype(np.float32)
-    result, segmenter = segment(turned)
-    assert not result.pose.is_level
-    scene = make_scene(View('a', turned), result, segmenter.config, segmenter.backend)
-    ground = scene.clouds['class'].points[result.label == Label.GROUND]
-    assert np.ptp(np.quantile(ground[:, 2], [0.01, 0.99])) < 0.3
-    assert np.median(np.abs(result.height[result.label == Label.GROUND])) < 0.05
-
-    vertices, triangles, colours = scene.surface
-    assert len(triangles) > 1000 and colours.shape == vertices.shape
-    a, b, c = (vertices[triangles[:, k]].astype(float) for k in range(3))
-    normal = np.cross(b - a, c - a)
-    assert (normal[:, 2] > 0.0).all()
-    assert np.median(normal[:, 2] / np.linalg.norm(normal, axis=1)) > 0.99
-    used = np.unique(triangles)
-    distance = np.abs(vertices[used, 2] - np.median(ground[:, 2]))
-    assert np.quantile(distance, 0.9) < 0.1 and distance.max() < 1.0
-    # The band is as many vertices below as above.
-    low, high = np.split(scene.band.vertices, 2)
-    assert (low[used, 2] < vertices[used, 2]).all() and (vertices[used, 2] < high[used, 2]).all()
-    assert len(scene.clouds['candidates'].points) == len(result.candidates.r)
-
-
-def test_faces_are_on_walls(sequence):
-    view = read_view(list_inputs(sequence)[0])
-    result, segmenter = segment(view.points)
-    scene = make_scene(view, result, segmenter.config, segmenter.backend)
-    kinds = simulated('urban')
-    tall = np.isin(scene.clouds['faces'].points, kinds.points[~kinds.is_ground, :3]).all(axis=1)
-    assert len(tall) > 300 and tall.mean() > 0.8
-    assert set(scene.clouds) == {'class', 'height', 'p_ground', 'errors', 'faces', 'candidates'}
 
 
 def test_scores_of_labels(tmp_path):
@@ -140,71 +92,6 @@ def test_a_slider_holds_the_value_at_hand_and_is_logarithmic_where_that_helps():
     assert (roll[0], roll[-1]) == (-0.3, 0.3)
 
 
-rerun = functools.partial(pytest.importorskip, 'rerun', reason='rerun is not installed')
-
-
-@pytest.fixture
-def record(tmp_path):
-    """Values by frame and by path of what `view --save` records, and what its views show."""
-    rerun()
-    from rerun.chunk import RrdReader
-
-    def record(*words):
-        path = tmp_path / 'a.rrd'
-        assert run('view', *words, '--save', path, '--quiet') == 0
-        reader, found = RrdReader(path), {}
-        (blueprint,) = reader.blueprints()
-        for chunk in reader.stream():
-            if not chunk.is_static:
-                batch = chunk.to_record_batch()
-                values = (':positions', ':scalars', ':vertex_positions')
-                (name,) = (n for n in batch.schema.names if n.endswith(values))
-                pairs = zip(batch['frame'].to_pylist(), batch[name].to_pylist(), strict=True)
-                found.setdefault(chunk.entity_path, {}).update(pairs)
-        batches = [chunk.to_record_batch() for chunk in reader.stream(store=blueprint)]
-        origin = 'ViewBlueprint:space_origin'
-        origins = [b[origin].to_pylist() for b in batches if origin in b.schema.names]
-        return found, {name for ((name,),) in origins} - {'scan', 'about'}
-
-    return record
-
-
-def test_a_recording_has_every_frame(sequence, record):
-    found, shown = record(sequence)
-    assert shown == {'latency', 'IoU', 'lost'}
-    layers = {'class', 'height', 'p_ground', 'errors', 'faces', 'candidates', 'surface', 'band'}
-    assert {f'/scan/{name}' for name in layers} | {'/IoU', '/lost', '/latency'} <= found.keys()
-    assert any(name.startswith('/theta/') for name in found)
-    assert all(sorted(values) == [0, 1] for values in found.values())
-    segmenter = GroundSegmenter()
-    for k, item in enumerate(list_inputs(sequence)):
-        view = read_view(item)
-        result = segmenter.segment(view.points)
-        assert found['/IoU'][k] == [pytest.approx(view.scores(result.label)['IoU'])]
-        assert np.array_equal(np.float32(found['/scan/class'][k]), view.points[:, :3])
-
-
-def test_only_the_frames_asked_for_and_no_series_that_need_labels(tmp_path, record):
-    write_ros2_bag(tmp_path / 'drive.mcap')
-    for words, expected in ((['--frame', 1], [1]), (['--frame-step', 2, '--force'], [0, 2])):
-        found, shown = record(tmp_path / 'drive.mcap', *words)
-        assert sorted(found['/scan/class']) == expected
-        assert shown == {'latency'}
-
-
-def free_ports():
-    """Return the first of two free ports in a row."""
-    while True:
-        with socket.socket() as one, socket.socket() as next_one:
-            one.bind(('127.0.0.1', 0))
-            port = one.getsockname()[1]
-            try:
-                next_one.bind(('127.0.0.1', port + 1))
-            except OSError:
-                continue
-            return port
-
-
 def test_the_tuner_draws_the_labels_of_its_parameters(sequence):
     pytest.importorskip('viser', reason='viser is not installed')
     name = 'label.ground_tolerance'
@@ -226,88 +113,41 @@ def test_a_server_that_cannot_be_guarded_is_refused():
         pass  # as a later viser might do: another function serves
 
 
-@pytest.mark.slow
-def test_the_web_viewer_is_served_here_only_and_ends_with_ctrl_c(sequence):
-    rerun()
-    port = free_ports()
-    with until_ctrl_c('view', sequence, '--web', '--port', port) as process:
-        address = process.stdout.readline().strip()
-        assert address.startswith(f'http://127.0.0.1:{port}/?url=rerun%2Bhttp')
-        with urllib.request.urlopen(address, timeout=PATIENCE) as answer:
-            assert b'Rerun' in answer.read()
-        assert listening(port) == listening(port + 1) == {'0100007F'}
-    assert listening(port) == listening(port + 1) == set()
-
-
 def test_the_next_free_port_is_taken_and_said(caplog):
-    port = free_ports()
-    assert html_page.free_port(port, 2) == port and not caplog.messages
-    with socket.create_server(('127.0.0.1', port + 1)):
-        assert html_page.free_port(port) == port
-        found = html_page.free_port(port, 2)
-    assert found >= port + 2
-    assert caplog.messages == [f'port {port} is in use: {found} instead']
-    with pytest.raises(DataError, match=r'--port 65536: no free port there'):
-        html_page.free_port(65536)
-
-
-def test_a_page_beside_another_one(sequence):
     pytest.importorskip('viser', reason='viser is not installed')
-    port = free_ports()
-    with open_server(port) as (_, first), open_server(port) as (_, second):
-        assert f':{port}/' in first and f':{port}/' not in second
-
-
-def listening(port):
-    """Addresses that a port listens on, as hexadecimal words; see proc_net_tcp(5)."""
-    tables = [Path(f'/proc/net/{name}').read_text() for name in ('tcp', 'tcp6')]
-    lines = [line.split() for table in tables for line in table.splitlines()[1:]]
-    found = [line[1].split(':') for line in lines if line[3] == '0A']
-    return {address for address, number in found if int(number, 16) == port}
+    with open_server(0) as (server, _):
+        port = server.get_port()
+        with open_server(port) as (_, address):
+            assert f':{port}/' not in address
+    (said,) = caplog.messages
+    assert re.fullmatch(rf'port {port} is in use: \d+ instead', said)
+    with (
+        pytest.raises(DataError, match=r'--port 65536: must be at most 64535'),
+        open_server(65536),
+    ):
+        pass
 
 
 def test_what_is_refused(sequence, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv('DISPLAY', raising=False)
-    monkeypatch.delenv('WAYLAND_DISPLAY', raising=False)
-    taken = {name: tmp_path / name for name in ('a.html', 'a.rrd', 'tuned.yaml')}
-    for path in taken.values():
-        path.write_text('mine')
+    (tmp_path / 'tuned.yaml').write_text('mine')
     cases = {
-        ('view', sequence): 'no display here: --web, --save FILE and --html FILE need none',
-        ('view', sequence, '--html', 'a.htm'): 'a.htm: must end in .html',
-        ('view', sequence, '--save', 'a.html'): 'a.html: must end in .rrd',
-        ('view', sequence, '--html', 'a.html'): 'a.html: exists already; --force replaces it',
-        ('view', sequence, '--frame', 2): '--frame 2: must be 0 to 1 here',
-        ('view', tmp_path / 'none'): f'{tmp_path / "none"}: no such file or folder',
-        ('tune', sequence): 'tuned.yaml: exists already; --force replaces it',
-        ('tune', sequence, '--topic', '/a'): f'--topic: is for bags, which {sequence} is not',
+        (tmp_path / 'none',): f'{tmp_path / "none"}: no such file or folder',
+        (sequence, '--frame', 2): '--frame 2: must be 0 to 1 here',
+        (sequence,): 'tuned.yaml: exists already; --force replaces it',
+        (sequence, '--topic', '/a'): f'--topic: is for bags, which {sequence} is not',
     }
-    if sys.version_info >= (3, 11):
-        cases['view', sequence, '--save', 'a.rrd'] = 'a.rrd: exists already; --force replaces it'
     for words, expected in cases.items():
-        assert run(*words, '--quiet') == 2
+        assert run('tune', *words, '--quiet') == 2
         assert error_line(capsys) == expected
-    assert [path.read_text() for path in taken.values()] == ['mine'] * 3
+    assert (tmp_path / 'tuned.yaml').read_text() == 'mine'
 
 
-@pytest.mark.parametrize(
-    ('words', 'module', 'package'),
-    [
-        (('view', '--save', 'a.rrd'), 'rerun', 'rerun-sdk'),
-        (('view', '--web'), 'rerun', 'rerun-sdk'),
-        (('view', '--html', 'a.html'), 'viser', 'viser'),
-        (('tune', '-o', 'a.yaml'), 'viser', 'viser'),
-    ],
-)
-def test_a_missing_library_is_one_line(
-    words, module, package, sequence, tmp_path, monkeypatch, capsys
-):
+def test_a_missing_library_is_one_line(sequence, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, module, None)
-    command, *more = words
-    assert run(command, sequence, '--quiet', *more) == 2
+    monkeypatch.setitem(sys.modules, 'viser', None)
+    assert run('tune', sequence, '--quiet', '-o', 'a.yaml') == 2
     line = error_line(capsys)
-    assert line.startswith(f'{module} is not installed')
-    assert line.endswith(f'pip install {package}')
+    assert line.startswith('viser is not installed')
+    assert line.endswith('pip install viser')
     assert not list(tmp_path.iterdir())

@@ -180,7 +180,6 @@ COMMANDS = [
     'segment FILE -o out --force',
     'segment FILE --format ply -o out --force',
     'plot above FILE -o out.png --force',
-    'view FILE --html out.html --force',
     'evaluate FILE --against paper --force',
 ]
 

@@ -34,8 +34,7 @@ COMMANDS = {
     'kitti-to-bag': ('bags', 'write a KITTI sequence as a rosbag2'),
     'segment': ('segment', 'label scans, or split the clouds of a bag'),
     'plot': ('plot', 'draw a scan in perspective, or a segment of it from the side'),
-    'view': ('view', 'look at scans in Rerun, a browser or a page'),
-    'tune': ('view', 'set parameters by sliders, and see the labels change'),
+    'tune': ('tune', 'set parameters by sliders, and see the labels change'),
     'evaluate': ('evaluate', 'score against SemanticKITTI labels'),
     'bench': ('bench', 'time the segmentation by stage, beside Patchwork++'),
     'experiment': ('experiment', 'repeat an experiment of docs/, such as ablation'),
@@ -45,6 +44,7 @@ GROUPS = {'robot': 'node', 'files': 'segment', 'laboratory': 'evaluate'}
 REMOVED = {
     'pose': '`gp-ground-seg segment INPUT` prints height and tilt of the sensor',
     'compare': 'use `gp-ground-seg evaluate ROOT --against FILE_OR_PRESET`',
+    'view': 'use `gp-ground-seg tune INPUT`, or Foxglove on what `gp-ground-seg segment` writes',
     'optimise': 'use `gp-ground-seg tune`, and `gp-ground-seg evaluate ROOT --against FILE`',
 }
 """Commands of earlier releases, and what has taken their place."""

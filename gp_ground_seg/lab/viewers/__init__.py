@@ -1,1 +1,1 @@
-"""Scans to turn, scrub and tune: Rerun, a page, a browser with sliders."""
+"""A scan in the browser, with sliders for the parameters."""

@@ -18,8 +18,8 @@ from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.inputs import Inputs
 from gp_ground_seg.lab.scoring.metrics import Labels
-from gp_ground_seg.lab.viewers.html_page import box, draw_points, legend, text
-from gp_ground_seg.lab.viewers.scene import Cloud, point_colours, read_view
+from gp_ground_seg.lab.viewers.html_page import box, legend, text
+from gp_ground_seg.lab.viewers.scene import point_colours, read_view
 
 N_STEPS = 400  # of a slider
 COLOURS = ('changes', 'class', 'height', 'p_ground', 'errors')
@@ -195,10 +195,14 @@ class Tuner:
                 self._cloud.colors = colours
             else:
                 level = result.pose.level(view.points[:, :3])[finite].astype(np.float32)
-                self._cloud = draw_points(self._server, 'scan', Cloud(level, colours))
+                # Half precision, the default, is 6 cm at 100 m.
+                self._cloud = self._server.scene.add_point_cloud(
+                    '/scan', level, colours, point_size=0.05, precision='float32',
+                    point_shading='flat',
+                )  # fmt: skip
                 self._drawn = drawn
-            words = legend(['class', name] if name == 'changes' else [name], config)
-            self._legend.content = f'<div style="font-size:12px;padding:4px 12px">{words}</div>'
+            names = ['class', name] if name == 'changes' else [name]
+            self._legend.content = box(legend(names))
             scores = view.scores(result.label), old_scores
             self._table.content = _table(result, before, scores)
 
