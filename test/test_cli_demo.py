@@ -204,8 +204,8 @@ def test_demo_without_data(rclpy, tmp_path):
     assert re.search(r'median [\d.]+ ms, 99 % within [\d.]+ ms', said)
     folder = tmp_path / 'demo_output'
     files = sorted(path.name for path in folder.iterdir())
-    assert files == ['birds_eye.png', 'drive.mcap', 'node.log']
-    assert (folder / 'birds_eye.png').read_bytes().startswith(b'\x89PNG')
+    assert files == ['drive.mcap', 'node.log', 'scan.png']
+    assert (folder / 'scan.png').read_bytes().startswith(b'\x89PNG')
     # Fast DDS only warns about a profile that it cannot read, and goes on without.
     assert 'XML' not in (folder / 'node.log').read_text()
     with BagReader(folder / 'drive.mcap') as bag:
@@ -223,7 +223,7 @@ def test_demo_on_real_scans(rclpy, kitti, tmp_path):
     assert 'KITTI sequence 00' in said
     assert '3 sent, 3 back, 0 lost' in said
     assert iou > 95.0
-    assert (tmp_path / 'real' / 'birds_eye.png').is_file()
+    assert (tmp_path / 'real' / 'scan.png').is_file()
 
 
 @contextlib.contextmanager

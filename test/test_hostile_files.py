@@ -73,7 +73,7 @@ def test_any_name_is_read_written_and_shown_escaped(tmp_path, monkeypatch, capsy
         ['segment', f'{name}.bin', '-o', f'{name}.label', '--config', f'{name}.yaml'],
         ['segment', f'{name}.mcap', '-o', f'{name}_ground.mcap'],
         ['segment', root, '-o', f'{name}_out'],
-        ['plot', 'above', f'{name}.bin', '-o', f'{name}.svg'],
+        ['plot', 'scan', f'{name}.bin', '-o', f'{name}.svg'],
         ['evaluate', root, '--per-frame', f'{name}.csv', '--json', f'{name}.json'],
         ['evaluate', f'{name}.mcap', '--against', f'{name}.yaml'],
         ['config', 'check', f'{name}.yaml'],
@@ -88,7 +88,7 @@ def test_any_name_is_read_written_and_shown_escaped(tmp_path, monkeypatch, capsy
 COMMANDS = """\
 segment NAME
 segment NAME -o out
-plot above NAME -o a.png
+plot scan NAME -o a.png
 evaluate NAME
 bench NAME
 bench --from NAME
@@ -98,7 +98,7 @@ kitti-to-bag NAME --sequence 00 out
 segment a.bin -o NAME
 segment a.mcap -o NAME
 kitti-to-bag root --sequence 00 NAME
-plot above a.bin -o NAME.png
+plot scan a.bin -o NAME.png
 """.splitlines()
 
 

@@ -17,7 +17,7 @@ from gp_ground_seg import GroundSegmenter, __version__
 from gp_ground_seg.cli import demo
 from gp_ground_seg.cli.main import COMMANDS, build_parser
 from gp_ground_seg.core.jit import JIT_ENABLED
-from gp_ground_seg.lab.plotting.scan import plot_birds_eye
+from gp_ground_seg.lab.plotting.scan import plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
 
 figures = load_script('docs/figures.py')
@@ -131,10 +131,9 @@ def test_the_picture_of_the_demo_is_that_of_the_demo(tmp_path):
         scan for _, scan in zip(range(number), demo.simulated_drive(30).scans, strict=False)
     )
     label = GroundSegmenter().segment(points).label
-    counts = plot_birds_eye(
-        points, label, tmp_path / 'a.png', GROUNDGRID.truth(semantic, points[:, 2])
-    )
-    assert f'(scan {number} from above: {counts}; commit ' in figure.body, f'now {counts}. {ANEW}'
+    truth = GROUNDGRID.truth(semantic, points[:, 2])
+    counts = plot_scan_view(points, label, tmp_path / 'a.png', truth=truth)
+    assert f'(scan {number}: {counts}; commit ' in figure.body, f'now {counts}. {ANEW}'
 
 
 def table_below(page, title):

@@ -13,6 +13,7 @@ from matplotlib.image import imread
 
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, PointCloudError
+from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.data import colours as colours_
 from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.lab.plotting import scan, style
@@ -21,22 +22,14 @@ from gp_ground_seg.lab.plotting.scan import (
     TARGET,
     ZOOM,
     camera_at,
-    plot_birds_eye,
+    label_layers,
     plot_scan_view,
     project,
 )
 
 
-def inches(*lengths):
-    return [round(length * style.DPI) for length in lengths]
-
-
 def close_to(pixels, colour, tolerance=0.005):
     return np.abs(pixels[..., :3] - np.array(to_rgb(colour))).max(axis=-1) < tolerance
-
-
-SQUARE, LEFT, RIGHT, TOP = inches(scan.SQUARE, scan.LEFT, scan.RIGHT, scan.ABOVE)
-PANEL = LEFT + SQUARE + RIGHT
 
 
 def patch(x, y, half=2.0, n=4000, seed=0):
@@ -49,63 +42,52 @@ def repeat(values, n=4000):
     return np.repeat(values, n).astype(np.uint8)
 
 
-def where(path, colour, left=LEFT):
-    """Centre [m] (x forward, y left) and number of the pixels of a colour in a square."""
-    square = imread(path)[TOP : TOP + SQUARE, left : left + SQUARE]
-    rows, columns = np.nonzero(close_to(square, colour))
+def where(path, colour):
+    """Centre of the pixels of a colour in the scene, in widths right and up, and their number."""
+    scene = imread(path)[: -round(scan.FOOT * style.DPI)]
+    rows, columns = np.nonzero(close_to(scene, colour))
     if not len(rows):
         return None, 0
-    # The median: here and there an edge of a letter or ring is of nearly the same grey.
-    centre = np.array([np.median(rows), np.median(columns)])
-    return scan.EXTENT * (1.0 - 2.0 * centre / SQUARE), len(rows)
+    height, width = scene.shape[:2]
+    x, y = np.median(columns), np.median(rows)
+    return np.array([x / width - 0.5, (0.5 * height - y) / width]), len(rows)
 
 
 def test_labels_and_errors_are_where_the_points_are(tmp_path):
-    corners = [(25, 25), (25, -25), (-25, 25), (-25, -25), (40, 0)]
-    points = np.concatenate([patch(*corner) for corner in corners])
+    places = {'ground': (10, 8), 'obstacle': (10, -8), 'false ground': (25, 12),
+              'missed ground': (25, -12)}  # fmt: skip
+    points = np.concatenate([patch(*place) for place in places.values()])
     points[-1, 2] = np.nan
-    plot_birds_eye(
-        points, repeat([1, 1, 2, 2, 0]), tmp_path / 'a.png', truth=repeat([1, 2, 1, 0, 1])
-    )
-    assert imread(tmp_path / 'a.png').shape[1] == 2 * PANEL
-    for panel, name, expected in (
-        (0, 'ground', (25, 0)),
-        (0, 'obstacle', (-25, 0)),
-        (0, 'unknown', (40, 0)),
-        (1, 'right', (25, 25)),
-        (1, 'false ground', (25, -25)),
-        (1, 'not scored', (-25, -25)),
-    ):
-        centre, n = where(tmp_path / 'a.png', COLOURS[name], left=LEFT + panel * PANEL)
-        assert n > 500
-        # Two patches of one colour lie left and right of the middle.
-        assert centre[0] == pytest.approx(expected[0], abs=0.5)
-        assert expected[1] == 0 or centre[1] == pytest.approx(expected[1], abs=0.5)
-    # Unknown points that are ground are missed, too.
-    assert where(tmp_path / 'a.png', COLOURS['missed ground'], left=LEFT + PANEL)[1] > 1500
-    plot_birds_eye(patch(60, 0), repeat(1), tmp_path / 'a.png')
-    assert where(tmp_path / 'a.png', COLOURS['ground'])[1] == 0
+    label, truth = repeat([1, 2, 1, 2]), repeat([1, 0, 2, 1])
+    plot_scan_view(points, label, tmp_path / 'a.png', truth=truth)
+    for name, (x, y) in places.items():
+        centre, n = where(tmp_path / 'a.png', COLOURS[name])
+        assert n > 300
+        np.testing.assert_allclose(centre, project(np.array([x, y, -1.75]))[0], atol=0.01)
+    # Without the truth, and from above.
+    above = camera_at(0, 89, 60)
+    plot_scan_view(points, label, tmp_path / 'a.png', camera=above)
+    assert where(tmp_path / 'a.png', COLOURS['missed ground'])[1] == 0
+    assert where(tmp_path / 'a.png', COLOURS['obstacle'])[1] > 1000
 
 
-def test_counts_are_in_the_titles():
+def test_counts_are_in_words():
     label = np.array([0, 1, 1, 2, 2, 2], dtype=np.uint8)
     truth = np.array([1, 1, 2, 1, 2, 0], dtype=np.uint8)
-    titles = [scan.label_panel(label)[0], scan.label_panel(label[1:])[0]]
-    assert titles == [
+    words = [label_layers(label)[0], label_layers(label[1:])[0]]
+    assert words == [
         '6 points: 2 ground, 3 obstacle, 1 unknown',
         '5 points: 2 ground, 3 obstacle',
     ]
-    errors, layers = scan.error_panel(label, truth)
-    assert errors == '1 false ground, 2 missed ground, IoU 25.00 %'
-    np.testing.assert_array_equal(sum(drawn.astype(int) for drawn in layers.values()), 1)
-    assert scan.error_panel(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
+    assert label_layers(label, truth)[0] == '1 false ground, 2 missed ground, IoU 25.00 %'
+    assert label_layers(label[:0], truth[:0])[0] == '0 false ground, 0 missed ground'
 
 
 @pytest.mark.parametrize('points', [np.zeros((0, 3)), np.full((3, 4), np.nan), np.zeros((1, 3))])
 def test_clouds_with_nothing_to_see(tmp_path, points):
     label = np.zeros(len(points), dtype=np.uint8)
     (tmp_path / 'a.png').write_text('old')
-    plot_birds_eye(points, label, tmp_path / 'a.png', truth=label, title=r'$\nothing _ %')
+    plot_scan_view(points, label, tmp_path / 'a.png', r'$\nothing _ %', truth=label)
     assert imread(tmp_path / 'a.png').ndim == 3
     assert list(tmp_path.iterdir()) == [tmp_path / 'a.png']
 
@@ -114,7 +96,7 @@ def test_colours_differ_in_grey_too():
     """Ground and obstacles must be told apart in print and with any colour vision."""
     grey = {name: np.dot(to_rgb(c), (0.2126, 0.7152, 0.0722)) for name, c in COLOURS.items()}
     assert grey['ground'] - grey['obstacle'] > 0.3
-    assert grey['right'] - max(grey['false ground'], grey['missed ground']) > 0.25
+    assert grey['ground'] - max(grey['false ground'], grey['missed ground']) > 0.25
 
 
 @pytest.mark.parametrize(
@@ -130,7 +112,7 @@ def test_colours_differ_in_grey_too():
 def test_bad_input_is_said(tmp_path, keywords, error, message):
     good = {'points': patch(0, 0), 'label': repeat(0), 'path': tmp_path / 'a.png'}
     with pytest.raises(error, match=message):
-        plot_birds_eye(**{**good, **keywords})
+        plot_scan_view(**{**good, **keywords})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -139,14 +121,14 @@ def test_matplotlib_is_optional_and_its_global_state_untouched(tmp_path, monkeyp
         'import sys, numpy as np\n'
         'from gp_ground_seg.lab.plotting import scan, segment\n'
         'assert "matplotlib" not in sys.modules\n'
-        'scan.plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
+        'scan.plot_scan_view(np.zeros((2, 3)), np.ones(2, np.uint8), sys.argv[1])\n'
         'assert "matplotlib" in sys.modules and "matplotlib.pyplot" not in sys.modules\n'
     )
     words = [sys.executable, '-c', script, str(tmp_path / 'a.png')]
     subprocess.run(words, check=True, timeout=60)
     monkeypatch.setitem(sys.modules, 'matplotlib.figure', None)
     with pytest.raises(MissingDependencyError, match='matplotlib'):
-        plot_birds_eye(np.zeros((2, 3)), np.ones(2, np.uint8), tmp_path / 'b.png')
+        plot_scan_view(np.zeros((2, 3)), np.ones(2, np.uint8), tmp_path / 'b.png')
     assert not (tmp_path / 'b.png').exists()
 
 
@@ -170,8 +152,9 @@ def test_picture_shows_ground_obstacles_and_model(tmp_path):
     points[:10] = np.nan
     config = Config()
     found = GroundSegmenter(config).segment(points)
-    for title, height, surface in (('title with $ and _', 840, True), ('', 792, False)):
-        plot_scan_view(points, found, config, tmp_path / 'scan.png', title, surface=surface)
+    model = GroundModel.of(found), config
+    for title, height, surface in (('title with $ and _', 840, model), ('', 792, None)):
+        plot_scan_view(points, found.label, tmp_path / 'scan.png', title, surface=surface)
         picture = imread(tmp_path / 'scan.png')
         assert picture.shape[:2] == (height, 1440)
         colours = (picture[60:650, ..., :3] * 255).round().astype(int).reshape(-1, 3)
@@ -184,8 +167,6 @@ def test_picture_shows_ground_obstacles_and_model(tmp_path):
         # Bluish lines: neither grey nor orange.
         n_bluish = (colours[:, 2] - colours[:, 0] > 60).sum()
         assert n_bluish > 300 if surface else n_bluish == 0
-    with pytest.raises(PointCloudError, match=r'label of shape \(8000,\) for 7999 points'):
-        plot_scan_view(points[1:], found, config, tmp_path / 'scan.png')
 
 
 def on_screen(camera, *points):
@@ -243,8 +224,6 @@ def test_pdf_and_svg_hold_points_as_pixels_and_are_the_same_each_time(drawn, tmp
         assert found[0] == found[1]
         assert found[0].startswith(begin) and len(found[0]) < 2_000_000
     assert found[0].count(b'<image') >= 1 and found[0].count(b'<use') < 100
-    assert run('plot', 'above', drawn, '-o', tmp_path / 'b.svg') == 0
-    assert (tmp_path / 'b.svg').read_bytes().count(b'<use') < 200
 
 
 @pytest.mark.parametrize('camera', ['90', '90,30', 'a,b,c', '0,90,20', '0,20,0.5', '0,20,nan'])
@@ -274,17 +253,15 @@ def test_command_draws_a_scan_and_keeps_what_is_there(tmp_path, capsys):
     assert path.read_bytes() != before
 
 
-def test_command_draws_a_scan_from_above(tmp_path, capsys):
+def test_command_draws_the_errors(tmp_path, capsys):
     points = np.column_stack([hilly_scan(8000), np.zeros(8000)]).astype('<f4')
     points.tofile(tmp_path / 'a.bin')
     np.full(8000, 40, '<u4').tofile(tmp_path / 'a.label')
-    for words, n_panels in (([], 1), (['--labels', tmp_path / 'a.label', '--force'], 2)):
-        assert run('plot', 'above', tmp_path / 'a.bin', '-o', tmp_path / 'a.png', *words) == 0
-        assert imread(tmp_path / 'a.png').shape[1] == n_panels * PANEL
+    words = ['--labels', tmp_path / 'a.label', '-o', tmp_path / 'a.png']
+    assert run('plot', 'scan', tmp_path / 'a.bin', *words) == 0
     said = r'0 false ground, [\d ]+ missed ground, IoU [\d.]+ %, written to'
     assert re.match(said, capsys.readouterr().out.splitlines()[-1])
-    missed = where(tmp_path / 'a.png', COLOURS['missed ground'], left=LEFT + PANEL)
-    assert missed[1] > 500
+    assert where(tmp_path / 'a.png', COLOURS['missed ground'])[1] > 500
 
 
 DEFICIENCIES = {

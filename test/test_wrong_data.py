@@ -115,7 +115,6 @@ COMMANDS = {
     'segment': 'segment SCAN -o OUT.label',
     'segment folder': 'segment ROOT/sequences/00 -o OUT',
     'plot scan': 'plot scan SCAN -o OUT.png',
-    'plot above': 'plot above SCAN -o OUT.png',
     'plot segment': 'plot segment SCAN --azimuth 0 -o OUT.png',
     'kitti-to-bag': 'kitti-to-bag ROOT --sequence 00 OUT.mcap',
     'bench': 'bench ROOT --threads 1 --json OUT.json',
@@ -151,7 +150,7 @@ def test_every_command_refuses_wrong_data_and_names_the_option(command, root, ca
     assert what_is_there(root) == ['root']
 
 
-@pytest.mark.parametrize('command', ['segment', 'segment folder', 'plot above'])
+@pytest.mark.parametrize('command', ['segment', 'segment folder', 'plot scan'])
 def test_the_option_helps_and_force_takes_it_with_a_note(command, root, capsys):
     words = words_of(command, root)
     assert run(*words, *DOUBLES) == 0
@@ -206,7 +205,7 @@ def test_other_huge_files_are_refused_by_their_size(root, tmp_path, capsys):
     os.truncate(label, SPARSE)
     for words in (
         ['evaluate', root],
-        ['plot', 'above', scan, '--labels', label, '-o', 'a.png'],
+        ['plot', 'scan', scan, '--labels', label, '-o', 'a.png'],
         ['kitti-to-bag', root, '--sequence', '00', tmp_path / 'a.mcap'],
     ):
         times.unlink(missing_ok=True)

@@ -179,7 +179,7 @@ MAKERS = {
 COMMANDS = [
     'segment FILE -o out --force',
     'segment FILE --format ply -o out --force',
-    'plot above FILE -o out.png --force',
+    'plot scan FILE -o out.png --force',
     'evaluate FILE --against paper --force',
 ]
 

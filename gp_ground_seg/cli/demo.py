@@ -25,7 +25,7 @@ from gp_ground_seg.data.semantic_kitti import (
     read_labels,
     read_points,
 )
-from gp_ground_seg.lab.plotting.scan import plot_birds_eye
+from gp_ground_seg.lab.plotting.scan import plot_scan_view
 from gp_ground_seg.lab.plotting.style import new_figure
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Confusion, Labels, count_confusion
 from gp_ground_seg.lab.scoring.report import Column
@@ -43,7 +43,7 @@ from gp_ground_seg.ros.start_stop import needing_ros
 if TYPE_CHECKING:
     from gp_ground_seg.ros.start_stop import Session
 
-BAG, PICTURE, LOG = 'drive.mcap', 'birds_eye.png', 'node.log'
+BAG, PICTURE, LOG = 'drive.mcap', 'scan.png', 'node.log'
 TOPIC = '/points'  # of the bag
 FRAME_ID = 'lidar'
 EPOCH = 1_700_000_000
@@ -59,7 +59,7 @@ DESCRIPTION = """\
 Show the node at work without data: simulate a short drive along a street, write it as a bag,
 start the node in a second process, send the scans of the bag to it through ROS, receive both
 clouds, check that every point came back exactly once, score the labels against the truth, and
-draw one scan from above. With --kitti it does the same on real, labelled scans.
+draw one scan with its errors. With --kitti it does the same on real, labelled scans.
 
 Its topics are in a namespace of a random name: other nodes are not disturbed.
 """
@@ -243,10 +243,10 @@ def run(arguments: argparse.Namespace) -> int:
             raise GroundSegError(f'no scan came back; the node said:\n{node.log_tail()}')
         number, xyz, label, truth = tally.picture
         title = f'{drive.name}, scan {number + 1} of {drive.n_frames}'
-        counts = plot_birds_eye(xyz, label, part / PICTURE, truth, title)
+        counts = plot_scan_view(xyz, label, part / PICTURE, title, truth=truth)
     text, is_good = result_text(tally, result, probe.n_stray, drive.truth)
     print(f'\n{text}\n')
-    print(f'picture  {folder / PICTURE}  scan {number + 1} from above: {counts}')
+    print(f'picture  {folder / PICTURE}  scan {number + 1}: {counts}')
     print(f'bag      {folder / BAG}  what was played; `gp-ground-seg play` plays it again')
     return 0 if is_good else 1
 

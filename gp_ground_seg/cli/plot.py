@@ -1,4 +1,4 @@
-"""``plot``: pictures of a segmented scan: in perspective, from above, one segment of it."""
+"""``plot``: pictures of a segmented scan: in perspective, or one segment of it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
+from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
@@ -21,7 +22,6 @@ from gp_ground_seg.lab.plotting.scan import (
     VALUES,
     Place,
     camera_at,
-    plot_birds_eye,
     plot_scan_view,
 )
 from gp_ground_seg.lab.plotting.segment import plot_segment, segment_at
@@ -29,8 +29,9 @@ from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 SCAN = """\
-Draw a scan in perspective: ground grey, obstacles orange. --surface adds the ground model,
-coloured by length-scale, with profiles of twice its standard deviation.
+Draw a scan in perspective: ground grey, obstacles orange; with --labels missed ground blue and
+false ground purple. --surface adds the ground model, coloured by length-scale, with profiles of
+twice its standard deviation.
 """
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
@@ -38,13 +39,7 @@ SCAN_EXAMPLES = """\
   gp-ground-seg plot scan --simulate road_then_rubble -o scan.png
   gp-ground-seg plot scan --simulate urban --sensor vlp-16 --colour height -o scan.svg
   gp-ground-seg plot scan 000000.bin --camera 90,30,40 -o from_the_left.pdf
-"""
-
-ABOVE = """\
-Draw a scan from above: ground and obstacles; with --labels the errors beside it.
-"""
-ABOVE_EXAMPLES = """\
-  gp-ground-seg plot above velodyne/000000.bin --labels labels/000000.label -o errors.png
+  gp-ground-seg plot scan velodyne/000000.bin --labels labels/000000.label -o errors.png
 """
 
 SEGMENT = """\
@@ -66,25 +61,24 @@ Segments are numbered counter-clockwise from straight behind.
 KINDS = ('.png', '.pdf', '.svg')
 ENDINGS = ' or '.join(KINDS)
 INPUT = ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'})
-LABELS = ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'})
 INTEGER: dict[str, Any] = {'metavar': 'N', 'type': int}
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Declare the command and its pictures."""
-    description = 'Draw a segmented scan: in perspective, from above, or one segment of it.'
-    examples = SCAN_EXAMPLES + ABOVE_EXAMPLES + SEGMENT_EXAMPLES
+    description = 'Draw a segmented scan: in perspective, or one segment of it.'
+    examples = SCAN_EXAMPLES + SEGMENT_EXAMPLES
     parser = options.new_parser(subparsers, 'plot', description, examples)
     pictures = parser.add_subparsers(metavar='PICTURE', required=True, dest='picture')
     for name, text, examples, purpose, declare in (
         ('scan', SCAN, SCAN_EXAMPLES, 'a scan in perspective', _declare_scan),
-        ('above', ABOVE, ABOVE_EXAMPLES, 'a scan and its errors from above', _declare_above),
         ('segment', SEGMENT, SEGMENT_EXAMPLES, 'a segment from the side', _declare_segment),
     ):
         picture = options.new_parser(pictures, name, text, examples, purpose)
         declare(picture)
         options.add(
             picture,
+            ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'}),
             ('--frame', 'which of several, from 0 (default: 0)', {**INTEGER, 'default': 0}),
             ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
             *options.CLOUDS,
@@ -114,14 +108,10 @@ def _declare_scan(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def _declare_above(parser: argparse.ArgumentParser) -> None:
-    options.add(parser, INPUT, LABELS)
-
-
 def _declare_segment(parser: argparse.ArgumentParser) -> None:
     metres, degrees = {'metavar': 'R', 'type': float}, {'metavar': 'DEG', 'type': float}
     extent = ('--max-range', 'range shown [m] (default: all candidates)', metres)
-    options.add(parser, INPUT, LABELS, extent)
+    options.add(parser, INPUT, extent)
     options.add(
         parser.add_mutually_exclusive_group(required=True),
         ('--segment', 'number of the segment, or of several side by side',
@@ -136,16 +126,18 @@ def run(arguments: argparse.Namespace) -> int:
     path = picture_path(arguments.output, force=arguments.force)
     points, title = _read(arguments) if arguments.input is not None else _simulate(arguments)
     truth = None
-    if getattr(arguments, 'labels', None) is not None:
+    if arguments.labels is not None:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
     with GroundSegmenter(config) as segmenter:
         result = segmenter.segment(points)
     if arguments.picture == 'scan':
-        look = arguments.camera, arguments.colour
-        is_drawn = arguments.surface
-        said = plot_scan_view(points, result, config, path, title, *look, surface=is_drawn)
-    elif arguments.picture == 'above':
-        said = plot_birds_eye(points, result.label, path, truth, title)
+        colour = arguments.colour
+        values = None if colour == 'class' else (colour, getattr(result, colour))
+        surface = (GroundModel.of(result), config) if arguments.surface else None
+        said = plot_scan_view(
+            points, result.label, path, title, arguments.camera,
+            truth=truth, values=values, surface=surface,
+        )  # fmt: skip
     else:
         segments, reach = _segment_numbers(arguments, config), arguments.max_range
         plot_segment(result, config, points, segments, path, truth, title, reach)

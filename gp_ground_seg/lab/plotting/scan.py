@@ -1,4 +1,4 @@
-"""A segmented scan: in perspective with the ground model on it, or from above with its errors."""
+"""A segmented scan in perspective: its labels, errors or heights, and the ground model."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from gp_ground_seg.core.frame import BoolArray, FloatArray, Label
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.log import in_thousands
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.core.pipeline.points import check_points, finite_points
-from gp_ground_seg.core.result import Segmentation
+from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.data.colours import COLOURS, HEIGHTS, length_scale_colours, ramp_colours
 from gp_ground_seg.lab.plotting import style
 from gp_ground_seg.lab.plotting.style import add_axes, new_figure, save, write_line
@@ -27,7 +26,7 @@ VALUES = {
 }
 """Attributes of `Segmentation` that points can be coloured by: title and ends of the scale."""
 
-# In perspective. Size of the scene, of the title above it and of the legend below it [inch].
+# Size of the scene, of the title above it and of the legend below it [inch].
 WIDTH, HEIGHT, TITLE, FOOT = 12.0, 6.0, 0.4, 0.6
 N_STD, N_PROFILES = 2.0, 60
 CLOSEST = 1.0
@@ -37,51 +36,48 @@ CAMERA, TARGET = (-16.0, -7.0, 10.0), (12.0, 1.0, -3.0)
 ZOOM = 0.75
 """Focal length over the width of the picture."""
 
-# From above.
-EXTENT, RING_STEP = 50.0, 10.0
-"""Half the side of the square that is shown, and the step between the rings in it [m]."""
-# Inches: the square of a panel, left, right, below and above it; the line above all panels.
-SQUARE, LEFT, RIGHT, BELOW, ABOVE, LINE = 6.2, 0.8, 0.2, 0.95, 0.4, 0.4
-
 Place = tuple[float, float, float]
 Layers = dict[str, BoolArray]
-"""Which points, (N,), are drawn in each of `COLOURS`, lowest first."""
+"""Which points, (N,), are drawn in each of `COLOURS`."""
+DEPTHS = {'ground': 1, 'obstacle': 4, 'missed ground': 5, 'false ground': 5}
+"""Layers of points from below; those of the surface are between the first two."""
 
 
 def plot_scan_view(
     points: npt.ArrayLike,
-    segmentation: Segmentation,
-    config: Config,
+    label: Labels,
     path: str | Path,
     title: str = '',
     camera: Place = CAMERA,
-    colour: str = 'class',
     *,
-    surface: bool = False,
+    truth: Labels | None = None,
+    values: tuple[str, FloatArray] | None = None,
+    surface: tuple[GroundModel, Config] | None = None,
 ) -> str:
     """Draw a scan in perspective, replacing the file `path`; return numbers of points.
 
-    Ground and obstacles of `points`, (N, >=3) [m]; with `surface` the ground model too, coloured
-    by length-scale, with profiles of two standard deviations, where it is at least as certain as
-    ``label.ground_tolerance``. In a PDF or SVG points are pixels. `camera` is in the sensor frame
-    [m]; `colour` is ``class`` or of `VALUES`.
+    Ground and obstacles of `points`, (N, >=3) [m], by their `Label`; with the true labels, UNKNOWN
+    where a point does not count, the errors too. `values` colour the points instead: a name of
+    `VALUES`, and (N,) of them. `surface` is drawn coloured by length-scale, with profiles of two
+    standard deviations, where it is at least as certain as ``label.ground_tolerance``. `camera`
+    is in the sensor frame [m]. In a PDF or SVG points are pixels.
     """
     xyz = check_points(points)
-    style.check_lengths(len(xyz), label=segmentation.label)
+    style.check_lengths(len(xyz), label=label, truth=truth)
+    said, layers = label_layers(label, truth)
     figure = new_figure(WIDTH, FOOT + HEIGHT + (TITLE if title else 0.0))
     write_line(figure, title, 0.5, 0.5 * TITLE, fontsize=14)
     axes = add_axes(figure, 0.0, FOOT, (WIDTH, HEIGHT))
-    _draw_points(axes, xyz, segmentation, camera, colour)
-    if surface:
-        model = GroundModel.of(segmentation)
-        _draw_surface(axes, model, config, camera, is_plain=colour in VALUES)
+    _draw_points(axes, xyz, layers, camera, values)
+    if surface is not None:
+        _draw_surface(axes, *surface, camera, is_plain=values is not None)
     axes.set_axis_off()
     axes.set_aspect('equal')
     axes.set_xlim(-0.5, 0.5)
     axes.set_ylim(-0.5 * HEIGHT / WIDTH, 0.5 * HEIGHT / WIDTH)
-    _draw_legend(figure, config, colour, surface)
+    _draw_legend(figure, layers, values, surface)
     save(figure, path)
-    return label_panel(segmentation.label)[0]
+    return said
 
 
 def camera_at(azimuth: float, elevation: float, distance: float) -> Place:
@@ -112,17 +108,20 @@ def project(points: FloatArray, camera: Place = CAMERA) -> tuple[FloatArray, Flo
 
 
 def _draw_points(
-    axes: Any, xyz: FloatArray, segmentation: Segmentation, camera: Place, colour: str
+    axes: Any,
+    xyz: FloatArray,
+    layers: Layers,
+    camera: Place,
+    values: tuple[str, FloatArray] | None,
 ) -> None:
     """Draw far points first, and the ground below all obstacles."""
     place, depth = project(xyz, camera)
-    for value, layer in ((Label.GROUND, 1), (Label.OBSTACLE, 4)):
-        chosen = np.flatnonzero((segmentation.label == value) & (depth > CLOSEST))
+    for name, layer in layers.items():
+        chosen = np.flatnonzero(layer & (depth > CLOSEST))
         chosen = chosen[np.argsort(-depth[chosen])]
-        look: dict[str, Any] = {'c': COLOURS[value.name.lower()], 'zorder': layer}
-        if colour in VALUES:
-            values = getattr(segmentation, colour)[chosen]
-            look = {'c': ramp_colours(values, *VALUES[colour][1:]), 'zorder': 4}
+        look: dict[str, Any] = {'c': COLOURS[name], 'zorder': DEPTHS[name]}
+        if values is not None and name in ('ground', 'obstacle'):
+            look = {'c': ramp_colours(values[1][chosen], *VALUES[values[0]][1:]), 'zorder': 4}
         axes.scatter(
             *place[chosen].T, s=np.clip(60.0 / depth[chosen], 1.0, 5.0), linewidths=0.0,
             rasterized=True, **look,
@@ -163,16 +162,23 @@ def _draw_surface(
     add(piece, along, LineCollection, linewidths=1.3, zorder=3)
 
 
-def _draw_legend(figure: Any, config: Config, colour: str, surface: bool) -> None:
+def _draw_legend(
+    figure: Any,
+    layers: Layers,
+    values: tuple[str, FloatArray] | None,
+    surface: tuple[GroundModel, Config] | None,
+) -> None:
     """Draw the legend below the scene."""
-    if colour in VALUES:
-        title, low, high = VALUES[colour]
+    names = [*layers]
+    if values is not None:
+        title, low, high = VALUES[values[0]]
         colours = ramp_colours(np.linspace(low, high, 200), low, high)
         _draw_ramp(figure, f'{title}; mid-grey: no model', colours, (low, high))
-        return
-    dots = style.legend_dots({name: COLOURS[name] for name in ('ground', 'obstacle')}, 7)
-    figure.legend(handles=dots, loc='lower left', fontsize=11, frameon=False, ncols=2)
-    if surface:
+        names = names[2:]
+    dots = style.legend_dots({name: COLOURS[name] for name in names}, 7)
+    figure.legend(handles=dots, loc='lower left', fontsize=11, frameon=False, ncols=4)
+    if surface is not None and values is None:
+        _, config = surface
         low, high = config.length_scale.min, config.length_scale.max
         colours = length_scale_colours(np.geomspace(low, high, 200), low, high)
         title = 'length-scale of the ground [m]; bands: ± 2 std'
@@ -190,103 +196,23 @@ def _draw_ramp(figure: Any, title: str, colours: FloatArray, ends: tuple[float, 
     return bar
 
 
-def plot_birds_eye(
-    points: npt.ArrayLike,
-    label: Labels,
-    path: str | Path,
-    truth: Labels | None = None,
-    title: str = '',
-) -> str:
-    """Draw points (N, >=3) [m] from above by their `Label`, as a PNG, replacing the file `path`.
+def label_layers(label: Labels, truth: Labels | None = None) -> tuple[str, Layers]:
+    """Return numbers of points in words, and the layers of their labels (N,).
 
-    With the true labels, UNKNOWN where a point does not count, a second panel shows the errors.
-    Returns the title of the last panel: the numbers of points in it.
+    With the true labels, UNKNOWN where a point does not count, those of the errors.
     """
-    xyz = check_points(points)
-    style.check_lengths(len(xyz), label=label, truth=truth)
-    panels = [label_panel(label)]
-    if truth is not None:
-        panels.append(error_panel(label, truth))
-    xy = np.where(finite_points(xyz)[:, None], xyz[:, :2], np.nan)
-    width = LEFT + SQUARE + RIGHT
-    height = BELOW + SQUARE + ABOVE + (LINE if title else 0.0)
-    figure = new_figure(width * len(panels), height)
-    write_line(figure, title, 0.5, 0.6 * LINE, fontsize=15, fontweight='bold')
-    for k, (panel_title, layers) in enumerate(panels):
-        axes = add_axes(figure, k * width + LEFT, BELOW, (SQUARE, SQUARE))
-        axes.set_title(panel_title, fontsize=11)
-        _draw_panel(axes, xy, layers)
-    save(figure, path)
-    return panels[-1][0]
-
-
-def label_panel(label: Labels) -> tuple[str, Layers]:
-    """Return title and layers of the given labels."""
-    shown = (Label.GROUND, Label.OBSTACLE, Label.UNKNOWN)
-    layers = {value.name.lower(): label == value for value in shown}
-    numbers = {name: int(chosen.sum()) for name, chosen in layers.items()}
-    named = [f'{in_thousands(n)} {name}' for name, n in numbers.items() if n or name != 'unknown']
-    return f'{in_thousands(len(label))} points: {", ".join(named)}', layers
-
-
-def error_panel(label: Labels, truth: Labels) -> tuple[str, Layers]:
-    """Return title and layers of the errors; each point is in one."""
-    given, ground, obstacle = label == Label.GROUND, truth == Label.GROUND, truth == Label.OBSTACLE
-    hit, missed, false = ground & given, ground & ~given, obstacle & given
-    layers = {
-        'not scored': ~(ground | obstacle),
-        'right': hit | (obstacle & ~given),
-        'missed ground': missed,
-        'false ground': false,
-    }
-    n_hit, n_missed, n_false = (int(part.sum()) for part in (hit, missed, false))
-    n_union = n_hit + n_missed + n_false
-    iou = f', IoU {100.0 * n_hit / n_union:.2f} %' if n_union else ''
-    return (
-        f'{in_thousands(n_false)} false ground, {in_thousands(n_missed)} missed ground{iou}',
-        layers,
-    )
-
-
-def _draw_panel(axes: Any, xy: npt.NDArray[np.floating], layers: Layers) -> None:
-    """Draw points, rings of equal range and the sensor, forward up and left to the left."""
-    inside = (np.abs(xy) <= EXTENT).all(axis=1)  # False where it is NaN.
-    shown = {}
-    for depth, (name, chosen) in enumerate(layers.items()):
-        x, y = xy[chosen & inside].T
-        if len(x):
-            shown[name] = colour = COLOURS[name]
-            size = 3.0 if name in ('missed ground', 'false ground') else 1.0
-            axes.scatter(y, x, s=size, c=colour, linewidths=0.0, zorder=depth, rasterized=True)
-    _draw_rings(axes, len(layers))
-    axes.set_aspect('equal')
-    axes.set_xlim(EXTENT, -EXTENT)
-    axes.set_ylim(-EXTENT, EXTENT)
-    axes.set_xlabel('y, to the left [m]')
-    axes.set_ylabel('x, forward [m]')
-    (sensor,) = axes.plot(
-        0, 0, marker='^', color='white', markeredgecolor='black', linestyle='none',
-        markersize=8, zorder=len(layers) + 1, label='sensor',
-    )  # fmt: skip
-    axes.legend(
-        handles=[*style.legend_dots(shown, 7), sensor], loc='upper center', frameon=False,
-        bbox_to_anchor=(0.5, -0.08), ncols=len(shown) + 1, fontsize=10.5, handletextpad=0.2,
-        columnspacing=1.5,
-    )  # fmt: skip
-
-
-def _draw_rings(axes: Any, layer: int) -> None:
-    """Draw rings of equal range, with their ranges."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    for radius in np.arange(RING_STEP, EXTENT * math.sqrt(2.0), RING_STEP):
-        axes.plot(
-            radius * np.cos(angle), radius * np.sin(angle), color='#6B7178', linewidth=0.5,
-            linestyle=(0, (4, 4)), zorder=layer,
-        )  # fmt: skip
-        if radius < EXTENT:
-            axes.text(
-                *(-radius * math.sqrt(0.5),) * 2, f'{radius:g} m', fontsize=8, color='#3B4046',
-                ha='center', va='center', zorder=layer,
-                bbox={'boxstyle': 'round,pad=0.15', 'facecolor': 'white', 'edgecolor': 'none',
-                      'alpha': 0.8},
-            )  # fmt: skip
+    layers = {'ground': label == Label.GROUND, 'obstacle': label == Label.OBSTACLE}
+    n_points, n_given, n_obstacle = len(label), *(int(part.sum()) for part in layers.values())
+    if truth is None:
+        words = f'{in_thousands(n_points)} points: {in_thousands(n_given)} ground'
+        words += f', {in_thousands(n_obstacle)} obstacle'
+        n_unknown = n_points - n_given - n_obstacle
+        return f'{words}, {in_thousands(n_unknown)} unknown' if n_unknown else words, layers
+    given, ground = layers['ground'], truth == Label.GROUND
+    layers['missed ground'] = ground & ~given
+    layers['false ground'] = given & (truth == Label.OBSTACLE)
+    n_missed, n_false = (int(layers[name].sum()) for name in ('missed ground', 'false ground'))
+    words = f'{in_thousands(n_false)} false ground, {in_thousands(n_missed)} missed ground'
+    if n_union := int(ground.sum()) + n_false:
+        words += f', IoU {100.0 * (1.0 - (n_missed + n_false) / n_union):.2f} %'
+    return words, layers

@@ -17,7 +17,7 @@ from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.lab.plotting import style
-from gp_ground_seg.lab.plotting.scan import Layers, error_panel, label_panel
+from gp_ground_seg.lab.plotting.scan import Layers, label_layers
 from gp_ground_seg.lab.plotting.style import new_figure, save
 from gp_ground_seg.lab.scoring.metrics import Labels
 
@@ -73,9 +73,7 @@ def plot_segment(
         name = f'{title}, {view.name}' if title else view.name
         name = f'{name}; {n_hidden} points outside'
         above.set_title(name, fontsize=12, loc='left', parse_math=False)
-        kinds = label_panel(result.label[part])[1]
-        if truth is not None:
-            kinds |= error_panel(result.label[part], truth[part])[1]
+        _, kinds = label_layers(result.label[part], None if truth is None else truth[part])
         view.draw_points(above, r, z, kinds)
         view.draw_ground(above)
         view.draw_length_scale(below, reach, with_pseudo_inputs=with_pseudo_inputs)
@@ -150,10 +148,7 @@ class SegmentView:
 
     def draw_points(self, axes: Any, r: FloatArray, z: FloatArray, kinds: Layers) -> None:
         """Draw points over range by label, and errors on them."""
-        for name in ('ground', 'obstacle', 'missed ground', 'false ground'):
-            if name not in kinds:
-                continue
-            chosen = kinds[name]
+        for name, chosen in kinds.items():
             look = {'color': COLOURS[name], 'label': f'{name} ({np.count_nonzero(chosen)})'}
             axes.plot(r[chosen], z[chosen], 'o', ms=3.6, mew=0, zorder=2, **look)
 
