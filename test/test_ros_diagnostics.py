@@ -106,6 +106,25 @@ def test_a_level_is_the_worst_of_the_latest_time(steps, recover_after):
         history.append((now, level))
 
 
+def test_one_line_of_the_log_in_ten_seconds_while_clouds_come():
+    node = MagicMock()
+    reporter = diagnostics.Diagnostics(node, lambda: (FACTS, {}), LIMITS)
+    said = node.get_logger().info
+    lines = []
+    for second in range(60):
+        if second < 25 or second == 50:
+            arrive(reporter.input, second)
+            process(reporter.processing, [0.0125])
+            reporter.model.segmented(GroundSegmenter().segment(np.zeros((0, 3))))
+        reporter.report(second + 0.5)
+        lines += [second] * (said.call_count > len(lines))
+    # The line at 30 is on clouds that came after the line at 20.
+    assert lines == [0, 10, 20, 30, 50]
+    assert said.call_args_list[1].args == (
+        '11 clouds segmented so far, 1.00 Hz, median latency 12.50 ms, share of ground unknown',
+    )
+
+
 def test_every_task_is_reported_and_holds_its_own_level():
     nothing = SimpleNamespace(create_publisher=lambda *_: None, create_timer=lambda *_, **__: None)
     reporter = diagnostics.Diagnostics(nothing, lambda: (FACTS, {'/ground': 1}), LIMITS)

@@ -1,8 +1,10 @@
 """The node, drivers and players, each a process: what comes back, what diagnostics say."""
 
+import re
 import signal
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -70,6 +72,15 @@ def test_values_of_every_type_are_answered(setter):
             wanted = 'must be a number in' if number < 10 else f': {number} is not a valid'
             assert result.successful or wanted in result.reason
         link.segment(to_message(street(500)))
+
+
+def test_the_log_says_that_the_node_works(node):
+    with ros.linked() as link:
+        link.segment(to_message(street(500)))
+    line = r'\[([\d.]+)\].*: \d+ clouds segmented so far, .* Hz, .* ms, share of ground 0\.'
+    ros.wait_for(lambda: re.search(line, node.log), 'line')
+    times = [float(text) for text in re.findall(line, node.log)]
+    assert all(after - before > 9.9 for before, after in pairwise(times))
 
 
 def test_what_rclpy_raises_does_not_end_the_node(node):

@@ -20,6 +20,7 @@ from gp_ground_seg.core.result import FitReport, Segmentation
 from gp_ground_seg.ros.input import STEADY_CLOCK
 
 RATE_WINDOW = 10.0  # time over which rates are taken [s]
+LOG_PERIOD = 10.0  # shortest time between two lines of the log that say that the node works [s]
 CLOUD_WINDOW = 100  # clouds over which percentiles are taken
 MIN_RATE_SPAN = 1.0  # shortest time from which the load is computed [s]: a burst is no rate
 Level = IntEnum('Level', 'OK WARN ERROR STALE', start=0)
@@ -366,6 +367,7 @@ class Diagnostics:
         self.processing, self.model, self.output = ProcessingTask(), ModelTask(), OutputTask()
         self._node, self._state, self._limits = node, state, limits
         self._hysteresis: defaultdict[str, Hysteresis] = defaultdict(Hysteresis)
+        self._logged, self._n_logged = -np.inf, '0'
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._timer = node.create_timer(limits.period, self._publish, clock=STEADY_CLOCK)
 
@@ -385,7 +387,20 @@ class Diagnostics:
             self.model.report(limits),
             self.output.report(now, n_subscribers),
         )
+        self._log(now, {name: text for status in found for name, text in status.values.items()})
         return [self._hysteresis[s.task].hold(now, s, limits.recover_after) for s in found]
+
+    def _log(self, now: float, values: Mapping[str, str]) -> None:
+        """Log that the node works, if it has processed clouds since the last such line."""
+        n = values['Clouds since startup']
+        if n == self._n_logged or now - self._logged < LOG_PERIOD:
+            return
+        self._logged, self._n_logged = now, n
+        self._node.get_logger().info(
+            f'{n} clouds segmented so far, {values["Actual frequency (Hz)"]} Hz, '
+            f'median latency {values["Latency p50 (ms)"]} ms, '
+            f'share of ground {values["Ground fraction"]}'
+        )
 
     def _publish(self) -> None:
         array = DiagnosticArray()
