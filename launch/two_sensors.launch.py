@@ -2,13 +2,19 @@
 
 The outputs are /front/ground, /front/obstacles, /rear/ground and /rear/obstacles. A Nav2 costmap
 takes all of them as sources; docs/node.md says when one node on merged clouds is the better way.
-Arguments of ground_segmentation.launch.py that are not set here hold for both nodes.
+Arguments of ground_segmentation.launch.py that are not set here hold for both nodes; a bag is
+played once.
 """
 
 from pathlib import Path
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    GroupAction,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+)
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
@@ -20,18 +26,27 @@ SENSORS = {
 }
 
 
-def generate_launch_description():
+def _nodes(context):
     """Return one group per sensor, so that the arguments of one are not those of the other."""
-    actions = []
+    groups = []
     for sensor, arguments in SENSORS.items():
-        # front_topic, front_params, rear_topic, rear_params
-        for name, value in arguments.items():
-            actions.append(DeclareLaunchArgument(f'{sensor}_{name}', default_value=value))
-        # A bag is played once: beside this file.
         given = {name: LaunchConfiguration(f'{sensor}_{name}') for name in arguments}
+        if groups and context.launch_configurations.get('bag'):
+            # The first plays the bag; this one has its time.
+            given.update(bag='', use_sim_time='true')
         node = IncludeLaunchDescription(
             PythonLaunchDescriptionSource(str(NODE)),
-            launch_arguments={'namespace': sensor, 'bag': '', **given}.items(),
+            launch_arguments={'namespace': sensor, **given}.items(),
         )
-        actions.append(GroupAction([node]))
-    return LaunchDescription(actions)
+        groups.append(GroupAction([node]))
+    return groups
+
+
+def generate_launch_description():
+    """Return the arguments front_topic, front_params, rear_topic, rear_params, and the nodes."""
+    declared = [
+        DeclareLaunchArgument(f'{sensor}_{name}', default_value=value)
+        for sensor, arguments in SENSORS.items()
+        for name, value in arguments.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=_nodes)])

@@ -231,12 +231,20 @@ def test_rviz_follows_the_topics_and_a_bag_gives_the_time(actions):
     ]  # fmt: skip
 
 
-def test_two_sensors_have_topics_and_parameters_as_arguments(actions):
+@pytest.mark.parametrize('bag', ['', 'drive'])
+def test_two_sensors_have_arguments_of_their_own_and_one_bag(actions, bag):
     description = load_script('launch/two_sensors.launch.py').generate_launch_description()
-    *front, group, _, _, _ = description.args[0]
-    assert {one.args[0]: one.options['default_value'] for one in front} == {
+    *declared, nodes = description.args[0]
+    assert {one.args[0]: one.options['default_value'] for one in declared[:2]} == {
         'front_topic': '/lidar_front/points', 'front_params': '{sensor.height: 1.2}'
     }  # fmt: skip
-    (node,) = group.args[0]
-    given = dict(node.options['launch_arguments'])
-    assert (given['namespace'], given['topic'].args) == ('front', ('front_topic',))
+    context = SimpleNamespace(launch_configurations={'bag': bag} if bag else {})
+    front, rear = (
+        dict(group.args[0][0].options['launch_arguments'])
+        for group in nodes.options['function'](context)
+    )
+    assert (front['namespace'], front['topic'].args) == ('front', ('front_topic',))
+    # The first takes bag:= as it is given; the second has its time and does not play it again.
+    assert front.keys() == {'namespace', 'topic', 'params'}
+    time = {'bag': '', 'use_sim_time': 'true'} if bag else {}
+    assert {name: rear[name] for name in rear.keys() - front.keys()} == time
