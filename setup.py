@@ -39,7 +39,6 @@ DEV = [
     'moto[server]>=5.0',
     'mypy>=1.10,<2.5',
     'plyfile>=1.0',
-    'pyarrow>=14',
     'pypatchworkpp>=1.4',
     'pypcd4>=1.1',
     'pytest-timeout>=2.3',

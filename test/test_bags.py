@@ -134,7 +134,6 @@ def test_ros1_types_unknown_to_ros2_are_carried_over_and_changed_ones_migrated(r
     with BagReader(ros1_bag) as bag:
         topic = bag.topic('/odd')
         messages, ranges = ([raw for _, _, raw in bag.messages([t])] for t in ('/odd', '/range'))
-        assert bag.migrated_topics == ['/range']
     types = get_typestore(Stores.EMPTY)
     types.register(get_types_from_msg(topic.definition, topic.msgtype))
     assert topic.type_hash == types.hash_rihs01(topic.msgtype)

@@ -11,7 +11,7 @@ from conftest import REPOSITORY
 from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.cli.experiment import EXPERIMENTS, THREE
+from gp_ground_seg.cli.experiment import EXPERIMENTS, FIVE
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
 from gp_ground_seg.core.errors import DataError
@@ -41,7 +41,7 @@ def few_places(monkeypatch):
     for name in ('ablation', 'scenes'):
         fewer = EXPERIMENTS[name]._replace(places=(12.0 * (name == 'ablation'),))
         monkeypatch.setitem(EXPERIMENTS, name, fewer)
-    monkeypatch.setattr(sensor_pose, 'MOUNTS', sensor_pose.MOUNTS[:2])
+    monkeypatch.setattr(sensor_pose, 'TURNS', sensor_pose.TURNS[:2])
     monkeypatch.setattr(ablation, 'DEPARTURES', {'near': {'grid.r_max': 15.0}})
     some = {'a wider gate': {'growth.max_standardised_residual': 4.0}}
     monkeypatch.setattr(ablation, 'ALTERNATIVES', some)
@@ -104,8 +104,8 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
     ('words', 'sensors', 'scenes', 'n_seeds'),
     [
         (['scenes', '--sensors', 'mid-360,hdl-64e'], ['mid-360', 'hdl-64e'], DRIVES, 3),
-        (['sensor-pose', '--simulated', '--seeds', '2', '--scenes', 'flat,kerb'],
-         THREE, ['flat', 'kerb'], 2),
+        (['coverage', '--simulated', '--seeds', '3', '--scenes', 'flat,kerb'],
+         FIVE, ['flat', 'kerb'], 3),
     ],
 )  # fmt: skip
 def test_scans_and_parameters_are_those_of_the_options(
@@ -142,7 +142,7 @@ def test_scans_and_parameters_are_those_of_the_options(
         (['steps', 'ROOT', '--set', 'grid.n_bins=40'], 'give no parameters'),
         (['steps', 'ROOT', '--preset', 'paper'], 'give no parameters'),
         (['ablation', '--simulated', '--set', 'length_scale.model=latent2'], 'length_scale.model'),
-        (['sensor-pose', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
+        (['coverage', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
         (['coverage', 'ROOT', '--sensors', 'vlp-16'], '--sensors: is for --simulated only'),
         (['coverage'], 'coverage: give either ROOT or --simulated'),
         (['sensor-pose', 'ROOT', '--set', 'sensor.height=1.0'], 'sensor.height = 1.0: the exp'),

@@ -203,14 +203,6 @@ def test_bad_cloud_stops_the_run_and_is_named(tmp_path, capsys, damage, message)
     assert read_messages(out) == before
 
 
-def test_note_on_migrated_topic(tmp_path, capsys):
-    write_bag(tmp_path / 'drive.bag', n_clouds=1)
-    assert segment(tmp_path / 'drive.bag') == 0
-    assert 'note: topic /range: sensor_msgs/msg/Range has other fields' in capsys.readouterr().err
-    assert segment(tmp_path / 'drive.bag', '--drop', '/range', '--force') == 0
-    assert capsys.readouterr().err == ''
-
-
 def expected_labels(segmenter, k, ground=40, obstacle=99):
     label = segmenter.segment(samples.scan(k)).label
     return np.select([label == Label.GROUND, label == Label.OBSTACLE], [ground, obstacle], 0)

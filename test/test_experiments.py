@@ -237,9 +237,7 @@ def streets(tmp_path_factory):
 
 
 def test_frames_turned(streets, monkeypatch):
-    monkeypatch.setattr(
-        sensor_pose, 'MOUNTS', [(1.73, turn) for turn in ((0, 0), (0, 3), (3, -3))]
-    )
+    monkeypatch.setattr(sensor_pose, 'TURNS', ((0, 0), (0, 3), (3, -3)))
     report = sensor_pose.score_poses(streets, FIXED)
     level, pitched, turned, pooled = report.tables['poses'].json()
     assert level['told'] == level['level'] > 0.9
@@ -249,26 +247,10 @@ def test_frames_turned(streets, monkeypatch):
         assert row['auto'] > level['told'] - 0.01
         assert row['worst'] == pytest.approx(row['change'])  # of one sequence
         assert max(abs(row['low']), abs(row['high'])) < 0.1
-    assert (turned['mount'], turned['levelled']) == ('1.73 m roll +3° pitch -3°', 1)
-    assert (pooled['mount'], pooled['scans'], pooled['levelled']) == ('all', 3, 2)
-    assert [row['method'] for row in report.rows][:3] == [
-        'given 1.73 m', 'level 1.73 m', 'auto 1.73 m',
-    ]  # fmt: skip
+    assert (turned['turn'], turned['levelled']) == ('roll +3° pitch -3°', 1)
+    assert (pooled['turn'], pooled['scans'], pooled['levelled']) == ('all', 3, 2)
+    assert [row['method'] for row in report.rows][:3] == ['given none', 'level none', 'auto none']
     assert len(report.rows) == 3 * 3
-
-
-def test_poses_of_simulated_scans(monkeypatch):
-    small = dataclasses.replace(simulation.VLP_16, n_columns=600)
-    monkeypatch.setitem(sensor_pose.SENSORS, 'vlp-16', small)
-    frames = variants.simulated_frames(['vlp-16'], ['flat'], 1, (0.0,))
-    report = sensor_pose.score_poses(frames, FIXED)
-    *rows, pooled = report.tables['poses'].json()
-    assert len(rows) == len(sensor_pose.SIMULATED_MOUNTS)
-    for row in rows:
-        assert max(abs(row['low']), abs(row['high'])) < 0.06
-        assert row['levelled'] == ('roll' in row['mount'])
-        assert row['auto'] == pytest.approx(row['told'], abs=1e-3)
-    assert pooled['auto'] > pooled['level']
 
 
 @pytest.mark.slow

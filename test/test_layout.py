@@ -49,7 +49,6 @@ ONLY_IN = {
     **dict.fromkeys(('dask', 'distributed'), ('lab/scale/cluster.py',)),
     'fsspec': ('data/files.py',),
     'lzf': ('data/pcd.py',),
-    'pyarrow': ('lab/scoring/report.py',),
     'matplotlib': ('lab/plotting/',),
     'numba': ('core/jit.py', 'core/compiled/'),
     'viser': ('lab/viewers/html_page.py',),

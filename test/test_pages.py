@@ -126,7 +126,7 @@ def test_numbers_of_pictures_come_out_again(figure, tmp_path, capsys, monkeypatc
 def test_the_picture_of_the_demo_is_that_of_the_demo(tmp_path):
     """The same scan without the node: the labels that came back are those of the library."""
     (figure,) = (figure for figure in FIGURES if figure.command == 'demo')
-    number = int(re.search(r'\(scan (\d+) ', figure.body)[1])
+    number = int(re.search(r'\(scan (\d+): ', figure.body)[1])
     *_, (points, semantic, _) = (
         scan for _, scan in zip(range(number), demo.simulated_drive(30).scans, strict=False)
     )

@@ -73,7 +73,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         parser,
         ROOT,
         *OF_FRAMES,
-        ('--per-frame', 'write the numbers of each frame (.csv, .parquet)', {'metavar': 'FILE'}),
+        ('--per-frame', 'write the numbers of each frame as CSV', {'metavar': 'FILE'}),
         ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
         ('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
         (
@@ -94,8 +94,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Evaluate, write the files, print the tables."""
     config = options.read_config(arguments)
     files = {'json': 'every number', 'per_frame': 'each frame'}
-    if arguments.per_frame is not None:
-        results.check_rows_file(arguments.per_frame)
     with options.staged_options(arguments, *files) as parts, ExitStack() as stack:
         items, load = _items(arguments)
         chosen: list[Method] = [stack.enter_context(closing(OurMethod(config)))]

@@ -97,7 +97,7 @@ EXPERIMENTS = {
     'wrong-values': Experiment(ablation.compare_wrong_values),
     'scenes': Experiment(score_scenes, THREE, n_seeds=3, places=(0.0, 6.0), labelled=False),
     'objects': Experiment(score_objects, [*SENSORS], CROWDED, n_seeds=2, labelled=False),
-    'sensor-pose': Experiment(score_poses, THREE),
+    'sensor-pose': Experiment(score_poses),
     'table1': Experiment(table1, is_timed=True),
 }
 """Experiments by name. A new one is a row here and its function."""

@@ -40,7 +40,6 @@ class BagTopic:
     encoding: str = 'cdr'  # of the messages; ``cdr`` for all that ROS 2 writes itself
     qos: tuple[Any, ...] = ()  # offered by the publishers (``rosbags.interfaces.Qos``)
     n_messages: int = 0
-    migrated: bool = False  # whether a ROS 1 type has other fields in ROS 2
     problem: str = ''  # why messages of ROS 1 cannot be converted, empty if they can
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,6 @@ from gp_ground_seg.data.bag_files import BAG_SUFFIXES
 from gp_ground_seg.data.bags import BagReader, BagWriter, cloud_topic
 from gp_ground_seg.data.point_cloud2 import decode_cloud, encode_cloud, read_xyz, select_points
 
-_LOGGER = logging.getLogger('gp_ground_seg')
 GROUND_TOPIC, OBSTACLES_TOPIC = '/ground', '/obstacles'
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
@@ -99,9 +97,6 @@ class BagOutput:
             raise DataError(
                 f'--obstacles-topic {self.obstacles_topic}: is the topic of the ground as well'
             )
-        for name in set(bag.migrated_topics) & set(copied):
-            kind = bag.topics[name]
-            _LOGGER.info('topic %s: %s has other fields in ROS 2; new ones are zero', name, kind)
         return copied
 
     def _storage(self, bag: BagReader, target: Path) -> str | None:

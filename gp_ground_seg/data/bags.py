@@ -116,14 +116,12 @@ def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
         target.register({**source.fielddefs, _HEADER: header})
     convert: Callable[[bytes], Any] = functools.partial(target.ros1_to_cdr, typename=new)
     # In the same layout only a header's ``seq`` goes; else fields of one name keep their value.
-    migrated = not is_same_wireformat(source, target, old, new)
-    if migrated:
+    if not is_same_wireformat(source, target, old, new):
         convert = functools.partial(
             migrate_bytes, source, target, old, new, {}, src_is2=False, dst_is2=True
         )
     qos = (_reliable_qos('TRANSIENT_LOCAL'),) if connection.ext.latching else ()
-    topic = _topic_of(target, connection.topic, new, qos)
-    return dataclasses.replace(topic, migrated=migrated), convert
+    return _topic_of(target, connection.topic, new, qos), convert
 
 
 def _unpack(new: Callable[[], Any], data: bytes, *_: object) -> bytes:
@@ -221,11 +219,6 @@ class BagReader(AbstractContextManager['BagReader']):
         kind = POINT_CLOUD2, 'cdr'
         return [name for name, t in self._topics.items() if (t.msgtype, t.encoding) == kind]
 
-    @property
-    def migrated_topics(self) -> list[str]:
-        """ROS 1 topics whose type has other fields in ROS 2: those of the same name are kept."""
-        return sorted(name for name, topic in self._topics.items() if topic.migrated)
-
     def topic(self, name: str) -> BagTopic:
         """Return the description of a topic; raises DataError if there is none of that name."""
         if name not in self._topics:
@@ -306,7 +299,6 @@ class BagReader(AbstractContextManager['BagReader']):
             known,
             n_messages=known.n_messages + n_messages,
             qos=tuple(dict.fromkeys((*known.qos, *topic.qos))),
-            migrated=known.migrated or topic.migrated,
             problem=known.problem or topic.problem,
         )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import importlib.metadata
-import importlib.util
 import itertools
 import json
 import math
@@ -18,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gp_ground_seg
-from gp_ground_seg.core.errors import DataError, MissingDependencyError, install_hint
 from gp_ground_seg.core.parameters.config import Config, parameter_specs
 from gp_ground_seg.core.parameters.schema import ParameterValue
 from gp_ground_seg.core.result import FitReport
@@ -150,27 +148,11 @@ def write_json(document: Any, path: str | Path) -> None:
     Path(path).write_text(text, encoding='utf-8')
 
 
-def check_rows_file(name: str) -> None:
-    """Raise an error if `write_rows` could not write a file of this name."""
-    if not name.endswith(('.csv', '.parquet')):
-        raise DataError(f'{name}: must end in .csv or .parquet')
-    if name.endswith('.parquet') and importlib.util.find_spec('pyarrow') is None:
-        raise MissingDependencyError(f'pyarrow is not installed: {install_hint("pyarrow")}')
-
-
 def write_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write rows as CSV or Parquet; a cell within a cell gets a column, as ``objects_vehicle``."""
+    """Write rows as CSV; a cell within a cell gets a column, as ``objects_vehicle``."""
     flat = [dict(_flat(row)) for row in rows]
-    names = list(dict.fromkeys(itertools.chain(*flat)))
-    if path.suffix == '.parquet':
-        from pyarrow import Table as ArrowTable
-        from pyarrow.parquet import write_table
-
-        whole = [{name: row.get(name) for name in names} for row in flat]
-        write_table(ArrowTable.from_pylist(whole), path)
-        return
     with path.open('w', newline='', encoding='utf-8') as file:
-        writer = csv.DictWriter(file, names)
+        writer = csv.DictWriter(file, list(dict.fromkeys(itertools.chain(*flat))))
         writer.writeheader()
         writer.writerows(flat)
 
