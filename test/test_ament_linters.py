@@ -13,6 +13,9 @@ import sys
 import pytest
 from conftest import REPOSITORY
 
+# `make lint` finds nearly the same, with ruff.
+pytestmark = pytest.mark.slow
+
 PLUGINS = ('builtins', 'comprehensions', 'docstrings', 'quotes')
 FLAKE8 = ('flake8', *(f'flake8_{name}' for name in PLUGINS))
 CONFIG = 'test/ament_flake8.ini'
@@ -34,7 +37,6 @@ def need(*modules):
         pytest.skip(f'not installed: {", ".join(missing)}')
 
 
-@pytest.mark.slow
 def test_flake8_with_the_settings_of_ament():
     need(*FLAKE8)
     done = run('-m', 'flake8', f'--config={CONFIG}', *SOURCES)

@@ -196,6 +196,7 @@ def run_demo(folder, *words):
     return done.stdout, iou
 
 
+@pytest.mark.slow
 def test_demo_without_data(rclpy, tmp_path):
     said, iou = run_demo(tmp_path, '--frames', 4)
     assert '4 sent, 4 back, 0 lost' in said

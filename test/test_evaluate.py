@@ -223,6 +223,7 @@ def test_the_surface_of_the_peer_is_that_of_its_planes():
     assert method.result().ground_z.shape == (0,)
 
 
+@pytest.mark.slow
 def test_patchworkpp_on_real_frames_scores_as_measured_elsewhere(kitti):
     """A check of our scoring by a number that is not ours: 95.15 % on these 60 frames."""
     frames = labelled_frames(kitti, ['00', '01', '03', '05', '08', '10'])

@@ -50,6 +50,7 @@ def test_labels_and_p_ground_are_as_frozen(kitti, n_threads):
         assert summary['p_ground'] == pytest.approx(frozen[name]['p_ground'], abs=SAME_P_GROUND)
 
 
+@pytest.mark.slow
 def test_numpy_gives_the_same_but_for_rounding(kitti):
     by_backend = (segmented(kitti, **{'runtime.backend': name}) for name in ('numba', 'numpy'))
     n_different = {}

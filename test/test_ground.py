@@ -1,5 +1,7 @@
 """Length-scales, inlier growth and the surface: both backends against loops."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import reference
@@ -43,8 +45,9 @@ def config_of(model='latent', slope_std=0.05, look_aside=False, **growth):
     )
 
 
-@pytest.mark.parametrize('seed', range(fewer(40, 6)))
-def test_surfaces_are_the_reference(backend, seed):
+@cache
+def surface_by_the_loops(seed):
+    """Arguments of a surface and what the loops make of them, for each backend in turn."""
     rng = np.random.default_rng(seed)
     model = rng.choice(['latent', 'latent', 'line_gradient', 'constant'])
     # Fewer segments than fit into one batch, or more; some of them empty.
@@ -57,8 +60,14 @@ def test_surfaces_are_the_reference(backend, seed):
     theta += np.where(np.arange(6) < 5, 0.3, 1.0) * rng.normal(size=theta.shape)
     if rng.random() < 0.3:
         frame = frame._replace(knots=frame.knots[:0])
-    found, knot_u, u = backend.estimate_surface(frame, theta, config)
-    expected, expected_knot_u, expected_u = reference.estimate_surface(frame, theta, config)
+    arguments = frame, theta, config
+    return arguments, reference.estimate_surface(*arguments)
+
+
+@pytest.mark.parametrize('seed', range(fewer(40, 6)))
+def test_surfaces_are_the_reference(backend, seed):
+    arguments, (expected, expected_knot_u, expected_u) = surface_by_the_loops(seed)
+    found, knot_u, u = backend.estimate_surface(*arguments)
     np.testing.assert_array_equal(found.inlier, expected.inlier)
     np.testing.assert_allclose(knot_u, expected_knot_u, atol=1e-9)
     np.testing.assert_allclose(u, expected_u, atol=1e-9)

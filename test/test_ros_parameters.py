@@ -340,6 +340,7 @@ def test_a_given_height_is_not_doubted_before_the_first_cloud(capfd):
     assert 'is sensor.height right' not in log
 
 
+@pytest.mark.slow
 def test_parameters_are_set_from_another_process(b):
     """By the function behind the button of ``tune``."""
     name = b.node.get_fully_qualified_name()

@@ -84,6 +84,7 @@ def remove(link, publisher):
     link.probe.executor.create_task(link.probe.destroy_publisher, publisher)
 
 
+@pytest.mark.slow
 def test_every_cloud_comes_however_the_publishers_change(link):
     reliable = add_publisher(link, RELIABLE, 'reliable')
     send_and_wait(link, LARGE, reliable)

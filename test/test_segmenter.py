@@ -241,7 +241,7 @@ def test_the_input_is_not_written_to_and_may_change_afterwards(backend, scan, ti
 @cache
 def labelled_by_the_loops(*changes):
     """Scan of few points with these parameters, for each backend in turn."""
-    return segmenter_of(Reference(), **dict(changes)).segment(hilly_scan(700))
+    return segmenter_of(Reference(), **dict(changes)).segment(hilly_scan(400))
 
 
 @pytest.mark.parametrize('model', ['latent', 'line_gradient', 'constant'])
@@ -258,7 +258,7 @@ def test_frames_are_labelled_as_by_the_loops(backend, model, scope, objective):
         'grid.n_segments': 12,
         'grid.n_bins': 60,
     }
-    found = segmenter_of(backend, **changes).segment(hilly_scan(700))
+    found = segmenter_of(backend, **changes).segment(hilly_scan(400))
     expected = labelled_by_the_loops(*changes.items())
     np.testing.assert_array_equal(found.label, expected.label)
     np.testing.assert_allclose(found.ground_z, expected.ground_z, atol=1e-5)

@@ -132,9 +132,8 @@ def test_a_scan_depends_on_seed_and_scene_only(scene):
     again = SCENES[scene.name](7)  # another object, and so scanned anew
     assert is_same(simulated(scene, FEW, 3), simulated(again, FEW, 3))
     assert not is_same(simulated(scene, FEW, 3), simulated(scene, FEW, 4))
-    exact = replace(FEW, range_std=0.0, dropout=0.0)
-    other = scene_of(scene.name, 8)
-    assert not is_same(simulated(scene, exact, 3), simulated(other, exact, 3))
+    # The noise of a ray depends on the seed alone.
+    assert not is_same(simulated(scene, FEW, 3), simulated(scene_of(scene.name, 8), FEW, 3))
 
 
 def flat_scan(**changes):
@@ -214,9 +213,9 @@ def test_tilted_sensor_sees_the_same_world(roll, pitch, scene):
 
 
 def test_drive_moves_over_the_terrain(scene):
-    scans = list(simulate_drive(scene, FEW, n_frames=3, speed=15.0, seed=5))
-    np.testing.assert_allclose([s.time for s in scans], [0.0, 0.1, 0.2])
-    np.testing.assert_allclose([s.position[0] for s in scans], [0.0, 1.5, 3.0])
+    scans = list(simulate_drive(scene, FEW, n_frames=2, speed=15.0, seed=5))
+    np.testing.assert_allclose([s.time for s in scans], [0.0, 0.1])
+    np.testing.assert_allclose([s.position[0] for s in scans], [0.0, 1.5])
     for s in scans:
         ground = float(scene.terrain.height(s.position[0], s.position[1]))
         assert s.position[2] - ground == pytest.approx(FEW.height)
