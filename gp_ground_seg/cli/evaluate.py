@@ -18,6 +18,7 @@ from gp_ground_seg.data.inputs import Input, list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
 from gp_ground_seg.lab.scoring import report as results
 from gp_ground_seg.lab.scoring import tables
+from gp_ground_seg.lab.scoring.comparison import counts_of_all
 from gp_ground_seg.lab.scoring.evaluate import (
     PATCHWORKPP,
     KnownScan,
@@ -27,7 +28,6 @@ from gp_ground_seg.lab.scoring.evaluate import (
     load_kitti,
     score_methods,
 )
-from gp_ground_seg.lab.scoring.objects import ObjectCount
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 
 DESCRIPTION = """\
@@ -165,8 +165,7 @@ def _result_lines(scores: Sequence[MethodScore]) -> list[str]:
             found = score.confusion
             ratios = {'IoU': found.iou, 'precision': found.precision, 'recall': found.recall}
             words += [f'{name} {100.0 * ratio:.2f} %' for name, ratio in ratios.items()]
-        bands = itertools.chain(*score.objects.values())
-        if (objects := sum(bands, ObjectCount())).n_objects:
+        if (objects := counts_of_all(score)).n_objects:
             words.append(f'{objects.n_lost} of {objects.n_objects} objects lost')
         words.append(f'{1e3 * score.seconds():.1f} ms')
         lines.append(results.fold(f'{score.title}: {", ".join(words)}'))

@@ -156,10 +156,8 @@ class SegmentedCloud:
 def first_of_voxels(xyz: PointArray, size: float) -> BoolArray:
     """Which points (N, 3) are the first in their cube of `size` [m], (N,) bool.
 
-    Points must be finite. A size below `SMALLEST_VOXEL` keeps every point.
+    Points must be finite, and the size at least `SMALLEST_VOXEL`.
     """
-    if size < SMALLEST_VOXEL:
-        return np.ones(len(xyz), dtype=np.bool_)
     key = np.zeros(len(xyz), dtype=np.int64)
     for values in xyz.T:
         place = np.floor(np.clip(values / size, -_VOXELS, _VOXELS - 1))

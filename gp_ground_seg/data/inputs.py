@@ -40,15 +40,12 @@ class Input:
         The file, or the bag.
     read : callable
         Returns the `Cloud`; raises DataError if it cannot be read, or can be no scan.
-    time : float or None
-        When it was recorded [s]; None if the format has no time.
     """
 
     name: str
     title: str
     path: AnyPath
     read: Callable[[], Cloud]
-    time: float | None = None
 
 
 class Inputs:
@@ -85,7 +82,7 @@ class Inputs:
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
                 read = partial(_decode, raw, f'{self.path}: {place}', bag.size, self._origin)
                 title = shown(f'{self.path.name}[{k}]')
-                yield Input(f'{k:06d}', title, self.path, read, 1e-9 * time)
+                yield Input(f'{k:06d}', title, self.path, read)
 
     def __getitem__(self, index: int) -> Input:
         """Return one cloud, not read yet; IndexError beyond the last."""

@@ -20,6 +20,7 @@ from numpy.lib.recfunctions import repack_fields
 from gp_ground_seg.core.errors import PointCloudError, in_one_line
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import jazzy_types
+from gp_ground_seg.data.clouds import gather
 from gp_ground_seg.data.files import check_points
 
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -261,11 +262,8 @@ def cloud_from_columns(
     """Message with one float32 or uint32 field per column (N,), packed; `stamp` in s and ns."""
     types = jazzy_types().types
     codes = {name: f'{values.dtype.kind}4' for name, values in columns.items()}
-    n_points = len(next(iter(columns.values()), ()))
-    points = np.empty(n_points, dtype=[(name, f'<{code}') for name, code in codes.items()])
-    for name, values in columns.items():
-        points[name] = values
-    step = points.dtype.itemsize
+    points = gather({name: values.astype(f'<{codes[name]}') for name, values in columns.items()})
+    step, n_points = points.dtype.itemsize, len(points)
     cloud: CloudMessage = types[POINT_CLOUD2](
         header=_new_header(stamp, frame_id),
         height=1,

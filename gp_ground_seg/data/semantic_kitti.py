@@ -73,8 +73,13 @@ def labelled_frames(
     DataError if a sequence is not there, a named one or a single frame has no labels, or all.
     """
     known = list_sequences(root)
+    chosen = list(dict.fromkeys(known if sequences is None else sequences))
+    unknown = [name for name in chosen if name not in known]
+    if unknown or not chosen:
+        problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
+        raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
     frames, left_out = [], []
-    for name in _chosen(root, sequences):
+    for name in chosen:
         listed = list_frames(root, name, layout)
         bare = [frame.index for frame in listed if frame.labels_path is None]
         if sequences is None and len(bare) == len(listed):
@@ -88,17 +93,6 @@ def labelled_frames(
     if left_out:
         _LOGGER.info('sequences without labels left out: %s', ', '.join(left_out))
     return frames
-
-
-def _chosen(root: str | AnyPath, sequences: Sequence[str] | None) -> list[str]:
-    """Sequences below `root` that are named, or all; raises DataError if one is not there."""
-    known = list_sequences(root)
-    chosen = list(dict.fromkeys(known if sequences is None else sequences))
-    unknown = [name for name in chosen if name not in known]
-    if unknown or not chosen:
-        problem = f'no sequence {", ".join(unknown)}' if chosen else 'no sequence asked for'
-        raise DataError(f'{root}: {problem}; sequences here: {", ".join(known)}')
-    return chosen
 
 
 def _read_times(path: AnyPath, frames: Sequence[AnyPath]) -> list[float]:

@@ -20,6 +20,7 @@ from rclpy.qos import qos_profile_parameters
 
 from gp_ground_seg.core.errors import ConfigError, DataError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
+from gp_ground_seg.core.parameters.export import differences
 from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec, ParameterValue
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.start_stop import start_errors
@@ -62,10 +63,9 @@ def changed(config: Config, parameters: Iterable[Parameter]) -> Config:
 def describe(config: Config, node_name: str) -> str:
     """Return one line per parameter that is not at its default, and how to see all."""
     lines = []
-    for spec in parameter_specs():
-        if (value := config[spec.name]) != spec.default:
-            unit = f' {spec.unit}' if spec.unit and not isinstance(value, str) else ''
-            lines.append(f'\n  {spec.name}: {value}{unit}  (default {spec.default})')
+    for spec, default, value in differences(Config(), config):
+        unit = f' {spec.unit}' if spec.unit and not isinstance(value, str) else ''
+        lines.append(f'\n  {spec.name}: {value}{unit}  (default {default})')
     head = 'parameters that differ from the defaults' if lines else 'parameters: all defaults'
     how = f'all values by ros2 param dump {node_name}, explained by gp-ground-seg config dump'
     return f'{head} ({how}){":" if lines else ""}{"".join(lines)}'

@@ -18,7 +18,7 @@ from gp_ground_seg.core.pipeline.points import check_points
 from gp_ground_seg.data.colours import COLOURS, HEIGHTS, length_scale_colours, ramp_colours
 from gp_ground_seg.lab.plotting import style
 from gp_ground_seg.lab.plotting.style import add_axes, new_figure, save, write_line
-from gp_ground_seg.lab.scoring.metrics import Labels
+from gp_ground_seg.lab.scoring.metrics import Labels, check_lengths
 
 VALUES = {
     'height': ('height over the ground [m]', *HEIGHTS),
@@ -63,7 +63,7 @@ def plot_scan_view(
     is in the sensor frame [m]. In a PDF or SVG points are pixels.
     """
     xyz = check_points(points)
-    style.check_lengths(len(xyz), label=label, truth=truth)
+    check_lengths(len(xyz), label=label, truth=truth)
     said, layers = label_layers(label, truth)
     figure = new_figure(WIDTH, FOOT + HEIGHT + (TITLE if title else 0.0))
     write_line(figure, title, 0.5, 0.5 * TITLE, fontsize=14)

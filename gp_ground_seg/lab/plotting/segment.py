@@ -19,7 +19,7 @@ from gp_ground_seg.data.colours import COLOURS
 from gp_ground_seg.lab.plotting import style
 from gp_ground_seg.lab.plotting.scan import Layers, label_layers
 from gp_ground_seg.lab.plotting.style import new_figure, save
-from gp_ground_seg.lab.scoring.metrics import Labels
+from gp_ground_seg.lab.scoring.metrics import Labels, check_lengths
 
 DPI = 130
 # Inches: the panels of one segment, those of each of several, and the legend beside them.
@@ -57,7 +57,7 @@ def plot_segment(
     that of the last candidate. The file `path`, a PDF or else a PNG, is replaced.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
-    style.check_lengths(len(z), result=result.label, truth=truth)
+    check_lengths(len(z), result=result.label, truth=truth)
     views = [SegmentView(result, segment) for segment in segments]
     inside = [
         (result.grid.segment == segment) & (result.grid.bin != OUTSIDE) for segment in segments

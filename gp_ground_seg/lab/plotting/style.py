@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gp_ground_seg.core.errors import PointCloudError, require
+from gp_ground_seg.core.errors import require
 from gp_ground_seg.data.atomic_output import staged_file
 
 DPI = 120
@@ -56,12 +56,3 @@ def save(figure: Any, path: str | Path) -> None:
     metadata = {'pdf': {'CreationDate': None}, 'svg': {'Date': None}}.get(kind, {})
     with staged_file(path, force=True) as part, rc_context({'svg.hashsalt': 'gp_ground_seg'}):
         figure.savefig(part, format=kind, metadata=metadata)
-
-
-def check_lengths(n_points: int, **values: Any) -> None:
-    """Raise `PointCloudError` for an array without one value per point; None is left out."""
-    for name, array in values.items():
-        if array is not None and array.shape != (n_points,):
-            raise PointCloudError(
-                f'{name} of shape {array.shape} for {n_points} points: must be ({n_points},)'
-            )

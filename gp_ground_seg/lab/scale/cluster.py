@@ -6,7 +6,6 @@ The one module that imports dask and distributed, optional packages.
 from __future__ import annotations
 
 import copy
-import importlib.metadata
 import itertools
 import logging
 import multiprocessing
@@ -27,10 +26,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-import gp_ground_seg
 from gp_ground_seg.core import log
 from gp_ground_seg.core.errors import DataError, in_one_line, require
 from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.lab.scoring.report import package_versions
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 BLOCK_SIZE = 64
@@ -201,13 +200,7 @@ def depends_on_past(config: Config) -> bool:
 
 def _versions() -> dict[str, str | None]:
     """Versions of what labels depend on."""
-    found: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
-    for package in ('numpy', 'scipy', 'numba'):
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = None
-    return {**found, 'Python': platform.python_version()}
+    return {**package_versions(), 'Python': platform.python_version()}
 
 
 def _compute(

@@ -71,7 +71,7 @@ def clusters(score: MethodScore) -> list[MethodScore]:
 
 def iou_sums(score: MethodScore) -> tuple[float, float]:
     """Return the IoU in the convention that counts, as a ratio."""
-    return score.confusion.tp, score.confusion.tp + score.confusion.errors
+    return score.confusion.iou_sums
 
 
 def mse_sums(score: MethodScore) -> tuple[float, float]:

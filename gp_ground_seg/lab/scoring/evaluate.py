@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -311,14 +312,9 @@ def score_methods(
     """
     score = partial(_score_block, load, methods, each_alone, clock)
     has_past = not each_alone and any(method.depends_on_past for method in methods)
-    parts = runner.run(score, items, _sequence_of if has_past else None)
+    parts = runner.run(score, items, attrgetter('sequence') if has_past else None)
     scans = [tuple(itertools.chain(*blocks)) for blocks in zip(*parts, strict=True)]
     return [MethodScore(m.name, found) for m, found in zip(methods, scans, strict=True)]
-
-
-def _sequence_of(item: Any) -> str:
-    name: str = item.sequence
-    return name
 
 
 def _score_block(

@@ -148,7 +148,12 @@ class Confusion(Sums):
     @property
     def iou(self) -> float:
         """TP / (TP + FP + FN)."""
-        return ratio(self.tp, self.tp + self.errors)
+        return ratio(*self.iou_sums)
+
+    @property
+    def iou_sums(self) -> tuple[int, int]:
+        """TP, and TP + FP + FN."""
+        return self.tp, self.tp + self.errors
 
     @property
     def points(self) -> int:
@@ -198,6 +203,15 @@ def ring_of(points: npt.NDArray[np.floating]) -> npt.NDArray[np.intp]:
     reach = np.hypot(x, y)
     ring: npt.NDArray[np.intp] = np.digitize(reach, RING_EDGES[1:-1])
     return np.where(np.isfinite(reach), ring, len(RING_TITLES))
+
+
+def check_lengths(n_points: int, **values: Any) -> None:
+    """Raise `PointCloudError` for an array without one value per point; None is left out."""
+    for name, array in values.items():
+        if array is not None and array.shape != (n_points,):
+            raise PointCloudError(
+                f'{name} of shape {array.shape} for {n_points} points: must be ({n_points},)'
+            )
 
 
 @dataclass(frozen=True)
@@ -295,10 +309,7 @@ def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Cali
 
     Points whose probability is NaN or whose truth is UNKNOWN do not count.
     """
-    if p_ground.shape != truth.shape:
-        raise PointCloudError(
-            f'p_ground of shape {p_ground.shape} for {len(truth)} points: must be ({len(truth)},)'
-        )
+    check_lengths(len(truth), p_ground=p_ground)
     known = ~np.isnan(p_ground)
     if not ((p_ground[known] >= 0.0) & (p_ground[known] <= 1.0)).all():
         raise PointCloudError('p_ground: a probability is outside [0, 1]')

@@ -15,9 +15,8 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray, Label
-from gp_ground_seg.lab.scoring.metrics import Labels, Sums, range_titles, ratio
+from gp_ground_seg.lab.scoring.metrics import Labels, Sums, check_lengths, range_titles, ratio
 
 MIN_HEIGHT = 0.3
 """Height above the local ground from which on a return on an object counts [m]."""
@@ -85,10 +84,7 @@ def count_objects(
     ground. A return counts in the band of its horizontal range, an object in that of the
     median of its returns that count. Classes without a return that counts, or would, are left out.
     """
-    n = len(points)
-    for name in ('class_of', 'object_id', 'ground_z'):
-        if (shape := getattr(objects, name).shape) != (n,):
-            raise PointCloudError(f'{name} of shape {shape} for {n} points: must be ({n},)')
+    check_lengths(len(points), **vars(objects))
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
     on, n_classes = (objects.class_of >= 0) & np.isfinite(reach + z), len(CLASSES)

@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gp_ground_seg
-from gp_ground_seg.core.parameters.config import Config, parameter_specs
+from gp_ground_seg.core.parameters.config import Config
+from gp_ground_seg.core.parameters.export import differences
 from gp_ground_seg.core.parameters.schema import ParameterValue
 from gp_ground_seg.core.result import FitReport
 
@@ -165,22 +166,27 @@ def _flat(row: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]
             yield prefix + key, _plain(value)
 
 
-def describe_environment(*packages: str) -> dict[str, Any]:
-    """Describe machine and software of a run, with the versions of further `packages`.
-
-    None stands for a package that is not installed, and for the commit outside git.
-    """
+def package_versions(*packages: str) -> dict[str, str | None]:
+    """Versions of what labels depend on, and of further `packages`; None: not installed."""
     versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
     for package in ('numpy', 'scipy', 'numba', *packages):
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             versions[package] = None
+    return versions
+
+
+def describe_environment(*packages: str) -> dict[str, Any]:
+    """Describe machine and software of a run, with the versions of further `packages`.
+
+    The commit is None outside git.
+    """
     return {
         'cpu': _cpu_name(),
         'n_cores': len(os.sched_getaffinity(0)),
         'python': platform.python_version(),
-        'versions': versions,
+        'versions': package_versions(*packages),
         'commit': _commit(Path(gp_ground_seg.__file__)),
     }
 
@@ -203,11 +209,7 @@ def machine_line(environment: Mapping[str, Any], fit: FitReport | None = None) -
 
 def changed_parameters(config: Config) -> dict[str, ParameterValue]:
     """Parameters that differ from their defaults, by dotted name."""
-    return {
-        spec.name: value
-        for spec in parameter_specs()
-        if (value := config[spec.name]) != spec.default
-    }
+    return {spec.name: value for spec, _, value in differences(Config(), config)}
 
 
 def parameters_line(changes: dict[str, ParameterValue]) -> str:

@@ -143,10 +143,10 @@ def _iou_differences(ours: MethodScore, peer: MethodScore) -> Table:
     """Differences of the IoU over all sequences: by convention, and by range."""
 
     def of_convention(key: str, score: MethodScore) -> tuple[float, float]:
-        return _iou_sums(score.pooled(key))
+        return score.pooled(key).iou_sums
 
     def of_ring(k: int, score: MethodScore) -> tuple[float, float]:
-        return _iou_sums(score.rings[k].confusion)
+        return score.rings[k].confusion.iou_sums
 
     cases: dict[str, Measure] = {
         f'all, {one.title} convention': partial(of_convention, one.key)
@@ -166,10 +166,6 @@ def _iou_differences(ours: MethodScore, peer: MethodScore) -> Table:
             ]
         )
     return Table(rows, f'IoU minus that of {peer.title}  [%]; {interval_note(ours)}')
-
-
-def _iou_sums(found: Confusion) -> tuple[float, float]:
-    return found.tp, found.tp + found.errors
 
 
 def _ring_table(scores: Sequence[MethodScore]) -> Table:
