@@ -174,12 +174,12 @@ def test_data_sets_are_known_by_their_folders(tmp_path, drive, hint):
 def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
     pytest.importorskip('matplotlib')
     bag, out = write_bag(tmp_path), tmp_path / 'a.png'
-    assert run('plot', 'above', bag, '--frame', '1', '-o', out) == 0
+    assert run('plot', 'scan', bag, '--frame', '1', '-o', out) == 0
     first = out.read_bytes()
-    assert run('plot', 'above', bag, '--frame', '2', '-o', out, '--force') == 0
+    assert run('plot', 'scan', bag, '--frame', '2', '-o', out, '--force') == 0
     assert out.read_bytes() != first
     capsys.readouterr()
-    assert run('plot', 'above', bag, '--frame', '3', '-o', tmp_path / 'b.png') == 2
+    assert run('plot', 'scan', bag, '--frame', '3', '-o', tmp_path / 'b.png') == 2
     assert '--frame 3: must be 0 to 2 here' in error_line(capsys)
 
 

@@ -28,7 +28,7 @@ COMMANDS = {
     'labels': ['segment', '--quiet', 'root/sequences/00/velodyne', '-o'],
     'kitti.mcap': ['kitti-to-bag', '--quiet', 'root', '--sequence', '00'],
     'kitti_bag': ['kitti-to-bag', '--quiet', 'root', '--sequence', '00'],
-    'scan.png': ['plot', 'above', 'root/sequences/00/velodyne/000000.bin', '-o'],
+    'scan.png': ['plot', 'scan', 'root/sequences/00/velodyne/000000.bin', '-o'],
 }
 SECONDS = 4.0
 """Most of a command's time from its start to the signal."""
