@@ -6,6 +6,7 @@ The one module that imports dask and distributed, optional packages.
 from __future__ import annotations
 
 import copy
+import importlib.metadata
 import itertools
 import logging
 import multiprocessing
@@ -26,10 +27,10 @@ from typing import Any
 
 from tqdm import tqdm
 
+import gp_ground_seg
 from gp_ground_seg.core import log
 from gp_ground_seg.core.errors import DataError, in_one_line, require
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.scoring.report import package_versions
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 BLOCK_SIZE = 64
@@ -196,6 +197,17 @@ def depends_on_past(config: Config) -> bool:
     return learning.mode in ('every_k', 'first_frame') or (
         learning.mode == 'every_frame' and learning.warm_start
     )
+
+
+def package_versions(*packages: str) -> dict[str, str | None]:
+    """Versions of what labels depend on, and of further `packages`; None: not installed."""
+    versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
+    for package in ('numpy', 'scipy', 'numba', *packages):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            versions[package] = None
+    return versions
 
 
 def _versions() -> dict[str, str | None]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib.metadata
 import itertools
 import json
 import math
@@ -21,6 +20,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import differences
 from gp_ground_seg.core.parameters.schema import ParameterValue
 from gp_ground_seg.core.result import FitReport
+from gp_ground_seg.lab.scale.cluster import package_versions
 
 WIDTH = 100
 """Columns of the terminal that titles and notes are folded to."""
@@ -164,17 +164,6 @@ def _flat(row: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]
             yield from _flat(value, f'{prefix}{key}_')
         else:
             yield prefix + key, _plain(value)
-
-
-def package_versions(*packages: str) -> dict[str, str | None]:
-    """Versions of what labels depend on, and of further `packages`; None: not installed."""
-    versions: dict[str, str | None] = {'gp_ground_seg': gp_ground_seg.__version__}
-    for package in ('numpy', 'scipy', 'numba', *packages):
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = None
-    return versions
 
 
 def describe_environment(*packages: str) -> dict[str, Any]:
