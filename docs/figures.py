@@ -13,6 +13,8 @@ sample: WORDS          further words for a run of seconds; its rows are kept in 
 keep: TITLE; TITLE     only the tables whose titles begin so
 picture: FILE -> PATH  the file that the command makes, and its place in the repository
 
+A command is one of gp-ground-seg, or a Python script: docs/drive.py.
+
 Pages and pictures are written when all commands have run: each runs on the commit it names.
 """
 
@@ -101,7 +103,9 @@ def words_of(command: str, kitti: str) -> list[str]:
 
 def run(command: str, kitti: str, folder: Path) -> str:
     """Run a command in a folder, and return what it prints."""
-    words = [sys.executable, '-m', 'gp_ground_seg', *words_of(command, kitti)]
+    words = words_of(command, kitti)
+    program = [] if words[0].endswith('.py') else ['-m', 'gp_ground_seg']
+    words = [sys.executable, *program, *words]
     done = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, text=True, check=True)
     return done.stdout.strip()
 
@@ -123,7 +127,8 @@ def kept(figure: Figure, output: str) -> str:
 
 def body_of(figure: Figure, output: str, commit: str) -> str:
     """Write what stands between the comments."""
-    shown = f'`gp-ground-seg {figure.command}`'
+    is_script = figure.command.partition(' ')[0].endswith('.py')
+    shown = f'`{"python" if is_script else "gp-ground-seg"} {figure.command}`'
     if 'picture' in figure.options:
         # The image, with the words it had, and the line that names the file.
         made = figure.options['picture'].partition(' -> ')[0]

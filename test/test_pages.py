@@ -123,6 +123,16 @@ def test_numbers_of_pictures_come_out_again(figure, tmp_path, capsys, monkeypatc
 
 @pytest.mark.slow
 @compiled
+def test_numbers_of_the_drive_come_out_again(tmp_path):
+    (figure,) = (figure for figure in FIGURES if figure.command.startswith('docs/drive.py'))
+    (tmp_path / 'docs').symlink_to(REPOSITORY / 'docs')
+    said = figures.caption(figures.run(figure.command, '', tmp_path), 'drive.gif')
+    assert f'({said}; commit ' in figure.body, f'now {said}. {ANEW}'
+    assert (tmp_path / 'drive.gif').stat().st_size < 3_000_000
+
+
+@pytest.mark.slow
+@compiled
 def test_the_picture_of_the_demo_is_that_of_the_demo(tmp_path):
     """The same scan without the node: the labels that came back are those of the library."""
     (figure,) = (figure for figure in FIGURES if figure.command == 'demo')
