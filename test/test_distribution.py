@@ -89,7 +89,8 @@ def test_what_pypi_would_object_to(built):
 
 @pytest.mark.slow
 def test_the_wheel_segments_a_scan(installed, tmp_path):
-    words = '-m', 'gp_ground_seg', 'plot', 'scan', '--simulate', 'flat', '-o', 'scan.png'
+    scan = str(REPOSITORY / 'docs' / 'scans' / 'vls128_street.npz')
+    words = '-m', 'gp_ground_seg', 'plot', 'scan', scan, '-o', 'scan.png'
     found = {'PYTHONPATH': str(installed), 'NUMBA_DISABLE_JIT': '1'}
     quick = '--set', 'runtime.backend=numpy'
     done = python(*words, *quick, folder=tmp_path, **found)

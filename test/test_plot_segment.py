@@ -187,7 +187,6 @@ def test_segments_with_nothing_to_see(tmp_path, points):
         (['--segment', '-1', '-o', 'a.png'], 'segment -1'),
         (['--azimuth', 'nan', '-o', 'a.png'], 'number of degrees'),
         (['--segment', '1', '-o', 'a.jpg'], 'must end in .png or .pdf or .svg'),
-        (['--segment', '1', '-o', 'a.png', '--max-range', '0'], 'max_range = 0'),
         (['--segment', '1', '-o', '/no/such/folder/a.png'], '/no/such/folder'),
         (['--segment', '1', '-o', 'a.png', '--labels', '/no.label'], '/no.label'),
     ],

@@ -12,6 +12,13 @@ import pytest
 from bag_samples import write_ros2_bag
 from cli_runner import INTERRUPTED, children, error_line, is_running, run, start
 from evaluation_samples import label_files, write_streets, write_two_drives
+from torture_resume import (
+    change_input,
+    delete_input,
+    delete_output,
+    link_output,
+    resize_output,
+)
 
 pytest.importorskip('distributed')
 # Dask leaves sockets and event loops to the garbage collector when its processes end.
@@ -77,7 +84,7 @@ def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, 
     assert sorted(finished(tmp_path / 'out')) == sorted(before)
 
 
-def other_folder(source, _out):
+def other_folder(_rng, source, _out):
     moved = source.with_name('other')
     for k, file in enumerate(sorted(source.rglob('*.bin'), reverse=True)):
         target = moved / sorted(source.rglob('*.bin'))[k].relative_to(source)
@@ -86,45 +93,22 @@ def other_folder(source, _out):
     return moved
 
 
-def change(source, _out):
-    scan = source / 'sequences/08/velodyne/000001.bin'
-    np.fromfile(scan, np.float32)[::-1].tofile(scan)
-
-
-def delete(_source, out):
-    (out / 'sequences/08/predictions/000001.label').unlink()
-
-
-def truncate(_source, out):
-    os.truncate(out / 'sequences/08/predictions/000001.label', 40)
-
-
-def remove_scan(source, out):
-    (source / 'sequences/08/velodyne/000000.bin').unlink()
-    (out / 'sequences/08/predictions/000000.label').unlink()
-
-
-def link(_source, out):
-    delete(_source, out)
-    (out / 'sequences/08/predictions/000001.label').symlink_to('nowhere')
-
-
 @pytest.mark.parametrize(
     ('harm', 'said', 'past'),
     [
         (other_folder, '0 of 12 were finished before; done again: 12 from another input', []),
-        (change, '11 of 12 were finished before; done again: 1 with a changed input', PAST),
-        (remove_scan, '7 of 11 were finished before; done again: 4 with a changed input', PAST),
-        (delete, 'done again: 1 with output missing or of another size', []),
-        (truncate, 'done again: 1 with output missing or of another size', PAST),
-        (link, 'done again: 1 with output missing or of another size', []),
+        (change_input, '11 of 12 were finished before; done again: 1 with a changed', PAST),
+        (delete_input, '5 of 11 were finished before; done again: 6 with a changed', PAST),
+        (delete_output, 'done again: 1 with output missing or of another size', []),
+        (resize_output, 'done again: 1 with output missing or of another size', PAST),
+        (link_output, 'done again: 1 with output missing or of another size', []),
     ],
 )
 def test_resume_does_again_what_does_not_fit(harm, said, past, root, tmp_path, capsys):
     source, out, anew = tmp_path / 'root', tmp_path / 'out', tmp_path / 'anew'
     shutil.copytree(root, source)
     assert run('segment', source, '-o', out, *past) == 0
-    source = harm(source, out) or source
+    source = harm(np.random.default_rng(0), source, out) or source
     capsys.readouterr()
     assert run('segment', source, '-o', out, '--resume', *past) == 0
     assert said in capsys.readouterr().out

@@ -9,21 +9,16 @@ import numpy as np
 import pytest
 from bag_samples import write_ros2_bag
 from cli_runner import error_line, run
+from conftest import simulated
 from evaluation_samples import write_frame
 
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, find_objection
 from gp_ground_seg.data.semantic_kitti import read_labels, read_points
-from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 SPARSE = 300 * 10**9
 DOUBLES = ('--dtype', 'float64')
-
-
-def simulated(sensor='hdl-32e', scene='urban', seed=1):
-    rng = np.random.default_rng(seed)
-    return simulate_scan(SCENES[scene](seed), SENSORS[sensor], rng).points.astype('<f4')
 
 
 def missing(points, share, value):
@@ -65,7 +60,7 @@ def scans(request):
         root = request.getfixturevalue('kitti')
         paths = sorted(root.glob('sequences/*/velodyne/*.bin'))
         return [read_points(path) for path in paths[::6]]
-    return [simulated(request.param, scene) for scene in ('flat', 'rough', 'urban')]
+    return [simulated(scene, request.param, 1).points for scene in ('flat', 'rough', 'urban')]
 
 
 @pytest.mark.parametrize('change', GOOD)
@@ -87,7 +82,7 @@ def test_wrong_data_are_refused_in_a_line_that_names_the_options(scans, tmp_path
 
 
 def test_the_library_reads_what_it_is_told(tmp_path):
-    points, path = simulated('vlp-16'), tmp_path / 'a.bin'
+    points, path = simulated('urban', seed=1).points, tmp_path / 'a.bin'
     for n_columns, dtype in ((3, '<f4'), (4, '<f4'), (5, '<f4'), (4, '<f8'), (7, '<f8')):
         table = np.zeros((len(points), n_columns), dtype)
         table[:, :4] = points[:, :n_columns]
@@ -104,7 +99,7 @@ def test_the_library_reads_what_it_is_told(tmp_path):
 @pytest.fixture
 def root(tmp_path):
     """A SemanticKITTI folder with two sequences of one frame of doubles, labelled."""
-    points = simulated('hdl-32e')
+    points = simulated('urban', 'hdl-32e', 1).points
     semantic = np.where(points[:, 2] < -1.5, 40, 10).astype('<u4')
     for sequence in ('00', '01'):
         write_frame(tmp_path / 'root', sequence, 0, points.astype('<f8'), semantic)
@@ -169,7 +164,6 @@ def test_the_option_helps_and_force_takes_it_with_a_note(command, root, capsys):
         ('segment BAG -o OUT.mcap', 'BAG'),
         ('bench BAG', 'BAG'),
         ('bench --from OLD.json', 'OLD.json'),
-        ('plot scan --simulate flat -o OUT.png', 'a simulated one'),
         ('demo --output OUT', 'a simulated one'),
     ],
 )

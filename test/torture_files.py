@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from bag_samples import scan, write_ros1_bag, write_ros2_bag
 from torture_cases import run_cases
+from torture_permissions import answer
 
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file
@@ -113,19 +114,16 @@ def run_case(number, samples, folder):
     outputs = [folder / 'out.mcap', folder / 'out.npz']
     try:
         path.write_bytes(damage(whole, rng, path.suffix == '.yaml'))
-        said, errors, started = io.StringIO(), io.StringIO(), time.monotonic()
+        started = time.monotonic()
         try:
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(errors):
-                code = cli.main([str(word) for word in words])
-        except SystemExit as stop:
-            code = stop.code
+            code, _, errors = answer(words)
         except BaseException as error:
             return f'{name}: {type(error).__name__}: {" ".join(str(error).split())[:200]}'
         # `config check` prints a line for each problem, other commands one error.
         mark = str(path) if words[1] == 'check' else 'error: '
-        n_lines = sum(mark in line for line in errors.getvalue().splitlines())
+        n_lines = sum(mark in line for line in errors.splitlines())
         if code not in (0, 2) or (code == 2 and not (n_lines == 1 or words[1] == 'check')):
-            return f'{name}: exit code {code}, {errors.getvalue()[-200:]!r}'
+            return f'{name}: exit code {code}, {errors[-200:]!r}'
         if code == 2 and any(out.exists() for out in outputs):
             return f'{name}: something was written'
         if time.monotonic() - started > SLOWEST:

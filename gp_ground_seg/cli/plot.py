@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +25,6 @@ from gp_ground_seg.lab.plotting.scan import (
 )
 from gp_ground_seg.lab.plotting.segment import plot_segment, segment_at
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
-from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
 
 SCAN = """\
 Draw a scan in perspective: ground grey, obstacles orange; with --labels missed ground blue and
@@ -36,8 +34,7 @@ twice its standard deviation.
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
   gp-ground-seg plot scan drive.mcap --frame 20 -o scan.png
-  gp-ground-seg plot scan --simulate road_then_rubble -o scan.png
-  gp-ground-seg plot scan --simulate urban --sensor vlp-16 --colour height -o scan.svg
+  gp-ground-seg plot scan 000000.pcd --colour height -o scan.svg
   gp-ground-seg plot scan 000000.bin --camera 90,30,40 -o from_the_left.pdf
   gp-ground-seg plot scan velodyne/000000.bin --labels labels/000000.label -o errors.png
 """
@@ -60,8 +57,6 @@ Segments are numbered counter-clockwise from straight behind.
 
 KINDS = ('.png', '.pdf', '.svg')
 ENDINGS = ' or '.join(KINDS)
-INPUT = ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'})
-INTEGER: dict[str, Any] = {'metavar': 'N', 'type': int}
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -78,28 +73,22 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         declare(picture)
         options.add(
             picture,
+            ('input', 'scan, folder of scans, or bag', {'metavar': 'INPUT'}),
             ('--labels', 'SemanticKITTI labels of the points', {'metavar': 'FILE'}),
-            ('--frame', 'which of several, from 0 (default: 0)', {**INTEGER, 'default': 0}),
+            ('--frame', 'which of several, from 0 (default: %(default)s)',
+             {'metavar': 'N', 'type': int, 'default': 0}),
             ('-o --output', f'{ENDINGS} file', {'metavar': 'OUT', 'required': True}),
             *options.CLOUDS,
             options.FORCE,
-        )
+        )  # fmt: skip
         options.add_config(picture)
         picture.set_defaults(run=run)
 
 
 def _declare_scan(parser: argparse.ArgumentParser) -> None:
-    options.add(
-        parser.add_mutually_exclusive_group(required=True),
-        (*INPUT[:2], {**INPUT[2], 'nargs': '?'}),
-        ('--simulate', ', '.join(SCENES), {'metavar': 'SCENE', 'choices': SCENES}),
-    )
     camera = {'metavar': 'AZIMUTH,ELEVATION,DISTANCE', 'type': _camera, 'default': CAMERA}
     options.add(
         parser,
-        ('--sensor', 'sensor of the simulated scan (default: %(default)s)',
-         {'choices': SENSORS, 'default': 'hdl-64e'}),
-        ('--seed', 'of the simulated scene (default: %(default)s)', {**INTEGER, 'default': 0}),
         ('--camera', 'where it stands, seen from the middle of the scene: counter-clockwise '
          'from ahead [deg], upwards [deg], away [m] (default: 196,24,32)', camera),
         ('--colour', 'colour points by class, or by the height over the ground or the '
@@ -109,14 +98,12 @@ def _declare_scan(parser: argparse.ArgumentParser) -> None:
 
 
 def _declare_segment(parser: argparse.ArgumentParser) -> None:
-    metres, degrees = {'metavar': 'R', 'type': float}, {'metavar': 'DEG', 'type': float}
-    extent = ('--max-range', 'range shown [m] (default: all candidates)', metres)
-    options.add(parser, INPUT, extent)
     options.add(
         parser.add_mutually_exclusive_group(required=True),
         ('--segment', 'number of the segment, or of several side by side',
          {'metavar': 'N[,N]', 'type': _integers}),
-        ('--azimuth', 'the segment in this direction, 90 = left', degrees),
+        ('--azimuth', 'the segment in this direction, 90 = left',
+         {'metavar': 'DEG', 'type': float}),
     )  # fmt: skip
 
 
@@ -124,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Segment the scan and draw it."""
     config = options.read_config(arguments)
     path = picture_path(arguments.output, force=arguments.force)
-    points, title = _read(arguments) if arguments.input is not None else _simulate(arguments)
+    points, title = _read(arguments)
     truth = None
     if arguments.labels is not None:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
@@ -139,8 +126,8 @@ def run(arguments: argparse.Namespace) -> int:
             truth=truth, values=values, surface=surface,
         )  # fmt: skip
     else:
-        segments, reach = _segment_numbers(arguments, config), arguments.max_range
-        plot_segment(result, config, points, segments, path, truth, title, reach)
+        segments = _segment_numbers(arguments, config)
+        plot_segment(result, config, points, segments, path, truth, title)
         said = '; '.join(_segment_counts(result, segment) for segment in segments)
     print(f'{said}, written to {shown(path)}')
     return 0
@@ -179,16 +166,6 @@ def _read(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]
     folder = Path(str(scan.path)).resolve().parent
     title = f'{folder.parent.name}/{scan.name}' if folder.name == 'velodyne' else scan.title
     return scan.read().xyz, shown(title)
-
-
-def _simulate(arguments: argparse.Namespace) -> tuple[npt.NDArray[np.floating], str]:
-    """Points of a simulated scan, and a title that names it."""
-    options.refuse_scan_layout(arguments, 'a simulated one')
-    if arguments.seed < 0:
-        raise DataError(f'--seed {arguments.seed}: must not be negative')
-    scene, rng = SCENES[arguments.simulate], np.random.default_rng(arguments.seed)
-    points = simulate_scan(scene(arguments.seed), SENSORS[arguments.sensor], rng).points
-    return points, f'simulated {arguments.sensor}: {arguments.simulate}'
 
 
 def _segment_numbers(arguments: argparse.Namespace, config: Config) -> list[int]:

@@ -48,13 +48,12 @@ def plot_segment(
     path: str | Path,
     truth: Labels | None = None,
     title: str = '',
-    max_range: float | None = None,
 ) -> None:
     """Draw segments from the side, side by side; below each the length-scale and pseudo-inputs.
 
     `result` is the segmentation of `points`, (N, >=3) [m], under `config`. `truth` (N,) are true
-    labels, UNKNOWN where a point does not count; `max_range` [m] is by default a little more than
-    that of the last candidate. The file `path`, a PDF or else a PNG, is replaced.
+    labels, UNKNOWN where a point does not count. The range is a little more than that of the last
+    candidate. The file `path`, a PDF or else a PNG, is replaced.
     """
     z = result.pose.level(check_points(points))[:, 2].astype(np.float64)
     check_lengths(len(z), result=result.label, truth=truth)
@@ -63,7 +62,7 @@ def plot_segment(
         (result.grid.segment == segment) & (result.grid.bin != OUTSIDE) for segment in segments
     ]
     points_of = [(result.grid.r[part], z[part]) for part in inside]
-    reach = max(v.reach(r, max_range) for v, (r, _) in zip(views, points_of, strict=True))
+    reach = max(v.reach(r) for v, (r, _) in zip(views, points_of, strict=True))
     shown = [v.heights_shown(reach, z) for v, (_, z) in zip(views, points_of, strict=True)]
     low, high = min(low for low, _ in shown), max(high for _, high in shown)
     figure, panels = _panels(len(views))
@@ -137,12 +136,8 @@ class SegmentView:
         model = '' if np.isfinite(self._mean).any() else ': no ground model'
         return f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
 
-    def reach(self, point_r: FloatArray, max_range: float | None) -> float:
-        """Return `max_range`, else what holds all candidates, or if none all points [m]."""
-        if max_range is not None:
-            if not (max_range > 0.0 and math.isfinite(max_range)):
-                raise ConfigError(f'max_range = {max_range}: must be a positive number of metres')
-            return max_range
+    def reach(self, point_r: FloatArray) -> float:
+        """Return the range that holds all candidates, or if none all points [m]."""
         r = self._r if len(self._r) else point_r
         return float(r.max()) + BEYOND if len(r) else float(self._result.grid.edges[-1])
 
