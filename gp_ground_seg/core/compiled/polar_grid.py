@@ -91,7 +91,7 @@ def sort_points(
         _resolve_lowest(columns[2, block], r[block], cell[block], tile[block], extremes, numbers)
 
 
-@jit()
+@jit(part=True)
 def _clear(
     extremes: PointArray, numbers: CellArray, tile_extremes: PointArray, occupied: CellArray
 ) -> None:
@@ -298,7 +298,7 @@ def merge_parts(
     return c
 
 
-@jit()
+@jit(part=True)
 def _merge_tiles(n_parts: int, extremes: PointArray, occupied: CellArray) -> None:
     n_occupied = occupied[0, 0]
     for index in range(1, n_parts):
