@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -78,8 +79,9 @@ def given_theta(config: Config) -> FloatArray:
     return np.append(np.log(values), np.zeros(n_factors))
 
 
+@lru_cache(maxsize=4)
 def theta_space(config: Config) -> ThetaSpace:
-    """Bounds, priors and free entries by the configuration."""
+    """Bounds, priors and free entries by the configuration; not to be written to."""
     learning, centre = config.learning, given_theta(config)
     width = WIDEST * learning.prior_std
     free = np.ones(len(centre), dtype=np.bool_)
