@@ -109,8 +109,7 @@ def run_convert(arguments: argparse.Namespace) -> int:
     frames = list_frames(arguments.root, arguments.sequence, layout)
     stamps = [_nanoseconds(frame) for frame in frames]
     target = Path(arguments.output)
-    if not arguments.quiet:
-        options.note_leftovers(target)
+    options.note_leftovers(target, quiet=arguments.quiet)
     n_points = 0
     with (
         BagWriter(target, force=arguments.force) as bag,

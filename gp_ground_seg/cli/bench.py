@@ -98,12 +98,16 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     except MissingDependencyError as error:
         options.note(f'no ratios without the baseline: {error}')
         baseline = None
-    frames = frames_from_options(arguments, arguments.frames)
+    source = Path(arguments.data)
+    if holds_bag(source):
+        options.refuse_scan_layout(arguments, source)
+    layout = options.scan_layout(arguments)
+    frames = load_frames(source, arguments.frames, arguments.topic, layout)
     cases = bench_cases(config, threads, with_numpy=arguments.numpy)
     make_baseline = PatchworkppMethod if baseline else None
     with options.runner(arguments, 'bench') as runner:
         measured = run_cases(frames, cases, make_baseline, arguments.passes, runner=runner)
-    data = Path(arguments.data).resolve().name
+    data = source.resolve().name
     return bench_document(measured, config, environment, baseline, data)
 
 
@@ -116,14 +120,6 @@ def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
     if min(threads) < 1 or len(set(threads)) < len(threads):
         raise DataError(f'--threads {text}: must be different whole numbers from 1, as in 1,4')
     return threads
-
-
-def frames_from_options(arguments: argparse.Namespace, n_frames: int) -> list[KnownScan]:
-    """Read about `n_frames` frames of the options."""
-    source = Path(arguments.data)
-    if holds_bag(source):
-        options.refuse_scan_layout(arguments, source)
-    return load_frames(source, n_frames, arguments.topic, options.scan_layout(arguments))
 
 
 def load_frames(

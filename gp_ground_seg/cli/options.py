@@ -225,9 +225,9 @@ def staged_options(arguments: argparse.Namespace, *names: str) -> Iterator[dict[
         }
 
 
-def note_leftovers(target: Path) -> None:
+def note_leftovers(target: Path, *, quiet: bool = False) -> None:
     """Name unfinished output that earlier runs left beside `target`."""
-    for path in leftovers(target):
+    for path in [] if quiet else leftovers(target):
         note(f'{path} is the unfinished output of another run; delete it if that one was killed')
 
 

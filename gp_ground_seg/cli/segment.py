@@ -185,8 +185,7 @@ def _segment_scans(
     if arguments.format not in (None, form):
         raise DataError(f'{target}: ends in {target.suffix}, which is not {arguments.format}')
     output = CloudOutput(form, arguments.raw, arguments.split, arguments.surface)
-    if not arguments.quiet:
-        options.note_leftovers(target)
+    options.note_leftovers(target, quiet=arguments.quiet)
     bar = options.progress('segment', quiet=arguments.quiet)
     with output.staged(scans, target, is_file=is_file, force=arguments.force) as paths:
         for scan in bar(scans, total=len(scans)):
@@ -198,8 +197,7 @@ def _segment_bag(
 ) -> Iterator[Segmentation]:
     """Write the bag of a bag; yield the results."""
     clouds = options.list_clouds(arguments)
-    if not arguments.quiet:
-        options.note_leftovers(target)
+    options.note_leftovers(target, quiet=arguments.quiet)
     output = _bag_output(arguments)
     results = output.write(Path(arguments.input), target, segmenter, force=arguments.force)
     bar = options.progress('segment', quiet=arguments.quiet)

@@ -106,18 +106,13 @@ class OurMethod:
         """Segment a scan."""
         self.last = self._segmenter.segment(points)
 
-    @property
-    def stages(self) -> dict[str, float]:
-        """Seconds of each stage of the last scan."""
-        timings = self.last.timings
-        return {stage: timings[stage] for stage in timings if stage != 'total'}
-
     def result(self) -> MethodResult:
         """Return the result of the last scan."""
         last = self.last
+        stages = {stage: s for stage, s in last.timings.items() if stage != 'total'}
         return MethodResult(
             last.label, last.ground_z, last.p_ground, last.return_std, last.ground_std,
-            self.stages, last.pose, last.fit,
+            stages, last.pose, last.fit,
         )  # fmt: skip
 
     def close(self) -> None:

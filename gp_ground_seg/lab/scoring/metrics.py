@@ -260,14 +260,6 @@ def class_errors(classes: Mapping[int, ClassCount]) -> list[ClassErrors]:
     return sorted(found, key=lambda entry: (-entry.errors, -entry.n_points, entry.number))
 
 
-def _no_points() -> npt.NDArray[np.int64]:
-    return np.zeros(N_BINS, dtype=np.int64)
-
-
-def _no_sums() -> FloatArray:
-    return np.zeros(N_BINS)
-
-
 @dataclass(frozen=True)
 class Calibration(Sums):
     """Probabilities of ground against the truth, as sums; ratios over nothing are NaN.
@@ -275,9 +267,13 @@ class Calibration(Sums):
     Sums by bin of probability, (N_BINS,); a bin holds its lower edge, the last one 1 as well.
     """
 
-    n_points: npt.NDArray[np.int64] = field(default_factory=_no_points)
-    n_ground: npt.NDArray[np.int64] = field(default_factory=_no_points)
-    sum_p: FloatArray = field(default_factory=_no_sums)
+    n_points: npt.NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros(N_BINS, dtype=np.int64)
+    )
+    n_ground: npt.NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros(N_BINS, dtype=np.int64)
+    )
+    sum_p: FloatArray = field(default_factory=lambda: np.zeros(N_BINS))
     sum_squared_error: float = 0.0  # of probability minus truth, 1 for ground, over all bins
 
     @property
