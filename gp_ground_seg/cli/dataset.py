@@ -22,7 +22,7 @@ from gp_ground_seg.lab.scale.cluster import Progress, depends_on_past
 from gp_ground_seg.lab.scale.dataset import Manifest, Outcome, Scan, digest, run_blocks, sweep
 
 # Options that the output depends on, beside the parameters and the layout of scans.
-_OPTIONS = ('raw', 'topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
+_OPTIONS = ('topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
 
 
 def is_dataset(arguments: argparse.Namespace) -> bool:

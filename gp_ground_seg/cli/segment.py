@@ -44,8 +44,8 @@ EXAMPLES = """\
   gp-ground-seg segment s3://bucket/kitti -o s3://bucket/labels --scheduler tcp://host:8786
 """
 
-FOR_BAGS = ('ground_topic', 'obstacles_topic', 'drop')
-FOR_SCANS = ('raw', 'split', 'surface', 'origin')
+FOR_BAGS: tuple[str, ...] = ('ground_topic', 'obstacles_topic', 'drop')
+FOR_SCANS: tuple[str, ...] = ('split', 'surface', 'origin')
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -67,7 +67,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     options.add_config(parser)
     options.add(
         parser.add_argument_group('for scans'),
-        ('--raw', 'write 0 unknown, 1 ground, 2 obstacle as labels', options.FLAG),
         ('--split', 'write ground and obstacles apart, as OUT_ground and OUT_obstacles',
          options.FLAG),
         ('--surface', 'write the ground as a grid as well, as OUT_surface.npz', options.FLAG),
@@ -130,8 +129,8 @@ def _segment_dataset(arguments: argparse.Namespace, config: Config, is_bag: bool
         write_bags = partial(_segment_bags, _bag_output(arguments), target)
         dataset.run(arguments, config, target, bags, write_bags, 'bag')
         return
-    scans, write = dataset.list_scans(arguments), partial(_write_labels, arguments.raw)
-    dataset.run(arguments, config, target, scans, partial(segment_block, write, target))
+    scans = dataset.list_scans(arguments)
+    dataset.run(arguments, config, target, scans, partial(segment_block, _write_labels, target))
 
 
 def _segment_bags(
@@ -151,8 +150,8 @@ def _segment_bags(
     return pool(outcomes)
 
 
-def _write_labels(raw: bool, path: AnyPath, result: Segmentation) -> int:
-    data = encode_labels(result, raw)
+def _write_labels(path: AnyPath, result: Segmentation) -> int:
+    data = encode_labels(result)
     write_file(path, data)
     return len(data)
 
@@ -184,7 +183,7 @@ def _segment_scans(
     form = target.suffix[1:] if is_file else arguments.format
     if arguments.format not in (None, form):
         raise DataError(f'{target}: ends in {target.suffix}, which is not {arguments.format}')
-    output = CloudOutput(form, arguments.raw, arguments.split, arguments.surface)
+    output = CloudOutput(form, arguments.split, arguments.surface)
     options.note_leftovers(target, quiet=arguments.quiet)
     bar = options.progress('segment', quiet=arguments.quiet)
     with output.staged(scans, target, is_file=is_file, force=arguments.force) as paths:

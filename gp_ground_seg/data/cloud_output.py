@@ -37,8 +37,6 @@ class CloudOutput:
     ----------
     form : str or None
         One of `FORMATS`; None: labels of a ``.bin`` scan, else the input's format.
-    raw : bool
-        Whether ``.label`` files hold `Label` rather than SemanticKITTI's codes.
     split : bool
         Whether ground and obstacles are written into separate files.
     surface : bool
@@ -46,7 +44,6 @@ class CloudOutput:
     """
 
     form: str | None = None
-    raw: bool = False
     split: bool = False
     surface: bool = False
 
@@ -97,7 +94,7 @@ class CloudOutput:
         except PointCloudError as error:
             raise PointCloudError(f'{scan.path}: {error}') from error
         if self._form(scan) == LABELS:
-            paths[0].write_bytes(encode_labels(result, self.raw))
+            paths[0].write_bytes(encode_labels(result))
         else:
             values = _results(result, cloud)
             for path, part in zip(paths, PARTS.values() if self.split else [None], strict=False):
@@ -109,9 +106,9 @@ class CloudOutput:
         return result
 
 
-def encode_labels(result: Segmentation, raw: bool) -> bytes:
-    """File of a uint32 for each point: SemanticKITTI's code, or `Label`."""
-    codes = sorted(Label) if raw else [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
+def encode_labels(result: Segmentation) -> bytes:
+    """File of a uint32 for each point, SemanticKITTI's code."""
+    codes = [SEMANTIC_KITTI_CODE[k] for k in sorted(Label)]
     return np.array(codes, dtype='<u4')[result.label].tobytes()
 
 
