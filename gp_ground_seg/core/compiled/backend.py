@@ -41,7 +41,7 @@ from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.labels import depth_of_ground, square_units
+from gp_ground_seg.core.pipeline.labels import VOTE_UNITS, depth_of_ground, square_units
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
@@ -255,16 +255,22 @@ class NumbaBackend:
         )
         is_predictive, sigma_n = config.label.rule == 'predictive', config.observation.sigma_n
         labels.set_bands(n_parts, label, is_predictive, sigma_n, buffers, result.roughness)
-        self.workers.run(
-            labels.label_part,
-            n_parts,
-            scan,
-            faces,
+        tolerance, columns = (
             label.ground_tolerance,
-            depth_of_ground(config.label),
-            buffers.band,
-            result,
+            take('columns', (len(faces.is_face), 2), np.int32),
         )
+        n_voxels = labels.place_voxels(scan.tiles, tolerance, columns) if is_predictive else 0
+        voxels = labels.Voxels(
+            columns,
+            take('voxels', (n_points,), np.int32),
+            take('votes', (n_parts, n_voxels, 2), np.int64),
+            take('votes_about', (n_voxels, 2), np.int64),
+        )
+        depth, run = depth_of_ground(config.label), self.workers.run
+        run(labels.label_part, n_parts, scan, faces, label, depth, buffers.band, voxels, result)
+        if is_predictive:
+            labels.add_up_votes(n_parts, scan.tiles, tolerance, voxels)
+            run(labels.settle_part, n_parts, voxels, tolerance / VOTE_UNITS, result)
         keep_code()
         return result
 

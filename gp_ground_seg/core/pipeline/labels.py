@@ -18,6 +18,7 @@ from gp_ground_seg.core.frame import (
     Labelled,
     PolarGrid,
     Scan,
+    Tiles,
     Values,
     at_points,
 )
@@ -26,6 +27,18 @@ from gp_ground_seg.core.parameters.config import Config, LabelConfig
 
 FINEST_UNITS = 2.0**40
 """Most of `square_units`."""
+FACE_SHARE = 0.6
+"""Part of the tolerance up to which a return over the lowest of a vertical face is ground before
+its neighbours vote. With 0.5 and 0.7 the IoU of the labelled frames is at most 0.02 % lower."""
+LAYERS_PER_TOLERANCE = 4.0
+N_LAYERS = 32
+"""Most voxels over each other in a tile, from its lowest return up."""
+FARTHEST = 1e6
+"""Heights beyond this are in one layer [m]: the number of a layer stays finite."""
+VOTE_UNITS = 2.0**12
+"""Whole units of a vote: the order in which they are added does not matter."""
+THREE_BY_THREE = tuple((across, along) for across in (-1, 0, 1) for along in (-1, 0, 1))
+"""Steps from a tile to itself and to the eight around it."""
 
 
 def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Config) -> Labelled:
@@ -33,7 +46,8 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
 
     A point within the paper's tolerance is ground; above it, the returns about the cell decide
     (see `ground_band`); and below the surface there is no obstacle. Of a vertical face only
-    returns near its lowest one are ground; none are where its base is occluded.
+    returns near its lowest one are ground; none are where its base is occluded. Then the returns
+    near the surface vote (see `mean_votes`).
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
     z = scan.xyz[:, 2].astype(np.float64)
@@ -53,6 +67,10 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     of_face = face_margin(margin, over_lowest, is_occluded, label.ground_tolerance)
     margin[in_face] = of_face[in_face]
     margin[~inside] = np.nan
+    if label.rule == 'predictive':
+        voters = np.flatnonzero(is_near(height, label) & inside)
+        means, voters = mean_votes(voters, z, margin, tiles, label.ground_tolerance)
+        margin[voters] = settled_margin(margin[voters], means)
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
     return Labelled(result, height, margin, roughness.reshape(grid.n_segments, grid.n_bins))
@@ -120,9 +138,87 @@ def face_margin(
 ) -> Values:
     """Return what `band_margin` is of a point in a vertical face, `over_lowest` its lowest [m]."""
     # With a limit below zero no return of the tile is ground; the margin stays a distance.
-    in_face = tolerance * (1.0 - 2.0 * is_occluded) - over_lowest
+    in_face = FACE_SHARE * tolerance * (1.0 - 2.0 * is_occluded) - over_lowest
     # Without a surface `margin` is NaN, and stays so.
     return choose(in_face < margin, in_face, margin)
+
+
+@shared
+def layer_of(z: Values, tolerance: float) -> Values:
+    """Layer of voxels that a height [m] lies in, a whole number."""
+    bounded = np.minimum(np.maximum(z, -FARTHEST), FARTHEST)
+    return np.floor(bounded * (LAYERS_PER_TOLERANCE / tolerance))
+
+
+@shared
+def vote_of(margin: Values, tolerance: float) -> Values:
+    """Vote of a return in whole units: its margin, at most the tolerance either way."""
+    share = np.minimum(np.maximum(margin / tolerance, -1.0), 1.0)
+    return np.floor(share * VOTE_UNITS + 0.5)
+
+
+@shared
+def settled_margin(margin: Values, mean: Values) -> Values:
+    """Margin of a return by the mean vote about it [m]: the larger where both agree, else that."""
+    return choose(mean >= 0.0, np.maximum(margin, mean), np.minimum(margin, mean))
+
+
+def mean_votes(
+    voters: IntArray, z: FloatArray, margin: FloatArray, tiles: Tiles, tolerance: float
+) -> tuple[FloatArray, IntArray]:
+    """Mean vote about each return that votes.
+
+    Returns side by side at one height are mostly of one kind: a low return of a fence, or one of a
+    bank that is too high for its cell, is judged with those about it. Voxels are as wide as a tile
+    and a part of the tolerance high; a return counts the votes (see `vote_of`) in its voxel and in
+    the 26 around it.
+
+    Parameters
+    ----------
+    voters : (V,) int64
+        Points that vote.
+    z, margin : (N,) float64
+        Their heights, and their margins before the vote (see `Labelled`) [m].
+    tiles : Tiles
+        Tiles of all points.
+    tolerance : float
+        Tolerance of ground [m].
+
+    Returns
+    -------
+    mean : (W,) float64
+        Mean vote [m].
+    voters : (W,) int64
+        Those that voted: without the ones that are above the voxels of their tile.
+    """
+    occupied, n_sides = tiles.occupied, math.isqrt(len(tiles.extremes))
+    base, top = layer_of(tiles.extremes[occupied].T.astype(np.float64), tolerance)
+    # A column of voxels has an empty one below and above, for the votes of those beside them.
+    n_voxels = np.minimum(top - base + 1.0, N_LAYERS).astype(np.int64) + 2
+    first = np.cumsum(n_voxels) - n_voxels
+    # Columns by tile, with a border of tiles that have none.
+    column = np.full((n_sides + 2, n_sides + 2), -1)
+    across, along = occupied // n_sides + 1, occupied % n_sides + 1
+    column[across, along] = np.arange(len(occupied))
+    own = column[1:-1, 1:-1].ravel()[tiles.tile[voters]]
+    layer = layer_of(z[voters], tolerance) - base[own]
+    voters, own, layer = (values[layer < N_LAYERS] for values in (voters, own, layer))
+    voxel = first[own] + 1 + layer.astype(np.int64)
+    votes = np.zeros((2, int(n_voxels.sum())))
+    votes[0] = np.bincount(voxel, minlength=votes.shape[1])
+    votes[1] = np.bincount(voxel, vote_of(margin[voters], tolerance), votes.shape[1])
+    votes[:, 1:-1] = votes[:, :-2] + votes[:, 1:-1] + votes[:, 2:]
+    of_voxel = np.repeat(np.arange(len(occupied)), n_voxels)
+    place = np.arange(votes.shape[1]) - first[of_voxel]
+    number, total = np.zeros_like(votes)
+    for step in THREE_BY_THREE:
+        other = column[across + step[0], along + step[1]]
+        there = place + (base - base[other]).astype(np.int64)[of_voxel]
+        known = (other >= 0)[of_voxel] & (there >= 0) & (there < n_voxels[other][of_voxel])
+        there = np.where(known, first[other][of_voxel] + there, 0)
+        number += np.where(known, votes[0, there], 0.0)
+        total += np.where(known, votes[1, there], 0.0)
+    return total[voxel] / number[voxel] * (tolerance / VOTE_UNITS), voters
 
 
 def _returns_about(
