@@ -467,34 +467,34 @@ def label_points(scan, faces, surface, config):
     for i, m, n in places:
         margin[i] = min(band[m, n] - height[i], height[i] + depth)
         if is_face[i]:
-            limit = 0.6 * label.ground_tolerance * (-1.0 if is_occluded[i] else 1.0)
+            limit = 0.5 * label.ground_tolerance * (-1.0 if is_occluded[i] else 1.0)
             lowest = float(scan.tiles.lowest_z[scan.tiles.tile[i]])
             margin[i] = min(margin[i], limit - (float(scan.xyz[i, 2]) - lowest))
     if label.rule == 'predictive':
-        margin = settle(scan, margin, grid.inside & (abs(height) < label.obstacle_min_height), label)
+        margin = settle(
+            scan, margin, grid.inside & (abs(height) < label.obstacle_min_height), label
+        )
     result[margin >= 0.0] = Label.GROUND
     return Labelled(result, height, margin, roughness)
 
 
 def settle(scan, margin, near, label):
-    """Margins by the mean vote in the 27 voxels about each return near the surface."""
+    """Margins by the mean vote in the block about each return near the surface."""
     tolerance, side = label.ground_tolerance, math.isqrt(len(scan.tiles.extremes))
-    members = {}
+    members, obstacles = {}, set()
     for i in np.flatnonzero(near):
-        tile = int(scan.tiles.tile[i])
-        lowest, z = float(scan.tiles.lowest_z[tile]), float(scan.xyz[i, 2])
-        layer, base = (math.floor(4.0 / tolerance * height) for height in (z, lowest))
-        if layer - base < 32:
-            members.setdefault((*divmod(tile, side), layer), []).append(i)
+        x, y = divmod(int(scan.tiles.tile[i]), side)
+        layer = math.floor(4.0 / tolerance * float(scan.xyz[i, 2])) % 64
+        members.setdefault((x // 4, y // 4), []).append((i, layer))
+        if margin[i] < 0.0:
+            obstacles.add((x // 4, y // 4))
+    # Votes have 4096 steps to the tolerance.
+    vote = np.floor(4096 * np.clip(margin / tolerance, -1.0, 1.0) + 0.5) / 4096 * tolerance
     settled = margin.copy()
-    for place, own in members.items():
-        steps = np.ndindex(3, 3, 3)
-        about = [tuple(np.add(place, step) - 1) for step in steps]
-        voters = [i for voxel in about for i in members.get(voxel, ())]
-        # Votes have 4096 steps to the tolerance.
-        votes = np.floor(4096 * np.clip(margin[voters] / tolerance, -1.0, 1.0) + 0.5)
-        mean = np.mean(votes) / 4096 * tolerance
-        for i in own:
+    for block in obstacles:
+        for i, layer in members[block]:
+            near_it = [j for j, other in members[block] if (other - layer) % 64 in (63, 0, 1)]
+            mean = np.mean(vote[near_it])
             settled[i] = max(margin[i], mean) if mean >= 0.0 else min(margin[i], mean)
     return settled
 

@@ -93,7 +93,7 @@ def test_the_band_is_where_ground_and_obstacle_are_equally_likely(backend):
 
 def test_of_a_face_only_the_base_is_ground_and_nothing_where_it_is_occluded(backend):
     # The surface climbs a step, and its riser lies on it.
-    ranges, riser = [5.0, 5.001, 5.002], np.array([0.0, 0.06, 0.14])
+    ranges, riser = [5.0, 5.001, 5.002], np.array([0.0, 0.04, 0.14])
     surface = surface_of([0.1] * 5)
     for faces, expected in ((None, [G, G, G]), ({0: False}, [G, G, O]), ({0: True}, [O, O, O])):
         assert list(label(backend, ranges, riser, surface, faces)[0].label) == expected
@@ -101,7 +101,13 @@ def test_of_a_face_only_the_base_is_ground_and_nothing_where_it_is_occluded(back
 
 @pytest.mark.parametrize(
     ('away', 'high', 'expected'),
-    [((), 0.08, O), ((0.5,), 0.08, G), ((0.5,), 0.02, O), ((0.5, 1.0), 0.08, G), ((1.0,), 0.08, O)],
+    [
+        ((), 0.08, O),
+        ((0.5,), 0.08, G),
+        ((0.5,), 0.02, O),
+        ((0.5, 1.0), 0.08, G),
+        ((1.0,), 0.08, O),
+    ],
 )
 def test_returns_of_one_height_in_tiles_side_by_side_are_judged_together(
     backend, away, high, expected

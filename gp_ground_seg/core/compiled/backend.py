@@ -41,7 +41,7 @@ from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.labels import VOTE_UNITS, depth_of_ground, square_units
+from gp_ground_seg.core.pipeline.labels import N_LAYERS, depth_of_ground, square_units
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
@@ -255,22 +255,23 @@ class NumbaBackend:
         )
         is_predictive, sigma_n = config.label.rule == 'predictive', config.observation.sigma_n
         labels.set_bands(n_parts, label, is_predictive, sigma_n, buffers, result.roughness)
-        tolerance, columns = (
-            label.ground_tolerance,
-            take('columns', (len(faces.is_face), 2), np.int32),
-        )
-        n_voxels = labels.place_voxels(scan.tiles, tolerance, columns) if is_predictive else 0
-        voxels = labels.Voxels(
-            columns,
-            take('voxels', (n_points,), np.int32),
-            take('votes', (n_parts, n_voxels, 2), np.int64),
-            take('votes_about', (n_voxels, 2), np.int64),
-        )
         depth, run = depth_of_ground(config.label), self.workers.run
-        run(labels.label_part, n_parts, scan, faces, label, depth, buffers.band, voxels, result)
+        has_obstacle = take('has_obstacle', (len(faces.is_face),), np.bool_)
+        has_obstacle.fill(False)
+        band = buffers.band
+        run(labels.label_part, n_parts, scan, faces, label, depth, band, has_obstacle, result)
         if is_predictive:
-            labels.add_up_votes(n_parts, scan.tiles, tolerance, voxels)
-            run(labels.settle_part, n_parts, voxels, tolerance / VOTE_UNITS, result)
+            rows = take('rows', (len(has_obstacle) + 1,), np.int32)
+            n_rows = labels.place_blocks(scan.tiles.occupied, has_obstacle, rows)
+            votes = labels.Votes(
+                rows,
+                take('votes', (n_parts, n_rows, N_LAYERS, 2), np.int64),
+                take('voters', (n_points,), np.int32),
+                np.empty(n_parts, dtype=np.int64),
+            )
+            run(labels.vote, n_parts, scan, label, votes, result)
+            labels.add_up_votes(votes.sums)
+            run(labels.settle, n_parts, scan, label.ground_tolerance, votes, result)
         keep_code()
         return result
 

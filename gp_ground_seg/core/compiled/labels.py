@@ -1,8 +1,9 @@
-"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in seven calls.
+"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in eight calls.
 
 `fit_pieces` prepares the surface of each cell, `survey` measures the heights of a part of the
 points over it, `set_bands` turns the sums of all parts into bands, `label_part` labels a part.
-For the votes `place_voxels` comes before that, and then `add_up_votes` and `settle_part`.
+Then `place_blocks` finds where there are obstacles, the points of a part `vote` there,
+`add_up_votes` sums what all parts voted, and `settle` changes the labels of a part.
 """
 
 from __future__ import annotations
@@ -24,15 +25,16 @@ from gp_ground_seg.core.frame import (
     Label,
     Labelled,
     Scan,
-    Tiles,
     line_between,
 )
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import LabelConfig
 from gp_ground_seg.core.pipeline.labels import (
+    BLOCK,
     N_LAYERS,
-    THREE_BY_THREE,
+    VOTE_UNITS,
     band_margin,
+    block_of,
     face_margin,
     ground_band,
     is_near,
@@ -48,7 +50,7 @@ _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.
 OBSTACLE_FLAG = 2**32
 """Added to the number of returns near the surface for each that shows an obstacle: more than there
 are points."""
-NO_VOXEL = -1
+NO_ROW = -1
 
 
 class LabelBuffers(NamedTuple):
@@ -151,38 +153,25 @@ def set_bands(
     buffers.band[n_segments * n_bins] = math.nan
 
 
-class Voxels(NamedTuple):
-    """Votes in voxels, see `gp_ground_seg.core.pipeline.labels.mean_votes`.
+class Votes(NamedTuple):
+    """Votes in blocks, see `gp_ground_seg.core.pipeline.labels.mean_votes`.
 
     Attributes
     ----------
-    columns : (T, 2) int32
-        First voxel of each occupied tile, and their number; the lowest and the highest are empty.
-    of_point : (N,) int32
-        Voxel of each point that votes, or `NO_VOXEL`.
-    votes : (n_parts, V, 2) int64
-        Number and sum of the votes in each voxel, of the points of each part [units].
-    about : (V, 2) int64
-        The same in each voxel and the 26 around it, of all points.
+    rows : (T + 1,) int32
+        Row of `sums` of each tile's block, or `NO_ROW`; the last one is for points in no tile.
+    sums : (n_parts, n_rows, N_LAYERS, 2) int64
+        Number and sum of the votes of the points of each part, by layer [units].
+    voters : (N,) int32
+        Points that vote, for each part from its first point.
+    n_voters : (n_parts,) int64
+        Number of them.
     """
 
-    columns: CellArray
-    of_point: CellArray
-    votes: IntArray
-    about: IntArray
-
-
-@jit(entry=True)
-def place_voxels(tiles: Tiles, tolerance: float, columns: CellArray) -> int:
-    """Fill in the columns of `Voxels`; return the number of voxels."""
-    n = 0
-    for tile in tiles.occupied:
-        t = np.uintp(tile)
-        base = layer_of(np.float64(tiles.extremes[t, 0]), tolerance)
-        top = layer_of(np.float64(tiles.extremes[t, 1]), tolerance)
-        columns[t, 0], columns[t, 1] = n, int(min(top - base + 1.0, float(N_LAYERS))) + 2
-        n += columns[t, 1]
-    return n
+    rows: CellArray
+    sums: IntArray
+    voters: CellArray
+    n_voters: IntArray
 
 
 @jit(entry=True)
@@ -193,88 +182,93 @@ def label_part(
     config: LabelConfig,
     depth: float,
     band: FloatArray,
-    voxels: Voxels,
+    has_obstacle: BoolArray,
     result: Labelled,
 ) -> None:
-    """Label the points of a part from their heights in `result`, and add up their votes.
+    """Label the points of a part from their heights in `result`, and find tiles of obstacles.
 
-    Ground reaches `depth` below the surface. Without voxels there are no votes.
+    Ground reaches `depth` below the surface. `has_obstacle` (T,) becomes true where a return near
+    the surface is no ground.
     """
-    votes, tolerance = voxels.votes[part.number], config.ground_tolerance
-    for v in range(len(votes)):
-        votes[v, 0] = votes[v, 1] = 0
     points = points_of(part, len(result.height))
     z, tile, cell = scan.xyz.T[2, points], scan.tiles.tile[points], scan.grid.cell[points]
     height, label, margins = result.height[points], result.label[points], result.margin[points]
-    of_point = voxels.of_point[points]
     for i in range(len(cell)):
-        n, h, high = cell[i], height[i], np.float64(z[i])
+        n, h = cell[i], height[i]
         margin = band_margin(h, band[np.uintp(n if n >= 0 else len(band) - 1)], depth)
         t = np.uintp(tile[i] if n >= 0 else 0)
-        lowest = np.float64(scan.tiles.extremes[t, 0])
         if faces.is_face[t]:
-            margin = face_margin(margin, high - lowest, faces.has_occluded_base[t], tolerance)
+            over_lowest = np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0])
+            over_face = faces.has_occluded_base[t]
+            margin = face_margin(margin, over_lowest, over_face, config.ground_tolerance)
         margins[i] = margin
         otherwise = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
         label[i] = _GROUND if margin >= 0.0 else otherwise
-        of_point[i] = NO_VOXEL
-        if len(votes) > 0 and n >= 0 and is_near(h, config):
-            layer = layer_of(high, tolerance) - layer_of(lowest, tolerance)
-            if layer < N_LAYERS:
-                v = voxels.columns[t, 0] + 1 + int(layer)
-                of_point[i] = v
-                votes[np.uintp(v), 0] += 1
-                votes[np.uintp(v), 1] += int(vote_of(margin, tolerance))
+        if margin < 0.0 and is_near(h, config):
+            # Other threads write nothing else here.
+            has_obstacle[t] = True
 
 
 @jit(entry=True)
-def add_up_votes(n_parts: int, tiles: Tiles, tolerance: float, voxels: Voxels) -> None:
-    """Add up the votes of all parts, then those of three layers, then those of nine tiles."""
-    columns, votes, about = voxels.columns, voxels.votes[0], voxels.about
-    for k in range(2):
-        below = here = np.int64(0)
-        for v in range(len(votes)):
-            above = np.int64(0)
-            for index in range(n_parts):
-                above += voxels.votes[index, v, k]
-            if v > 0:
-                votes[v - 1, k] = below + here + above
-            below, here = here, above
-        # The last voxel stays as it is: the empty one over the last column.
-    about[:] = 0
-    n_sides = int(math.sqrt(len(columns)))
-    for tile in tiles.occupied:
-        t = np.uintp(tile)
-        first, n_voxels, base = columns[t, 0], columns[t, 1], _base(tiles, tile, tolerance)
-        for i in range(len(THREE_BY_THREE)):
-            across = tile // n_sides + THREE_BY_THREE[i][0]
-            along = tile % n_sides + THREE_BY_THREE[i][1]
-            if not (0 <= across < n_sides and 0 <= along < n_sides):
-                continue
-            o = np.uintp(across * n_sides + along)
-            if tiles.extremes[o, 0] > tiles.extremes[o, 1]:  # an empty tile
-                continue
-            up = base - _base(tiles, o, tolerance)
-            for k in range(max(0, -up), min(n_voxels, columns[o, 1] - up)):
-                here, there = np.uintp(first + k), np.uintp(columns[o, 0] + k + up)
-                about[here, 0] += votes[there, 0]
-                about[here, 1] += votes[there, 1]
-
-
-@jit()
-def _base(tiles: Tiles, tile: int, tolerance: float) -> int:
-    """Layer of the lowest point of a tile."""
-    return int(layer_of(np.float64(tiles.extremes[np.uintp(tile), 0]), tolerance))
+def place_blocks(occupied: CellArray, has_obstacle: BoolArray, rows: CellArray) -> int:
+    """Fill in the rows of `Votes` for blocks with an obstacle; return their number."""
+    n_sides, n_rows = int(math.sqrt(len(has_obstacle))), 0
+    row_of_block = np.full((n_sides // BLOCK + 1) ** 2, NO_ROW, np.int32)
+    for tile in occupied:
+        block = np.uintp(block_of(tile, n_sides))
+        if has_obstacle[np.uintp(tile)] and row_of_block[block] == NO_ROW:
+            row_of_block[block] = n_rows
+            n_rows += 1
+    for tile in occupied:
+        rows[np.uintp(tile)] = row_of_block[np.uintp(block_of(tile, n_sides))]
+    rows[len(rows) - 1] = NO_ROW
+    return n_rows
 
 
 @jit(entry=True)
-def settle_part(part: Part, voxels: Voxels, metres_per_unit: float, result: Labelled) -> None:
-    """Change margins and labels of the points of a part by the mean votes about them."""
+def vote(part: Part, scan: Scan, config: LabelConfig, votes: Votes, result: Labelled) -> None:
+    """Add up the votes of the points of a part."""
+    sums, tolerance, n = votes.sums[part.number], config.ground_tolerance, 0
+    sums[:] = 0
     points = points_of(part, len(result.height))
-    label, margins, of_point = result.label[points], result.margin[points], voxels.of_point[points]
-    for i in range(len(of_point)):
-        if of_point[i] != NO_VOXEL:
-            v = np.uintp(of_point[i])
-            mean = voxels.about[v, 1] / voxels.about[v, 0] * metres_per_unit
-            margins[i] = settled_margin(margins[i], mean)
-            label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE
+    z, tile, voters = scan.xyz.T[2, points], scan.tiles.tile[points], votes.voters[points]
+    height, margin = result.height[points], result.margin[points]
+    for i in range(len(tile)):
+        row = votes.rows[np.uintp(tile[i] if tile[i] >= 0 else len(votes.rows) - 1)]
+        if row != NO_ROW and is_near(height[i], config):
+            layer = np.uintp(layer_of(np.float64(z[i]), tolerance))
+            sums[np.uintp(row), layer, 0] += 1
+            sums[np.uintp(row), layer, 1] += int(vote_of(margin[i], tolerance))
+            voters[n] = i
+            n += 1
+    votes.n_voters[part.number] = n
+
+
+@jit(entry=True)
+def add_up_votes(sums: IntArray) -> None:
+    """Add up the votes of all parts, then those of three layers, in the first table of `sums`."""
+    layers = np.empty(N_LAYERS + 2, np.int64)
+    for row in range(sums.shape[1]):
+        for k in range(2):
+            for layer in range(N_LAYERS):
+                layers[layer + 1] = 0
+                for index in range(len(sums)):
+                    layers[layer + 1] += sums[index, row, layer, k]
+            layers[0], layers[N_LAYERS + 1] = layers[N_LAYERS], layers[1]
+            for layer in range(N_LAYERS):
+                sums[0, row, layer, k] = layers[layer] + layers[layer + 1] + layers[layer + 2]
+
+
+@jit(entry=True)
+def settle(part: Part, scan: Scan, tolerance: float, votes: Votes, result: Labelled) -> None:
+    """Change margins and labels of the points of a part by the mean votes about them."""
+    points, sums = points_of(part, len(result.height)), votes.sums[0]
+    z, tile, voters = scan.xyz.T[2, points], scan.tiles.tile[points], votes.voters[points]
+    label, margins = result.label[points], result.margin[points]
+    for n in range(votes.n_voters[part.number]):
+        i = np.uintp(voters[n])
+        row = np.uintp(votes.rows[np.uintp(tile[i])])
+        layer = np.uintp(layer_of(np.float64(z[i]), tolerance))
+        mean = sums[row, layer, 1] / sums[row, layer, 0] * (tolerance / VOTE_UNITS)
+        margins[i] = settled_margin(margins[i], mean)
+        label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE
