@@ -87,6 +87,8 @@ def write_two_drives(folder):
 
 
 def label_files(folder):
-    """Label files below a folder, by path."""
-    files = sorted(Path(folder).rglob('*.label'))
-    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+    """Label files below a folder, by path; None for a link to nowhere."""
+    return {
+        str(file.relative_to(folder)): file.read_bytes() if file.exists() else None
+        for file in sorted(Path(folder).rglob('*.label'))
+    }

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from bag_samples import scan
 from cli_runner import run, start
+from evaluation_samples import label_files
 from torture_cases import run_cases
 
 N_SCANS = {'00': 5, '08': 4}
@@ -113,13 +114,6 @@ def said_by(*words):
     return code, text.getvalue()
 
 
-def labels(folder):
-    return {
-        str(path.relative_to(folder)): path.read_bytes() if path.exists() else None
-        for path in folder.rglob('*.label')
-    }
-
-
 def harm(rng, command, source, out, anew):
     """Return what is wrong after some harm and a `--resume`, or None."""
     code, said = said_by(*command, '-o', out)
@@ -128,17 +122,17 @@ def harm(rng, command, source, out, anew):
     for each in chosen:
         with contextlib.suppress(FileNotFoundError):  # of a manifest that was deleted
             each(rng, source, out)
-    what, before = ', '.join(each.__name__ for each in chosen), labels(out)
+    what, before = ', '.join(each.__name__ for each in chosen), label_files(out)
     code, said = said_by(*command, '-o', out, '--resume')
     if code == 2:
         is_damaged = {flip_manifest, delete_manifest} & set(chosen)
-        if not (is_damaged and said.count('\n') == 1 and labels(out) == before):
+        if not (is_damaged and said.count('\n') == 1 and label_files(out) == before):
             return f'{what}: {said[-300:]!r}'
         code, said = said_by(*command, '-o', out, '--force')
     if code != 0:
         return f'{what}: exit code {code}: {said[-300:]!r}'
     assert said_by(*command, '-o', anew)[0] == 0
-    if labels(out) != labels(anew):
+    if label_files(out) != label_files(anew):
         return f'{what}: the labels are not those of a new run'
     return None
 
@@ -160,7 +154,7 @@ def compete(rng, command, _source, out, anew):
         return f'{words}: both were refused'
     code, said = said_by(*command, '-o', out, '--resume')
     assert said_by(*command, '-o', anew)[0] == 0
-    if code != 0 or labels(out) != labels(anew):
+    if code != 0 or label_files(out) != label_files(anew):
         return f'{words}: not resumed: exit code {code}: {said[-300:]!r}'
     return None
 
