@@ -335,7 +335,7 @@ def grow(frame, theta, config, m, z, seed, evidence):
             in_doubt &= chosen.any() | (weight > 0)
             follows = np.append(False, continues[1:] & chosen[:-1]) & ~chosen
             joining, in_doubt = in_doubt | follows, in_doubt & ~follows
-        for i in np.flatnonzero(joining & in_doubt & (config.label.rule == 'predictive')):
+        for i in np.flatnonzero(joining & in_doubt & (config.label.rule == 'roughness')):
             noise[i] = doubtful_noise(z[i] - height[i], 1 / precision[i], sigma_n, in_face[i])
         if not joining.any():
             break
@@ -454,7 +454,7 @@ def label_points(scan, faces, surface, config):
         aside = np.isin(grid.segment, [(m + k) % grid.n_segments for k in (-1, 0, 1)])
         about = height[near & aside & (abs(grid.bin - n) <= 1)]
         roughness[m, n] = math.sqrt(np.mean(about**2)) if len(about) else 0.0
-        if label.rule == 'predictive':
+        if label.rule == 'roughness':
             depth = label.obstacle_max_height
             n_obstacles = np.sum(shows & aside & grid.inside & (abs(grid.bin - n) <= 1))
             span = label.obstacle_max_height - label.obstacle_min_height
@@ -470,7 +470,7 @@ def label_points(scan, faces, surface, config):
             limit = 0.5 * label.ground_tolerance * (-1.0 if is_occluded[i] else 1.0)
             lowest = float(scan.tiles.lowest_z[scan.tiles.tile[i]])
             margin[i] = min(margin[i], limit - (float(scan.xyz[i, 2]) - lowest))
-    if label.rule == 'predictive':
+    if label.rule == 'roughness':
         margin = settle(
             scan, margin, grid.inside & (abs(height) < label.obstacle_min_height), label
         )

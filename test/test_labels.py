@@ -51,7 +51,7 @@ def label(backend, ranges, z, surface=None, faces=None, angle=0.1, sigma_n=0.05,
 
 
 @pytest.mark.parametrize(
-    ('rule', 'expected'), [('tolerance', [G, G, O, G, O, U]), ('predictive', [G, G, O, G, G, U])]
+    ('rule', 'expected'), [('tolerance', [G, G, O, G, O, U]), ('roughness', [G, G, O, G, G, U])]
 )
 def test_labels_by_height(backend, rule, expected):
     # On a surface as smooth as this the returns about a cell say less than the tolerance.
@@ -59,7 +59,7 @@ def test_labels_by_height(backend, rule, expected):
     found, _ = label(backend, 3.0, heights, rule=rule, sigma_n=0.001)
     assert list(found.label[:6]) == expected
     np.testing.assert_allclose(found.margin[:3], [0.1, 0.01, -0.04], atol=2e-5)
-    below = {'tolerance': 0.1 - 0.11, 'predictive': 0.1 + 0.11}[rule]
+    below = {'tolerance': 0.1 - 0.11, 'roughness': 0.1 + 0.11}[rule]
     np.testing.assert_allclose(found.margin[4], below, atol=1e-12)
     assert np.isnan(found.margin[5])
 
@@ -162,10 +162,10 @@ def test_labels_are_the_reference(backend, seed, dtype):
     # More tolerance moves points from obstacle to ground; none the other way, but by votes.
     is_ground = np.zeros(len(xyz), dtype=bool)
     for tolerance in (0.05, 0.1, 0.2, rng.uniform(0.2, 1.0)):
-        rule = ('predictive', 'tolerance')[seed % 2]
+        rule = ('roughness', 'tolerance')[seed % 2]
         config = CONFIG.replace(**{'label.rule': rule, 'label.ground_tolerance': tolerance})
         found = backend.label_points(scan, faces, surface, config)
-        assert rule == 'predictive' or not (is_ground & (found.label != Label.GROUND)).any()
+        assert rule == 'roughness' or not (is_ground & (found.label != Label.GROUND)).any()
         is_ground = found.label == Label.GROUND
     expected = reference.label_points(scan, faces, surface, config)
     np.testing.assert_array_equal(found.label, expected.label)

@@ -193,7 +193,7 @@ class NumbaBackend:
             *take('surfaces', (2, *shape), np.float64),
         )
         looks_aside = looks_aside_in(frame, config)
-        doubts = config.label.rule == 'predictive'
+        doubts = config.label.rule == 'roughness'
         max_slope = CLEARLY * slope_std if looks_aside else -1.0
         shown, beside = take('aside', (2, 2, *shape), np.float64)
         evidence.find_seeds(frame, theta, growth, max_slope, shown[0], alone.seed)
@@ -253,14 +253,14 @@ class NumbaBackend:
         self.workers.run(
             labels.survey, n_parts, scan, faces.is_face, label, result.height, buffers
         )
-        is_predictive, sigma_n = config.label.rule == 'predictive', config.observation.sigma_n
-        labels.set_bands(n_parts, label, is_predictive, sigma_n, buffers, result.roughness)
+        by_roughness, sigma_n = config.label.rule == 'roughness', config.observation.sigma_n
+        labels.set_bands(n_parts, label, by_roughness, sigma_n, buffers, result.roughness)
         depth, run = depth_of_ground(config.label), self.workers.run
         has_obstacle = take('has_obstacle', (len(faces.is_face),), np.bool_)
         has_obstacle.fill(False)
         band = buffers.band
         run(labels.label_part, n_parts, scan, faces, label, depth, band, has_obstacle, result)
-        if is_predictive:
+        if by_roughness:
             rows = take('rows', (len(has_obstacle) + 1,), np.int32)
             n_rows = labels.place_blocks(scan.tiles.occupied, has_obstacle, rows)
             votes = labels.Votes(

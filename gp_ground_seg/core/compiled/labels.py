@@ -121,7 +121,7 @@ def survey(
 def set_bands(
     n_parts: int,
     config: LabelConfig,
-    is_predictive: bool,
+    by_roughness: bool,
     sigma_n: float,
     buffers: LabelBuffers,
     roughness: FloatArray,
@@ -146,7 +146,7 @@ def set_bands(
             total = squares[n] + squares[n + 1] + squares[n + 2]
             rough = roughness_of(total, n_near, buffers.units)
             band = config.ground_tolerance
-            if is_predictive:
+            if by_roughness:
                 band = ground_band(n_near, rough, n_obstacles, config, sigma_n)
             buffers.band[m * n_bins + n] = band
             roughness[m, n] = rough

@@ -221,9 +221,7 @@ def _grow_batch(
         frame.in_face[layout.place],
         Evidence(layout.take(aside.height), layout.take(aside.precision)),
     )
-    chosen, height, variance = _grow(
-        batch, config.growth, doubts=config.label.rule == 'predictive'
-    )
+    chosen, height, variance = _grow(batch, config.growth, doubts=config.label.rule == 'roughness')
     alone.inlier[layout.place[layout.mask]] = chosen[layout.mask]
     is_known = is_wanted & chosen.any(axis=1, keepdims=True)
     n = chosen.shape[1]

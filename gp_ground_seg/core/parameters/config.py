@@ -216,9 +216,10 @@ class FacesConfig:
 class LabelConfig:
     """Labels from the distance to the surface."""
 
-    rule: str = advanced('predictive', ('predictive', 'tolerance'),
-        'predictive = ground if the height is more likely of ground than of an obstacle, given '
-        'the returns near it; tolerance = ground_tolerance alone, above and below')
+    rule: str = advanced('roughness', ('roughness', 'tolerance'),
+        'roughness = ground if the height is more likely of ground than of an obstacle, given '
+        'the returns about it, which then vote; tolerance = ground_tolerance alone, above and '
+        'below')
     ground_tolerance: float = basic(0.1, (0.001, 5.0),
         'height above the surface up to which a return is ground in any case; more = more ground',
         'm', 'zeta_g')

@@ -56,7 +56,7 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     n_near, squares, n_obstacles = _returns_about(height, grid, in_face, label)
     roughness = roughness_of(squares, n_near, square_units(len(z), label.obstacle_min_height))
     band = np.full(len(roughness), label.ground_tolerance)
-    if label.rule == 'predictive':
+    if label.rule == 'roughness':
         band = ground_band(n_near, roughness, n_obstacles, label, config.observation.sigma_n)
     margin: FloatArray = band_margin(
         height, band[np.maximum(grid.cell, 0)], depth_of_ground(label)
@@ -66,7 +66,7 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     of_face = face_margin(margin, over_lowest, is_occluded, label.ground_tolerance)
     margin[in_face] = of_face[in_face]
     margin[~inside] = np.nan
-    if label.rule == 'predictive':
+    if label.rule == 'roughness':
         voters = np.flatnonzero(is_near(height, label) & inside)
         voters, means = mean_votes(voters, z, margin, tiles, label.ground_tolerance)
         margin[voters] = settled_margin(margin[voters], means)
@@ -77,8 +77,8 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
 
 def depth_of_ground(label: LabelConfig) -> float:
     """Depth below the surface down to which a return is ground [m]."""
-    is_predictive = label.rule == 'predictive'
-    return label.obstacle_max_height if is_predictive else label.ground_tolerance
+    by_roughness = label.rule == 'roughness'
+    return label.obstacle_max_height if by_roughness else label.ground_tolerance
 
 
 @shared

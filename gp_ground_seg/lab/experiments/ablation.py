@@ -65,7 +65,7 @@ DEPARTURES: dict[str, Changes] = {
     },
     'vertical faces': {'faces.max_normal_z': 0.0},
     'vertical faces with occluded base': {'faces.max_foot_distance': 0.0},
-    'labels by the predictive distribution': _PLAIN_BAND,
+    'labels by local roughness': _PLAIN_BAND,
     'bins that widen, 80 of them': {'grid.n_bins': 120, 'grid.bin_growth': 1.0},
     'lines end at 0.1 rad': {'lines.slope_tolerance': 0.02},
     'length-scales not learned': {'learning.fixed': 'none'},
@@ -84,7 +84,7 @@ ALTERNATIVES: dict[str, Changes] = {
 
 STEPS = {
     'vertical faces': ('faces.',),
-    'labels by the predictive distribution': ('label.',),
+    'labels by local roughness': ('label.',),
     'sloping mean': ('observation.slope_std',),
     'segments look aside': ('surface.',),
     'gate and lines of the growth': ('growth.', 'lines.'),
