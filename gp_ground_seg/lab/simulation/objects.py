@@ -149,6 +149,8 @@ def nearest_solid(
         if origin.ndim == 1:
             rays = order[_find_towards(solid, origin, azimuth)]
             rays = rays[distance[rays] > gaps[k]]  # the others end before it
+        if not len(rays):
+            continue
         entry = solid.entry(starts[rays], direction[rays])
         nearer = entry < distance[rays]
         distance[rays[nearer]], index[rays[nearer]] = entry[nearer], k
