@@ -270,7 +270,6 @@ class NumbaBackend:
                 np.empty(n_parts, dtype=np.int64),
             )
             run(labels.vote, n_parts, scan, label, votes, result)
-            labels.add_up_votes(votes.sums)
             run(labels.settle, n_parts, scan, label.ground_tolerance, votes, result)
         keep_code()
         return result

@@ -1,9 +1,9 @@
-"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in eight calls.
+"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in seven calls.
 
 `fit_pieces` prepares the surface of each cell, `survey` measures the heights of a part of the
 points over it, `set_bands` turns the sums of all parts into bands, `label_part` labels a part.
-Then `place_blocks` finds where there are obstacles, the points of a part `vote` there,
-`add_up_votes` sums what all parts voted, and `settle` changes the labels of a part.
+Then `place_blocks` finds where there are obstacles, the points of a part `vote` there, and
+`settle` changes the labels of a part.
 """
 
 from __future__ import annotations
@@ -245,30 +245,20 @@ def vote(part: Part, scan: Scan, config: LabelConfig, votes: Votes, result: Labe
 
 
 @jit(entry=True)
-def add_up_votes(sums: IntArray) -> None:
-    """Add up the votes of all parts, then those of three layers, in the first table of `sums`."""
-    layers = np.empty(N_LAYERS + 2, np.int64)
-    for row in range(sums.shape[1]):
-        for k in range(2):
-            for layer in range(N_LAYERS):
-                layers[layer + 1] = 0
-                for index in range(len(sums)):
-                    layers[layer + 1] += sums[index, row, layer, k]
-            layers[0], layers[N_LAYERS + 1] = layers[N_LAYERS], layers[1]
-            for layer in range(N_LAYERS):
-                sums[0, row, layer, k] = layers[layer] + layers[layer + 1] + layers[layer + 2]
-
-
-@jit(entry=True)
 def settle(part: Part, scan: Scan, tolerance: float, votes: Votes, result: Labelled) -> None:
     """Change margins and labels of the points of a part by the mean votes about them."""
-    points, sums = points_of(part, len(result.height)), votes.sums[0]
+    points, sums = points_of(part, len(result.height)), votes.sums
     z, tile, voters = scan.xyz.T[2, points], scan.tiles.tile[points], votes.voters[points]
     label, margins = result.label[points], result.margin[points]
     for n in range(votes.n_voters[part.number]):
         i = np.uintp(voters[n])
         row = np.uintp(votes.rows[np.uintp(tile[i])])
-        layer = np.uintp(layer_of(np.float64(z[i]), tolerance))
-        mean = sums[row, layer, 1] / sums[row, layer, 0] * (tolerance / VOTE_UNITS)
-        margins[i] = settled_margin(margins[i], mean)
+        layer = int(layer_of(np.float64(z[i]), tolerance))
+        number = total = np.int64(0)
+        for index in range(len(sums)):
+            for step in range(N_LAYERS - 1, N_LAYERS + 2):
+                k = np.uintp((layer + step) % N_LAYERS)
+                number += sums[index, row, k, 0]
+                total += sums[index, row, k, 1]
+        margins[i] = settled_margin(margins[i], total / number * (tolerance / VOTE_UNITS))
         label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE

@@ -16,6 +16,7 @@ from gp_ground_seg.core.parameters.schema import (
     ROS_PARAMETERS_KEY,
     ParameterSpec,
     ParameterValue,
+    load_yaml,
     read_parameters,
 )
 
@@ -63,8 +64,9 @@ def _comment(text: str, depth: int) -> list[str]:
 
 def yaml_scalar(value: ParameterValue) -> str:
     """Write a value the way it is written in a parameter file, quoted where needed."""
-    text: str = yaml.safe_dump({'x': value})
-    return text.strip().removeprefix('x: ')
+    text: str = yaml.safe_dump({'x': value}).strip().removeprefix('x: ')
+    # PyYAML writes a frame named 1e5 without quotes: a number, for us as for ROS.
+    return text if load_yaml(text) == value else f"'{value}'"
 
 
 def accepted_values(spec: ParameterSpec) -> str:
