@@ -54,7 +54,7 @@ DEV = [
 
 setup(
     name=PACKAGE,
-    version='0.2.0',  # a literal: catkin_prepare_release writes it here and into package.xml
+    version='0.3.0',  # a literal: catkin_prepare_release writes it here and into package.xml
     description='Ground segmentation of LiDAR scans with two coupled Gaussian processes',
     long_description=Path('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from gp_ground_seg.core.result import Segmentation
     from gp_ground_seg.core.segmenter import GroundSegmenter
 
-__version__ = '0.2.0'
+__version__ = '0.3.0'
 
 __all__ = [
     'Config',
