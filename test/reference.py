@@ -481,10 +481,15 @@ def label_points(scan, faces, surface, config):
 def settle(scan, margin, near, label):
     """Margins by the mean vote in the block about each return near the surface."""
     tolerance, side = label.ground_tolerance, math.isqrt(len(scan.tiles.extremes))
-    members, obstacles = {}, set()
+    members, obstacles, lowest = {}, set(), {}
+    for tile in scan.tiles.occupied:
+        x, y = divmod(int(tile), side)
+        z = float(scan.tiles.lowest_z[tile])
+        lowest[x // 4, y // 4] = min(z, lowest.get((x // 4, y // 4), math.inf))
     for i in np.flatnonzero(near):
         x, y = divmod(int(scan.tiles.tile[i]), side)
-        layer = math.floor(4.0 / tolerance * float(scan.xyz[i, 2])) % 64
+        over_lowest = float(scan.xyz[i, 2]) - lowest[x // 4, y // 4]
+        layer = math.floor(4.0 / tolerance * over_lowest) % 64
         members.setdefault((x // 4, y // 4), []).append((i, layer))
         if margin[i] < 0.0:
             obstacles.add((x // 4, y // 4))

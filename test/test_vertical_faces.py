@@ -102,9 +102,9 @@ def test_a_wall_seen_over_an_obstacle_is_no_ground(backend):
     rng, n = np.random.default_rng(4), fewer(20_000, 6000)
     azimuth, r = rng.uniform(-np.pi, np.pi, n), rng.uniform(2.0, 25.0, n)
     ground = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full(n, -1.7)])
-    # Ahead, a hedge at 12 m occludes the ground behind it and the lowest decimetre of a wall.
+    # Ahead, a hedge at 12 m occludes the ground behind it and the lowest 5 cm of a wall.
     ahead, n = (np.abs(azimuth) < 0.4) & (r >= 12.0), n * 2 // 5
-    facade = [np.full(n, 16.2), rng.uniform(-4.0, 4.0, n), rng.uniform(-1.6, 0.5, n)]
+    facade = [np.full(n, 16.2), rng.uniform(-4.0, 4.0, n), rng.uniform(-1.65, 0.5, n)]
     facade = np.column_stack(facade) + rng.normal(0.0, 0.01, (n, 3))
     scan = np.vstack([ground[~ahead], facade])
     behind = np.arange(len(scan)) >= (~ahead).sum()

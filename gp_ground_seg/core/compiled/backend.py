@@ -262,8 +262,10 @@ class NumbaBackend:
         run(labels.label_part, n_parts, scan, faces, label, depth, band, has_obstacle, result)
         if by_roughness:
             rows = take('rows', (len(has_obstacle) + 1,), np.int32)
-            n_rows = labels.place_blocks(scan.tiles.occupied, has_obstacle, rows)
+            lowest = take('lowest', (len(has_obstacle),), np.float64)
+            n_rows = labels.place_blocks(scan.tiles, has_obstacle, lowest, rows)
             votes = labels.Votes(
+                lowest,
                 rows,
                 take('votes', (n_parts, n_rows, N_LAYERS, 2), np.int64),
                 take('voters', (n_points,), np.int32),

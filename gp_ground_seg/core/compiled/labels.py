@@ -25,6 +25,7 @@ from gp_ground_seg.core.frame import (
     Label,
     Labelled,
     Scan,
+    Tiles,
     line_between,
 )
 from gp_ground_seg.core.jit import jit
@@ -158,6 +159,8 @@ class Votes(NamedTuple):
 
     Attributes
     ----------
+    lowest : (T,) float64
+        Height of the lowest point of each row [m]; there are fewer rows.
     rows : (T + 1,) int32
         Row of `sums` of each tile's block, or `NO_ROW`; the last one is for points in no tile.
     sums : (n_parts, n_rows, N_LAYERS, 2) int64
@@ -168,6 +171,7 @@ class Votes(NamedTuple):
         Number of them.
     """
 
+    lowest: FloatArray
     rows: CellArray
     sums: IntArray
     voters: CellArray
@@ -210,17 +214,23 @@ def label_part(
 
 
 @jit(entry=True)
-def place_blocks(occupied: CellArray, has_obstacle: BoolArray, rows: CellArray) -> int:
-    """Fill in the rows of `Votes` for blocks with an obstacle; return their number."""
+def place_blocks(
+    tiles: Tiles, has_obstacle: BoolArray, lowest: FloatArray, rows: CellArray
+) -> int:
+    """Fill in heights and rows of `Votes` for blocks with an obstacle; return their number."""
     n_sides, n_rows = int(math.sqrt(len(has_obstacle))), 0
     row_of_block = np.full((n_sides // BLOCK + 1) ** 2, NO_ROW, np.int32)
-    for tile in occupied:
+    for tile in tiles.occupied:
         block = np.uintp(block_of(tile, n_sides))
         if has_obstacle[np.uintp(tile)] and row_of_block[block] == NO_ROW:
-            row_of_block[block] = n_rows
+            row_of_block[block], lowest[n_rows] = n_rows, math.inf
             n_rows += 1
-    for tile in occupied:
-        rows[np.uintp(tile)] = row_of_block[np.uintp(block_of(tile, n_sides))]
+    for tile in tiles.occupied:
+        t = np.uintp(tile)
+        row = rows[t] = row_of_block[np.uintp(block_of(tile, n_sides))]
+        if row != NO_ROW:
+            z = np.float64(tiles.extremes[t, 0])
+            lowest[np.uintp(row)] = min(lowest[np.uintp(row)], z)
     rows[len(rows) - 1] = NO_ROW
     return n_rows
 
@@ -236,7 +246,8 @@ def vote(part: Part, scan: Scan, config: LabelConfig, votes: Votes, result: Labe
     for i in range(len(tile)):
         row = votes.rows[np.uintp(tile[i] if tile[i] >= 0 else len(votes.rows) - 1)]
         if row != NO_ROW and is_near(height[i], config):
-            layer = np.uintp(layer_of(np.float64(z[i]), tolerance))
+            over_lowest = np.float64(z[i]) - votes.lowest[np.uintp(row)]
+            layer = np.uintp(layer_of(over_lowest, tolerance))
             sums[np.uintp(row), layer, 0] += 1
             sums[np.uintp(row), layer, 1] += int(vote_of(margin[i], tolerance))
             voters[n] = i
@@ -253,7 +264,7 @@ def settle(part: Part, scan: Scan, tolerance: float, votes: Votes, result: Label
     for n in range(votes.n_voters[part.number]):
         i = np.uintp(voters[n])
         row = np.uintp(votes.rows[np.uintp(tile[i])])
-        layer = int(layer_of(np.float64(z[i]), tolerance))
+        layer = int(layer_of(np.float64(z[i]) - votes.lowest[row], tolerance))
         number = total = np.int64(0)
         for index in range(len(sums)):
             for step in range(N_LAYERS - 1, N_LAYERS + 2):

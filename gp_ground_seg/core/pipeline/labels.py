@@ -143,9 +143,9 @@ def face_margin(
 
 
 @shared
-def layer_of(z: Values, tolerance: float) -> Values:
-    """Layer of a block that holds a height [m], a whole number below `N_LAYERS`."""
-    layer = np.floor(z * (LAYERS_PER_TOLERANCE / tolerance))
+def layer_of(over_lowest: Values, tolerance: float) -> Values:
+    """Layer of a block that holds a height over its lowest return [m], below `N_LAYERS`."""
+    layer = np.floor(over_lowest * (LAYERS_PER_TOLERANCE / tolerance))
     return layer - N_LAYERS * np.floor(layer / N_LAYERS)
 
 
@@ -198,11 +198,15 @@ def mean_votes(
     means : (W,) float64
         Mean of the votes that they count [m].
     """
-    block = block_of(tiles.tile[voters], math.isqrt(len(tiles.extremes)))
+    n_sides = math.isqrt(len(tiles.extremes))
+    block = block_of(tiles.tile[voters], n_sides)
     named = np.unique(block[margin[voters] < 0.0])
     is_named = np.isin(block, named)
     voters, row = voters[is_named], np.searchsorted(named, block[is_named])
-    place = row * N_LAYERS + layer_of(z[voters], tolerance).astype(np.int64)
+    lowest = np.full((n_sides // BLOCK + 1) ** 2, np.inf)
+    np.minimum.at(lowest, block_of(tiles.occupied, n_sides), tiles.lowest_z[tiles.occupied])
+    layer = layer_of(z[voters] - lowest[named[row]], tolerance)
+    place = row * N_LAYERS + layer.astype(np.int64)
     sums = np.empty((2, len(named) * N_LAYERS))
     sums[0] = np.bincount(place, minlength=sums.shape[1])
     sums[1] = np.bincount(place, vote_of(margin[voters], tolerance), sums.shape[1])
