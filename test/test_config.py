@@ -156,7 +156,7 @@ def test_unknown_names_come_with_the_nearest(name, hint):
 @pytest.mark.parametrize(
     ('changes', 'words'),
     [
-        ({'grid.r_max': 500.0, 'faces.cell_size': 0.05}, ['faces.cell_size', '38.4 GB', '2 GB']),
+        ({'grid.r_max': 500.0, 'faces.cell_size': 0.05}, ['faces.cell_size', '40.4 GB', '2 GB']),
         ({'runtime.n_threads': 64, 'faces.cell_size': 0.1}, ['runtime.n_threads = 64', '2 GB']),
         ({'grid.r_min': np.nextafter(50.0, 0.0), 'grid.r_max': 50.0}, ['first bin', '0.0001 m']),
         ({'grid.n_bins': 1024, 'grid.bin_growth': 3.0}, ['grid.bin_growth = 3', '1.1e-07 m']),

@@ -262,7 +262,7 @@ class NumbaBackend:
         run(labels.label_part, n_parts, scan, faces, label, depth, band, has_obstacle, result)
         if by_roughness:
             rows = take('rows', (len(has_obstacle) + 1,), np.int32)
-            lowest = take('lowest', (len(has_obstacle),), np.float64)
+            lowest = take('lowest', (len(scan.tiles.occupied),), np.float64)
             n_rows = labels.place_blocks(scan.tiles, has_obstacle, lowest, rows)
             votes = labels.Votes(
                 lowest,

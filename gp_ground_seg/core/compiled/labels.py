@@ -159,7 +159,7 @@ class Votes(NamedTuple):
 
     Attributes
     ----------
-    lowest : (T,) float64
+    lowest : (K,) float64
         Height of the lowest point of each row [m]; there are fewer rows.
     rows : (T + 1,) int32
         Row of `sums` of each tile's block, or `NO_ROW`; the last one is for points in no tile.

@@ -359,7 +359,7 @@ def size_of_tables(config: Config) -> int:
     n_tiles = math.ceil(2.0 * config.grid.r_max / config.faces.cell_size) ** 2
     n_cells = config.grid.n_segments * config.grid.n_bins
     # Once, and for each thread; held against both backends by test_robustness.py.
-    return (16 + 20 * n_threads) * n_tiles + (160 + 48 * n_threads) * n_cells
+    return (21 + 20 * n_threads) * n_tiles + (160 + 48 * n_threads) * n_cells
 
 
 def _check_memory(config: Config) -> None:
