@@ -203,8 +203,8 @@ def label_part(
         t = np.uintp(tile[i] if n >= 0 else 0)
         if faces.is_face[t]:
             over_lowest = np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0])
-            over_face = faces.has_occluded_base[t]
-            margin = face_margin(margin, over_lowest, over_face, config.ground_tolerance)
+            is_occluded = faces.has_occluded_base[t]
+            margin = face_margin(margin, over_lowest, is_occluded, config.ground_tolerance)
         margins[i] = margin
         otherwise = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
         label[i] = _GROUND if margin >= 0.0 else otherwise
