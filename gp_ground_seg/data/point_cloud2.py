@@ -233,8 +233,7 @@ def select_points(
     kept.data = as_data(select_rows(cloud, mask))
     kept.height, kept.width = 1, int(np.count_nonzero(mask))
     kept.row_step = kept.width * cloud.point_step
-    xyz = _views(kept, 'xyz', _FLOATS).values()
-    kept.is_dense = all(bool(np.isfinite(column).all()) for column in xyz)
+    kept.is_dense = bool(np.isfinite(read_xyz(kept)).all())
     return kept
 
 
