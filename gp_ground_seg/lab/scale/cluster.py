@@ -6,6 +6,7 @@ The one module that imports dask and distributed, optional packages.
 from __future__ import annotations
 
 import copy
+import gc
 import importlib.metadata
 import itertools
 import logging
@@ -338,6 +339,9 @@ def _connect(address: str) -> Any:
     with warnings.catch_warnings():
         # Versions are compared by `_compute`, which says in one line what differs.
         warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
+        # A client that could not connect closes itself when it is collected; within the start of
+        # another it waits for that one's lock for ever.
+        gc.collect()
         try:
             return distributed.Client(address, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
