@@ -5,8 +5,8 @@ The one module that imports dask and distributed, optional packages.
 
 from __future__ import annotations
 
+import asyncio
 import copy
-import gc
 import importlib.metadata
 import itertools
 import logging
@@ -336,16 +336,25 @@ def _connect(address: str) -> Any:
     if not address.startswith(('tcp://', 'tls://')):
         raise DataError(f'--scheduler {address}: must be tcp://HOST:PORT, or tls://')
     distributed = _distributed()
-    with warnings.catch_warnings():
-        # Versions are compared by `_compute`, which says in one line what differs.
-        warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
-        # A client that could not connect closes itself when it is collected; within the start of
-        # another it waits for that one's lock for ever.
-        gc.collect()
-        try:
+    try:
+        # A client that cannot connect is left half made: it closes when it is collected, and where
+        # that falls into the start of the next one, both wait for one lock for ever.
+        asyncio.run(_greet(address))
+        with warnings.catch_warnings():
+            # Versions are compared by `_compute`, which says in one line what differs.
+            warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
             return distributed.Client(address, set_as_default=False)
-        except (OSError, ValueError, TypeError) as error:
-            raise DataError(f'--scheduler {address}: does not answer ({error})') from error
+    except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask speaks there
+        raise DataError(f'--scheduler {address}: does not answer ({error})') from error
+
+
+async def _greet(address: str) -> None:
+    """Connect to a scheduler with the keys of Dask's configuration, and hang up."""
+    from distributed import Security
+    from distributed.comm import connect
+
+    comm = await connect(address, **Security().get_connection_args('client'))
+    await comm.close()
 
 
 def _distributed() -> Any:
