@@ -453,7 +453,11 @@ def label_points(scan, faces, surface, config):
         # The cell and the eight around it; segments form a ring.
         aside = np.isin(grid.segment, [(m + k) % grid.n_segments for k in (-1, 0, 1)])
         about = height[near & aside & (abs(grid.bin - n) <= 1)]
-        roughness[m, n] = math.sqrt(np.mean(about**2)) if len(about) else 0.0
+        if len(about):
+            variance = max(surface.std[m, n : n + 2]) ** 2 + config.observation.sigma_n**2
+            largest = 2.0 * math.sqrt(np.var(about) + variance)
+            offset = abs(np.mean(about))
+            roughness[m, n] = math.hypot(np.std(about), largest if largest < offset else offset)
         if label.rule == 'roughness':
             depth = label.obstacle_max_height
             n_obstacles = np.sum(shows & aside & grid.inside & (abs(grid.bin - n) <= 1))

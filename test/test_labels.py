@@ -140,6 +140,18 @@ def test_the_band_follows_the_roughness_up_to_the_height_of_an_obstacle(backend,
     assert list(label(backend, ranges, heights, rule='tolerance')[0].label[:3]) == [O, O, O]
 
 
+@pytest.mark.parametrize(
+    ('std', 'spread', 'expected'), [(0.05, 0.0, O), (0.05, 0.1, G), (0.3, 0.0, G)]
+)
+def test_returns_at_one_height_are_no_roughness_where_the_surface_is_certain(
+    backend, std, spread, expected
+):
+    surface = surface_of()._replace(std=np.full((4, 5), std))
+    heights = 0.35 + np.tile([-spread, spread], 2)
+    found, _ = label(backend, 3.0, [0.35, *heights], surface)
+    assert found.label[0] == expected
+
+
 @settings(max_examples=fewer(60, 10))
 @given(st.integers(0, 10_000), st.sampled_from([np.float32, np.float64]))
 def test_labels_are_the_reference(backend, seed, dtype):
@@ -151,7 +163,7 @@ def test_labels_are_the_reference(backend, seed, dtype):
     xyz[100:200, :2] = places + rng.normal(0, 0.02, (100, 2))
     xyz[100:200, 2] = rng.uniform(-0.1, 0.8, 100)
     xyz[::20] = np.nan
-    mean, std = rng.normal(0, 0.3, (4, 5)), rng.uniform(0, 1, (4, 5))
+    mean, std = rng.normal(0, 0.3, (4, 5)), rng.uniform(0, rng.choice([0.05, 1.0]), (4, 5))
     mean[seed % 4] = std[seed % 4] = np.nan
     surface = GroundSurface(KNOTS, mean, std, np.ones(0, dtype=bool))
     scan: Scan = backend.build_grid(xyz, CONFIG)

@@ -227,7 +227,10 @@ class Segmentation:
 
     @property
     def roughness(self) -> FloatArray:
-        """Root mean square height of the returns over the surface about each bin, (M, n_bins)."""
+        """Root mean square height of returns over the surface about each bin, (M, n_bins) [m].
+
+        See `gp_ground_seg.core.pipeline.labels.roughness_of`.
+        """
         return self.labelled.roughness
 
     # What follows is computed when it is first asked for: not every user asks.

@@ -41,7 +41,7 @@ from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.labels import N_LAYERS, depth_of_ground, square_units
+from gp_ground_seg.core.pipeline.labels import N_LAYERS, depth_of_ground, sum_units
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
@@ -239,9 +239,9 @@ class NumbaBackend:
         n_cells, n_parts = scan.grid.n_segments * n_bins, self.workers.n_parts(n_points)
         buffers = labels.LabelBuffers(
             take('pieces', (n_cells + 1, 2), np.float64),
-            take('square_sums', (n_parts, n_cells + 1, 2), np.int64),
+            take('height_sums', (n_parts, n_cells + 1, 3), np.int64),
             take('band', (n_cells + 1,), np.float64),
-            square_units(n_points, label.obstacle_min_height),
+            sum_units(n_points, label.obstacle_min_height),
         )
         result = Labelled(
             np.empty(n_points, dtype=np.uint8),
@@ -254,7 +254,8 @@ class NumbaBackend:
             labels.survey, n_parts, scan, faces.is_face, label, result.height, buffers
         )
         by_roughness, sigma_n = config.label.rule == 'roughness', config.observation.sigma_n
-        labels.set_bands(n_parts, label, by_roughness, sigma_n, buffers, result.roughness)
+        bands_of = n_parts, label, by_roughness, sigma_n, surface.std, buffers, result.roughness
+        labels.set_bands(*bands_of)
         depth, run = depth_of_ground(config.label), self.workers.run
         has_obstacle = take('has_obstacle', (len(faces.is_face),), np.bool_)
         has_obstacle.fill(False)

@@ -36,6 +36,7 @@ from gp_ground_seg.core.pipeline.labels import (
     VOTE_UNITS,
     band_margin,
     block_of,
+    cell_variance,
     face_margin,
     ground_band,
     is_near,
@@ -44,6 +45,7 @@ from gp_ground_seg.core.pipeline.labels import (
     settled_margin,
     shows_obstacle,
     vote_of,
+    whole_units,
 )
 
 # Plain integers, as compiled code has no enumerations.
@@ -61,14 +63,14 @@ class LabelBuffers(NamedTuple):
     ----------
     pieces : (M * n_bins + 1, 2) float64
         Surface in each cell, level and slope over range.
-    sums : (n_parts, M * n_bins + 1, 2) int64
+    sums : (n_parts, M * n_bins + 1, 3) int64
         For each cell the number of points near the surface, with `OBSTACLE_FLAG` added for
-        each that shows an obstacle, and the sum of squared heights in whole units. Their
-        order does not matter, nor how the points are split.
+        each that shows an obstacle, and the sums of heights and squared heights in whole units.
+        Their order does not matter, nor how the points are split.
     band : (M * n_bins + 1,) float64
         Largest height of ground [m].
     units : float
-        Whole units of squared heights [1/m^2].
+        Whole units of heights and their squares [1/m, 1/m^2].
     """
 
     pieces: FloatArray
@@ -101,7 +103,7 @@ def survey(
     """Heights of the points of a part over the surface, and the sums for roughness."""
     pieces, sums, nearest = buffers.pieces, buffers.sums[part.number], scan.grid.edges[0]
     for k in range(len(sums)):
-        sums[k, 0] = sums[k, 1] = 0
+        sums[k, 0] = sums[k, 1] = sums[k, 2] = 0
     # Slices, because indices from 0 on need no check for negative ones.
     points = points_of(part, len(height))
     z, tile, heights = scan.xyz.T[2, points], scan.tiles.tile[points], height[points]
@@ -115,7 +117,8 @@ def survey(
             sums[c, 0] += OBSTACLE_FLAG
         elif is_near(h, config) and not is_face[np.uintp(tile[i])]:
             sums[c, 0] += 1
-            sums[c, 1] += int(h * h * buffers.units + 0.5)
+            sums[c, 1] += int(whole_units(h, buffers.units))
+            sums[c, 2] += int(whole_units(h * h, buffers.units))
 
 
 @jit(entry=True)
@@ -124,6 +127,7 @@ def set_bands(
     config: LabelConfig,
     by_roughness: bool,
     sigma_n: float,
+    surface_std: FloatArray,
     buffers: LabelBuffers,
     roughness: FloatArray,
 ) -> None:
@@ -131,21 +135,25 @@ def set_bands(
     n_segments, n_bins = roughness.shape
     # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
     number = np.empty(n_bins + 2, np.int64)
+    heights = np.empty(n_bins + 2, np.int64)
     squares = np.empty(n_bins + 2, np.int64)
     for m in range(n_segments):
         for n in range(n_bins + 2):
-            number[n] = squares[n] = 0
+            number[n] = heights[n] = squares[n] = 0
         for index in range(n_parts):
             for k in range(-1, 2):
                 first = (m + k + n_segments) % n_segments * n_bins
                 for n in range(n_bins):
                     number[n + 1] += buffers.sums[index, first + n, 0]
-                    squares[n + 1] += buffers.sums[index, first + n, 1]
+                    heights[n + 1] += buffers.sums[index, first + n, 1]
+                    squares[n + 1] += buffers.sums[index, first + n, 2]
         for n in range(n_bins):
             flagged = number[n] + number[n + 1] + number[n + 2]
             n_near, n_obstacles = flagged & (OBSTACLE_FLAG - 1), flagged >> 32
-            total = squares[n] + squares[n + 1] + squares[n + 2]
-            rough = roughness_of(total, n_near, buffers.units)
+            height = heights[n] + heights[n + 1] + heights[n + 2]
+            square = squares[n] + squares[n + 1] + squares[n + 2]
+            variance = cell_variance(surface_std[m, n], surface_std[m, n + 1], sigma_n)
+            rough = roughness_of(n_near, height, square, buffers.units, variance)
             band = config.ground_tolerance
             if by_roughness:
                 band = ground_band(n_near, rough, n_obstacles, config, sigma_n)

@@ -26,7 +26,10 @@ from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
 
 FINEST_UNITS = 2.0**40
-"""Most of `square_units`."""
+"""Most of `sum_units`."""
+FARTHEST_OFFSET = 2.0
+"""Standard deviations up to which the mean height of returns over the surface counts as their
+roughness."""
 FACE_SHARE = 0.5
 """Part of the tolerance up to which a return over the lowest of a vertical face is ground before
 the vote."""
@@ -53,11 +56,13 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     height = z - at_points(surface.knots, surface.mean, grid)
     tile, inside = np.maximum(tiles.tile, 0), grid.inside
     in_face = faces.is_face[tile] & inside
-    n_near, squares, n_obstacles = _returns_about(height, grid, in_face, label)
-    roughness = roughness_of(squares, n_near, square_units(len(z), label.obstacle_min_height))
+    n_near, heights, squares, n_obstacles = _returns_about(height, grid, in_face, label)
+    units, sigma_n = sum_units(len(z), label.obstacle_min_height), config.observation.sigma_n
+    variance = cell_variance(surface.std[:, :-1], surface.std[:, 1:], sigma_n).ravel()
+    roughness = roughness_of(n_near, heights, squares, units, variance)
     band = np.full(len(roughness), label.ground_tolerance)
     if label.rule == 'roughness':
-        band = ground_band(n_near, roughness, n_obstacles, label, config.observation.sigma_n)
+        band = ground_band(n_near, roughness, n_obstacles, label, sigma_n)
     margin: FloatArray = band_margin(
         height, band[np.maximum(grid.cell, 0)], depth_of_ground(label)
     )
@@ -94,12 +99,32 @@ def shows_obstacle(height: Values, label: LabelConfig) -> Values:
 
 
 @shared
-def roughness_of(squares: Values, n_near: Values, units: float) -> Values:
+def cell_variance(std_before: Values, std_behind: Values, sigma_n: float) -> Values:
+    """Variance of a height over the surface of a cell, from its deviations at both edges [m^2]."""
+    std = np.maximum(std_before, std_behind)
+    return std * std + sigma_n * sigma_n
+
+
+@shared
+def roughness_of(
+    n_near: Values, heights: Values, squares: Values, units: float, variance: Values
+) -> Values:
     """Root mean square height of returns near the surface [m]; 0 where there are none.
 
-    `squares` is the sum of their squared heights in whole units, see `square_units`.
+    Returns of the side of a car, all at one height over the surface, are not rough ground: their
+    mean counts up to `FARTHEST_OFFSET` standard deviations, of their spread about it and of
+    `variance` together, that of a height over the surface [m^2].
+
+    `heights` and `squares` are sums of the `n_near` heights and of their squares in whole units,
+    see `sum_units`.
     """
-    return np.sqrt(squares / (units * np.maximum(n_near, 1.0)))
+    number = units * np.maximum(n_near, 1.0)
+    offset = heights / number
+    offset_square = offset * offset
+    spread = np.maximum(squares / number - offset_square, 0.0)
+    largest = FARTHEST_OFFSET * FARTHEST_OFFSET * (spread + variance)
+    # Without a surface `variance` is NaN, and the offset counts in full.
+    return np.sqrt(spread + choose(largest < offset_square, largest, offset_square))
 
 
 @shared
@@ -160,7 +185,7 @@ def vote_of(margin: Values, tolerance: float) -> Values:
     """Vote of a return in whole units: its margin, at most the tolerance either way."""
     share = margin / tolerance
     share = choose(share < -1.0, -1.0, choose(share > 1.0, 1.0, share))
-    return np.floor(share * VOTE_UNITS + 0.5)
+    return whole_units(share, VOTE_UNITS)
 
 
 @shared
@@ -218,10 +243,11 @@ def mean_votes(
 
 def _returns_about(
     height: FloatArray, grid: PolarGrid, in_face: BoolArray, label: LabelConfig
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Count returns in each cell and the eight around it, (M * n_bins,) each.
 
-    Those near the surface, their squared heights in whole units, those that show an obstacle.
+    Those near the surface, their heights and squared heights in whole units, those that show an
+    obstacle.
     `height` (N,) is over the surface [m], NaN where there is none; points `in_face` (N,), of
     vertical faces, are no roughness of the ground.
     """
@@ -231,18 +257,25 @@ def _returns_about(
         return sum_neighbourhood(table.reshape(grid.n_segments, grid.n_bins)).ravel()
 
     near = is_near(height, label) & grid.inside & ~in_face
-    units = square_units(len(height), label.obstacle_min_height)
-    squares = total(near, np.floor(height[near] ** 2 * units + 0.5))
-    return total(near), squares, total(shows_obstacle(height, label) & grid.inside)
+    units = sum_units(len(height), label.obstacle_min_height)
+    heights = total(near, whole_units(height[near], units))
+    squares = total(near, whole_units(height[near] * height[near], units))
+    return total(near), heights, squares, total(shows_obstacle(height, label) & grid.inside)
 
 
-def square_units(n_points: int, max_height: float) -> float:
-    """Whole units that squared heights are rounded to [1/m^2].
+@shared
+def whole_units(value: Values, units: float) -> Values:
+    """Round a value to whole units."""
+    return np.floor(value * units + 0.5)
+
+
+def sum_units(n_points: int, max_height: float) -> float:
+    """Whole units that heights and their squares are rounded to [1/m, 1/m^2].
 
     The order in which whole numbers are summed does not matter. The sum over all points fits
     into 63 bits even if each is `max_height` [m] from the surface.
     """
-    largest = max(n_points, 1) * max_height**2
+    largest = max(n_points, 1) * max(1.0, max_height) ** 2
     return min(FINEST_UNITS, 2.0 ** math.floor(62.0 - math.log2(largest)))
 
 
