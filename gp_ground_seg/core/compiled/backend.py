@@ -41,7 +41,7 @@ from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.labels import N_LAYERS, depth_of_ground, sum_units
+from gp_ground_seg.core.pipeline.labels import depth_of_ground, sum_units
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
@@ -256,24 +256,17 @@ class NumbaBackend:
         by_roughness, sigma_n = config.label.rule == 'roughness', config.observation.sigma_n
         bands_of = n_parts, label, by_roughness, sigma_n, surface.std, buffers, result.roughness
         labels.set_bands(*bands_of)
-        depth, run = depth_of_ground(config.label), self.workers.run
+        depth, band = depth_of_ground(config.label), buffers.band
         has_obstacle = take('has_obstacle', (len(faces.is_face),), np.bool_)
         has_obstacle.fill(False)
-        band = buffers.band
-        run(labels.label_part, n_parts, scan, faces, label, depth, band, has_obstacle, result)
+        given = scan, faces, label, depth, band, has_obstacle
+        self.workers.run(labels.label_part, n_parts, *given, result)
         if by_roughness:
-            rows = take('rows', (len(has_obstacle) + 1,), np.int32)
-            lowest = take('lowest', (len(scan.tiles.occupied),), np.float64)
-            n_rows = labels.place_blocks(scan.tiles, has_obstacle, lowest, rows)
-            votes = labels.Votes(
-                lowest,
-                rows,
-                take('votes', (n_parts, n_rows, N_LAYERS, 2), np.int64),
-                take('voters', (n_points,), np.int32),
-                np.empty(n_parts, dtype=np.int64),
+            votes = labels.VoteBuffers(
+                take('rows', (len(has_obstacle) + 1,), np.int32),
+                *take('voters', (2, n_points), np.int32),
             )
-            run(labels.vote, n_parts, scan, label, votes, result)
-            run(labels.settle, n_parts, scan, label.ground_tolerance, votes, result)
+            labels.settle(scan, has_obstacle, label, votes, result)
         keep_code()
         return result
 

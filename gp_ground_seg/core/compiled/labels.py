@@ -1,9 +1,8 @@
-"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in seven calls.
+"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in five calls.
 
 `fit_pieces` prepares the surface of each cell, `survey` measures the heights of a part of the
-points over it, `set_bands` turns the sums of all parts into bands, `label_part` labels a part.
-Then `place_blocks` finds where there are obstacles, the points of a part `vote` there, and
-`settle` changes the labels of a part.
+points over it, `set_bands` turns the sums of all parts into bands, `label_part` labels a part,
+and `settle` changes labels near obstacles by votes.
 """
 
 from __future__ import annotations
@@ -162,28 +161,23 @@ def set_bands(
     buffers.band[n_segments * n_bins] = math.nan
 
 
-class Votes(NamedTuple):
-    """Votes in blocks, see `gp_ground_seg.core.pipeline.labels.mean_votes`.
+class VoteBuffers(NamedTuple):
+    """Working arrays of the votes, see `gp_ground_seg.core.pipeline.labels.mean_votes`.
 
     Attributes
     ----------
-    lowest : (K,) float64
-        Height of the lowest point of each row [m]; there are fewer rows.
     rows : (T + 1,) int32
-        Row of `sums` of each tile's block, or `NO_ROW`; the last one is for points in no tile.
-    sums : (n_parts, n_rows, N_LAYERS, 2) int64
-        Number and sum of the votes of the points of each part, by layer [units].
+        Row of each tile's block in the table of votes, or `NO_ROW`; the last one is for points in
+        no tile.
     voters : (N,) int32
-        Points that vote, for each part from its first point.
-    n_voters : (n_parts,) int64
-        Number of them.
+        Points that vote; there are fewer.
+    places : (N,) int32
+        Layer of each of them, counted over all rows.
     """
 
-    lowest: FloatArray
     rows: CellArray
-    sums: IntArray
     voters: CellArray
-    n_voters: IntArray
+    places: CellArray
 
 
 @jit(entry=True)
@@ -222,10 +216,42 @@ def label_part(
 
 
 @jit(entry=True)
-def place_blocks(
+def settle(
+    scan: Scan,
+    has_obstacle: BoolArray,
+    config: LabelConfig,
+    buffers: VoteBuffers,
+    result: Labelled,
+) -> None:
+    """Change margins and labels of the returns near an obstacle by the mean votes about them.
+
+    One thread does it: to wake others takes as long as they would save.
+    """
+    tolerance, voters, places = config.ground_tolerance, buffers.voters, buffers.places
+    lowest = np.empty(len(scan.tiles.occupied))
+    n_rows = _place_blocks(scan.tiles, has_obstacle, lowest, buffers.rows)
+    numbers, totals = np.zeros((n_rows, N_LAYERS)), np.zeros((n_rows, N_LAYERS))
+    means = np.empty((n_rows, N_LAYERS))
+    n_voters = _vote(scan, config, result, lowest, buffers, numbers, totals)
+    for row in range(n_rows):
+        for layer in range(N_LAYERS):
+            number = total = 0.0
+            for step in range(N_LAYERS - 1, N_LAYERS + 2):
+                number += numbers[row, (layer + step) % N_LAYERS]
+                total += totals[row, (layer + step) % N_LAYERS]
+            means[row, layer] = total / number * (tolerance / VOTE_UNITS)
+    mean_of, margins = means.reshape(-1), result.margin
+    for n in range(n_voters):
+        i = np.uintp(voters[n])
+        margins[i] = settled_margin(margins[i], mean_of[np.uintp(places[n])])
+        result.label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE
+
+
+@jit(part=True)
+def _place_blocks(
     tiles: Tiles, has_obstacle: BoolArray, lowest: FloatArray, rows: CellArray
 ) -> int:
-    """Fill in heights and rows of `Votes` for blocks with an obstacle; return their number."""
+    """Set rows of blocks with an obstacle, and their lowest points; return how many there are."""
     n_sides, n_rows = int(math.sqrt(len(has_obstacle))), 0
     row_of_block = np.full((n_sides // BLOCK + 1) ** 2, NO_ROW, np.int32)
     for tile in tiles.occupied:
@@ -243,41 +269,26 @@ def place_blocks(
     return n_rows
 
 
-@jit(entry=True)
-def vote(part: Part, scan: Scan, config: LabelConfig, votes: Votes, result: Labelled) -> None:
-    """Add up the votes of the points of a part."""
-    sums, tolerance, n = votes.sums[part.number], config.ground_tolerance, 0
-    sums[:] = 0
-    points = points_of(part, len(result.height))
-    z, tile, voters = scan.xyz.T[2, points], scan.tiles.tile[points], votes.voters[points]
-    height, margin = result.height[points], result.margin[points]
+@jit(part=True)
+def _vote(
+    scan: Scan,
+    config: LabelConfig,
+    result: Labelled,
+    lowest: FloatArray,
+    buffers: VoteBuffers,
+    numbers: FloatArray,
+    totals: FloatArray,
+) -> int:
+    """Add up the votes in each layer, whole numbers; return the number of voters."""
+    tolerance, rows, n = config.ground_tolerance, buffers.rows, 0
+    z, tile, number_in, total_in = scan.xyz.T[2], scan.tiles.tile, numbers.ravel(), totals.ravel()
     for i in range(len(tile)):
-        row = votes.rows[np.uintp(tile[i] if tile[i] >= 0 else len(votes.rows) - 1)]
-        if row != NO_ROW and is_near(height[i], config):
-            over_lowest = np.float64(z[i]) - votes.lowest[np.uintp(row)]
-            layer = np.uintp(layer_of(over_lowest, tolerance))
-            sums[np.uintp(row), layer, 0] += 1
-            sums[np.uintp(row), layer, 1] += int(vote_of(margin[i], tolerance))
-            voters[n] = i
+        row = rows[np.uintp(tile[i] if tile[i] >= 0 else len(rows) - 1)]
+        if row != NO_ROW and is_near(result.height[i], config):
+            over_lowest = np.float64(z[i]) - lowest[np.uintp(row)]
+            place = row * N_LAYERS + int(layer_of(over_lowest, tolerance))
+            number_in[np.uintp(place)] += 1.0
+            total_in[np.uintp(place)] += vote_of(result.margin[i], tolerance)
+            buffers.voters[n], buffers.places[n] = i, place
             n += 1
-    votes.n_voters[part.number] = n
-
-
-@jit(entry=True)
-def settle(part: Part, scan: Scan, tolerance: float, votes: Votes, result: Labelled) -> None:
-    """Change margins and labels of the points of a part by the mean votes about them."""
-    points, sums = points_of(part, len(result.height)), votes.sums
-    z, tile, voters = scan.xyz.T[2, points], scan.tiles.tile[points], votes.voters[points]
-    label, margins = result.label[points], result.margin[points]
-    for n in range(votes.n_voters[part.number]):
-        i = np.uintp(voters[n])
-        row = np.uintp(votes.rows[np.uintp(tile[i])])
-        layer = int(layer_of(np.float64(z[i]) - votes.lowest[row], tolerance))
-        number = total = np.int64(0)
-        for index in range(len(sums)):
-            for step in range(N_LAYERS - 1, N_LAYERS + 2):
-                k = np.uintp((layer + step) % N_LAYERS)
-                number += sums[index, row, k, 0]
-                total += sums[index, row, k, 1]
-        margins[i] = settled_margin(margins[i], total / number * (tolerance / VOTE_UNITS))
-        label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE
+    return n
