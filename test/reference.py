@@ -475,34 +475,32 @@ def label_points(scan, faces, surface, config):
             lowest = float(scan.tiles.lowest_z[scan.tiles.tile[i]])
             margin[i] = min(margin[i], limit - (float(scan.xyz[i, 2]) - lowest))
     if label.rule == 'roughness':
-        margin = settle(
-            scan, margin, grid.inside & (abs(height) < label.obstacle_min_height), label
-        )
+        near = grid.inside & (abs(height) < label.obstacle_min_height)
+        margin = settle(scan, surface, margin, near, label)
     result[margin >= 0.0] = Label.GROUND
     return Labelled(result, height, margin, roughness)
 
 
-def settle(scan, margin, near, label):
-    """Margins by the mean vote in the block about each return near the surface."""
+def settle(scan, surface, margin, near, label):
+    """Margins by the mean vote about each return near the surface."""
     tolerance, side = label.ground_tolerance, math.isqrt(len(scan.tiles.extremes))
-    members, obstacles, lowest = {}, set(), {}
-    for tile in scan.tiles.occupied:
-        x, y = divmod(int(tile), side)
-        z = float(scan.tiles.lowest_z[tile])
-        lowest[x // 4, y // 4] = min(z, lowest.get((x // 4, y // 4), math.inf))
+    members, obstacles = {}, set()
     for i in np.flatnonzero(near):
-        x, y = divmod(int(scan.tiles.tile[i]), side)
-        over_lowest = float(scan.xyz[i, 2]) - lowest[x // 4, y // 4]
-        layer = math.floor(4.0 / tolerance * over_lowest) % 64
-        members.setdefault((x // 4, y // 4), []).append((i, layer))
+        tile = divmod(int(scan.tiles.tile[i]), side)
+        over_lowest = float(scan.xyz[i, 2]) - np.nanmin(surface.mean)
+        # The nearest of four layers to the tolerance; after 64 they are counted from 0 again.
+        layer = math.floor(4.0 / tolerance * over_lowest + 0.5) % 64
+        members.setdefault(tile, []).append((i, layer))
         if margin[i] < 0.0:
-            obstacles.add((x // 4, y // 4))
+            obstacles.add(tile)
     # Votes have 4096 steps to the tolerance.
     vote = np.floor(4096 * np.clip(margin / tolerance, -1.0, 1.0) + 0.5) / 4096 * tolerance
     settled = margin.copy()
-    for block in obstacles:
-        for i, layer in members[block]:
-            near_it = [j for j, other in members[block] if (other - layer) % 64 in (63, 0, 1)]
+    for x, y in obstacles:
+        beside = [(x + j, y + k) for j in (-1, 0, 1) for k in (-1, 0, 1)]
+        about = [one for tile in beside for one in members.get(tile, [])]
+        for i, layer in members[x, y]:
+            near_it = [j for j, other in about if (other - layer) % 64 in (63, 0, 1)]
             mean = np.mean(vote[near_it])
             settled[i] = max(margin[i], mean) if mean >= 0.0 else min(margin[i], mean)
     return settled

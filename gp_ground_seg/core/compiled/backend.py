@@ -41,7 +41,7 @@ from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
 from gp_ground_seg.core.pipeline.ground_plane import GroundPlane
-from gp_ground_seg.core.pipeline.labels import depth_of_ground, sum_units
+from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, sum_units
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
@@ -266,7 +266,7 @@ class NumbaBackend:
                 take('rows', (len(has_obstacle) + 1,), np.int32),
                 *take('voters', (2, n_points), np.int32),
             )
-            labels.settle(scan, has_obstacle, label, votes, result)
+            labels.settle(scan, lowest_of(surface), has_obstacle, label, votes, result)
         keep_code()
         return result
 

@@ -30,11 +30,9 @@ from gp_ground_seg.core.frame import (
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import LabelConfig
 from gp_ground_seg.core.pipeline.labels import (
-    BLOCK,
     N_LAYERS,
     VOTE_UNITS,
     band_margin,
-    block_of,
     cell_variance,
     face_margin,
     ground_band,
@@ -52,7 +50,8 @@ _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.
 OBSTACLE_FLAG = 2**32
 """Added to the number of returns near the surface for each that shows an obstacle: more than there
 are points."""
-NO_ROW = -1
+VOTER_FLAG = 2**38
+"""Added to the sum of votes for each voter: more than the votes of all of them."""
 
 
 class LabelBuffers(NamedTuple):
@@ -167,10 +166,10 @@ class VoteBuffers(NamedTuple):
     Attributes
     ----------
     rows : (T + 1,) int32
-        Row of each tile's block in the table of votes, or `NO_ROW`; the last one is for points in
-        no tile.
+        Row of each tile in the table of votes, 0 if none is about it; the last one is for points
+        in no tile.
     voters : (N,) int32
-        Points that vote; there are fewer.
+        Points in tiles with an obstacle; there are fewer.
     places : (N,) int32
         Layer of each of them, counted over all rows.
     """
@@ -218,6 +217,7 @@ def label_part(
 @jit(entry=True)
 def settle(
     scan: Scan,
+    lowest: float,
     has_obstacle: BoolArray,
     config: LabelConfig,
     buffers: VoteBuffers,
@@ -225,70 +225,88 @@ def settle(
 ) -> None:
     """Change margins and labels of the returns near an obstacle by the mean votes about them.
 
-    One thread does it: to wake others takes as long as they would save.
+    `lowest` is that of `lowest_of` [m]. One thread does it: to wake others takes as long as they
+    would save.
     """
-    tolerance, voters, places = config.ground_tolerance, buffers.voters, buffers.places
-    lowest = np.empty(len(scan.tiles.occupied))
-    n_rows = _place_blocks(scan.tiles, has_obstacle, lowest, buffers.rows)
-    numbers, totals = np.zeros((n_rows, N_LAYERS)), np.zeros((n_rows, N_LAYERS))
-    means = np.empty((n_rows, N_LAYERS))
-    n_voters = _vote(scan, config, result, lowest, buffers, numbers, totals)
-    for row in range(n_rows):
-        for layer in range(N_LAYERS):
-            number = total = 0.0
-            for step in range(N_LAYERS - 1, N_LAYERS + 2):
-                number += numbers[row, (layer + step) % N_LAYERS]
-                total += totals[row, (layer + step) % N_LAYERS]
-            means[row, layer] = total / number * (tolerance / VOTE_UNITS)
-    mean_of, margins = means.reshape(-1), result.margin
+    settled, n_rows = _number_tiles(scan.tiles, has_obstacle, buffers.rows)
+    votes = np.zeros((n_rows, N_LAYERS), np.int64)
+    n_voters = _vote(scan, lowest, len(settled), config, result, buffers, votes.reshape(-1))
+    sums = _sum_around(settled, scan.tiles, buffers.rows, votes)
+    margins, unit = result.margin, config.ground_tolerance / VOTE_UNITS
     for n in range(n_voters):
-        i = np.uintp(voters[n])
-        margins[i] = settled_margin(margins[i], mean_of[np.uintp(places[n])])
+        i, place = np.uintp(buffers.voters[n]), buffers.places[n]
+        layer, total = place % N_LAYERS, 0
+        for step in range(N_LAYERS - 1, N_LAYERS + 2):
+            total += sums[np.uintp(place - layer + (layer + step) % N_LAYERS)]
+        number = total // VOTER_FLAG
+        mean = (total - number * VOTER_FLAG) / number - VOTE_UNITS
+        margins[i] = settled_margin(margins[i], mean * unit)
         result.label[i] = _GROUND if margins[i] >= 0.0 else _OBSTACLE
 
 
 @jit(part=True)
-def _place_blocks(
-    tiles: Tiles, has_obstacle: BoolArray, lowest: FloatArray, rows: CellArray
-) -> int:
-    """Set rows of blocks with an obstacle, and their lowest points; return how many there are."""
-    n_sides, n_rows = int(math.sqrt(len(has_obstacle))), 0
-    row_of_block = np.full((n_sides // BLOCK + 1) ** 2, NO_ROW, np.int32)
+def _number_tiles(tiles: Tiles, has_obstacle: BoolArray, rows: CellArray) -> tuple[CellArray, int]:
+    """Give rows to tiles with an obstacle, from 1 on, then to those around.
+
+    Returns the tiles of the first rows, and the number of all. Row 0 is for the other tiles, and
+    gets no votes.
+    """
+    n_sides, n_rows = int(math.sqrt(len(has_obstacle))), 1
+    settled = np.empty(len(tiles.occupied) + 1, np.int32)
+    rows[:] = 0
     for tile in tiles.occupied:
-        block = np.uintp(block_of(tile, n_sides))
-        if has_obstacle[np.uintp(tile)] and row_of_block[block] == NO_ROW:
-            row_of_block[block], lowest[n_rows] = n_rows, math.inf
+        if has_obstacle[np.uintp(tile)]:
+            settled[n_rows], rows[np.uintp(tile)] = tile, n_rows
             n_rows += 1
-    for tile in tiles.occupied:
-        t = np.uintp(tile)
-        row = rows[t] = row_of_block[np.uintp(block_of(tile, n_sides))]
-        if row != NO_ROW:
-            z = np.float64(tiles.extremes[t, 0])
-            lowest[np.uintp(row)] = min(lowest[np.uintp(row)], z)
-    rows[len(rows) - 1] = NO_ROW
-    return n_rows
+    settled = settled[:n_rows]
+    for tile in settled[1:]:
+        column, row = tile // n_sides, tile % n_sides
+        for x in range(max(column - 1, 0), min(column + 2, n_sides)):
+            for y in range(max(row - 1, 0), min(row + 2, n_sides)):
+                t = np.uintp(x * n_sides + y)
+                if rows[t] == 0 and tiles.extremes[t, 0] < math.inf:
+                    rows[t] = n_rows
+                    n_rows += 1
+    return settled, n_rows
 
 
 @jit(part=True)
 def _vote(
     scan: Scan,
+    lowest: float,
+    n_settled: int,
     config: LabelConfig,
     result: Labelled,
-    lowest: FloatArray,
     buffers: VoteBuffers,
-    numbers: FloatArray,
-    totals: FloatArray,
+    votes: IntArray,
 ) -> int:
-    """Add up the votes in each layer, whole numbers; return the number of voters."""
+    """Add up the votes in each layer, whole numbers; return the number of voters to settle."""
     tolerance, rows, n = config.ground_tolerance, buffers.rows, 0
-    z, tile, number_in, total_in = scan.xyz.T[2], scan.tiles.tile, numbers.ravel(), totals.ravel()
+    z, tile = scan.xyz.T[2], scan.tiles.tile
     for i in range(len(tile)):
         row = rows[np.uintp(tile[i] if tile[i] >= 0 else len(rows) - 1)]
-        if row != NO_ROW and is_near(result.height[i], config):
-            over_lowest = np.float64(z[i]) - lowest[np.uintp(row)]
+        if row > 0 and is_near(result.height[i], config):
+            over_lowest = np.float64(z[i]) - lowest
             place = row * N_LAYERS + int(layer_of(over_lowest, tolerance))
-            number_in[np.uintp(place)] += 1.0
-            total_in[np.uintp(place)] += vote_of(result.margin[i], tolerance)
-            buffers.voters[n], buffers.places[n] = i, place
-            n += 1
+            vote = vote_of(result.margin[i], tolerance)
+            votes[np.uintp(place)] += VOTER_FLAG + int(vote + VOTE_UNITS)
+            if row < n_settled:
+                buffers.voters[n], buffers.places[n] = i, place
+                n += 1
     return n
+
+
+@jit(part=True)
+def _sum_around(settled: CellArray, tiles: Tiles, rows: CellArray, votes: IntArray) -> IntArray:
+    """Sum the votes of each settled tile and the eight around it, layer by layer."""
+    n_sides, sums = int(math.sqrt(len(rows))), np.zeros((len(settled), N_LAYERS), np.int64)
+    for k in range(1, len(settled)):
+        column, row, about = settled[k] // n_sides, settled[k] % n_sides, sums[k]
+        for x in range(max(column - 1, 0), min(column + 2, n_sides)):
+            for y in range(max(row - 1, 0), min(row + 2, n_sides)):
+                k_beside = rows[np.uintp(x * n_sides + y)]
+                if k_beside > 0:
+                    beside = votes[np.uintp(k_beside)]
+                    for layer in range(N_LAYERS):
+                        about[layer] += beside[layer]
+    return sums.reshape(-1)

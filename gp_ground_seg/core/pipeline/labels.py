@@ -33,11 +33,9 @@ roughness."""
 FACE_SHARE = 0.5
 """Part of the tolerance up to which a return over the lowest of a vertical face is ground before
 the vote."""
-BLOCK = 4
-"""Sides of a block of returns that vote, in tiles."""
 LAYERS_PER_TOLERANCE = 4.0
 N_LAYERS = 64
-"""Layers of a block, after which they are counted from the first again: returns near the surface
+"""Layers of a tile, after which they are counted from the first again: returns near the surface
 lie closer together."""
 VOTE_UNITS = 2.0**12
 """Whole units of a vote: the order in which they are added does not matter."""
@@ -73,7 +71,8 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     margin[~inside] = np.nan
     if label.rule == 'roughness':
         voters = np.flatnonzero(is_near(height, label) & inside)
-        voters, means = mean_votes(voters, z, margin, tiles, label.ground_tolerance)
+        over_lowest = z - lowest_of(surface)
+        voters, means = mean_votes(voters, over_lowest, margin, tiles, label.ground_tolerance)
         margin[voters] = settled_margin(margin[voters], means)
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
@@ -167,17 +166,19 @@ def face_margin(
     return choose(in_face < margin, in_face, margin)
 
 
+def lowest_of(surface: GroundSurface) -> float:
+    """Lowest height of the surface [m], from which layers of votes are counted; NaN without one.
+
+    Where the origin of the heights lies does not matter.
+    """
+    return float(np.fmin.reduce(surface.mean, axis=None))
+
+
 @shared
 def layer_of(over_lowest: Values, tolerance: float) -> Values:
-    """Layer of a block that holds a height over its lowest return [m], below `N_LAYERS`."""
-    layer = np.floor(over_lowest * (LAYERS_PER_TOLERANCE / tolerance))
+    """Layer, below `N_LAYERS`, of a height over that of `lowest_of` [m]."""
+    layer = np.floor(over_lowest * (LAYERS_PER_TOLERANCE / tolerance) + 0.5)
     return layer - N_LAYERS * np.floor(layer / N_LAYERS)
-
-
-@shared
-def block_of(tile: Values, n_sides: int) -> Values:
-    """Block of a tile of `n_sides` ** 2."""
-    return tile // n_sides // BLOCK * (n_sides // BLOCK + 1) + tile % n_sides // BLOCK
 
 
 @shared
@@ -196,21 +197,22 @@ def settled_margin(margin: Values, mean: Values) -> Values:
 
 
 def mean_votes(
-    voters: IntArray, z: FloatArray, margin: FloatArray, tiles: Tiles, tolerance: float
+    voters: IntArray, over_lowest: FloatArray, margin: FloatArray, tiles: Tiles, tolerance: float
 ) -> tuple[IntArray, FloatArray]:
     """Mean vote about each return near an obstacle.
 
     Returns side by side at one height are mostly of one kind: a low return of a fence, or one of a
-    bank that is too high for its cell, is judged with those about it. In each block with a return
-    that is no ground, a return counts the votes (see `vote_of`) in its layer, the one above and
-    the one below.
+    bank that is too high for its cell, is judged with those about it. In each tile with a return
+    that is no ground, a return counts the votes (see `vote_of`) of this tile and the eight around
+    it, in its layer, the one above and the one below.
 
     Parameters
     ----------
     voters : (V,) int64
         Points that vote: those near the surface.
-    z, margin : (N,) float64
-        Heights of all points, and their margins before the vote (see `Labelled`) [m].
+    over_lowest, margin : (N,) float64
+        Heights of all points over `lowest_of`, and their margins before the vote (see `Labelled`)
+        [m].
     tiles : Tiles
         Tiles of all points.
     tolerance : float
@@ -219,26 +221,33 @@ def mean_votes(
     Returns
     -------
     voters : (W,) int64
-        Those in such a block.
+        Those in such a tile.
     means : (W,) float64
         Mean of the votes that they count [m].
     """
     n_sides = math.isqrt(len(tiles.extremes))
-    block = block_of(tiles.tile[voters], n_sides)
-    named = np.unique(block[margin[voters] < 0.0])
-    is_named = np.isin(block, named)
-    voters, row = voters[is_named], np.searchsorted(named, block[is_named])
-    lowest = np.full((n_sides // BLOCK + 1) ** 2, np.inf)
-    np.minimum.at(lowest, block_of(tiles.occupied, n_sides), tiles.lowest_z[tiles.occupied])
-    layer = layer_of(z[voters] - lowest[named[row]], tolerance)
-    place = row * N_LAYERS + layer.astype(np.int64)
-    sums = np.empty((2, len(named) * N_LAYERS))
-    sums[0] = np.bincount(place, minlength=sums.shape[1])
-    sums[1] = np.bincount(place, vote_of(margin[voters], tolerance), sums.shape[1])
+    # Places of tiles in a square with one more at each side, so that each has eight around it.
+    width = n_sides + 2
+    around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
+    column, row = np.divmod(tiles.tile[voters], n_sides)
+    place = (column + 1) * width + row + 1
+    has_obstacle, counts = np.zeros((2, width * width), dtype=np.bool_)
+    has_obstacle[place[margin[voters] < 0.0]] = True
+    counts[np.flatnonzero(has_obstacle)[:, None] + around] = True
+    rows = np.cumsum(counts) - 1
+    voters, place = voters[counts[place]], place[counts[place]]
+    layer = layer_of(over_lowest[voters], tolerance).astype(np.int64)
+    entry, size = rows[place] * N_LAYERS + layer, np.count_nonzero(counts) * N_LAYERS
+    votes = vote_of(margin[voters], tolerance)
+    sums = np.empty((2, size))
+    sums[0], sums[1] = np.bincount(entry, None, size), np.bincount(entry, votes, size)
     layers = sums.reshape(2, -1, N_LAYERS)
-    about = layers + np.roll(layers, 1, axis=2) + np.roll(layers, -1, axis=2)
-    number, total = about.reshape(2, -1)[:, place]
-    return voters, total / number * (tolerance / VOTE_UNITS)
+    # With the layers above and below.
+    number, total = layers + np.roll(layers, 1, axis=2) + np.roll(layers, -1, axis=2)
+    settles = has_obstacle[place]
+    about, layer = rows[place[settles][:, None] + around], layer[settles][:, None]
+    mean = total[about, layer].sum(axis=1) / number[about, layer].sum(axis=1)
+    return voters[settles], mean * (tolerance / VOTE_UNITS)
 
 
 def _returns_about(
