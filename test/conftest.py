@@ -104,7 +104,7 @@ def fewer(n: int, n_plain: int) -> int:
 def sharing(n_threads: int) -> Iterator[NumbaBackend]:
     """Backend that splits even the smallest clouds, in threads also without compiled code."""
     threads = 'gp_ground_seg.core.compiled.threads'
-    one = {'MIN_POINTS_TO_SPLIT': 1, 'MIN_SEGMENTS_TO_SPLIT': 1, 'JIT_ENABLED': True}
+    one = {'POINTS_TO_SORT': 1, 'POINTS_TO_LABEL': 1, 'SEGMENTS_TO_GROW': 1, 'JIT_ENABLED': True}
     with patch.multiple(threads, **one):
         backend = NumbaBackend(n_threads)
         yield backend

@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config
 from gp_ground_seg.core.compiled import threads
 from gp_ground_seg.core.compiled.backend import NumbaBackend
-from gp_ground_seg.core.compiled.threads import MIN_POINTS_TO_SPLIT, Part, Workers, run_of
+from gp_ground_seg.core.compiled.threads import (
+    POINTS_TO_SORT,
+    SEGMENTS_TO_GROW,
+    Part,
+    Workers,
+    run_of,
+)
 from gp_ground_seg.core.frame import GroundSurface
 
 
@@ -126,17 +132,19 @@ def test_number_of_threads():
         assert Workers(7).n_threads == 1
 
 
-def test_few_segments_are_not_split(workers):
+def test_little_work_is_not_split(workers):
     """Learning looks at 6 segments again and again; a hand-over takes longer than they do."""
-    assert [workers.n_segment_parts(n) for n in (1, 45, 180)] == [1, 1, 3]
+    assert [workers.n_parts(n, SEGMENTS_TO_GROW) for n in (0, 1, 45, 119, 120, 180, 2048)] == [
+        1, 1, 1, 1, 2, 3, 3
+    ]  # fmt: skip
 
 
 def test_points_of_small_clouds_are_not_split_and_threads_end_and_start_again():
     with patch.object(threads, 'JIT_ENABLED', True):
         backend = NumbaBackend(3)
-    points = np.random.default_rng(0).uniform(-30.0, 30.0, (MIN_POINTS_TO_SPLIT, 3))
+    points = np.random.default_rng(0).uniform(-30.0, 30.0, (3 * POINTS_TO_SORT, 3))
     config, before = Config(), threading.active_count()
-    for n_points, n_started in ((len(points) - 1, 0), (len(points), 2), (len(points), 2)):
+    for n_points, n_started in ((POINTS_TO_SORT, 0), (len(points), 2), (len(points), 2)):
         scan = backend.build_grid(points[:n_points], config)
         flat = np.zeros((config.grid.n_segments, len(scan.grid.edges)))
         surface = GroundSurface(scan.grid.edges, flat, flat, np.ones(0, dtype=bool))

@@ -14,6 +14,7 @@ from gp_ground_seg.core.compiled import (
     likelihood,
     lines,
     polar_grid,
+    threads,
 )
 from gp_ground_seg.core.compiled import latent as latent_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
@@ -87,7 +88,7 @@ class NumbaBackend:
             self._renew()
         n_points, dtype, take = len(xyz), xyz.dtype, self._buffers.take
         geometry = grid_geometry(config.grid, config.faces.cell_size, dtype)
-        n_parts = self.workers.n_parts(n_points)
+        n_parts = self.workers.n_parts(n_points, threads.POINTS_TO_SORT)
         n_segments, n_cells = config.grid.n_segments, config.grid.n_segments * config.grid.n_bins
         n_tiles = geometry.n_sides**2
         columns = take('columns', (3, n_points), dtype)
@@ -128,7 +129,8 @@ class NumbaBackend:
         """Tiles that hold a vertical face."""
         take = self._buffers.take
         thresholds, heights = numbers_of(config.faces), numbers_of(config.label)
-        n_tiles, n_parts = len(scan.tiles.extremes), self.workers.n_parts(len(scan.xyz))
+        n_tiles = len(scan.tiles.extremes)
+        n_parts = self.workers.n_parts(len(scan.xyz), threads.POINTS_TO_LABEL)
         tile_to_row, row_to_tile = take('tile_rows', (2, n_tiles), np.int32)
         n_tall = faces_.select_tall(scan.tiles, heights, tile_to_row, row_to_tile)
         sums = take('face_sums', (n_parts, 2 * n_tall, faces_.N_COLUMNS), np.float64)
@@ -163,7 +165,7 @@ class NumbaBackend:
         values, gradients = np.empty(n_segments), np.empty((n_segments, len(theta)))
         self.workers.run(
             likelihood.log_likelihood,
-            self.workers.n_segment_parts(n_segments),
+            self.workers.n_parts(n_segments, threads.SEGMENTS_TO_GROW),
             theta,
             inliers,
             slope_std,
@@ -183,7 +185,6 @@ class NumbaBackend:
         take, knots, slope_std = self._buffers.take, frame.knots, config.observation.slope_std
         observation, growth = numbers_of(config.observation), numbers_of(config.growth)
         shape, n_candidates = (len(theta), len(knots)), len(frame.candidates.r)
-        n_parts = self.workers.n_segment_parts(len(theta))
         u, knot_u = self._log_length_scales(frame, theta, config)
         alone = ground.SegmentSurfaces(
             u,
@@ -199,6 +200,7 @@ class NumbaBackend:
         evidence.find_seeds(frame, theta, growth, max_slope, shown[0], alone.seed)
 
         def grow(aside: FloatArray, step: int) -> None:
+            n_parts = self.workers.n_parts(len(theta) // step, threads.SEGMENTS_TO_GROW)
             grow_surfaces = ground.grow_surfaces, n_parts, frame, theta, observation
             self.workers.run(*grow_surfaces, growth, doubts, aside, step, alone)
 
@@ -226,8 +228,7 @@ class NumbaBackend:
             return given_log_length_scales(frame, config.length_scale)
         u = self._buffers.take('u', (len(frame.candidates.r),), np.float64)
         knot_u = np.empty((len(theta), len(frame.knots)))
-        n_parts = self.workers.n_segment_parts(len(theta))
-        self.workers.run(latent_.latent_log_length_scales, n_parts, frame, theta, u, knot_u)
+        latent_.latent_log_length_scales(frame, theta, u, knot_u)
         return u, knot_u
 
     def label_points(
@@ -236,7 +237,8 @@ class NumbaBackend:
         """Height, label and margin of each point; roughness of each cell."""
         take, label = self._buffers.take, numbers_of(config.label)
         n_points, n_bins = len(scan.xyz), scan.grid.n_bins
-        n_cells, n_parts = scan.grid.n_segments * n_bins, self.workers.n_parts(n_points)
+        n_cells = scan.grid.n_segments * n_bins
+        n_parts = self.workers.n_parts(n_points, threads.POINTS_TO_LABEL)
         buffers = labels.LabelBuffers(
             take('pieces', (n_cells + 1, 2), np.float64),
             take('height_sums', (n_parts, n_cells + 1, 3), np.int64),

@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 from gp_ground_seg.core.jit import JIT_ENABLED, jit
 from gp_ground_seg.core.parameters.config import DEFAULT_MAX_THREADS
 
-MIN_POINTS_TO_SPLIT = 4096
-"""Points below which sharing out costs more than it saves."""
-MIN_SEGMENTS_TO_SPLIT = 64
-"""The same for segments: to wake a thread and wait for it takes as long as several of them."""
+POINTS_TO_SORT, POINTS_TO_LABEL, SEGMENTS_TO_GROW = 40_000, 120_000, 60
+"""Least number of a part: it then takes about 0.4 ms, several times what it takes to wake a thread
+and to wait for it."""
 
 
 class Part(NamedTuple):
@@ -59,13 +58,12 @@ class Workers:
         self.is_idle = True
         self._pool: ThreadPoolExecutor | None = None
 
-    def n_parts(self, n_points: int) -> int:
-        """Return the number of parts that so many points are split into."""
-        return self.n_threads if n_points >= MIN_POINTS_TO_SPLIT else 1
+    def n_parts(self, n: int, least: int) -> int:
+        """Return the number of parts that `n` points or segments are split into.
 
-    def n_segment_parts(self, n_segments: int) -> int:
-        """Return the number of parts that so many segments are split into."""
-        return self.n_threads if n_segments >= MIN_SEGMENTS_TO_SPLIT else 1
+        Each has the `least` number, if there is more than one.
+        """
+        return max(min(self.n_threads, n // least), 1)
 
     def run(self, function: Callable[..., None], n_parts: int, *arguments: Any) -> None:
         """Call ``function(part, *arguments)`` for each part; return when all are done.
