@@ -10,6 +10,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.frame import (
     NOT_FINITE,
     BoolArray,
+    CellArray,
     Faces,
     FloatArray,
     GroundSurface,
@@ -229,24 +230,37 @@ def mean_votes(
     # Places of tiles in a square with one more at each side, so that each has eight around it.
     width = n_sides + 2
     around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
-    column, row = np.divmod(tiles.tile[voters], n_sides)
-    place = (column + 1) * width + row + 1
+
+    def place_of(tile: CellArray) -> CellArray:
+        return tile + 2 * (tile // n_sides) + (width + 1)
+
+    tile = tiles.tile[voters]
     has_obstacle, counts = np.zeros((2, width * width), dtype=np.bool_)
-    has_obstacle[place[margin[voters] < 0.0]] = True
+    has_obstacle[place_of(tile[margin[voters] < 0.0])] = True
     counts[np.flatnonzero(has_obstacle)[:, None] + around] = True
-    rows = np.cumsum(counts) - 1
-    voters, place = voters[counts[place]], place[counts[place]]
+    # Most voters are in none of these tiles.
+    is_counted = counts.reshape(width, width)[1:-1, 1:-1].ravel()[tile]
+    voters, place = voters[is_counted], place_of(tile[is_counted])
+    row_to_place = np.flatnonzero(counts)
+    rows = np.empty(len(counts), dtype=np.int64)
+    rows[row_to_place] = np.arange(len(row_to_place))
+    # Layers of a row stand between copies of the last and of the first one.
+    shape = len(row_to_place), N_LAYERS + 2
     layer = layer_of(over_lowest[voters], tolerance).astype(np.int64)
-    entry, size = rows[place] * N_LAYERS + layer, np.count_nonzero(counts) * N_LAYERS
-    votes = vote_of(margin[voters], tolerance)
-    sums = np.empty((2, size))
-    sums[0], sums[1] = np.bincount(entry, None, size), np.bincount(entry, votes, size)
-    layers = sums.reshape(2, -1, N_LAYERS)
-    # With the layers above and below.
-    number, total = layers + np.roll(layers, 1, axis=2) + np.roll(layers, -1, axis=2)
+    entry = rows[place] * shape[1] + layer + 1
     settles = has_obstacle[place]
     about, layer = rows[place[settles][:, None] + around], layer[settles][:, None]
-    mean = total[about, layer].sum(axis=1) / number[about, layer].sum(axis=1)
+
+    def total(weights: FloatArray | None) -> FloatArray:
+        """Sum of votes about the voters that settle."""
+        layers = np.bincount(entry, weights, shape[0] * shape[1]).reshape(shape)
+        layers[:, 0], layers[:, -1] = layers[:, -2], layers[:, 1]
+        three = layers[:, :-2] + layers[:, 1:-1]
+        three += layers[:, 2:]
+        sums: FloatArray = three[about, layer].sum(axis=1)
+        return sums
+
+    mean = total(vote_of(margin[voters], tolerance)) / total(None)
     return voters[settles], mean * (tolerance / VOTE_UNITS)
 
 
