@@ -23,7 +23,7 @@ help:
 	@echo 'make colcon    colcon build and colcon test (PYTEST_ARGS=... for some tests)'
 	@echo 'make lint      ruff, mypy and codespell'
 	@echo 'make format    format the code'
-	@echo 'make generate  rewrite the files derived from gp_ground_seg/core/parameters'
+	@echo 'make generate  rewrite the tables of README, config/ and docs/parameters.md'
 	@echo 'make clean     remove the environment and build results'
 
 $(VENV)/.python:
@@ -72,9 +72,11 @@ bench-docs: $(VENV)/.dev
 	$(BIN)/gp-ground-seg bench $(KITTI) --passes 3 --numpy --force \
 		--json docs/performance.json
 	$(BIN)/python docs/stages.py
+	$(BIN)/python docs/generate.py
 
 figures: $(VENV)/.dev
 	$(BIN)/python docs/figures.py $(KITTI) $(ONLY)
+	$(BIN)/python docs/generate.py
 
 docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going docs build/docs

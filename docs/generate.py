@@ -1,5 +1,6 @@
-"""Rewrite config/*.yaml and the tables of parameters in README.md and docs/: `make generate`."""
+"""Rewrite config/*.yaml, the tables of parameters, and README's scores: `make generate`."""
 
+import json
 from pathlib import Path
 
 from gp_ground_seg.core.errors import DataError
@@ -9,7 +10,7 @@ from gp_ground_seg.core.parameters.presets import PRESETS
 
 ROOT = Path(__file__).resolve().parent.parent
 README = 'README.md'
-BEGIN, END = '<!-- parameters:begin -->', '<!-- parameters:end -->'
+PARAMETERS, SCORES = 'parameters', 'scores'
 PAGE_HEAD = """\
 # Parameters
 
@@ -37,25 +38,87 @@ def to_markdown_table(*, basic_only: bool = False) -> str:
     return '\n'.join(lines) + '\n'
 
 
+def marks_of(name: str) -> tuple[str, str]:
+    """Lines between which a table of the README is written."""
+    return f'<!-- {name}:begin -->', f'<!-- {name}:end -->'
+
+
+def with_table(readme: str, name: str, table: str) -> str:
+    """Write a table between its marks; raise DataError if they are not there once, in order."""
+    begin, end = marks_of(name)
+    head, found, rest = readme.partition(begin)
+    _, found_end, tail = rest.partition(end)
+    if not found or not found_end or begin in rest or readme.count(end) > 1:
+        raise DataError(
+            f'must hold the lines {begin} and {end} once each, in this order; '
+            'a table goes between them'
+        )
+    return f'{head}{begin}\n{table}{end}{tail}'
+
+
+def rows_below(page: str, title: str) -> list[list[str]]:
+    """Cells of the rows of the first table below a title of a page."""
+    text = (ROOT / page).read_text(encoding='utf-8')
+    below = text[text.index(f'\n{title}') :].partition('\n|')[2].partition('\n\n')[0]
+    _, _, *rows = f'|{below}'.splitlines()
+    return [[cell.strip() for cell in row.split('|')[1:-1]] for row in rows]
+
+
+GAINS = {
+    'all, GroundGrid convention': 'IoU, vegetation left out',
+    'all, Patchwork convention': 'IoU, low vegetation counted as ground',
+    '40-50 m': 'IoU at 40 to 50 m, vegetation left out',
+}
+OBJECTS = {'vehicles': ('vehicle',), 'persons and cyclists': ('person', 'cyclist')}
+TIMES = {
+    'learning, 2 threads': 'learning, 2 threads',
+    'theta fixed, 2 threads': 'no learning, 2 threads',
+    'learning, numpy': 'learning, without numba',
+}
+
+
+def to_scores_table() -> str:
+    """Write a table of the scores of docs/accuracy.md and the times of docs/performance.json."""
+    page = 'docs/accuracy.md'
+    rows = [['Measure', 'gp_ground_seg', 'Patchwork++', 'Difference (95 % interval)'], ['---'] * 4]
+    gains = {points: cells for points, *cells in rows_below(page, 'IoU minus that of ')}
+    for points, title in GAINS.items():
+        ours, peer, gain, interval = gains[points]
+        rows.append([title, f'{ours} %', f'{peer} %', f'{gain} ({interval})'])
+    *without, _ = rows_below(page, 'IoU without one sequence')
+    left_out, ours, peer, gain = min(without, key=lambda row: float(row[3]))
+    rows.insert(3, [f'the same without sequence {left_out}', f'{ours} %', f'{peer} %', gain])
+    objects = [row for row in rows_below(page, 'Objects: ') if row[1] == 'all']
+    for title, kinds in OBJECTS.items():
+        counts = [map(int, row[6:9]) for row in objects if row[0] in kinds]
+        number, ours, peer = (str(sum(column)) for column in zip(*counts, strict=True))
+        rows.append([f'{title} lost, of {number}', ours, peer, ''])
+    record = json.loads((ROOT / 'docs' / 'performance.json').read_text(encoding='utf-8'))
+    cases = {case['name']: case for case in record['cases']}
+    baseline = f'{record["baseline_ms"]["median"]:.1f} ms'
+    for name, title in TIMES.items():
+        time, ratio = cases[name]['ms']['median'], cases[name]['ratio']['median']
+        cells = f'time per frame, {title}', f'{time:.3g} ms', baseline, f'{ratio:#.2g} times'
+        rows.append([*cells])
+    table = ''.join(f'| {" | ".join(row)} |\n' for row in rows)
+    machine = record['environment']
+    cpu = f'{machine["cpu"]}, {machine["n_cores"]} cores'
+    notes = f'Times are medians ({cpu}); the factor is the median of the ratios frame by frame.'
+    return f'{table}\n{notes}\n'
+
+
 def generated_files(readme: str) -> dict[str, str]:
     """Text of every generated file of a checkout, by its path from the root.
 
-    The table of the basic parameters goes between the markers of `readme`, the text of README.md;
-    raises DataError if the two are not there once each, in order.
+    Of the text of README.md, `readme`, the tables between `marks_of` are replaced; raises
+    DataError as `with_table`.
     """
-    head, begin, rest = readme.partition(BEGIN)
-    _, end, tail = rest.partition(END)
-    if not end or BEGIN in rest or readme.count(END) > 1:
-        raise DataError(
-            f'must hold the lines {BEGIN} and {END} once each, in this order; '
-            'the parameter table goes between them'
-        )
     files = {
         f'config/{preset.name}.yaml': to_yaml(preset.config, preset.title, preset.reasons)
         for preset in PRESETS.values()
     }
-    table = to_markdown_table(basic_only=True)
-    files[README] = f'{head}{begin}\n\n{table}\n{end}{tail}'
+    readme = with_table(readme, PARAMETERS, to_markdown_table(basic_only=True))
+    files[README] = with_table(readme, SCORES, to_scores_table())
     files['docs/parameters.md'] = PAGE_HEAD + to_markdown_table()
     return files
 

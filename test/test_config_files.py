@@ -95,7 +95,8 @@ def test_tables_have_a_row_for_each_parameter():
         symbol = f'`{spec.symbol}`' if spec.symbol else ''
         assert cells[3:] == [spec.unit, symbol, spec.description]
     # README.md has the basic ones, the page all of them.
-    files = generate.generated_files(f'{generate.BEGIN}{generate.END}')
+    marks = [*generate.marks_of(generate.PARAMETERS), *generate.marks_of(generate.SCORES)]
+    files = generate.generated_files(''.join(marks))
     assert files['docs/parameters.md'].endswith(table)
     is_basic = [spec.basic for spec in parameter_specs()]
     basic = [row for row, wanted in zip(rows, is_basic, strict=True) if wanted]
@@ -104,9 +105,10 @@ def test_tables_have_a_row_for_each_parameter():
 
 @pytest.mark.parametrize('marks', ['', 'b', 'e', 'eb', 'bbe', 'bee'])
 def test_the_readme_needs_its_markers(marks):
-    readme = '\n'.join({'b': generate.BEGIN, 'e': generate.END}[mark] for mark in marks)
-    with pytest.raises(DataError, match=f'{generate.BEGIN} and {generate.END} once each'):
-        generate.generated_files(readme)
+    begin, end = generate.marks_of('scores')
+    readme = '\n'.join({'b': begin, 'e': end}[mark] for mark in marks)
+    with pytest.raises(DataError, match=f'{begin} and {end} once each'):
+        generate.with_table(readme, 'scores', '')
 
 
 def test_the_presets_are_those_promised_and_another_is_refused():

@@ -1,6 +1,5 @@
 """The pages hold: samples of their tables and the numbers of their pictures, computed again."""
 
-import json
 import os
 import re
 import shlex
@@ -21,6 +20,7 @@ from gp_ground_seg.lab.plotting.scan import plot_scan_view
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
 
 figures = load_script('docs/figures.py')
+generate = load_script('docs/generate.py')
 
 FIGURES = [
     figure
@@ -146,41 +146,10 @@ def test_the_picture_of_the_demo_is_that_of_the_demo(tmp_path):
     assert f'(scan {number}: {counts}; commit ' in figure.body, f'now {counts}. {ANEW}'
 
 
-def table_below(page, title):
-    """Rows of the first table below a title, as lists of cells."""
-    text = (REPOSITORY / page).read_text(encoding='utf-8')
-    below = text[text.index(f'\n{title}') :].partition('\n|')[2].partition('\n\n')[0]
-    rows = f'|{below}'.splitlines()
-    return [[cell.strip() for cell in row.split('|')[1:-1]] for row in rows]
-
-
-def test_numbers_of_the_readme_are_those_of_the_pages():
-    """Scores are those of docs/accuracy.md, times those that `make bench-docs` measured."""
-    expected = []
-    page = 'docs/accuracy.md'
-    gains = {row[0]: row[1:] for row in table_below(page, 'IoU minus that of ')}
-    for points in ('all, GroundGrid convention', 'all, Patchwork convention', '40-50 m'):
-        iou, peer, gain, interval = gains[points]
-        expected.append([f'{iou} %', f'{peer} %', f'{gain} ({interval})'])
-    lost = {row[0]: row[6:9] for row in table_below(page, 'Objects: ') if row[1] == 'all'}
-    cars, others = (
-        [sum(int(lost[kind][k]) for kind in kinds) for k in range(3)]
-        for kinds in (('vehicle',), ('person', 'cyclist'))
-    )
-    expected += [[str(cars[1]), str(cars[2]), ''], [str(others[1]), str(others[2]), '']]
-    record = json.loads((REPOSITORY / 'docs' / 'performance.json').read_text(encoding='utf-8'))
-    cases = {case['name']: case for case in record['cases']}
-    baseline = f'{record["baseline_ms"]["median"]:.1f} ms'
-    for name in ('learning, 2 threads', 'theta fixed, 2 threads', 'learning, numpy'):
-        time, ratio = cases[name]['ms']['median'], cases[name]['ratio']['median']
-        expected.append([f'{time:.3g} ms', baseline, f'{ratio:#.2g} times'])
-    shown = table_below('README.md', '## How good, how fast')[2:]
-    assert [row[1:] for row in shown] == expected
-    assert shown[3][0] == f'vehicles lost, of {cars[0]}'
-    assert shown[4][0] == f'persons and cyclists lost, of {others[0]}'
-    steps = table_below('docs/algorithm.md', '60 scans of ')
+def test_the_score_of_the_paper_in_readme_is_that_of_the_steps():
+    _, iou, *_ = generate.rows_below('docs/algorithm.md', '60 scans of ')[0]
     text = (REPOSITORY / 'README.md').read_text(encoding='utf-8')
-    assert f'(`--preset paper`) reaches {steps[2][1]} %' in text
+    assert f'(`--preset paper`) reaches {iou} %' in text
 
 
 LINK = re.compile(r'\]\(([^)\s]+)\)')
