@@ -320,7 +320,9 @@ def grow(frame, theta, config, m, z, seed, evidence):
         for height, s, w in zip(z, shown, weight, strict=True)
     ], bool)  # fmt: skip
     in_face, continues = frame.in_face[own], frame.continues_line[own] & ~is_above
-    noise = np.full(len(r), sigma_n)
+    # Candidates within sigma_l_bar of each other show together as much as one.
+    reach = np.exp(theta[m, 3]) if config.label.rule == 'roughness' else 0.0
+    noise = np.array([sigma_n * math.sqrt(sum(abs(r - own) <= reach)) for own in r])
     chosen = np.zeros(len(r), dtype=bool)
     joining, in_doubt = seed & ~is_above, seed & in_face
     height, variance = np.zeros(len(r)), sigma_f**2 + slope_std**2 * r**2
@@ -336,7 +338,7 @@ def grow(frame, theta, config, m, z, seed, evidence):
             follows = np.append(False, continues[1:] & chosen[:-1]) & ~chosen
             joining, in_doubt = in_doubt | follows, in_doubt & ~follows
         for i in np.flatnonzero(joining & in_doubt & (config.label.rule == 'roughness')):
-            noise[i] = doubtful_noise(z[i] - height[i], 1 / precision[i], sigma_n, in_face[i])
+            noise[i] = doubtful_noise(z[i] - height[i], 1 / precision[i], noise[i], in_face[i])
         if not joining.any():
             break
         chosen |= joining
@@ -349,11 +351,11 @@ def grow(frame, theta, config, m, z, seed, evidence):
     return chosen, u, u_star, height, np.sqrt(variance)
 
 
-def doubtful_noise(residual, variance, sigma_n, in_face):
+def doubtful_noise(residual, variance, noise, in_face):
     """Deviation of the noise with which the variance shrinks by the probability of ground."""
     if residual <= 0.0:
-        return sigma_n
-    spread = variance + sigma_n**2
+        return noise
+    spread = variance + noise**2
     ground = norm.pdf(residual, scale=math.sqrt(spread))
     probability = ground / (ground + (4.0 if in_face else 0.25))
     left = variance - probability * variance**2 / spread

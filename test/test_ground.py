@@ -119,6 +119,22 @@ def test_noise_free_candidates_are_interpolated_with_no_uncertainty(backend):
     np.testing.assert_allclose(surface.std[m, :-1], 0.0, atol=1e-4)
 
 
+@pytest.mark.parametrize(('rule', 'n_shown'), [('roughness', 1), ('tolerance', 3)])
+def test_candidates_close_together_show_as_much_as_one(backend, rule, n_shown):
+    config = config_of('constant', slope_std=0.0).replace(
+        **{'length_scale.constant': 50.0, 'label.rule': rule}
+    )
+    sigma_f, sigma_n = np.exp(theta_of(config)[0, :2])
+    for r, n in ([4.0, 4.75, 5.5], n_shown), ([4.0, 8.0, 12.0], 3):
+        r = np.array(r)
+        frame = frame_of(np.column_stack([r, 0.01 * r, np.full(3, -1.73)]), config)
+        surface, *_ = backend.estimate_surface(frame, theta_of(config), config)
+        assert surface.inlier.all() and len(surface.inlier) == 3
+        expected = (1.0 / sigma_f**2 + n / sigma_n**2) ** -0.5
+        std = surface.std[frame.candidates.segment[0]]
+        assert np.nanmin(std) == pytest.approx(expected, rel=0.02)
+
+
 def test_rounding_beside_little_noise_is_no_fault(backend):
     config = config_of('constant', slope_std=2.0).replace(
         **{

@@ -17,7 +17,7 @@ from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.compiled.threads import Part
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
-from gp_ground_seg.core.gp.ground import fits, noise_in_doubt, observed_noise
+from gp_ground_seg.core.gp.ground import fits, noise_among, noise_in_doubt, observed_noise
 from gp_ground_seg.core.gp.kernels import exp_neg, paciorek
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
@@ -59,7 +59,8 @@ class _Columns(NamedTuple):
     height, variance : (size,) float64
         Prediction about the prior mean [m], and its variance [m^2].
     z, noise : (size,) float64
-        Heights of the candidates about the prior mean [m], and variances of their noise [m^2].
+        Heights of the candidates about the prior mean [m], and variances of the noise with which
+        they are observed [m^2].
     aside_height, aside_precision : (size,) float64
         Evidence at the candidates.
     above : (n,) bool
@@ -98,7 +99,8 @@ def grow_surfaces(
     """Inliers and surface of one of `step` segments of a part, into `alone`.
 
     `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none. With
-    `doubts` a candidate that joins in doubt shows less, see `noise_in_doubt`.
+    `doubts` a candidate among others, or that joins in doubt, shows less: see `noise_among` and
+    `noise_in_doubt`.
     """
     offsets, mean, std = frame.candidates.offsets, alone.mean, alone.std
     most = 0
@@ -125,7 +127,8 @@ def grow_surfaces(
         sill, noise = math.exp(theta[m, 0]) ** 2, math.exp(theta[m, 1]) ** 2
         for j in range(len(frame.knots)):
             mean[m, j] = std[m, j] = np.nan
-        n, n_new, has_aside = _begin(frame, m, noise, aside, alone, columns)
+        reach = math.exp(theta[m, 3]) if doubts else 0.0
+        n, n_new, has_aside = _begin(frame, m, noise, reach, aside, alone, columns)
         if n_new == 0 and not has_aside:
             continue
         n_knots = 0
@@ -149,6 +152,7 @@ def _begin(
     frame: Frame,
     m: int,
     noise: float,
+    reach: float,
     aside: FloatArray,
     alone: SegmentSurfaces,
     columns: _Columns,
@@ -160,13 +164,18 @@ def _begin(
     candidates, knots = frame.candidates, frame.knots
     first, stop = candidates.offsets[m], candidates.offsets[m + 1]
     n_new, has_aside = 0, False
+    near = far = first
     for i in range(stop - first):
         c = first + i
-        z = candidates.z[c] - frame.prior_mean
-        columns.z[i], columns.noise[i] = z, noise
+        z, r = candidates.z[c] - frame.prior_mean, candidates.r[c]
+        while r - candidates.r[near] > reach:
+            near += 1
+        while far < stop and candidates.r[far] - r <= reach:
+            far += 1
+        columns.z[i], columns.noise[i] = z, noise_among(far - near, noise)
         height = precision = 0.0
         if aside.shape[1] > 0:
-            j, r = candidates.bin[c], candidates.r[c]
+            j = candidates.bin[c]
             heights, precisions = aside[0, m], aside[1, m]
             height = between_knots(r, knots[j], knots[j + 1], heights[j], heights[j + 1])
             precision = between_knots(r, knots[j], knots[j + 1], precisions[j], precisions[j + 1])
@@ -234,7 +243,9 @@ def _grow(
             height, variance = combined(
                 0.0, columns.variance[i], columns.aside_height[i], columns.aside_precision[i]
             )
-            columns.noise[i] = noise_in_doubt(columns.z[i], height, variance, noise, True)
+            columns.noise[i] = noise_in_doubt(
+                columns.z[i], height, variance, columns.noise[i], True
+            )
     while n_new > 0 or n_inliers == 0:
         for a in range(n_new):
             i = columns.new[a]
@@ -258,7 +269,7 @@ def _grow(
                 follows = fits(columns.z[i], height, variance, noise, growth)
                 if follows and doubts:
                     columns.noise[i] = noise_in_doubt(
-                        columns.z[i], height, variance, noise, in_face[i]
+                        columns.z[i], height, variance, columns.noise[i], in_face[i]
                     )
             if follows:
                 columns.new[n_new] = i

@@ -165,6 +165,17 @@ def observed_noise(noise: Values, prior: Values) -> Values:
 
 
 @shared
+def noise_among(n: Values, noise: Values) -> Values:
+    """Variance of the noise with which one of `n` candidates close together is observed [m^2].
+
+    Close together is within sigma_l_bar, the distance over which the latent process takes the
+    ground for alike. There a bump or a wrong length-scale moves all candidates alike: together
+    they show as much as one. `noise` is the variance of a single candidate, which the gate uses.
+    """
+    return n * noise
+
+
+@shared
 def noise_in_doubt(
     z: Values, height: Values, variance: Values, noise: Values, in_face: Values
 ) -> Values:
@@ -202,26 +213,31 @@ def _grow_batch(
 ) -> None:
     frame, theta, slope_std = model.frame, model.theta[segments], config.observation.slope_std
     layout = Padded.of(segments, frame.candidates.offsets)
+    doubts = config.label.rule == 'roughness'
     sill, noise = np.exp(theta[:, :2]).T[:, :, None] ** 2
+    r = layout.take(frame.candidates.r)
+    reach = np.exp(theta[:, 3, None, None]) if doubts else 0.0
+    is_near = (np.abs(r[:, :, None] - r[:, None, :]) <= reach) & layout.mask[:, None, :]
     is_wanted = np.isfinite(model.knot_length_scale[segments])
     n_knots = int(is_wanted.sum(axis=1).max())
     is_wanted = is_wanted[:, :n_knots]
     knots = np.broadcast_to(frame.knots[:n_knots], is_wanted.shape)
     knot_l = np.where(is_wanted, model.knot_length_scale[segments, :n_knots], 1.0)
     batch = _Batch(
-        np.concatenate([layout.take(frame.candidates.r), knots], axis=1),
+        np.concatenate([r, knots], axis=1),
         np.concatenate([layout.take(model.length_scale, 1.0), knot_l], axis=1),
         sill,
         slope_std,
         layout.take(model.z),
-        np.repeat(noise, layout.mask.shape[1], axis=1),
+        noise,
+        noise_among(is_near.sum(axis=2), noise),
         layout.mask,
         model.seed[layout.place] & layout.mask,
         model.continues_line[layout.place] & layout.mask,
         frame.in_face[layout.place],
         Evidence(layout.take(aside.height), layout.take(aside.precision)),
     )
-    chosen, height, variance = _grow(batch, config.growth, doubts=config.label.rule == 'roughness')
+    chosen, height, variance = _grow(batch, config.growth, doubts=doubts)
     alone.inlier[layout.place[layout.mask]] = chosen[layout.mask]
     is_known = is_wanted & chosen.any(axis=1, keepdims=True)
     n = chosen.shape[1]
@@ -238,7 +254,9 @@ class _Batch(NamedTuple):
     sill: FloatArray  # (S, 1)
     slope_std: float
     z: FloatArray  # (S, n) about the prior mean
-    noise: FloatArray  # (S, n) variance; grows where a candidate joins in doubt
+    gate_noise: FloatArray  # (S, 1) variance of the noise of a candidate
+    # (S, n) variance of that with which it is observed; grows where it joins in doubt
+    noise: FloatArray
     mask: BoolArray  # (S, n)
     seed: BoolArray  # (S, n)
     continues_line: BoolArray  # (S, n)
@@ -277,7 +295,7 @@ def _grow(
         following[:, 1:] &= chosen[active, :-1]
         following[:, 0] = False
         predicted = combined(height[active, :n], variance[active, :n], *aside)
-        joining = fits(z, *predicted, noise, growth) | following
+        joining = fits(z, *predicted, batch.gate_noise[active], growth) | following
         joining &= ~chosen[active] & batch.mask[active]
         # Before anything has joined, only evidence from aside decides.
         joining &= chosen[active].any(axis=1, keepdims=True) | (aside.precision > 0.0)
