@@ -90,15 +90,15 @@ def grow_surfaces(
     theta: FloatArray,
     observation: ObservationConfig,
     growth: GrowthConfig,
-    doubts: bool,
+    odds: float,
     aside: FloatArray,
     step: int,
     alone: SegmentSurfaces,
 ) -> None:
     """Inliers and surface of one of `step` segments of a part, into `alone`.
 
-    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none. With
-    `doubts` a candidate that joins in doubt shows less, see `noise_in_doubt`.
+    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none. A
+    candidate that joins in doubt shows less, see `noise_in_doubt`, unless `odds` are 0.
     """
     offsets, mean, std = frame.candidates.offsets, alone.mean, alone.std
     most = 0
@@ -134,9 +134,7 @@ def grow_surfaces(
             n_knots += 1
         size = (n + n_knots + LANES - 1) & -LANES
         _lay_out(frame, m, n_knots, size, sill, slope, alone, columns)
-        n_inliers = _grow(
-            frame, m, size, n_new, sill, slope, noise, growth, doubts, alone, columns
-        )
+        n_inliers = _grow(frame, m, size, n_new, sill, slope, noise, growth, odds, alone, columns)
         if n_inliers == 0:
             continue
         for j in range(n_knots):
@@ -219,7 +217,7 @@ def _grow(
     slope: float,
     noise: float,
     growth: GrowthConfig,
-    doubts: bool,
+    odds: float,
     alone: SegmentSurfaces,
     columns: _Columns,
 ) -> int:
@@ -230,11 +228,11 @@ def _grow(
     n_inliers = done = 0
     for a in range(n_new):
         i = columns.new[a]
-        if doubts and in_face[i]:
+        if odds > 0.0 and in_face[i]:
             height, variance = combined(
                 0.0, columns.variance[i], columns.aside_height[i], columns.aside_precision[i]
             )
-            columns.noise[i] = noise_in_doubt(columns.z[i], height, variance, noise, True)
+            columns.noise[i] = noise_in_doubt(columns.z[i], height, variance, noise, True, odds)
     while n_new > 0 or n_inliers == 0:
         for a in range(n_new):
             i = columns.new[a]
@@ -256,9 +254,9 @@ def _grow(
                     columns.height[i], columns.variance[i], columns.aside_height[i], precision
                 )
                 follows = fits(columns.z[i], height, variance, noise, growth)
-                if follows and doubts:
+                if follows and odds > 0.0:
                     columns.noise[i] = noise_in_doubt(
-                        columns.z[i], height, variance, noise, in_face[i]
+                        columns.z[i], height, variance, noise, in_face[i], odds
                     )
             if follows:
                 columns.new[n_new] = i
