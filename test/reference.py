@@ -257,13 +257,14 @@ def estimate_surface(frame, theta, config):
     looks_aside = config.surface.look_aside and slope_std > 0.0 and len(frame.knots) > 0
     z, first = frame.candidates.z - frame.prior_mean, frame.candidates.offsets
     seed = (frame.candidates.r <= growth.seed_range) & (abs(z) <= growth.seed_height_tolerance)
+    seed &= z < frame.sensor_height
     nothing = np.zeros((2, n, max(len(frame.knots), 1)))
-    evidence = nothing
+    evidence, odds = nothing, 0.25
     if looks_aside:
-        seed = unlifted(frame, z, seed, np.exp(theta[:, 1]), config)
-        rows = [(m, grow(frame, theta, config, m, z, seed, nothing)) for m in range(0, n, 4)]
+        seed, odds = unlifted(frame, z, seed, np.exp(theta[:, 1]), config)
+        rows = [(m, grow(frame, theta, config, m, z, seed, odds, nothing)) for m in range(0, n, 4)]
         evidence = evidence_beside(dict(rows), theta, frame.knots, slope_std, n)
-    own = {m: grow(frame, theta, config, m, z, seed, evidence) for m in range(n)}
+    own = {m: grow(frame, theta, config, m, z, seed, odds, evidence) for m in range(n)}
     mean, std, knot_u = np.full((3, n, len(frame.knots)), np.nan)
     inlier, u_all = np.zeros(len(z), dtype=bool), np.zeros(len(z))
     if looks_aside:
@@ -284,11 +285,15 @@ def estimate_surface(frame, theta, config):
 
 
 def unlifted(frame, z, seed, sigma_n, config):
-    """Seeds that do not stand higher over another seed than noise and prior slope explain."""
+    """Seeds that do not stand higher over a seed than noise and prior slope explain, and the odds.
+
+    The odds are those of obstacles among the candidates as near as seeds, faces left out.
+    """
     candidates, n = frame.candidates, len(frame.candidates.offsets) - 1
     slope, noise = 2 * config.observation.slope_std, 2 * math.sqrt(2) * sigma_n
-    kept, segment, r = seed.copy(), candidates.segment, frame.knots[candidates.bin]
-    for i in np.flatnonzero(seed):
+    stands, segment, r = np.zeros_like(seed), candidates.segment, frame.knots[candidates.bin]
+    near = candidates.bin <= candidates.bin[seed].max(initial=-1)
+    for i in np.flatnonzero(near):
         lowest = math.inf
         for k in np.flatnonzero(seed):
             steps = abs(segment[i] - segment[k])
@@ -299,11 +304,14 @@ def unlifted(frame, z, seed, sigma_n, config):
                 for at in frame.knots[: candidates.bin[seed].max() + 1]
             )
             lowest = min(lowest, z[k] + slope * min(arcs))
-        kept[i] = z[i] <= lowest + noise[segment[i]]
-    return kept
+        stands[i] = z[i] > lowest + noise[segment[i]]
+    n_ground, n_standing = (
+        int((near & ~frame.in_face & is_it).sum()) for is_it in (~stands, stands)
+    )
+    return seed & ~stands, max((n_standing + 1) / (n_ground + 4), 0.25)
 
 
-def grow(frame, theta, config, m, z, seed, evidence):
+def grow(frame, theta, config, m, z, seed, odds, evidence):
     """Inliers of a segment, log length-scales, height and deviation at the knots."""
     growth, slope_std = config.growth, config.observation.slope_std
     own = slice(*frame.candidates.offsets[m : m + 2])
@@ -338,7 +346,8 @@ def grow(frame, theta, config, m, z, seed, evidence):
             follows = np.append(False, continues[1:] & chosen[:-1]) & ~chosen
             joining, in_doubt = in_doubt | follows, in_doubt & ~follows
         for i in np.flatnonzero(joining & in_doubt & (config.label.rule == 'roughness')):
-            noise[i] = doubtful_noise(z[i] - height[i], 1 / precision[i], noise[i], in_face[i])
+            own_odds = max(odds, 4.0) if in_face[i] else odds
+            noise[i] = doubtful_noise(z[i] - height[i], 1 / precision[i], noise[i], own_odds)
         if not joining.any():
             break
         chosen |= joining
@@ -351,13 +360,13 @@ def grow(frame, theta, config, m, z, seed, evidence):
     return chosen, u, u_star, height, np.sqrt(variance)
 
 
-def doubtful_noise(residual, variance, noise, in_face):
+def doubtful_noise(residual, variance, noise, odds):
     """Deviation of the noise with which the variance shrinks by the probability of ground."""
     if residual <= 0.0:
         return noise
     spread = variance + noise**2
     ground = norm.pdf(residual, scale=math.sqrt(spread))
-    probability = ground / (ground + (4.0 if in_face else 0.25))
+    probability = ground / (ground + odds)
     left = variance - probability * variance**2 / spread
     return math.sqrt(1 / (1 / left - 1 / variance))
 

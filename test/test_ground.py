@@ -13,7 +13,8 @@ from scipy.stats import norm
 from gp_ground_seg import Config
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.frame import Frame
-from gp_ground_seg.core.gp.ground import ODDS, ODDS_IN_FACE, noise_in_doubt
+from gp_ground_seg.core.gp.evidence import ODDS, seeds
+from gp_ground_seg.core.gp.ground import ODDS_IN_FACE, noise_in_doubt
 from gp_ground_seg.core.gp.learning import given_theta, in_rows
 
 
@@ -60,6 +61,7 @@ def surface_by_the_loops(seed):
     theta += np.where(np.arange(6) < 5, 0.3, 1.0) * rng.normal(size=theta.shape)
     if rng.random() < 0.3:
         frame = frame._replace(knots=frame.knots[:0])
+    frame = frame._replace(sensor_height=rng.choice([0.1, 0.3, np.inf]))
     arguments = frame, theta, config
     return arguments, reference.estimate_surface(*arguments)
 
@@ -258,13 +260,64 @@ def test_what_stands_over_the_ground_beside_it_starts_nothing(backend):
     assert alone.inlier.all()
 
 
-@given(st.floats(0.01, 1.0), st.floats(1e-3, 0.35), st.floats(1e-3, 0.2), st.booleans())
-def test_what_joins_in_doubt_shows_as_much_as_it_is_likely_ground(residual, std, noise, in_face):
+@given(
+    st.floats(0.01, 1.0),
+    st.floats(1e-3, 0.35),
+    st.floats(1e-3, 0.2),
+    st.booleans(),
+    st.floats(ODDS, 10.0),
+)
+def test_what_joins_in_doubt_shows_as_much_as_it_is_likely_ground(
+    residual, std, noise, in_face, odds
+):
     variance, noise = std**2, noise**2
-    found = noise_in_doubt(residual, 0.0, variance, noise, in_face)
+    found = noise_in_doubt(residual, 0.0, variance, noise, in_face, odds)
     density = norm.pdf(residual, scale=np.sqrt(variance + noise))
-    likely = density / (density + (ODDS_IN_FACE if in_face else ODDS))
+    likely = density / (density + (max(odds, ODDS_IN_FACE) if in_face else odds))
     taken, certain = (variance**2 / (variance + n) for n in (found, noise))
     assert taken == pytest.approx(likely * certain, rel=1e-6, abs=1e-12)
     # Obstacles stand above the ground.
-    assert noise_in_doubt(-residual, 0.0, variance, noise, in_face) == noise
+    assert noise_in_doubt(-residual, 0.0, variance, noise, in_face, odds) == noise
+
+
+def frame_of_a_sill(n_walls):
+    """Frame of level ground, 90 of its segments with a sill at 8 m, and some with a wall."""
+    config = config_of('constant', seed_height_tolerance=0.3, look_aside=True)
+    segment, r = (a.ravel() for a in np.meshgrid(np.arange(180), np.arange(3.0, 20.0)))
+    z = np.where(segment < 90, np.where(r == 8.0, 0.4, 0.0), 0.0)
+    z[(segment >= 180 - n_walls) & (r >= 8.0)] = 1.5
+    # The sill lies between two rings, and hides what is behind it.
+    seen = (segment >= 90) | (r < 5.0) | (r == 8.0)
+    azimuth = (segment + 0.5) * 2.0 * np.pi / 180.0
+    xyz = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z - 1.73])[seen]
+    return frame_of(xyz, config), config
+
+
+@pytest.mark.parametrize('n_walls', [0, 20, 70])
+def test_the_odds_of_an_obstacle_are_those_of_the_frame(n_walls):
+    frame, config = frame_of_a_sill(n_walls)
+    stands = frame.candidates.z > -1.0
+    odds = seeds(frame, theta_of(config), config)[1]
+    assert odds == pytest.approx(max(stands.sum() / (~stands).sum(), ODDS), rel=0.02)
+
+
+def test_among_many_obstacles_sills_lift_less(backend):
+    def lifted(n_walls):
+        frame, config = frame_of_a_sill(n_walls)
+        config = config.replace(**{'observation.sigma_f': 0.35})
+        surface = backend.estimate_surface(frame, theta_of(config), config)[0]
+        return surface.mean[135, np.searchsorted(frame.knots, 8.0)] + 1.73
+
+    assert lifted(85) < 0.7 * lifted(0)
+
+
+def test_what_is_as_high_as_the_sensor_is_no_seed(backend):
+    frame, config = frame_of_a_sill(0)
+    config = config.replace(**{'growth.seed_height_tolerance': 0.45, 'surface.look_aside': False})
+    on_sill, lifts = frame.candidates.z > -1.5, []
+    for sensor_height, is_seed in ((np.inf, True), (0.5, True), (0.3, False)):
+        low = frame._replace(sensor_height=sensor_height)
+        assert (seeds(low, theta_of(config), config)[0] == (is_seed | ~on_sill)).all()
+        surface, *_ = backend.estimate_surface(low, theta_of(config), config)
+        lifts.append(surface.mean[135, np.searchsorted(frame.knots, 8.0)] + 1.73)
+    assert lifts[0] == lifts[1] > lifts[2] + 0.05

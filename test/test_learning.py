@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import reference
 from conftest import fewer, hilly_scan
+from test_ground import frame_of_a_sill
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.backend import NumpyBackend
@@ -12,6 +13,7 @@ from gp_ground_seg.core.frame import Frame, Inliers
 from gp_ground_seg.core.gp.learning import (
     ThetaSpace,
     every_segment,
+    first_theta,
     given_theta,
     in_rows,
     maximise,
@@ -69,6 +71,14 @@ def learn(inliers, space, start, use_priors=True, max_evaluations=200, out_of_ti
     learned = maximise(objective, space, start, len(inliers.r), use_priors=use_priors, **budget)
     assert learned.n_evaluations == len(values)
     return learned, values
+
+
+def test_what_is_as_high_as_the_sensor_does_not_say_where_learning_starts():
+    frame, config = frame_of_a_sill(60)
+    given = given_theta(config)[0]
+    # The ground is level: only walls of 1.5 m say more than the values given.
+    high, low = (first_theta(frame._replace(sensor_height=h), config)[0] for h in (2.0, 0.5))
+    assert low == given < high
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2])

@@ -144,7 +144,9 @@ def test_the_origin_may_be_at_any_height(sensor, scene, height):
     own = SEGMENTER.segment(points)
     assert own.pose.height_estimated and own.warnings == ()
     for lift in (height, height - 0.1, height + 0.33, height + 3.0, height - 15.0):
-        found = SEGMENTER.segment(moved(points, lift))
+        # What is as high as a low sensor is no seed: its place must be known.
+        origin = (0.0, 0.0, lift if height < 1.0 else 0.0)
+        found = SEGMENTER.segment(moved(points, lift), origin=origin)
         assert found.pose.height_estimated and found.warnings == ()
         assert found.pose.height == pytest.approx(own.pose.height - lift, abs=1e-4)
         assert (found.label != own.label).mean() < 0.002
@@ -204,6 +206,22 @@ def test_low_robots(scene, height):
     points = scan_of(scene, SMALL_VLP, height).points
     for lift in (0.0, height):
         assert pose_of(moved(points, lift)).height == pytest.approx(height - lift, abs=0.04)
+
+
+def test_a_low_sensor_is_told_from_the_origin_of_a_vehicle():
+    config, highest = Config().sensor, 0.45
+    for height, lift, is_low in ((0.15, 0.0, True), (1.73, 0.0, False), (1.73, 1.53, False)):
+        pose = pose_of(moved(scan_of('kerb', SMALL_VLP, height).points, lift))
+        found = pose.low_sensor(config, highest)
+        assert found == (pose.height if is_low else math.inf)
+    # The sensor is where the origin is given to be.
+    low, given = (
+        scan_of('kerb', SMALL_VLP, 0.15).points,
+        dataclasses.replace(config, origin_z=0.15),
+    )
+    pose = pose_of(moved(low, 0.15), origin_z=0.15)
+    assert pose.low_sensor(given, highest) == pytest.approx(0.15, abs=0.04)
+    assert pose.low_sensor(given, 0.1) == math.inf
 
 
 @pytest.mark.parametrize('degrees', [35, 40, 45])

@@ -121,7 +121,8 @@ class GroundSegmenter:
         #    occluded base are left out. Heights are relative to the sensor: the prior mean is
         #    the ground below it.
         extracted = backend.extract_lines(scan.candidates, faces, config)
-        frame = Frame(*extracted, scan.grid.edges, prior_mean=-pose.height)
+        sensor_height = pose.low_sensor(sensor, config.growth.seed_height_tolerance)
+        frame = Frame(*extracted, scan.grid.edges, -pose.height, sensor_height)
         timer.mark('lines')
         # 5. Observation process (height over range) and latent process (its log length-scale):
         #    hyper-parameters theta, in log space, then inliers and surface.

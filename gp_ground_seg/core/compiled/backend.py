@@ -194,15 +194,15 @@ class NumbaBackend:
             *take('surfaces', (2, *shape), np.float64),
         )
         looks_aside = looks_aside_in(frame, config)
-        doubts = config.label.rule == 'roughness'
         max_slope = CLEARLY * slope_std if looks_aside else -1.0
         shown, beside = take('aside', (2, 2, *shape), np.float64)
-        evidence.find_seeds(frame, theta, growth, max_slope, shown[0], alone.seed)
+        odds = evidence.find_seeds(frame, theta, growth, max_slope, shown[0], alone.seed)
+        odds = odds if config.label.rule == 'roughness' else 0.0
 
         def grow(aside: FloatArray, step: int) -> None:
             n_parts = self.workers.n_parts(len(theta) // step, threads.SEGMENTS_TO_GROW)
             grow_surfaces = ground.grow_surfaces, n_parts, frame, theta, observation
-            self.workers.run(*grow_surfaces, growth, doubts, aside, step, alone)
+            self.workers.run(*grow_surfaces, growth, odds, aside, step, alone)
 
         def find_evidence() -> None:
             evidence.find_evidence(alone.mean, alone.std, theta, knots, slope_std, shown, beside)

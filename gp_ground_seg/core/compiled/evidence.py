@@ -9,8 +9,10 @@ import numpy as np
 from gp_ground_seg.core.compiled.ground import SegmentSurfaces
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame
 from gp_ground_seg.core.gp.evidence import (
+    ODDS,
     combined_surface,
     is_low_and_near,
+    odds_of,
     shown_by,
     stands_on,
 )
@@ -27,21 +29,21 @@ def find_seeds(
     max_slope: float,
     table: FloatArray,
     seed: BoolArray,
-) -> None:
+) -> float:
     """Do what `seeds` of the twin does, into `seed`; `max_slope` < 0: segments do not look aside.
 
-    `table` (M, K) is overwritten.
+    Returns the odds of obstacles; `table` (M, K) is overwritten.
     """
     candidates, knots = frame.candidates, frame.knots
     n_segments = len(candidates.offsets) - 1
     n_bins = 0
     for i in range(len(seed)):
         z = candidates.z[i] - frame.prior_mean
-        seed[i] = is_low_and_near(candidates.r[i], z, growth)
+        seed[i] = is_low_and_near(candidates.r[i], z, frame.sensor_height, growth)
         if seed[i]:
             n_bins = max(n_bins, candidates.bin[i] + 1)
     if max_slope < 0.0 or n_bins == 0:
-        return
+        return ODDS
     for m in range(n_segments):
         for j in range(n_bins):
             table[m, j] = np.inf
@@ -58,11 +60,18 @@ def find_seeds(
     for m in range(2 * n_segments - 2, -1, -1):
         rise_from(table[m % n_segments], table[(m + 1) % n_segments], rise)
     rise_along(table, n_bins, max_slope, knots)
+    n_standing = n_near = 0
     for m in range(n_segments):
+        sigma_n = math.exp(theta[m, 1])
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
-            if seed[i]:
+            if candidates.bin[i] < n_bins:
                 z = candidates.z[i] - frame.prior_mean
-                seed[i] = not stands_on(z, table[m, candidates.bin[i]], theta[m, 1], growth)
+                stands = stands_on(z, table[m, candidates.bin[i]], sigma_n)
+                seed[i] &= not stands
+                n_standing += stands and not frame.in_face[i]
+                n_near += not frame.in_face[i]
+    odds: float = odds_of(n_standing, n_near)
+    return odds
 
 
 @jit()

@@ -91,16 +91,16 @@ def grow_surfaces(
     theta: FloatArray,
     observation: ObservationConfig,
     growth: GrowthConfig,
-    doubts: bool,
+    odds: float,
     aside: FloatArray,
     step: int,
     alone: SegmentSurfaces,
 ) -> None:
     """Inliers and surface of one of `step` segments of a part, into `alone`.
 
-    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none. With
-    `doubts` a candidate among others, or that joins in doubt, shows less: see `noise_among` and
-    `noise_in_doubt`.
+    `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none.
+    Unless `odds` are 0, a candidate among others, or that joins in doubt, shows less: see
+    `noise_among` and `noise_in_doubt`.
     """
     offsets, mean, std = frame.candidates.offsets, alone.mean, alone.std
     most = 0
@@ -127,7 +127,7 @@ def grow_surfaces(
         sill, noise = math.exp(theta[m, 0]) ** 2, math.exp(theta[m, 1]) ** 2
         for j in range(len(frame.knots)):
             mean[m, j] = std[m, j] = np.nan
-        reach = math.exp(theta[m, 3]) if doubts else 0.0
+        reach = math.exp(theta[m, 3]) if odds > 0.0 else 0.0
         n, n_new, has_aside = _begin(frame, m, noise, reach, aside, alone, columns)
         if n_new == 0 and not has_aside:
             continue
@@ -137,9 +137,7 @@ def grow_surfaces(
             n_knots += 1
         size = (n + n_knots + LANES - 1) & -LANES
         _lay_out(frame, m, n_knots, size, sill, slope, alone, columns)
-        n_inliers = _grow(
-            frame, m, size, n_new, sill, slope, noise, growth, doubts, alone, columns
-        )
+        n_inliers = _grow(frame, m, size, n_new, sill, slope, noise, growth, odds, alone, columns)
         if n_inliers == 0:
             continue
         for j in range(n_knots):
@@ -228,7 +226,7 @@ def _grow(
     slope: float,
     noise: float,
     growth: GrowthConfig,
-    doubts: bool,
+    odds: float,
     alone: SegmentSurfaces,
     columns: _Columns,
 ) -> int:
@@ -239,12 +237,12 @@ def _grow(
     n_inliers = done = 0
     for a in range(n_new):
         i = columns.new[a]
-        if doubts and in_face[i]:
+        if odds > 0.0 and in_face[i]:
             height, variance = combined(
                 0.0, columns.variance[i], columns.aside_height[i], columns.aside_precision[i]
             )
             columns.noise[i] = noise_in_doubt(
-                columns.z[i], height, variance, columns.noise[i], True
+                columns.z[i], height, variance, columns.noise[i], True, odds
             )
     while n_new > 0 or n_inliers == 0:
         for a in range(n_new):
@@ -267,9 +265,9 @@ def _grow(
                     columns.height[i], columns.variance[i], columns.aside_height[i], precision
                 )
                 follows = fits(columns.z[i], height, variance, noise, growth)
-                if follows and doubts:
+                if follows and odds > 0.0:
                     columns.noise[i] = noise_in_doubt(
-                        columns.z[i], height, variance, columns.noise[i], in_face[i]
+                        columns.z[i], height, variance, columns.noise[i], in_face[i], odds
                     )
             if follows:
                 columns.new[n_new] = i

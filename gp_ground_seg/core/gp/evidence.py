@@ -29,6 +29,10 @@ LEAST_PRECISION = 1e-3
 """Precision below which a surface shows nothing [1/m^2]: rounding is left of the prior."""
 
 
+ODDS = 0.25
+"""Least obstacles for each ground among the candidates."""
+
+
 class Evidence(NamedTuple):
     """Height of the ground at places of segments, by the segments beside them.
 
@@ -111,16 +115,31 @@ def between_knots(r: Values, near: Values, far: Values, a: Values, b: Values) ->
 
 
 @shared
-def is_low_and_near(r: Values, z: Values, growth: GrowthConfig) -> Values:
-    """Whether candidates at ranges and heights may be seeds [m]."""
-    return (r <= growth.seed_range) & (np.abs(z) <= growth.seed_height_tolerance)
+def is_low_and_near(r: Values, z: Values, sensor_height: float, growth: GrowthConfig) -> Values:
+    """Whether candidates at ranges and heights may be seeds [m].
+
+    Rays that do not point down to the candidate meet objects: of a sensor that is lower than the
+    tolerance of seeds, what is as high as itself is no seed.
+    """
+    is_low = (np.abs(z) <= growth.seed_height_tolerance) & (z < sensor_height)
+    return (r <= growth.seed_range) & is_low
 
 
 @shared
-def stands_on(z: Values, highest: Values, log_sigma_n: Values, growth: GrowthConfig) -> Values:
-    """Whether a seed is higher than the `highest` ground and the noise of two seeds explain."""
-    noise = CLEARLY * math.sqrt(2.0) * np.exp(log_sigma_n)
-    return z > highest + noise
+def stands_on(z: Values, highest: Values, sigma_n: Values) -> Values:
+    """Whether a candidate is higher than the `highest` ground and the noise of two explain."""
+    return z > highest + CLEARLY * math.sqrt(2.0) * sigma_n
+
+
+@shared
+def odds_of(n_standing: Values, n_candidates: Values) -> Values:
+    """Obstacles for each ground among the candidates of a frame.
+
+    `n_standing` of `n_candidates` near the sensor stand on something. Others may, so the odds are
+    at least `ODDS`; and as if these had been seen once before, few candidates prove little.
+    """
+    seen = (n_standing + 1.0) / (n_candidates - n_standing + 1.0 / ODDS)
+    return np.maximum(seen, ODDS)
 
 
 def looks_aside_in(frame: Frame, config: Config) -> bool:
@@ -129,20 +148,24 @@ def looks_aside_in(frame: Frame, config: Config) -> bool:
     return wanted and len(frame.knots) > 0
 
 
-def seeds(frame: Frame, theta: FloatArray, config: Config) -> BoolArray:
-    """Candidates that start the inlier set, (C,) bool.
+def seeds(frame: Frame, theta: FloatArray, config: Config) -> tuple[BoolArray, float]:
+    """Candidates that start the inlier set, (C,) bool, and the odds of obstacles, see `odds_of`.
 
-    They are low and near (``growth.seed_height_tolerance``, ``growth.seed_range``). One that
-    stands higher over another than noise and prior slope explain stands on something.
+    Seeds are low and near (``growth.seed_height_tolerance``, ``growth.seed_range``). What stands
+    higher over one of these than noise and prior slope explain stands on something. Candidates
+    as near as the farthest of them and not in vertical faces count for the odds.
     """
     candidates, growth = frame.candidates, config.growth
     z = candidates.z - frame.prior_mean
-    seed: BoolArray = is_low_and_near(candidates.r, z, growth)
-    if looks_aside_in(frame, config):
-        max_slope = CLEARLY * config.observation.slope_std
-        highest = highest_ground(frame, z, seed, max_slope)
-        seed &= ~stands_on(z, highest, theta[candidates.segment, 1], growth)
-    return seed
+    seed: BoolArray = is_low_and_near(candidates.r, z, frame.sensor_height, growth)
+    if not looks_aside_in(frame, config):
+        return seed, ODDS
+    max_slope = CLEARLY * config.observation.slope_std
+    highest = highest_ground(frame, z, seed, max_slope)
+    stands = stands_on(z, highest, np.exp(theta[candidates.segment, 1]))
+    counts = np.isfinite(highest) & ~frame.in_face
+    n_standing, n_candidates = np.count_nonzero(stands & counts), np.count_nonzero(counts)
+    return seed & ~stands, float(odds_of(n_standing, n_candidates))
 
 
 def highest_ground(frame: Frame, z: FloatArray, seed: BoolArray, max_slope: float) -> FloatArray:

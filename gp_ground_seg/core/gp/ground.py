@@ -77,14 +77,16 @@ def estimate_surface(
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
     alone = SegmentSurfaces.empty(len(z), knot_u.shape)
+    seed, odds = seeds(frame, theta, config)
     model = _Model(
         frame,
         theta,
         z,
         np.exp(u),
         np.exp(knot_u),
-        seeds(frame, theta, config),
+        seed,
         frame.continues_line,
+        odds if config.label.rule == 'roughness' else 0.0,
     )
     everywhere = np.arange(len(theta))
     looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
@@ -106,8 +108,8 @@ def estimate_surface(
 
 OBSTACLE_DEPTH = 1.0
 """Height over which the lowest returns of obstacles are spread [m]."""
-ODDS, ODDS_IN_FACE = 0.25, 4.0
-"""Obstacles for each ground among the candidates, and among those in vertical faces."""
+ODDS_IN_FACE = 4.0
+"""Least obstacles for each ground among the candidates in vertical faces."""
 MOST_DOUBT = 30.0
 """Logarithm of odds that are as good as infinite."""
 
@@ -142,6 +144,7 @@ class _Model(NamedTuple):
     knot_length_scale: FloatArray  # (M, K) at the knots [m]
     seed: BoolArray  # (C,) candidates that start the inlier set
     continues_line: BoolArray  # (C,) candidates that join if the one before them has joined
+    odds: float  # obstacles for each ground among the candidates; 0: none joins in doubt
 
 
 @shared
@@ -177,19 +180,21 @@ def noise_among(n: Values, noise: Values) -> Values:
 
 @shared
 def noise_in_doubt(
-    z: Values, height: Values, variance: Values, noise: Values, in_face: Values
+    z: Values, height: Values, variance: Values, noise: Values, in_face: Values, odds: Values
 ) -> Values:
     """Variance of the noise of a candidate that joins, which may be an obstacle [m^2].
 
     As for the labels, ground and obstacle are compared: the heights of the one are distributed by
-    the prediction, those of the other evenly over `OBSTACLE_DEPTH`. With this noise the variance
+    the prediction, those of the other evenly over `OBSTACLE_DEPTH`; `odds` are the obstacles for
+    each ground in the frame. With this noise the variance
     of the prediction shrinks by the probability of ground times what certain ground would take
     from it: a candidate in doubt shows little (probabilistic data association). Obstacles stand
     above the ground, so there is no doubt below.
     """
     residual, spread = z - height, variance + noise
-    odds = choose(in_face, ODDS_IN_FACE, ODDS) * np.sqrt(2.0 * np.pi * spread) / OBSTACLE_DEPTH
-    doubt = odds * np.exp(np.minimum(0.5 * residual * residual / spread, MOST_DOUBT))
+    odds = choose(in_face, np.maximum(odds, ODDS_IN_FACE), odds)
+    density = np.sqrt(2.0 * np.pi * spread) / OBSTACLE_DEPTH
+    doubt = odds * density * np.exp(np.minimum(0.5 * residual * residual / spread, MOST_DOUBT))
     return noise + choose(residual > 0.0, doubt * spread, 0.0)
 
 
@@ -213,10 +218,9 @@ def _grow_batch(
 ) -> None:
     frame, theta, slope_std = model.frame, model.theta[segments], config.observation.slope_std
     layout = Padded.of(segments, frame.candidates.offsets)
-    doubts = config.label.rule == 'roughness'
     sill, noise = np.exp(theta[:, :2]).T[:, :, None] ** 2
     r = layout.take(frame.candidates.r)
-    reach = np.exp(theta[:, 3, None, None]) if doubts else 0.0
+    reach = np.exp(theta[:, 3, None, None]) if model.odds > 0.0 else 0.0
     is_near = (np.abs(r[:, :, None] - r[:, None, :]) <= reach) & layout.mask[:, None, :]
     is_wanted = np.isfinite(model.knot_length_scale[segments])
     n_knots = int(is_wanted.sum(axis=1).max())
@@ -237,7 +241,7 @@ def _grow_batch(
         frame.in_face[layout.place],
         Evidence(layout.take(aside.height), layout.take(aside.precision)),
     )
-    chosen, height, variance = _grow(batch, config.growth, doubts=doubts)
+    chosen, height, variance = _grow(batch, config.growth, model.odds)
     alone.inlier[layout.place[layout.mask]] = chosen[layout.mask]
     is_known = is_wanted & chosen.any(axis=1, keepdims=True)
     n = chosen.shape[1]
@@ -266,13 +270,13 @@ class _Batch(NamedTuple):
 
 @np.errstate(over='ignore')  # the square of 1e200 m: no fit
 def _grow(
-    batch: _Batch, growth: GrowthConfig, *, doubts: bool
+    batch: _Batch, growth: GrowthConfig, odds: float
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Inliers of each segment, (S, n), and height and variance at all places, (S, N).
 
-    With `doubts` the noise of the inliers is set, see `noise_in_doubt`. Candidates that join in a
-    round are conditioned on at once: their rows of ``L^-1 K(inliers, all places)`` are appended to
-    those of the rounds before, and nothing is factored twice.
+    The noise of the inliers is set, see `noise_in_doubt`, unless `odds` are 0. Candidates that
+    join in a round are conditioned on at once: their rows of ``L^-1 K(inliers, all places)`` are
+    appended to those of the rounds before, and nothing is factored twice.
     """
     n_segments, n = batch.seed.shape
     chosen = np.zeros_like(batch.seed)
@@ -280,10 +284,9 @@ def _grow(
     # Segments that still grow, and the whitened rows of their inliers.
     active, joining = np.arange(n_segments), batch.seed
     whitened = np.empty((n_segments, 0, variance.shape[1]))
-    if doubts:
-        doubtful = noise_in_doubt(
-            batch.z, *combined(0.0, variance[:, :n], *batch.aside), batch.noise, True
-        )
+    if odds > 0.0:
+        predicted = combined(0.0, variance[:, :n], *batch.aside)
+        doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, True, odds)
         batch.noise[:] = np.where(joining & batch.in_face, doubtful, batch.noise)
     while len(active):
         chosen[active] |= joining
@@ -299,8 +302,8 @@ def _grow(
         joining &= ~chosen[active] & batch.mask[active]
         # Before anything has joined, only evidence from aside decides.
         joining &= chosen[active].any(axis=1, keepdims=True) | (aside.precision > 0.0)
-        if doubts:
-            doubtful = noise_in_doubt(z, *predicted, noise, batch.in_face[active])
+        if odds > 0.0:
+            doubtful = noise_in_doubt(z, *predicted, noise, batch.in_face[active], odds)
             batch.noise[active] = np.where(joining & ~following, doubtful, noise)
         grows = joining.any(axis=1)
         active, joining, whitened = active[grows], joining[grows], whitened[grows]
