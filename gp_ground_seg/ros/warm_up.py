@@ -15,7 +15,9 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.segmenter import warm_up
 from gp_ground_seg.ros.start_stop import child_command
 
-FOLLOWS = 'segmenting with numpy until the compiled code is there; to compile takes a minute'
+FOLLOWS = (
+    'segmenting with numpy until the compiled code is there: a second, or 10 to 40 s to compile it'
+)
 CHANGED = 'segmenting with numba now'
 STAYS = 'segmenting with numpy from now on'
 JOIN_TIMEOUT = 0.5  # longest wait for the thread [s]
@@ -76,7 +78,7 @@ class BackendLoader:
         """Stop; free a backend that was not taken.
 
         A thread that compiles in this process, as where no folder can keep the code, does so for
-        a minute: nobody waits for it, and it frees what it makes.
+        10 to 40 s: nobody waits for it, and it frees what it makes.
         """
         self.stop()
         if self._thread is not None:
