@@ -128,6 +128,14 @@ def test_a_folder_of_several_formats(tmp_path, expected, capsys):
     np.testing.assert_array_equal(found['column_5'], POINTS[:, 0])
 
 
+def test_output_beside_its_scan_is_no_scan(tmp_path, caplog):
+    for name in ('a', 'a_ground', 'a_ground_obstacles', 'b_ground', 'c_surface'):
+        np.save(tmp_path / f'{name}.npy', POINTS)
+    caplog.set_level('INFO', 'gp_ground_seg')
+    assert [one.name for one in list_inputs(tmp_path)] == ['a', 'b_ground', 'c_surface']
+    assert caplog.messages == ['output of earlier runs left out: 2 of 5 files']
+
+
 def test_clouds_of_a_bag(tmp_path):
     bag = write_bag(tmp_path)
     inputs = list_inputs(bag)
@@ -204,6 +212,7 @@ def test_pictures_of_a_frame_of_a_bag_or_folder(tmp_path, capsys):
         (['far.npy', '-o', 'x.pcd'], 'm (millimetres? a scan is in'),
         (['none.npy', '-o', 'x.pcd'], 'none of 200 points is finite; --force'),
         (['empty.npy', '-o', 'x.pcd'], 'no points in it; --force'),
+        (['names.csv', '-o', 'x.pcd'], 'names.csv: no points in it, only a line of names'),
     ],
 )  # fmt: skip
 def test_refused(tmp_path, monkeypatch, capsys, words, message):
@@ -219,6 +228,7 @@ def test_refused(tmp_path, monkeypatch, capsys, words, message):
     np.save('far.npy', 1000.0 * POINTS)
     np.save('none.npy', np.full((200, 3), np.nan))
     np.save('empty.npy', np.zeros((0, 3)))
+    (tmp_path / 'names.csv').write_text('a,b,c\n# no more\n\n')
     write_bag(tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
     assert run('segment', *words) == 2

@@ -48,6 +48,22 @@ def test_a_misspelt_command_is_one_line(word, hint, capsys):
     assert error_line(capsys) == f'{word}: no such command; {hint}'
 
 
+@pytest.mark.parametrize(
+    ('line', 'hint'),
+    [
+        ('play BAG --foo', 'gp-ground-seg play --help lists what it takes'),
+        ('node -r points:=/x', 'put --ros-args before -r'),
+        ('node --params-file my.yaml', 'put --ros-args before --params-file'),
+        ('config dump -p a:=1', 'gp-ground-seg config --help lists what it takes'),
+    ],
+)
+def test_words_that_a_command_does_not_take(line, hint, capsys):
+    words = line.split()
+    assert cli.main(words) == 2
+    said = error_line(capsys)
+    assert said.startswith(f'{words[0]}: unrecognized arguments: ') and said.endswith(f'; {hint}')
+
+
 @pytest.mark.parametrize('name', sorted(cli.REMOVED.keys() - cli.COMMANDS.keys()))
 def test_a_removed_command_names_what_has_taken_its_place(name, capsys):
     assert cli.main([name, 'a.bin', '--json', 'a.json']) == 2

@@ -281,7 +281,11 @@ def test_label_files_are_replaced_only_with_force(segmenter, tmp_path, capsys):
     ('given', 'words', 'message'),
     [
         ('missing.bin', [], r'missing\.bin: no such file or folder'),
-        ('empty', [], r'empty: no \.bin, .*, \.xyz file in it, and not a rosbag2 folder$'),
+        (
+            'empty',
+            [],
+            r'empty: no \.bin, .*, \.xyz file in it \(\.txt and \.csv by name only\), and',
+        ),
         ('root', ['--format', 'ply'], r'--format: whole data sets give \.label files and bags'),
         ('unfinished', [], r'no metadata\.yaml in it\); bag files in it.*: x_0\.mcap'),
         ('notes.md', [], r'not a scan or bag; accepted are \.bin'),

@@ -163,7 +163,8 @@ def test_differences_by_hand():
     assert (lost['peer'], lost['given']) == (0.0, 2 / 8)
     within = [rows[f'heights within {k} std, ideally {n} [%]'] for k, n in ((1, 68.3), (2, 95.4))]
     assert (within[0]['peer'], within[1]['given']) == pytest.approx((0.75, 0.75))
-    assert 'bootstrap over 2 sequences' in table.title and 'Given minus peer, x' in table.title
+    assert 'bootstrap over 2 sequences' in table.title and 'Given minus x; ' in table.title
+    assert re.search(r'measure +given +x +difference', table.text())
     assert '92.00   85.00       +7.00  +5.00 to +9.00' in table.text()
     assert table.notes == ['points with two labels: 15.00%; most in 08/0 (30.00%), 00/0 (0.00%)']
     alone = difference_table(ours.of('00'), other.of('00'))
@@ -236,7 +237,8 @@ def test_scans_without_labels_have_points_that_differ_and_time_only(strict, tmp_
         (['ROOT', '--against', 'paper', '--peer', 'patchworkpp'], '--against: compares with p'),
         *((['SCAN', '--against', 'paper', option, '2'], f'{option}: ')
           for option in ('--sequences', '--frame-step', '--worst', '--workers')),
-        (['SCAN'], 'no sequences/*/velodyne folder below it'),
+        (['SCAN'], 'no sequences/*/velodyne folder below it (SemanticKITTI layout); scans without '
+         'labels need --against'),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line(words, message, root, capsys):

@@ -175,6 +175,9 @@ def test_check_says_everything_at_once(tmp_path, capsys):
     n = len(parameter_specs())
     assert out.startswith(f'{good}: good for --config, but not for the node, which needs the form')
     assert out.endswith(f'; 2 of {n} parameters given, 2 differ from the defaults\n')
+    good.write_text('sensor: {height: 2}\n')
+    assert run('config', 'check', good) == 0
+    assert capsys.readouterr().out.endswith(', 1 differs from the defaults\n')
     for text, problem in (
         ('grid: {r_min: 20.0, r_max: 10.0}', 'grid.r_min = 20: must be below grid.r_max = 10'),
         ('grid: [', 'not valid YAML'),
@@ -185,6 +188,15 @@ def test_check_says_everything_at_once(tmp_path, capsys):
         assert problem in found
     (found,) = file_problems(tmp_path / 'missing.yaml')
     assert 'No such file' in found
+
+
+@pytest.mark.parametrize('words', [('check',), ('dump', '--config')])
+def test_a_file_without_parameters_gets_a_note(tmp_path, capsys, words):
+    path = tmp_path / 'my.yaml'
+    path.write_text('# nothing\n')
+    assert run('config', *words, path) == 0
+    note = f'gp-ground-seg: note: {path}: no parameters of the segmentation in it\n'
+    assert capsys.readouterr().err == note
 
 
 def test_diff_of_files_and_presets(tmp_path, capsys):

@@ -10,7 +10,7 @@ from gp_ground_seg.core.errors import shown
 from gp_ground_seg.core.parameters import export
 from gp_ground_seg.core.parameters.config import Config, parameter_specs
 from gp_ground_seg.core.parameters.presets import find_preset
-from gp_ground_seg.core.parameters.schema import read_parameters
+from gp_ground_seg.core.parameters.schema import NO_VALUES, read_parameters
 
 EXAMPLES = """\
   gp-ground-seg config dump > my.yaml            every parameter, explained, with its default
@@ -76,6 +76,8 @@ def run_check(arguments: argparse.Namespace) -> int:
             print(*lines, sep='\n', file=sys.stderr)
             continue
         file = read_parameters(path)
+        if not file.values:
+            options.note(f'{path}: {NO_VALUES}')
         n_changed = len(export.differences(Config(), Config().replace(**file.values)))
         given = f'{len(file.values)} of {len(parameter_specs())} parameters given'
         use = ''
@@ -84,7 +86,8 @@ def run_check(arguments: argparse.Namespace) -> int:
             use += 'gp-ground-seg config dump --config FILE > ros.yaml'
         elif not file.is_ours:
             use = f' for a node named {shown(file.node)} only'
-        print(f'{shown(path)}: good{use}; {given}, {n_changed} differ from the defaults')
+        differ = 'differs' if n_changed == 1 else 'differ'
+        print(f'{shown(path)}: good{use}; {given}, {n_changed} {differ} from the defaults')
     return code
 
 

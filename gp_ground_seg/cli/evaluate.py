@@ -141,8 +141,15 @@ def _items(
 ) -> tuple[Any, Callable[[Any], KnownScan]]:
     """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
     root = as_path(arguments.root)
-    if arguments.against is None or any(root.glob('sequences/*/velodyne')):
+    if any(root.glob('sequences/*/velodyne')):
         return frames_from_options(arguments), load_kitti
+    if not root.exists():
+        raise DataError(f'{root}: no such file or folder')
+    if arguments.against is None:
+        raise DataError(
+            f'{root}: no sequences/*/velodyne folder below it (SemanticKITTI layout); scans '
+            'without labels need --against'
+        )
     for name in ('sequences', 'frame_step', 'worst', 'workers', 'scheduler'):
         if getattr(arguments, name) is not None:
             option = name.replace('_', '-')

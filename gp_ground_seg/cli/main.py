@@ -21,6 +21,8 @@ from gp_ground_seg import __version__
 from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
 
 ROS_ARGS = '--ros-args'
+OF_ROS = ('-r', '--remap', '-p', '--param', '--params-file', '--log-level')
+"""Options that ROS reads, behind `ROS_ARGS`."""
 COLLECT_AFTER = 50_000
 """New objects after which Python looks for garbage: compiling makes a million that stay, and with
 the usual 700 a tenth of its time goes into the search."""
@@ -123,9 +125,15 @@ def _parse(words: list[str]) -> argparse.Namespace:
         hint = f'did you mean {close[0]}?' if close else '--help lists them'
         raise GroundSegError(f'{command}: no such command; {hint}')
     parser = build_parser(command if command in COMMANDS else None)
-    arguments = parser.parse_args(words[:n_before])
+    arguments, unknown = parser.parse_known_args(words[:n_before])
+    accepts_ros_args = getattr(arguments, 'accepts_ros_args', False)
+    if unknown:
+        hint = f'gp-ground-seg {command} --help lists what it takes'
+        if accepts_ros_args and unknown[0] in OF_ROS:
+            hint = f'put {ROS_ARGS} before {unknown[0]}'
+        raise GroundSegError(f'{command}: unrecognized arguments: {" ".join(unknown)}; {hint}')
     arguments.ros_args = words[n_before:]
-    if arguments.ros_args and not getattr(arguments, 'accepts_ros_args', False):
+    if arguments.ros_args and not accepts_ros_args:
         parser.error(f'{ROS_ARGS}: this command takes none')
     return arguments
 

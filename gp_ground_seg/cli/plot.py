@@ -172,8 +172,9 @@ def _segment_numbers(arguments: argparse.Namespace, config: Config) -> list[int]
     if arguments.azimuth is None:
         chosen: list[int] = arguments.segment
         return chosen
-    if not math.isfinite(arguments.azimuth):
-        raise DataError(f'--azimuth {arguments.azimuth}: must be a number of degrees')
+    if not abs(arguments.azimuth) <= 360.0:
+        wanted = 'a number of degrees, -360 to 360'
+        raise DataError(f'--azimuth {arguments.azimuth:g}: must be {wanted}')
     return [segment_at(math.radians(arguments.azimuth), config.grid.n_segments)]
 
 

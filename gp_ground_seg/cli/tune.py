@@ -7,11 +7,10 @@ import importlib.util
 from pathlib import Path
 
 from gp_ground_seg.cli import options
-from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.export import to_yaml
 from gp_ground_seg.core.parameters.schema import NODE_NAME
-from gp_ground_seg.data.atomic_output import staged_file
+from gp_ground_seg.data.atomic_output import check_writable, staged_file
 from gp_ground_seg.lab.viewers.html_page import open_server
 from gp_ground_seg.lab.viewers.tuner import Tuner, tunable
 
@@ -62,8 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Serve the page."""
     inputs, config = options.list_clouds(arguments), options.read_config(arguments)
     output, is_ours = Path(arguments.output), arguments.force
-    if output.exists() and not is_ours:
-        raise DataError(f'{output}: exists already; --force replaces it')
+    check_writable(output, force=is_ours)
 
     def write(values: Config) -> str:
         nonlocal is_ours

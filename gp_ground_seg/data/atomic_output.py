@@ -8,6 +8,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from pathlib import Path
 
 from gp_ground_seg.core.errors import DataError, reason_of
@@ -28,13 +29,13 @@ def staged_file(target: str | Path, *, force: bool) -> AbstractContextManager[Pa
     The block raises DataError if the target exists and `force` is false, is not a regular file,
     or cannot be written.
     """
+    return _staged(target, partial(_check_file, target, force), os.replace)
 
-    def check(path: Path) -> None:
-        if path.exists() and not path.is_file():
-            raise DataError(f'{target}: is not a file, not replaced')
-        _refuse_existing(path, target, force)
 
-    return _staged(target, check, os.replace)
+def check_writable(target: str | Path, *, force: bool) -> None:
+    """Raise what `staged_file` would, for a file that is written later; write nothing."""
+    with _staged(target, partial(_check_file, target, force), lambda _product, _path: None):
+        pass
 
 
 def staged_bag_folder(target: str | Path, *, force: bool) -> AbstractContextManager[Path]:
@@ -90,6 +91,12 @@ def staged_files(folder: str | Path, names: Sequence[str], *, force: bool) -> It
     with _staged(folder, check, place) as product:
         product.mkdir()
         yield product
+
+
+def _check_file(target: str | Path, force: bool, path: Path) -> None:
+    if path.exists() and not path.is_file():
+        raise DataError(f'{target}: is not a file, not replaced')
+    _refuse_existing(path, target, force)
 
 
 def _refuse_existing(path: Path, shown: str | Path, force: bool) -> None:

@@ -81,14 +81,17 @@ def _table_name(arrays: Columns) -> str:
 def _read_text(data: bytes) -> tuple[Fields, None]:
     """Read lines of x, y, z, ..., split by spaces, commas or semicolons; names may be first."""
     text = data.decode('utf-8-sig')
-    lines = (line.strip() for line in io.StringIO(text))
-    first = next((line for line in lines if line and not line.startswith(COMMENTS)), '')
+    stripped = (line.strip() for line in io.StringIO(text))
+    lines = (line for line in stripped if line and not line.startswith(COMMENTS))
+    first = next(lines, '')
     delimiter = next((mark for mark in ',;' if mark in first), None)
     words = [word.strip(' "') for word in first.split(delimiter)]
     check_points(text.count('\n'), len(words), len(data))
     if not first:
         raise PointCloudError('no line of numbers in it')
     before = 0 if all(map(_is_number, words)) else text.partition(first)[0].count('\n') + 1
+    if before and next(lines, None) is None:
+        raise PointCloudError('no points in it, only a line of names')
     table = np.loadtxt(
         io.StringIO(text), delimiter=delimiter, comments=COMMENTS, skiprows=before, ndmin=2
     )

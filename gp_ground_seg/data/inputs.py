@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -23,7 +25,11 @@ _SCAN_FOLDERS = ('.', 'velodyne', 'velodyne_points/data', 'samples/LIDAR_TOP')
 _DRIVES = ('sequences/*/velodyne', 'data_3d_raw/*/velodyne_points', '*/velodyne_points')
 
 # In a folder, a text may be of times or a calibration.
-_IN_FOLDERS = tuple(suffix for suffix in SUFFIXES if suffix not in ('.txt', '.csv'))
+_BY_NAME = ('.txt', '.csv')
+_IN_FOLDERS = tuple(suffix for suffix in SUFFIXES if suffix not in _BY_NAME)
+_OUTPUT = re.compile(r'_ground(_ground|_obstacles|_surface)?$')
+"""What `segment` adds to the name of a scan whose output goes beside it."""
+_LOGGER = logging.getLogger('gp_ground_seg')
 
 
 @dataclass(frozen=True)
@@ -150,14 +156,28 @@ def _find_files(source: AnyPath) -> Sequence[AnyPath]:
     for name in _SCAN_FOLDERS:
         folder = source / name
         if files := sorted((file for file in folder.glob('*') if _is_scan(file)), key=str):
-            return files
+            return _without_output(files)
     drives = sorted({str(path.parent) for pattern in _DRIVES for path in source.glob(pattern)})
     hint = ''
     if drives:
         names = ', '.join(Path(drive).name for drive in drives)
         hint = f'; give one of its sequences ({names}), as in {drives[0]}'
-    accepted = ', '.join(_IN_FOLDERS)
-    raise DataError(f'{source}: no {accepted} file in it, and not a rosbag2 folder{hint}')
+    accepted = f'{", ".join(_IN_FOLDERS)} file in it ({" and ".join(_BY_NAME)} by name only)'
+    raise DataError(f'{source}: no {accepted}, and not a rosbag2 folder{hint}')
+
+
+def _without_output(files: Sequence[AnyPath]) -> Sequence[AnyPath]:
+    """Leave out files that are named as the output of another one."""
+    stems = {_stem(file) for file in files}
+    kept = [file for file in files if not _is_output(_stem(file), stems)]
+    if n_left_out := len(files) - len(kept):
+        _LOGGER.info('output of earlier runs left out: %d of %d files', n_left_out, len(files))
+    return kept
+
+
+def _is_output(stem: str, stems: Set[str]) -> bool:
+    source = _OUTPUT.sub('', stem)
+    return source != stem and source in stems
 
 
 def _stem(path: AnyPath) -> str:

@@ -264,7 +264,8 @@ def main(
                 node = make_node(stop)
             _spin(node, stop)
         except GroundSegError as error:
-            sys.stderr.write(f'{NODE_NAME}: error: {shown(error)}\n')
+            problem = start_stop.with_file(str(error), words)
+            sys.stderr.write(f'{NODE_NAME}: error: {shown(problem)}\n')
             return 2
         finally:
             if node is not None:

@@ -10,6 +10,7 @@ import contextlib
 import importlib
 import itertools
 import os
+import re
 import shutil
 import signal
 import sys
@@ -26,10 +27,17 @@ from gp_ground_seg.core.errors import (
     GroundSegError,
     MissingDependencyError,
     install_hint,
+    reason_of,
 )
+from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.schema import ROS_PARAMETERS_KEY, read_yaml
 
 HIGHEST_DOMAIN = 232
+_RULES = {
+    'remap': 'FROM:=TO, as in -r points:=/lidar',
+    'parameter': 'NAME:=VALUE, as in -p sensor.height:=1.2',
+}
+"""What rcl calls a rule, and its form."""
 LOG_FOLDER = 'set ROS_LOG_DIR to a folder that the node may write to'
 ROS_WHEELS = "'ros-jazzy-rclpy[fastrtps]' ros-jazzy-common-interfaces ros-jazzy-rmw-fastrtps-cpp"
 
@@ -70,7 +78,10 @@ def start_errors() -> Iterator[None]:
     except (ParameterException, NameValidationException, RuntimeError, ValueError) as error:
         if isinstance(error, GroundSegError):
             raise
-        text = ' '.join(str(error).split())
+        # Without the places in the source code of rcl.
+        text = re.sub(r', at \S+\.c:\d+', '', ' '.join(str(error).split()))
+        if rule := re.search(r"Couldn't parse (remap|parameter) .*rule: ('.*')\. Error", text):
+            raise ConfigError(f'{rule[2]}: must be {_RULES[rule[1]]}') from error
         kind = type(error).__name__
         is_of_log = text.startswith(('failed to initialize logging', 'Failed opening file'))
         text += f': {LOG_FOLDER}' if is_of_log else ''
@@ -84,18 +95,33 @@ def _check_surroundings(words: Sequence[str]) -> None:
         raise ConfigError(f'ROS_DOMAIN_ID = {domain}: must be an integer in [0, {HIGHEST_DOMAIN}]')
     if not any(os.environ.get(name) for name in ('ROS_LOG_DIR', 'ROS_HOME', 'HOME')):
         raise ConfigError(f'no folder for logs, as HOME is not set: {LOG_FOLDER}')
-    for path in (path for flag, path in itertools.pairwise(words) if flag == '--params-file'):
+    for path in _parameter_files(words):
         try:
             document = read_yaml(path)
-        except OSError:
-            continue  # rcl says it
+        except OSError as error:
+            raise ConfigError(f'{path}: {reason_of(error)}') from error
         except (UnicodeDecodeError, ConfigError) as error:
             raise ConfigError(f'{path}: {error}') from error
         if document and not _is_of_ros(document):
-            raise ConfigError(
-                f'{path}: no {ROS_PARAMETERS_KEY}; bare groups are good for --config; for the '
-                'node: gp-ground-seg config dump --config FILE > ros.yaml'
-            )
+            hint = 'gp-ground-seg config dump writes a file of the form of ROS'
+            if not file_problems(path):
+                hint = (
+                    'bare groups are good for --config; for the node: gp-ground-seg config dump '
+                )
+                hint += '--config FILE > ros.yaml'
+            raise ConfigError(f'{path}: no {ROS_PARAMETERS_KEY}; {hint}')
+
+
+def _parameter_files(words: Sequence[str]) -> list[str]:
+    return [path for flag, path in itertools.pairwise(words) if flag == '--params-file']
+
+
+def with_file(problem: str, words: Sequence[str]) -> str:
+    """Return a problem of the parameters, after the last of the files `words` that has it."""
+    for path in reversed(_parameter_files(words)):
+        if problem in file_problems(path):
+            return f'{path}: {problem}'
+    return problem
 
 
 def _is_of_ros(document: object) -> bool:

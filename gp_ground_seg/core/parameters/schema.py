@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
+import logging
 import numbers
 import re
 from collections import Counter
@@ -31,6 +32,8 @@ MAX_FILE_BYTES = 1 << 18  # twenty times the largest of config/
 MAX_VALUES = 500  # of a file: five times those there are
 MAX_DIGITS = 100  # of an integer; Python cannot print one of more than 4,300
 MAX_DEPTH = 20  # of values in each other: a parameter has five
+NO_VALUES = 'no parameters of the segmentation in it'
+_LOGGER = logging.getLogger('gp_ground_seg')
 OF_EVERY_NODE = ('use_sim_time', 'start_type_description_service')
 """Parameters that every ROS node has."""
 
@@ -190,6 +193,8 @@ class ParameterGroups:
                 raise ConfigError(
                     f'parameters of node {file.node}; must be of {ROS_NODE_KEY} or {NODE_NAME}'
                 )
+            if not file.values:
+                _LOGGER.warning('%s: %s', path, NO_VALUES)
             return (base or cls()).replace(**file.values)
         except ConfigError as error:
             raise ConfigError(f'{path}: {error}') from error

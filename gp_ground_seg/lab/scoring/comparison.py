@@ -192,12 +192,12 @@ def difference_table(ours: MethodScore, other: MethodScore) -> Table:
             [
                 (Column('measure'), column.title),
                 (replace(column, title='given', key=''), value),
-                (replace(column, title='peer', key=''), peer),
+                (replace(column, title=other.title, key='peer'), peer),
                 (signed, value - peer),
                 (INTERVAL, None if interval is None else interval.text(column)),
             ]
         )
-    title = f'Given minus peer, {other.title}; {interval_note(ours)}'
+    title = f'Given minus {other.title}; {interval_note(ours)}'
     return Table(rows, title, [_changed_note(other)])
 
 
