@@ -196,7 +196,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
             assert shares[f'{prefix}{title}'] == pytest.approx(expected)
     notes = report.tables['objects'].notes
     assert notes[0] == 'refused: hedge: z does not point up'
-    assert notes[1].startswith(f'objects lost: {sensor} {scene} {row['lost_vehicles']} of')
+    assert notes[1].startswith(f'objects lost: {sensor} {scene} {row["lost_vehicles"]} of')
     with pytest.raises(PointCloudError, match='refused: hedge'):
         scenes.score_objects(frames[1:], FIXED, with_peer=False)
 
