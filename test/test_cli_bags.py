@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -156,10 +157,14 @@ def test_bag_of_ros_1_on_another_topic_for_a_best_effort_subscriber(tmp_path, ca
     write_ros1_bag(bag, 2)
     with listening('/points', qos=BEST_EFFORT) as listener:
         remap = '/kitti/velo/pointcloud:=/points'
-        assert play(bag, '--quiet', '--ros-args', '-r', remap) == 0
-        wait_for(lambda: len(listener.clouds['/points']) == 2, 'last cloud')
-    (first, _) = recorded(bag, '/kitti/velo/pointcloud')
-    assert listener.clouds['/points'][0] == first
+        (first, _) = recorded(bag, '/kitti/velo/pointcloud')
+        # DDS may lose a cloud for a best-effort subscriber: the first of any of the plays will do.
+        for _ in range(5):
+            assert play(bag, '--quiet', '--ros-args', '-r', remap) == 0
+            time.sleep(0.5)
+            if first in listener.clouds['/points']:
+                break
+    assert first in listener.clouds['/points']
     assert decode_cloud(first).header.frame_id == 'velo_link'
 
 
