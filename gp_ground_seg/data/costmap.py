@@ -32,6 +32,8 @@ FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Values of cells, those of ``nav_msgs/OccupancyGrid``."""
 SMALLEST_VOXEL = 1e-3  # below it every point is kept: no sensor is that precise [m]
 
+# Plain integers: comparing with an enumeration is five times slower.
+_GROUND, _OBSTACLE = int(Label.GROUND), int(Label.OBSTACLE)
 _VOXELS = 1 << 20  # of an axis on each side of 0; points beyond belong to the last
 _SLOT_BITS = 18
 _ROWS = 32  # rows of cells at a time: their arrays stay in the cache
@@ -84,7 +86,7 @@ class SegmentedCloud:
     @cached_property
     def is_ground(self) -> BoolArray:
         """Ground points within the range, (N,) bool."""
-        return self._within_range(self.segmentation.label == Label.GROUND)
+        return self._within_range(self.segmentation.label == _GROUND)
 
     @cached_property
     def is_obstacle(self) -> BoolArray:
@@ -93,7 +95,7 @@ class SegmentedCloud:
         Heights are over the surface that the labels follow from. A point without a height, where
         there is no model, may stand in the way: it is one of them.
         """
-        chosen = self._within_range(self.segmentation.label == Label.OBSTACLE)
+        chosen = self._within_range(self.segmentation.label == _OBSTACLE)
         output, height = self.config.output, self.segmentation.labelled.height
         if output.min_height > -ANY_HEIGHT:
             chosen &= ~(height < output.min_height)

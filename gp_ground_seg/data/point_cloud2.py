@@ -104,19 +104,29 @@ def write_xyz(cloud: CloudMessage, xyz: npt.NDArray[np.floating]) -> None:
                 column[...] = values.reshape(column.shape)
 
 
-def select_rows(cloud: CloudMessage, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
-    """Every byte of the points where `mask`, (height * width,) bool, is true, in one row."""
+def select_rows(
+    cloud: CloudMessage,
+    mask: npt.NDArray[np.bool_],
+    make_data: Callable[[int], Any] = lambda size: np.empty(size, np.uint8),
+) -> Any:
+    """Every byte of the points where `mask`, (height * width,) bool, is true, in one row.
+
+    `make_data` makes what holds so many bytes.
+    """
     size = cloud.height * cloud.width
     if mask.shape != (size,) or mask.dtype != np.bool_:
         raise PointCloudError(
             f'mask of shape {mask.shape} and type {mask.dtype}: '
             f'must be bool of shape ({size},), one per point'
         )
-    if size == 0:
-        return np.empty(0, dtype=np.uint8)
-    # Whole points are 10 times as fast to move as bytes.
-    points = _view(cloud, f'V{cloud.point_step}').reshape(-1)
-    return points.take(np.flatnonzero(mask)).view(np.uint8)
+    index = np.flatnonzero(mask)
+    data = make_data(len(index) * cloud.point_step)
+    if len(index):
+        # Whole points are 10 times as fast to move as bytes. In any other mode numpy fills an
+        # array of its own first.
+        points = _view(cloud, f'V{cloud.point_step}').reshape(-1)
+        points.take(index, out=np.frombuffer(data, points.dtype), mode='clip')
+    return data
 
 
 def append_columns(
@@ -222,23 +232,27 @@ def _view(cloud: CloudMessage, code: npt.DTypeLike, offset: int = 0) -> npt.NDAr
 def select_points(
     cloud: Cloud,
     mask: npt.NDArray[np.bool_],
-    as_data: Callable[[npt.NDArray[np.uint8]], Any] = lambda data: data,
+    make_data: Callable[[int], Any] = lambda size: np.empty(size, np.uint8),
 ) -> Cloud:
-    """Message of the points where `mask` is true: same header, same fields, one row.
+    """Message of the points where `mask` is true, finite ones: same header and fields, one row.
 
-    ``is_dense`` says whether the kept points are all finite. `as_data` makes the bytes what the
-    message wants. Raises as `select_rows` and `read_xyz` do.
+    `make_data` makes what the message holds so many bytes in. Raises as `select_rows` does.
     """
     kept = copy(cloud)
-    kept.data = as_data(select_rows(cloud, mask))
+    kept.data = select_rows(cloud, mask, make_data)
     kept.height, kept.width = 1, int(np.count_nonzero(mask))
     kept.row_step = kept.width * cloud.point_step
-    kept.is_dense = bool(np.isfinite(read_xyz(kept)).all())
+    kept.is_dense = True
     return kept
 
 
+def message_bytes(size: int) -> array[int]:
+    """Return `size` bytes as the one type that rclpy takes without a look at each."""
+    return array('B', [0]) * size
+
+
 def message_data(values: npt.NDArray[Any], typecode: str = 'B') -> array[Any]:
-    """Return the bytes of an array as the one type that rclpy takes without a look at each."""
+    """Return the bytes of an array as `message_bytes` does."""
     data = array(typecode)
     data.frombytes(np.ascontiguousarray(values).data.cast('B') if values.size else b'')
     return data

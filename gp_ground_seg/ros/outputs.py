@@ -31,6 +31,7 @@ from gp_ground_seg.data.costmap import (
 )
 from gp_ground_seg.data.point_cloud2 import (
     append_columns,
+    message_bytes,
     message_data,
     read_xyz,
     select_points,
@@ -156,7 +157,7 @@ def _colours(rgb: FloatArray) -> list[ColorRGBA]:
 
 def _selected(segmented: SegmentedCloud, chosen: BoolArray, voxel: float) -> PointCloud2:
     """Return the `chosen` points, thinned to one in each `voxel` [m], in the output frame."""
-    message = select_points(segmented.cloud, segmented.thinned(chosen, voxel), message_data)
+    message = select_points(segmented.cloud, segmented.thinned(chosen, voxel), message_bytes)
     if segmented.placement is not None:
         rotation, translation = segmented.placement
         message.header = _header(segmented)
