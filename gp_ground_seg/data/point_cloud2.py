@@ -16,6 +16,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.recfunctions import repack_fields
+from numpy.lib.stride_tricks import as_strided
 
 from gp_ground_seg.core.errors import PointCloudError, in_one_line
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
@@ -48,16 +49,23 @@ Cloud = TypeVar('Cloud', bound=CloudMessage)
 
 
 def read_xyz(cloud: CloudMessage) -> npt.NDArray[np.float32] | npt.NDArray[np.float64]:
-    """Coordinates of every point, row by row, a copy in native byte order, (height * width, 3).
+    """Coordinates of every point, row by row, in native byte order, (height * width, 3).
 
-    float64 if any of the three is FLOAT64. Only x, y and z are checked. A cloud of one row never
-    uses ``row_step``, which must not exceed its data; bytes after the last point are ignored. A
-    cloud without points needs no fields. Raises PointCloudError if the layout cannot hold what it
-    claims.
+    They may lie in the data of the cloud, read-only. float64 if any of the three is FLOAT64. Only
+    x, y and z are checked. A cloud of one row never uses ``row_step``, which must not exceed its
+    data; bytes after the last point are ignored. A cloud without points needs no fields. Raises
+    PointCloudError if the layout cannot hold what it claims.
     """
     if cloud.height * cloud.width == 0:
         return np.empty((0, 3), dtype=np.float32)
     columns = list(_views(cloud, 'xyz', _FLOATS).values())
+    first, size = columns[0], columns[0].dtype.itemsize
+    x, y, z = (column.ctypes.data for column in columns)
+    is_one_type = first.dtype.isnative and all(column.dtype == first.dtype for column in columns)
+    if is_one_type and y - x == z - y == size:
+        # Side by side, as most sensors write them.
+        shape, strides = (*first.shape, 3), (*first.strides, size)
+        return as_strided(first, shape, strides, writeable=False).reshape(-1, 3)
     wide = any(column.dtype.itemsize == 8 for column in columns)
     # Arbitrary bytes may be a signalling NaN, one more value that is not finite.
     with np.errstate(invalid='ignore'):
