@@ -102,6 +102,7 @@ def test_parameters_and_environment_are_recorded():
     line = report.machine_line({**environment, 'n_cores': 1, 'commit': f'{"a" * 40}-dirty'})
     assert ', 1 core; Python' in line and 'no-such-package absent' in line
     assert line.endswith(f'commit {"a" * 12} (changed since)')
+    assert 'commit' not in report.machine_line({**environment, 'commit': None})
 
 
 def git(folder, *words):

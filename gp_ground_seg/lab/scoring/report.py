@@ -189,11 +189,11 @@ def machine_line(environment: Mapping[str, Any], fit: FitReport | None = None) -
             threads = f'workers with {n_workers} threads in all'
         cores = f'{threads} on {cores}, {fit.backend}'
     versions = ', '.join(f'{name} {v or "absent"}' for name, v in environment['versions'].items())
-    commit, _, dirty = (environment['commit'] or 'unknown').partition('-')
-    return (
-        f'machine: {environment["cpu"]}, {cores}; Python {environment["python"]}, {versions}, '
-        f'commit {commit[:12]}{" (changed since)" if dirty else ""}'
-    )
+    machine = f'machine: {environment["cpu"]}, {cores}; Python {environment["python"]}, {versions}'
+    if not environment['commit']:
+        return machine  # installed, not run from a checkout
+    commit, _, dirty = environment['commit'].partition('-')
+    return f'{machine}, commit {commit[:12]}{" (changed since)" if dirty else ""}'
 
 
 def changed_parameters(config: Config) -> dict[str, ParameterValue]:
