@@ -7,10 +7,14 @@ import numpy as np
 from gp_ground_seg.core.frame import Values
 from gp_ground_seg.core.jit import shared
 
+LARGEST_EXPONENT = 300.0
+"""Largest x of which ``exp(-x)`` is computed: 5e-131, as good as nothing. Numbers below 1e-308
+lose digits, which takes tens of times as long; even the square of this is none of them."""
+
 
 def exp_neg(x: Values) -> Values:
     """``exp(-x)``; of numbers in compiled code, see `gp_ground_seg.core.compiled.numerics`."""
-    return np.exp(-x)
+    return np.exp(-np.minimum(x, LARGEST_EXPONENT))
 
 
 @shared
