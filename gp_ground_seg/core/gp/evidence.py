@@ -263,9 +263,8 @@ def _of_nearest(
     height, deviation = np.roll(height, side, axis=0), np.roll(deviation, side, axis=0) + step
     for reach in _reaches(len(height)):
         farther = np.roll(deviation, side * reach, axis=0) + reach * step
-        is_better = farther < deviation
-        height = np.where(is_better, np.roll(height, side * reach, axis=0), height)
-        deviation = np.where(is_better, farther, deviation)
+        np.copyto(height, np.roll(height, side * reach, axis=0), where=farther < deviation)
+        np.minimum(deviation, farther, out=deviation)
     return height, deviation
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from gp_ground_seg.core.frame import (
     BoolArray,
+    Candidates,
     FloatArray,
     Frame,
     GroundSurface,
@@ -27,7 +28,13 @@ from gp_ground_seg.core.gp.evidence import (
 )
 from gp_ground_seg.core.gp.kernels import paciorek, prior_variance
 from gp_ground_seg.core.gp.latent import given_log_length_scales, latent_log_length_scales
-from gp_ground_seg.core.gp.linalg import Padded, add_noise, batches, single_threaded_blas
+from gp_ground_seg.core.gp.linalg import (
+    Padded,
+    add_noise,
+    batches,
+    inverse_of_lower,
+    single_threaded_blas,
+)
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GrowthConfig
 
@@ -76,17 +83,16 @@ def estimate_surface(
     else:
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
+    noise = np.exp(2.0 * theta[candidates.segment, 1])
     alone = SegmentSurfaces.empty(len(z), knot_u.shape)
     seed, odds = seeds(frame, theta, config)
+    if config.label.rule == 'roughness':
+        n_near = _count_near(candidates, np.exp(theta[candidates.segment, 3]))
+        noise = noise_among(n_near, noise)
+    else:
+        odds = 0.0
     model = _Model(
-        frame,
-        theta,
-        z,
-        np.exp(u),
-        np.exp(knot_u),
-        seed,
-        frame.continues_line,
-        odds if config.label.rule == 'roughness' else 0.0,
+        frame, theta, z, noise, np.exp(u), np.exp(knot_u), seed, frame.continues_line, odds
     )
     everywhere = np.arange(len(theta))
     looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
@@ -140,6 +146,8 @@ class _Model(NamedTuple):
     frame: Frame
     theta: FloatArray  # (M, T)
     z: FloatArray  # (C,) about the prior mean [m]
+    # (C,) variance of the noise with which a candidate is observed, unless it joins in doubt
+    noise: FloatArray
     length_scale: FloatArray  # (C,) at the candidates [m]
     knot_length_scale: FloatArray  # (M, K) at the knots [m]
     seed: BoolArray  # (C,) candidates that start the inlier set
@@ -176,6 +184,19 @@ def noise_among(n: Values, noise: Values) -> Values:
     they show as much as one. `noise` is the variance of a single candidate, which the gate uses.
     """
     return n * noise
+
+
+def _count_near(candidates: Candidates, reach: FloatArray) -> IntArray:
+    """Count the candidates of its segment within `reach` (C,) [m] of each, itself as well."""
+    r, segment = candidates.r, candidates.segment
+    number = np.ones(len(r), dtype=np.int64)
+    for n in range(1, len(r)):
+        is_near = (r[n:] - r[:-n] <= reach[n:]) & (segment[n:] == segment[:-n])
+        if not is_near.any():
+            break
+        number[n:] += is_near
+        number[:-n] += is_near
+    return number
 
 
 @shared
@@ -220,8 +241,6 @@ def _grow_batch(
     layout = Padded.of(segments, frame.candidates.offsets)
     sill, noise = np.exp(theta[:, :2]).T[:, :, None] ** 2
     r = layout.take(frame.candidates.r)
-    reach = np.exp(theta[:, 3, None, None]) if model.odds > 0.0 else 0.0
-    is_near = (np.abs(r[:, :, None] - r[:, None, :]) <= reach) & layout.mask[:, None, :]
     is_wanted = np.isfinite(model.knot_length_scale[segments])
     n_knots = int(is_wanted.sum(axis=1).max())
     is_wanted = is_wanted[:, :n_knots]
@@ -234,7 +253,7 @@ def _grow_batch(
         slope_std,
         layout.take(model.z),
         noise,
-        noise_among(is_near.sum(axis=2), noise),
+        layout.take(model.noise),
         layout.mask,
         model.seed[layout.place] & layout.mask,
         model.continues_line[layout.place] & layout.mask,
@@ -289,24 +308,21 @@ def _grow(
         doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, True, odds)
         batch.noise[:] = np.where(joining & batch.in_face, doubtful, batch.noise)
     while len(active):
-        chosen[active] |= joining
+        chosen |= joining
         if joining.any():
-            whitened = _condition(batch, active, joining, whitened, height, variance)
-        z, noise = batch.z[active], batch.noise[active]
-        aside = Evidence(*(values[active] for values in batch.aside))
-        following = batch.continues_line[active]
-        following[:, 1:] &= chosen[active, :-1]
-        following[:, 0] = False
-        predicted = combined(height[active, :n], variance[active, :n], *aside)
-        joining = fits(z, *predicted, batch.gate_noise[active], growth) | following
-        joining &= ~chosen[active] & batch.mask[active]
+            whitened = _condition(batch, active, joining[active], whitened, height, variance)
+        following = np.zeros_like(chosen)
+        following[:, 1:] = batch.continues_line[:, 1:] & chosen[:, :-1]
+        predicted = combined(height[:, :n], variance[:, :n], *batch.aside)
+        joining = fits(batch.z, *predicted, batch.gate_noise, growth) | following
+        joining &= ~chosen & batch.mask
         # Before anything has joined, only evidence from aside decides.
-        joining &= chosen[active].any(axis=1, keepdims=True) | (aside.precision > 0.0)
+        joining &= chosen.any(axis=1, keepdims=True) | (batch.aside.precision > 0.0)
         if odds > 0.0:
-            doubtful = noise_in_doubt(z, *predicted, noise, batch.in_face[active], odds)
-            batch.noise[active] = np.where(joining & ~following, doubtful, noise)
-        grows = joining.any(axis=1)
-        active, joining, whitened = active[grows], joining[grows], whitened[grows]
+            doubtful = noise_in_doubt(batch.z, *predicted, batch.noise, batch.in_face, odds)
+            batch.noise[:] = np.where(joining & ~following, doubtful, batch.noise)
+        grows = joining[active].any(axis=1)
+        active, whitened = active[grows], whitened[grows]
     return chosen, height, variance
 
 
@@ -332,20 +348,20 @@ def _condition(
     Returns their rows, (A, m + n_new, N), behind those `whitened`, (A, m, N).
     """
     # Places of the new ones, first in each row; the rest is padding.
-    n_new, segment = int(new.sum(axis=1).max()), active[:, None]
-    place = np.argsort(~new, axis=1, kind='stable')[:, :n_new]
-    is_new = np.take_along_axis(new, place, axis=1)
+    own, segment, n_new = np.arange(len(new))[:, None], active[:, None], new.sum(axis=1)
+    place = np.argsort(~new, axis=1, kind='stable')[:, : n_new.max()]
+    is_new = np.arange(place.shape[1]) < n_new[:, None]
     which, rank = np.nonzero(is_new)
     rows = np.zeros((*place.shape, batch.r.shape[1]))
     rows[which, rank] = _prior_rows(batch, active[which], place[which, rank])
-    rows -= np.matmul(whitened[np.arange(len(new))[:, None], :, place], whitened)
-    rows *= is_new[:, :, None]
-    within = np.take_along_axis(rows, place[:, None, :], axis=2)
+    if whitened.size:
+        rows -= np.matmul(whitened[own, :, place], whitened)
+    within = rows[own, :, place]
     prior = prior_variance(batch.sill[active], batch.slope_std, batch.r[segment, place])
     add_noise(within, observed_noise(batch.noise[segment, place], prior), is_new)
-    unit = np.linalg.inv(np.linalg.cholesky(within))
+    unit = inverse_of_lower(np.linalg.cholesky(within)) * is_new[:, :, None]
     rows = np.matmul(unit, rows)
-    innovation = (batch.z[segment, place] - height[segment, place]) * is_new
+    innovation = batch.z[segment, place] - height[segment, place]
     innovation = np.matmul(unit, innovation[:, :, None])
     height[active] += np.matmul(innovation.swapaxes(1, 2), rows)[:, 0]
     variance[active] -= np.einsum('sij,sij->sj', rows, rows)

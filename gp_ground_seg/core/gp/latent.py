@@ -35,10 +35,10 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
     Returns log length-scales at the candidates, (C,), and at the knots, (M, K) [log m]; NaN there
     behind the bin of the last candidate.
     """
-    candidates, pseudo, knots = frame.candidates, frame.pseudo, frame.knots
+    candidates, pseudo = frame.candidates, frame.pseudo
     n_knots = n_wanted_knots(frame)
     at_candidates = np.empty(len(candidates.r))
-    at_knots = np.full((len(theta), len(knots)), np.nan)
+    at_knots = np.full((len(theta), len(frame.knots)), np.nan)
     for segments in batches(candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
         bar = Padded.of(segments, pseudo.offsets)
@@ -55,9 +55,11 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
         cross = squared_exponential(r, r_bar[:, None, :], *kernel)
         found = (cross @ weight)[:, :, 0] + mean
         at_candidates[layout.place[layout.mask]] = found[layout.mask]
+        knots = frame.knots[: n_knots[segments].max()]
         cross = squared_exponential(knots[:, None], r_bar[:, None, :], *kernel)
         is_wanted = np.arange(len(knots)) < n_knots[segments, None]
-        at_knots[segments] = np.where(is_wanted, (cross @ weight)[:, :, 0] + mean, np.nan)
+        found = (cross @ weight)[:, :, 0] + mean
+        at_knots[segments, : len(knots)] = np.where(is_wanted, found, np.nan)
     bound = MAX_ABS_LOG_LENGTH_SCALE
     return np.clip(at_candidates, -bound, bound), np.clip(at_knots, -bound, bound)
 

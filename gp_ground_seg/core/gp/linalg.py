@@ -17,7 +17,7 @@ try:
 except ImportError:  # then BLAS keeps its threads, which compete with ours
     ThreadpoolController = None
 
-SEGMENTS_PER_BATCH = 32
+SEGMENTS_PER_BATCH = 48
 """Larger batches waste room on padding and leave the processor's cache; smaller ones cost
 calls."""
 
@@ -59,9 +59,19 @@ def add_noise(covariance: FloatArray, noise: FloatArray, mask: BoolArray) -> Flo
     variances, `mask` (S, n) is False where there is padding.
     """
     covariance *= mask[:, :, None] & mask[:, None, :]
-    n = mask.shape[1]
-    covariance[:, range(n), range(n)] += np.where(mask, noise, 1.0)
+    np.einsum('sii->si', covariance)[:] += np.where(mask, noise, 1.0)
     return covariance
+
+
+def inverse_of_lower(factors: FloatArray) -> FloatArray:
+    """Inverses of lower triangular matrices (S, n, n).
+
+    One by one takes a third of the time of ``np.linalg.inv``, which is for any matrix.
+    """
+    from scipy.linalg.lapack import dtrtri
+
+    # LAPACK takes arrays by columns: our rows are to it the columns of an upper triangle.
+    return np.array([dtrtri(factor.T)[0].T for factor in factors])
 
 
 @functools.cache
