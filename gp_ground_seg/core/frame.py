@@ -34,6 +34,11 @@ NO_TILE = 2**31 - 1
 """Tile of the lowest point of an empty cell."""
 
 
+def as_index(places: CellArray) -> IntArray:
+    """Places in the type that numpy indexes by: with another it takes three times as long."""
+    return places.astype(np.int64)
+
+
 @contextmanager
 def usual_errors() -> Iterator[None]:
     """Have numpy raise nothing within the block or function, whatever the caller has set.
@@ -257,9 +262,10 @@ def at_points(knots: FloatArray, table: FloatArray, grid: PolarGrid) -> FloatArr
     `knots` (K,) are ranges [m], `table` (M, K) the values there.
     """
     level, slope = linear_pieces(knots, table)
-    cell = np.maximum(grid.cell, 0)
+    cell = as_index(grid.cell)  # where it is negative, the value does not matter
     with np.errstate(invalid='ignore'):  # points outside may be infinitely far
-        value: FloatArray = level[cell] + slope[cell] * np.maximum(grid.r, knots[0])
+        value: FloatArray = slope[cell] * np.maximum(grid.r, knots[0])
+        value += level[cell]
     value[~grid.inside] = np.nan
     return value
 

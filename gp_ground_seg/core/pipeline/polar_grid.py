@@ -21,6 +21,7 @@ from gp_ground_seg.core.frame import (
     Scan,
     Tiles,
     Values,
+    as_index,
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, GridConfig
@@ -147,7 +148,7 @@ class BinLookup(NamedTuple):
             found = np.searchsorted(self.edges, values, side='right') - 1
             return np.maximum(found, 0).astype(np.int32)
         beyond = np.maximum(values - self.edges[0], 0.0)
-        entry = (beyond * values.dtype.type(self.scale)).astype(np.int32)
+        entry = (beyond * values.dtype.type(self.scale)).astype(np.int64)
         result: CellArray = self.bins[entry]
         result += values >= self.ends[entry]
         return result
@@ -192,18 +193,17 @@ def build_polar_grid(xyz: PointArray, geometry: GridGeometry) -> PolarGrid:
     ranges, azimuths = geometry.ranges, geometry.azimuths
     n_segments, n_bins = len(azimuths.edges) - 1, len(ranges.edges) - 1
     finite = finite_points(xyz)
-    zero, four, nothing = map(xyz.dtype.type, (0.0, 4.0, np.nan))
-    x, y = np.where(finite, xyz[:, 0], zero), np.where(finite, xyz[:, 1], zero)
-    with np.errstate(over='ignore'):  # infinitely far is outside
+    x, y, _ = xyz.T
+    with np.errstate(over='ignore', invalid='ignore'):  # infinitely far is outside
         r = np.sqrt(x * x + y * y)
-    near = r < ranges.edges[-1]
-    key = azimuth_key(np.where(near, x, zero), np.where(near, y, zero), xyz.dtype.type)
+        inside = np.flatnonzero(finite & (r < ranges.edges[-1]))
+    key = azimuth_key(x[inside], y[inside], xyz.dtype.type)
     # Exactly 4 is the edge that ends the last segment: that is segment 0 again.
-    segment = azimuths.find(np.where(key < four, key, zero))
-    cell = segment * n_bins + ranges.find(np.where(near, r, zero))
-    cell = np.where(near, cell, OUTSIDE).astype(np.int32)
-    cell[~finite] = NOT_FINITE
-    return PolarGrid(cell, np.where(finite, r, nothing), geometry.edges, n_segments)
+    key[key == 4.0] = 0.0
+    cell = np.full(len(xyz), OUTSIDE, dtype=np.int32)
+    cell[inside] = azimuths.find(key) * n_bins + ranges.find(r[inside])
+    cell[~finite], r[~finite] = NOT_FINITE, np.nan
+    return PolarGrid(cell, r, geometry.edges, n_segments)
 
 
 def build_tiles(xyz: PointArray, grid: PolarGrid, geometry: GridGeometry) -> Tiles:
@@ -214,12 +214,11 @@ def build_tiles(xyz: PointArray, grid: PolarGrid, geometry: GridGeometry) -> Til
     inside = np.flatnonzero(grid.inside)
     tile = np.full(len(xyz), OUTSIDE, dtype=np.int32)
     column, row = (
-        np.minimum(((xyz[inside, i] + half) * per_metre).astype(np.int32), side - 1)
+        np.minimum(((xyz[:, i][inside] + half) * per_metre).astype(np.int32), side - 1)
         for i in range(2)
     )
-    place = column * side + row
-    tile[inside] = place
-    z = xyz[inside, 2]
+    tile[inside] = column * side + row
+    place, z = as_index(tile[inside]), xyz[:, 2][inside]
     extremes = np.empty((2, side * side), dtype=xyz.dtype)
     lowest_z, highest_z = extremes
     lowest_z[:], highest_z[:] = np.inf, -np.inf
@@ -243,17 +242,17 @@ def reduce_cells(grid: PolarGrid, z: PointArray, tile: CellArray) -> tuple[Point
     """
     size = grid.n_segments * grid.n_bins
     inside = np.flatnonzero(grid.inside)
-    cell = grid.cell[inside]
+    cell = as_index(grid.cell[inside])
     z_inside, r_inside = z[inside], grid.r[inside]
     lowest_z, lowest_r = np.full((2, size), np.inf, dtype=z.dtype)
     highest_z = np.full(size, -np.inf, dtype=z.dtype)
     np.minimum.at(lowest_z, cell, z_inside)
-    is_lowest = z_inside == lowest_z[cell]
-    np.minimum.at(lowest_r, cell[is_lowest], r_inside[is_lowest])
-    is_lowest &= r_inside == lowest_r[cell]
-    lowest_tile = np.full(size, NO_TILE, dtype=np.int32)
-    np.minimum.at(lowest_tile, cell[is_lowest], tile[inside][is_lowest])
     np.maximum.at(highest_z, cell, z_inside)
+    lowest = np.flatnonzero(z_inside == lowest_z[cell])
+    np.minimum.at(lowest_r, cell[lowest], r_inside[lowest])
+    lowest = lowest[r_inside[lowest] == lowest_r[cell[lowest]]]
+    lowest_tile = np.full(size, NO_TILE, dtype=np.int32)
+    np.minimum.at(lowest_tile, cell[lowest], tile[inside[lowest]])
     number = np.bincount(cell, minlength=size).astype(np.int32)
     return (
         np.column_stack([lowest_z, lowest_r, highest_z]),

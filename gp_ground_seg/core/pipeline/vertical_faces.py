@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from gp_ground_seg.core.frame import OUTSIDE, Faces, FloatArray, IntArray, Scan, Values
+from gp_ground_seg.core.frame import OUTSIDE, Faces, FloatArray, IntArray, Scan, Values, as_index
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, FacesConfig
 
@@ -45,9 +45,10 @@ def find_faces(scan: Scan, config: Config) -> Faces:
     # Most returns are in tiles where nothing stands, and are left out.
     is_tall = highest_z - lowest_z > label.obstacle_min_height
     tall, lowest_z = tiles.occupied[is_tall], lowest_z[is_tall]
-    row_of_tile = np.full(n_tiles, OUTSIDE)
+    # One more than there are tiles: `OUTSIDE` is the index of the last.
+    row_of_tile = np.full(n_tiles + 1, OUTSIDE)
     row_of_tile[tall] = np.arange(len(tall))
-    row = np.where(tiles.tile != OUTSIDE, row_of_tile[tiles.tile], OUTSIDE)
+    row = row_of_tile[as_index(tiles.tile)]
     used = np.flatnonzero(row != OUTSIDE)
     above = scan.xyz[used, 2].astype(np.float64) - lowest_z[row[used]]
     low = np.flatnonzero(above <= label.obstacle_max_height)
