@@ -10,7 +10,6 @@ import numpy.typing as npt
 from gp_ground_seg.core.frame import (
     NOT_FINITE,
     BoolArray,
-    CellArray,
     Faces,
     FloatArray,
     GroundSurface,
@@ -21,6 +20,7 @@ from gp_ground_seg.core.frame import (
     Scan,
     Tiles,
     Values,
+    as_index,
     at_points,
 )
 from gp_ground_seg.core.jit import choose, shared
@@ -52,9 +52,9 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
     z = scan.xyz[:, 2].astype(np.float64)
+    # NaN outside, as is what follows; cells and tiles there are negative, which index something.
     height = z - at_points(surface.knots, surface.mean, grid)
-    tile, inside = np.maximum(tiles.tile, 0), grid.inside
-    in_face = faces.is_face[tile] & inside
+    in_face = faces.is_face[as_index(tiles.tile)] & grid.inside
     n_near, heights, squares, n_obstacles = _returns_about(height, grid, in_face, label)
     units, sigma_n = sum_units(len(z), label.obstacle_min_height), config.observation.sigma_n
     variance = cell_variance(surface.std[:, :-1], surface.std[:, 1:], sigma_n).ravel()
@@ -62,18 +62,19 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     band = np.full(len(roughness), label.ground_tolerance)
     if label.rule == 'roughness':
         band = ground_band(n_near, roughness, n_obstacles, label, sigma_n)
-    margin: FloatArray = band_margin(
-        height, band[np.maximum(grid.cell, 0)], depth_of_ground(label)
+    margin: FloatArray = band_margin(height, band[as_index(grid.cell)], depth_of_ground(label))
+    of_face = np.flatnonzero(in_face)
+    tile = as_index(tiles.tile[of_face])
+    margin[of_face] = face_margin(
+        margin[of_face],
+        z[of_face] - tiles.lowest_z[tile],
+        faces.has_occluded_base[tile],
+        label.ground_tolerance,
     )
-    over_lowest = z - np.where(in_face, tiles.lowest_z[tile], 0.0)
-    is_occluded = faces.has_occluded_base[tile]
-    of_face = face_margin(margin, over_lowest, is_occluded, label.ground_tolerance)
-    margin[in_face] = of_face[in_face]
-    margin[~inside] = np.nan
     if label.rule == 'roughness':
-        voters = np.flatnonzero(is_near(height, label) & inside)
-        over_lowest = z - lowest_of(surface)
-        voters, means = mean_votes(voters, over_lowest, margin, tiles, label.ground_tolerance)
+        voters = np.flatnonzero(is_near(height, label))
+        heights = z[voters] - lowest_of(surface)
+        voters, means = mean_votes(voters, heights, margin, tiles, label.ground_tolerance)
         margin[voters] = settled_margin(margin[voters], means)
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
@@ -211,9 +212,10 @@ def mean_votes(
     ----------
     voters : (V,) int64
         Points that vote: those near the surface.
-    over_lowest, margin : (N,) float64
-        Heights of all points over `lowest_of`, and their margins before the vote (see `Labelled`)
-        [m].
+    over_lowest : (V,) float64
+        Their heights over `lowest_of` [m].
+    margin : (N,) float64
+        Margins of all points before the vote (see `Labelled`) [m].
     tiles : Tiles
         Tiles of all points.
     tolerance : float
@@ -231,33 +233,37 @@ def mean_votes(
     width = n_sides + 2
     around = (np.arange(-1, 2)[:, None] * width + np.arange(-1, 2)).ravel()
 
-    def place_of(tile: CellArray) -> CellArray:
+    def place_of(tile: IntArray) -> IntArray:
         return tile + 2 * (tile // n_sides) + (width + 1)
 
-    tile = tiles.tile[voters]
-    has_obstacle, counts = np.zeros((2, width * width), dtype=np.bool_)
-    has_obstacle[place_of(tile[margin[voters] < 0.0])] = True
+    tile = as_index(tiles.tile[voters])
+    has_obstacle, counts, has_votes = np.zeros((3, width * width), dtype=np.bool_)
+    has_obstacle[place_of(tile[np.flatnonzero(margin[voters] < 0.0)])] = True
     counts[np.flatnonzero(has_obstacle)[:, None] + around] = True
     # Most voters are in none of these tiles.
     is_counted = counts.reshape(width, width)[1:-1, 1:-1].ravel()[tile]
-    voters, place = voters[is_counted], place_of(tile[is_counted])
-    row_to_place = np.flatnonzero(counts)
-    rows = np.empty(len(counts), dtype=np.int64)
-    rows[row_to_place] = np.arange(len(row_to_place))
+    voters, over_lowest = voters[is_counted], over_lowest[is_counted]
+    place = place_of(tile[is_counted])
+    has_votes[place] = True
+    row_to_place = np.flatnonzero(has_votes)
+    rows = np.zeros(len(counts), dtype=np.int32)  # row 0 is that of tiles without votes
+    rows[row_to_place] = np.arange(1, len(row_to_place) + 1)
     # Layers of a row stand between copies of the last and of the first one.
-    shape = len(row_to_place), N_LAYERS + 2
-    layer = layer_of(over_lowest[voters], tolerance).astype(np.int64)
+    shape = len(row_to_place) + 1, N_LAYERS + 2
+    layer = layer_of(over_lowest, tolerance).astype(np.int64)
     entry = rows[place] * shape[1] + layer + 1
     settles = has_obstacle[place]
-    about, layer = rows[place[settles][:, None] + around], layer[settles][:, None]
+    place, layer = place[settles], layer[settles]
+    about = [rows[place + step] * shape[1] + layer for step in around]
 
     def total(weights: FloatArray | None) -> FloatArray:
-        """Sum of votes about the voters that settle."""
+        """Sum of votes about the voters that settle: of three layers, each from the lowest on."""
         layers = np.bincount(entry, weights, shape[0] * shape[1]).reshape(shape)
         layers[:, 0], layers[:, -1] = layers[:, -2], layers[:, 1]
-        three = layers[:, :-2] + layers[:, 1:-1]
-        three += layers[:, 2:]
-        sums: FloatArray = three[about, layer].sum(axis=1)
+        flat = layers.ravel()
+        three = flat[:-2] + flat[1:-1]
+        three += flat[2:]
+        sums: FloatArray = sum(three[entries] for entries in about)
         return sums
 
     mean = total(vote_of(margin[voters], tolerance)) / total(None)
@@ -275,15 +281,18 @@ def _returns_about(
     vertical faces, are no roughness of the ground.
     """
 
-    def total(counts: BoolArray, weights: FloatArray | None = None) -> FloatArray:
-        table = np.bincount(grid.cell[counts], weights, grid.n_segments * grid.n_bins)
+    def total(cell: IntArray, weights: FloatArray | None = None) -> FloatArray:
+        table = np.bincount(cell, weights, grid.n_segments * grid.n_bins)
         return sum_neighbourhood(table.reshape(grid.n_segments, grid.n_bins)).ravel()
 
-    near = is_near(height, label) & grid.inside & ~in_face
+    # `height` is NaN outside, which is neither.
+    shows = as_index(grid.cell[np.flatnonzero(shows_obstacle(height, label))])
+    near = np.flatnonzero(is_near(height, label) & ~in_face)
+    cell, near_height = as_index(grid.cell[near]), height[near]
     units = sum_units(len(height), label.obstacle_min_height)
-    heights = total(near, whole_units(height[near], units))
-    squares = total(near, whole_units(height[near] * height[near], units))
-    return total(near), heights, squares, total(shows_obstacle(height, label) & grid.inside)
+    heights = total(cell, whole_units(near_height, units))
+    squares = total(cell, whole_units(near_height * near_height, units))
+    return total(cell), heights, squares, total(shows)
 
 
 @shared
