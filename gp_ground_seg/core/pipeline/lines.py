@@ -35,6 +35,9 @@ MIN_BREAK_CANDIDATES = 3
 N_CLASSES = 9
 """Classes of lines that share a length-scale."""
 
+Groups = tuple[LinesConfig, GrowthConfig, LatentConfig, LengthScaleConfig]
+"""Parameters that lines and pseudo-inputs depend on."""
+
 
 def find_lines(
     candidates: Candidates, faces: Faces, config: Config
@@ -57,10 +60,11 @@ def lines_through(
     offsets = np.empty(len(candidates.offsets), np.int64)
     pseudo = PseudoInputs(np.empty(n), np.empty(n), offsets, np.empty(n, np.int64))
     continues_line = np.empty(n, np.bool_)
-    groups = config.lines, config.growth, config.latent, config.length_scale
-    n_lines, n_pseudo = trace_lines(
-        candidates, *map(numbers_of, groups), lines, pseudo, continues_line
+    groups = tuple(
+        map(numbers_of, (config.lines, config.growth, config.latent, config.length_scale))
     )
+    is_break = find_breaks(candidates.r, candidates.density, config.lines)
+    n_lines, n_pseudo = trace_lines(candidates, is_break, groups, lines, pseudo, continues_line)
     lines = Lines(lines.line, lines.slope[:n_lines], lines.start[: n_lines + 1])
     r_bar, log_extent, offsets, line = pseudo
     line = line[:n_pseudo]
@@ -70,16 +74,15 @@ def lines_through(
     return lines, pseudo, continues_line
 
 
-def _trace_lists(candidates: Candidates, *arguments: Any) -> tuple[int, int]:
-    """Do what `trace` does, in lists: plain Python reads and writes them faster than arrays."""
-    arrays = *arguments[-3], *arguments[-2], arguments[-1]
-    lists: Any = [array.tolist() for array in arrays]
-    results: Any = Lines(*lists[:3]), PseudoInputs(*lists[3:7]), lists[7]
-    inputs: Any = (column.tolist() for column in candidates)
-    counts = trace(Candidates(*inputs), *arguments[:-3], *results)
-    for array, values in zip(arrays, lists, strict=True):
-        array[:] = values
-    return counts
+def _trace_lists(
+    candidates: Candidates, is_break: BoolArray, groups: Groups, *results: Any
+) -> tuple[int, int]:
+    """Do what `trace` does: plain Python reads lists, and writes views, faster than arrays."""
+    lines, pseudo, continues_line = results
+    *inputs, breaks = (column.tolist() for column in (*candidates, is_break))
+    views: Any = [memoryview(array) for array in (*lines, *pseudo, continues_line)]
+    results = Lines(*views[:3]), PseudoInputs(*views[3:7]), views[7]
+    return trace(Candidates(*inputs), breaks, groups, *results)
 
 
 def class_middles(limits: LengthScaleConfig) -> FloatArray:
@@ -111,28 +114,38 @@ def shared_by_class(
     return pseudo._replace(log_extent=class_middles(limits)[kind], kind=kind)
 
 
+def find_breaks(r: FloatArray, density: FloatArray, tolerances: LinesConfig) -> BoolArray:
+    """Whether a gap, or a sharp change of the density, lies before each candidate, (C,)."""
+    breaks, ratio = np.zeros(len(r), np.bool_), tolerances.max_density_ratio
+    breaks[1:] = r[1:] - r[:-1] > tolerances.max_gap + tolerances.max_gap_growth * r[1:]
+    breaks[1:] |= density[1:] > ratio * density[:-1]
+    breaks[1:] |= density[:-1] > ratio * density[1:]
+    return breaks
+
+
 @shared
 def trace(
     candidates: Candidates,
-    tolerances: LinesConfig,
-    growth: GrowthConfig,
-    latent: LatentConfig,
-    limits: LengthScaleConfig,
+    is_break: BoolArray,
+    groups: Groups,
     lines: Lines,
     pseudo: PseudoInputs,
     continues_line: BoolArray,
 ) -> tuple[int, int]:
     """Fill the last three; return the number of lines, and that of pseudo-inputs.
 
-    There is room for as many as there are candidates.
+    There is room for as many as there are candidates. For `is_break` see `find_breaks`.
     """
-    n_lines = extract_lines(candidates, tolerances, lines)
+    tolerances, growth, latent, limits = groups
+    n_lines = extract_lines(candidates, is_break, tolerances, lines)
     mark_continued(candidates, lines, n_lines, tolerances, growth, continues_line)
     return n_lines, select_pseudo_inputs(candidates, lines, n_lines, latent, limits, pseudo)
 
 
 @shared
-def extract_lines(candidates: Candidates, tolerances: LinesConfig, lines: Lines) -> int:
+def extract_lines(
+    candidates: Candidates, is_break: BoolArray, tolerances: LinesConfig, lines: Lines
+) -> int:
     """Cut each segment's candidates into lines; return their number.
 
     Paper, section III-D and Algorithm 1. A line grows over the candidates in order of range until
@@ -140,13 +153,13 @@ def extract_lines(candidates: Candidates, tolerances: LinesConfig, lines: Lines)
     distance from the line that is too large, or a sharp change of the vertical density. The next
     line starts there, independent of the one before.
     """
-    r, z, density, offsets = candidates.r, candidates.z, candidates.density, candidates.offsets
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
     tangent = math.tan(tolerances.slope_tolerance)
     n_lines = 0
     for m in range(len(offsets) - 1):
         first, stop = offsets[m], offsets[m + 1]
         while first < stop:
-            behind, slope = grow_line(first, stop, r, z, density, tolerances, tangent)
+            behind, slope = grow_line(first, stop, r, z, is_break, tolerances, tangent)
             lines.start[n_lines], lines.slope[n_lines] = first, slope
             for c in range(first, behind):
                 lines.line[c] = n_lines
@@ -162,7 +175,7 @@ def grow_line(
     stop: int,
     r: FloatArray,
     z: FloatArray,
-    density: FloatArray,
+    is_break: BoolArray,
     tolerances: LinesConfig,
     tangent: float,
 ) -> tuple[int, float]:
@@ -175,7 +188,7 @@ def grow_line(
     sum_r = sum_z = sum_rr = sum_zz = sum_rz = mean_r = mean_z = 0.0
     slope, n = math.nan, 1
     for j in range(first + 1, stop):
-        if ends_before(j, r, density, tolerances):
+        if is_break[j]:
             return j, slope
         dr, dz = r[j] - r[first], z[j] - z[first]
         expected = mean_z + slope * (dr - mean_r)
@@ -197,18 +210,6 @@ def grow_line(
                 return j, slope
         slope = new_slope
     return stop, slope
-
-
-@shared
-def ends_before(j: int, r: FloatArray, density: FloatArray, tolerances: LinesConfig) -> bool:
-    """Whether a gap, or a sharp change of the density, lies before candidate `j`."""
-    ratio = tolerances.max_density_ratio
-    ends: bool = (
-        r[j] - r[j - 1] > tolerances.max_gap + tolerances.max_gap_growth * r[j]
-        or density[j] > ratio * density[j - 1]
-        or density[j - 1] > ratio * density[j]
-    )
-    return ends
 
 
 @shared
@@ -307,9 +308,10 @@ def mark_continued(
             at_break = meets_line_before(
                 first, stop, candidates, before, lines.slope[q], tolerances.offset_tolerance
             )
+        continues = at_break or (is_flat and stop - first >= growth.min_line_size)
         continues_line[first] = at_break
         for c in range(first + 1, stop):
-            continues_line[c] = at_break or (is_flat and stop - first >= growth.min_line_size)
+            continues_line[c] = continues
 
 
 @shared
