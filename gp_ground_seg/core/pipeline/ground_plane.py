@@ -119,9 +119,13 @@ def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> IntArray:
     segment = np.repeat(np.arange(n_segments), np.diff(offsets))[near]
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
     cell = (segment * N_SECTORS // n_segments) * N_RINGS + ring
-    order = np.lexsort((segment, r[near], z[near], cell))
+    lowest_z, lowest = np.full(N_SECTORS * N_RINGS, np.inf), np.full(N_SECTORS * N_RINGS, _NONE)
+    np.minimum.at(lowest_z, cell, z[near])
+    is_lowest = z[near] == lowest_z[cell]
+    near, cell = near[is_lowest], cell[is_lowest]
+    # Equally near ones stay in order of their segments.
+    order = np.lexsort((r[near], cell))
     occupied, first = np.unique(cell[order], return_index=True)
-    lowest = np.full(N_SECTORS * N_RINGS, _NONE)
     lowest[occupied] = near[order[first]]
     return lowest
 
