@@ -54,7 +54,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
         ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
-        ('--numpy', 'time learning without compiled code as well', options.FLAG),
+        ('--numpy', 'time both without compiled code as well', options.FLAG),
         *options.SCAN_LAYOUT,
         options.TO_JSON,
         options.FORCE,

@@ -27,7 +27,7 @@ MODES = {'fixed': 'theta fixed', 'every_frame': 'learning'}
 
 
 def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> dict[str, Config]:
-    """Theta fixed and learned in every frame, on each number of threads; learning with numpy."""
+    """Theta fixed and learned in every frame, on each number of threads and with numpy."""
     cases = {
         f'{title}, {n} thread{"s" if n > 1 else ""}': config.replace(
             **{'learning.mode': mode, 'runtime.n_threads': n}
@@ -35,9 +35,9 @@ def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> 
         for mode, title in MODES.items()
         for n in threads
     }
-    if with_numpy:
-        changes = {'learning.mode': 'every_frame', 'runtime.backend': 'numpy'}
-        cases['learning, numpy'] = config.replace(**changes)
+    for mode, title in MODES.items() if with_numpy else ():
+        changes = {'learning.mode': mode, 'runtime.backend': 'numpy'}
+        cases[f'{title}, numpy'] = config.replace(**changes)
     return cases
 
 
