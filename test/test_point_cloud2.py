@@ -246,6 +246,7 @@ def test_selection_and_another_header_keep_all_else():
     data = cloud.data.reshape(-1, cloud.point_step)[mask].ravel()
     shape = {'width': mask.sum(), 'row_step': len(data)}
     assert_same_cloud(kept, dataclasses.replace(cloud, **shape, data=data, is_dense=True))
+    assert not point_cloud2.select_points(cloud, ~mask).is_dense
     for frame, expected in ((None, 'velo_link'), ('map', 'map')):
         moved = decode_cloud(encode_cloud(point_cloud2.with_header(cloud, (7, 8), frame)))
         assert (point_cloud2.stamp_of(moved), moved.header.frame_id) == ((7, 8), expected)

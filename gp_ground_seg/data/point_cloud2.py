@@ -19,6 +19,7 @@ from numpy.lib.recfunctions import repack_fields
 from numpy.lib.stride_tricks import as_strided
 
 from gp_ground_seg.core.errors import PointCloudError, in_one_line
+from gp_ground_seg.core.pipeline.points import finite_points
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import jazzy_types
 from gp_ground_seg.data.clouds import gather
@@ -241,16 +242,20 @@ def select_points(
     cloud: Cloud,
     mask: npt.NDArray[np.bool_],
     make_data: Callable[[int], Any] = lambda size: np.empty(size, np.uint8),
+    *,
+    are_finite: bool = False,
 ) -> Cloud:
-    """Message of the points where `mask` is true, finite ones: same header and fields, one row.
+    """Message of the points where `mask` is true: same header, same fields, one row.
 
-    `make_data` makes what the message holds so many bytes in. Raises as `select_rows` does.
+    ``is_dense`` says whether the kept points are all finite; they are looked at unless the caller
+    knows that they `are_finite`. `make_data` makes what the message holds so many bytes in.
+    Raises as `select_rows` and `read_xyz` do.
     """
     kept = copy(cloud)
     kept.data = select_rows(cloud, mask, make_data)
     kept.height, kept.width = 1, int(np.count_nonzero(mask))
     kept.row_step = kept.width * cloud.point_step
-    kept.is_dense = True
+    kept.is_dense = are_finite or bool(finite_points(read_xyz(kept)).all())
     return kept
 
 

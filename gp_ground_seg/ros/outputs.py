@@ -157,7 +157,9 @@ def _colours(rgb: FloatArray) -> list[ColorRGBA]:
 
 def _selected(segmented: SegmentedCloud, chosen: BoolArray, voxel: float) -> PointCloud2:
     """Return the `chosen` points, thinned to one in each `voxel` [m], in the output frame."""
-    message = select_points(segmented.cloud, segmented.thinned(chosen, voxel), message_bytes)
+    kept = segmented.thinned(chosen, voxel)
+    # Ground and obstacles are finite points.
+    message = select_points(segmented.cloud, kept, message_bytes, are_finite=True)
     if segmented.placement is not None:
         rotation, translation = segmented.placement
         message.header = _header(segmented)

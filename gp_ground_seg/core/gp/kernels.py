@@ -8,8 +8,8 @@ from gp_ground_seg.core.frame import Values
 from gp_ground_seg.core.jit import shared
 
 LARGEST_EXPONENT = 300.0
-"""Largest x of which ``exp(-x)`` is computed: 5e-131, as good as nothing. Numbers below 1e-308
-lose digits, which takes tens of times as long; even the square of this is none of them."""
+"""Largest x of which ``exp(-x)`` is computed: 5e-131, as good as nothing. Numbers below 1e-308,
+which a square of this is not, lose digits and take numpy tens of times as long."""
 
 
 def exp_neg(x: Values) -> Values:

@@ -35,9 +35,10 @@ def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> 
         for mode, title in MODES.items()
         for n in threads
     }
-    for mode, title in MODES.items() if with_numpy else ():
-        changes = {'learning.mode': mode, 'runtime.backend': 'numpy'}
-        cases[f'{title}, numpy'] = config.replace(**changes)
+    if with_numpy:
+        for mode, title in MODES.items():
+            changes = {'learning.mode': mode, 'runtime.backend': 'numpy'}
+            cases[f'{title}, numpy'] = config.replace(**changes)
     return cases
 
 
