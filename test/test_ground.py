@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-import reference
+import reference_gp
 from conftest import fewer, hilly_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -63,7 +63,7 @@ def surface_by_the_loops(seed):
         frame = frame._replace(knots=frame.knots[:0])
     frame = frame._replace(sensor_height=rng.choice([0.1, 0.3, np.inf]))
     arguments = frame, theta, config
-    return arguments, reference.estimate_surface(*arguments)
+    return arguments, reference_gp.estimate_surface(*arguments)
 
 
 @pytest.mark.parametrize('seed', range(fewer(40, 6)))
@@ -89,13 +89,15 @@ def test_the_oracle_is_the_conditional_of_the_joint_gaussian(seed, n, slope_std)
     rng = np.random.default_rng(seed)
     r, length_scale = rng.uniform(2, 60, n + 4), rng.uniform(0.5, 30, n + 4)
     noise, values = np.diag(np.arange(n + 4) < n), rng.normal(1.0, 0.5, n)
-    joint = reference.paciorek(r, length_scale, r, length_scale, 0.6)
+    joint = reference_gp.paciorek(r, length_scale, r, length_scale, 0.6)
     joint += slope_std**2 * np.outer(r, r) + 0.1**2 * noise
     at = (r[:n], values, length_scale[:n], r[n:], length_scale[n:], 0.6, 0.1, slope_std)
-    for found, expected in zip(reference.posterior(*at), conditional(joint, values), strict=True):
+    for found, expected in zip(
+        reference_gp.posterior(*at), conditional(joint, values), strict=True
+    ):
         np.testing.assert_allclose(found, expected, atol=1e-9)
-    latent = reference.squared_exponential(r, r, 0.8, 4.0) + 0.3**2 * noise
-    found = reference.log_length_scale(r[:n], values, r[n:], 0.8, 4.0, 0.3)
+    latent = reference_gp.squared_exponential(r, r, 0.8, 4.0) + 0.3**2 * noise
+    found = reference_gp.log_length_scale(r[:n], values, r[n:], 0.8, 4.0, 0.3)
     mean = values.mean()
     np.testing.assert_allclose(found, mean + conditional(latent, values - mean)[0], atol=1e-9)
 

@@ -1,7 +1,7 @@
 """Covariance functions, and the padding of many segments into batches."""
 
 import numpy as np
-import reference
+import reference_gp
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,7 +12,7 @@ from gp_ground_seg.core.gp.linalg import SEGMENTS_PER_BATCH, Padded, batches
 def kernels(r_a, l_a, r_b, l_b, sigma_f):
     """Of `gp.kernels`, and of the reference."""
     found = paciorek(r_a[:, None], l_a[:, None], r_b, l_b, sigma_f**2)
-    return found, reference.paciorek(r_a, l_a, r_b, l_b, sigma_f)
+    return found, reference_gp.paciorek(r_a, l_a, r_b, l_b, sigma_f)
 
 
 def random_inputs(seed, n):
@@ -32,7 +32,7 @@ def test_kernel_contract(seed, n, sigma_f):
     same = np.full(n, 4.0)
     stationary = sigma_f**2 * np.exp(-((r[:, None] - r) ** 2) / (2 * 4.0**2))
     ours = squared_exponential(r[:, None], r, sigma_f**2, 0.5 / 4.0**2)
-    plain = reference.squared_exponential(r, r, sigma_f, 4.0)
+    plain = reference_gp.squared_exponential(r, r, sigma_f, 4.0)
     for k in (*kernels(r, same, r, same, sigma_f), ours, plain):
         np.testing.assert_allclose(k, stationary, rtol=1e-12, atol=1e-15)
 

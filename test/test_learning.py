@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import reference
+import reference_gp
 from conftest import fewer, hilly_scan
 from test_ground import frame_of_a_sill
 
@@ -36,7 +36,7 @@ def draw_inliers(seed, n_segments=120, n=50, sigma_f=0.3, sigma_n=0.05):
     for _ in range(n_segments):
         own = np.sort(rng.uniform(3, 50, n))
         length = np.exp(profile(truth, r_bar, log_extent, own))
-        a = reference.paciorek(own, length, own, length, sigma_f) + sigma_n**2 * np.eye(n)
+        a = reference_gp.paciorek(own, length, own, length, sigma_f) + sigma_n**2 * np.eye(n)
         r.append(own)
         z.append(np.linalg.cholesky(a) @ rng.standard_normal(n))
     number = np.arange(n_segments + 1)
@@ -49,7 +49,7 @@ def draw_inliers(seed, n_segments=120, n=50, sigma_f=0.3, sigma_n=0.05):
 
 
 def profile(theta, r_bar, log_extent, r):
-    return reference.log_length_scale(r_bar, theta[5] + log_extent, r, *np.exp(theta[2:5]))
+    return reference_gp.log_length_scale(r_bar, theta[5] + log_extent, r, *np.exp(theta[2:5]))
 
 
 def space_about(centre, free=None, factor=20.0):

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-import reference
+import reference_gp
 
 from gp_ground_seg.core.backend import make_backend
 from gp_ground_seg.core.frame import Inliers
@@ -62,7 +62,7 @@ def random_inliers(seed, bars='all', n_segments=6):
 
 @functools.cache
 def expected(name, latent_terms, bars):
-    return reference.log_likelihood(THETAS[name], random_inliers(7, bars), 0.05, latent_terms)
+    return reference_gp.log_likelihood(THETAS[name], random_inliers(7, bars), 0.05, latent_terms)
 
 
 @pytest.mark.parametrize('latent_terms', [False, True])
@@ -108,7 +108,7 @@ def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
 ):
     inliers = random_inliers(4)
     inliers = inliers._replace(**{k: np.full_like(inliers.z, v) for k, v in changes.items()})
-    for model in (backend, reference):
+    for model in (backend, reference_gp):
         value, gradient = model.log_likelihood(theta, inliers, 0.0, False)
         assert value == -np.inf
         assert not gradient.any()
