@@ -7,6 +7,7 @@ from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import parameter_specs
 from gp_ground_seg.core.parameters.export import accepted_values, to_yaml, yaml_scalar
 from gp_ground_seg.core.parameters.presets import PRESETS
+from gp_ground_seg.core.parameters.removed import REMOVED
 
 ROOT = Path(__file__).resolve().parent.parent
 README = 'README.md'
@@ -18,6 +19,14 @@ PAGE_HEAD = """\
 only those in the table of the README. `gp-ground-seg config dump` writes all of them, with values
 and ranges, as a parameter file. A symbol is that of the paper.
 
+"""
+REMOVED_HEAD = """
+## Removed
+
+A file or a command that has one of these ends with its line. The node leaves it out, and warns.
+
+| Removed | Instead |
+| --- | --- |
 """
 
 
@@ -119,7 +128,8 @@ def generated_files(readme: str) -> dict[str, str]:
     }
     readme = with_table(readme, PARAMETERS, to_markdown_table(basic_only=True))
     files[README] = with_table(readme, SCORES, to_scores_table())
-    files['docs/parameters.md'] = PAGE_HEAD + to_markdown_table()
+    removed = ''.join(f'| `{name}` | {instead} |\n' for name, instead in REMOVED.items())
+    files['docs/parameters.md'] = PAGE_HEAD + to_markdown_table() + REMOVED_HEAD + removed
     return files
 
 

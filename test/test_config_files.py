@@ -16,6 +16,7 @@ from gp_ground_seg.core.parameters import export
 from gp_ground_seg.core.parameters.config import parameter_specs
 from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.presets import PRESETS, find_preset
+from gp_ground_seg.core.parameters.removed import REMOVED
 
 GENERATE = 'run: make generate'
 generate = load_script('docs/generate.py')
@@ -97,7 +98,9 @@ def test_tables_have_a_row_for_each_parameter():
     # README.md has the basic ones, the page all of them.
     marks = [*generate.marks_of(generate.PARAMETERS), *generate.marks_of(generate.SCORES)]
     files = generate.generated_files(''.join(marks))
-    assert files['docs/parameters.md'].endswith(table)
+    page, removed = files['docs/parameters.md'].split(generate.REMOVED_HEAD)
+    assert page.endswith(table)
+    assert removed.splitlines() == [f'| `{name}` | {use} |' for name, use in REMOVED.items()]
     is_basic = [spec.basic for spec in parameter_specs()]
     basic = [row for row, wanted in zip(rows, is_basic, strict=True) if wanted]
     assert [row for row in files['README.md'].splitlines() if row.startswith('| `')] == basic

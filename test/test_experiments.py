@@ -43,7 +43,6 @@ def test_models_are_what_their_names_say_and_each_way_to_learn_gives_a_theta(fra
     for title, config in configs.items():
         assert config.length_scale.model == models[title.split(',')[0]]
         assert (config.learning.mode == 'fixed') == ('not learned' in title)
-        assert (config.learning.scope == 'segment') == ('per segment' in title)
     # The last one is the paper's method.
     assert config == Config().replace(**{'learning.fixed': 'none'})
     scores = variants.score_variants(frames[:1], configs)

@@ -15,12 +15,12 @@ from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.frame import Frame
 from gp_ground_seg.core.gp.evidence import ODDS, seeds
 from gp_ground_seg.core.gp.ground import ODDS_IN_FACE, noise_in_doubt
-from gp_ground_seg.core.gp.learning import given_theta, in_rows
+from gp_ground_seg.core.gp.learning import given_theta
 
 
 def theta_of(config):
     """Given theta of every segment."""
-    return in_rows(given_theta(config), config.grid.n_segments)
+    return np.tile(given_theta(config), (config.grid.n_segments, 1))
 
 
 def frame_of(xyz, config):

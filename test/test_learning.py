@@ -58,7 +58,7 @@ def space_about(centre, free=None, factor=20.0):
     return ThetaSpace(centre, centre - width, centre + width, free, 1.0)
 
 
-def learn(inliers, space, start, use_priors=True, max_evaluations=200, out_of_time=False):
+def learn(inliers, space, start, use_priors=True, max_evaluations=200):
     """Outcome, and the values of the objective without priors."""
     values = []
 
@@ -67,8 +67,8 @@ def learn(inliers, space, start, use_priors=True, max_evaluations=200, out_of_ti
         values.append(value)
         return value, gradient
 
-    budget = {'max_evaluations': max_evaluations, 'out_of_time': lambda: out_of_time}
-    learned = maximise(objective, space, start, len(inliers.r), use_priors=use_priors, **budget)
+    how = {'use_priors': use_priors, 'max_evaluations': max_evaluations}
+    learned = maximise(objective, space, start, len(inliers.r), **how)
     assert learned.n_evaluations == len(values)
     return learned, values
 
@@ -146,9 +146,8 @@ def test_budget_is_kept_and_the_best_so_far_is_used(budget):
     assert MODEL.log_likelihood(learned.theta, inliers, 0.0, True)[0] == max(values)
 
 
-def test_no_time_means_one_evaluation_and_nowhere_finite_is_a_failure():
+def test_nowhere_finite_is_a_failure():
     inliers, truth = draw_inliers(6, n_segments=2)
-    assert len(learn(inliers, space_about(truth), truth, out_of_time=True)[1]) == 1
     hopeless = inliers._replace(z=np.full_like(inliers.z, np.nan))
     learned, _ = learn(hopeless, space_about(truth), truth, max_evaluations=20)
     assert learned.status == 'failed'
@@ -208,14 +207,12 @@ def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame(step):
     frame = Frame(found.candidates, found.lines, found.pseudo, continues, continues, edges, -1.73)
     own = every_segment(frame, step)
     kept = np.isin(frame.candidates.segment, np.arange(0, config.grid.n_segments, step))
-    theta = in_rows(given_theta(config), config.grid.n_segments)
+    theta = given_theta(config)
     # Copied, as the next call reuses the buffer of the length-scales.
     (whole, whole_u), (alone, alone_u) = (
         (surface.inlier, u.copy())
         for one in (frame, own)
-        for surface, _, u in [
-            MODEL.estimate_surface(one, theta[: len(one.candidates.offsets) - 1], config)
-        ]
+        for surface, _, u in [MODEL.estimate_surface(one, in_rows(theta, one), config)]
     )
     np.testing.assert_array_equal(own.candidates.r, frame.candidates.r[kept])
     np.testing.assert_array_equal(alone, whole[kept])
@@ -228,47 +225,12 @@ def segmenter_of(**changes):
 
 
 def test_modes():
-    def learned(seeds, segmenter):
-        fits = [segmenter.segment(hilly_scan(N_POINTS, seed=s)).fit for s in seeds]
-        return [fit.status != 'kept' for fit in fits], fits
-
-    assert learned((1, 2), segmenter_of())[0] == [True, True]
-    first = segmenter_of(**{'learning.mode': 'first_frame'})
-    flags, fits = learned((1, 2), first)
-    assert flags == [True, False]
-    assert fits[0].theta == fits[1].theta
-    flags, fits = learned((1, 2), segmenter_of(**{'learning.mode': 'fixed'}))
-    assert flags == [False, False]
+    for mode, is_learned in (('every_frame', True), ('fixed', False)):
+        segmenter = segmenter_of(**{'learning.mode': mode})
+        fits = [segmenter.segment(hilly_scan(N_POINTS, seed=s)).fit for s in (1, 2)]
+        assert [fit.status != 'kept' for fit in fits] == [is_learned] * 2
     assert fits[1].n_evaluations == 0
     assert fits[1].theta['sigma_n'] == pytest.approx(Config().observation.sigma_n)
-    every_k = segmenter_of(**{'learning.mode': 'every_k', 'learning.period': 3})
-    assert learned(range(1, 6), every_k)[0] == [True, False, False, True, False]
-    every_k.reset()
-    assert learned((6, 7), every_k)[0] == [True, False]
-    # Another configuration forgets what was learned, other diagnostics do not.
-    first.configure(first.config.replace(**{'diagnostics.period': 2.0}))
-    assert learned((3,), first)[0] == [False]
-    first.configure(first.config.replace(**{'label.ground_tolerance': 0.2}))
-    assert learned((3, 4), first)[0] == [True, False]
-
-
-def test_a_warm_start_needs_fewer_evaluations_on_the_same_scan():
-    changes = {'learning.max_evaluations': 200}
-    cold, warm = segmenter_of(**changes), segmenter_of(**changes, **{'learning.warm_start': True})
-    scan = hilly_scan(2 * N_POINTS)
-    first, again = (
-        [s.segment(scan).fit.n_evaluations for s in (cold, warm)] for _ in ('first', 'again')
-    )
-    assert first[0] == first[1] == again[0]
-    assert again[1] < again[0]
-
-
-def test_learning_ends_when_its_time_is_up():
-    ticks = iter(range(10_000))
-    changes = {'learning.max_time': 1.0, 'learning.max_evaluations': 200, 'learning.fixed': 'none'}
-    config = Config().replace(**changes)
-    segmenter = GroundSegmenter(config, clock=lambda: 0.4 * next(ticks), backend=MODEL)
-    assert segmenter.segment(hilly_scan(N_POINTS)).fit.n_evaluations == 3
 
 
 def test_the_preset_paper_learns_until_no_more_join():

@@ -235,6 +235,5 @@ def test_a_ramp_seen_by_few_rings_is_ground():
         for seed in (0, 1):
             scan = simulate_scan(SCENES['ramp'](seed), VLP_16, np.random.default_rng(seed))
             far = scan.is_ground & (np.hypot(*scan.points[:, :2].T) > 25.0)
-            segmenter.reset()
             missed[-1] += (segmenter.segment(scan.points).label[far] != 1).sum()
     assert missed[0] < 0.6 * missed[1]

@@ -253,7 +253,6 @@ def test_the_table_of_objects_is_that_of_the_labels(tmp_path, capsys):
     segmenter, total, n_ground = GroundSegmenter(), 0, 0
     for k, name in enumerate(('00', '08')):
         points, entries = street_with_cars(k)
-        segmenter.reset()
         label = segmenter.segment(points).label
         # The road is level.
         own = (entries & 0xFFFF == 10) & (points[:, 2] > -1.73 + MIN_HEIGHT)

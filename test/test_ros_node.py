@@ -100,9 +100,8 @@ MODEL_KEYS = (
 )
 
 
-def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch, capfd):
-    points, resets, reset = street(3000), [], GroundSegmenter.reset
-    monkeypatch.setattr(GroundSegmenter, 'reset', lambda s: [resets.append(1), reset(s)])
+def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(capfd):
+    points = street(3000)
     limits = '-p', 'diagnostics.stale_after:=3.0', '-p', 'diagnostics.max_latency:=10.0'
     with ros.bench(*OFTEN, *limits) as b:
 
@@ -115,9 +114,7 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch, ca
 
         stale = b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.STALE)
         assert f'{NAMESPACE}/points' in stale.message
-        segment(0, 1, 2)
-        assert resets == []
-        segment(0, 1, 0)
+        segment(0, 1, 2, 0, 1, 0)
         b.wait_for_status('input', lambda _, s: s.level == DiagnosticStatus.OK)
         tasks = {
             'input': wait_for_counter('input', 'Events since startup', '6'),
@@ -125,9 +122,8 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch, ca
             'model': wait_for_counter('model', 'Learned since startup', '6'),
             'output': wait_for_counter('output', f'{NAMESPACE}/ground since startup', '6'),
         }
-        assert resets == [1, 1]
         # Throttled: two jumps, one message.
-        said = ros.said_by(capfd, 'time jumped back by 2.0 s: what earlier clouds taught')
+        said = ros.said_by(capfd, 'time jumped back by 2.0 s')
         assert said.count('time jumped back') == 1
         assert b.set('diagnostics.max_latency', 0.001).successful
         b.wait_for_status('processing', lambda _, s: s.level == DiagnosticStatus.WARN)
@@ -170,7 +166,7 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(monkeypatch, ca
     assert values['output'][f'{NAMESPACE}/obstacles since startup'] == '6'
 
 
-def test_simulated_time_that_jumps_back_resets_what_was_learned():
+def test_simulated_time_that_jumps_back_is_counted_once():
     with ros.bench(*OFTEN, '-p', 'use_sim_time:=true') as b:
 
         def wait_for_input(counter, value):

@@ -22,6 +22,7 @@ from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import find_spec, parameter_specs
 from gp_ground_seg.core.parameters.export import file_problems
 from gp_ground_seg.core.parameters.presets import PRESETS
+from gp_ground_seg.core.parameters.removed import REMOVED
 from gp_ground_seg.ros.parameters import set_remotely
 from gp_ground_seg.ros.warm_up import CHANGED
 
@@ -321,6 +322,23 @@ def test_unknown_names_are_reported_and_not_declared(capfd):
     assert '  sensor.height: 2.5 m  (default auto)' in shown
     assert len(shown) == len(changes)  # a line for each that differs, and no other
     assert 'ros2 param dump /ground_segmentation_node' in log
+
+
+def test_what_is_removed_is_a_warning_at_the_start_and_refused_later(tmp_path, capfd):
+    """A node with the parameter file of an earlier release starts; all else in it holds."""
+    path = tmp_path / 'old.yaml'
+    groups = {'learning': {'mode': 'every_k', 'period': 3, 'segment_step': 20}}
+    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': groups}}))
+    with ros.started_node('--params-file', str(path)) as node:
+        assert node.config == Config().replace(**{'learning.segment_step': 20})
+        log = ros.said_by(capfd, 'learning.period')
+        for key in ('learning.mode=every_k', 'learning.period'):
+            name, line = key.split('=')[0], f'{key} was removed: {REMOVED[key]}'
+            assert log.count(f'parameter {name} is not used: {line}\n') == 1
+            assert not node.has_parameter('learning.period')
+            value = Parameter(name, value=groups['learning'][name.split('.')[1]])
+            result = node.set_parameters_atomically([value])
+            assert (result.successful, result.reason) == (False, line)
 
 
 def test_a_start_with_the_defaults_is_one_line_about_them(capfd):

@@ -26,14 +26,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.scale import cluster
 
 dask, distributed = pytest.importorskip('dask'), pytest.importorskip('distributed')
 # Dask leaves sockets and event loops to the garbage collector when its processes end.
 pytestmark = pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
 
-PAST = ['--set', 'learning.mode=first_frame']
 ATTACK = """
 import asyncio, os, sys, dask, distributed
 from distributed.protocol.pickle import dumps
@@ -99,7 +97,7 @@ def assert_same(scheduler, tmp_path, capsys):
     return compare
 
 
-@pytest.mark.parametrize('more', [[], PAST, ['--peer', 'patchworkpp']])
+@pytest.mark.parametrize('more', [[], ['--peer', 'patchworkpp']])
 def test_an_evaluation_is_the_same_to_the_last_digit(root, assert_same, more):
     assert_same(', 2 workers beside one another  [ms]', 'evaluate', root, *more)
 
@@ -119,15 +117,15 @@ def test_an_experiment_is_the_same_to_the_last_digit(words, root, assert_same):
 
 
 def test_labels_are_the_same_with_any_number_of_workers(root, scheduler, tmp_path, capsys):
-    assert run('segment', root, '-o', tmp_path / '0', *PAST) == 0
+    assert run('segment', root, '-o', tmp_path / '0') == 0
     for n, words in (('1', ['--workers', '1']), ('2', ['--scheduler', scheduler])):
-        assert run('segment', root, '-o', tmp_path / n, *words, *PAST) == 0
+        assert run('segment', root, '-o', tmp_path / n, *words) == 0
         said = capsys.readouterr()
         assert f'in each of {n} worker' in said.out
         assert said.err == '' or '--scheduler' in words
         assert label_files(tmp_path / n) == label_files(tmp_path / '0')
     for name in ('00', '08'):
-        assert run('segment', root / 'sequences' / name, '-o', tmp_path / 'alone', *PAST) == 0
+        assert run('segment', root / 'sequences' / name, '-o', tmp_path / 'alone') == 0
         of_sequence = tmp_path / f'0/sequences/{name}/predictions'
         assert label_files(tmp_path / 'alone') == label_files(of_sequence)
         shutil.rmtree(tmp_path / 'alone')
@@ -148,15 +146,6 @@ def test_blocks_hold_every_item_once_and_groups_stay_whole(groups, grouped, n_wo
     else:
         assert all(len(block) <= cluster.BLOCK_SIZE for block in blocks)
         assert len(blocks) >= min(len(items), n_workers)
-
-
-def test_only_past_that_counts_keeps_sequences_whole():
-    def depends(**changes):
-        named = {f'learning.{name}': value for name, value in changes.items()}
-        return cluster.depends_on_past(Config().replace(**named))
-
-    assert not depends() and not depends(mode='fixed', warm_start=True)
-    assert depends(mode='every_k') and depends(mode='first_frame') and depends(warm_start=True)
 
 
 def _module_path():

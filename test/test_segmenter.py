@@ -245,12 +245,10 @@ def labelled_by_the_loops(*changes):
 
 
 @pytest.mark.parametrize('model', ['latent', 'line_gradient', 'constant'])
-@pytest.mark.parametrize('scope', ['frame', 'segment'])
 @pytest.mark.parametrize('objective', ['map', 'paper'])
-def test_frames_are_labelled_as_by_the_loops(backend, model, scope, objective):
+def test_frames_are_labelled_as_by_the_loops(backend, model, objective):
     changes = {
         'length_scale.model': model,
-        'learning.scope': scope,
         'learning.objective': objective,
         'learning.length_scale': 'classes' if objective == 'paper' else 'factor',
         'learning.fixed': 'none' if objective == 'paper' else 'length_scales',
@@ -321,7 +319,7 @@ def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
     expected, is_closed = SEGMENTER.segment(scan), []
     for changes in (
         {'runtime.backend': 'numpy'},
-        {'runtime.backend': 'numpy', 'learning.period': 3},
+        {'runtime.backend': 'numpy', 'diagnostics.period': 3.0},
         {'runtime.backend': 'numba' if HAVE_NUMBA else 'auto'},
         {'runtime.backend': 'numpy'},
         {},

@@ -303,7 +303,7 @@ def test_files_of_this_machine_to_a_url(url, store, root, tmp_path, capsys):
 
 def test_of_two_runs_on_a_url_one_ends(url):
     scans = [
-        Scan(UrlPath(f'{url}/sequences/00/velodyne/00000{k}.bin'), f'{k}.label', '', list)
+        Scan(UrlPath(f'{url}/sequences/00/velodyne/00000{k}.bin'), f'{k}.label', list)
         for k in range(3)
     ]
     one, two = (Manifest(UrlPath('s3://drives/both'), '', scans) for _ in range(2))

@@ -85,7 +85,6 @@ def random_config(rng):
         changes['grid.n_bins'] = min(changes.get('grid.n_bins', 160), 400)
         changes['faces.cell_size'] = max(changes.get('faces.cell_size', 0.5), 0.25)
         changes['learning.max_evaluations'] = min(changes.get('learning.max_evaluations', 4), 8)
-        changes.pop('learning.max_time', None)  # a clock decides
         try:
             # Tables grow with the threads, of which up to eight are tried.
             return Config().replace(**changes, **{'runtime.n_threads': 8})

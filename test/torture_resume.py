@@ -19,7 +19,6 @@ from evaluation_samples import label_files
 from torture_cases import run_cases
 
 N_SCANS = {'00': 5, '08': 4}
-PAST = ['--set', 'learning.mode=first_frame']
 
 
 def make_root(root):
@@ -164,7 +163,7 @@ def run_case(number, folder):
     rng = np.random.default_rng([11, number])
     source, out, anew = folder / 'source', folder / 'out', folder / 'anew'
     shutil.copytree(folder / 'root', source)
-    command = ['segment', source, '--quiet', *(PAST if rng.random() < 0.5 else [])]
+    command = ['segment', source, '--quiet']
     try:
         return (compete if number % 6 == 5 else harm)(rng, command, source, out, anew)
     finally:

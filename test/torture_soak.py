@@ -23,7 +23,7 @@ SETTINGS = [
     {'learning.mode': 'fixed', 'sensor.height': 1.7},
     {'grid.r_max': 80.0, 'grid.n_segments': 240},
     {'faces.cell_size': 0.4, 'runtime.n_threads': 2},
-    {'learning.mode': 'every_k', 'learning.period': 3},
+    {'learning.mode': 'every_frame', 'learning.segment_step': 20},
     {'sensor.roll': 0.05, 'sensor.pitch': -0.05},
     {'runtime.backend': 'numpy'},
     {'runtime.backend': 'auto', 'learning.mode': 'every_frame', 'sensor.roll': 0.0},

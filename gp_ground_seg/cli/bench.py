@@ -152,7 +152,7 @@ def load_frames(
 def runs(name: str, n_available: int, n_wanted: int) -> list[tuple[str, int]]:
     """Name and index of frames in runs of `RUN_LENGTH`, spread evenly; all if no more are there.
 
-    Each run has another name: learning over time must not reach over the gap before it.
+    Each run has another name: Patchwork++ must not learn over the gap before it.
     """
     if n_available <= n_wanted or not n_wanted:
         return [(name, k) for k in range(min(n_available, n_wanted))]

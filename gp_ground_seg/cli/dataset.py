@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from gp_ground_seg.data.cloud_output import FORMATS
 from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
-from gp_ground_seg.lab.scale.cluster import Progress, depends_on_past
+from gp_ground_seg.lab.scale.cluster import Progress
 from gp_ground_seg.lab.scale.dataset import Manifest, Outcome, Scan, digest, run_blocks, sweep
 
 # Options that the output depends on, beside the parameters and the layout of scans.
@@ -42,16 +43,17 @@ def list_scans(arguments: argparse.Namespace) -> list[Scan]:
     layout = options.scan_layout(arguments)
     if not _is_root(arguments.input):
         found = list_inputs(as_path(arguments.input), layout)
-        return [Scan(item.path, f'{item.name}.label', '', partial(_read, item)) for item in found]
+        return [Scan(item.path, f'{item.name}.label', partial(_read, item)) for item in found]
     names = list_sequences(arguments.input)
     frames = [frame for name in names for frame in list_frames(arguments.input, name, layout)]
     return [
         Scan(
-            frame.points_path, f'sequences/{frame.sequence}/predictions/{frame.index}.label',
-            frame.sequence, partial(read_points, frame.points_path, layout),
+            frame.points_path,
+            f'sequences/{frame.sequence}/predictions/{frame.index}.label',
+            partial(read_points, frame.points_path, layout),
         )
         for frame in frames
-    ]  # fmt: skip
+    ]
 
 
 def _read(item: Input) -> Any:
@@ -59,7 +61,7 @@ def _read(item: Input) -> Any:
 
 
 def list_bags(arguments: argparse.Namespace, name_of: Callable[[Path], str]) -> list[Scan]:
-    """List the bags of the input, each as a sequence."""
+    """List the bags of the input."""
     paths = [Path(source) for source in (arguments.input, *arguments.more)]
     for path in paths:
         if not holds_bag(path):
@@ -68,7 +70,7 @@ def list_bags(arguments: argparse.Namespace, name_of: Callable[[Path], str]) -> 
     for name in names:
         if names.count(name) > 1:
             raise DataError(f'two of the bags would become {name}')
-    return [Scan(path, name, name, list) for path, name in zip(paths, names, strict=True)]
+    return [Scan(path, name, list) for path, name in zip(paths, names, strict=True)]
 
 
 def run(
@@ -89,8 +91,9 @@ def run(
         raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')
     layout = replace(options.scan_layout(arguments), doubts='ignore')
     given = [getattr(arguments, name) for name in _OPTIONS]
-    by_sequence = unit == 'bag' or depends_on_past(config)
-    manifest = Manifest(target, digest(config, layout, given), items, by_sequence=by_sequence)
+    # A bag takes long: each is a block by itself, and kept once it is finished.
+    group = attrgetter('name') if unit == 'bag' else None
+    manifest = Manifest(target, digest(config, layout, given), items)
     with closing(manifest):
         done, again = manifest.open(resume=arguments.resume, force=arguments.force)
         if done or again:
@@ -99,7 +102,7 @@ def run(
         if len(done) < len(items):
             with options.runner(arguments, 'segment', unit) as runner:
                 manifest.begin()
-                found = run_blocks(runner, function, config, items, manifest, done, by_sequence)
+                found = run_blocks(runner, function, config, items, manifest, done, group)
                 n_workers = runner.n_workers
             print_summary(found, target, n_workers)
     if isinstance(target, Path):

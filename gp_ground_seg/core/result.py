@@ -69,8 +69,7 @@ class Fitting:
     """Facts for `FitReport` that are not in the other results."""
 
     mode: str  # ``learning.mode`` of the frame
-    # Outcome of the learning, of each segment where each has its own; empty where there was none.
-    learned: list[Learned]
+    learned: Learned | None  # outcome of the learning; None where there was none
     backend: str  # ``numba`` or ``numpy``
     n_threads: int  # that were used
 
@@ -86,14 +85,13 @@ class FitReport:
     status : str
         ``converged``, ``budget`` or ``failed``; ``kept`` when nothing was learned on this frame.
     n_evaluations : int
-        Evaluations of the objective, over all segments where each has its own.
+        Evaluations of the objective.
     objective : float
         Objective per inlier at the end; NaN when nothing was learned.
     theta : dict of str to float
         Hyper-parameters used: sigma_f, sigma_n [m], sigma_f_bar, sigma_l_bar [m],
         sigma_n_bar, and the factor on the length-scales that the lines suggest, or one for
-        each class of lines. Means
-        of the logarithms where each segment has its own.
+        each class of lines.
     at_bound : tuple of str
         Those that ended at a bound.
     n_segments : int
@@ -126,17 +124,15 @@ class FitReport:
         """Sum up one frame."""
         learned = frame.fitting.learned
         values, names = np.exp(frame.theta.mean(axis=0)), theta_names(frame.theta.shape[1])
-        statuses = {one.status for one in learned}
-        at_bound = np.any([one.at_bound for one in learned], axis=0) if learned else []
+        at_bound = learned.at_bound if learned else np.zeros(len(names), np.bool_)
         n_inliers = int(frame.surface.inlier.sum())
-        total = sum(one.objective for one in learned)
         return cls(
             mode=frame.fitting.mode,
-            status=next((s for s in ('failed', 'budget', 'converged') if s in statuses), 'kept'),
-            n_evaluations=sum(one.n_evaluations for one in learned),
-            objective=total / n_inliers if learned and n_inliers else float('nan'),
+            status=learned.status if learned else 'kept',
+            n_evaluations=learned.n_evaluations if learned else 0,
+            objective=learned.objective / n_inliers if learned and n_inliers else float('nan'),
             theta={name: float(value) for name, value in zip(names, values, strict=True)},
-            at_bound=tuple(n for n, hit in zip(names, at_bound, strict=False) if hit),
+            at_bound=tuple(n for n, hit in zip(names, at_bound, strict=True) if hit),
             n_segments=int(np.isfinite(frame.surface.mean[:, 0]).sum()),
             n_candidates=len(frame.candidates.r),
             n_inliers=n_inliers,

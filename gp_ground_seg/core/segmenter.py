@@ -20,7 +20,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.backend import Backend, make_backend
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_errors
-from gp_ground_seg.core.gp.learning import Learned, given_theta, in_rows, learn_frame
+from gp_ground_seg.core.gp.learning import given_theta, in_rows, learn_frame
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.pipeline.points import take_points
@@ -43,7 +43,7 @@ class GroundSegmenter:
     config : Config
         Parameters; `configure` changes them between scans.
     clock : callable
-        Source of the seconds in ``Segmentation.timings`` and of ``learning.max_time``.
+        Source of the seconds in ``Segmentation.timings``.
     backend : Backend, optional
         Backend to use until the parameters ``runtime`` change; by default one made from them.
 
@@ -63,8 +63,6 @@ class GroundSegmenter:
         self._config = config if config is not None else Config()
         self._backend = make_backend(self._config.runtime) if backend is None else backend
         self._sample_backend: Backend | None = None
-        self._theta: FloatArray | None = None
-        self._frames_since_learning = 0
         self._warned: set[str] = set()
         self._lock, self._pid = threading.RLock(), os.getpid()
 
@@ -126,7 +124,8 @@ class GroundSegmenter:
         timer.mark('lines')
         # 5. Observation process (height over range) and latent process (its log length-scale):
         #    hyper-parameters theta, in log space, then inliers and surface.
-        theta, learned = self._learn(frame)
+        learned = learn_frame(frame, config, backend)
+        theta = in_rows(learned.theta if learned else given_theta(config), frame)
         timer.mark('learning')
         surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
         timer.mark('surface')
@@ -172,13 +171,10 @@ class GroundSegmenter:
         return self._backend
 
     def configure(self, config: Config) -> None:
-        """Use `config` from the next scan on; what was learned under another is forgotten."""
+        """Use `config` from the next scan on."""
         with self._exclusive():
             if config.runtime != self._config.runtime:
                 self.use_backend(make_backend(config.runtime))
-            before = {name: getattr(self._config, name) for name in ('output', 'diagnostics')}
-            if dataclasses.replace(config, **before) != self._config:
-                self.reset()
             self._config = config
             self._warned.clear()
 
@@ -187,10 +183,6 @@ class GroundSegmenter:
         with self._exclusive():
             self.close()
             self._backend, self._sample_backend = backend, None
-
-    def reset(self) -> None:
-        """Forget what was learned on earlier scans, as after a jump in time."""
-        self._theta = None
 
     def close(self) -> None:
         """End the worker threads, once the scan at hand is segmented."""
@@ -247,27 +239,6 @@ class GroundSegmenter:
             scan = backend.build_grid(pose.level(xyz), config)
         timer.mark('pose')
         return scan, pose
-
-    def _learn(self, frame: Frame) -> tuple[FloatArray, list[Learned]]:
-        """Theta of this frame by ``learning.mode``; (M, 6) and the outcome, if learned."""
-        learning = self._config.learning
-        if learning.mode == 'fixed':
-            n_segments = len(frame.candidates.offsets) - 1
-            return in_rows(given_theta(self._config), n_segments), []
-        period = {'every_frame': 1, 'every_k': learning.period, 'first_frame': None}[learning.mode]
-        self._frames_since_learning += 1
-        is_kept = period is None or self._frames_since_learning < period
-        if self._theta is not None and is_kept:
-            return self._theta, []
-        started = self._clock() if learning.max_time > 0.0 else 0.0
-
-        def out_of_time() -> bool:
-            return 0.0 < learning.max_time <= self._clock() - started
-
-        before = self._theta if learning.warm_start else None
-        self._theta, learned = learn_frame(frame, before, self._config, self._backend, out_of_time)
-        self._frames_since_learning = 0
-        return self._theta, learned
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:

@@ -260,6 +260,5 @@ class TimeJumps:
     def _jumped(self, seconds: float) -> None:
         self._on_jump(seconds)
         self._node.get_logger().info(
-            f'time jumped back by {seconds:.1f} s: what earlier clouds taught is forgotten',
-            **THROTTLED,
+            f'time jumped back by {seconds:.1f} s, as when a bag starts again', **THROTTLED
         )

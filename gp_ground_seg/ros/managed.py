@@ -60,7 +60,7 @@ class ManagedNode(LifecycleNodeMixin, node.GroundSegmentationNode):  # type: ign
         return self._set_active(False)
 
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
-        """Free the backend, and forget what was learned."""
+        """Free the backend."""
         self._is_configured = False
         self._free_segmenter()
         self._make_segmenter()

@@ -215,7 +215,6 @@ class GroundSegmentationNode(ConfiguredNode):
         self._library_log.close()
 
     def _on_time_jump(self, seconds: float) -> None:
-        self._segmenter.reset()
         if self._tf is not None:
             self._tf.time_jumped(seconds)
         self._diagnostics.input.time_jumped()

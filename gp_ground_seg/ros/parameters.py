@@ -21,6 +21,7 @@ from rclpy.qos import qos_profile_parameters
 from gp_ground_seg.core.errors import ConfigError, DataError, GroundSegError
 from gp_ground_seg.core.parameters.config import Config, find_spec, parameter_specs
 from gp_ground_seg.core.parameters.export import differences
+from gp_ground_seg.core.parameters.removed import removal
 from gp_ground_seg.core.parameters.schema import OF_EVERY_NODE, ParameterSpec, ParameterValue
 from gp_ground_seg.ros.input import QOS_OVERRIDES, check_overrides
 from gp_ground_seg.ros.start_stop import start_errors
@@ -95,7 +96,9 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         if not isinstance(use_sim_time, bool):
             raise ConfigError(f'use_sim_time = {use_sim_time!r}: must be true or false')
         check_overrides({name: parameter.value for name, parameter in given.items()})
-        self._config = changed(Config(), given.values())
+        # What is removed is left out for one release, see `warn_of_unused_parameters`.
+        kept = [p for p in given.values() if not removal(p.name, p.value)]
+        self._config = changed(Config(), kept)
         self.check_config(self._config)
         for parameter_name in given:
             self.undeclare_parameter(parameter_name)
@@ -103,7 +106,7 @@ class ConfiguredNode(Node):  # type: ignore[misc]
             for spec in parameter_specs():
                 value = self._config[spec.name]
                 self.declare_parameter(spec.name, value, descriptor(spec), ignore_override=True)
-        self._given_names = frozenset(given)
+        self._given = given
         self.add_pre_set_parameters_callback(lambda parameters: list(map(_typed, parameters)))
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._post_set)
@@ -127,11 +130,13 @@ class ConfiguredNode(Node):  # type: ignore[misc]
         """Use `config`, which `check_config` has accepted, from now on."""
 
     def warn_of_unused_parameters(self) -> None:
-        """Log the given names that are not declared; call it after all topics are made."""
-        for name in sorted(self._given_names):
-            if not self.has_parameter(name):
+        """Log what was given and is removed or not declared; call it after all topics are made."""
+        for name, parameter in sorted(self._given.items()):
+            reason = removal(name, parameter.value)
+            if not (reason or self.has_parameter(name)):
                 is_qos = name.startswith(QOS_OVERRIDES)
                 reason = 'no such topic or policy here' if is_qos else _unknown(name)
+            if reason:
                 self.get_logger().warning(f'parameter {name} is not used: {reason}')
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> Result:

@@ -2,8 +2,7 @@
 
 Theta is a vector of logarithms: sigma_f, sigma_n, sigma_f_bar, sigma_l_bar, sigma_n_bar, then a
 factor on the length-scales that the lines suggest, or with ``learning.length_scale = classes`` one
-for each class of lines. A frame has one row of it per segment; learned over the whole frame, the
-rows are equal.
+for each class of lines. It is learned over the whole frame: the rows of its segments are equal.
 """
 
 from __future__ import annotations
@@ -153,26 +152,17 @@ class Model(Protocol):
         """Log marginal likelihood and its gradient."""
 
 
-def learn_frame(
-    frame: Frame,
-    before: FloatArray | None,
-    config: Config,
-    model: Model,
-    out_of_time: Callable[[], bool],
-) -> tuple[FloatArray, list[Learned]]:
+def learn_frame(frame: Frame, config: Config, model: Model) -> Learned | None:
     """Learn theta on the inliers that grow under it, then on those under what was learned, ...
 
     It ends when the inliers of a later round are no more than before, or when
-    ``learning.max_evaluations`` are spent, of which the first round has half. `before`, (M, T),
-    is where to begin, if not at `first_theta`; for `out_of_time` see `maximise`.
-    Returns the hyper-parameters of each segment, (M, T), and one outcome for the frame, or one
-    for each segment.
+    ``learning.max_evaluations`` are spent, of which the first round has half. None if
+    ``learning.mode`` is fixed.
     """
-    learning, n_segments = config.learning, len(frame.candidates.offsets) - 1
-    by_frame, space = learning.scope == 'frame', theta_space(config)
-    thin = every_segment(frame, learning.segment_step if by_frame else 1)
-    n_thin = len(thin.candidates.offsets) - 1
-    theta = in_rows(first_theta(frame, config), n_thin) if before is None else before[:n_thin]
+    learning, space = config.learning, theta_space(config)
+    if learning.mode == 'fixed':
+        return None
+    thin = every_segment(frame, learning.segment_step)
     has_latent = bool(space.free[2:].any())
     is_map, slope_std = learning.objective == 'map', config.observation.slope_std
 
@@ -181,38 +171,27 @@ def learn_frame(
             return model.log_likelihood(theta, data, slope_std, not is_map)
 
         return maximise(
-            objective,
-            space,
-            begin,
-            len(data.r),
-            use_priors=is_map,
-            max_evaluations=budget,
-            out_of_time=out_of_time,
+            objective, space, begin, len(data.r), use_priors=is_map, max_evaluations=budget
         )
 
-    learned: list[Learned] = []
+    none_at_bound = np.zeros_like(space.free)
+    learned = Learned(first_theta(frame, config), -math.inf, 0, 'budget', none_at_bound)
     numbers: list[int] = []
     budget = max(learning.max_evaluations // 2, 1)
-    while budget > 0 and not (learned and out_of_time()):
-        surface, _, u = model.estimate_surface(thin, theta, config)
+    while budget > 0:
+        surface, _, u = model.estimate_surface(thin, in_rows(learned.theta, thin), config)
         numbers.append(int(surface.inlier.sum()))
         if len(numbers) > 2 and numbers[-1] <= numbers[-2]:
             break
-        inliers = take_inliers(thin, surface.inlier, u, has_latent)
-        parts = [inliers] if by_frame else [_one_segment(inliers, m) for m in range(n_thin)]
-        earlier = [one.n_evaluations for one in learned] or [0] * len(parts)
-        learned = [learn(*one, budget) for one in zip(theta, parts, strict=False)]
-        theta = np.array([one.theta for one in learned])
-        theta = in_rows(theta[0], n_thin) if by_frame else theta
-        spent = [one.n_evaluations + n for one, n in zip(learned, earlier, strict=True)]
-        learned = [one._replace(n_evaluations=n) for one, n in zip(learned, spent, strict=True)]
-        budget = learning.max_evaluations - max(spent)
-    return in_rows(theta[0], n_segments) if by_frame else theta, learned
+        found = learn(learned.theta, take_inliers(thin, surface.inlier, u, has_latent), budget)
+        learned = found._replace(n_evaluations=learned.n_evaluations + found.n_evaluations)
+        budget = learning.max_evaluations - learned.n_evaluations
+    return learned
 
 
-def in_rows(theta: FloatArray, n: int) -> FloatArray:
-    """Return the same theta for each of `n` segments, (n, 6)."""
-    return np.repeat(theta[None], n, axis=0)
+def in_rows(theta: FloatArray, frame: Frame) -> FloatArray:
+    """Return the same theta for each segment of a frame, (M, T)."""
+    return np.repeat(theta[None], len(frame.candidates.offsets) - 1, axis=0)
 
 
 def every_segment(frame: Frame, step: int) -> Frame:
@@ -271,21 +250,6 @@ def take_inliers(frame: Frame, inlier: BoolArray, u: FloatArray, has_latent: boo
     )
 
 
-def _one_segment(inliers: Inliers, m: int) -> Inliers:
-    inside = slice(inliers.offsets[m], inliers.offsets[m + 1])
-    bar = slice(inliers.bar_offsets[m], inliers.bar_offsets[m + 1])
-    return Inliers(
-        np.array([0, inside.stop - inside.start]),
-        inliers.r[inside],
-        inliers.z[inside],
-        inliers.log_length_scale[inside],
-        np.array([0, bar.stop - bar.start]),
-        inliers.r_bar[bar],
-        inliers.log_extent[bar],
-        inliers.kind[bar],
-    )
-
-
 def maximise(
     objective: Objective,
     space: ThetaSpace,
@@ -294,7 +258,6 @@ def maximise(
     *,
     use_priors: bool,
     max_evaluations: int,
-    out_of_time: Callable[[], bool],
 ) -> Learned:
     """Maximise objective plus log priors from `start`, within bounds and budget.
 
@@ -305,7 +268,7 @@ def maximise(
 
     `objective` gives the log marginal likelihood of a theta and its gradient, ``-inf`` is allowed;
     `start` is in log space, `n_data` the number of inliers. The best theta so far is returned
-    after `max_evaluations`, or when `out_of_time`, called before each but the first, says so.
+    after `max_evaluations`.
     """
     free, theta = space.free, np.clip(start, space.lower, space.upper)
     lower, upper = space.lower[free], space.upper[free]
@@ -325,7 +288,7 @@ def maximise(
         if float(np.abs(slope).max()) < _LEVEL:
             status = 'converged'
             break
-        if n_evaluations >= max_evaluations or out_of_time():
+        if n_evaluations >= max_evaluations:
             break
         trial = x + step * (reach * min(1.0, _LONGEST_STEP / longest))
         trial = np.minimum(np.maximum(trial, lower), upper)

@@ -235,24 +235,14 @@ class LabelConfig:
 class LearningConfig:
     """Learning of the hyper-parameters."""
 
-    mode: str = basic('every_frame', ('every_frame', 'every_k', 'first_frame', 'fixed'),
+    mode: str = basic('every_frame', ('every_frame', 'fixed'),
         'when the hyper-parameters are learned; fixed = never, the values given here are used')
-    period: int = advanced(10, (1, 10000),
-        'frames from one learning to the next in the mode every_k')
-    scope: str = advanced('frame', ('frame', 'segment'),
-        'frame = one set of hyper-parameters for the whole frame; segment = one for each segment '
-        '(slow, for comparison)')
     segment_step: int = advanced(30, (1, 60),
-        'for the scope frame: learn from every n-th segment; neighbours see similar ground')
+        'learn from every n-th segment; neighbours see similar ground')
     objective: str = advanced('map', ('map', 'paper'),
         'map = likelihood of the heights and priors; paper = as printed, which has no upper bound')
-    warm_start: bool = advanced(False, (),
-        'start from the frame before instead of the lines; the labels then depend on the past')
     max_evaluations: int = advanced(5, (1, 1000),
         'evaluations of the objective per frame; the best so far is used')
-    max_time: float = advanced(0.0, (0.0, 60.0),
-        'time for the learning of a frame, after which the best so far is used; 0 = no limit; the '
-        'labels then depend on the speed of the machine', 's')
     prior_std: float = advanced(1.0, (0.01, 10.0),
         'standard deviation of the log-normal priors about the values given here')
     length_scale: str = advanced('factor', ('factor', 'classes'),

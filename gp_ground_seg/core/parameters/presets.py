@@ -66,7 +66,6 @@ _PRESETS = (
             'label.ground_tolerance': (0.2, 'zeta_g, not printed: one for all'),
             'label.rule': ('tolerance', 'one zeta_g for all (Algorithm 2)'),
             'learning.objective': ('paper', 'section III-E as printed'),
-            'learning.scope': ('frame', 'one theta for the whole frame, section III-E'),
             'learning.fixed': ('none', 'all hyper-parameters are learned, section III-E'),
             'learning.length_scale': ('classes', 'all segments share L_bar, section III-E'),
             'learning.max_evaluations': (1000, 'learning ends by itself before'),

@@ -31,18 +31,18 @@ from gp_ground_seg.lab.scoring.report import (
 from gp_ground_seg.lab.scoring.tables import make_report
 
 _FIXED: Changes = {'learning.mode': 'fixed'}
-_WHOLE_FRAME: Changes = {'learning.mode': 'every_frame', 'learning.scope': 'frame'}
+_LEARNED: Changes = {'learning.mode': 'every_frame'}
 _CONSTANT: Changes = {'length_scale.model': 'constant'}
 _GRADIENT: Changes = {'length_scale.model': 'line_gradient'}
 _LATENT: Changes = {'length_scale.model': 'latent', 'learning.fixed': 'none'}
 
 MODELS: dict[str, Changes] = {
     'constant, not learned': {**_CONSTANT, **_FIXED},
-    'constant, learned': {**_CONSTANT, **_WHOLE_FRAME},
+    'constant, learned': {**_CONSTANT, **_LEARNED},
     'Z, not learned': {**_GRADIENT, **_FIXED},
-    'Z, learned': {**_GRADIENT, **_WHOLE_FRAME},
+    'Z, learned': {**_GRADIENT, **_LEARNED},
     'Z-L, not learned': {**_LATENT, **_FIXED},
-    'Z-L, learned over the frame': {**_LATENT, **_WHOLE_FRAME},
+    'Z-L, learned over the frame': {**_LATENT, **_LEARNED},
 }
 """Length-scale models, each with theta given and learned; the last one is the paper's."""
 
@@ -72,7 +72,6 @@ DEPARTURES: dict[str, Changes] = {
     'lines continued outside the gate': {'growth.max_line_slope': 0.0},
     'lines continued past a slope break': {'growth.min_bend_extent': 1000.0},
     'learning from every 30th segment': {'learning.segment_step': 1},
-    'one theta for the frame': {'learning.scope': 'segment'},
 }
 """What the defaults have and the paper has not, and the changes that switch it off."""
 ALTERNATIVES: dict[str, Changes] = {

@@ -31,7 +31,6 @@ from tqdm import tqdm
 import gp_ground_seg
 from gp_ground_seg.core import log
 from gp_ground_seg.core.errors import DataError, in_one_line, require
-from gp_ground_seg.core.parameters.config import Config
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 BLOCK_SIZE = 64
@@ -190,14 +189,6 @@ def cut(
         return [[*members] for _, members in itertools.groupby(items, key=group)]
     size = max(1, min(BLOCK_SIZE, -(-len(items) // (2 * max(1, n_workers)))))
     return [[*items[k : k + size]] for k in range(0, len(items), size)]
-
-
-def depends_on_past(config: Config) -> bool:
-    """Whether the labels of a scan depend on the scans before it."""
-    learning = config.learning
-    return learning.mode in ('every_k', 'first_frame') or (
-        learning.mode == 'every_frame' and learning.warm_start
-    )
 
 
 def package_versions(*packages: str) -> dict[str, str | None]:

@@ -8,7 +8,7 @@ import itertools
 import json
 import logging
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import IO, Any, NamedTuple
@@ -33,7 +33,6 @@ class Scan(NamedTuple):
 
     path: AnyPath
     name: str  # of the file to write, below the output folder
-    sequence: str  # labels may depend on the scans before it in the same sequence
     read: Callable[[], Any]  # returns the points
 
     def __str__(self) -> str:
@@ -83,18 +82,14 @@ def segment_block(
     scans: Sequence[Scan],
     progress: Progress,
 ) -> Outcome:
-    """Label scans of one sequence, or of several where none depends on another; write the files.
+    """Label scans and write their files.
 
     `write` takes the path of a file and the `Segmentation`, and returns its size [bytes].
     """
     sizes = []
 
     def results(segmenter: GroundSegmenter) -> Iterator[Segmentation]:
-        sequence = None
         for scan in progress(scans):
-            if scan.sequence != sequence:
-                segmenter.reset()
-            sequence = scan.sequence
             try:
                 result = segmenter.segment(scan.read())
             except PointCloudError as error:
@@ -120,26 +115,12 @@ class Manifest:
         Digest of all that the output depends on, beside the inputs; see `digest`.
     scans : sequence of Scan
         All that are to be labelled.
-    by_sequence : bool
-        Whether labels depend on the other scans of the sequence.
     """
 
-    def __init__(
-        self,
-        folder: AnyPath,
-        configuration: str,
-        scans: Sequence[Scan],
-        *,
-        by_sequence: bool = False,
-    ) -> None:
+    def __init__(self, folder: AnyPath, configuration: str, scans: Sequence[Scan]) -> None:
         self._path = folder / MANIFEST
         self._run = {'configuration': configuration, 'version': gp_ground_seg.__version__}
         self._inputs = {scan.name: [_place(scan.path), *stamp(scan.path)] for scan in scans}
-        if by_sequence:
-            for block in cut(scans, lambda scan: scan.sequence):
-                names = [scan.name for scan in block]
-                for name in names:
-                    self._inputs[name].append(hashlib.sha256(repr(names).encode()).hexdigest())
         self._text = b''
         self._file: IO[bytes] | None = None
 
@@ -266,22 +247,16 @@ def run_blocks(
     items: Sequence[Scan],
     manifest: Manifest,
     done: set[str],
-    by_sequence: bool,
+    group: Callable[[Any], Hashable] | None,
 ) -> Outcome:
     """Compute the items whose names are not `done`, and add each block to the manifest.
 
-    With `by_sequence` a block is a whole sequence, computed again from its first scan if it is not
-    finished: the labels of a scan may depend on the scans before it.
+    Blocks are cut by `group`, see `cut`.
     """
     left = [item for item in items if item.name not in done]
     if runner.n_workers:
         config = config.replace(**{'runtime.n_threads': 1})
-    if by_sequence:
-        unfinished = {item.sequence for item in left}
-        again = [item for item in items if item.sequence in unfinished]
-        blocks = cut(again, lambda item: item.sequence)
-    else:
-        blocks = cut(left, None, runner.n_workers)
+    blocks = cut(left, group, runner.n_workers)
     found = []
     for k, outcome in runner.map_blocks(partial(function, config), blocks):
         manifest.add([item.name for item in blocks[k]], outcome.sizes)

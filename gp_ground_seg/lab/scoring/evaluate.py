@@ -23,7 +23,7 @@ from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.result import FitReport
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import Frame, read_entries, read_points
-from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner, depends_on_past
+from gp_ground_seg.lab.scale.cluster import HERE, Progress, Runner
 from gp_ground_seg.lab.scoring import metrics
 from gp_ground_seg.lab.scoring.metrics import (
     CONVENTIONS,
@@ -84,13 +84,15 @@ class Method(Protocol):
 class OurMethod:
     """`GroundSegmenter` as a method; `last` is its last result."""
 
+    depends_on_past = False
+
     def __init__(
         self,
         config: Config,
         name: str = OURS,
         make: Callable[[RuntimeConfig], Backend] = make_backend,
     ) -> None:
-        self.name, self.depends_on_past, self._make = name, depends_on_past(config), make
+        self.name, self._make = name, make
         self._segmenter = GroundSegmenter(config, backend=make(config.runtime))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -99,8 +101,7 @@ class OurMethod:
         return type(self), (config, self.name, self._make)
 
     def reset(self) -> None:
-        """Forget what was learned."""
-        self._segmenter.reset()
+        """Do nothing: each scan is segmented by itself."""
 
     def run(self, points: Points) -> None:
         """Segment a scan."""

@@ -173,8 +173,6 @@ class Tuner:
 
     def _segment(self, number: int, config: Config) -> Segmentation:
         self._segmenter.configure(config)
-        # A scan by itself, whatever was segmented before.
-        self._segmenter.reset()
         return self._segmenter.segment(self._view(number).points)
 
     def _labels_and_scores(self, number: int, config: Config) -> tuple[Labels, dict[str, float]]:
