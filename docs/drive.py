@@ -22,7 +22,8 @@ WIDTH, N_COLOURS = 720, 24
 def main(path: str) -> int:
     """Segment and draw each scan; write one file of all."""
     drive, pictures, n_points, n_ground = simulated_drive(N_SCANS), [], 0, 0
-    with tempfile.TemporaryDirectory() as folder, GroundSegmenter() as segmenter:
+    segmenter = GroundSegmenter()
+    with tempfile.TemporaryDirectory() as folder:
         still = Path(folder) / 'scan.png'
         for points, _, _ in drive.scans:
             label = segmenter.segment(points).label

@@ -80,8 +80,8 @@ GAINS = {
 }
 OBJECTS = {'vehicles': ('vehicle',), 'persons and cyclists': ('person', 'cyclist')}
 TIMES = {
-    'learning, 2 threads': 'learning, 2 threads',
-    'theta fixed, 2 threads': 'no learning, 2 threads',
+    'learning, 1 thread': 'learning',
+    'theta fixed, 1 thread': 'no learning',
     'learning, numpy': 'learning, without numba',
 }
 

@@ -32,7 +32,6 @@ ARGUMENTS = (
     ('obstacles', 'obstacles', 'topic of the obstacles'),
     ('params_file', '', 'parameter file, or the name of one of config/: default, paper'),
     ('params', '{}', "more parameters, as YAML: '{sensor.height: 1.2, learning.mode: fixed}'"),
-    ('threads', '', 'threads of the compiled code: runtime.n_threads'),
     ('name', 'ground_segmentation_node', 'name of the node'),
     ('namespace', '', 'namespace of the node and of its outputs'),
     ('log_level', 'info', 'level of its log: debug, info, warn, error'),
@@ -57,9 +56,9 @@ def _boolean(values, name):
     return text in ('true', '1')
 
 
-def _number(values, name, kind):
+def _number(values, name):
     try:
-        return kind(values[name])
+        return float(values[name])
     except ValueError:
         raise ValueError(f'{name}:={values[name]}: must be a number') from None
 
@@ -79,8 +78,6 @@ def _parameters(values):
         more = None
     if not isinstance(more, dict):
         raise ValueError(f"params:={values['params']}: must be YAML as '{{sensor.height: 1.2}}'")
-    if values['threads']:
-        more['runtime.n_threads'] = _number(values, 'threads', int)
     if _is_simulated(values):
         more['use_sim_time'] = True
     return [*found, more] if more else found
@@ -134,7 +131,7 @@ def _actions(context):
             ros_arguments=['--log-level', values['log_level']],
             output='screen',
             respawn=is_respawned,
-            respawn_delay=_number(values, 'respawn_delay', float),
+            respawn_delay=_number(values, 'respawn_delay'),
             on_exit=None if is_respawned else _end,
         )
     ]

@@ -3,11 +3,8 @@
 import importlib.util
 import os
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from functools import cache, lru_cache
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -100,30 +97,17 @@ def fewer(n: int, n_plain: int) -> int:
     return n if JIT_ENABLED else n_plain
 
 
-@contextmanager
-def sharing(n_threads: int) -> Iterator[NumbaBackend]:
-    """Backend that splits even the smallest clouds, in threads also without compiled code."""
-    threads = 'gp_ground_seg.core.compiled.threads'
-    one = {'POINTS_TO_SORT': 1, 'POINTS_TO_LABEL': 1, 'SEGMENTS_TO_GROW': 1, 'JIT_ENABLED': True}
-    with patch.multiple(threads, **one):
-        backend = NumbaBackend(n_threads)
-        yield backend
-        backend.close()
-
-
-@pytest.fixture(scope='module', params=['numpy', 'numba', 'numba, 3 threads'])
-def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
+@pytest.fixture(scope='module', params=[NumpyBackend, NumbaBackend], ids=['numpy', 'numba'])
+def backend(request: pytest.FixtureRequest) -> Backend:
     """Each backend in turn; its buffers hold what the tests before left in them."""
-    plain = nullcontext(NumpyBackend())
-    with plain if request.param == 'numpy' else sharing(3 if '3' in request.param else 1) as one:
-        yield one
+    return request.param()
 
 
 @pytest.fixture(scope='session', autouse=True)
 def compiled_code():
     """Code compiled once for this checkout: nodes and commands of the tests load it."""
     if JIT_ENABLED:
-        warm_up().close()
+        warm_up()
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """Two checkouts of this package on the same frames, in turns: time, start and memory.
 
-`python test/paired_bench.py OTHER_CHECKOUT [--frames N] [--passes N] [--threads N] [--cold]`,
+`python test/paired_bench.py OTHER_CHECKOUT [--frames N] [--passes N] [--cold]`,
 on an idle machine. Prints ratios of this checkout over the other one.
 """
 
@@ -19,8 +19,8 @@ WORKER = """
 import resource, sys, time
 from gp_ground_seg import Config, GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import read_points
-mode, n_threads, backend, *paths = sys.argv[1:]
-changes = {'learning.mode': mode, 'runtime.n_threads': int(n_threads), 'runtime.backend': backend}
+mode, backend, *paths = sys.argv[1:]
+changes = {'learning.mode': mode, 'runtime.backend': backend}
 segmenter = GroundSegmenter(Config().replace(**changes))
 clouds = [read_points(path) for path in paths]
 segmenter.segment(clouds[0])
@@ -89,7 +89,7 @@ def compare_starts(other, path, n_runs, *, cold):
         for checkout in (REPOSITORY, other):
             with tempfile.TemporaryDirectory() as cache:
                 changes = {'NUMBA_CACHE_DIR': cache} if cold else {}
-                worker = Worker(checkout, ('every_frame', '1', 'numba'), [path], **changes)
+                worker = Worker(checkout, ('every_frame', 'numba'), [path], **changes)
                 worker.close()
             seconds.append(worker.start)
     here, there = np.median(np.reshape(seconds, (-1, 2)), axis=0)
@@ -102,7 +102,6 @@ def main():
     parser.add_argument('other', type=Path)
     parser.add_argument('--frames', type=int, default=60)
     parser.add_argument('--passes', type=int, default=5)
-    parser.add_argument('--threads', type=int, nargs='+', default=[1, 2])
     parser.add_argument('--cold', action='store_true', help='an empty cache too')
     given = parser.parse_args()
     kitti = find_kitti()
@@ -111,10 +110,9 @@ def main():
     paths = paths[:: max(1, len(paths) // given.frames)]
     other = given.other.resolve()
     print(f'{len(paths)} frames, {given.passes} passes; this checkout first')
-    for n_threads in given.threads:
-        for mode in ('fixed', 'every_frame'):
-            compare_frames(other, (mode, str(n_threads), 'numba'), paths, given.passes)
-    compare_frames(other, ('fixed', '1', 'numpy'), paths[::4], 1)
+    for mode in ('fixed', 'every_frame'):
+        compare_frames(other, (mode, 'numba'), paths, given.passes)
+    compare_frames(other, ('fixed', 'numpy'), paths[::4], 1)
     compare_starts(other, paths[0], 5, cold=False)
     if given.cold:
         compare_starts(other, paths[0], 2, cold=True)

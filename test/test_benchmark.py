@@ -21,7 +21,7 @@ from gp_ground_seg.lab.scoring.benchmark import bench_cases, bench_document, run
 from gp_ground_seg.lab.scoring.evaluate import PATCHWORKPP, KnownScan, MethodScore
 from gp_ground_seg.lab.scoring.report import describe_environment
 
-QUICK = ('--threads', '1', '--set', 'grid.n_segments=24')
+QUICK = ('--set', 'grid.n_segments=24')
 NUMPY = Config().replace(
     **{'runtime.backend': 'numpy', 'grid.n_segments': 8, 'learning.max_evaluations': 1}
 )
@@ -61,10 +61,9 @@ def test_every_case_runs_on_every_frame_beside_its_own_baseline():
         return rulers[-1]
 
     frames = frames_of(('a', 3), ('b', 2))
-    cases = bench_cases(NUMPY, [1, 2], with_numpy=True)
+    cases = bench_cases(NUMPY, with_numpy=True)
     assert list(cases) == [
-        'theta fixed, 1 thread', 'theta fixed, 2 threads',
-        'learning, 1 thread', 'learning, 2 threads', 'theta fixed, numpy', 'learning, numpy',
+        'theta fixed, 1 thread', 'learning, 1 thread', 'theta fixed, numpy', 'learning, numpy',
     ]  # fmt: skip
     measured = run_cases(frames, cases, make, n_passes=2, clock=lambda: next(clock))
     assert list(measured) == list(cases)
@@ -79,7 +78,7 @@ def test_every_case_runs_on_every_frame_beside_its_own_baseline():
         # Once to warm up, then on each frame; forgotten at each change of sequence.
         assert (ruler.journal.count('b'), ruler.journal.count('Rb')) == (1 + 10, 4)
     modes = [ours.scans[-1].fit.mode for ours, _ in measured.values()]
-    assert modes == ['fixed'] * 2 + ['every_frame'] * 2 + ['fixed', 'every_frame']
+    assert modes == ['fixed', 'every_frame'] * 2
 
 
 @given(st.integers(1, 500), st.integers(1, 100))
@@ -138,7 +137,7 @@ def scans(tmp_path_factory):
 @pytest.fixture(scope='module')
 def record(scans, tmp_path_factory):
     path = tmp_path_factory.mktemp('record') / 'bench.json'
-    assert run('bench', scans, '--threads', '1,2', '--numpy', '--json', path) == 0
+    assert run('bench', scans, '--numpy', '--json', path) == 0
     return path
 
 
@@ -149,11 +148,9 @@ def test_record_holds_machine_cases_stages_and_series(record, scans):
     environment = document['environment']
     assert environment['cpu']
     assert {'numpy', 'numba', 'scipy', 'pypatchworkpp'} <= set(environment['versions'])
-    assert [(c['mode'], c['backend'], c['n_threads']) for c in document['cases']] == [
-        ('fixed', 'numba', 1), ('fixed', 'numba', 2),
-        ('every_frame', 'numba', 1), ('every_frame', 'numba', 2),
-        ('fixed', 'numpy', 1), ('every_frame', 'numpy', 1),
-    ]  # fmt: skip
+    assert [(case['mode'], case['backend']) for case in document['cases']] == [
+        (mode, backend) for backend in ('numba', 'numpy') for mode in ('fixed', 'every_frame')
+    ]
     for case in document['cases']:
         assert len(case['frames']) == 5
         assert all(frame['ms'] > 0 and frame['baseline_ms'] > 0 for frame in case['frames'])
@@ -221,8 +218,8 @@ def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
         (('DATA', '--from', 'x.json'), 'either DATA'),
         (('nowhere',), 'no such file'),
         (('DATA', '--topic', '/points'), 'is for bags'),
-        (('DATA', '--threads', '0'), '--threads 0'),
-        (('DATA', '--threads', 'two'), '--threads two'),
+        (('DATA', '--threads', '2'), 'bench --threads was removed: leave it out'),
+        (('DATA', '--threads=2'), 'bench --threads was removed: leave it out'),
         (('DATA', '--set', 'grid.n_segments=0'), 'grid.n_segments'),
         (('--from', 'nowhere.json'), 'nowhere.json'),
         (('--from', 'OTHER'), 'not a record'),

@@ -95,7 +95,7 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
         rows = [re.split(r'  +', line.strip()) for line in lines if line.startswith(first)]
         assert len(row) in map(len, rows), row
     assert max(map(len, lines)) <= 100
-    assert document['n_threads'] >= 1 and document['environment']['cpu']
+    assert document['backend'] and document['environment']['cpu']
     if 'grid.n_bins=40' in words:
         assert document['config_changes']['grid.n_bins'] == 40
 

@@ -141,7 +141,6 @@ def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path
     ours = OurMethod(Config())
     with pytest.raises(PointCloudError, match='00/000003: gp_ground_seg: '):
         evaluate(tmp_path, ours)
-    ours.close()
     path = tmp_path / 'sequences/00/labels/000003.label'
     path.write_bytes(path.read_bytes()[:-4])
     with pytest.raises(DataError, match=r'000003\.label'):
@@ -150,11 +149,8 @@ def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path
 
 def test_ours_is_the_library(tmp_path):
     write_streets(tmp_path, s00=2)
-    config = Config().replace(**{'runtime.n_threads': 1})
-    ours = OurMethod(config)
-    (score,) = evaluate(tmp_path, ours)
-    ours.close()
-    segmenter = GroundSegmenter(config)
+    (score,) = evaluate(tmp_path, OurMethod(Config()))
+    segmenter = GroundSegmenter()
     for frame, scored in zip(labelled_frames(tmp_path), score.scans, strict=True):
         scan = runner.load_kitti(frame)
         result = segmenter.segment(scan.points)
@@ -168,7 +164,6 @@ def test_ours_is_the_library(tmp_path):
         assert 'total' not in scored.stages
         assert 0.0 < sum(scored.stages.values()) <= scored.seconds
         assert scored.pose.height == result.pose.height
-    assert score.scans[0].fit.n_threads == 1
 
 
 def test_a_missing_peer_is_said(monkeypatch):
@@ -287,7 +282,6 @@ def test_tables_hold_the_sums_of_the_frames(root, evaluated, capfd):
     ratio = times['gp_ground_seg']['median'] / times['Patchwork++']['median']
     assert times['Patchwork++']['ratio'] == pytest.approx(ratio)
     assert document['environment']['versions']['pypatchworkpp']
-    assert document['n_threads'] >= 1
     for row in frames:
         assert row['points'] == len(street()[0])
         has_errors = row['groundgrid_fp'] + row['groundgrid_fn'] > 0
@@ -334,14 +328,13 @@ def test_classes_rings_and_probabilities(evaluated):
 
 def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
     settings = ['label.ground_tolerance=0.011', 'sensor.height=1.7', 'growth.seed_range=19.5']
-    settings += ['runtime.n_threads=1', 'lines.max_gap=1.25', 'grid.r_max=15.0']
+    settings += ['lines.max_gap=1.25', 'grid.r_max=15.0']
     run('evaluate', root, '--json', tmp_path / 'a.json')
     words = [f'--set={setting}' for setting in settings]
     run('evaluate', root, '--json', tmp_path / 'b.json', *words)
     a, b = (json.loads((tmp_path / f'{name}.json').read_text()) for name in 'ab')
     assert a['config_changes'] == {}
     assert b['config_changes']['label.ground_tolerance'] == 0.011
-    assert b['n_threads'] == 1
     assert b['groundgrid'][-1]['recall'] < a['groundgrid'][-1]['recall']
     output = capsys.readouterr().out
     assert 'Patchwork++' not in output

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -76,9 +75,9 @@ def test_interpolation_joins_lowest_points_that_are_not_too_steep():
 
 def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
     scan = runner.load_kitti(frames[0])
-    with closing(interpolation.interpolation_method(Config())) as plain:
-        plain.run(scan.points)
-        result = plain.last
+    plain = interpolation.interpolation_method(Config())
+    plain.run(scan.points)
+    result = plain.last
     candidates, surface, segment = result.candidates, result.surface, 60
     lines = []
     for k in (segment - 1, segment, segment + 1):

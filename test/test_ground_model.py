@@ -85,9 +85,9 @@ def test_knots_are_exact(segmented):
 def test_in_a_tilted_frame_heights_are_on_the_surface(tilt):
     points = half_scan()
     turn = rotation(*tilt)
-    with GroundSegmenter(CONFIGS[0]) as segmenter:
-        level = GroundModel.of(segmenter.segment(points, (0.0, 0.0)))
-        found = segmenter.segment(points @ turn, tilt)
+    segmenter = GroundSegmenter(CONFIGS[0])
+    level = GroundModel.of(segmenter.segment(points, (0.0, 0.0)))
+    found = segmenter.segment(points @ turn, tilt)
     model = GroundModel.of(found)
     assert (model.roll, model.pitch) == tilt
     places = (points @ turn)[:, :2]

@@ -14,7 +14,7 @@ from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import MIN_CELLS, N_SECTORS, RING_EDGES, solve_plane
 from gp_ground_seg.core.pipeline.tilt import rotation
 
-BACKENDS = NumpyBackend(), NumbaBackend(1)
+BACKENDS = NumpyBackend(), NumbaBackend()
 ORIGIN = (0.0, 0.0, 0.0)
 
 

@@ -40,7 +40,6 @@ def test_no_person_is_lost_and_near_vehicles_are_obstacles(kitti):
     frames = [frame for one in list_sequences(kitti) for frame in list_frames(kitti, one)]
     ours = runner.OurMethod(Config())
     (score,) = runner.score_methods(frames, [ours])
-    ours.close()
     for name in ('person', 'cyclist'):
         found = score.objects[name]
         assert sum(band.n_objects for band in found) > 10

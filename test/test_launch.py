@@ -159,7 +159,7 @@ def test_each_argument_reaches_the_node(actions, tmp_path):
     namespace = ros.NAMESPACE.strip('/')
     (_, node), (kind, note) = actions(
         'topic:=lidar', 'ground:=free', 'obstacles:=/taken', f'namespace:={namespace}',
-        'name:=cutter', 'threads:=1', 'log_level:=debug', 'use_sim_time:=True', 'rviz:=1',
+        'name:=cutter', 'log_level:=debug', 'use_sim_time:=True', 'rviz:=1',
         'params:={diagnostics.period: 0.1}',
     )  # fmt: skip
     # There is no RViz here: one line says so, and the node starts.
@@ -182,7 +182,6 @@ def test_each_argument_reaches_the_node(actions, tmp_path):
         assert {status.hardware_id for status in statuses} == {f'{ros.NAMESPACE}/cutter'}
         values = {k: v for status in statuses for k, v in ros.values_of(status).items()}
         assert values['Clock'].startswith('simulated')
-        assert 'runtime.n_threads: 1' in process.log
         assert '[DEBUG]' in process.log
         assert process.stop(signal.SIGINT)[0] == 0
 
@@ -208,7 +207,7 @@ def test_launch_ends_with_a_node_that_fails_unless_it_is_respawned(actions, tmp_
     assert (node['respawn'], node['respawn_delay'], node['on_exit']) == (True, 2.0, None)
 
 
-@pytest.mark.parametrize('word', [*WRONG, 'threads:=many', 'use_sim_time:=yes'])
+@pytest.mark.parametrize('word', [*WRONG, 'use_sim_time:=yes'])
 def test_a_wrong_argument_starts_nothing_and_fails_when_launch_can_end_the_rest(actions, word):
     ((kind, timer),) = actions(word)
     assert kind == 'TimerAction'

@@ -23,7 +23,7 @@ from gp_ground_seg.core.jit import JIT_ENABLED
 from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.core.pipeline.lines import class_middles
 
-MODEL = NumbaBackend(1) if JIT_ENABLED else NumpyBackend()
+MODEL = NumbaBackend() if JIT_ENABLED else NumpyBackend()
 
 
 def draw_inliers(seed, n_segments=120, n=50, sigma_f=0.3, sigma_n=0.05):

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from conftest import fewer, hilly_scan, sharing
+from conftest import fewer, hilly_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import Reference, place_of
@@ -105,12 +105,11 @@ def test_the_narrowest_bins_that_are_accepted_do_not_fill_the_memory():
     assert len(geometry.ranges.bins) < 40_000
     assert geometry.ranges.is_coarse
     xyz = hilly_scan(4000, seed=3)
-    found = NumbaBackend(1).build_grid(xyz, config)
+    found = NumbaBackend().build_grid(xyz, config)
     assert_same_scan(found, NumpyBackend().build_grid(xyz, config))
 
 
-@pytest.mark.parametrize('n_threads', [1, 2, 3])
-def test_nothing_of_one_scan_shows_in_the_next(n_threads):
+def test_nothing_of_one_scan_shows_in_the_next():
     n = fewer(5000, 500)
     other = Config().replace(**{'faces.cell_size': 0.7})
     scans = [
@@ -118,13 +117,13 @@ def test_nothing_of_one_scan_shows_in_the_next(n_threads):
         (n, other, np.float64), (n, Config(), np.float64), (n, Config(), np.float32),
         (0, Config(), np.float32), (2 * n, Config(), np.float64), (n, Config(), np.float64),
     ]  # fmt: skip
-    with sharing(n_threads) as backend:
-        for seed, (n_points, config, dtype) in enumerate(scans):
-            xyz = hilly_scan(n_points, seed=seed).astype(dtype)
-            xyz[::3] = np.round(xyz[::3])  # equal heights, in all parts
-            found, fresh = backend.build_grid(xyz, config), NumpyBackend()
-            expected = fresh.build_grid(xyz, config)
-            assert_same_scan(found, expected)
-            faces, same = backend.find_faces(found, config), fresh.find_faces(expected, config)
-            np.testing.assert_array_equal(faces.is_face, same.is_face)
-            np.testing.assert_array_equal(faces.has_occluded_base, same.has_occluded_base)
+    backend = NumbaBackend()
+    for seed, (n_points, config, dtype) in enumerate(scans):
+        xyz = hilly_scan(n_points, seed=seed).astype(dtype)
+        xyz[::3] = np.round(xyz[::3])  # equal heights
+        found, fresh = backend.build_grid(xyz, config), NumpyBackend()
+        expected = fresh.build_grid(xyz, config)
+        assert_same_scan(found, expected)
+        faces, same = backend.find_faces(found, config), fresh.find_faces(expected, config)
+        np.testing.assert_array_equal(faces.is_face, same.is_face)
+        np.testing.assert_array_equal(faces.has_occluded_base, same.has_occluded_base)

@@ -77,7 +77,7 @@ def test_what_is_there_is_kept_and_other_parameters_are_refused(root, tmp_path, 
     assert was == first['configuration'] != now
     assert run(*command, '--resume', '--columns', '5', '--force') == 2
     assert was in error_line(capsys)
-    assert run(*command, '--resume', '--force', '--set', 'runtime.n_threads=1') == 0
+    assert run(*command, '--resume', '--force') == 0
     assert label_files(tmp_path / 'out') == before
     assert run(*command, '--force', *other) == 0
     assert label_files(tmp_path / 'out') != before

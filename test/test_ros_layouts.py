@@ -21,7 +21,6 @@ CHANGES = {
     'learning.mode': 'fixed',
     'grid.n_segments': 16,
     'grid.n_bins': 16,
-    'runtime.n_threads': 1,
 }
 CASES = {
     'one row without row_step': ('<f4', (1, 200), 0, 0.1),
@@ -74,7 +73,6 @@ def tested():
         ros.wait_for(lambda: publisher.get_subscription_count() == 1, 'ear of the labelled cloud')
         segmenter = GroundSegmenter(Config().replace(**CHANGES))
         yield b, labelled, segmenter
-        segmenter.close()
 
 
 @pytest.mark.parametrize('case', CASES)

@@ -96,7 +96,6 @@ def test_a_change_takes_effect_with_the_next_cloud(b, capfd):
     for name, value in (
         ('label.ground_tolerance', 0.01),
         ('grid.n_segments', 8),
-        ('runtime.n_threads', 1),
         ('runtime.backend', 'numpy'),
     ):
         before = b.node.config
@@ -232,9 +231,9 @@ def dump(b):
 @settings(max_examples=40)
 @given(config=configs(), order=st.permutations(NAMES))
 def test_any_configuration_can_be_loaded_over_any_other_in_any_order(shared, config, order):
-    # Hundreds of threads made and ended for nothing; TF may not be installed.
-    plain = {'runtime.n_threads': 1, 'runtime.backend': 'auto'}
-    plain |= {'frame.level': 'sensor', 'frame.sensor': 'none', 'output.frame': 'none'}
+    # TF may not be installed.
+    plain = {'frame.level': 'sensor', 'frame.sensor': 'none', 'output.frame': 'none'}
+    plain['runtime.backend'] = 'auto'
     config = config.replace(**plain)
     values = {name: config[name] for name in order}
     assert all(result.successful for result in shared.load(values))
@@ -277,7 +276,6 @@ def test_changes_during_playback_lose_no_frame(b):
     for k, tolerance in enumerate(tolerances):
         b.publisher.publish(message)
         assert b.set('grid.n_segments', 90 if k % 2 else 180).successful
-        assert b.set('runtime.n_threads', 1 + k % 2).successful
         is_bad = k % 10 == 9
         result = b.set('label.ground_tolerance', 9.0 if is_bad else float(tolerance))
         assert result.successful != is_bad

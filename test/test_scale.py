@@ -72,7 +72,7 @@ def scheduler():
 def everything(path):
     """Numbers of a report but for times, and what it ran on."""
     document = json.loads(path.read_text())
-    for name in ('environment', 'n_threads', 'times', 'stages'):
+    for name in ('environment', 'times', 'stages'):
         document.pop(name, None)
     if 'measures' in document:
         assert document['measures'].pop()['measure'].startswith('time')

@@ -1,4 +1,4 @@
-"""The segmenter: properties of its results, history, threads, forks, change of backend."""
+"""The segmenter: properties of its results, history, callers in threads, forks, backends."""
 
 import concurrent.futures
 import copy
@@ -14,14 +14,13 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from conftest import fewer, hilly_scan, sharing
+from conftest import fewer, hilly_scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference import Reference
 
 from gp_ground_seg import Config, ConfigError, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.core.backend import NumpyBackend
-from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.gp.evidence import STEP
 from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.jit import HAVE_NUMBA, JIT_ENABLED
@@ -207,16 +206,11 @@ def test_results_are_equal_to_themselves_and_can_be_copied(scan):
 
 
 @pytest.mark.parametrize('attempt', [pickle.dumps, copy.copy, copy.deepcopy])
-def test_a_segmenter_is_closed_by_with_and_is_not_copied(attempt, scan):
-    before = set(threading.enumerate())
-    with sharing(3) as backend, GroundSegmenter(CONFIG, backend=backend) as segmenter:
-        label = segmenter.segment(scan).label
-        with pytest.raises(TypeError, match='cannot be pickled or copied: pass its config'):
-            attempt(segmenter)
-        config = pickle.loads(pickle.dumps(segmenter.config))
-    assert set(threading.enumerate()) <= before
-    with GroundSegmenter(config) as other:
-        np.testing.assert_array_equal(other.segment(scan).label, label)
+def test_a_segmenter_is_not_copied_but_its_config_is(attempt, scan):
+    with pytest.raises(TypeError, match='cannot be pickled or copied: pass its config'):
+        attempt(SEGMENTER)
+    other = GroundSegmenter(pickle.loads(pickle.dumps(SEGMENTER.config)))
+    same(other.segment(scan), SEGMENTER.segment(scan))
 
 
 @pytest.mark.parametrize('tilt', [None, (0.05, -0.04)])
@@ -297,26 +291,22 @@ def test_a_result_is_not_changed_by_the_next_scan(backend, scan):
 
 
 @pytest.mark.parametrize('mode', ['fixed', 'every_frame'])
-def test_threads_and_history_do_not_change_a_bit(scan, mode):
+def test_history_does_not_change_a_bit(backend, scan, mode):
     config = CONFIG.replace(**{'learning.mode': mode})
-    expected = GroundSegmenter(config, backend=NumbaBackend(1)).segment(scan)
-    for n_threads in (1, 2, 3, 5):
-        with sharing(n_threads) as backend:
-            other = GroundSegmenter(config, backend=backend)
-            other.segment(hilly_scan(N_POINTS, seed=9))
-            result = other.segment(scan)
-            same(result, expected)
-            assert result.fit.n_threads == n_threads
+    expected = GroundSegmenter(config, backend=type(backend)()).segment(scan)
+    other = GroundSegmenter(config, backend=backend)
+    other.segment(hilly_scan(N_POINTS, seed=9))
+    result = other.segment(scan)
+    same(result, expected)
     np.testing.assert_array_equal(result.theta, expected.theta)
 
 
 def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
     segmenter, own = GroundSegmenter(CONFIG), SEGMENTER.backend.name
-    segmenter.configure(CONFIG.replace(**{'grid.n_segments': 90, 'runtime.n_threads': 1}))
+    segmenter.configure(CONFIG.replace(**{'grid.n_segments': 90}))
     after = segmenter.segment(scan)
     assert len(after.surface.mean) == segmenter.config.grid.n_segments == 90
-    assert after.fit.n_threads == 1
-    expected, is_closed = SEGMENTER.segment(scan), []
+    expected = SEGMENTER.segment(scan)
     for changes in (
         {'runtime.backend': 'numpy'},
         {'runtime.backend': 'numpy', 'diagnostics.period': 3.0},
@@ -330,71 +320,59 @@ def test_configure_and_use_backend_take_effect_on_the_next_scan(scan):
         assert result.fit.backend == segmenter.backend.name == name
         np.testing.assert_array_equal(result.label, expected.label)
     same(result, expected)
-
-    class Closing(NumpyBackend):
-        def close(self):
-            is_closed.append(True)
-
     # A backend that was handed over stays until the parameters of the runtime change.
-    segmenter.use_backend(Closing())
+    segmenter.use_backend(given := NumpyBackend())
     segmenter.configure(CONFIG.replace(**{'label.ground_tolerance': 0.2}))
-    assert (segmenter.backend.name, is_closed) == ('numpy', [])
-    segmenter.configure(CONFIG.replace(**{'runtime.n_threads': 1}))
-    assert (segmenter.backend.name, is_closed) == (own, [True])
+    assert segmenter.backend is given
+    segmenter.configure(CONFIG.replace(**{'runtime.backend': 'numpy'}))
+    assert segmenter.backend is not given
+    segmenter.configure(CONFIG)
+    assert segmenter.backend.name == own
 
 
-def test_callers_take_turns_while_the_segmenter_is_closed_and_configured():
+def test_callers_take_turns_while_the_segmenter_is_configured():
     scans = [hilly_scan(fewer(n, n // 8), seed=n) for n in (3000, 4000, 5000, 6000)]
-    before = set(threading.enumerate())
-    with sharing(3) as backend:
-        segmenter = GroundSegmenter(CONFIG, backend=backend)
-        expected = [segmenter.segment(scan) for scan in scans]
-        with ThreadPoolExecutor(4) as callers:
-            results = callers.map(segmenter.segment, scans * fewer(10, 1))
-            for _ in range(fewer(20, 1)):
-                segmenter.close()
-                segmenter.configure(CONFIG.replace(**{'diagnostics.period': 2.0}))
-                segmenter.estimate_pose(scans[0][:100])
-        for k, result in enumerate(results):
-            same(result, expected[k % len(scans)])
-        segmenter.close()
-        assert set(threading.enumerate()) <= before
+    segmenter = GroundSegmenter(CONFIG)
+    expected = [segmenter.segment(scan) for scan in scans]
+    with ThreadPoolExecutor(4) as callers:
+        results = callers.map(segmenter.segment, scans * fewer(10, 1))
+        for _ in range(fewer(20, 1)):
+            segmenter.configure(CONFIG.replace(**{'diagnostics.period': 2.0}))
+            segmenter.estimate_pose(scans[0][:100])
+    for k, result in enumerate(results):
+        same(result, expected[k % len(scans)])
 
 
 FORK = """
 import os, sys, threading, warnings
 warnings.simplefilter('ignore')  # newer Pythons warn of a fork beside threads
 import numpy as np
-from conftest import hilly_scan, sharing
+from conftest import hilly_scan
 from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.core.compiled.backend import NumbaBackend
 scan, is_busy = hilly_scan(int(sys.argv[1])), True
-with sharing(3) as backend:
-    segmenter = GroundSegmenter(Config(), backend=backend)
-    expected = segmenter.segment(scan).label
-    def work():
-        while is_busy:
-            assert (segmenter.segment(scan).label == expected).all()
-    caller = threading.Thread(target=work)
-    caller.start()
-    codes = []
-    for k in range(int(sys.argv[2])):
-        # Sometimes in the middle of a hand-over to the workers.
-        lock = backend.workers._pool._shutdown_lock if k % 4 == 1 else threading.Lock()
-        lock.acquire()
-        child = os.fork()
-        if child == 0:
-            is_busy = False
-            if k % 2:
-                segmenter.close()
-            assert segmenter.segment(scan).fit.n_threads == 3
-            segmenter.configure(Config().replace(**{'runtime.n_threads': 2}))
-            assert (segmenter.segment(scan).label == expected).all()
-            sys.exit(7)
-        lock.release()
-        codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-    is_busy = False
-    caller.join()
-    print(codes)
+segmenter = GroundSegmenter(Config(), backend=NumbaBackend())
+expected = segmenter.segment(scan).label
+def work():
+    while is_busy:
+        assert (segmenter.segment(scan).label == expected).all()
+caller = threading.Thread(target=work)
+caller.start()
+codes = []
+for k in range(int(sys.argv[2])):
+    child = os.fork()
+    if child == 0:
+        is_busy = False
+        half_filled = segmenter.backend._buffers
+        assert (segmenter.segment(scan).label == expected).all()
+        assert segmenter.backend._buffers is not half_filled
+        segmenter.configure(Config().replace(**{'runtime.backend': 'numba'}))
+        assert (segmenter.segment(scan).label == expected).all()
+        sys.exit(7)
+    codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+is_busy = False
+caller.join()
+print(codes)
 """
 
 

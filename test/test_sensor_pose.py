@@ -24,7 +24,7 @@ from gp_ground_seg.lab.simulation import scenes as landforms
 from gp_ground_seg.lab.simulation.objects import floating_box, wall
 
 # Scans of 100,000 points, too many for the compiled twins as plain Python.
-BACKEND = NumbaBackend(2) if JIT_ENABLED else NumpyBackend()
+BACKEND = NumbaBackend() if JIT_ENABLED else NumpyBackend()
 TILTS = st.floats(-0.2, 0.2)
 SLOW = pytest.mark.slow
 # Every beam, and a third to a half of the columns.
@@ -270,7 +270,7 @@ FEW = THREE[:0], THREE * np.nan, THREE[:1], THREE, HUGE, -1e108 * HUGE
 
 @pytest.mark.filterwarnings('ignore:overflow')
 @pytest.mark.parametrize('points', FEW)
-@pytest.mark.parametrize('backend', [NumbaBackend(1), NumpyBackend()], ids=lambda b: b.name)
+@pytest.mark.parametrize('backend', [NumbaBackend(), NumpyBackend()], ids=lambda b: b.name)
 def test_too_few_points_to_determine_anything(points, backend):
     pose = segmenter(backend).estimate_pose(points)
     assert (pose.height, pose.roll, pose.pitch) == (DEFAULT_HEIGHT, 0.0, 0.0)

@@ -112,7 +112,7 @@ COMMANDS = {
     'plot scan': 'plot scan SCAN -o OUT.png',
     'plot segment': 'plot segment SCAN --azimuth 0 -o OUT.png',
     'kitti-to-bag': 'kitti-to-bag ROOT --sequence 00 OUT.mcap',
-    'bench': 'bench ROOT --threads 1 --json OUT.json',
+    'bench': 'bench ROOT --json OUT.json',
     'evaluate': 'evaluate ROOT --json OUT.json',
     'ablation': 'experiment ablation ROOT --json OUT.json',
     'departures': 'experiment departures ROOT --json OUT.json',

@@ -40,7 +40,7 @@ PARTS = {
         'torture_clouds.py', 100, 50, ('PYTHONMALLOC=debug', 'MALLOC_PERTURB_=165'),
         sources=SEGMENTATION,
     ),
-    'threads, processes, signals, limits': Part('torture_processes.py', 110, 11),
+    'threads, processes, signals, limits': Part('torture_processes.py', 90, 9),
     'damaged compiled code': Part('torture_cache.py', 40, 20),
     'commands killed, interrupted, disk full': Part('torture_writes.py', 40, 20),
     'data sets that change, two runs at once': Part('torture_resume.py', 120, 40),

@@ -49,7 +49,7 @@ ROS = ['-p', '-r', ':=', 'a:=', '-p x', '--params-file missing.yaml', '--params-
        '--params-file good/scan.bin', '-p grid.n_bins:=x', '-p grid.n_bins:=-1']  # fmt: skip
 WRITTEN = ('output', 'json', 'save', 'html', 'per_frame')
 RIGHT = {
-    'sequence': '00', 'sequences': '00', 'preset': 'paper', 'threads': '1', 'topic': '/points',
+    'sequence': '00', 'sequences': '00', 'preset': 'paper', 'topic': '/points',
     'scheduler': 'tcp://127.0.0.1:1', 'sensors': 'vlp-16', 'scenes': 'flat', 'seeds': '1',
     'parameters': 'label.ground_tolerance', 'camera': '0,20,30', 'workers': '1', 'node': '/x',
 }  # fmt: skip

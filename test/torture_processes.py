@@ -20,7 +20,7 @@ import asyncio, os, random, resource, signal, sys, threading, time, warnings
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 import multiprocessing
 import numpy as np
-from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg import GroundSegmenter
 from gp_ground_seg.core.segmenter import warm_up
 # A campaign in the background of a shell begins with SIGINT ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -29,8 +29,6 @@ rng = np.random.default_rng(seed)
 azimuth, r = rng.uniform(-3.14, 3.14, 20000), rng.uniform(2.0, 60.0, 20000)
 scan = np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), rng.normal(-1.73, 0.02, 20000)])
 scan[::7, 2] += rng.uniform(0.0, 2.0, len(scan[::7]))
-def make(n_threads=2):
-    return GroundSegmenter(Config().replace(**{'runtime.n_threads': n_threads}))
 """
 
 
@@ -44,25 +42,15 @@ class Scenario(NamedTuple):
 
 SCENARIOS = {
     'shared by threads': Scenario("""
-segmenter = make()
+segmenter = GroundSegmenter()
 expected = segmenter.segment(scan).label
 with ThreadPoolExecutor(4) as pool:
     for result in pool.map(segmenter.segment, [scan] * 20):
         assert (result.label == expected).all()
 """),
-    'closed meanwhile': Scenario("""
-segmenter = make()
-expected = segmenter.segment(scan).label
-def close():
-    for _ in range(30):
-        time.sleep(random.uniform(0.0, 0.02)); segmenter.close()
-thread = threading.Thread(target=close); thread.start()
-while thread.is_alive():
-    assert (segmenter.segment(scan).label == expected).all()
-"""),
     'forked meanwhile': Scenario("""
 warnings.simplefilter('ignore')
-segmenter = make(3)
+segmenter = GroundSegmenter()
 expected, busy = segmenter.segment(scan).label, True
 def work():
     while busy: segmenter.segment(scan)
@@ -79,7 +67,7 @@ busy = False
 thread.join()
 """),
     'forked before the first scan': Scenario("""
-segmenter = make()
+segmenter = GroundSegmenter()
 child = os.fork()
 if child == 0:
     segmenter.segment(scan); sys.exit(7)
@@ -87,7 +75,7 @@ segmenter.segment(scan)
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 """),
     'exit while busy': Scenario("""
-segmenter = make()
+segmenter = GroundSegmenter()
 def work():
     while True: segmenter.segment(scan)
 for _ in range(2): threading.Thread(target=work, daemon=True).start()
@@ -96,13 +84,13 @@ time.sleep(random.uniform(0.2, 0.6))
     'terminated': Scenario(
         """
 threading.Timer(random.uniform(0.05, 0.5), os.kill, (os.getpid(), signal.SIGTERM)).start()
-segmenter = make()
+segmenter = GroundSegmenter()
 while True: segmenter.segment(scan)
 """,
         (-15,),
     ),
     'interrupted': Scenario("""
-segmenter = make()
+segmenter = GroundSegmenter()
 expected = segmenter.segment(scan).label
 for _ in range(30):
     timer = threading.Timer(random.uniform(0.0, 0.05), os.kill, (os.getpid(), signal.SIGINT))
@@ -113,15 +101,9 @@ for _ in range(30):
         timer.join()
     assert (segmenter.segment(scan).label == expected).all()
 """),
-    'no thread can start': Scenario("""
-def refuse(thread): raise RuntimeError("can't start new thread")
-threading.Thread.start = refuse
-segmenter = make(4)
-for _ in range(3): assert segmenter.segment(scan).fit.n_threads == 1
-"""),
     'little memory': Scenario(
         """
-segmenter = make()
+segmenter = GroundSegmenter()
 segmenter.segment(scan)
 with open('/proc/self/statm') as file: used = int(file.read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (used + random.randrange(2**20, 2**27),) * 2)
@@ -135,14 +117,14 @@ segmenter.segment(scan)
         r'.*MemoryError.*|.*RLIMIT.*|.*not allowed.*|',
     ),
     'asyncio': Scenario("""
-segmenter = make()
+segmenter = GroundSegmenter()
 async def run():
     return await asyncio.gather(*(asyncio.to_thread(segmenter.segment, scan) for _ in range(8)))
 expected = segmenter.segment(scan).label
 for result in asyncio.run(run()): assert (result.label == expected).all()
 """),
     'process pools': Scenario("""
-def ground(points): return int((make(1).segment(points).label == 1).sum())
+def ground(points): return int((GroundSegmenter().segment(points).label == 1).sum())
 if __name__ == '__main__':
     expected = ground(scan)
     for method in ('fork', 'forkserver', 'spawn'):

@@ -19,10 +19,10 @@ RATE = 10.0
 MAX_GROWTH = 0.03
 MIN_ANSWERED = 0.9
 SETTINGS = [
-    {'label.ground_tolerance': 0.2, 'runtime.n_threads': 1},
+    {'label.ground_tolerance': 0.2},
     {'learning.mode': 'fixed', 'sensor.height': 1.7},
     {'grid.r_max': 80.0, 'grid.n_segments': 240},
-    {'faces.cell_size': 0.4, 'runtime.n_threads': 2},
+    {'faces.cell_size': 0.4},
     {'learning.mode': 'every_frame', 'learning.segment_step': 20},
     {'sensor.roll': 0.05, 'sensor.pitch': -0.05},
     {'runtime.backend': 'numpy'},

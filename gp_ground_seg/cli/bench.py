@@ -11,8 +11,6 @@ import numpy as np
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, MissingDependencyError, shown
-from gp_ground_seg.core.jit import HAVE_NUMBA
-from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.inputs import holds_bag, list_inputs
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 from gp_ground_seg.data.semantic_kitti import list_sequences
@@ -24,15 +22,15 @@ from gp_ground_seg.lab.scoring.report import Column, Row, Table
 
 DESCRIPTION = """\
 Measure the time of the segmentation on your data, by stage: with theta fixed and learned in
-every frame, on one thread and on all. If pypatchworkpp is installed, Patchwork++ runs on
-each frame just before or after ours, so the ratio of the two times holds although the speed
-of the machine drifts. Reading is left out. Run nothing else meanwhile.
+every frame. If pypatchworkpp is installed, Patchwork++ runs on each frame just before or
+after ours, so the ratio of the two times holds although the speed of the machine drifts.
+Both take one thread. Reading is left out. Run nothing else meanwhile.
 
 DATA is a folder with sequences/*/velodyne below it, a scan, a folder of scans, or a bag.
 """
 EXAMPLES = """\
   gp-ground-seg bench KITTI_ROOT
-  gp-ground-seg bench drive.mcap --frames 20 --threads 1
+  gp-ground-seg bench drive.mcap --frames 20
   gp-ground-seg bench KITTI_ROOT --set grid.n_segments=120 --json mine.json
   gp-ground-seg bench --from mine.json
 """
@@ -52,7 +50,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
          {**options.NUMBER, 'default': 60}),
         ('--passes', 'measure all frames N times', {**options.NUMBER, 'default': 1}),
         ('--from', 'show what --json wrote, measure nothing', {**file, 'dest': 'record'}),
-        ('--threads', 'numbers of threads, as in 1,4 (default: 1 and all)', {'metavar': 'LIST'}),
         ('--topic', 'PointCloud2 topic of a bag', {'metavar': 'T'}),
         ('--numpy', 'time both without compiled code as well', options.FLAG),
         *options.SCAN_LAYOUT,
@@ -92,7 +89,6 @@ def read_record(path: str | Path) -> dict[str, Any]:
 def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
     config = options.read_config(arguments)
     environment = report.describe_environment('pypatchworkpp')
-    threads = _threads(arguments.threads, config, environment['n_cores'])
     try:
         baseline = PatchworkppMethod().name
     except MissingDependencyError as error:
@@ -103,23 +99,12 @@ def _measure(arguments: argparse.Namespace) -> dict[str, Any]:
         options.refuse_scan_layout(arguments, source)
     layout = options.scan_layout(arguments)
     frames = load_frames(source, arguments.frames, arguments.topic, layout)
-    cases = bench_cases(config, threads, with_numpy=arguments.numpy)
+    cases = bench_cases(config, with_numpy=arguments.numpy)
     make_baseline = PatchworkppMethod if baseline else None
     with options.runner(arguments, 'bench') as runner:
         measured = run_cases(frames, cases, make_baseline, arguments.passes, runner=runner)
     data = source.resolve().name
     return bench_document(measured, config, environment, baseline, data)
-
-
-def _threads(text: str | None, config: Config, n_cores: int) -> list[int]:
-    if not HAVE_NUMBA or config.runtime.backend == 'numpy':
-        return [1]
-    if text is None:
-        return sorted({1, n_cores})
-    threads = [int(word) if word.isdecimal() else 0 for word in text.split(',')]
-    if min(threads) < 1 or len(set(threads)) < len(threads):
-        raise DataError(f'--threads {text}: must be different whole numbers from 1, as in 1,4')
-    return threads
 
 
 def load_frames(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -96,12 +96,11 @@ def run(arguments: argparse.Namespace) -> int:
     files = {'json': 'every number', 'per_frame': 'each frame'}
     with options.staged_options(arguments, *files) as parts, ExitStack() as stack:
         items, load = _items(arguments)
-        chosen: list[Method] = [stack.enter_context(closing(OurMethod(config)))]
+        chosen: list[Method] = [OurMethod(config)]
         changed: list[str] = []
         if arguments.against is not None:
             other, changed = _other_config(arguments, config)
-            method = OurMethod(other, shown(Path(arguments.against).name))
-            chosen.append(stack.enter_context(closing(method)))
+            chosen.append(OurMethod(other, shown(Path(arguments.against).name)))
         elif arguments.peer is not None:
             chosen.append(PatchworkppMethod.of_sensor(config.sensor))
         runner = stack.enter_context(options.runner(arguments, 'evaluate'))

@@ -19,6 +19,7 @@ from typing import NoReturn
 
 from gp_ground_seg import __version__
 from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
+from gp_ground_seg.core.parameters.removed import removal
 
 ROS_ARGS = '--ros-args'
 OF_ROS = ('-r', '--remap', '-p', '--param', '--params-file', '--log-level')
@@ -128,6 +129,8 @@ def _parse(words: list[str]) -> argparse.Namespace:
     arguments, unknown = parser.parse_known_args(words[:n_before])
     accepts_ros_args = getattr(arguments, 'accepts_ros_args', False)
     if unknown:
+        if line := removal(f'{command} {unknown[0].partition("=")[0]}'):
+            raise GroundSegError(line)
         hint = f'gp-ground-seg {command} --help lists what it takes'
         if accepts_ros_args and unknown[0] in OF_ROS:
             hint = f'put {ROS_ARGS} before {unknown[0]}'

@@ -61,7 +61,7 @@ def run_warm_up(_arguments: argparse.Namespace) -> int:
             f'numba is not installed, nothing to compile: {install_hint("numba")}'
         )
     begin = time.monotonic()
-    warm_up().close()
+    warm_up()
     seconds, folder = time.monotonic() - begin, code_folder()
     if folder is None:
         raise GroundSegError('compiled code is not kept on disk, see the note above')

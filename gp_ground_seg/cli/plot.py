@@ -115,8 +115,7 @@ def run(arguments: argparse.Namespace) -> int:
     truth = None
     if arguments.labels is not None:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
-    with GroundSegmenter(config) as segmenter:
-        result = segmenter.segment(points)
+    result = GroundSegmenter(config).segment(points)
     if arguments.picture == 'scan':
         colour = arguments.colour
         values = None if colour == 'class' else (colour, getattr(result, colour))

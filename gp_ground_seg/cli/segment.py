@@ -108,9 +108,9 @@ def run(arguments: argparse.Namespace) -> int:
         _segment_dataset(arguments, config, is_bag)
         return 0
     target = Path(arguments.output or _default_output(source, arguments.format))
-    with GroundSegmenter(config) as segmenter:
-        segment = _segment_bag if gives_bag else _segment_scans
-        dataset.print_summary(Outcome.of(segment(target, arguments, segmenter)), target)
+    segment = _segment_bag if gives_bag else _segment_scans
+    results = segment(target, arguments, GroundSegmenter(config))
+    dataset.print_summary(Outcome.of(results), target)
     return 0
 
 
@@ -141,12 +141,11 @@ def _segment_bags(
     progress: Progress,
 ) -> Outcome:
     """Segment bags, each into one in the folder `target`."""
-    outcomes = []
+    outcomes, segmenter = [], GroundSegmenter(config)
     for bag in progress(bags):
-        with GroundSegmenter(config) as segmenter:
-            source, path = Path(str(bag.path)), target / bag.name
-            outcome = Outcome.of(output.write(source, path, segmenter, force=True))
-            outcomes.append(outcome._replace(sizes=[stamp(path)[0]]))
+        source, path = Path(str(bag.path)), target / bag.name
+        outcome = Outcome.of(output.write(source, path, segmenter, force=True))
+        outcomes.append(outcome._replace(sizes=[stamp(path)[0]]))
     return pool(outcomes)
 
 

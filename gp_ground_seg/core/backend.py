@@ -41,10 +41,6 @@ class Backend(Protocol):
     def name(self) -> str:
         """``numba`` or ``numpy``."""
 
-    @property
-    def n_threads(self) -> int:
-        """Number of threads, the caller's included."""
-
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:
         """See `gp_ground_seg.core.pipeline.polar_grid.build_scan`."""
 
@@ -76,15 +72,11 @@ class Backend(Protocol):
     ) -> Labelled:
         """See `gp_ground_seg.core.pipeline.labels.label_points`."""
 
-    def close(self) -> None:
-        """End worker threads; they start again if they are needed again."""
-
 
 class NumpyBackend:
-    """Plain numpy, one thread."""
+    """Plain numpy."""
 
     name = 'numpy'
-    n_threads = 1
     build_grid = staticmethod(polar_grid.build_scan)
     fit_plane = staticmethod(ground_plane.fit_plane)
     find_faces = staticmethod(vertical_faces.find_faces)
@@ -92,9 +84,6 @@ class NumpyBackend:
     log_likelihood = staticmethod(likelihood.log_likelihood)
     estimate_surface = staticmethod(ground.estimate_surface)
     label_points = staticmethod(labels.label_points)
-
-    def close(self) -> None:
-        """Nothing to end."""
 
 
 def choose_backend(wanted: str) -> str:
@@ -127,7 +116,7 @@ def make_backend(runtime: RuntimeConfig) -> Backend:
             raise MissingDependencyError(f'runtime.backend = numba: {error}') from error
         _warn_slow('cannot be imported', error)
         return NumpyBackend()
-    return NumbaBackend(runtime.n_threads)
+    return NumbaBackend()
 
 
 def _warn_slow(reason: str, more: object) -> None:

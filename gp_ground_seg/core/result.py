@@ -71,7 +71,6 @@ class Fitting:
     mode: str  # ``learning.mode`` of the frame
     learned: Learned | None  # outcome of the learning; None where there was none
     backend: str  # ``numba`` or ``numpy``
-    n_threads: int  # that were used
 
 
 @dataclass(frozen=True)
@@ -101,8 +100,6 @@ class FitReport:
         pseudo-inputs of the latent process.
     backend : str
         ``numba`` or ``numpy``.
-    n_threads : int
-        Threads used.
     """
 
     mode: str
@@ -117,7 +114,6 @@ class FitReport:
     n_lines: int
     n_pseudo_inputs: int
     backend: str
-    n_threads: int
 
     @classmethod
     def of(cls, frame: Segmentation) -> FitReport:
@@ -139,7 +135,6 @@ class FitReport:
             n_lines=len(frame.lines.slope),
             n_pseudo_inputs=len(frame.pseudo.r_bar),
             backend=frame.fitting.backend,
-            n_threads=frame.fitting.n_threads,
         )
 
 

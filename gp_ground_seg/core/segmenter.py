@@ -34,9 +34,8 @@ _LOGGER = logging.getLogger('gp_ground_seg')
 class GroundSegmenter:
     """Splits scans into ground and obstacles.
 
-    It may be called from several threads, which then take turns, and in a forked process. As a
-    context manager it closes itself. It cannot be copied or pickled: another process makes its
-    own from the same `Config`.
+    It may be called from several threads, which then take turns, and in a forked process. It
+    cannot be copied or pickled: another process makes its own from the same `Config`.
 
     Parameters
     ----------
@@ -137,7 +136,7 @@ class GroundSegmenter:
         return Segmentation(
             labelled=labelled,
             timings=timer.seconds,
-            fitting=Fitting(config.learning.mode, learned, backend.name, backend.n_threads),
+            fitting=Fitting(config.learning.mode, learned, backend.name),
             grid=scan.grid,
             frame=frame,
             surface=surface,
@@ -179,26 +178,12 @@ class GroundSegmenter:
             self._warned.clear()
 
     def use_backend(self, backend: Backend) -> None:
-        """Use `backend` from the next scan on, and close the one before."""
+        """Use `backend` from the next scan on."""
         with self._exclusive():
-            self.close()
             self._backend, self._sample_backend = backend, None
 
-    def close(self) -> None:
-        """End the worker threads, once the scan at hand is segmented."""
-        with self._exclusive():
-            self._backend.close()
-
-    def __enter__(self) -> GroundSegmenter:
-        """Return the segmenter itself."""
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        """Call `close`."""
-        self.close()
-
     def __reduce__(self) -> NoReturn:
-        """Refuse to be pickled or copied: there are a lock, threads and their buffers."""
+        """Refuse to be pickled or copied: there are a lock and buffers."""
         raise TypeError(
             'a GroundSegmenter cannot be pickled or copied: pass its config, and make a '
             'GroundSegmenter of that'
@@ -229,7 +214,7 @@ class GroundSegmenter:
         def scan_rotated(matrix: FloatArray) -> Scan:
             # `backend` would overwrite the scan in its buffers.
             if self._sample_backend is None:
-                runtime = dataclasses.replace(config.runtime, n_threads=1, backend=backend.name)
+                runtime = dataclasses.replace(config.runtime, backend=backend.name)
                 self._sample_backend = make_backend(runtime)
             sample = rotate_sample(scan.xyz, matrix)
             return self._sample_backend.build_grid(sample, config)

@@ -185,7 +185,7 @@ class ProcessingTask:
         self._sent = Rate()
         self._n_processed = self._n_dropped = 0
         self._n_sent_recent = self._n_dropped_recent = 0
-        self._backend, self._n_threads = '', 0
+        self._backend = ''
 
     def arrived(self, now: float, n_lost: int) -> None:
         """Count a cloud that arrived, and `n_lost` before it that did not."""
@@ -198,7 +198,7 @@ class ProcessingTask:
         """Count a cloud processed in `duration` [s]; `stages` has its wait too, as ``queue``."""
         self._n_processed += 1
         self._times.append((stages['queue'] + duration, duration, stages))
-        self._backend, self._n_threads = fit.backend, fit.n_threads
+        self._backend = fit.backend
 
     def load(self, now: float) -> float | None:
         """Time that the clouds sent in a second take to process [s/s]; None if unknown."""
@@ -225,7 +225,7 @@ class ProcessingTask:
         for stage in self._times[-1][2] if self._times else ():
             times = [stages[stage] for _, _, stages in self._times if stage in stages]
             values.update(_percentiles(f'Stage {stage}', times))
-        values.update({'Backend': self._backend, 'Threads': str(self._n_threads)})
+        values['Backend'] = self._backend
         return Status('processing', level, message, values)
 
     def _judge(self, now: float, limits: DiagnosticsConfig) -> Finding:

@@ -62,7 +62,7 @@ class ManagedNode(LifecycleNodeMixin, node.GroundSegmentationNode):  # type: ign
     def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Free the backend."""
         self._is_configured = False
-        self._free_segmenter()
+        self._loader.close()
         self._make_segmenter()
         return self._set_active(False)
 

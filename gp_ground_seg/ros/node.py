@@ -63,10 +63,6 @@ class GroundSegmentationNode(ConfiguredNode):
         self._is_compiled = False
         self._loader = BackendLoader(self._loaded.trigger)
 
-    def _free_segmenter(self) -> None:
-        self._loader.close()
-        self._segmenter.close()
-
     def _start(self) -> None:
         logger = self.get_logger()
         logger.info(describe(self.config, self.get_fully_qualified_name()))
@@ -188,8 +184,6 @@ class GroundSegmentationNode(ConfiguredNode):
         if choose_backend(self.config.runtime.backend) == 'numba':
             self._segmenter.use_backend(backend)
             self.get_logger().info(f'{CHANGED}, after {self._loader.seconds:.1f} s')
-        else:
-            backend.close()
         # Where `runtime` has changed meanwhile, this makes another backend.
         self._segmenter.configure(self.config)
 
@@ -207,11 +201,11 @@ class GroundSegmentationNode(ConfiguredNode):
         return self._loader.is_busy
 
     def destroy_node(self) -> None:
-        """Free what the node holds, the worker threads too."""
+        """Free what the node holds."""
         self._loader.stop()
-        # The network before the threads: they may end late.
+        # The network before the thread of the loader: it may end late.
         super().destroy_node()
-        self._free_segmenter()
+        self._loader.close()
         self._library_log.close()
 
     def _on_time_jump(self, seconds: float) -> None:

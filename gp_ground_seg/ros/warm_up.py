@@ -75,16 +75,14 @@ class BackendLoader:
                 self._compiler.kill()
 
     def close(self) -> None:
-        """Stop; free a backend that was not taken.
+        """Stop, and wait for the thread.
 
         A thread that compiles in this process, as where no folder can keep the code, does so for
-        10 to 40 s: nobody waits for it, and it frees what it makes.
+        10 to 40 s: nobody waits for it.
         """
         self.stop()
         if self._thread is not None:
             self._thread.join(JOIN_TIMEOUT)
-        if (backend := self.take_backend()) is not None:
-            backend.close()
 
     def _run(self, config: Config) -> None:
         start = time.monotonic()
@@ -104,8 +102,6 @@ class BackendLoader:
             if not self._is_stopped:
                 self._backend, self.is_ready = backend, True
                 self._on_done()
-            elif backend is not None:
-                backend.close()
 
     def _compile(self) -> None:
         """Compile in a child process, whose memory is free after it: twice what the node needs."""

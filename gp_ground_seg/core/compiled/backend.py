@@ -1,4 +1,4 @@
-"""The numba backend: each stage as a few calls of compiled functions, in threads."""
+"""The numba backend: each stage as a few calls of compiled functions."""
 
 from __future__ import annotations
 
@@ -14,12 +14,10 @@ from gp_ground_seg.core.compiled import (
     likelihood,
     lines,
     polar_grid,
-    threads,
 )
 from gp_ground_seg.core.compiled import latent as latent_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
 from gp_ground_seg.core.compiled.buffers import Buffers
-from gp_ground_seg.core.compiled.threads import Part, Workers, run_of
 from gp_ground_seg.core.frame import (
     BoolArray,
     Candidates,
@@ -52,70 +50,41 @@ from gp_ground_seg.core.pipeline.tilt import Direction
 class NumbaBackend:
     """See `gp_ground_seg.core.backend.Backend`.
 
-    A process forked off this one has no threads, and perhaps half-filled buffers; after Ctrl-C a
-    thread may still write to the buffers. The next frame then begins with new ones.
-
-    Parameters
-    ----------
-    n_threads : int
-        Number of threads; 0 = all cores, at most 4.
-
-    Attributes
-    ----------
-    workers : Workers
-        The threads.
+    A process that is forked while a thread of this one segments has half-filled buffers: it begins
+    with new ones.
     """
 
     name = 'numba'
 
-    def __init__(self, n_threads: int) -> None:
-        self._wanted_threads = n_threads
-        self._renew()
-
-    def _renew(self) -> None:
-        self._pid = os.getpid()
-        self.workers, self._buffers = Workers(self._wanted_threads), Buffers()
-
-    @property
-    def n_threads(self) -> int:
-        """Number of threads, the caller's included."""
-        return self.workers.n_threads
+    def __init__(self) -> None:
+        self._pid, self._buffers = os.getpid(), Buffers()
 
     def build_grid(self, xyz: PointArray, config: Config) -> Scan:
         """Sort points into cells and tiles; lowest point of each cell."""
         announce_compiling()
-        if self._pid != os.getpid() or not self.workers.is_idle:
-            self._renew()
+        if self._pid != os.getpid():
+            self._pid, self._buffers = os.getpid(), Buffers()
         n_points, dtype, take = len(xyz), xyz.dtype, self._buffers.take
         geometry = grid_geometry(config.grid, config.faces.cell_size, dtype)
-        n_parts = self.workers.n_parts(n_points, threads.POINTS_TO_SORT)
         n_segments, n_cells = config.grid.n_segments, config.grid.n_segments * config.grid.n_bins
-        n_tiles = geometry.n_sides**2
         columns = take('columns', (3, n_points), dtype)
         cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points, dtype=dtype)
         tile = take('tile', (n_points,), np.int32)
         cells = polar_grid.CellTable(
-            take('extremes', (n_parts, n_cells + 1, 3), dtype),
-            take('numbers', (n_parts, n_cells + 1, 2), np.int32),
+            take('extremes', (n_cells + 1, 3), dtype),
+            take('numbers', (n_cells + 1, 2), np.int32),
         )
-        tiles = self._buffers.tile_table(self.workers.n_threads, n_tiles, dtype)
+        tiles = self._buffers.tile_table(geometry.n_sides**2, dtype)
+        copy_points(xyz, columns)
         places = polar_grid.Places(cell, r, tile)
-
-        def copy_and_sort(part: Part) -> None:
-            points = run_of(part, n_points)
-            copy_points(xyz[points], columns[:, points])
-            polar_grid.sort_points(part, columns, geometry, places, cells, tiles)
-
-        self.workers.run(copy_and_sort, n_parts)
+        polar_grid.sort_points(columns, geometry, places, cells, tiles)
         buffers = Candidates.buffers(n_cells, n_segments)
-        n = polar_grid.merge_parts(
-            n_parts, cells, tiles, geometry.edges, config.lines.min_density_extent, buffers
-        )
-        occupied = tiles.occupied[0, 1 : 1 + tiles.occupied[0, 0]]
+        min_extent = config.lines.min_density_extent
+        n = polar_grid.take_candidates(cells, geometry.edges, min_extent, buffers)
         return Scan(
             points_in(columns),
             PolarGrid(cell, r, geometry.edges, n_segments),
-            Tiles(tile, tiles.extremes[0, :-1], occupied),
+            Tiles(tile, tiles.extremes[:-1], tiles.occupied[1 : 1 + tiles.occupied[0]]),
             buffers.first(n),
         )
 
@@ -130,23 +99,14 @@ class NumbaBackend:
         take = self._buffers.take
         thresholds, heights = numbers_of(config.faces), numbers_of(config.label)
         n_tiles = len(scan.tiles.extremes)
-        n_parts = self.workers.n_parts(len(scan.xyz), threads.POINTS_TO_LABEL)
         tile_to_row, row_to_tile = take('tile_rows', (2, n_tiles), np.int32)
         n_tall = faces_.select_tall(scan.tiles, heights, tile_to_row, row_to_tile)
-        sums = take('face_sums', (n_parts, 2 * n_tall, faces_.N_COLUMNS), np.float64)
+        sums = take('face_sums', (2 * n_tall, faces_.N_COLUMNS), np.float64)
         buffers = faces_.FaceSums(tile_to_row, row_to_tile, sums)
-        self.workers.run(
-            faces_.sum_returns,
-            n_parts,
-            scan.xyz.T,
-            scan.tiles,
-            thresholds.cell_size,
-            heights,
-            n_tall,
-            buffers,
-        )
+        tile_size = thresholds.cell_size
+        faces_.sum_returns(scan.xyz.T, scan.tiles, tile_size, heights, n_tall, buffers)
         result = Faces(*take('faces', (2, n_tiles), np.bool_))
-        faces_.decide_faces(n_parts, n_tall, thresholds, heights, buffers, result)
+        faces_.decide_faces(n_tall, thresholds, heights, buffers, result)
         return result
 
     def extract_lines(
@@ -163,16 +123,7 @@ class NumbaBackend:
         """Log marginal likelihood of the frame and its gradient."""
         n_segments = len(inliers.offsets) - 1
         values, gradients = np.empty(n_segments), np.empty((n_segments, len(theta)))
-        self.workers.run(
-            likelihood.log_likelihood,
-            self.workers.n_parts(n_segments, threads.SEGMENTS_TO_GROW),
-            theta,
-            inliers,
-            slope_std,
-            latent_terms,
-            values,
-            gradients,
-        )
+        likelihood.log_likelihood(theta, inliers, slope_std, latent_terms, values, gradients)
         value = float(values.sum())
         if not np.isfinite(value):
             return -np.inf, np.zeros(len(theta))
@@ -200,9 +151,7 @@ class NumbaBackend:
         odds = odds if config.label.rule == 'roughness' else 0.0
 
         def grow(aside: FloatArray, step: int) -> None:
-            n_parts = self.workers.n_parts(len(theta) // step, threads.SEGMENTS_TO_GROW)
-            grow_surfaces = ground.grow_surfaces, n_parts, frame, theta, observation
-            self.workers.run(*grow_surfaces, growth, odds, aside, step, alone)
+            ground.grow_surfaces(frame, theta, observation, growth, odds, aside, step, alone)
 
         def find_evidence() -> None:
             evidence.find_evidence(alone.mean, alone.std, theta, knots, slope_std, shown, beside)
@@ -238,10 +187,9 @@ class NumbaBackend:
         take, label = self._buffers.take, numbers_of(config.label)
         n_points, n_bins = len(scan.xyz), scan.grid.n_bins
         n_cells = scan.grid.n_segments * n_bins
-        n_parts = self.workers.n_parts(n_points, threads.POINTS_TO_LABEL)
         buffers = labels.LabelBuffers(
             take('pieces', (n_cells + 1, 2), np.float64),
-            take('height_sums', (n_parts, n_cells + 1, 3), np.int64),
+            take('height_sums', (n_cells + 1, 3), np.int64),
             take('band', (n_cells + 1,), np.float64),
             sum_units(n_points, label.obstacle_min_height),
         )
@@ -252,17 +200,13 @@ class NumbaBackend:
             np.empty((scan.grid.n_segments, n_bins)),
         )
         labels.fit_pieces(surface, buffers)
-        self.workers.run(
-            labels.survey, n_parts, scan, faces.is_face, label, result.height, buffers
-        )
+        labels.survey(scan, faces.is_face, label, result.height, buffers)
         by_roughness, sigma_n = config.label.rule == 'roughness', config.observation.sigma_n
-        bands_of = n_parts, label, by_roughness, sigma_n, surface.std, buffers, result.roughness
-        labels.set_bands(*bands_of)
+        labels.set_bands(label, by_roughness, sigma_n, surface.std, buffers, result.roughness)
         depth, band = depth_of_ground(config.label), buffers.band
         has_obstacle = take('has_obstacle', (len(faces.is_face),), np.bool_)
         has_obstacle.fill(False)
-        given = scan, faces, label, depth, band, has_obstacle
-        self.workers.run(labels.label_part, n_parts, *given, result)
+        labels.label_by_bands(scan, faces, label, depth, band, has_obstacle, result)
         if by_roughness:
             votes = labels.VoteBuffers(
                 take('rows', (len(has_obstacle) + 1,), np.int32),
@@ -271,10 +215,3 @@ class NumbaBackend:
             labels.settle(scan, lowest_of(surface), has_obstacle, label, votes, result)
         keep_code()
         return result
-
-    def close(self) -> None:
-        """End the threads."""
-        if self._pid != os.getpid():
-            # The pool is that of the parent process, and its lock perhaps held for ever.
-            self._renew()
-        self.workers.close()

@@ -12,15 +12,15 @@ from gp_ground_seg.core.frame import CellArray, PointArray
 
 
 class TileTable(NamedTuple):
-    """Extremes of the points of each tile, one table for each part of the points.
+    """Extremes of the points of each tile.
 
     Attributes
     ----------
-    extremes : (n_parts, T + 1, 2) float32 or float64
+    extremes : (T + 1, 2) float32 or float64
         Height of the lowest and the highest point [m]; infinite, minus infinite in empty
         tiles. The last row is for points in no tile.
-    occupied : (n_parts, T + 2) int32
-        Number of tiles with a point, then these tiles. Code that fills a table first empties
+    occupied : (T + 2,) int32
+        Number of tiles with a point, then these tiles. Code that fills the table first empties
         those, a tenth of all.
     """
 
@@ -28,11 +28,11 @@ class TileTable(NamedTuple):
     occupied: CellArray
 
     @classmethod
-    def empty(cls, n_parts: int, n_tiles: int, dtype: npt.DTypeLike) -> TileTable:
-        """Tables without a point."""
-        extremes = np.empty((n_parts, n_tiles + 1, 2), dtype=dtype)
-        extremes[:, :, 0], extremes[:, :, 1] = np.inf, -np.inf
-        return cls(extremes, np.zeros((n_parts, n_tiles + 2), dtype=np.int32))
+    def empty(cls, n_tiles: int, dtype: npt.DTypeLike) -> TileTable:
+        """Table without a point."""
+        extremes = np.empty((n_tiles + 1, 2), dtype=dtype)
+        extremes[:, 0], extremes[:, 1] = np.inf, -np.inf
+        return cls(extremes, np.zeros(n_tiles + 2, dtype=np.int32))
 
 
 class Buffers:
@@ -69,10 +69,9 @@ class Buffers:
         view = self._views[name] = held[:size].reshape(shape)
         return view
 
-    def tile_table(self, n_parts: int, n_tiles: int, dtype: npt.DTypeLike) -> TileTable:
-        """Tables as the last call left them, or new ones of the size wanted."""
+    def tile_table(self, n_tiles: int, dtype: npt.DTypeLike) -> TileTable:
+        """Table as the last scan left it, or a new one of the size wanted."""
         held = self._tiles
-        wanted = n_parts, n_tiles + 1, 2
-        if held is None or held.extremes.shape != wanted or held.extremes.dtype != dtype:
-            held = self._tiles = TileTable.empty(n_parts, n_tiles, dtype)
+        if held is None or len(held.extremes) != n_tiles + 1 or held.extremes.dtype != dtype:
+            held = self._tiles = TileTable.empty(n_tiles, dtype)
         return held

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.compiled.numerics import LANES
-from gp_ground_seg.core.compiled.threads import Part
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
 from gp_ground_seg.core.gp.ground import fits, noise_among, noise_in_doubt, observed_noise
@@ -86,7 +85,6 @@ class _Columns(NamedTuple):
 
 @jit(entry=True)
 def grow_surfaces(
-    part: Part,
     frame: Frame,
     theta: FloatArray,
     observation: ObservationConfig,
@@ -96,7 +94,7 @@ def grow_surfaces(
     step: int,
     alone: SegmentSurfaces,
 ) -> None:
-    """Inliers and surface of one of `step` segments of a part, into `alone`.
+    """Inliers and surface of every `step`-th segment, into `alone`.
 
     `aside` (2, M, K) is the evidence of the segments beside each, (2, 0, 0) if there is none.
     Unless `odds` are 0, a candidate among others, or that joins in doubt, shows less: see
@@ -104,7 +102,7 @@ def grow_surfaces(
     """
     offsets, mean, std = frame.candidates.offsets, alone.mean, alone.std
     most = 0
-    for m in range(part.number * step, len(mean), part.n_parts * step):
+    for m in range(0, len(mean), step):
         most = max(most, offsets[m + 1] - offsets[m])
     width = (most + len(frame.knots) + LANES - 1) & -LANES
     table = np.empty((8, width))
@@ -123,7 +121,7 @@ def grow_surfaces(
         np.empty((most, width)),
     )
     slope = observation.slope_std**2
-    for m in range(part.number * step, len(mean), part.n_parts * step):
+    for m in range(0, len(mean), step):
         sill, noise = math.exp(theta[m, 0]) ** 2, math.exp(theta[m, 1]) ** 2
         for j in range(len(frame.knots)):
             mean[m, j] = std[m, j] = np.nan

@@ -1,8 +1,8 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.labels`, in five calls.
 
-`fit_pieces` prepares the surface of each cell, `survey` measures the heights of a part of the
-points over it, `set_bands` turns the sums of all parts into bands, `label_part` labels a part,
-and `settle` changes labels near obstacles by votes.
+`fit_pieces` prepares the surface of each cell, `survey` measures the heights of the points over
+it, `set_bands` turns their sums into bands, `label_by_bands` labels the points, and `settle`
+changes labels near obstacles by votes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.threads import Part, points_of
 from gp_ground_seg.core.frame import (
     NOT_FINITE,
     BoolArray,
@@ -61,10 +60,10 @@ class LabelBuffers(NamedTuple):
     ----------
     pieces : (M * n_bins + 1, 2) float64
         Surface in each cell, level and slope over range.
-    sums : (n_parts, M * n_bins + 1, 3) int64
+    sums : (M * n_bins + 1, 3) int64
         For each cell the number of points near the surface, with `OBSTACLE_FLAG` added for
-        each that shows an obstacle, and the sums of heights and squared heights in whole units.
-        Their order does not matter, nor how the points are split.
+        each that shows an obstacle, and the sums of heights and squared heights in whole units:
+        the order of the points does not matter.
     band : (M * n_bins + 1,) float64
         Largest height of ground [m].
     units : float
@@ -91,26 +90,22 @@ def fit_pieces(surface: GroundSurface, buffers: LabelBuffers) -> None:
 
 @jit(entry=True)
 def survey(
-    part: Part,
     scan: Scan,
     is_face: BoolArray,
     config: LabelConfig,
     height: FloatArray,
     buffers: LabelBuffers,
 ) -> None:
-    """Heights of the points of a part over the surface, and the sums for roughness."""
-    pieces, sums, nearest = buffers.pieces, buffers.sums[part.number], scan.grid.edges[0]
+    """Heights of the points over the surface, and the sums for roughness."""
+    pieces, sums, nearest = buffers.pieces, buffers.sums, scan.grid.edges[0]
     for k in range(len(sums)):
         sums[k, 0] = sums[k, 1] = sums[k, 2] = 0
-    # Slices, because indices from 0 on need no check for negative ones.
-    points = points_of(part, len(height))
-    z, tile, heights = scan.xyz.T[2, points], scan.tiles.tile[points], height[points]
-    cell, r = scan.grid.cell[points], scan.grid.r[points]
+    z, tile, cell, r = scan.xyz.T[2], scan.tiles.tile, scan.grid.cell, scan.grid.r
     for i in range(len(cell)):
         c = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
         away = max(np.float64(r[i]), nearest)
         h = np.float64(z[i]) - (pieces[c, 0] + pieces[c, 1] * away)
-        heights[i] = h
+        height[i] = h
         if shows_obstacle(h, config):
             sums[c, 0] += OBSTACLE_FLAG
         elif is_near(h, config) and not is_face[np.uintp(tile[i])]:
@@ -121,7 +116,6 @@ def survey(
 
 @jit(entry=True)
 def set_bands(
-    n_parts: int,
     config: LabelConfig,
     by_roughness: bool,
     sigma_n: float,
@@ -129,7 +123,7 @@ def set_bands(
     buffers: LabelBuffers,
     roughness: FloatArray,
 ) -> None:
-    """Roughness and band of each cell from the sums of all parts."""
+    """Roughness and band of each cell from the sums."""
     n_segments, n_bins = roughness.shape
     # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
     number = np.empty(n_bins + 2, np.int64)
@@ -138,13 +132,12 @@ def set_bands(
     for m in range(n_segments):
         for n in range(n_bins + 2):
             number[n] = heights[n] = squares[n] = 0
-        for index in range(n_parts):
-            for k in range(-1, 2):
-                first = (m + k + n_segments) % n_segments * n_bins
-                for n in range(n_bins):
-                    number[n + 1] += buffers.sums[index, first + n, 0]
-                    heights[n + 1] += buffers.sums[index, first + n, 1]
-                    squares[n + 1] += buffers.sums[index, first + n, 2]
+        for k in range(-1, 2):
+            first = (m + k + n_segments) % n_segments * n_bins
+            for n in range(n_bins):
+                number[n + 1] += buffers.sums[first + n, 0]
+                heights[n + 1] += buffers.sums[first + n, 1]
+                squares[n + 1] += buffers.sums[first + n, 2]
         for n in range(n_bins):
             flagged = number[n] + number[n + 1] + number[n + 2]
             n_near, n_obstacles = flagged & (OBSTACLE_FLAG - 1), flagged >> 32
@@ -180,8 +173,7 @@ class VoteBuffers(NamedTuple):
 
 
 @jit(entry=True)
-def label_part(
-    part: Part,
+def label_by_bands(
     scan: Scan,
     faces: Faces,
     config: LabelConfig,
@@ -190,14 +182,13 @@ def label_part(
     has_obstacle: BoolArray,
     result: Labelled,
 ) -> None:
-    """Label the points of a part from their heights in `result`, and find tiles of obstacles.
+    """Label the points from their heights in `result`, and find tiles of obstacles.
 
     Ground reaches `depth` below the surface. `has_obstacle` (T,) becomes true where a return near
     the surface is no ground.
     """
-    points = points_of(part, len(result.height))
-    z, tile, cell = scan.xyz.T[2, points], scan.tiles.tile[points], scan.grid.cell[points]
-    height, label, margins = result.height[points], result.label[points], result.margin[points]
+    z, tile, cell = scan.xyz.T[2], scan.tiles.tile, scan.grid.cell
+    height, label, margins = result.height, result.label, result.margin
     for i in range(len(cell)):
         n, h = cell[i], height[i]
         margin = band_margin(h, band[np.uintp(n if n >= 0 else len(band) - 1)], depth)
@@ -210,7 +201,6 @@ def label_part(
         otherwise = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
         label[i] = _GROUND if margin >= 0.0 else otherwise
         if margin < 0.0 and is_near(h, config):
-            # Other threads write nothing else here.
             has_obstacle[t] = True
 
 
@@ -225,8 +215,7 @@ def settle(
 ) -> None:
     """Change margins and labels of the returns near an obstacle by the mean votes about them.
 
-    `lowest` is that of `lowest_of` [m]. One thread does it: to wake others takes as long as they
-    would save.
+    `lowest` is that of `lowest_of` [m].
     """
     settled, n_rows = _number_tiles(scan.tiles, has_obstacle, buffers.rows)
     votes = np.zeros((n_rows, N_LAYERS), np.int64)

@@ -17,7 +17,7 @@ from gp_ground_seg.core.jit import jit
 def latent_log_length_scales(
     frame: Frame, theta: FloatArray, at_candidates: FloatArray, at_knots: FloatArray
 ) -> None:
-    """Do what the twin does, into the last two arrays; on one thread, as it takes 0.3 ms."""
+    """Do what the twin does, into the last two arrays."""
     candidates, pseudo, knots = frame.candidates, frame.pseudo, frame.knots
     most = most_bar = 0
     for m in range(len(at_knots)):

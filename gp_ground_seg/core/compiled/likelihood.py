@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.compiled.numerics import factorise, invert, invert_triangle
-from gp_ground_seg.core.compiled.threads import Part
 from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray
 from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
@@ -30,7 +29,6 @@ class _Latent(NamedTuple):
 
 @jit(entry=True)
 def log_likelihood(
-    part: Part,
     theta: FloatArray,
     inliers: Inliers,
     slope_std: float,
@@ -38,8 +36,8 @@ def log_likelihood(
     values: FloatArray,
     gradients: FloatArray,
 ) -> None:
-    """Set ``values[m]`` and ``gradients[m]`` of the segments of a part; -inf where not defined."""
-    for m in range(part.number, len(values), part.n_parts):
+    """Set ``values[m]`` and ``gradients[m]`` of each segment; -inf where not defined."""
+    for m in range(len(values)):
         first, bar_first = inliers.offsets[m], inliers.bar_offsets[m]
         n, p = inliers.offsets[m + 1] - first, inliers.bar_offsets[m + 1] - bar_first
         gradient, values[m] = gradients[m], 0.0

@@ -1,7 +1,6 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.polar_grid`.
 
-Each part of the points fills tables of its own; `merge_parts` reduces them to the candidates and
-to the first table of the tiles.
+`sort_points` fills tables of the cells and of the tiles, `take_candidates` takes the candidates.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gp_ground_seg.core.compiled.buffers import TileTable
-from gp_ground_seg.core.compiled.threads import Part, points_of
 from gp_ground_seg.core.frame import (
     NO_TILE,
     NOT_FINITE,
@@ -35,14 +33,14 @@ BLOCK = 512
 
 
 class CellTable(NamedTuple):
-    """Extremes and numbers of the points of each cell, one table for each part.
+    """Extremes and numbers of the points of each cell.
 
     Attributes
     ----------
-    extremes : (n_parts, M * n_bins + 1, 3) float32 or float64
+    extremes : (M * n_bins + 1, 3) float32 or float64
         Height of the lowest point, its range, and height of the highest point [m]. The last
         row is for points in no cell.
-    numbers : (n_parts, M * n_bins + 1, 2) int32
+    numbers : (M * n_bins + 1, 2) int32
         Number of points; tile of the lowest point.
     """
 
@@ -60,34 +58,31 @@ class Places(NamedTuple):
 
 @jit(entry=True)
 def sort_points(
-    part: Part,
     columns: PointArray,
     geometry: GridGeometry,
     places: Places,
     cells: CellTable,
     tiles: TileTable,
 ) -> None:
-    """Sort the points of a part, (3, N), into cells and tiles, with the extremes of each.
+    """Sort points, (3, N), into cells and tiles, with the extremes of each.
 
     Block by block: first the places of the points, in loops without branches; then the
     extremes.
     """
     cell, r, tile = places.cell, places.r, places.tile
-    points = points_of(part, len(r))
-    extremes, numbers = cells.extremes[part.number], cells.numbers[part.number]
-    tile_extremes, occupied = tiles.extremes[part.number], tiles.occupied[part.number]
-    _clear(extremes, numbers, tile_extremes, occupied)
+    extremes, numbers = cells.extremes, cells.numbers
+    _clear(extremes, numbers, tiles.extremes, tiles.occupied)
     range_entry = np.empty(BLOCK, dtype=np.int32)
     key, key_entry = np.empty(BLOCK, dtype=r.dtype), np.empty(BLOCK, dtype=np.int32)
-    for first in range(points.start, points.stop, BLOCK):
-        block = slice(first, min(first + BLOCK, points.stop))
+    for first in range(0, len(r), BLOCK):
+        block = slice(first, min(first + BLOCK, len(r)))
         x, y, z = columns[0, block], columns[1, block], columns[2, block]
         _compute_range(x, y, z, geometry.ranges, r[block], range_entry, cell[block])
         _compute_azimuth_key(x, y, geometry, cell[block], key, key_entry, tile[block])
         _look_up(geometry, r[block], range_entry, key, key_entry, cell[block])
-        _widen(z, cell[block], tile[block], extremes, numbers, tile_extremes, occupied)
-    for first in range(points.start, points.stop, BLOCK):
-        block = slice(first, min(first + BLOCK, points.stop))
+        _widen(z, cell[block], tile[block], extremes, numbers, tiles.extremes, tiles.occupied)
+    for first in range(0, len(r), BLOCK):
+        block = slice(first, min(first + BLOCK, len(r)))
         _resolve_lowest(columns[2, block], r[block], cell[block], tile[block], extremes, numbers)
 
 
@@ -253,60 +248,29 @@ def _resolve_lowest(
 
 
 @jit(entry=True)
-def merge_parts(
-    n_parts: int,
-    cells: CellTable,
-    tiles: TileTable,
-    edges: FloatArray,
-    min_extent: float,
-    candidates: Candidates,
+def take_candidates(
+    cells: CellTable, edges: FloatArray, min_extent: float, candidates: Candidates
 ) -> int:
-    """Reduce the tables of all parts: candidates, into arrays with room for all cells.
+    """Take the lowest point of each cell, into arrays with room for all cells.
 
     Returns the number of candidates. `edges` and `min_extent` are those of `ground_candidates`
-    of the twin. The first table of the tiles becomes that of all points.
+    of the twin.
     """
-    _merge_tiles(n_parts, tiles.extremes, tiles.occupied)
     extremes, numbers, n_bins = cells.extremes, cells.numbers, len(edges) - 1
-    low = near = high = extremes.dtype.type(0.0)
-    lowest_tile = NO_TILE
     c = 0
     for m in range(len(candidates.offsets) - 1):
         candidates.offsets[m] = c
         for n in range(n_bins):
             k = m * n_bins + n
-            count = 0
-            for index in range(n_parts):
-                number = numbers[index, k, 0]
-                if number == 0:
-                    continue
-                z, r = extremes[index, k, 0], extremes[index, k, 1]
-                top, tile = extremes[index, k, 2], numbers[index, k, 1]
-                if count == 0 or (z, r, tile) < (low, near, lowest_tile):
-                    low, near, lowest_tile = z, r, tile
-                high = top if count == 0 else max(high, top)
-                count += number
+            count = numbers[k, 0]
             if count == 0:
                 continue
-            candidates.z[c], candidates.r[c], candidates.bin[c] = low, near, n
-            candidates.tile[c] = lowest_tile
+            low, high = np.float64(extremes[k, 0]), np.float64(extremes[k, 2])
+            candidates.z[c], candidates.r[c], candidates.bin[c] = low, extremes[k, 1], n
+            candidates.tile[c] = numbers[k, 1]
             candidates.density[c] = vertical_density(
-                count, edges[n + 1] - edges[n], np.float64(low), np.float64(high), min_extent
+                count, edges[n + 1] - edges[n], low, high, min_extent
             )
             c += 1
     candidates.offsets[len(candidates.offsets) - 1] = c
     return c
-
-
-@jit(part=True)
-def _merge_tiles(n_parts: int, extremes: PointArray, occupied: CellArray) -> None:
-    n_occupied = occupied[0, 0]
-    for index in range(1, n_parts):
-        for place in range(1, occupied[index, 0] + 1):
-            k = np.uintp(occupied[index, place])
-            if extremes[0, k, 0] > extremes[0, k, 1]:
-                n_occupied += 1
-                occupied[0, n_occupied] = occupied[index, place]
-            extremes[0, k, 0] = min(extremes[0, k, 0], extremes[index, k, 0])
-            extremes[0, k, 1] = max(extremes[0, k, 1], extremes[index, k, 1])
-    occupied[0, 0] = n_occupied

@@ -1,8 +1,8 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.vertical_faces`.
 
 In three calls: `select_tall` lists the tiles with a high return, `sum_returns` sums over the
-returns of a part of the points in them, the lowest and those above apart, `decide_faces` decides
-from the sums of all parts. Coordinates are rounded so that the sums are exact in any order.
+returns in them, the lowest and those above apart, `decide_faces` decides from the sums.
+Coordinates are rounded so that the sums are exact in any order.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.threads import Part, points_of
 from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, PointArray, Tiles
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
@@ -44,8 +43,8 @@ class FaceSums(NamedTuple):
         First of the two rows of each occupied tile, or `NOT_TALL`.
     row_to_tile : (T,) int32
         Tile of each pair of rows.
-    sums : (n_parts, rows, N_COLUMNS) float64
-        Sums of each part.
+    sums : (rows, N_COLUMNS) float64
+        Sums of each row.
     """
 
     tile_to_row: CellArray
@@ -73,7 +72,6 @@ def select_tall(
 
 @jit(entry=True)
 def sum_returns(
-    part: Part,
     columns: PointArray,
     tiles: Tiles,
     tile_size: float,
@@ -81,14 +79,11 @@ def sum_returns(
     n_tall: int,
     buffers: FaceSums,
 ) -> None:
-    """Sum over the returns of a part of the points, (3, N), in tall tiles."""
-    sums = buffers.sums[part.number]
+    """Sum over the returns, (3, N), in tall tiles."""
+    sums = buffers.sums
     _clear_sums(tiles.extremes, tile_size, n_tall, buffers.row_to_tile, sums)
     foot_height, max_height = FOOT_SHARE * label.obstacle_min_height, label.obstacle_max_height
-    # Slices, because indices from 0 on need no check for negative ones.
-    points = points_of(part, len(tiles.tile))
-    x, y, z = columns[0, points], columns[1, points], columns[2, points]
-    tile = tiles.tile[points]
+    x, y, z, tile = columns[0], columns[1], columns[2], tiles.tile
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
             continue
@@ -136,32 +131,19 @@ def _clear_sums(
 
 @jit(entry=True)
 def decide_faces(
-    n_parts: int,
     n_tall: int,
     config: FacesConfig,
     label: LabelConfig,
     buffers: FaceSums,
     faces: Faces,
 ) -> None:
-    """Decide from the sums of all parts which tiles hold a face, into `faces`."""
+    """Decide from the sums which tiles hold a face, into `faces`."""
     for t in range(len(faces.is_face)):
         faces.is_face[t] = faces.has_occluded_base[t] = False
-    low, high = np.empty(N_COLUMNS), np.empty(N_COLUMNS)
     for k in range(n_tall):
-        _add_parts(n_parts, 2 * k, buffers.sums, low)
-        _add_parts(n_parts, 2 * k + 1, buffers.sums, high)
+        low, high = buffers.sums[2 * k], buffers.sums[2 * k + 1]
         top = max(low[_TOP], high[_TOP])
         if top > label.obstacle_min_height and is_vertical(low, high, config):
             t = buffers.row_to_tile[k]
             faces.is_face[t] = True
             faces.has_occluded_base[t] = is_base_occluded(low, high, config)
-
-
-@jit()
-def _add_parts(n_parts: int, row: int, sums: FloatArray, total: FloatArray) -> None:
-    for c in range(_TOP + 1):
-        total[c] = 0.0
-    for index in range(n_parts):
-        for c in range(_TOP):
-            total[c] += sums[index, row, c]
-        total[_TOP] = max(total[_TOP], sums[index, row, _TOP])

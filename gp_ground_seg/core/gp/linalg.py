@@ -14,7 +14,7 @@ from gp_ground_seg.core.frame import BoolArray, FloatArray, IntArray
 
 try:
     from threadpoolctl import ThreadpoolController
-except ImportError:  # then BLAS keeps its threads, which compete with ours
+except ImportError:  # then BLAS keeps its threads
     ThreadpoolController = None
 
 SEGMENTS_PER_BATCH = 48

@@ -256,7 +256,6 @@ class LearningConfig:
 class RuntimeConfig:
     """How the work is done; nothing here changes a label."""
 
-    n_threads: int = basic(0, (0, 64), 'threads of the compiled code; 0 = all cores, at most 4')
     backend: str = advanced('auto', ('auto', 'numba', 'numpy'),
         'auto = numba if it is installed, else numpy')
 
@@ -293,9 +292,6 @@ _ASCENDING = (
 """Pairs of which the first must be below the second."""
 NARROWEST_BIN = 1e-4
 """Least width of a bin [m]: above the resolution of ranges in single precision."""
-DEFAULT_MAX_THREADS = 4
-"""Most threads where their number is not given: each has tables to fill and a wake-up, which
-costs more than a small part of the work saves."""
 MAX_TABLES = 2e9
 """Most memory that the tables of tiles and cells may take [bytes]."""
 
@@ -345,20 +341,18 @@ def _check_bins(grid: GridConfig) -> None:
 
 def size_of_tables(config: Config) -> int:
     """Memory that tables of tiles and cells take, of points of double precision [bytes]."""
-    n_threads = config.runtime.n_threads or DEFAULT_MAX_THREADS
     n_tiles = math.ceil(2.0 * config.grid.r_max / config.faces.cell_size) ** 2
     n_cells = config.grid.n_segments * config.grid.n_bins
-    # Once, and for each thread; held against both backends by test_robustness.py.
-    return (21 + 20 * n_threads) * n_tiles + (160 + 48 * n_threads) * n_cells
+    # Held against both backends by test_robustness.py.
+    return 41 * n_tiles + 208 * n_cells
 
 
 def _check_memory(config: Config) -> None:
     size = size_of_tables(config)
     if size > MAX_TABLES:
         raise ConfigError(
-            f'grid.r_max = {config.grid.r_max:g}, faces.cell_size = {config.faces.cell_size:g}, '
-            f'runtime.n_threads = {config.runtime.n_threads or DEFAULT_MAX_THREADS}: tables of '
-            f'tiles and cells would take {size / 1e9:.1f} GB; must be at most '
+            f'grid.r_max = {config.grid.r_max:g}, faces.cell_size = {config.faces.cell_size:g}: '
+            f'tables of tiles and cells would take {size / 1e9:.1f} GB; must be at most '
             f'{MAX_TABLES / 1e9:g} GB'
         )
 

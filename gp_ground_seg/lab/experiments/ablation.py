@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -111,8 +110,7 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
     """
     refuse_changed(config, {name for changes in MODELS.values() for name in changes}, _LATENT)
     variants = {name: config.replace(**changes) for name, changes in MODELS.items()}
-    with closing(interpolation_method(config)) as plain:
-        scores = score_variants(items, variants, [plain], runner=runner)
+    scores = score_variants(items, variants, [interpolation_method(config)], runner=runner)
     last = scores[len(MODELS) - 1]
     rows: list[Row] = [
         [
@@ -204,9 +202,9 @@ def compare_steps(
     if config != Config():
         raise ConfigError('steps: goes from the preset paper to the defaults, give no parameters')
     steps = paper_steps()
-    with closing(interpolation_method(config)) as plain:
-        peers: list[Method] = [plain, *([PatchworkppMethod()] if with_peer else [])]
-        scores = score_variants(items, steps, peers, runner=runner)
+    peers: list[Method] = [interpolation_method(config)]
+    peers += [PatchworkppMethod()] if with_peer else []
+    scores = score_variants(items, steps, peers, runner=runner)
     rows: list[Row] = []
     for k, score in enumerate(scores):
         other = scores[min(max(k, 1), len(steps)) - 1]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
 from functools import partial
 from typing import Any
 
@@ -73,13 +72,12 @@ def _measure(
 ) -> tuple[list[dict[str, Any]], FitReport]:
     """Rows of the segments chosen, and a fit of the latent model."""
     rows: list[dict[str, Any]] = []
-    with ExitStack() as stack:
-        methods = []
-        for name, model in MODELS.items():
-            variant = config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
-            methods.append(stack.enter_context(closing(OurMethod(variant, name))))
-        for choice in progress(choices):
-            rows += _rows(frames[choice], CHOICES[choice], methods)
+    methods = []
+    for name, model in MODELS.items():
+        variant = config.replace(**{'length_scale.model': model, 'learning.fixed': 'none'})
+        methods.append(OurMethod(variant, name))
+    for choice in progress(choices):
+        rows += _rows(frames[choice], CHOICES[choice], methods)
     return rows, methods[0].last.fit
 
 

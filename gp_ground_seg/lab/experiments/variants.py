@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -105,9 +104,8 @@ def score_variants(
     runner: Runner = HERE,
 ) -> list[MethodScore]:
     """Run variants, then `peers`, once on every scan, alternately, each scan without a past."""
-    with ExitStack() as stack:
-        ours = [stack.enter_context(closing(OurMethod(c, name))) for name, c in variants.items()]
-        return score_methods(items, [*ours, *peers], load, each_alone=True, runner=runner)
+    ours = [OurMethod(config, name) for name, config in variants.items()]
+    return score_methods(items, [*ours, *peers], load, each_alone=True, runner=runner)
 
 
 def score_simulated(

@@ -97,8 +97,7 @@ def segment_block(
             sizes.append(write(target / scan.name, result))
             yield result
 
-    with GroundSegmenter(config) as segmenter:
-        return Outcome.of(results(segmenter))._replace(sizes=sizes)
+    return Outcome.of(results(GroundSegmenter(config)))._replace(sizes=sizes)
 
 
 class Manifest:
@@ -254,8 +253,6 @@ def run_blocks(
     Blocks are cut by `group`, see `cut`.
     """
     left = [item for item in items if item.name not in done]
-    if runner.n_workers:
-        config = config.replace(**{'runtime.n_threads': 1})
     blocks = cut(left, group, runner.n_workers)
     found = []
     for k, outcome in runner.map_blocks(partial(function, config), blocks):
@@ -265,9 +262,8 @@ def run_blocks(
 
 
 def digest(config: Config, *more: object) -> str:
-    """Digest of what labels depend on: parameters but for the number of threads, and `more`."""
-    nested = config.replace(**{'runtime.n_threads': 1}).nested()
-    text = json.dumps([nested, *map(repr, more)], sort_keys=True)
+    """Digest of what labels depend on: the parameters, and `more`."""
+    text = json.dumps([config.nested(), *map(repr, more)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
 from typing import Any
 
 import numpy as np
@@ -26,14 +25,11 @@ MODES = {'fixed': 'theta fixed', 'every_frame': 'learning'}
 """Values of ``learning.mode`` that are timed, and their titles."""
 
 
-def bench_cases(config: Config, threads: Sequence[int], *, with_numpy: bool) -> dict[str, Config]:
-    """Theta fixed and learned in every frame, on each number of threads and with numpy."""
+def bench_cases(config: Config, *, with_numpy: bool) -> dict[str, Config]:
+    """Theta fixed and learned in every frame, on one thread, and with numpy."""
     cases = {
-        f'{title}, {n} thread{"s" if n > 1 else ""}': config.replace(
-            **{'learning.mode': mode, 'runtime.n_threads': n}
-        )
+        f'{title}, 1 thread': config.replace(**{'learning.mode': mode})
         for mode, title in MODES.items()
-        for n in threads
     }
     if with_numpy:
         for mode, title in MODES.items():
@@ -58,12 +54,11 @@ def run_cases(
     that of its baseline if there is one.
     """
     methods: list[Method] = []
-    with ExitStack() as stack:
-        for name, config in cases.items():
-            methods.append(stack.enter_context(closing(OurMethod(config, name))))
-            methods += [make_baseline()] if make_baseline else []
-        items = [*scans] * n_passes
-        scores = score_methods(items, methods, as_it_is, clock=clock, runner=runner)
+    for name, config in cases.items():
+        methods.append(OurMethod(config, name))
+        methods += [make_baseline()] if make_baseline else []
+    items = [*scans] * n_passes
+    scores = score_methods(items, methods, as_it_is, clock=clock, runner=runner)
     n = len(methods) // len(cases)
     return {name: scores[n * k : n * (k + 1)] for k, name in enumerate(cases)}
 
@@ -107,7 +102,6 @@ def _case(name: str, ours: MethodScore, baseline: MethodScore | None = None) -> 
         'name': name,
         'mode': fit.mode,
         'backend': fit.backend,
-        'n_threads': fit.n_threads,
         'ms': _spread(seconds),
         'stages_ms': {stage: _ms(statistics.median(values)) for stage, values in stages.items()},
         'frames': [

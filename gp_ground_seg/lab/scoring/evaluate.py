@@ -96,9 +96,8 @@ class OurMethod:
         self._segmenter = GroundSegmenter(config, backend=make(config.runtime))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Send the configuration to a worker, with one thread: there are many workers."""
-        config = self._segmenter.config.replace(**{'runtime.n_threads': 1})
-        return type(self), (config, self.name, self._make)
+        """Send the configuration to a worker."""
+        return type(self), (self._segmenter.config, self.name, self._make)
 
     def reset(self) -> None:
         """Do nothing: each scan is segmented by itself."""
@@ -115,10 +114,6 @@ class OurMethod:
             last.label, last.ground_z, last.p_ground, last.return_std, last.ground_std,
             stages, last.pose, last.fit,
         )  # fmt: skip
-
-    def close(self) -> None:
-        """End the worker threads."""
-        self._segmenter.close()
 
 
 @dataclass(frozen=True)

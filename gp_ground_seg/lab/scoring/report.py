@@ -184,9 +184,8 @@ def machine_line(environment: Mapping[str, Any], fit: FitReport | None = None) -
     """One line on where a measurement ran."""
     cores = '1 core' if environment['n_cores'] == 1 else f'{environment["n_cores"]} cores'
     if fit is not None:
-        threads = '1 thread' if fit.n_threads == 1 else f'{fit.n_threads} threads'
-        if n_workers := environment.get('n_workers'):
-            threads = f'workers with {n_workers} threads in all'
+        n_workers = environment.get('n_workers')
+        threads = f'workers with {n_workers} threads in all' if n_workers else '1 thread'
         cores = f'{threads} on {cores}, {fit.backend}'
     versions = ', '.join(f'{name} {v or "absent"}' for name, v in environment['versions'].items())
     machine = f'machine: {environment["cpu"]}, {cores}; Python {environment["python"]}, {versions}'
@@ -248,7 +247,6 @@ class Report(NamedTuple):
         """Write every number as JSON."""
         document = {
             **self.facts,
-            'n_threads': self.fit.n_threads,
             'backend': self.fit.backend,
             'environment': environment,
             **{name: table.json() for name, table in self.tables.items()},
