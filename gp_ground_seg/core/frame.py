@@ -295,6 +295,5 @@ class Labelled(NamedTuple):
     # (N,) distance of each point to the nearer edge of the band that is ground [m], negative for
     # obstacles; NaN where there is no surface
     margin: FloatArray
-    # (M, n_bins) root mean square height of the returns over the surface about each bin [m], less
-    # what of their mean the surface excludes
+    # (N,) roughness of the ground about each point [m]; NaN outside the grid
     roughness: FloatArray

@@ -218,9 +218,9 @@ class Segmentation:
 
     @property
     def roughness(self) -> FloatArray:
-        """Root mean square height of returns over the surface about each bin, (M, n_bins) [m].
+        """Roughness of the ground about each point, (N,) float64 [m]; NaN outside the grid.
 
-        See `gp_ground_seg.core.pipeline.labels.roughness_of`.
+        See `gp_ground_seg.core.pipeline.roughness.ground_roughness`.
         """
         return self.labelled.roughness
 
@@ -303,8 +303,7 @@ class Segmentation:
         At least 0.5 for points labelled ground; 0 where there is no model, NaN for
         points that are not finite.
         """
-        rough = self.roughness.ravel()[np.maximum(self.grid.cell, 0)]
-        noise = float(np.exp(self.theta[:, 1].mean()))
-        result = ground_probability(self.margin, self._at_points(self.surface.std), rough, noise)
+        noise, std = float(np.exp(self.theta[:, 1].mean())), self._at_points(self.surface.std)
+        result = ground_probability(self.margin, std, self.roughness, noise)
         result[self.label == Label.UNKNOWN] = np.nan
         return result

@@ -223,12 +223,14 @@ class LabelConfig:
     ground_tolerance: float = basic(0.1, (0.001, 5.0),
         'height above the surface up to which a return is ground in any case; more = more ground',
         'm', 'zeta_g')
-    obstacle_min_height: float = advanced(0.5, (0.01, 10.0),
-        'height above the surface from which a return is an obstacle on any ground',
+    obstacle_min_height: float = advanced(0.2, (0.01, 10.0),
+        'least height over the ground of an obstacle that matters; on rough ground a vertical face '
+        'is one if it stands so much higher than ground_tolerance',
         'm')
     obstacle_max_height: float = advanced(1.0, (0.02, 50.0),
-        'height above the surface up to which returns are evidence of obstacles (higher ones '
-        'overhang), and depth below it down to which a return is ground', 'm')
+        'height above the lowest return of a tile up to which returns belong to a vertical face '
+        '(higher ones overhang), and depth below the surface down to which a return is ground',
+        'm')
 
 
 @dataclass(frozen=True)

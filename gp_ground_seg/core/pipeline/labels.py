@@ -16,7 +16,6 @@ from gp_ground_seg.core.frame import (
     IntArray,
     Label,
     Labelled,
-    PolarGrid,
     Scan,
     Tiles,
     Values,
@@ -25,12 +24,17 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
+from gp_ground_seg.core.pipeline.roughness import ground_roughness
 
 FINEST_UNITS = 2.0**40
 """Most of `sum_units`."""
-FARTHEST_OFFSET = 2.0
-"""Standard deviations up to which the mean height of returns over the surface counts as their
-roughness."""
+HIGHEST_GROUND = 0.5
+"""Height over the surface from which no return is ground, however rough the ground is [m]; returns
+below it tell how rough it is."""
+ROUGHNESS_IN_BAND = 2.25
+"""Height over the surface up to which a return is ground, in roughnesses of the ground about it:
+of returns spread evenly over the height of grass all are within 1.7, of those normally distributed
+98 in 100 are within 2.25."""
 FACE_SHARE = 0.5
 """Part of the tolerance up to which a return over the lowest of a vertical face is ground before
 the vote."""
@@ -45,40 +49,38 @@ VOTE_UNITS = 2.0**12
 def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Config) -> Labelled:
     """Label points by their height over the surface (paper, Algorithm 2, line 14).
 
-    A point within the paper's tolerance is ground; above it, the returns about the cell decide
-    (see `ground_band`); and below the surface there is no obstacle. Of a vertical face only
-    returns near its lowest one are ground; none are where its base is occluded. Then the returns
-    near the surface vote (see `mean_votes`).
+    A point within the paper's tolerance is ground; above it, the roughness of the ground about it
+    decides (see `ground_band`); and below the surface there is no obstacle. Of a vertical face
+    only returns near its lowest one are ground; none are where its base is occluded. Then the
+    returns near the surface vote (see `mean_votes`).
     """
     grid, tiles, label = scan.grid, scan.tiles, config.label
     z = scan.xyz[:, 2].astype(np.float64)
-    # NaN outside, as is what follows; cells and tiles there are negative, which index something.
+    # NaN outside, as is what follows; tiles there are negative, which index something.
     height = z - at_points(surface.knots, surface.mean, grid)
-    in_face = faces.is_face[as_index(tiles.tile)] & grid.inside
-    n_near, heights, squares, n_obstacles = _returns_about(height, grid, in_face, label)
-    units, sigma_n = sum_units(len(z), label.obstacle_min_height), config.observation.sigma_n
-    variance = cell_variance(surface.std[:, :-1], surface.std[:, 1:], sigma_n).ravel()
-    roughness = roughness_of(n_near, heights, squares, units, variance)
+    tile = as_index(tiles.tile)
+    in_face = faces.is_face[tile] & grid.inside
+    units = sum_units(len(z))
+    roughness = ground_roughness(tiles, *_near_sums(height, tiles, in_face, units), units)
     band = np.full(len(roughness), label.ground_tolerance)
     if label.rule == 'roughness':
-        band = ground_band(n_near, roughness, n_obstacles, label, sigma_n)
-    margin: FloatArray = band_margin(height, band[as_index(grid.cell)], depth_of_ground(label))
+        band = ground_band(roughness, label)
+    margin: FloatArray = band_margin(height, band[tile], depth_of_ground(label))
     of_face = np.flatnonzero(in_face)
-    tile = as_index(tiles.tile[of_face])
     margin[of_face] = face_margin(
         margin[of_face],
-        z[of_face] - tiles.lowest_z[tile],
-        faces.has_occluded_base[tile],
+        z[of_face] - tiles.lowest_z[tile[of_face]],
+        faces.has_occluded_base[tile[of_face]],
         label.ground_tolerance,
     )
     if label.rule == 'roughness':
-        voters = np.flatnonzero(is_near(height, label))
+        voters = np.flatnonzero(is_near(height))
         heights = z[voters] - lowest_of(surface)
         voters, means = mean_votes(voters, heights, margin, tiles, label.ground_tolerance)
         margin[voters] = settled_margin(margin[voters], means)
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
-    return Labelled(result, height, margin, roughness.reshape(grid.n_segments, grid.n_bins))
+    return Labelled(result, height, margin, np.where(grid.inside, roughness[tile], np.nan))
 
 
 def depth_of_ground(label: LabelConfig) -> float:
@@ -88,66 +90,20 @@ def depth_of_ground(label: LabelConfig) -> float:
 
 
 @shared
-def is_near(height: Values, label: LabelConfig) -> Values:
+def is_near(height: Values) -> Values:
     """Whether a return so high over the surface [m] tells its roughness."""
-    return (height < label.obstacle_min_height) & (height >= -label.obstacle_min_height)
+    return (height < HIGHEST_GROUND) & (height >= -HIGHEST_GROUND)
 
 
 @shared
-def shows_obstacle(height: Values, label: LabelConfig) -> Values:
-    """Whether a return so high over the surface [m] shows an obstacle: higher ones overhang."""
-    return (height >= label.obstacle_min_height) & (height <= label.obstacle_max_height)
+def ground_band(roughness: Values, label: LabelConfig) -> Values:
+    """Largest height of ground over the surface, where the ground is so rough [m].
 
-
-@shared
-def cell_variance(std_before: Values, std_behind: Values, sigma_n: float) -> Values:
-    """Variance of a height over the surface of a cell, from its deviations at both edges [m^2]."""
-    std = np.maximum(std_before, std_behind)
-    return std * std + sigma_n * sigma_n
-
-
-@shared
-def roughness_of(
-    n_near: Values, heights: Values, squares: Values, units: float, variance: Values
-) -> Values:
-    """Root mean square height of returns near the surface [m]; 0 where there are none.
-
-    Returns of the side of a car, all at one height over the surface, are not rough ground: their
-    mean counts up to `FARTHEST_OFFSET` standard deviations, of their spread about it and of
-    `variance` together, that of a height over the surface [m^2].
-
-    `heights` and `squares` are sums of the `n_near` heights and of their squares in whole units,
-    see `sum_units`.
+    See `gp_ground_seg.core.pipeline.roughness.ground_roughness`: a thing on the ground does not
+    widen the band, since it fills few of the tiles about it.
     """
-    number = units * np.maximum(n_near, 1.0)
-    offset = heights / number
-    offset_square = offset * offset
-    spread = np.maximum(squares / number - offset_square, 0.0)
-    largest = FARTHEST_OFFSET * FARTHEST_OFFSET * (spread + variance)
-    # Without a surface `variance` is NaN, and the offset counts in full.
-    return np.sqrt(spread + choose(largest < offset_square, largest, offset_square))
-
-
-@shared
-def ground_band(
-    n_near: Values, roughness: Values, n_obstacles: Values, label: LabelConfig, sigma_n: float
-) -> Values:
-    """Largest height of ground over the surface of a cell [m].
-
-    The height of a ground return is normally distributed about the surface, with the local
-    roughness and the noise; returns of obstacles are spread evenly over height, as densely as
-    those that are too high for ground. Up to the band a return is more likely ground. One more
-    obstacle return is counted than there is: that none was seen does not exclude any.
-
-    `n_near` returns near the surface and `n_obstacles` that show obstacles were counted.
-    """
-    depth = label.obstacle_max_height - label.obstacle_min_height
-    variance = roughness * roughness + sigma_n * sigma_n
-    obstacles_per_metre = (n_obstacles + 1.0) / depth
-    ground_per_metre = np.maximum(n_near, 1.0) / np.sqrt(2.0 * np.pi * variance)
-    log_ratio = np.log(ground_per_metre / obstacles_per_metre)
-    likely = np.sqrt(2.0 * variance * np.maximum(log_ratio, 0.0))
-    return np.minimum(np.maximum(likely, label.ground_tolerance), label.obstacle_min_height)
+    likely = np.minimum(ROUGHNESS_IN_BAND * roughness, HIGHEST_GROUND)
+    return np.maximum(likely, label.ground_tolerance)
 
 
 @shared
@@ -270,29 +226,18 @@ def mean_votes(
     return voters[settles], mean * (tolerance / VOTE_UNITS)
 
 
-def _returns_about(
-    height: FloatArray, grid: PolarGrid, in_face: BoolArray, label: LabelConfig
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Count returns in each cell and the eight around it, (M * n_bins,) each.
+def _near_sums(
+    height: FloatArray, tiles: Tiles, in_face: BoolArray, units: float
+) -> tuple[IntArray, FloatArray]:
+    """Count the returns near the surface in each tile, and sum their squared heights, (T,) each.
 
-    Those near the surface, their heights and squared heights in whole units, those that show an
-    obstacle.
     `height` (N,) is over the surface [m], NaN where there is none; points `in_face` (N,), of
-    vertical faces, are no roughness of the ground.
+    vertical faces, are no roughness of the ground. The sums are in whole units.
     """
-
-    def total(cell: IntArray, weights: FloatArray | None = None) -> FloatArray:
-        table = np.bincount(cell, weights, grid.n_segments * grid.n_bins)
-        return sum_neighbourhood(table.reshape(grid.n_segments, grid.n_bins)).ravel()
-
-    # `height` is NaN outside, which is neither.
-    shows = as_index(grid.cell[np.flatnonzero(shows_obstacle(height, label))])
-    near = np.flatnonzero(is_near(height, label) & ~in_face)
-    cell, near_height = as_index(grid.cell[near]), height[near]
-    units = sum_units(len(height), label.obstacle_min_height)
-    heights = total(cell, whole_units(near_height, units))
-    squares = total(cell, whole_units(near_height * near_height, units))
-    return total(cell), heights, squares, total(shows)
+    near = np.flatnonzero(is_near(height) & ~in_face)
+    tile, n_tiles, heights = as_index(tiles.tile[near]), len(tiles.extremes), height[near]
+    squares = np.bincount(tile, whole_units(heights * heights, units), n_tiles)
+    return np.bincount(tile, minlength=n_tiles), squares
 
 
 @shared
@@ -301,23 +246,13 @@ def whole_units(value: Values, units: float) -> Values:
     return np.floor(value * units + 0.5)
 
 
-def sum_units(n_points: int, max_height: float) -> float:
-    """Whole units that heights and their squares are rounded to [1/m, 1/m^2].
+def sum_units(n_points: int) -> float:
+    """Whole units that squared heights of returns near the surface are rounded to [1/m^2].
 
     The order in which whole numbers are summed does not matter. The sum over all points fits
-    into 63 bits even if each is `max_height` [m] from the surface.
+    into 63 bits even if each is as far from the surface as `is_near` allows.
     """
-    largest = max(n_points, 1) * max(1.0, max_height) ** 2
-    return min(FINEST_UNITS, 2.0 ** math.floor(62.0 - math.log2(largest)))
-
-
-def sum_neighbourhood(table: FloatArray | IntArray) -> FloatArray:
-    """Sum over each cell and the eight around it; segments form a ring, bins do not."""
-    ring = np.roll(table, 1, axis=0) + table + np.roll(table, -1, axis=0)
-    result: FloatArray = ring.astype(np.float64)
-    result[:, 1:] += ring[:, :-1]
-    result[:, :-1] += ring[:, 1:]
-    return result
+    return min(FINEST_UNITS, 2.0 ** math.floor(62.0 - math.log2(max(n_points, 1))))
 
 
 def ground_probability(

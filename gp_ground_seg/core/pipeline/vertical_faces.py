@@ -14,15 +14,13 @@ import numpy as np
 
 from gp_ground_seg.core.frame import OUTSIDE, Faces, FloatArray, IntArray, Scan, Values, as_index
 from gp_ground_seg.core.jit import choose, shared
-from gp_ground_seg.core.parameters.config import Config, FacesConfig
+from gp_ground_seg.core.parameters.config import Config, FacesConfig, LabelConfig
 
 MIN_RETURNS = 4
 """Returns that a tile needs to have an orientation."""
 FLATNESS = 1e-9
 """Scatter across a line, in parts of that along it, or of each return [m^2], which is none: as
 wide as coordinates are rounded to. What is left is rounding, and has no orientation."""
-FOOT_SHARE = 0.2
-"""Part of the least height of a face whose returns are its foot, the lowest ones."""
 UNITS_PER_METRE = 2.0**16
 """Coordinates are rounded to units of 15 um: squares and products within a tile, and sums of two
 hundred thousand of them, are then exact, so that their order does not matter."""
@@ -35,15 +33,14 @@ SUMS = 10
 def find_faces(scan: Scan, config: Config) -> Faces:
     """Find the tiles that hold a vertical face.
 
-    A tile is examined if a return lies more than ``label.obstacle_min_height`` above the lowest.
-    The scatter of its returns determines their orientation, see `normal_z`; those higher than
+    A tile is examined if a return lies more than `face_height` above the lowest. The scatter of its returns determines their orientation, see `normal_z`; those higher than
     ``label.obstacle_max_height`` above the lowest may overhang, and are left out.
     """
     tiles, faces, label = scan.tiles, config.faces, config.label
     n_tiles = len(tiles.extremes)
     lowest_z, highest_z = tiles.extremes[tiles.occupied].astype(np.float64).T
     # Most returns are in tiles where nothing stands, and are left out.
-    is_tall = highest_z - lowest_z > label.obstacle_min_height
+    is_tall = highest_z - lowest_z > face_height(label)
     tall, lowest_z = tiles.occupied[is_tall], lowest_z[is_tall]
     # One more than there are tiles: `OUTSIDE` is the index of the last.
     row_of_tile = np.full(n_tiles + 1, OUTSIDE)
@@ -62,15 +59,24 @@ def find_faces(scan: Scan, config: Config) -> Faces:
         for i, place in enumerate(np.divmod(tall, n_sides))
     )
     # Rows of the foot first, then those of the rest.
-    is_rest = above > FOOT_SHARE * label.obstacle_min_height
+    is_rest = above > label.ground_tolerance
     sums = _sums(x, y, above, row + len(tall) * is_rest, 2 * len(tall))
     foot, rest = sums[:, : len(tall)], sums[:, len(tall) :]
     reaches = np.zeros(len(tall), dtype=np.bool_)
-    reaches[row[above > label.obstacle_min_height]] = True
+    reaches[row[above > face_height(label)]] = True
     result = Faces(*np.zeros((2, n_tiles), dtype=np.bool_))
     result.is_face[tall] = reaches & is_vertical(foot, rest, faces)
     result.has_occluded_base[tall] = result.is_face[tall] & is_base_occluded(foot, rest, faces)
     return result
+
+
+@shared
+def face_height(label: LabelConfig) -> float:
+    """Least height of a face over the lowest return of its tile [m].
+
+    The lowest return may be of ground, which reaches as high as the tolerance.
+    """
+    return label.obstacle_min_height + label.ground_tolerance
 
 
 def _rounded(values: FloatArray) -> FloatArray:
