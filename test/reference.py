@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 from reference_gp import estimate_surface, log_likelihood
-from scipy.stats import norm
 
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.frame import (
@@ -66,13 +65,13 @@ def lowest_of_cells(scan, config):
 def find_faces(scan, config):
     """Tall tiles whose returns have a level normal; of those, faces down to the lowest return."""
     faces, label = config.faces, config.label
-    limit = label.obstacle_max_height
+    limit, least = label.obstacle_max_height, label.obstacle_min_height + label.ground_tolerance
     result = Faces(*np.zeros((2, len(scan.tiles.extremes)), dtype=bool))
     for t in np.unique(scan.tiles.tile[scan.tiles.tile >= 0]):
         own = scan.xyz[scan.tiles.tile == t].astype(np.float64)
         above = own[:, 2] - own[:, 2].min()
         own, above = own[above <= limit], above[above <= limit]
-        if len(own) < 4 or above.max() <= label.obstacle_min_height:
+        if len(own) < 4 or above.max() <= least:
             continue
         value, vector = np.linalg.eigh(np.cov(own.T))
         # Each eigenvector is a normal with the product of the other two eigenvalues.
@@ -86,7 +85,7 @@ def find_faces(scan, config):
 
 
 def _is_occluded(own, above, config):
-    faces, foot_height = config.faces, 0.2 * config.label.obstacle_min_height
+    faces, foot_height = config.faces, config.label.ground_tolerance
     low, high = own[above <= foot_height, :2], own[above > foot_height, :2]
     if len(high) < 2 or faces.max_foot_distance <= 0.0:
         return False
@@ -202,51 +201,64 @@ def continues_line(candidates, lines, config):
 
 
 def label_points(scan, faces, surface, config):
-    """Label each point by its height over the surface, against the band of its cell."""
+    """Label each point by its height over the surface, against the band of its tile."""
     grid, label, n_points = scan.grid, config.label, len(scan.xyz)
-    height, margin = np.full((2, n_points), np.nan)
-    roughness = np.zeros((grid.n_segments, grid.n_bins))
-    band, depth = np.full(roughness.shape, label.ground_tolerance), label.ground_tolerance
+    height, margin, roughness = np.full((3, n_points), np.nan)
     result = np.full(n_points, Label.OBSTACLE, np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
     is_face, is_occluded = (mask[scan.tiles.tile] & grid.inside for mask in faces)
-    places = [(i, grid.segment[i], grid.bin[i]) for i in np.flatnonzero(grid.inside)]
-    for i, m, n in places:
-        r = max(float(grid.r[i]), grid.edges[0])
-        ends = slice(n, n + 2)
+    for i in np.flatnonzero(grid.inside):
+        m, n = grid.segment[i], grid.bin[i]
+        r, ends = max(float(grid.r[i]), grid.edges[0]), slice(n, n + 2)
         height[i] = scan.xyz[i, 2] - np.interp(r, surface.knots[ends], surface.mean[m, ends])
-    near = grid.inside & ~is_face & (abs(height) < label.obstacle_min_height)
-    shows = (height >= label.obstacle_min_height) & (height <= label.obstacle_max_height)
-    for m, n in np.ndindex(roughness.shape):
-        # The cell and the eight around it; segments form a ring.
-        aside = np.isin(grid.segment, [(m + k) % grid.n_segments for k in (-1, 0, 1)])
-        about = height[near & aside & (abs(grid.bin - n) <= 1)]
-        if len(about):
-            variance = max(surface.std[m, n : n + 2]) ** 2 + config.observation.sigma_n**2
-            largest = 2.0 * math.sqrt(np.var(about) + variance)
-            offset = abs(np.mean(about))
-            roughness[m, n] = math.hypot(np.std(about), largest if largest < offset else offset)
+    near = grid.inside & (height < 0.5) & (height >= -0.5)
+    rough = ground_roughness(scan.tiles, height, near & ~is_face)
+    for i in np.flatnonzero(grid.inside):
+        roughness[i] = rough.get(scan.tiles.tile[i], 0.0)
+        band, depth = label.ground_tolerance, label.ground_tolerance
         if label.rule == 'roughness':
-            depth = label.obstacle_max_height
-            n_obstacles = np.sum(shows & aside & grid.inside & (abs(grid.bin - n) <= 1))
-            span = label.obstacle_max_height - label.obstacle_min_height
-            spread = math.hypot(roughness[m, n], config.observation.sigma_n)
-            # Where max(n, 1) N(h; 0, spread) falls to the density of obstacles.
-            peak = norm.pdf(0.0, 0.0, spread) * max(len(about), 1)
-            log_ratio = math.log(peak * span / (n_obstacles + 1))
-            likely = spread * math.sqrt(2.0 * log_ratio) if log_ratio > 0.0 else 0.0
-            band[m, n] = min(max(likely, label.ground_tolerance), label.obstacle_min_height)
-    for i, m, n in places:
-        margin[i] = min(band[m, n] - height[i], height[i] + depth)
+            band, depth = max(min(2.25 * roughness[i], 0.5), band), label.obstacle_max_height
+        margin[i] = min(band - height[i], height[i] + depth)
         if is_face[i]:
             limit = 0.5 * label.ground_tolerance * (-1.0 if is_occluded[i] else 1.0)
             lowest = float(scan.tiles.lowest_z[scan.tiles.tile[i]])
             margin[i] = min(margin[i], limit - (float(scan.xyz[i, 2]) - lowest))
     if label.rule == 'roughness':
-        near = grid.inside & (abs(height) < label.obstacle_min_height)
         margin = settle(scan, surface, margin, near, label)
     result[margin >= 0.0] = Label.GROUND
     return Labelled(result, height, margin, roughness)
+
+
+def ground_roughness(tiles, height, counted):
+    """Roughness of each tile with returns that count, by the tiles in the windows about it."""
+    side = math.isqrt(len(tiles.extremes))
+    spread = {
+        tile: math.sqrt(np.mean(height[counted & (tiles.tile == tile)] ** 2))
+        for tile in np.unique(tiles.tile[counted])
+    }
+    edges = [0.01 * 1.14**k for k in range(31)]
+    # Levels are 14 % apart, and as rough as the middle of theirs.
+    value = [0.01, *(edge * math.sqrt(1.14) for edge in edges)]
+    level = {tile: sum(rms >= edge for edge in edges) for tile, rms in spread.items()}
+    if not level:
+        return {}
+    median = sorted(level.values())[(len(level) - 1) // 2]
+
+    def about(tile, size, share, prior):
+        """Level that a share of the tiles in 3 x 3 blocks of a size does not exceed."""
+        block = [place // size for place in divmod(tile, side)]
+        beside = [
+            found
+            for other, found in level.items()
+            if all(
+                abs(place // size - own) <= 1
+                for place, own in zip(divmod(other, side), block, strict=True)
+            )
+        ]
+        ranked = sorted([*beside, *[median] * prior])
+        return value[ranked[int(share * (len(ranked) - 1))]]
+
+    return {tile: min(about(tile, 2, 0.75, 4), 3.2 * about(tile, 4, 0.5, 16)) for tile in level}
 
 
 def settle(scan, surface, margin, near, label):

@@ -128,8 +128,8 @@ class GroundSegmenter:
         timer.mark('learning')
         surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
         timer.mark('surface')
-        # 6. Labels: a point is ground where its height over the surface is more likely of ground
-        #    than of an obstacle.
+        # 6. Labels: a point is ground up to the tolerance over the surface, or higher where the
+        #    ground about it is rough.
         labelled = backend.label_points(scan, faces, surface, config)
         tilted_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
         timer.mark('label')
@@ -181,6 +181,13 @@ class GroundSegmenter:
         """Use `backend` from the next scan on."""
         with self._exclusive():
             self._backend, self._sample_backend = backend, None
+
+    def __enter__(self) -> GroundSegmenter:
+        """Return the segmenter itself: as a context manager it has nothing to end."""
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        """Do nothing."""
 
     def __reduce__(self) -> NoReturn:
         """Refuse to be pickled or copied: there are a lock and buffers."""

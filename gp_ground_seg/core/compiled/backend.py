@@ -16,6 +16,7 @@ from gp_ground_seg.core.compiled import (
     polar_grid,
 )
 from gp_ground_seg.core.compiled import latent as latent_
+from gp_ground_seg.core.compiled import roughness as roughness_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
 from gp_ground_seg.core.compiled.buffers import Buffers
 from gp_ground_seg.core.frame import (
@@ -183,33 +184,26 @@ class NumbaBackend:
     def label_points(
         self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
     ) -> Labelled:
-        """Height, label and margin of each point; roughness of each cell."""
+        """Height, label and margin of each point, and the roughness of the ground about it."""
         take, label = self._buffers.take, numbers_of(config.label)
-        n_points, n_bins = len(scan.xyz), scan.grid.n_bins
-        n_cells = scan.grid.n_segments * n_bins
-        buffers = labels.LabelBuffers(
-            take('pieces', (n_cells + 1, 2), np.float64),
-            take('height_sums', (n_cells + 1, 3), np.int64),
-            take('band', (n_cells + 1,), np.float64),
-            sum_units(n_points, label.obstacle_min_height),
-        )
-        result = Labelled(
-            np.empty(n_points, dtype=np.uint8),
-            np.empty(n_points),
-            np.empty(n_points),
-            np.empty((scan.grid.n_segments, n_bins)),
-        )
-        labels.fit_pieces(surface, buffers)
-        labels.survey(scan, faces.is_face, label, result.height, buffers)
-        by_roughness, sigma_n = config.label.rule == 'roughness', config.observation.sigma_n
-        labels.set_bands(label, by_roughness, sigma_n, surface.std, buffers, result.roughness)
-        depth, band = depth_of_ground(config.label), buffers.band
-        has_obstacle = take('has_obstacle', (len(faces.is_face),), np.bool_)
+        n_points, n_tiles = len(scan.xyz), len(faces.is_face)
+        by_roughness, units = config.label.rule == 'roughness', sum_units(n_points)
+        pieces = take('pieces', (scan.grid.n_segments * scan.grid.n_bins + 1, 2), np.float64)
+        sums = take('height_sums', (n_tiles + 1, 2), np.int64)
+        buffers = roughness_.RoughnessBuffers(sums, *take('levels', (4, n_tiles), np.int32))
+        roughness = take('roughness', (n_tiles + 1,), np.float64)
+        result = Labelled(np.empty(n_points, np.uint8), *np.empty((3, n_points)))
+        labels.fit_pieces(surface, pieces)
+        labels.survey(scan, faces.is_face, pieces, units, result.height, sums)
+        roughness_.set_roughness(scan.tiles, units, buffers, roughness)
+        depth, has_obstacle = depth_of_ground(config.label), take('has_obstacle', (n_tiles,), bool)
         has_obstacle.fill(False)
-        labels.label_by_bands(scan, faces, label, depth, band, has_obstacle, result)
+        labels.label_by_bands(
+            scan, faces, label, depth, by_roughness, roughness, has_obstacle, result
+        )
         if by_roughness:
             votes = labels.VoteBuffers(
-                take('rows', (len(has_obstacle) + 1,), np.int32),
+                take('rows', (n_tiles + 1,), np.int32),
                 *take('voters', (2, n_points), np.int32),
             )
             labels.settle(scan, lowest_of(surface), has_obstacle, label, votes, result)

@@ -1,8 +1,8 @@
-"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in five calls.
+"""Compiled twin of `gp_ground_seg.core.pipeline.labels`, in four calls.
 
 `fit_pieces` prepares the surface of each cell, `survey` measures the heights of the points over
-it, `set_bands` turns their sums into bands, `label_by_bands` labels the points, and `settle`
-changes labels near obstacles by votes.
+it, `gp_ground_seg.core.compiled.roughness` the roughness of the ground, `label_by_bands` labels
+the points, and `settle` changes labels near obstacles by votes.
 """
 
 from __future__ import annotations
@@ -32,54 +32,28 @@ from gp_ground_seg.core.pipeline.labels import (
     N_LAYERS,
     VOTE_UNITS,
     band_margin,
-    cell_variance,
     face_margin,
     ground_band,
     is_near,
     layer_of,
-    roughness_of,
     settled_margin,
-    shows_obstacle,
     vote_of,
     whole_units,
 )
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
-OBSTACLE_FLAG = 2**32
-"""Added to the number of returns near the surface for each that shows an obstacle: more than there
-are points."""
 VOTER_FLAG = 2**38
 """Added to the sum of votes for each voter: more than the votes of all of them."""
 
 
-class LabelBuffers(NamedTuple):
-    """Working arrays of the labels; the last row of each is for points in no cell.
-
-    Attributes
-    ----------
-    pieces : (M * n_bins + 1, 2) float64
-        Surface in each cell, level and slope over range.
-    sums : (M * n_bins + 1, 3) int64
-        For each cell the number of points near the surface, with `OBSTACLE_FLAG` added for
-        each that shows an obstacle, and the sums of heights and squared heights in whole units:
-        the order of the points does not matter.
-    band : (M * n_bins + 1,) float64
-        Largest height of ground [m].
-    units : float
-        Whole units of heights and their squares [1/m, 1/m^2].
-    """
-
-    pieces: FloatArray
-    sums: IntArray
-    band: FloatArray
-    units: float
-
-
 @jit(entry=True)
-def fit_pieces(surface: GroundSurface, buffers: LabelBuffers) -> None:
-    """Line of the surface across each cell; NaN in the last row."""
-    knots, mean, pieces = surface.knots, surface.mean, buffers.pieces
+def fit_pieces(surface: GroundSurface, pieces: FloatArray) -> None:
+    """Line of the surface across each cell, level and slope over range, (M * n_bins + 1, 2).
+
+    The last row is for points in no cell, and NaN.
+    """
+    knots, mean = surface.knots, surface.mean
     n_bins = len(knots) - 1
     for m in range(len(mean)):
         for n in range(n_bins):
@@ -92,65 +66,29 @@ def fit_pieces(surface: GroundSurface, buffers: LabelBuffers) -> None:
 def survey(
     scan: Scan,
     is_face: BoolArray,
-    config: LabelConfig,
+    pieces: FloatArray,
+    units: float,
     height: FloatArray,
-    buffers: LabelBuffers,
+    sums: IntArray,
 ) -> None:
-    """Heights of the points over the surface, and the sums for roughness."""
-    pieces, sums, nearest = buffers.pieces, buffers.sums, scan.grid.edges[0]
-    for k in range(len(sums)):
-        sums[k, 0] = sums[k, 1] = sums[k, 2] = 0
+    """Heights of the points over the surface, and the sums for the roughness of tiles.
+
+    For `pieces` see `fit_pieces`, for `sums`
+    `gp_ground_seg.core.compiled.roughness.RoughnessBuffers`.
+    """
+    nearest, outside = scan.grid.edges[0], len(sums) - 1
+    for occupied in scan.tiles.occupied:
+        sums[np.uintp(occupied), 0] = sums[np.uintp(occupied), 1] = 0
     z, tile, cell, r = scan.xyz.T[2], scan.tiles.tile, scan.grid.cell, scan.grid.r
     for i in range(len(cell)):
         c = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
         away = max(np.float64(r[i]), nearest)
         h = np.float64(z[i]) - (pieces[c, 0] + pieces[c, 1] * away)
         height[i] = h
-        if shows_obstacle(h, config):
-            sums[c, 0] += OBSTACLE_FLAG
-        elif is_near(h, config) and not is_face[np.uintp(tile[i])]:
-            sums[c, 0] += 1
-            sums[c, 1] += int(whole_units(h, buffers.units))
-            sums[c, 2] += int(whole_units(h * h, buffers.units))
-
-
-@jit(entry=True)
-def set_bands(
-    config: LabelConfig,
-    by_roughness: bool,
-    sigma_n: float,
-    surface_std: FloatArray,
-    buffers: LabelBuffers,
-    roughness: FloatArray,
-) -> None:
-    """Roughness and band of each cell from the sums."""
-    n_segments, n_bins = roughness.shape
-    # Columns 0 and n_bins + 1 stay empty: there is nothing beside the first and last bin.
-    number = np.empty(n_bins + 2, np.int64)
-    heights = np.empty(n_bins + 2, np.int64)
-    squares = np.empty(n_bins + 2, np.int64)
-    for m in range(n_segments):
-        for n in range(n_bins + 2):
-            number[n] = heights[n] = squares[n] = 0
-        for k in range(-1, 2):
-            first = (m + k + n_segments) % n_segments * n_bins
-            for n in range(n_bins):
-                number[n + 1] += buffers.sums[first + n, 0]
-                heights[n + 1] += buffers.sums[first + n, 1]
-                squares[n + 1] += buffers.sums[first + n, 2]
-        for n in range(n_bins):
-            flagged = number[n] + number[n + 1] + number[n + 2]
-            n_near, n_obstacles = flagged & (OBSTACLE_FLAG - 1), flagged >> 32
-            height = heights[n] + heights[n + 1] + heights[n + 2]
-            square = squares[n] + squares[n + 1] + squares[n + 2]
-            variance = cell_variance(surface_std[m, n], surface_std[m, n + 1], sigma_n)
-            rough = roughness_of(n_near, height, square, buffers.units, variance)
-            band = config.ground_tolerance
-            if by_roughness:
-                band = ground_band(n_near, rough, n_obstacles, config, sigma_n)
-            buffers.band[m * n_bins + n] = band
-            roughness[m, n] = rough
-    buffers.band[n_segments * n_bins] = math.nan
+        t = np.uintp(tile[i] if tile[i] >= 0 else outside)
+        if is_near(h) and not is_face[t]:
+            sums[t, 0] += 1
+            sums[t, 1] += int(whole_units(h * h, units))
 
 
 class VoteBuffers(NamedTuple):
@@ -178,29 +116,34 @@ def label_by_bands(
     faces: Faces,
     config: LabelConfig,
     depth: float,
-    band: FloatArray,
+    by_roughness: bool,
+    roughness: FloatArray,
     has_obstacle: BoolArray,
     result: Labelled,
 ) -> None:
     """Label the points from their heights in `result`, and find tiles of obstacles.
 
     Ground reaches `depth` below the surface. `has_obstacle` (T,) becomes true where a return near
-    the surface is no ground.
+    the surface is no ground. `roughness` (T + 1,) is that of the ground in each tile [m]; the last
+    one is for points in no tile.
     """
     z, tile, cell = scan.xyz.T[2], scan.tiles.tile, scan.grid.cell
     height, label, margins = result.height, result.label, result.margin
+    roughness[len(roughness) - 1] = math.nan
     for i in range(len(cell)):
         n, h = cell[i], height[i]
-        margin = band_margin(h, band[np.uintp(n if n >= 0 else len(band) - 1)], depth)
-        t = np.uintp(tile[i] if n >= 0 else 0)
-        if faces.is_face[t]:
+        t = np.uintp(tile[i] if n >= 0 else len(roughness) - 1)
+        result.roughness[i] = roughness[t]
+        band = ground_band(roughness[t], config) if by_roughness else config.ground_tolerance
+        margin = band_margin(h, band, depth)
+        if n >= 0 and faces.is_face[t]:
             over_lowest = np.float64(z[i]) - np.float64(scan.tiles.extremes[t, 0])
             is_occluded = faces.has_occluded_base[t]
             margin = face_margin(margin, over_lowest, is_occluded, config.ground_tolerance)
         margins[i] = margin
         otherwise = _UNKNOWN if n == NOT_FINITE else _OBSTACLE
         label[i] = _GROUND if margin >= 0.0 else otherwise
-        if margin < 0.0 and is_near(h, config):
+        if margin < 0.0 and is_near(h):
             has_obstacle[t] = True
 
 
@@ -274,7 +217,7 @@ def _vote(
     z, tile = scan.xyz.T[2], scan.tiles.tile
     for i in range(len(tile)):
         row = rows[np.uintp(tile[i] if tile[i] >= 0 else len(rows) - 1)]
-        if row > 0 and is_near(result.height[i], config):
+        if row > 0 and is_near(result.height[i]):
             over_lowest = np.float64(z[i]) - lowest
             place = row * N_LAYERS + int(layer_of(over_lowest, tolerance))
             vote = vote_of(result.margin[i], tolerance)

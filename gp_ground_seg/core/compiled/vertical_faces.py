@@ -16,9 +16,9 @@ from gp_ground_seg.core.frame import OUTSIDE, CellArray, Faces, FloatArray, Poin
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import FacesConfig, LabelConfig
 from gp_ground_seg.core.pipeline.vertical_faces import (
-    FOOT_SHARE,
     SUMS,
     UNITS_PER_METRE,
+    face_height,
     is_base_occluded,
     is_vertical,
 )
@@ -61,7 +61,7 @@ def select_tall(
     for tile in tiles.occupied:
         t = np.uintp(tile)
         height = np.float64(extremes[t, 1]) - np.float64(extremes[t, 0])
-        if height > label.obstacle_min_height:
+        if height > face_height(label):
             tile_to_row[t] = 2 * n_tall
             row_to_tile[n_tall] = tile
             n_tall += 1
@@ -82,7 +82,7 @@ def sum_returns(
     """Sum over the returns, (3, N), in tall tiles."""
     sums = buffers.sums
     _clear_sums(tiles.extremes, tile_size, n_tall, buffers.row_to_tile, sums)
-    foot_height, max_height = FOOT_SHARE * label.obstacle_min_height, label.obstacle_max_height
+    foot_height, max_height = label.ground_tolerance, label.obstacle_max_height
     x, y, z, tile = columns[0], columns[1], columns[2], tiles.tile
     for i in range(len(tile)):
         if tile[i] == OUTSIDE:
@@ -143,7 +143,7 @@ def decide_faces(
     for k in range(n_tall):
         low, high = buffers.sums[2 * k], buffers.sums[2 * k + 1]
         top = max(low[_TOP], high[_TOP])
-        if top > label.obstacle_min_height and is_vertical(low, high, config):
+        if top > face_height(label) and is_vertical(low, high, config):
             t = buffers.row_to_tile[k]
             faces.is_face[t] = True
             faces.has_occluded_base[t] = is_base_occluded(low, high, config)

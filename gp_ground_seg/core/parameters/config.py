@@ -217,15 +217,14 @@ class LabelConfig:
     """Labels from the distance to the surface."""
 
     rule: str = advanced('roughness', ('roughness', 'tolerance'),
-        'roughness = ground if the height is more likely of ground than of an obstacle, given '
-        'the returns about it, which then vote; tolerance = ground_tolerance alone, above and '
-        'below')
+        'roughness = ground up to ground_tolerance, or higher where the ground about it is rough; '
+        'returns at one height then vote; tolerance = ground_tolerance alone, above and below')
     ground_tolerance: float = basic(0.1, (0.001, 5.0),
         'height above the surface up to which a return is ground in any case; more = more ground',
         'm', 'zeta_g')
     obstacle_min_height: float = advanced(0.2, (0.01, 10.0),
-        'least height over the ground of an obstacle that matters; on rough ground a vertical face '
-        'is one if it stands so much higher than ground_tolerance',
+        'least height over the ground of an obstacle that matters: on rough ground, a vertical '
+        'face that stands so much higher than ground_tolerance is one',
         'm')
     obstacle_max_height: float = advanced(1.0, (0.02, 50.0),
         'height above the lowest return of a tile up to which returns belong to a vertical face '
@@ -346,7 +345,7 @@ def size_of_tables(config: Config) -> int:
     n_tiles = math.ceil(2.0 * config.grid.r_max / config.faces.cell_size) ** 2
     n_cells = config.grid.n_segments * config.grid.n_bins
     # Held against both backends by test_robustness.py.
-    return 41 * n_tiles + 208 * n_cells
+    return 80 * n_tiles + 168 * n_cells
 
 
 def _check_memory(config: Config) -> None:

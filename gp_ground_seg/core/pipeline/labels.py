@@ -61,7 +61,7 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     tile = as_index(tiles.tile)
     in_face = faces.is_face[tile] & grid.inside
     units = sum_units(len(z))
-    roughness = ground_roughness(tiles, *_near_sums(height, tiles, in_face, units), units)
+    roughness = ground_roughness(tiles, _near_sums(height, tiles, in_face, units), units)
     band = np.full(len(roughness), label.ground_tolerance)
     if label.rule == 'roughness':
         band = ground_band(roughness, label)
@@ -226,18 +226,18 @@ def mean_votes(
     return voters[settles], mean * (tolerance / VOTE_UNITS)
 
 
-def _near_sums(
-    height: FloatArray, tiles: Tiles, in_face: BoolArray, units: float
-) -> tuple[IntArray, FloatArray]:
-    """Count the returns near the surface in each tile, and sum their squared heights, (T,) each.
+def _near_sums(height: FloatArray, tiles: Tiles, in_face: BoolArray, units: float) -> FloatArray:
+    """Count the returns near the surface in each tile, and sum their squared heights, (2, T).
 
     `height` (N,) is over the surface [m], NaN where there is none; points `in_face` (N,), of
     vertical faces, are no roughness of the ground. The sums are in whole units.
     """
     near = np.flatnonzero(is_near(height) & ~in_face)
-    tile, n_tiles, heights = as_index(tiles.tile[near]), len(tiles.extremes), height[near]
-    squares = np.bincount(tile, whole_units(heights * heights, units), n_tiles)
-    return np.bincount(tile, minlength=n_tiles), squares
+    tile, heights = as_index(tiles.tile[near]), height[near]
+    sums = np.empty((2, len(tiles.extremes)))
+    sums[0] = np.bincount(tile, minlength=sums.shape[1])
+    sums[1] = np.bincount(tile, whole_units(heights * heights, units), sums.shape[1])
+    return sums
 
 
 @shared

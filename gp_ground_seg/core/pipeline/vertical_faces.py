@@ -33,7 +33,8 @@ SUMS = 10
 def find_faces(scan: Scan, config: Config) -> Faces:
     """Find the tiles that hold a vertical face.
 
-    A tile is examined if a return lies more than `face_height` above the lowest. The scatter of its returns determines their orientation, see `normal_z`; those higher than
+    A tile is examined if a return lies more than `face_height` above the lowest. The scatter of
+    its returns determines their orientation, see `normal_z`; those higher than
     ``label.obstacle_max_height`` above the lowest may overhang, and are left out.
     """
     tiles, faces, label = scan.tiles, config.faces, config.label

@@ -76,7 +76,7 @@ DEPARTURES: dict[str, Changes] = {
 ALTERNATIVES: dict[str, Changes] = {
     '240 segments': {'grid.n_segments': 240},
     'a narrower gate (2)': {'growth.max_standardised_residual': 2.0},
-    'obstacles from 0.3 m on': {'label.obstacle_min_height': 0.3},
+    'faces from 0.5 m on': {'label.obstacle_min_height': 0.4},
 }
 """Choices that the defaults do not have, and the changes that switch them on."""
 
