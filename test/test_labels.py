@@ -152,8 +152,8 @@ def test_returns_of_one_height_in_tiles_side_by_side_are_judged_together(
 def test_probability_is_a_half_at_the_edge_and_follows_the_certainty():
     margin = np.array([0.0, 0.1, 0.1, -0.1, np.nan])
     std = np.array([0.1, 0.01, 0.3, 0.01, np.nan])
-    found = ground_probability(margin, std, np.full(5, 0.02), 0.03)
-    expected = scipy.stats.norm.cdf(margin / np.sqrt(std**2 + 0.02**2 + 0.03**2))
+    found = ground_probability(margin, std)
+    expected = scipy.stats.norm.cdf(margin / np.sqrt(std**2 + 0.02**2))
     np.testing.assert_allclose(found[:4], expected[:4], rtol=1e-6)
     assert found[0] == 0.5
     assert found[1] > found[2] > 0.5

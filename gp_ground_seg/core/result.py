@@ -303,7 +303,6 @@ class Segmentation:
         At least 0.5 for points labelled ground; 0 where there is no model, NaN for
         points that are not finite.
         """
-        noise, std = float(np.exp(self.theta[:, 1].mean())), self._at_points(self.surface.std)
-        result = ground_probability(self.margin, std, self.roughness, noise)
+        result = ground_probability(self.margin, self._at_points(self.surface.std))
         result[self.label == Label.UNKNOWN] = np.nan
         return result

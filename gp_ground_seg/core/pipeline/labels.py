@@ -35,6 +35,8 @@ ROUGHNESS_IN_BAND = 2.25
 """Height over the surface up to which a return is ground, in roughnesses of the ground about it:
 of returns spread evenly over the height of grass all are within 1.7, of those normally distributed
 98 in 100 are within 2.25."""
+RETURN_NOISE = 0.02
+"""Standard deviation of the height of a single return by the noise of the sensor [m]."""
 FACE_SHARE = 0.5
 """Part of the tolerance up to which a return over the lowest of a vertical face is ground before
 the vote."""
@@ -255,21 +257,17 @@ def sum_units(n_points: int) -> float:
     return min(FINEST_UNITS, 2.0 ** math.floor(62.0 - math.log2(max(n_points, 1))))
 
 
-def ground_probability(
-    margin: FloatArray, ground_std: FloatArray, roughness: FloatArray, noise: float
-) -> npt.NDArray[np.float32]:
-    """Probability that each point is ground.
+def ground_probability(margin: FloatArray, std: FloatArray) -> npt.NDArray[np.float32]:
+    """Probability that each point is ground: that its height lies within the band of ground.
 
-    The height of a point over the surface is uncertain by the standard deviation of the
-    surface, the noise and the roughness together. The result is the probability that it
-    lies within the band of ground.
+    The height over the surface is uncertain by the standard deviation of the surface, `std` (N,)
+    [m], and by `RETURN_NOISE`; how far ground lies from the surface is in the band.
 
-    For `margin` (N,) see `Labelled.margin` [m]; `ground_std` and `roughness` (N,) are those at the
-    point, `noise` is a standard deviation [m]. Returns (N,), at least 0.5 where the margin is not
+    For `margin` (N,) see `Labelled.margin` [m]. Returns (N,), at least 0.5 where the margin is not
     negative; 0 where it is NaN.
     """
     from scipy.special import ndtr
 
-    spread = np.sqrt(ground_std**2 + roughness**2 + noise**2)
+    spread = np.sqrt(std**2 + RETURN_NOISE**2)
     result: npt.NDArray[np.float32] = np.nan_to_num(ndtr(margin / spread)).astype(np.float32)
     return result
