@@ -20,6 +20,7 @@ from gp_ground_seg.lab.scoring.metrics import GROUND_CLASSES
 from gp_ground_seg.lab.scoring.objects import (
     BAND_EDGES,
     CLASSES,
+    LOW_CLASSES,
     MIN_HEIGHT,
     MIN_RETURNS,
     ObjectCount,
@@ -76,14 +77,14 @@ def counted_by_loops(points, label, objects):
         reach, is_ground = math.hypot(x, y), label[k] == Label.GROUND
         if kind >= 0 and math.isnan(objects.ground_z[k]):
             unknown.append((kind, band_of(reach)))
-        if kind < 0 or not z - objects.ground_z[k] >= MIN_HEIGHT:
+        if kind < 0 or not z - objects.ground_z[k] >= (0.1 if kind >= 3 else MIN_HEIGHT):
             continue
         share.setdefault((kind, band_of(reach)), []).append(is_ground)
         if number:
             own.setdefault((kind, number), []).append((reach, is_ground))
     found = {}
     for (kind, _), its in own.items():
-        if len(its) >= MIN_RETURNS:
+        if len(its) >= (3 if kind >= 3 else MIN_RETURNS):
             band = band_of(np.median([reach for reach, _ in its]))
             is_lost = sum(is_ground for _, is_ground in its) > len(its) / 2
             found.setdefault((kind, band), []).append(is_lost)
@@ -110,7 +111,7 @@ def drawn_scan(seed, n):
     points = rng.integers(-9, 10, (n, 3)) * (0.5 * rng.integers(1, 10), 0.5, 0.1)
     label = rng.integers(0, 3, n).astype(np.uint8)
     ground_z = np.where(rng.random(n) < 0.1, np.nan, 0.0)
-    kind, number = rng.integers(-1, 2, n), rng.integers(0, 4, n)
+    kind, number = rng.choice([-1, 0, 1, 3], n), rng.integers(0, 4, n)
     return points, label, Objects(kind, number, ground_z)
 
 
@@ -204,7 +205,7 @@ def test_objects_of_labels_are_instances_by_group():
     entries = np.array([number | 5 << 16 for number in known] + [10, 30], dtype=np.uint32)
     points, nothing = np.zeros((len(entries), 3)), np.zeros(len(entries), dtype=bool)
     found = labelled_objects(points, entries, nothing)
-    assert [*CLASSES] == ['vehicle', 'person', 'cyclist']
+    assert [*CLASSES] == ['vehicle', 'person', 'cyclist', *LOW_CLASSES]
     assert found.class_of.tolist() == [*known.values(), 0, 1]
     assert found.object_id[-2:].tolist() == [0, 0]
     assert len(set(found.object_id[:-2].tolist())) == len(known)

@@ -31,12 +31,18 @@ CELL_SIZE = 0.5  # of the cells of ground that is known [m]
 N_CELLS = 5  # of them that make the local ground
 MAX_GROUND_DISTANCE = 5.0  # to the farthest of them [m]
 
-CLASSES = {
+LOW_HEIGHTS = (0.2, 0.3, 0.4, 0.5, 0.6)
+"""Heights of low objects [m], each a class of its own, which only simulated scans have."""
+LOW_CLASSES = tuple(f'low, {height:g} m' for height in LOW_HEIGHTS)
+CLASSES: dict[str, tuple[int, ...]] = {
     'vehicle': (10, 13, 16, 18, 20, 252, 256, 257, 258, 259),
     'person': (30, 254),
     'cyclist': (11, 15, 31, 32, 253, 255),
+    **dict.fromkeys(LOW_CLASSES, ()),
 }
 """Classes of objects, by numbers of SemanticKITTI; two-wheelers with or without a rider."""
+LOW_MIN_HEIGHT, LOW_MIN_RETURNS = 0.1, 3
+"""`MIN_HEIGHT` [m] and `MIN_RETURNS` of `LOW_CLASSES`."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +94,8 @@ def count_objects(
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
     on, n_classes = (objects.class_of >= 0) & np.isfinite(reach + z), len(CLASSES)
-    counts, lacks = on & (z - objects.ground_z >= MIN_HEIGHT), on & np.isnan(objects.ground_z)
+    least = np.where(_is_low(objects.class_of), LOW_MIN_HEIGHT, MIN_HEIGHT)
+    counts, lacks = on & (z - objects.ground_z >= least), on & np.isnan(objects.ground_z)
     unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks], n_classes)
     kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
     returns = _by_class_and_band(kind, reach, is_ground, n_classes)
@@ -101,7 +108,7 @@ def count_objects(
     number = number.reshape(-1)
     n_ground = np.bincount(number, is_ground[known], minlength=len(n_returns))
     middle = _medians(reach[known], number, len(n_returns))
-    enough = n_returns >= MIN_RETURNS
+    enough = n_returns >= np.where(_is_low(of_object[:, 0]), LOW_MIN_RETURNS, MIN_RETURNS)
     lost = 2 * n_ground[enough] > n_returns[enough]
     found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, n_classes)
     bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
@@ -110,6 +117,11 @@ def count_objects(
         for name, found in zip(CLASSES, bands, strict=True)
         if found.any()
     }
+
+
+def _is_low(class_of: npt.NDArray[np.integer]) -> BoolArray:
+    """Whether objects are of `LOW_CLASSES`, the last of all."""
+    return class_of >= len(CLASSES) - len(LOW_CLASSES)
 
 
 def _by_class_and_band(
