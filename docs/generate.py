@@ -79,6 +79,12 @@ GAINS = {
     '40-50 m': 'IoU at 40 to 50 m, vegetation left out',
 }
 OBJECTS = {'vehicles': ('vehicle',), 'persons and cyclists': ('person', 'cyclist')}
+ROBOT = {
+    1: 'low things: returns called ground',
+    4: 'false cells of road',
+    7: 'false cells of ground',
+}
+"""Rows of low things and false cells, by the column of what is counted."""
 TIMES = {
     'learning, 1 thread': 'learning',
     'theta fixed, 1 thread': 'no learning',
@@ -102,6 +108,11 @@ def to_scores_table() -> str:
         counts = [map(int, row[6:9]) for row in objects if row[0] in kinds]
         number, ours, peer = (str(sum(column)) for column in zip(*counts, strict=True))
         rows.append([f'{title} lost, of {number}', ours, peer, ''])
+    *_, pooled = rows_below(page, 'Low things and false cells')
+    for k, title in ROBOT.items():
+        number, ours, peer = pooled[k : k + 3]
+        cells = ('-' if share == '-' else f'{share} %' for share in (ours, peer))
+        rows.append([f'{title}, of {number}', *cells, ''])
     record = json.loads((ROOT / 'docs' / 'performance.json').read_text(encoding='utf-8'))
     cases = {case['name']: case for case in record['cases']}
     baseline = f'{record["baseline_ms"]["median"]:.1f} ms'

@@ -23,6 +23,7 @@ from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.simulation import (
     DRIVES,
     HDL_32E,
+    LOW,
     SCENES,
     semantic_kitti_labels,
     simulate_scan,
@@ -65,6 +66,7 @@ CASES = {
         ['--sensors', 'vlp-16,os1-128', '--scenes', 'flat,slope', '--seeds', '1'],
         'scenes', 2 * 4,
     ),
+    'scenes --sensors': (['vlp-16', '--scenes', 'low_boxes,flat', '--seeds', '1'], 'low', 2 * 2),
     'scenes --no-peer': (['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', '1'], 'scenes', 1),
     'objects': (
         ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
@@ -103,7 +105,8 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
 @pytest.mark.parametrize(
     ('words', 'sensors', 'scenes', 'n_seeds'),
     [
-        (['scenes', '--sensors', 'mid-360,hdl-64e'], ['mid-360', 'hdl-64e'], DRIVES, 3),
+        (['scenes', '--sensors', 'mid-360,hdl-64e'], ['mid-360', 'hdl-64e'],
+         {*DRIVES, *LOW}, 3),
         (['coverage', '--simulated', '--seeds', '3', '--scenes', 'flat,kerb'],
          FIVE, ['flat', 'kerb'], 3),
     ],

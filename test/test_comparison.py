@@ -23,7 +23,7 @@ from gp_ground_seg.lab.scoring.comparison import (
 )
 from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
 from gp_ground_seg.lab.scoring.metrics import Confusion, height_error
-from gp_ground_seg.lab.scoring.objects import ObjectCount
+from gp_ground_seg.lab.scoring.objects import SHARES, ObjectCount, Share
 
 
 def sequences_of(*hits, of=100, n_frames=1):
@@ -133,10 +133,11 @@ def score(*frames, sequences=('00', '08'), n_changed=0):
     for sequence, (hits, *errors) in zip(sequences, frames, strict=True):
         height = height_error(np.zeros(len(errors)), np.array(errors), np.full(len(errors), 0.1))
         objects = {'person': (ObjectCount(10, 100 - hits, 4, hits % 2),)}
+        shares = {name: Share(50, 100 - hits) for name in SHARES}
         confusions = {'g': Confusion(hits, 0, 100 - hits)}
         scans.append(
             ScanScore(sequence, '0', 1e-3 * hits, {}, confusions, height, objects=objects,
-                      n_points=100, n_changed=n_changed * len(scans))
+                      shares=shares, n_points=100, n_changed=n_changed * len(scans))
         )  # fmt: skip
     return MethodScore('x', tuple(scans))
 
@@ -159,6 +160,8 @@ def test_differences_by_hand():
     assert (rows['recall [%]']['peer'], rows['precision [%]']['given']) == pytest.approx((0.85, 1))
     returns = rows['returns on objects called ground [%]']
     assert returns['difference'] == pytest.approx((16 - 30) / 20)
+    low = rows['returns on low things called ground [%]']
+    assert (low['given'], low['peer'], low['interval']) == (0.16, 0.3, '-18.00 to -10.00')
     lost = rows['objects lost [%]']
     assert (lost['peer'], lost['given']) == (0.0, 2 / 8)
     within = [rows[f'heights within {k} std, ideally {n} [%]'] for k, n in ((1, 68.3), (2, 95.4))]
@@ -236,7 +239,7 @@ def test_scans_without_labels_have_points_that_differ_and_time_only(strict, tmp_
         (['ROOT', '--against', 'paper', '--sequences', '99'], 'no sequence 99'),
         (['ROOT', '--against', 'paper', '--peer', 'patchworkpp'], '--against: compares with p'),
         *((['SCAN', '--against', 'paper', option, '2'], f'{option}: ')
-          for option in ('--sequences', '--frame-step', '--worst', '--workers')),
+          for option in ('--sequences', '--frame-step', '--cut', '--worst', '--workers')),
         (['SCAN'], 'no sequences/*/velodyne folder below it (SemanticKITTI layout); scans without '
          'labels need --against'),
     ],

@@ -5,6 +5,7 @@ import json
 import logging
 import math
 import sys
+from functools import partial
 
 import numpy as np
 import pypatchworkpp
@@ -21,6 +22,7 @@ from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring import metrics
 from gp_ground_seg.lab.scoring.evaluate import OurMethod
 from gp_ground_seg.lab.scoring.metrics import ClassCount, Confusion, height_error
+from gp_ground_seg.lab.scoring.objects import Share
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 
 
@@ -91,6 +93,53 @@ def test_methods_alternate_after_one_warm_up(tmp_path, each_alone):
         # The clock is read right before and right after.
         assert [scan.seconds for scan in score.scans] == [1.0] * 3
         assert [scan.index for scan in score.scans] == ['000000', '000001', '000000']
+
+
+def test_cut_scans_are_a_second_run_that_is_not_timed(tmp_path):
+    """By copies of the methods, which are reset as they are: here all write into one journal."""
+    points, semantic = street()
+    semantic[semantic == 50] = 10
+    for name, index in (('00', 0), ('00', 1), ('08', 0)):
+        write_frame(tmp_path, name, index, points, semantic)
+    journal, ticks = [], itertools.count()
+    rules = [HeightRule(name, -1.5, journal) for name in 'ab']
+    load = partial(runner.load_kitti, cut=0.45)
+    scores = evaluate(tmp_path, *rules, load=load, clock=lambda: float(next(ticks)))
+    first = ['Ra', 'a', 'Rb', 'b', 'Ra', 'a', 'Rb', 'b']
+    assert journal == ['a', 'b', *first, 'b', 'a', 'a', 'b', *first]
+    cut = load(labelled_frames(tmp_path)[0]).cut
+    assert 50 < cut.is_low.sum() < (~cut.is_kept).sum() < 900
+    n_wrong = int((points[cut.is_low, 2] < -1.5).sum())
+    plain = evaluate(tmp_path, rules[0])[0]
+    for score in scores:
+        assert [scan.seconds for scan in score.scans] == [1.0] * 3
+        # Such a rule has no heights, and so no false cells.
+        assert score.shares == {'low_things': Share(3 * int(cut.is_low.sum()), 3 * n_wrong)}
+        assert score.confusion == plain.confusion and plain.shares == {}
+
+
+class Learner(HeightRule):
+    """A height rule that rises by 0.1 m with each scan of a sequence."""
+
+    depends_on_past = True
+
+    def reset(self):
+        self.height = -1.75
+
+    def run(self, points):
+        super().run(points)
+        self.height += 0.1
+
+
+def test_what_a_method_learns_from_cut_scans_it_does_not_know_in_whole_ones(tmp_path):
+    write_streets(tmp_path, s00=3)
+    plain, cut = (
+        evaluate(tmp_path, Learner('a', -1.75), load=partial(runner.load_kitti, cut=height))[0]
+        for height in (0.0, 0.45)
+    )
+    assert [s.confusions for s in plain.scans] == [s.confusions for s in cut.scans]
+    assert len({s.confusion.fp for s in plain.scans}) == 3
+    assert 'low_things' in cut.scans[-1].shares
 
 
 def test_scores_of_a_rule_known_by_hand(tmp_path):
@@ -368,6 +417,13 @@ def test_errors_are_said_before_any_frame_is_read(
     assert run('evaluate', root, *(mine if word == 'MINE' else word for word in words)) == 2
     assert message in error_line(capsys)
     assert mine.read_text() == 'mine'
+
+
+@pytest.mark.parametrize('cut', ['-0.1', 'nan', 'low'])
+def test_a_height_of_the_cut_is_a_number_from_0_on(root, cut, capsys):
+    with pytest.raises(SystemExit):
+        run('evaluate', root, f'--cut={cut}')
+    assert 'must be a number, at least 0' in capsys.readouterr().err
 
 
 def test_frames_without_a_scored_point_and_a_root_without_sequences(tmp_path, capsys):

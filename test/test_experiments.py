@@ -199,6 +199,35 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
         scenes.score_objects(frames[1:], FIXED, with_peer=False)
 
 
+def test_low_things_lost_follow_their_definitions():
+    """By plain loops over the returns of each object of two scenes, ours and the peer's."""
+    frames = variants.simulated_frames(['vlp-16'], ['low_boxes', 'low_walls', 'ramp'], 2, (0.0,))
+    report = scenes.score_scenes(frames, FIXED)
+    assert [row['scene'] for row in report.tables['objects'].json()] == ['ramp']
+    rows = report.tables['low'].json()
+    assert [row['scene'] for row in rows] == ['low_boxes', 'low_walls']
+    for row in rows:
+        lost = {}
+        for seed in range(2):
+            scene = SCENES[row['scene']](seed)
+            made = simulate_scan(scene, SENSORS['vlp-16'], np.random.default_rng(seed))
+            high = made.points[:, 2] - made.ground_z >= 0.1
+            method = PatchworkppMethod(0.8)
+            method.run(made.points)
+            labels = GroundSegmenter(FIXED).segment(made.points).label, method.result().label
+            for number, solid in enumerate(scene.solids, 1):
+                own = high & (made.object_id == number)
+                if own.sum() >= 3:
+                    height = f'{solid.top - float(scene.terrain.height(solid.x, solid.y)):.1f} m'
+                    found = [(label[own] == Label.GROUND).mean() > 0.5 for label in labels]
+                    lost.setdefault(height, []).append(found)
+        assert row['things'] == sum(map(len, lost.values())) >= 5
+        for height in ('0.2 m', '0.3 m', '0.4 m', '0.5 m', '0.6 m'):
+            expected = np.mean(lost[height], axis=0) if height in lost else (None, None)
+            assert (row[height], row[f'peer_{height}']) == pytest.approx(tuple(expected))
+    assert len(lost) == 2  # heights of walls
+
+
 def test_scenes_by_hand_and_behind_is_said():
     """Scores are those of each scan as `test_lost_objects_follow_their_definitions` has them."""
 

@@ -1,4 +1,4 @@
-"""Objects lost: counts against plain loops, local ground, the command."""
+"""Objects lost, low things and false cells: plain loops, hand-made frames, the command."""
 
 import itertools
 import json
@@ -20,14 +20,19 @@ from gp_ground_seg.lab.scoring.metrics import GROUND_CLASSES
 from gp_ground_seg.lab.scoring.objects import (
     BAND_EDGES,
     CLASSES,
+    LOW_CLASSES,
     MIN_HEIGHT,
     MIN_RETURNS,
     ObjectCount,
     Objects,
+    Share,
+    count_false_cells,
     count_objects,
+    cut_objects,
     labelled_objects,
     local_ground,
     pool_objects,
+    pool_shares,
 )
 
 
@@ -76,14 +81,14 @@ def counted_by_loops(points, label, objects):
         reach, is_ground = math.hypot(x, y), label[k] == Label.GROUND
         if kind >= 0 and math.isnan(objects.ground_z[k]):
             unknown.append((kind, band_of(reach)))
-        if kind < 0 or not z - objects.ground_z[k] >= MIN_HEIGHT:
+        if kind < 0 or not z - objects.ground_z[k] >= (0.1 if kind >= 3 else MIN_HEIGHT):
             continue
         share.setdefault((kind, band_of(reach)), []).append(is_ground)
         if number:
             own.setdefault((kind, number), []).append((reach, is_ground))
     found = {}
     for (kind, _), its in own.items():
-        if len(its) >= MIN_RETURNS:
+        if len(its) >= (3 if kind >= 3 else MIN_RETURNS):
             band = band_of(np.median([reach for reach, _ in its]))
             is_lost = sum(is_ground for _, is_ground in its) > len(its) / 2
             found.setdefault((kind, band), []).append(is_lost)
@@ -110,7 +115,7 @@ def drawn_scan(seed, n):
     points = rng.integers(-9, 10, (n, 3)) * (0.5 * rng.integers(1, 10), 0.5, 0.1)
     label = rng.integers(0, 3, n).astype(np.uint8)
     ground_z = np.where(rng.random(n) < 0.1, np.nan, 0.0)
-    kind, number = rng.integers(-1, 2, n), rng.integers(0, 4, n)
+    kind, number = rng.choice([-1, 0, 1, 3], n), rng.integers(0, 4, n)
     return points, label, Objects(kind, number, ground_z)
 
 
@@ -204,11 +209,69 @@ def test_objects_of_labels_are_instances_by_group():
     entries = np.array([number | 5 << 16 for number in known] + [10, 30], dtype=np.uint32)
     points, nothing = np.zeros((len(entries), 3)), np.zeros(len(entries), dtype=bool)
     found = labelled_objects(points, entries, nothing)
-    assert [*CLASSES] == ['vehicle', 'person', 'cyclist']
+    assert [*CLASSES] == ['vehicle', 'person', 'cyclist', *LOW_CLASSES]
     assert found.class_of.tolist() == [*known.values(), 0, 1]
     assert found.object_id[-2:].tolist() == [0, 0]
     assert len(set(found.object_id[:-2].tolist())) == len(known)
     assert np.isnan(found.ground_z).all()
+
+
+# Low things and false cells.
+
+
+def test_objects_are_cut_and_what_counts_is_low_and_near():
+    """Ground that falls by 0.1 to each side of x = 0, at places 0.05 m from the objects asked."""
+    shifts = np.array([[0.0, 0.0], [0.05, 0.0], [-0.05, 0.0], [0.0, 0.05], [0.0, -0.05]])
+    heights = np.array([0.0, 0.0, 0.0, 0.0, -5.0])  # of the five nearest the median
+    over = (0.1, 0.2, 0.44, 0.46, 2.0)
+    parts, expected = [], []
+    for x, is_object in ((10.0, True), (10.0, False), (24.9, True), (25.1, True)):
+        place, z = (x, 0.0), -1.73 - 0.1 * x
+        parts.append((np.column_stack([place + shifts, z + heights]), False, True))
+        parts.append((np.array([[*place, z + h] for h in over]), is_object, False))
+        expected += [(True, False)] * 5
+        expected += [(not is_object or h < 0.45, is_object and 0.15 < h < 0.45 and x < 25.0)
+                     for h in over]  # fmt: skip
+    parts.append((np.full((1, 3), math.nan), True, False))
+    points = np.concatenate([p for p, _, _ in parts]).astype(np.float32)
+    is_object, is_ground = (
+        np.concatenate([np.full(len(part[0]), part[k]) for part in parts]) for k in (1, 2)
+    )
+    cut = cut_objects(points, is_object, is_ground, 0.45)
+    assert list(zip(cut.is_kept, cut.is_low, strict=True)) == [*expected, (True, False)]
+    # Labels are of what is left: ground is what lies 0.2 m over it, and so two of four are.
+    left = points[cut.is_kept]
+    label = np.where(left[:, 2] - (-1.73 - 0.1 * left[:, 0]) < 0.3, Label.GROUND, Label.OBSTACLE)
+    assert cut.count(label.astype(np.uint8)) == Share(4, 2)
+    few = cut_objects(points[5:10], is_object[5:10], ~is_object[5:10], 0.45)
+    assert few.is_kept.all() and not few.is_low.any()
+
+
+def test_false_cells_by_hand():
+    road, parking, walk, terrain, car = 40, 44, 48, 72, 10
+    rows = [
+        # x, y, class, label, height: two returns of road in one cell, one of them wrong
+        (1.01, 1.01, road, Label.GROUND, 0.0),
+        (1.09, 1.09, road, Label.OBSTACLE, 0.16),
+        (1.05, 1.05, road, Label.OBSTACLE, 0.3),
+        (-0.05, 0.05, parking, Label.OBSTACLE, 0.14),  # a costmap clears what is that low
+        (0.05, 0.05, parking, Label.UNKNOWN, 0.5),
+        (5.05, 0.05, walk, Label.OBSTACLE, 0.16),
+        (6.05, 0.05, walk, Label.OBSTACLE, math.nan),
+        (1.01, 1.01, car, Label.OBSTACLE, 0.5),
+        (7.05, 0.05, terrain, Label.OBSTACLE, 0.5),
+        (0.05, 19.95, road, Label.OBSTACLE, 0.15),
+        (0.05, 20.05, road, Label.OBSTACLE, 0.5),
+        (math.nan, 0.0, road, Label.OBSTACLE, 0.5),
+    ]
+    x, y, semantic, label, height = np.array(rows, dtype=float).T
+    points = np.column_stack([x, y, 0 * x])
+    counts = count_false_cells(points, label.astype(np.uint8), height, semantic.astype(int))
+    assert counts == {'road_cells': Share(4, 2), 'ground_cells': Share(6, 3)}
+    pooled = pool_shares([counts, {'low_things': Share(3, 1)}, counts])
+    assert list(pooled) == ['low_things', 'road_cells', 'ground_cells']
+    assert (pooled['road_cells'], pooled['low_things'].ratio) == (Share(8, 4), 1 / 3)
+    assert math.isnan(Share().ratio)
 
 
 # The command.
@@ -275,6 +338,39 @@ def test_the_table_of_objects_is_that_of_the_labels(tmp_path, capsys):
     ours = [scan for scan in document['rows'] if scan['method'] == 'gp_ground_seg']
     own = sum(b['n_ground'] for s in ours for b in s['objects']['vehicle'].values())
     assert own == pytest.approx(row['share_ground'] * row['returns'])
+
+
+def test_the_table_of_low_things_is_that_of_the_labels(tmp_path, capsys):
+    """Both cars cut, and segmented by the library; the frame as it is has the false cells."""
+    root = write_cars(tmp_path / 'kitti', '00')
+    document = evaluated(root, tmp_path, '--peer', 'patchworkpp', '--cut', 1)
+    points, entries = street_with_cars(0)
+    is_ground, is_car = entries == 40, entries & 0xFFFF == 10
+    cut = cut_objects(points, is_car, is_ground, 1.0)
+    assert 50 < (~cut.is_kept).sum() < 500 and cut.is_low.sum() > 50
+    segmenter = GroundSegmenter()
+    low = cut.count(segmenter.segment(points[cut.is_kept]).label)
+    result = segmenter.segment(points)
+    cells = count_false_cells(points, result.label, result.height, entries & 0xFFFF)
+    row, pooled = document['low_things']
+    assert {**row, 'sequence': 'all'} == pooled and document['cut'] == 1.0
+    ours, peer = document['rows']
+    for name, share in {'low_things': low, **cells}.items():
+        assert (row[name], row[f'{name}_wrong']) == (share.n, share.ratio)
+        assert ours[name] == {'n': share.n, 'n_wrong': share.n_wrong}
+    # The peer has no heights over a surface.
+    assert row['patchworkpp_road_cells_wrong'] is None and 'road_cells' not in peer
+    found = peer['low_things']
+    assert found['n_wrong'] / found['n'] == row['patchworkpp_low_things_wrong']
+    title = capsys.readouterr().out.replace('\n  ', ' ')
+    assert 'Low things and false cells [%]; low: returns left of objects that are cut at 1 m' in (
+        title.replace('  [', ' [')
+    )
+    none = evaluated(root, tmp_path, '--cut', 0)
+    assert set(none['low_things'][0]) == {
+        'sequence', *(f'{name}{end}' for name in cells for end in ('', '_wrong')),
+    }  # fmt: skip
+    assert 'objects that are cut' not in capsys.readouterr().out.replace('\n  ', ' ')
 
 
 def test_where_nothing_stands_or_nothing_has_a_number_it_is_said(tmp_path, capsys):

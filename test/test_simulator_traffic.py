@@ -10,6 +10,7 @@ from conftest import scene_of, simulated
 
 from gp_ground_seg.lab.simulation import (
     HDL_64E,
+    LOW,
     PLACES,
     SCENES,
     SENSORS,
@@ -109,14 +110,16 @@ def test_persons_and_cyclists(make, kind, label, height, wide):
 def test_numbers_of_objects_go_with_their_kinds(name):
     made = simulated(name, EXACT, 2)
     numbered = made.object_id > 0
-    assert np.isin(made.kind[numbered], OF_OBJECTS).all()
+    kinds = [*OF_OBJECTS, Kind.WALL] if name == 'low_walls' else OF_OBJECTS
+    assert np.isin(made.kind[numbered], kinds).all()
     assert numbered[np.isin(made.kind, [Kind.PERSON, Kind.CYCLIST])].all()
-    assert (made.object_id[~np.isin(made.kind, OF_OBJECTS)] == 0).all()
+    assert (made.object_id[~np.isin(made.kind, kinds)] == 0).all()
     x, y, _ = in_world(made).T
     for number in np.unique(made.object_id[numbered]):
         returns = made.object_id == number
         assert len(set(made.kind[returns])) == 1
-        assert np.hypot(np.ptp(x[returns]), np.ptp(y[returns])) < 11.0  # a truck
+        longest = 12.1 if name == 'low_walls' else 11.0  # a truck
+        assert np.hypot(np.ptp(x[returns]), np.ptp(y[returns])) < longest
 
 
 def test_a_vehicle_of_several_solids_is_one_object():
@@ -220,6 +223,61 @@ def test_hedges_are_low_dense_and_beside_the_path():
     assert 2.2 < np.abs(y).min() < np.abs(y).max() < 6.9
     assert min((y > 0).sum(), (y < 0).sum()) > 200
     assert {Kind.POLE, Kind.OVERHANG, Kind.PERSON} <= set(made.kind)
+
+
+SIZES = {
+    'low_boxes': ((0.44, 2.0), (0.44, 2.0), (0.2, 0.6)),
+    'low_boxes_rough': ((0.44, 2.0), (0.44, 2.0), (0.2, 0.6)),
+    'low_walls': ((12.0, 12.0), (0.3, 0.3), (0.25, 0.4)),
+    'lying_persons': ((1.7, 1.7), (0.45, 0.45), (0.22, 0.22)),
+}
+
+
+@pytest.mark.parametrize('name', LOW)
+@of_three_seeds
+def test_low_things_are_objects_of_their_sizes_and_heights(name, seed):
+    scene = scene_of(name, seed)
+    n_least = 4 if name == 'low_walls' else 25
+    assert len(scene.solids) >= n_least
+    assert objects.number_objects(scene.solids).tolist() == [*range(1, len(scene.solids) + 1)]
+    none, *heights = objects.object_heights(scene.terrain, scene.solids)
+    assert math.isnan(none)
+    measures = ([s.length for s in scene.solids], [s.width for s in scene.solids], heights)
+    for found, (least, most) in zip(measures, SIZES[name], strict=True):
+        assert least - 1e-9 <= min(found) and max(found) <= most + 1e-9
+    if 'boxes' in name:
+        assert {round(height, 9) for height in heights} == {0.2, 0.3, 0.4, 0.5, 0.6}
+        n_narrow = sum(solid.length == 0.44 for solid in scene.solids)
+        assert 0.2 < n_narrow / len(scene.solids) < 0.8
+    is_rough = np.ptp(scene.terrain.height(*np.random.default_rng(0).uniform(-9, 9, (2, 99)))) > 0
+    assert is_rough == (name == 'low_boxes_rough')
+
+
+@pytest.mark.parametrize('name', LOW)
+@of_three_seeds
+def test_low_things_are_in_plain_view_and_have_tops(name, seed):
+    """Each alone on the ground has the returns that it has among the others."""
+    scene = scene_of(name, seed)
+    made = simulated(name, TALL, seed)
+    x, y, z = in_world(made).T
+    reach = np.hypot(x, y)
+    assert reach[made.object_id > 0].min() > 3.0 and len(set(made.object_id)) > 4
+    for number, solid in enumerate(scene.solids[:6], 1):
+        assert reach[made.object_id == number].min(initial=20.0) < 20.2
+        alone = simulated(Scene('one', scene.terrain, (solid,)), TALL, seed)
+        assert (alone.object_id == 1).sum() == (made.object_id == number).sum()
+    tops = np.array([np.nan, *(solid.top for solid in scene.solids)])[made.object_id]
+    assert (np.abs(z - tops) < 1e-4).sum() > 50
+
+
+def test_the_height_of_an_object_is_that_of_its_highest_part_above_the_ground():
+    hill = slope(0.1)
+    low = objects.parts_of(0.0, 20.0, [objects.standing_box(hill, 0.0, 20.0, (1.0, 1.0, 0.3))])
+    crate = objects.standing_box(hill, 5.0, 0.0, (1.0, 1.0, 9.0))
+    solids = (*objects.car(hill, 10.0, 0.0), crate, *low)
+    none, car, box = objects.object_heights(hill, solids)
+    assert (car, box) == pytest.approx((1.5, 0.3)) and math.isnan(none)
+    assert len(objects.object_heights(hill, ())) == 1
 
 
 # Mounts.

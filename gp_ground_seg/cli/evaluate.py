@@ -28,6 +28,7 @@ from gp_ground_seg.lab.scoring.evaluate import (
     load_kitti,
     score_methods,
 )
+from gp_ground_seg.lab.scoring.objects import CUT_HEIGHT
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 
 DESCRIPTION = """\
@@ -36,6 +37,12 @@ recall, F1, accuracy, IoU, time per frame. Count vehicles, persons and cyclists 
 lost: the share of their returns from 0.3 m above the local ground that is labelled ground,
 and the objects with more than half of these returns labelled ground. Objects are the
 instances of the labels (their upper 16 bits). The last line is the result.
+
+Low things: the returns of vehicles, persons and cyclists more than --cut above the ground are
+taken out, and what is left, as low as a parcel, is segmented in a second run, which does not
+count in the times. The share of the low returns that is labelled ground is reported. False
+cells: the share of the cells of 0.1 m of road, and of ground, in which a return of it is
+labelled obstacle, 0.15 m or more over the surface. Patchwork++ has no such heights.
 
 With --against another parameter file or preset, or with --peer Patchwork++, runs in turns on
 the same frames. Each difference has a bootstrap interval over the sequences, or over blocks of
@@ -74,6 +81,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         ROOT,
         *OF_FRAMES,
         ('--per-frame', 'write the numbers of each frame as CSV', {'metavar': 'FILE'}),
+        (
+            '--cut',
+            f'height [m] at which objects are cut, to count low things (default: {CUT_HEIGHT}); '
+            '0 = no low things: each method segments a frame once',
+            {'metavar': 'HEIGHT', 'type': partial(options.above_zero, or_zero=True)},
+        ),
         ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
         ('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
         (
@@ -105,8 +118,9 @@ def run(arguments: argparse.Namespace) -> int:
             chosen.append(PatchworkppMethod.of_sensor(config.sensor))
         runner = stack.enter_context(options.runner(arguments, 'evaluate'))
         scores = score_methods(items, chosen, load, runner=runner)
-        report = tables.evaluation(scores, config, arguments.worst, runner.n_workers)
-        report.facts['data'] = arguments.root
+        cut = _cut_of(arguments)
+        report = tables.evaluation(scores, config, arguments.worst, runner.n_workers, cut)
+        report.facts.update(data=arguments.root, cut=cut)
         environment = results.describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
         environment['n_workers'] = runner.n_workers
         if 'json' in parts:
@@ -135,13 +149,18 @@ def _other_config(arguments: argparse.Namespace, config: Config) -> tuple[Config
     return other, changed
 
 
+def _cut_of(arguments: argparse.Namespace) -> float:
+    """Return the height at which objects are cut [m]."""
+    return CUT_HEIGHT if arguments.cut is None else float(arguments.cut)
+
+
 def _items(
     arguments: argparse.Namespace,
 ) -> tuple[Any, Callable[[Any], KnownScan]]:
     """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
     root = as_path(arguments.root)
     if any(root.glob('sequences/*/velodyne')):
-        return frames_from_options(arguments), load_kitti
+        return frames_from_options(arguments), partial(load_kitti, cut=_cut_of(arguments))
     if not root.exists():
         raise DataError(f'{root}: no such file or folder')
     if arguments.against is None:
@@ -149,7 +168,7 @@ def _items(
             f'{root}: no sequences/*/velodyne folder below it (SemanticKITTI layout); scans '
             'without labels need --against'
         )
-    for name in ('sequences', 'frame_step', 'worst', 'workers', 'scheduler'):
+    for name in ('sequences', 'frame_step', 'cut', 'worst', 'workers', 'scheduler'):
         if getattr(arguments, name) is not None:
             option = name.replace('_', '-')
             raise DataError(f'--{option}: {root} has no sequences/*/velodyne below it')

@@ -12,12 +12,20 @@ from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.comparison import INTERVAL, interval_text
 from gp_ground_seg.lab.scoring.evaluate import MethodScore
 from gp_ground_seg.lab.scoring.metrics import ratio
-from gp_ground_seg.lab.scoring.objects import MIN_HEIGHT, MIN_RETURNS, ObjectCount
+from gp_ground_seg.lab.scoring.objects import (
+    LOW_CLASSES,
+    LOW_HEIGHTS,
+    LOW_MIN_HEIGHT,
+    LOW_MIN_RETURNS,
+    MIN_HEIGHT,
+    MIN_RETURNS,
+    ObjectCount,
+)
 from gp_ground_seg.lab.scoring.report import Column, Report, Row, Table, centimetres, percent
 from gp_ground_seg.lab.scoring.tables import make_report
-from gp_ground_seg.lab.simulation import PLACES
+from gp_ground_seg.lab.simulation import LOW, PLACES
 
-CROWDED = (*PLACES, 'urban')
+CROWDED = (*(name for name in PLACES if name not in LOW), 'urban')
 """Scenes where objects hide the ground."""
 BANDS = {'0-10 m': slice(0, 1), '10-20 m': slice(1, 2), '> 20 m': slice(2, None)}
 """Bands of range of the columns, as parts of `scoring.objects.BAND_TITLES`."""
@@ -37,13 +45,19 @@ def score_scenes(
     *,
     with_peer: bool = True,
 ) -> Report:
-    """Score simulated scans by exact labels and heights, and count objects lost.
+    """Score simulated scans by exact labels and heights, and count objects and low things lost.
 
     Patchwork++ beside it has its published parameters and the true height of the sensor. All
     sensors have one set of parameters.
     """
     scores, refused = score_simulated(frames, config, runner, with_peer=with_peer)
-    tables = {'scenes': scene_table(scores, refused), 'objects': lost_table(scores)}
+    low = [name for name in scores[0].sequences if name.split()[1] in LOW]
+    rest = [name for name in scores[0].sequences if name not in low]
+    tables = {'scenes': scene_table(scores, refused)}
+    if rest:
+        tables['objects'] = lost_table([score.of(*rest) for score in scores])
+    if low:
+        tables['low'] = low_table([score.of(*low) for score in scores])
     return make_report(tables, scores, config)
 
 
@@ -111,9 +125,10 @@ def scene_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> T
             elif not difference > 0.0:
                 behind.append(name)
         rows.append(row)
-    n_scans = len(scores[0].of(scores[0].sequences[0]).scans)
+    n_scans = {len(score.scans) for _, score in scores[0].by_sequence()[:-1]}
     title = (
-        f'{n_scans} simulated scans per row; IoU against exact labels [%], every point counts; '
+        f'{" or ".join(map(str, sorted(n_scans)))} simulated scans per row; IoU against exact '
+        'labels [%], every point counts; '
         'height of the surface under true ground [cm]; gaps: share of it without a model [%]'
     )
     notes = [*refused]
@@ -152,6 +167,30 @@ def lost_table(scores: Sequence[MethodScore], refused: Sequence[str] = ()) -> Ta
         title += f'; peer: {peer}, which gets the true height and place of the sensor'
         notes.append(f'IoU behind {peer}: {", ".join(behind) or "nowhere"}')
     return Table(rows, title, notes)
+
+
+def low_table(scores: Sequence[MethodScore]) -> Table:
+    """Lay out the share of low things lost, by height; ours, then the peer if there is one."""
+    rows: list[Row] = []
+    for _, row, parts in _groups(scores):
+        counts = {
+            f'{height:g} m': [sum(s.objects.get(name, ()), ObjectCount()) for s in parts]
+            for name, height in zip(LOW_CLASSES, LOW_HEIGHTS, strict=True)
+        }
+        row.append((Column('things', '_d'), sum(found[0].n_objects for found in counts.values())))
+        for title, found in counts.items():
+            lost = [ratio(count.n_lost, count.n_objects) for count in found]
+            names = (title, title), ('peer', f'peer_{title}')
+            columns = [percent(*pair, '.0f') for pair in names[: len(lost)]]
+            row += zip(columns, lost, strict=True)
+        rows.append(row)
+    title = (
+        'Low things by height, in plain view 3 to 20 m away: those with at least '
+        f'{LOW_MIN_RETURNS} returns from {LOW_MIN_HEIGHT:g} m above the exact ground, and the '
+        'share of them that is lost [%]: more than half of these returns called ground'
+    )
+    title += f'; peer: {scores[1].title}' if len(scores) > 1 else ''
+    return Table(rows, title)
 
 
 def return_table(scores: Sequence[MethodScore]) -> Table:

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from gp_ground_seg.core.errors import ConfigError, PointCloudError
 from gp_ground_seg.core.frame import Label
@@ -24,15 +25,19 @@ from gp_ground_seg.lab.scoring.evaluate import (
     pool,
     score_methods,
 )
-from gp_ground_seg.lab.scoring.objects import CLASSES, Objects
+from gp_ground_seg.lab.scoring.objects import CLASSES, LOW_CLASSES, LOW_HEIGHTS, Objects
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
-from gp_ground_seg.lab.simulation import PLACES, SCENES, SENSORS, Kind, simulate_scan
+from gp_ground_seg.lab.simulation import PLACES, SCENES, SENSORS, Kind, Scene, simulate_scan
+from gp_ground_seg.lab.simulation.objects import object_heights
+from gp_ground_seg.lab.simulation.scan import SimulatedScan
 
 Changes = Mapping[str, ParameterValue]
 """Values of parameters, by dotted name."""
 
 OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
 """Kinds of objects that rays hit, by `CLASSES`; crates are boxes too, but no objects."""
+LOWEST_OBJECT = 0.7
+"""Objects of less than this height are of the nearest of `LOW_CLASSES`, of any kind [m]."""
 
 
 class SimulatedFrame(NamedTuple):
@@ -59,15 +64,25 @@ def load_simulated(frame: SimulatedFrame) -> KnownScan:
     scene, rng = SCENES[frame.scene](frame.seed), np.random.default_rng(frame.seed)
     made = simulate_scan(scene, SENSORS[frame.sensor], rng, x=frame.x)
     truth = np.where(made.is_ground, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
-    class_of = np.full(len(truth), -1)
-    for number, name in enumerate(CLASSES):
-        class_of[(made.kind == OBJECT_KINDS[name]) & (made.object_id > 0)] = number
     return KnownScan(
         frame.sequence, f'{frame.seed}/{frame.x:g}', made.points, {'exact': truth},
         ground_z=made.ground_z, is_ground=made.is_ground,
-        objects=Objects(class_of, made.object_id, made.ground_z),
+        objects=Objects(_class_of(scene, made), made.object_id, made.ground_z),
         std='ground_std', cluster=f'{frame.sequence} {frame.seed}',
     )  # fmt: skip
+
+
+def _class_of(scene: Scene, made: SimulatedScan) -> npt.NDArray[np.integer]:
+    """Index into `CLASSES` of what each ray of a scan hit, (N,); -1: no object."""
+    class_of = np.full(len(made.kind), -1)
+    for number, name in enumerate(CLASSES):
+        if name in OBJECT_KINDS:
+            class_of[(made.kind == OBJECT_KINDS[name]) & (made.object_id > 0)] = number
+    height = object_heights(scene.terrain, scene.solids)[made.object_id]
+    low = height < LOWEST_OBJECT
+    nearest = np.abs(height[low, None] - LOW_HEIGHTS).argmin(axis=1)
+    class_of[low] = len(CLASSES) - len(LOW_CLASSES) + nearest
+    return class_of
 
 
 def simulated_frames(

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.lab.scoring import report
 from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
 from gp_ground_seg.lab.scoring.metrics import ratio
-from gp_ground_seg.lab.scoring.objects import ObjectCount
+from gp_ground_seg.lab.scoring.objects import SHARES, ObjectCount, Share
 from gp_ground_seg.lab.scoring.report import Column, Table, percent
 
 CONFIDENCE, N_DRAWS, SEED = 0.95, 10_000, 0
@@ -157,6 +158,12 @@ def counts_of_all(score: MethodScore) -> ObjectCount:
     return sum(itertools.chain(*score.objects.values()), ObjectCount())
 
 
+def share_sums(name: str, score: MethodScore) -> tuple[float, float]:
+    """Return one of `SHARES` as a ratio."""
+    found = score.shares.get(name, Share())
+    return found.n_wrong, found.n
+
+
 MEASURES: tuple[tuple[Column, Measure], ...] = (
     (percent('IoU [%]'), iou_sums),
     (percent('precision [%]'),
@@ -166,6 +173,7 @@ MEASURES: tuple[tuple[Column, Measure], ...] = (
      lambda s: (counts_of_all(s).n_ground, counts_of_all(s).n_returns)),
     (percent('objects lost [%]'),
      lambda s: (counts_of_all(s).n_lost, counts_of_all(s).n_objects)),
+    *((percent(f'{title} [%]'), partial(share_sums, name)) for name, title in SHARES.items()),
     (report.centimetres('RMSE of the height [cm]'), mse_sums),
     (percent('heights within 1 std, ideally 68.3 [%]'),
      lambda s: (s.height.n_within_1, s.height.n_with_std)),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from operator import attrgetter
 from typing import Any, Protocol
@@ -36,11 +37,17 @@ from gp_ground_seg.lab.scoring.metrics import (
     Sums,
 )
 from gp_ground_seg.lab.scoring.objects import (
+    LOW_THINGS,
+    CutScan,
     ObjectCounts,
     Objects,
+    Shares,
+    count_false_cells,
     count_objects,
+    cut_objects,
     labelled_objects,
     pool_objects,
+    pool_shares,
 )
 
 OURS = 'gp_ground_seg'
@@ -63,6 +70,7 @@ class MethodResult:
     stages: dict[str, float] = field(default_factory=dict)  # seconds
     pose: SensorPose | None = None
     fit: FitReport | None = None
+    height: FloatArray | None = None  # (N,) over the surface, where the method has one [m]
 
 
 class Method(Protocol):
@@ -112,7 +120,7 @@ class OurMethod:
         stages = {stage: s for stage, s in last.timings.items() if stage != 'total'}
         return MethodResult(
             last.label, last.ground_z, last.p_ground, last.return_std, last.ground_std,
-            stages, last.pose, last.fit,
+            stages, last.pose, last.fit, last.height,
         )  # fmt: skip
 
 
@@ -133,6 +141,7 @@ class KnownScan:
     """Field of `MethodResult` that the errors of the height are compared with: heights of ground
     returns scatter by `return_std`, exact heights by `ground_std`."""
     cluster: str = ''  # scans that the bootstrap draws together; by default the sequence
+    cut: CutScan | None = None  # what of it is segmented once more, to count low things
 
 
 @dataclass(frozen=True)
@@ -157,6 +166,7 @@ class ScanScore:
     classes: dict[int, ClassCount] = field(default_factory=dict)
     rings: tuple[RingScore, ...] = ()  # by `metrics.RING_TITLES`, where the truth is known
     objects: ObjectCounts = field(default_factory=dict)
+    shares: Shares = field(default_factory=dict)
     pose: SensorPose | None = None  # of our method
     fit: FitReport | None = None
     cluster: str = ''  # as in `KnownScan`
@@ -241,6 +251,11 @@ class MethodScore:
         return pool_objects([scan.objects for scan in self.scans])
 
     @property
+    def shares(self) -> Shares:
+        """Low things called ground, and false cells."""
+        return pool_shares([scan.shares for scan in self.scans])
+
+    @property
     def calibration(self) -> Calibration:
         """Probabilities against the truth."""
         return sum((scan.calibration for scan in self.scans), Calibration())
@@ -266,8 +281,11 @@ def pool(name: str, scores: Sequence[MethodScore]) -> MethodScore:
     return MethodScore(name, tuple(scan for score in scores for scan in score.scans))
 
 
-def load_kitti(frame: Frame) -> KnownScan:
-    """Read a labelled frame; the ground whose height counts is what is labelled ground."""
+def load_kitti(frame: Frame, cut: float = 0.0) -> KnownScan:
+    """Read a labelled frame; the ground whose height counts is what is labelled ground.
+
+    Objects are cut at the height `cut` [m] to count low things; with 0 none are.
+    """
     if frame.labels_path is None:
         raise DataError(f'{frame.points_path}: has no labels')
     points = read_points(frame.points_path, frame.layout)
@@ -278,7 +296,8 @@ def load_kitti(frame: Frame) -> KnownScan:
     is_ground = truths[GROUNDGRID.key] == Label.GROUND
     objects = labelled_objects(points, entries, is_ground)
     names = shown(frame.sequence), shown(frame.index)
-    return KnownScan(*names, points, truths, semantic, z, is_ground, objects)
+    low = cut_objects(points, objects.class_of >= 0, is_ground, cut) if cut else None
+    return KnownScan(*names, points, truths, semantic, z, is_ground, objects, cut=low)
 
 
 def as_it_is(scan: KnownScan) -> KnownScan:
@@ -300,6 +319,9 @@ def score_methods(
     Which method goes first changes from scan to scan. Each runs once without counting:
     compilation and first allocations are not its speed. `items`, grouped by sequence, are loaded
     one by one. Methods are reset before each sequence, or with `each_alone` before each scan.
+
+    Of scans with a `KnownScan.cut`, which all have or none, copies of the methods run on it, in
+    the same order, without being timed.
     """
     score = partial(_score_block, load, methods, each_alone, clock)
     has_past = not each_alone and any(method.depends_on_past for method in methods)
@@ -322,6 +344,10 @@ def _score_block(
     for k, item in enumerate(progress(items)):
         scan = load(item)
         if k == 0:
+            # What a method learns from cut scans it must not know in the whole ones.
+            copies = (
+                [copy.copy(method) for method in methods] if scan.cut else [None] * len(methods)
+            )
             for method in methods:
                 _run(method, scan)
         forgets = each_alone or scan.sequence != sequence
@@ -334,8 +360,9 @@ def _score_block(
             _run(method, scan)
             seconds[method] = clock() - start
         results = [method.result() for method in methods]
-        for method, result, found in zip(methods, results, scores, strict=True):
-            found.append(_score(scan, result, seconds[method], results[0].label))
+        for method, other, result, found in zip(methods, copies, results, scores, strict=True):
+            shares = _low_things(scan, other, forgets=forgets)
+            found.append(_score(scan, result, seconds[method], results[0].label, shares))
     return scores
 
 
@@ -346,8 +373,22 @@ def _run(method: Method, scan: KnownScan) -> None:
         raise PointCloudError(f'{scan.sequence}/{scan.index}: {method.name}: {error}') from error
 
 
-def _score(scan: KnownScan, result: MethodResult, seconds: float, first: Labels) -> ScanScore:
+def _low_things(scan: KnownScan, method: Method | None, *, forgets: bool) -> Shares:
+    """Run a method on what is left of a cut scan, and count the low things called ground."""
+    if scan.cut is None or method is None:
+        return {}
+    if forgets:
+        method.reset()
+    _run(method, replace(scan, points=scan.points[scan.cut.is_kept]))
+    return {LOW_THINGS: scan.cut.count(method.result().label)}
+
+
+def _score(
+    scan: KnownScan, result: MethodResult, seconds: float, first: Labels, shares: Shares
+) -> ScanScore:
     label, max_nlpd = result.label, _max_nlpd(scan, result)
+    if scan.semantic is not None and result.height is not None:
+        shares = shares | count_false_cells(scan.points, label, result.height, scan.semantic)
     return ScanScore(
         scan.sequence, scan.index, seconds, result.stages,
         {key: metrics.count_confusion(label, truth) for key, truth in scan.truths.items()},
@@ -355,7 +396,7 @@ def _score(scan: KnownScan, result: MethodResult, seconds: float, first: Labels)
         {} if scan.semantic is None else metrics.count_classes(label, scan.semantic),
         _score_rings(scan, result, max_nlpd),
         {} if scan.objects is None else count_objects(scan.points, label, scan.objects),
-        result.pose, result.fit, scan.cluster or scan.sequence,
+        shares, result.pose, result.fit, scan.cluster or scan.sequence,
         len(label), int((label != first).sum()),
     )  # fmt: skip
 

@@ -2,12 +2,15 @@
 
 An object is lost where more than half of its returns from `MIN_HEIGHT` above the local ground are
 called ground. What lies below does not count: there the feet of an object and the ground mix.
+
+Two more measures are of what a robot meets: **low things**, labelled objects of which the upper
+part is cut off, and **false cells**, ground that a costmap takes for an obstacle.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,12 +34,36 @@ CELL_SIZE = 0.5  # of the cells of ground that is known [m]
 N_CELLS = 5  # of them that make the local ground
 MAX_GROUND_DISTANCE = 5.0  # to the farthest of them [m]
 
-CLASSES = {
+LOW_HEIGHTS = (0.2, 0.3, 0.4, 0.5, 0.6)
+"""Heights of low objects [m], each a class of its own, which only simulated scans have."""
+LOW_CLASSES = tuple(f'low, {height:g} m' for height in LOW_HEIGHTS)
+CLASSES: dict[str, tuple[int, ...]] = {
     'vehicle': (10, 13, 16, 18, 20, 252, 256, 257, 258, 259),
     'person': (30, 254),
     'cyclist': (11, 15, 31, 32, 253, 255),
+    **dict.fromkeys(LOW_CLASSES, ()),
 }
 """Classes of objects, by numbers of SemanticKITTI; two-wheelers with or without a rider."""
+LOW_MIN_HEIGHT, LOW_MIN_RETURNS = 0.1, 3
+"""`MIN_HEIGHT` [m] and `MIN_RETURNS` of `LOW_CLASSES`."""
+
+LOW_THINGS = 'low_things'
+CELLS = {'road_cells': (40, 44), 'ground_cells': (40, 44, 48, 49, 60)}
+"""Classes of SemanticKITTI whose cells are counted."""
+SHARES = {
+    LOW_THINGS: 'returns on low things called ground',
+    'road_cells': 'cells of road called obstacle',
+    'ground_cells': 'cells of ground called obstacle',
+}
+"""Shares that are counted, in words."""
+CUT_HEIGHT = 0.45
+"""Height above the ground at which labelled objects are cut [m]."""
+LOW_OVER, LOW_RANGE, LOW_N_GROUND = 0.15, 25.0, 5
+"""A return on a cut object counts if it is more than so high above the ground [m], and nearer
+than this [m]; number of the nearest returns of ground whose median is that ground."""
+FALSE_SIZE, FALSE_RANGE, FALSE_OVER = 0.1, 20.0, 0.15
+"""Size of the cells of ground [m], range within which they count [m], and height over the surface
+[m] from which on an obstacle in them makes them false."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +115,8 @@ def count_objects(
     x, y, z = points[:, :3].astype(np.float64).T
     reach = np.hypot(x, y)
     on, n_classes = (objects.class_of >= 0) & np.isfinite(reach + z), len(CLASSES)
-    counts, lacks = on & (z - objects.ground_z >= MIN_HEIGHT), on & np.isnan(objects.ground_z)
+    least = np.where(_is_low(objects.class_of), LOW_MIN_HEIGHT, MIN_HEIGHT)
+    counts, lacks = on & (z - objects.ground_z >= least), on & np.isnan(objects.ground_z)
     unknown = _by_class_and_band(objects.class_of[lacks], reach[lacks], lacks[lacks], n_classes)
     kind, reach, is_ground = objects.class_of[counts], reach[counts], label[counts] == Label.GROUND
     returns = _by_class_and_band(kind, reach, is_ground, n_classes)
@@ -101,7 +129,7 @@ def count_objects(
     number = number.reshape(-1)
     n_ground = np.bincount(number, is_ground[known], minlength=len(n_returns))
     middle = _medians(reach[known], number, len(n_returns))
-    enough = n_returns >= MIN_RETURNS
+    enough = n_returns >= np.where(_is_low(of_object[:, 0]), LOW_MIN_RETURNS, MIN_RETURNS)
     lost = 2 * n_ground[enough] > n_returns[enough]
     found = _by_class_and_band(of_object[enough, 0], middle[enough], lost, n_classes)
     bands = np.concatenate([returns, found, unknown[:, :, :1]], axis=2)
@@ -110,6 +138,11 @@ def count_objects(
         for name, found in zip(CLASSES, bands, strict=True)
         if found.any()
     }
+
+
+def _is_low(class_of: npt.NDArray[np.integer]) -> BoolArray:
+    """Whether objects are of `LOW_CLASSES`, the last of all."""
+    return class_of >= len(CLASSES) - len(LOW_CLASSES)
 
 
 def _by_class_and_band(
@@ -176,3 +209,89 @@ def labelled_objects(
         class_of[np.isin(entries & 0xFFFF, numbers)] = k
     object_id = np.where(entries >> 16 > 0, entries, 0).astype(np.int64)
     return Objects(class_of, object_id, local_ground(points, is_ground, class_of >= 0))
+
+
+@dataclass(frozen=True)
+class Share(Sums):
+    """Returns or cells, and how many of them have the wrong label; over nothing NaN."""
+
+    n: int = 0
+    n_wrong: int = 0
+
+    @property
+    def ratio(self) -> float:
+        """Share that is wrong."""
+        return ratio(self.n_wrong, self.n)
+
+
+Shares = dict[str, Share]
+"""By `SHARES`, those that are known."""
+
+
+def pool_shares(shares: Sequence[Mapping[str, Share]]) -> Shares:
+    """Sum up the shares of several scans."""
+    names = [name for name in SHARES if any(name in own for own in shares)]
+    return {name: sum((own.get(name, Share()) for own in shares), Share()) for name in names}
+
+
+@dataclass(frozen=True)
+class CutScan:
+    """A scan of N points without what is high of its objects.
+
+    Attributes
+    ----------
+    is_kept : (N,) whether a return is left
+    is_low : (N,) whether it counts as one on a low thing
+    """
+
+    is_kept: BoolArray
+    is_low: BoolArray
+
+    def count(self, label: Labels) -> Share:
+        """Count low returns called ground; `label` is of those left, in their order."""
+        is_low = self.is_low[self.is_kept]
+        return Share(int(is_low.sum()), int((label[is_low] == Label.GROUND).sum()))
+
+
+def cut_objects(
+    points: npt.NDArray[np.floating], is_object: BoolArray, is_ground: BoolArray, height: float
+) -> CutScan:
+    """Cut objects at a `height` above the ground [m]; what is left is as low as a parcel.
+
+    `points` (N, >=3) are x, y, z [m], `is_object` and `is_ground` (N,) what the labels say. Rays
+    that met the upper part have no return.
+    """
+    xyz = points[:, :3].astype(np.float64)
+    finite = np.isfinite(xyz).all(axis=1)
+    ground, on = xyz[finite & is_ground], finite & is_object
+    over = np.full(len(xyz), np.nan)
+    if len(ground) >= LOW_N_GROUND and on.any():
+        _, nearest = KDTree(ground[:, :2]).query(xyz[on, :2], k=LOW_N_GROUND)
+        over[on] = xyz[on, 2] - np.median(ground[nearest, 2], axis=1)
+    is_near = np.hypot(xyz[:, 0], xyz[:, 1]) < LOW_RANGE
+    is_kept = ~(over > height)
+    return CutScan(is_kept, is_kept & (over > LOW_OVER) & is_near)
+
+
+def count_false_cells(
+    points: npt.NDArray[np.floating],
+    label: Labels,
+    height: npt.NDArray[np.floating],
+    semantic: npt.NDArray[np.integer],
+) -> Shares:
+    """Count cells of labelled ground, and those that a costmap takes for an obstacle.
+
+    A cell is false where one of its returns of ground (`semantic`, (N,)) is called obstacle
+    (`label`, (N,)) and is `FALSE_OVER` or more above the surface: `height` (N,) [m]. `points`
+    (N, >=2) are x, y [m].
+    """
+    near = np.hypot(points[:, 0], points[:, 1]) < FALSE_RANGE
+    x, y = np.floor(points[near, :2] / FALSE_SIZE).T
+    cell = x + 1j * y
+    is_false = (label[near] == Label.OBSTACLE) & (height[near] >= FALSE_OVER)
+    found = {}
+    for name, numbers in CELLS.items():
+        own = np.isin(semantic[near], numbers)
+        n_cells, n_false = (len(np.unique(cell[part])) for part in (own, own & is_false))
+        found[name] = Share(n_cells, n_false)
+    return found

@@ -24,19 +24,43 @@ from gp_ground_seg.lab.scoring.comparison import (
 )
 from gp_ground_seg.lab.scoring.evaluate import ALL, MethodScore
 from gp_ground_seg.lab.scoring.metrics import Confusion
-from gp_ground_seg.lab.scoring.objects import BAND_TITLES, MIN_HEIGHT, MIN_RETURNS, ObjectCount
+from gp_ground_seg.lab.scoring.objects import (
+    BAND_TITLES,
+    CUT_HEIGHT,
+    FALSE_OVER,
+    FALSE_RANGE,
+    FALSE_SIZE,
+    LOW_OVER,
+    LOW_RANGE,
+    LOW_THINGS,
+    MIN_HEIGHT,
+    MIN_RETURNS,
+    ObjectCount,
+    Share,
+)
 from gp_ground_seg.lab.scoring.report import Column, Report, Row, Table, percent
 
 COUNTS_AS = {Label.GROUND: 'ground', Label.OBSTACLE: 'obstacle', Label.UNKNOWN: 'left out'}
 RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
+SHARE_TITLES = {
+    LOW_THINGS: ('low returns', percent('as ground')),
+    'road_cells': ('road cells', percent('false', form='.3f')),
+    'ground_cells': ('ground cells', percent('false', form='.3f')),
+}
+"""Columns of `scoring.objects.SHARES`: of what is counted, and of what of it is wrong."""
 
 
 def evaluation(
-    scores: Sequence[MethodScore], config: Config, n_worst: int = 0, n_workers: int = 0
+    scores: Sequence[MethodScore],
+    config: Config,
+    n_worst: int = 0,
+    n_workers: int = 0,
+    cut: float = CUT_HEIGHT,
 ) -> Report:
     """Report of our method with `config`, and of at most one other method on the same scans.
 
-    Scans without labels have tables of time and of differing labels only.
+    Scans without labels have tables of time and of differing labels only. `cut` is the height at
+    which objects were cut [m].
     """
     ours, *others = scores
     tables: dict[str, Table] = {}
@@ -52,6 +76,7 @@ def evaluation(
         tables['rings'] = _ring_table(scores)
         tables['classes'] = _class_table(ours)
         tables['objects'] = object_table(scores)
+        tables['low_things'] = _share_table(scores, cut)
         tables['probabilities'] = _calibration_table(ours)
         tables['heights'] = _height_table(scores)
         if n_worst:
@@ -96,6 +121,7 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
         if scan.classes:
             main = metrics.class_errors(scan.classes)[0]
             row['main_error_class'] = metrics.class_name(main.number) if main.errors else ''
+        row |= {name: dataclasses.asdict(share) for name, share in scan.shares.items()}
         if scan.objects:
             row['objects'] = {
                 name: dict(zip(BAND_TITLES, map(dataclasses.asdict, bands), strict=True))
@@ -272,6 +298,33 @@ def _object_sums(name: str, k: int, score: MethodScore) -> tuple[float, float]:
     bands = score.objects.get(name, ())
     found = sum(bands if k == len(BAND_TITLES) else bands[k : k + 1], ObjectCount())
     return found.n_ground, found.n_returns
+
+
+def _share_table(scores: Sequence[MethodScore], cut: float) -> Table:
+    """Low things and false cells by sequence and pooled, with the columns that ours has."""
+    rows: list[Row] = []
+    for parts in zip(*(score.by_sequence() for score in scores), strict=True):
+        row: Row = [(Column('sequence'), parts[0][0])]
+        for name, (title, column) in SHARE_TITLES.items():
+            if name in scores[0].shares:
+                ours, *others = (score.shares.get(name, Share()) for _, score in parts)
+                row.append((Column(title, '_d', name), ours.n))
+                row.append((dataclasses.replace(column, key=f'{name}_wrong'), ours.ratio))
+                for peer, found in zip(scores[1:], others, strict=True):
+                    key = f'{peer.name}_{name}_wrong'
+                    row.append((dataclasses.replace(column, title='peer', key=key), found.ratio))
+        rows.append(row)
+    low = (
+        f'low: returns left of objects that are cut at {cut:g} m, more than {LOW_OVER:g} m over '
+        f'the ground and within {LOW_RANGE:g} m, and the share called ground; '
+    )
+    title = (
+        f'Low things and false cells  [%]; {low if cut else ""}cells of {FALSE_SIZE:g} m within '
+        f'{FALSE_RANGE:g} m that hold labelled road or ground, false: a return of it is called '
+        f'obstacle and is {FALSE_OVER:g} m or more over the surface'
+    )
+    title += f'; peer: {scores[1].title}' if len(scores) > 1 else ''
+    return Table(rows, title, n_sums=1)
 
 
 def _calibration_table(score: MethodScore) -> Table:

@@ -165,6 +165,19 @@ def number_objects(solids: Iterable[Solid]) -> npt.NDArray[np.int32]:
     return np.array(found, dtype=np.int32)
 
 
+def object_heights(terrain: Terrain, solids: Sequence[Solid]) -> FloatArray:
+    """Height of each object above the ground below it, (n + 1,) [m].
+
+    Indexed by the numbers of `number_objects`; NaN at 0, which is no object.
+    """
+    numbers = number_objects(solids)
+    heights = np.full(numbers.max(initial=0) + 1, -np.inf)
+    above = [solid.top - float(terrain.height(solid.x, solid.y)) for solid in solids]
+    np.maximum.at(heights, numbers, above)
+    heights[0] = np.nan
+    return heights
+
+
 def parts_of(x: float, y: float, solids: Iterable[Solid]) -> tuple[Solid, ...]:
     """Return the solids as parts of the one object at x, y."""
     return tuple(replace(solid, part_of=(x, y)) for solid in solids)

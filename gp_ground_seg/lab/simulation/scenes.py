@@ -12,6 +12,7 @@ import numpy as np
 
 import gp_ground_seg.lab.simulation.objects as objects
 import gp_ground_seg.lab.simulation.traffic as traffic
+from gp_ground_seg.lab.scoring.objects import LOW_HEIGHTS
 from gp_ground_seg.lab.simulation.objects import Kind, Solid
 from gp_ground_seg.lab.simulation.terrain import Profile, Terrain, Waves
 
@@ -21,6 +22,8 @@ N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
 CARS = ('saloon', 'hatchback', 'suv')
 MIXED = (*CARS, *CARS, 'van', 'van', 'truck')
 """Models of vehicles, among which the parked and the waiting ones are drawn."""
+LOW_DISTANCE, LOW_GAP = (3.0, 20.0), 0.03
+"""Distance of the nearest corner of a low thing [m], and angle between neighbours [rad]."""
 URBAN_X = (-80.0, 160.0)  # where the street of the urban scene begins and ends [m]
 
 
@@ -381,11 +384,64 @@ def _hedge(seed: int) -> Scene:
     return Scene('hedge', terrain, tuple(solids))
 
 
+def _low_box(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
+    """Box, half of them 0.44 m wide, the others up to 2 m by 2 m."""
+    length, width = rng.uniform(0.8, 2.0, 2) if rng.random() < 0.5 else (0.44, 0.44)
+    return Kind.BOX, (length, width, float(rng.choice(LOW_HEIGHTS)))
+
+
+def _low_wall(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
+    """Wall of 12 m, 0.25 to 0.4 m high."""
+    return Kind.WALL, (12.0, objects.WALL_THICKNESS, rng.uniform(0.25, 0.4))
+
+
+def _lying_person(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
+    """Person who lies on the ground."""
+    return Kind.PERSON, (1.7, 0.45, 0.22)
+
+
+_LOW_THINGS: dict[str, tuple[Callable[[np.random.Generator], tuple[Kind, objects.Size]], str]] = {
+    'low_boxes': (_low_box, 'flat'),
+    'low_boxes_rough': (_low_box, 'rough'),
+    'low_walls': (_low_wall, 'flat'),
+    'lying_persons': (_lying_person, 'flat'),
+}
+
+
+def _low_scene(name: str, seed: int) -> Scene:
+    """Low things all around the sensor, each an object in plain view.
+
+    A wall is across its direction, all else is turned at random.
+    """
+    rng = np.random.default_rng(seed)
+    make, ground = _LOW_THINGS[name]
+    terrain = _OPEN_COUNTRY[ground](rng)
+    solids: list[Solid] = []
+    start = bearing = rng.uniform(-math.pi, math.pi)
+    while True:
+        kind, (length, width, height) = make(rng)
+        turned = rng.uniform(-1.0, 1.0) * (0.3 if kind == Kind.WALL else 0.5 * math.pi)
+        cos, sin, near = math.cos(turned), abs(math.sin(turned)), rng.uniform(*LOW_DISTANCE)
+        half = math.atan2(0.5 * (length * cos + width * sin), near)
+        if bearing + 2.0 * half + LOW_GAP > start + 2.0 * math.pi:
+            return Scene(name, terrain, tuple(solids))
+        middle, away = bearing + half, near + 0.5 * (length * sin + width * cos)
+        x, y, yaw = away * math.cos(middle), away * math.sin(middle), middle + 0.5 * math.pi
+        size = length, width, height
+        box = objects.standing_box(terrain, x, y, size, yaw + turned, kind)
+        solids += objects.parts_of(x, y, [box])
+        bearing += 2.0 * half + LOW_GAP
+
+
 DRIVES: dict[str, Callable[[int], Scene]] = {
     **{name: functools.partial(_open_scene, name) for name in _OPEN_COUNTRY},
     'urban': _urban,
 }
 """Builders of the scenes whose lane along x is free: seed -> scene."""
+LOW: dict[str, Callable[[int], Scene]] = {
+    name: functools.partial(_low_scene, name) for name in _LOW_THINGS
+}
+"""Builders of the scenes of low things, around a sensor at the origin."""
 PLACES: dict[str, Callable[[int], Scene]] = {
     'traffic_jam': _traffic_jam,
     'car_park': _car_park,
@@ -394,6 +450,7 @@ PLACES: dict[str, Callable[[int], Scene]] = {
     'wet_road': _wet_road,
     'blind_slope': _blind_slope,
     'hedge': _hedge,
+    **LOW,
 }
 """Builders of the scenes around a sensor at the origin."""
 SCENES = {**DRIVES, **PLACES}
