@@ -254,11 +254,12 @@ def test_a_segment_without_a_model_gets_its_neighbours(backend):
 
 
 def test_what_stands_over_the_ground_beside_it_starts_nothing(backend):
-    # 0.29 m over the plane is low enough for a seed: by itself the segment would grow on it.
-    _, surface, on_car = ring_of_ground(backend, 0.29, look_aside=True)
-    assert on_car.sum() == 32 and not surface.inlier[on_car].any()
+    # 0.4 m over the plane is low enough for a seed: by itself the segment would grow on it. Three
+    # of the 32 are in a tile that reaches down to the road: a face, whose lowest is no candidate.
+    _, surface, on_car = ring_of_ground(backend, 0.4, look_aside=True)
+    assert on_car.sum() == 29 and not surface.inlier[on_car].any()
     assert surface.inlier[~on_car].all()
-    _, alone, _ = ring_of_ground(backend, 0.29)
+    _, alone, _ = ring_of_ground(backend, 0.4)
     assert alone.inlier.all()
 
 
