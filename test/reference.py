@@ -203,7 +203,7 @@ def continues_line(candidates, lines, config):
 def label_points(scan, faces, surface, config):
     """Label each point by its height over the surface, against the band of its tile."""
     grid, label, n_points = scan.grid, config.label, len(scan.xyz)
-    height, margin, roughness = np.full((3, n_points), np.nan)
+    height, margin = np.full((2, n_points), np.nan)
     result = np.full(n_points, Label.OBSTACLE, np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
     is_face, is_occluded = (mask[scan.tiles.tile] & grid.inside for mask in faces)
@@ -214,10 +214,10 @@ def label_points(scan, faces, surface, config):
     near = grid.inside & (height < 0.5) & (height >= -0.5)
     rough = ground_roughness(scan.tiles, height, near & ~is_face)
     for i in np.flatnonzero(grid.inside):
-        roughness[i] = rough.get(scan.tiles.tile[i], 0.0)
+        roughness = rough.get(scan.tiles.tile[i], 0.0)
         band, depth = label.ground_tolerance, label.ground_tolerance
         if label.rule == 'roughness':
-            band, depth = max(min(2.25 * roughness[i], 0.5), band), label.obstacle_max_height
+            band, depth = max(min(2.25 * roughness, 0.5), band), label.obstacle_max_height
         margin[i] = min(band - height[i], height[i] + depth)
         if is_face[i]:
             limit = 0.5 * label.ground_tolerance * (-1.0 if is_occluded[i] else 1.0)
@@ -226,7 +226,7 @@ def label_points(scan, faces, surface, config):
     if label.rule == 'roughness':
         margin = settle(scan, surface, margin, near, label)
     result[margin >= 0.0] = Label.GROUND
-    return Labelled(result, height, margin, roughness)
+    return Labelled(result, height, margin)
 
 
 def ground_roughness(tiles, height, counted):

@@ -52,13 +52,13 @@ def test_a_return_from_far_above_is_no_overflow(backend):
     assert (result.label == Label.GROUND).mean() > 0.5
 
 
-def test_many_points_in_one_spot_have_a_roughness(backend):
+def test_many_points_in_one_spot_are_counted(backend):
+    # Sums of squares of a quarter of a million returns, 0.4 m from the surface, fit.
     spot = np.tile([10.0, 0.0, -1.73], (260_000, 1))
     spot[::2, 2] += 0.4
-    config = Config().replace(**{'label.rule': 'tolerance', 'faces.max_normal_z': 0.0})
+    config = Config().replace(**{'faces.max_normal_z': 0.0})
     result = GroundSegmenter(config, backend=backend).segment(np.vstack([ring_scan(), spot]))
-    assert np.isfinite(result.roughness[result.grid.inside]).all()
-    assert result.roughness[-1] == result.roughness[-2]
+    assert set(result.label[-2:]) == {Label.GROUND, Label.OBSTACLE}
 
 
 def test_masked_arrays_are_refused():

@@ -295,5 +295,3 @@ class Labelled(NamedTuple):
     # (N,) distance of each point to the nearer edge of the band that is ground [m], negative for
     # obstacles; NaN where there is no surface
     margin: FloatArray
-    # (N,) roughness of the ground about each point [m]; NaN outside the grid
-    roughness: FloatArray

@@ -147,8 +147,8 @@ class Segmentation:
     Attributes
     ----------
     labelled : Labelled
-        Labels and what they follow from, heights over `surface` among it; `label`, `margin`
-        and `roughness` are taken from it.
+        Labels and what they follow from, heights over `surface` among it; `label` and
+        `margin` are taken from it.
     timings : dict of str to float
         Seconds per stage, and ``total``.
     fitting : Fitting
@@ -215,14 +215,6 @@ class Segmentation:
         Not negative for ground; NaN where there is no model.
         """
         return self.labelled.margin
-
-    @property
-    def roughness(self) -> FloatArray:
-        """Roughness of the ground about each point, (N,) float64 [m]; NaN outside the grid.
-
-        See `gp_ground_seg.core.pipeline.roughness.ground_roughness`.
-        """
-        return self.labelled.roughness
 
     # What follows is computed when it is first asked for: not every user asks.
 

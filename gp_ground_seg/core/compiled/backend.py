@@ -45,6 +45,7 @@ from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, sum_u
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
+from gp_ground_seg.core.pipeline.roughness import N_LEVELS
 from gp_ground_seg.core.pipeline.tilt import Direction
 
 
@@ -184,18 +185,19 @@ class NumbaBackend:
     def label_points(
         self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
     ) -> Labelled:
-        """Height, label and margin of each point, and the roughness of the ground about it."""
+        """Height, label and margin of each point."""
         take, label = self._buffers.take, numbers_of(config.label)
         n_points, n_tiles = len(scan.xyz), len(faces.is_face)
         by_roughness, units = config.label.rule == 'roughness', sum_units(n_points)
         pieces = take('pieces', (scan.grid.n_segments * scan.grid.n_bins + 1, 2), np.float64)
         sums = take('height_sums', (n_tiles + 1, 2), np.int64)
-        buffers = roughness_.RoughnessBuffers(sums, *take('levels', (4, n_tiles), np.int32))
+        blocks = take('block_rows', (n_tiles,), np.int32)
+        counts = take('counts', (N_LEVELS * (len(scan.tiles.occupied) + 1),), np.int32)
         roughness = take('roughness', (n_tiles + 1,), np.float64)
-        result = Labelled(np.empty(n_points, np.uint8), *np.empty((3, n_points)))
+        result = Labelled(np.empty(n_points, np.uint8), np.empty(n_points), np.empty(n_points))
         labels.fit_pieces(surface, pieces)
         labels.survey(scan, faces.is_face, pieces, units, result.height, sums)
-        roughness_.set_roughness(scan.tiles, units, buffers, roughness)
+        roughness_.set_roughness(scan.tiles, sums, units, blocks, counts, roughness)
         depth, has_obstacle = depth_of_ground(config.label), take('has_obstacle', (n_tiles,), bool)
         has_obstacle.fill(False)
         labels.label_by_bands(

@@ -1,8 +1,8 @@
 """Compiled twin of `gp_ground_seg.core.pipeline.labels`, in four calls.
 
 `fit_pieces` prepares the surface of each cell, `survey` measures the heights of the points over
-it, `gp_ground_seg.core.compiled.roughness` the roughness of the ground, `label_by_bands` labels
-the points, and `settle` changes labels near obstacles by votes.
+it, `label_by_bands` labels the points by the roughness of the ground (see
+`gp_ground_seg.core.compiled.roughness`), and `settle` changes labels near obstacles by votes.
 """
 
 from __future__ import annotations
@@ -73,8 +73,7 @@ def survey(
 ) -> None:
     """Heights of the points over the surface, and the sums for the roughness of tiles.
 
-    For `pieces` see `fit_pieces`, for `sums`
-    `gp_ground_seg.core.compiled.roughness.RoughnessBuffers`.
+    For `pieces` see `fit_pieces`, for `sums` `gp_ground_seg.core.compiled.roughness`.
     """
     nearest, outside = scan.grid.edges[0], len(sums) - 1
     for occupied in scan.tiles.occupied:
@@ -125,15 +124,13 @@ def label_by_bands(
 
     Ground reaches `depth` below the surface. `has_obstacle` (T,) becomes true where a return near
     the surface is no ground. `roughness` (T + 1,) is that of the ground in each tile [m]; the last
-    one is for points in no tile.
+    one, for points in no tile, is NaN.
     """
     z, tile, cell = scan.xyz.T[2], scan.tiles.tile, scan.grid.cell
     height, label, margins = result.height, result.label, result.margin
-    roughness[len(roughness) - 1] = math.nan
     for i in range(len(cell)):
         n, h = cell[i], height[i]
         t = np.uintp(tile[i] if n >= 0 else len(roughness) - 1)
-        result.roughness[i] = roughness[t]
         band = ground_band(roughness[t], config) if by_roughness else config.ground_tolerance
         margin = band_margin(h, band, depth)
         if n >= 0 and faces.is_face[t]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,100 +14,97 @@ from gp_ground_seg.core.pipeline.roughness import (
     NEAR,
     ROUGHNESS,
     SQUARE_EDGES,
-    UNKNOWN_LEVEL,
     WIDE,
     Window,
 )
 
 
-class RoughnessBuffers(NamedTuple):
-    """Working arrays of `set_roughness`.
-
-    Attributes
-    ----------
-    sums : (T + 1, 2) int64
-        For each occupied tile the number of returns near the surface and the sum of their squared
-        heights in whole units; the last row is for points in no tile.
-    level : (T,) int32
-        Level of roughness of each occupied tile, or `UNKNOWN_LEVEL`.
-    near, wide : (T,) int32
-        Level about each occupied tile of known level in the two windows.
-    block_to_row : (T,) int32
-        Row of each block of tiles in the table of counts, 0 for those without a known level.
-    """
-
-    sums: IntArray
-    level: CellArray
-    near: CellArray
-    wide: CellArray
-    block_to_row: CellArray
-
-
 @jit(entry=True)
 def set_roughness(
-    tiles: Tiles, units: float, buffers: RoughnessBuffers, roughness: FloatArray
+    tiles: Tiles,
+    sums: IntArray,
+    units: float,
+    block_to_row: CellArray,
+    counts: CellArray,
+    roughness: FloatArray,
 ) -> None:
-    """Roughness of the ground in each occupied tile, into `roughness` (T + 1,) [m]."""
-    level, near, wide = buffers.level, buffers.near, buffers.wide
-    of_frame = _set_levels(tiles, units, buffers.sums, level)
-    _set_levels_about(tiles, NEAR, of_frame, level, buffers.block_to_row, near)
-    _set_levels_about(tiles, WIDE, of_frame, level, buffers.block_to_row, wide)
+    """Roughness of the ground in each occupied tile, into `roughness` (T + 1,) [m].
+
+    Parameters
+    ----------
+    tiles : Tiles
+        Tiles of the points.
+    sums : (T + 1, 2) int64
+        For each occupied tile the number of returns near the surface and the sum of their squared
+        heights; the last row is for points in no tile.
+    units : float
+        Whole units of squared heights for 1 m^2.
+    block_to_row, counts : (T,) int32, (levels * (K + 1),) int32
+        Working arrays with arbitrary content; K tiles are occupied.
+    roughness : (T + 1,) float64
+        Of the occupied tiles the roughness, 0 where no return is near the surface; the last one,
+        for points in no tile, is NaN.
+    """
+    # Of the occupied tiles in their order: those of all tiles would lie far apart in memory.
+    known, level, of_frame = _known_levels(tiles, sums, units)
+    n_sides = int(math.sqrt(len(roughness) - 1))
+    near = _levels_about(known, level, n_sides, NEAR, of_frame, block_to_row, counts)
+    wide = _levels_about(known, level, n_sides, WIDE, of_frame, block_to_row, counts)
     for tile in tiles.occupied:
-        t = np.uintp(tile)
-        roughness[t] = 0.0
-        if level[t] != UNKNOWN_LEVEL:
-            most = MOST_OVER_WIDE * ROUGHNESS[np.uintp(wide[t])]
-            roughness[t] = min(ROUGHNESS[np.uintp(near[t])], most)
+        roughness[np.uintp(tile)] = 0.0
+    for k in range(len(known)):
+        most = MOST_OVER_WIDE * ROUGHNESS[np.uintp(wide[k])]
+        roughness[np.uintp(known[k])] = min(ROUGHNESS[np.uintp(near[k])], most)
+    roughness[len(roughness) - 1] = math.nan
 
 
 @jit()
-def _set_levels(tiles: Tiles, units: float, sums: IntArray, level: CellArray) -> int:
-    """Set the level of each occupied tile, and return the median of those that are known."""
-    counts = np.zeros(N_LEVELS, np.int32)
+def _known_levels(tiles: Tiles, sums: IntArray, units: float) -> tuple[CellArray, CellArray, int]:
+    """Tiles with a return near the surface, the level of each (K,), and the median of these."""
+    counts, n_known = np.zeros(N_LEVELS, np.int32), 0
+    known, level = np.empty((2, len(tiles.occupied)), np.int32)
     for tile in tiles.occupied:
-        t = np.uintp(tile)
-        level[t] = UNKNOWN_LEVEL
-        if sums[t, 0] > 0:
-            square = np.float64(sums[t, 1]) / (units * np.float64(sums[t, 0]))
+        number = sums[np.uintp(tile), 0]
+        if number > 0:
+            square = np.float64(sums[np.uintp(tile), 1]) / (units * np.float64(number))
             found = 0
             for k in range(len(SQUARE_EDGES)):
                 found += np.int64(square >= SQUARE_EDGES[k])
-            level[t] = found
+            known[n_known], level[n_known] = tile, found
             counts[found] += 1
-    return _level_at(counts, 0.5)
+            n_known += 1
+    return known[:n_known], level[:n_known], _level_at(counts, 0.5)
 
 
 @jit()
-def _set_levels_about(
-    tiles: Tiles,
+def _levels_about(
+    tile: CellArray,
+    level: CellArray,
+    n_sides: int,
     window: Window,
     of_frame: int,
-    level: CellArray,
     block_to_row: CellArray,
-    result: CellArray,
-) -> None:
-    """Level in the window about each tile of known level, into `result` (T,)."""
-    n_sides, shift = int(math.sqrt(len(level))), window.shift
+    counts: CellArray,
+) -> CellArray:
+    """Level in the window about each of the tiles (K,) of known `level`, (K,)."""
+    shift, n_rows = window.shift, 1
     # Blocks in a square with one more at each side, so that each has eight around it.
-    width, n_rows = (n_sides - 1 >> shift) + 3, 1
+    width = (n_sides - 1 >> shift) + 3
     block_to_row[: width * width] = 0
-    row_to_block = np.empty(len(tiles.occupied) + 1, np.int64)
-    for tile in tiles.occupied:
-        if level[np.uintp(tile)] != UNKNOWN_LEVEL:
-            column = tile // n_sides
-            row = tile - column * n_sides
-            block = np.uintp(((column >> shift) + 1) * width + (row >> shift) + 1)
-            if block_to_row[block] == 0:
-                block_to_row[block], row_to_block[n_rows] = n_rows, block
-                n_rows += 1
-            result[np.uintp(tile)] = block_to_row[block]
-    # Row 0 stays empty: blocks without such a tile. One dimension, as views of rows take longer
-    # than the sums.
-    counts = np.zeros(n_rows * N_LEVELS, np.int32)
-    for tile in tiles.occupied:
-        t = np.uintp(tile)
-        if level[t] != UNKNOWN_LEVEL:
-            counts[np.uintp(result[t] * N_LEVELS + level[t])] += 1
+    own, row_to_block = np.empty((2, len(tile) + 1), np.int32)
+    for k in range(len(tile)):
+        column = tile[k] // n_sides
+        row = tile[k] - column * n_sides
+        block = np.uintp(((column >> shift) + 1) * width + (row >> shift) + 1)
+        if block_to_row[block] == 0:
+            block_to_row[block], row_to_block[n_rows] = n_rows, block
+            n_rows += 1
+        own[k] = block_to_row[block]
+    # Row 0 is that of blocks without such a tile. One dimension, as views of rows take longer than
+    # the sums.
+    counts[: n_rows * N_LEVELS] = 0
+    for k in range(len(tile)):
+        counts[np.uintp(own[k] * N_LEVELS + level[k])] += 1
     about, level_of_row = np.empty(N_LEVELS, np.int32), np.empty(n_rows, np.int32)
     for n in range(1, n_rows):
         about[:] = 0
@@ -116,13 +112,13 @@ def _set_levels_about(
         for step in range(-width, width + 1, width):
             for beside in range(row_to_block[n] + step - 1, row_to_block[n] + step + 2):
                 first = block_to_row[np.uintp(beside)] * N_LEVELS
-                for k in range(N_LEVELS):
-                    about[k] += counts[np.uintp(first + k)]
+                if first > 0:
+                    for j in range(N_LEVELS):
+                        about[j] += counts[np.uintp(first + j)]
         level_of_row[n] = _level_at(about, window.share)
-    for tile in tiles.occupied:
-        t = np.uintp(tile)
-        if level[t] != UNKNOWN_LEVEL:
-            result[t] = level_of_row[np.uintp(result[t])]
+    for k in range(len(tile)):
+        own[k] = level_of_row[np.uintp(own[k])]
+    return own
 
 
 @jit()

@@ -82,7 +82,7 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
         margin[voters] = settled_margin(margin[voters], means)
     result = np.where(margin >= 0.0, Label.GROUND, Label.OBSTACLE).astype(np.uint8)
     result[grid.cell == NOT_FINITE] = Label.UNKNOWN
-    return Labelled(result, height, margin, np.where(grid.inside, roughness[tile], np.nan))
+    return Labelled(result, height, margin)
 
 
 def depth_of_ground(label: LabelConfig) -> float:

@@ -22,8 +22,6 @@ SQUARE_EDGES = EDGES * EDGES
 ROUGHNESS = np.concatenate([[0.01], EDGES * math.sqrt(1.14)])
 """Roughness of each level: the geometric mean of its edges [m]."""
 N_LEVELS = len(ROUGHNESS)
-UNKNOWN_LEVEL = -1
-"""Level of a tile without a return near the surface."""
 
 
 class Window(NamedTuple):
