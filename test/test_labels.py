@@ -90,8 +90,6 @@ def test_a_thing_on_the_ground_is_no_roughness(backend, std, size):
     found = labels_of(backend, points)
     assert (found.label[is_box] == Label.OBSTACLE).all()
     assert (found.label[~is_box] == Label.GROUND).mean() > 0.98
-    # Votes change no margin above the tolerance: the band about the box is as that of the ground.
-    assert np.median((found.margin + found.height)[is_box]) < 0.15
 
 
 def test_ground_as_rough_as_that_everywhere_is_ground(backend):
