@@ -217,7 +217,7 @@ def label_points(scan, faces, surface, config):
         roughness = rough.get(scan.tiles.tile[i], 0.0)
         band, depth = label.ground_tolerance, label.ground_tolerance
         if label.rule == 'roughness':
-            band, depth = max(min(2.25 * roughness, 0.5), band), label.obstacle_max_height
+            band, depth = max(min(2.1 * roughness, 0.5), band), label.obstacle_max_height
         margin[i] = min(band - height[i], height[i] + depth)
         if is_face[i]:
             limit = 0.5 * label.ground_tolerance * (-1.0 if is_occluded[i] else 1.0)
@@ -258,7 +258,7 @@ def ground_roughness(tiles, height, counted):
         ranked = sorted([*beside, *[median] * prior])
         return value[ranked[int(share * (len(ranked) - 1))]]
 
-    return {tile: min(about(tile, 2, 0.75, 4), 3.2 * about(tile, 4, 0.5, 16)) for tile in level}
+    return {tile: min(about(tile, 2, 0.8, 4), 3.4 * about(tile, 4, 0.5, 16)) for tile in level}
 
 
 def settle(scan, surface, margin, near, label):

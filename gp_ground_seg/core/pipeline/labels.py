@@ -31,10 +31,10 @@ FINEST_UNITS = 2.0**40
 HIGHEST_GROUND = 0.5
 """Height over the surface from which no return is ground, however rough the ground is [m]; returns
 below it tell how rough it is."""
-ROUGHNESS_IN_BAND = 2.25
+ROUGHNESS_IN_BAND = 2.1
 """Height over the surface up to which a return is ground, in roughnesses of the ground about it:
 of returns spread evenly over the height of grass all are within 1.7, of those normally distributed
-98 in 100 are within 2.25."""
+98 in 100 are within 2.1."""
 RETURN_NOISE = 0.02
 """Standard deviation of the height of a single return by the noise of the sensor [m]."""
 FACE_SHARE = 0.5

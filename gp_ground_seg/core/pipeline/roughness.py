@@ -32,9 +32,9 @@ class Window(NamedTuple):
     prior: int  # tiles as rough as the median of the frame that count beside those seen
 
 
-NEAR, WIDE = Window(1, 0.75, 4), Window(2, 0.5, 16)
+NEAR, WIDE = Window(1, 0.8, 4), Window(2, 0.5, 16)
 """Windows of 3 m and of 6 m, for tiles of 0.5 m."""
-MOST_OVER_WIDE = 3.2
+MOST_OVER_WIDE = 3.4
 """Largest roughness of a tile over that of the wide window."""
 
 
