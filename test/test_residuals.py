@@ -24,7 +24,7 @@ def correct(cells, residuals, surface, noise=0.02, slope_std=0.05, find=correct_
     cells, residuals = np.asarray(cells, np.int32), np.asarray(residuals, float)
     label = np.full(len(cells), Label.GROUND, np.uint8)
     grid = PolarGrid(cells, np.ones(len(cells)), KNOTS, N_SEGMENTS)
-    labelled = Labelled(label, residuals, residuals, np.zeros((N_SEGMENTS, len(KNOTS) - 1)))
+    labelled = Labelled(label, residuals, residuals)
     return find(surface, labelled, grid, np.full((N_SEGMENTS, 1), noise), slope_std)
 
 
