@@ -61,6 +61,21 @@ def test_many_points_in_one_spot_are_counted(backend):
     assert set(result.label[-2:]) == {Label.GROUND, Label.OBSTACLE}
 
 
+@pytest.mark.parametrize('cell_size', [10.0, 2.0, 1.0])
+def test_few_tiles_are_no_access_beyond_the_tables(cell_size):
+    # Plain Python checks the indices that compiled code does not.
+    script = (
+        'import numpy as np; from gp_ground_seg import Config, GroundSegmenter\n'
+        "values = {'grid.r_min': 0.2, 'grid.r_max': 1.5, 'grid.n_bins': 5, 'grid.n_segments': 8}\n"
+        f"values |= {{'faces.cell_size': {cell_size}, 'runtime.backend': 'numba'}}\n"
+        'xy = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 2))\n'
+        'points = np.column_stack([xy, np.full(200, -1.0)])\n'
+        'GroundSegmenter(Config().replace(**values)).segment(points)\n'
+    )
+    environment = {**os.environ, 'NUMBA_DISABLE_JIT': '1'}
+    subprocess.run([sys.executable, '-c', script], check=True, env=environment, timeout=120)
+
+
 def test_masked_arrays_are_refused():
     masked = np.ma.masked_greater(ring_scan(), 20.0)
     with pytest.raises(PointCloudError, match='masked array: pass'):

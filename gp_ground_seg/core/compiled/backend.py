@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 
 import numpy as np
@@ -191,7 +192,7 @@ class NumbaBackend:
         by_roughness, units = config.label.rule == 'roughness', sum_units(n_points)
         pieces = take('pieces', (scan.grid.n_segments * scan.grid.n_bins + 1, 2), np.float64)
         sums = take('height_sums', (n_tiles + 1, 2), np.int64)
-        blocks = take('block_rows', (n_tiles,), np.int32)
+        blocks = take('block_rows', ((math.isqrt(n_tiles) + 2) ** 2,), np.int32)
         counts = take('counts', (N_LEVELS * (len(scan.tiles.occupied) + 1),), np.int32)
         roughness = take('roughness', (n_tiles + 1,), np.float64)
         result = Labelled(np.empty(n_points, np.uint8), np.empty(n_points), np.empty(n_points))

@@ -39,7 +39,7 @@ def set_roughness(
         heights; the last row is for points in no tile.
     units : float
         Whole units of squared heights for 1 m^2.
-    block_to_row, counts : (T,) int32, (levels * (K + 1),) int32
+    block_to_row, counts : ((sqrt(T) + 2)^2,) int32, (levels * (K + 1),) int32
         Working arrays with arbitrary content; K tiles are occupied.
     roughness : (T + 1,) float64
         Of the occupied tiles the roughness, 0 where no return is near the surface; the last one,
