@@ -15,7 +15,8 @@ from gp_ground_seg.data import costmap
 from gp_ground_seg.data.costmap import DIRECTIONS, FREE, OCCUPIED, UNKNOWN, Placement
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan
 from gp_ground_seg.lab.simulation.objects import standing_box
-from gp_ground_seg.lab.simulation.scenes import Scene, flat
+from gp_ground_seg.lab.simulation.scenes import Scene
+from gp_ground_seg.lab.simulation.terrain import flat
 
 BAND = {'output.min_height': 0.2, 'output.max_height': 2.0}
 

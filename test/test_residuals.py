@@ -13,7 +13,8 @@ from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.frame import GroundSurface, Labelled, PolarGrid
 from gp_ground_seg.core.pipeline.residuals import correct_surface
 from gp_ground_seg.lab.simulation import DRIVES, SENSORS, VLP_16, objects, simulate_scan
-from gp_ground_seg.lab.simulation.scenes import Scene, ramp
+from gp_ground_seg.lab.simulation.scenes import Scene
+from gp_ground_seg.lab.simulation.terrain import ramp
 
 N_SEGMENTS = 7
 KNOTS = np.array([1.0, 2.0, 3.5, 5.0, 7.0, 10.0])

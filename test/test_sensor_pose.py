@@ -20,7 +20,7 @@ from gp_ground_seg.core.pipeline.tilt import angles_of, rotate, rotation
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.lab import simulation
 from gp_ground_seg.lab.simulation import HDL_64E, OS1_128, SCENES, VLP_16, Scene, simulate_scan
-from gp_ground_seg.lab.simulation import scenes as landforms
+from gp_ground_seg.lab.simulation import terrain as landforms
 from gp_ground_seg.lab.simulation.objects import floating_box, wall
 
 # Scans of 100,000 points, too many for the compiled twins as plain Python.

@@ -21,7 +21,8 @@ from gp_ground_seg.lab.simulation import (
     semantic_kitti_labels,
     simulate_drive,
 )
-from gp_ground_seg.lab.simulation.scenes import WetPatch, flat
+from gp_ground_seg.lab.simulation.scenes import WetPatch
+from gp_ground_seg.lab.simulation.terrain import flat
 
 COARSE = replace(HDL_64E, n_columns=240)
 EXACT = replace(COARSE, range_std=0.0, dropout=0.0)

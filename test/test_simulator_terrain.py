@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gp_ground_seg.lab.simulation import DRIVES, SCENES, Kind, objects
-from gp_ground_seg.lab.simulation import scenes as landforms
+from gp_ground_seg.lab.simulation import terrain as landforms
 from gp_ground_seg.lab.simulation.objects import Box, Cylinder, nearest_solid
-from gp_ground_seg.lab.simulation.scenes import polyline
-from gp_ground_seg.lab.simulation.terrain import first_hit
+from gp_ground_seg.lab.simulation.terrain import first_hit, polyline
 
 MAX_RANGE = 60.0
 SENSOR_POSITION = np.array([0.0, 0.0, 1.73])

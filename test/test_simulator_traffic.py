@@ -21,7 +21,7 @@ from gp_ground_seg.lab.simulation import (
     semantic_kitti_labels,
     traffic,
 )
-from gp_ground_seg.lab.simulation.scenes import flat, slope
+from gp_ground_seg.lab.simulation.terrain import flat, slope
 
 EXACT = replace(HDL_64E, n_columns=700, range_std=0.0, dropout=0.0)
 TALL = replace(EXACT, elevations=SENSORS['os1-128'].elevations)

@@ -214,6 +214,13 @@ def floating_box(
     return replace(box, bottom=bottom, top=bottom + size[2])
 
 
+def crate(
+    terrain: Terrain, x: float, y: float, height: float, yaw: float = 0.0
+) -> tuple[Solid, ...]:
+    """Crate, an object of its own."""
+    return parts_of(x, y, [standing_box(terrain, x, y, (0.8, 0.6, height), yaw)])
+
+
 def pole(
     terrain: Terrain, x: float, y: float, height: float = 6.0, radius: float = 0.1
 ) -> Cylinder:

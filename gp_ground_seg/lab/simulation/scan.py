@@ -23,6 +23,7 @@ from gp_ground_seg.lab.simulation.terrain import Terrain, first_hit
 
 FRAME_PERIOD = 0.1  # time of one turn of the sensor [s]
 REFLECTION_MIN_DEPTH = 0.1  # a mirrored point less deep below the ground is the road itself [m]
+STANCE = 1.0  # half the length and width of a vehicle on its wheels [m]
 PLUMB_LINE = 200.0  # of a tilted sensor: the search for the ground starts that far above [m]
 
 # Multiples of these fill the unit square evenly: the powers of the plastic number, the
@@ -43,10 +44,10 @@ class SensorModel:
     range_std: float  # standard deviation of the range noise, along the ray [m]
     height: float  # above the ground under the sensor [m]
     dropout: float = 0.02  # probability that a return is lost
-    # Tilt against the level vehicle [rad] (REP-103):
+    # Tilt against the vehicle [rad] (REP-103):
     roll: float = 0.0  # positive lowers the right side
     pitch: float = 0.0  # positive lowers the nose
-    # Where the rays start in a cloud with the axes of the level vehicle [m]; None: the cloud is in
+    # Where the rays start in a cloud with the axes of the vehicle [m]; None: the cloud is in
     # the frame of the sensor itself.
     origin: tuple[float, float, float] | None = None
     sector: float = 2.0 * math.pi  # of azimuths in one turn, its middle straight ahead [rad]
@@ -73,7 +74,7 @@ class SensorModel:
         return rays.reshape(-1, 3)
 
     def rotation(self) -> FloatArray:
-        """Matrix (3, 3) from the sensor frame to that of the level vehicle."""
+        """Matrix (3, 3) from the sensor frame to that of the vehicle."""
         return np.asarray(Rotation.from_euler('YX', [self.pitch, self.roll]).as_matrix())
 
 
@@ -197,21 +198,44 @@ def simulate_scan(
     `rng` draws numbers for each ray, whether or not it hits anything: the same generator state
     gives the same noise in another scene.
     """
+    vehicle = _rotation_of_vehicle(scene, x)
     ground = float(scene.terrain.height(x, 0.0))
     ahead, left, _ = sensor.origin or (0.0, 0.0, 0.0)
-    position = np.array([x - ahead, 0.0 - left, ground + sensor.height_of_cloud])
-    rotation = np.eye(3) if sensor.origin else sensor.rotation()
-    parts = [_cast(scene, lidar, rng, position) for lidar in (sensor, *sensor.others)]
+    position = [x, 0.0, ground] + vehicle @ [-ahead, -left, sensor.height_of_cloud]
+    rotation = vehicle if sensor.origin else vehicle @ sensor.rotation()
+    parts = [_cast(scene, lidar, rng, position, vehicle) for lidar in (sensor, *sensor.others)]
     points, kind, object_id = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     ground_z = _ground_below(scene.terrain, points, position, rotation)
     is_ground = kind == Kind.TERRAIN
     return SimulatedScan(points, is_ground, ground_z, kind, object_id, time, position, rotation)
 
 
+def _rotation_of_vehicle(scene: Scene, x: float) -> FloatArray:
+    """Matrix (3, 3) from the frame of the vehicle at the place `x` [m] to the world's.
+
+    A vehicle that leans stands on the ground at four places: ahead, behind, left and right.
+    """
+    if not scene.leans:
+        return np.eye(3)
+    at = STANCE * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    ahead, behind, left, right = scene.terrain.height(x + at[:, 0], at[:, 1]).tolist()
+    forward = np.array([2.0 * STANCE, 0.0, ahead - behind])
+    up = np.cross(forward, [0.0, 2.0 * STANCE, left - right])
+    forward, up = (axis / np.linalg.norm(axis) for axis in (forward, up))
+    return np.column_stack([forward, np.cross(up, forward), up])
+
+
 def _cast(
-    scene: Scene, sensor: SensorModel, rng: np.random.Generator, position: FloatArray
+    scene: Scene,
+    sensor: SensorModel,
+    rng: np.random.Generator,
+    position: FloatArray,
+    vehicle: FloatArray,
 ) -> tuple[npt.NDArray[np.float32], KindArray, npt.NDArray[np.int32]]:
-    """Points, kinds and objects that one sensor sees; `position` is of the cloud's frame."""
+    """Points, kinds and objects that one sensor sees.
+
+    `position` is of the cloud's frame, `vehicle` turns vectors of the vehicle into the world's.
+    """
     beams = sensor.directions(rng.uniform(0.0, sensor.sector / sensor.n_columns))
     n_rays = len(beams)
     mirror_draw, drop_draw = rng.random(n_rays), rng.random(n_rays)
@@ -221,7 +245,7 @@ def _cast(
     start = np.zeros(3)
     if sensor.origin:
         beams, start = direction, np.array(sensor.origin)
-    position = position + start
+    position, direction = position + vehicle @ start, direction @ vehicle.T
     origin = np.broadcast_to(position, direction.shape)
 
     distance = first_hit(scene.terrain, origin, direction, sensor.max_range)

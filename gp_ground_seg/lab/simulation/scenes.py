@@ -1,4 +1,4 @@
-"""Landforms; named scenes, each built from a seed around a drive along x from the origin."""
+"""Named scenes, each built from a seed around a drive along x from the origin."""
 
 from __future__ import annotations
 
@@ -14,9 +14,20 @@ import gp_ground_seg.lab.simulation.objects as objects
 import gp_ground_seg.lab.simulation.traffic as traffic
 from gp_ground_seg.lab.scoring.objects import LOW_HEIGHTS
 from gp_ground_seg.lab.simulation.objects import Kind, Solid
-from gp_ground_seg.lab.simulation.terrain import Profile, Terrain, Waves
+from gp_ground_seg.lab.simulation.terrain import (
+    Sum,
+    Terrain,
+    crest,
+    ditch,
+    flat,
+    kerb,
+    polyline,
+    ramp,
+    rough,
+    slope,
+    smooth_then_rough,
+)
 
-N_WAVES = 8
 N_SCATTERED, SCATTER_X, SCATTER_Y = 36, (-60.0, 100.0), (6.0, 35.0)
 """Scattered solids, and their distance from the drive [m], which leaves its lane free."""
 CARS = ('saloon', 'hatchback', 'suv')
@@ -24,98 +35,14 @@ MIXED = (*CARS, *CARS, 'van', 'van', 'truck')
 """Models of vehicles, among which the parked and the waiting ones are drawn."""
 LOW_DISTANCE, LOW_GAP = (3.0, 20.0), 0.03
 """Distance of the nearest corner of a low thing [m], and angle between neighbours [rad]."""
+N_OF_EACH, APART = 4, 5.5
+"""Cars, persons, crates, poles and walls around a vehicle, and least distance of two [m]."""
+CRATES = 0.4, 0.65
+"""Heights of the crates that are objects [m]."""
+ENDS = -15.0, -8.0, 8.0, 15.0
+"""Places of persons and crates along a valley or a dike [m]."""
+BANKS = tuple(np.radians((15.0, 25.0, 35.0)).tolist())  # slopes of banks [rad]
 URBAN_X = (-80.0, 160.0)  # where the street of the urban scene begins and ends [m]
-
-
-def rough(
-    rng: np.random.Generator,
-    rms: float = 0.08,
-    wavelengths: tuple[float, float] = (2.0, 20.0),
-    envelope: Profile | None = None,
-) -> Waves:
-    """Ground with waves of random heading and phase, scaled by `envelope` (see `Waves`).
-
-    `rms` [m] is the height of all waves together where the envelope is one. Their lengths [m] are
-    evenly spread on a log scale between the two ends; all waves are equally steep.
-    """
-    shortest, longest = np.log(wavelengths)
-    wavelength = np.exp(rng.uniform(shortest, longest, N_WAVES))
-    heading = rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
-    phase = rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
-    k = (2.0 * np.pi / wavelength)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-    amplitude = wavelength * rms * np.sqrt(2.0 / np.sum(wavelength**2))
-    return Waves(k, amplitude, phase, flat(1.0) if envelope is None else envelope)
-
-
-def polyline(
-    heading: float, points: Sequence[tuple[float, float]], slope_after: float = 0.0
-) -> Profile:
-    """Profile of straight pieces along `heading` [rad], level before the first corner.
-
-    `points` are the corners (u, z) in ascending u [m]; those of the same u are a vertical step
-    from the first to the last of them. `slope_after` is that after the last corner.
-    """
-    (first_u, first_z), (last_u, last_z) = points[0], points[-1]
-    pieces = [(first_u, first_z, 0.0)]
-    for (u0, z0), (u1, z1) in itertools.pairwise(points):
-        if u1 > u0:
-            pieces.append((u0, z0, (z1 - z0) / (u1 - u0)))
-    anchor, height, rise = np.array([*pieces, (last_u, last_z, slope_after)]).T
-    # A piece ends where the next one begins; one lone vertical step has its one edge at the end.
-    return Profile(heading, anchor[1:], anchor, np.column_stack([height, rise, 0.0 * rise]))
-
-
-def flat(z: float = 0.0) -> Profile:
-    """Level ground at height `z` [m]."""
-    return slope(0.0, 0.0, z)
-
-
-def slope(gradient: float, heading: float = 0.0, z: float = 0.0) -> Profile:
-    """Plane that rises by `gradient` per metre towards `heading` [rad], `z` [m] at the origin."""
-    return Profile(heading, np.empty(0), np.zeros(1), np.array([[z, gradient, 0.0]]))
-
-
-def ramp(start: float, gradient: float, heading: float = 0.0) -> Profile:
-    """Level ground until u = `start` [m], then a plane that rises by `gradient` per metre."""
-    return polyline(heading, [(start, 0.0)], slope_after=gradient)
-
-
-def kerb(
-    half_width: float, height: float, face_width: float = 0.05, heading: float = math.pi / 2
-) -> Profile:
-    """Road between sidewalks, `heading` [rad] across it; a kerb is `face_width` [m] deep."""
-    outer = half_width + face_width
-    corners = [(-outer, height), (-half_width, 0.0), (half_width, 0.0), (outer, height)]
-    return polyline(heading, corners)
-
-
-def ditch(
-    heading: float, start: float, top_width: float, bottom_width: float, depth: float
-) -> Profile:
-    """Trapezoidal ditch in level ground, from u = `start` to `start` + `top_width` [m]."""
-    side = (top_width - bottom_width) / 2.0
-    end = start + top_width
-    corners = [(start, 0.0), (start + side, -depth), (end - side, -depth), (end, 0.0)]
-    return polyline(heading, corners)
-
-
-def crest(
-    start: float, climb: float, gradient: float, rounding: float, heading: float = 0.0
-) -> Profile:
-    """Climb from u = `start` [m], rounded top, descent as steep; horizontal lengths [m]."""
-    top, z, level = start + climb, gradient * climb, (0.0, 0.0, 0.0)
-    edges = np.array([start, top, top + rounding, top + rounding + climb])
-    up, down = (0.0, gradient, 0.0), (z, -gradient, 0.0)
-    coefficients = np.array([level, up, (z, gradient, -gradient / rounding), down, level])
-    return Profile(heading, edges, np.array([start, *edges]), coefficients)
-
-
-def smooth_then_rough(
-    rng: np.random.Generator, start: float, transition: float, rms: float = 0.15
-) -> Waves:
-    """Flat ground that grows rough from x = `start` [m] on, fully so after `transition` [m]."""
-    envelope = polyline(0.0, [(start, 0.0), (start + transition, 1.0)])
-    return rough(rng, rms, (0.8, 6.0), envelope=envelope)
 
 
 @dataclass(frozen=True)
@@ -137,6 +64,7 @@ class Scene:
     terrain: Terrain
     solids: tuple[Solid, ...] = ()
     wet_patches: tuple[WetPatch, ...] = ()
+    leans: bool = False  # whether the vehicle leans with the ground under it, or is level
 
 
 def _scattered(terrain: Terrain, rng: np.random.Generator) -> tuple[Solid, ...]:
@@ -384,6 +312,107 @@ def _hedge(seed: int) -> Scene:
     return Scene('hedge', terrain, tuple(solids))
 
 
+def _around(
+    smooth: Terrain,
+    terrain: Terrain,
+    rng: np.random.Generator,
+    reach: tuple[float, float],
+    places: Sequence[tuple[float, float]] = (),
+) -> tuple[Solid, ...]:
+    """Cars, persons, crates, poles and walls on `terrain`, in a `reach` [m] from the origin.
+
+    Cars are where `smooth`, the terrain without its small waves, is even, and lean with it. There
+    are a person and a crate in turns at `places` (x, y) [m] as well.
+    """
+    solids: list[Solid] = []
+    for k, place in enumerate(places):
+        crate = objects.crate(terrain, *place, rng.uniform(*CRATES))
+        solids += crate if k % 2 else traffic.person(terrain, *place)
+    taken = [*places]
+    while (k := len(taken) - len(places)) < 5 * N_OF_EACH:
+        away, bearing, yaw = rng.uniform(*reach), *rng.uniform(-math.pi, math.pi, 2)
+        x, y = away * math.cos(bearing), away * math.sin(bearing)
+        if any(math.dist((x, y), place) < APART for place in taken):
+            continue
+        match k // N_OF_EACH:
+            case 0:
+                if not traffic.is_even(smooth, x, y):
+                    continue
+                solids += traffic.vehicle(smooth, str(rng.choice(CARS)), x, y, yaw)
+            case 1:
+                solids += traffic.person(terrain, x, y)
+            case 2:
+                solids += objects.crate(terrain, x, y, rng.uniform(*CRATES), yaw)
+            case 3:
+                solids.append(objects.pole(terrain, x, y))
+            case _:
+                dx, dy = 2.5 * math.cos(yaw), 2.5 * math.sin(yaw)
+                ends = (x - dx, y - dy), (x + dx, y + dy)
+                solids += objects.wall(terrain, *ends, rng.uniform(1.0, 2.5))
+        taken.append((x, y))
+    return tuple(solids)
+
+
+def _hills(seed: int) -> Scene:
+    """Waves of 14 to 45 m, 0.9 m rms, and of 1 to 5 m, 4 cm rms, on which the vehicle leans."""
+    rng = np.random.default_rng(seed)
+    smooth = rough(rng, 0.9, (14.0, 45.0))
+    terrain = Sum((smooth, rough(rng, 0.04, (1.0, 5.0))))
+    solids = _around(smooth, terrain, rng, (6.0, 32.0))
+    return Scene('hills', terrain, solids, leans=True)
+
+
+def _valley(seed: int) -> Scene:
+    """Level floor 6 to 10 m wide between sides of 15 to 25 degrees that are 6 m high."""
+    rng = np.random.default_rng(seed)
+    floor, gradient = rng.uniform(3.0, 5.0), math.tan(math.radians(rng.uniform(15.0, 25.0)))
+    top = floor + 6.0 / gradient
+    corners = [(-top, 6.0), (-floor, 0.0), (floor, 0.0), (top, 6.0)]
+    heading = rng.uniform(-math.pi, math.pi)
+    smooth = polyline(heading, corners)
+    terrain = Sum((smooth, rough(rng, 0.03, (1.0, 6.0))))
+    along = _Line(terrain, rng, heading - 0.5 * math.pi, 0.0)
+    places = [along.at(k, rng.uniform(-0.6, 0.6) * floor) for k in ENDS]
+    return Scene('valley', terrain, _around(smooth, terrain, rng, (6.0, 24.0), places))
+
+
+def _bank(seed: int) -> Scene:
+    """Bank of 15, 25 or 35 degrees, 2.5 to 4.5 m high, with persons and crates on it."""
+    rng = np.random.default_rng(seed)
+    heading, gradient = rng.uniform(-math.pi, math.pi), math.tan(BANKS[seed % len(BANKS)])
+    foot, rise = rng.uniform(9.0, 14.0), rng.uniform(2.5, 4.5)
+    depth = rise / gradient
+    smooth = polyline(heading, [(foot, 0.0), (foot + depth, rise)])
+    terrain = Sum((smooth, rough(rng, 0.02, (1.0, 8.0))))
+    middle = _Line(terrain, rng, heading - 0.5 * math.pi, foot + 0.5 * depth)
+    places = [middle.at(k, rng.uniform(-0.25, 0.25) * depth) for k in (-10.0, -3.5, 3.5, 10.0)]
+    return Scene('bank', terrain, _around(smooth, terrain, rng, (6.0, 32.0), places))
+
+
+def _on_ramp(seed: int) -> Scene:
+    """Ramp of 15 to 25 % on which the vehicle stands, 9 to 17 m long, level land at both ends."""
+    rng = np.random.default_rng(seed)
+    gradient, behind, ahead = rng.uniform((0.15, 4.0, 5.0), (0.25, 8.0, 9.0)).tolist()
+    corners = [(-behind, -gradient * behind), (ahead, gradient * ahead)]
+    smooth = polyline(rng.uniform(-math.pi, math.pi), corners)
+    terrain = Sum((smooth, rough(rng, 0.01, (1.0, 8.0))))
+    solids = _around(smooth, terrain, rng, (6.0, 28.0))
+    return Scene('on_ramp', terrain, solids, leans=True)
+
+
+def _dike(seed: int) -> Scene:
+    """Dike 5 to 8 m wide, 1 to 2 m above the land on both sides; the vehicle stands on it."""
+    rng = np.random.default_rng(seed)
+    heading, gradient = rng.uniform(-math.pi, math.pi), rng.uniform(0.4, 0.7)
+    half, high = rng.uniform(2.5, 4.0), rng.uniform(1.0, 2.0)
+    foot = half + high / gradient
+    smooth = polyline(heading, [(-foot, -high), (-half, 0.0), (half, 0.0), (foot, -high)])
+    terrain = Sum((smooth, rough(rng, 0.02, (1.0, 8.0))))
+    along = _Line(terrain, rng, heading - 0.5 * math.pi, 0.0)
+    places = [along.at(k, rng.uniform(-0.6, 0.6) * half) for k in ENDS]
+    return Scene('dike', terrain, _around(smooth, terrain, rng, (6.0, 32.0), places))
+
+
 def _low_box(rng: np.random.Generator) -> tuple[Kind, objects.Size]:
     """Box, half of them 0.44 m wide, the others up to 2 m by 2 m."""
     length, width = rng.uniform(0.8, 2.0, 2) if rng.random() < 0.5 else (0.44, 0.44)
@@ -442,6 +471,14 @@ LOW: dict[str, Callable[[int], Scene]] = {
     name: functools.partial(_low_scene, name) for name in _LOW_THINGS
 }
 """Builders of the scenes of low things, around a sensor at the origin."""
+STEEP: dict[str, Callable[[int], Scene]] = {
+    'hills': _hills,
+    'valley': _valley,
+    'bank': _bank,
+    'on_ramp': _on_ramp,
+    'dike': _dike,
+}
+"""Builders of the scenes of steep ground, around a sensor at the origin."""
 PLACES: dict[str, Callable[[int], Scene]] = {
     'traffic_jam': _traffic_jam,
     'car_park': _car_park,
@@ -451,6 +488,7 @@ PLACES: dict[str, Callable[[int], Scene]] = {
     'blind_slope': _blind_slope,
     'hedge': _hedge,
     **LOW,
+    **STEEP,
 }
 """Builders of the scenes around a sensor at the origin."""
 SCENES = {**DRIVES, **PLACES}

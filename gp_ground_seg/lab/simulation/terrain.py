@@ -1,4 +1,4 @@
-"""Analytic terrain: height, slope and bend at any point, and where rays meet it.
+"""Analytic terrain: height, slope and bend at any point, landforms, and where rays meet them.
 
 Every terrain is smooth on pieces between parallel break lines, which rays cross one by one, so
 that kinks and vertical steps are met exactly. Within a piece the clearance f(t) of a ray has a
@@ -9,8 +9,10 @@ Why no mesh library: heights and labels are to be exact.
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
@@ -20,6 +22,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.frame import FloatArray
 
 OptionalArray: TypeAlias = FloatArray | None
+N_WAVES = 8
 TOLERANCE = 1e-9  # height at which a ray has met the terrain; length of an empty piece [m]
 
 
@@ -148,6 +151,118 @@ class Waves(Terrain):
         """Envelope times the sum of all amplitudes."""
         total = float(np.abs(self.amplitudes).sum())
         return replace(self.envelope, coefficients=self.envelope.coefficients * total)
+
+
+@dataclass(frozen=True, eq=False)
+class Sum(Terrain):
+    """Terrains on top of one another: their heights are added."""
+
+    parts: tuple[Terrain, ...]
+
+    def along(self, at: FloatArray, direction: FloatArray, piece: OptionalArray = None) -> Along:
+        """See `Terrain.along`."""
+        columns = zip(*(part.along(at, direction, piece) for part in self.parts), strict=True)
+        return Along(*(np.sum(column, axis=0) for column in columns))
+
+    def breaks(self) -> FloatArray:
+        """Break lines of all parts, (B, 3)."""
+        return np.concatenate([part.breaks() for part in self.parts])
+
+    def ceiling(self) -> Terrain:
+        """Sum of the ceilings."""
+        ceilings = tuple(part.ceiling() for part in self.parts)
+        return self if ceilings == self.parts else Sum(ceilings)
+
+
+def rough(
+    rng: np.random.Generator,
+    rms: float = 0.08,
+    wavelengths: tuple[float, float] = (2.0, 20.0),
+    envelope: Profile | None = None,
+) -> Waves:
+    """Ground with waves of random heading and phase, scaled by `envelope` (see `Waves`).
+
+    `rms` [m] is the height of all waves together where the envelope is one. Their lengths [m] are
+    evenly spread on a log scale between the two ends; all waves are equally steep.
+    """
+    shortest, longest = np.log(wavelengths)
+    wavelength = np.exp(rng.uniform(shortest, longest, N_WAVES))
+    heading = rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
+    phase = rng.uniform(0.0, 2.0 * np.pi, N_WAVES)
+    k = (2.0 * np.pi / wavelength)[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+    amplitude = wavelength * rms * np.sqrt(2.0 / np.sum(wavelength**2))
+    return Waves(k, amplitude, phase, flat(1.0) if envelope is None else envelope)
+
+
+def polyline(
+    heading: float, points: Sequence[tuple[float, float]], slope_after: float = 0.0
+) -> Profile:
+    """Profile of straight pieces along `heading` [rad], level before the first corner.
+
+    `points` are the corners (u, z) in ascending u [m]; those of the same u are a vertical step
+    from the first to the last of them. `slope_after` is that after the last corner.
+    """
+    (first_u, first_z), (last_u, last_z) = points[0], points[-1]
+    pieces = [(first_u, first_z, 0.0)]
+    for (u0, z0), (u1, z1) in itertools.pairwise(points):
+        if u1 > u0:
+            pieces.append((u0, z0, (z1 - z0) / (u1 - u0)))
+    anchor, height, rise = np.array([*pieces, (last_u, last_z, slope_after)]).T
+    # A piece ends where the next one begins; one lone vertical step has its one edge at the end.
+    return Profile(heading, anchor[1:], anchor, np.column_stack([height, rise, 0.0 * rise]))
+
+
+def flat(z: float = 0.0) -> Profile:
+    """Level ground at height `z` [m]."""
+    return slope(0.0, 0.0, z)
+
+
+def slope(gradient: float, heading: float = 0.0, z: float = 0.0) -> Profile:
+    """Plane that rises by `gradient` per metre towards `heading` [rad], `z` [m] at the origin."""
+    return Profile(heading, np.empty(0), np.zeros(1), np.array([[z, gradient, 0.0]]))
+
+
+def ramp(start: float, gradient: float, heading: float = 0.0) -> Profile:
+    """Level ground until u = `start` [m], then a plane that rises by `gradient` per metre."""
+    return polyline(heading, [(start, 0.0)], slope_after=gradient)
+
+
+def kerb(
+    half_width: float, height: float, face_width: float = 0.05, heading: float = math.pi / 2
+) -> Profile:
+    """Road between sidewalks, `heading` [rad] across it; a kerb is `face_width` [m] deep."""
+    outer = half_width + face_width
+    corners = [(-outer, height), (-half_width, 0.0), (half_width, 0.0), (outer, height)]
+    return polyline(heading, corners)
+
+
+def ditch(
+    heading: float, start: float, top_width: float, bottom_width: float, depth: float
+) -> Profile:
+    """Trapezoidal ditch in level ground, from u = `start` to `start` + `top_width` [m]."""
+    side = (top_width - bottom_width) / 2.0
+    end = start + top_width
+    corners = [(start, 0.0), (start + side, -depth), (end - side, -depth), (end, 0.0)]
+    return polyline(heading, corners)
+
+
+def crest(
+    start: float, climb: float, gradient: float, rounding: float, heading: float = 0.0
+) -> Profile:
+    """Climb from u = `start` [m], rounded top, descent as steep; horizontal lengths [m]."""
+    top, z, level = start + climb, gradient * climb, (0.0, 0.0, 0.0)
+    edges = np.array([start, top, top + rounding, top + rounding + climb])
+    up, down = (0.0, gradient, 0.0), (z, -gradient, 0.0)
+    coefficients = np.array([level, up, (z, gradient, -gradient / rounding), down, level])
+    return Profile(heading, edges, np.array([start, *edges]), coefficients)
+
+
+def smooth_then_rough(
+    rng: np.random.Generator, start: float, transition: float, rms: float = 0.15
+) -> Waves:
+    """Flat ground that grows rough from x = `start` [m] on, fully so after `transition` [m]."""
+    envelope = polyline(0.0, [(start, 0.0), (start + transition, 1.0)])
+    return rough(rng, rms, (0.8, 6.0), envelope=envelope)
 
 
 def first_hit(

@@ -94,6 +94,14 @@ MODELS = {
 WHEEL_WIDTH = 0.2
 
 
+def is_even(terrain: Terrain, x: float, y: float) -> bool:
+    """Whether a car can stand at a place: the ground is no steeper than 0.3, and hardly bent."""
+    half = 2.3
+    around = terrain.height(x + half * np.array([1, 0, -1, 0]), y + half * np.array([0, 1, 0, -1]))
+    bend = float(np.mean(around) - terrain.height(x, y))
+    return bool(np.ptp(around) < 0.3 * 2.0 * half and abs(bend) < 0.1)
+
+
 def vehicle(
     terrain: Terrain, name: str, x: float, y: float, yaw: float = 0.0
 ) -> tuple[Solid, ...]:
