@@ -18,7 +18,7 @@ from gp_ground_seg.lab.experiments.sensor_pose import score_poses
 from gp_ground_seg.lab.experiments.table1 import table1
 from gp_ground_seg.lab.experiments.variants import simulated_frames
 from gp_ground_seg.lab.scoring.report import Report, describe_environment, machine_line, written
-from gp_ground_seg.lab.simulation import DRIVES, LOW, SCENES, SENSORS
+from gp_ground_seg.lab.simulation import DRIVES, LOW, SCENES, SENSORS, STEEP
 
 Option = tuple[str, str, dict[str, Any]]
 
@@ -96,7 +96,7 @@ EXPERIMENTS = {
     'pseudo-inputs': Experiment(ablation.compare_pseudo_inputs, is_timed=True),
     'wrong-values': Experiment(ablation.compare_wrong_values),
     'scenes': Experiment(
-        score_scenes, THREE, (*DRIVES, *LOW), n_seeds=3, places=(0.0, 6.0), labelled=False
+        score_scenes, THREE, (*DRIVES, *LOW, *STEEP), 3, places=(0.0, 6.0), labelled=False
     ),
     'objects': Experiment(score_objects, [*SENSORS], CROWDED, n_seeds=2, labelled=False),
     'sensor-pose': Experiment(score_poses),

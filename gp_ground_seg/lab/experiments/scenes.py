@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from statistics import fmean
 
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.lab.experiments.variants import SimulatedFrame, score_simulated
+from gp_ground_seg.lab.experiments.variants import TOLD, SimulatedFrame, score_simulated
 from gp_ground_seg.lab.scale.cluster import HERE, Runner
-from gp_ground_seg.lab.scoring.comparison import INTERVAL, interval_text
-from gp_ground_seg.lab.scoring.evaluate import MethodScore
+from gp_ground_seg.lab.scoring.comparison import INTERVAL, counts_of_all, interval_text
+from gp_ground_seg.lab.scoring.evaluate import ALL, MethodScore
 from gp_ground_seg.lab.scoring.metrics import ratio
 from gp_ground_seg.lab.scoring.objects import (
     LOW_CLASSES,
@@ -23,10 +24,12 @@ from gp_ground_seg.lab.scoring.objects import (
 )
 from gp_ground_seg.lab.scoring.report import Column, Report, Row, Table, centimetres, percent
 from gp_ground_seg.lab.scoring.tables import make_report
-from gp_ground_seg.lab.simulation import LOW, PLACES
+from gp_ground_seg.lab.simulation import LOW, PLACES, STEEP
 
-CROWDED = (*(name for name in PLACES if name not in LOW), 'urban')
+CROWDED = (*(name for name in PLACES if name not in (*LOW, *STEEP)), 'urban')
 """Scenes where objects hide the ground."""
+ROUGH = ('rough', 'road_then_rubble', 'ramp', 'ditch', 'crest', 'blind_slope', *STEEP)
+"""Scenes of rough and of steep ground."""
 BANDS = {'0-10 m': slice(0, 1), '10-20 m': slice(1, 2), '> 20 m': slice(2, None)}
 """Bands of range of the columns, as parts of `scoring.objects.BAND_TITLES`."""
 COUNTED = {'vehicles': ('vehicle',), 'persons': ('person', 'cyclist')}
@@ -48,9 +51,12 @@ def score_scenes(
     """Score simulated scans by exact labels and heights, and count objects and low things lost.
 
     Patchwork++ beside it has its published parameters and the true height of the sensor. All
-    sensors have one set of parameters.
+    sensors have one set of parameters. Rough and steep ground has a table of its own, in which
+    ours is there twice: as it is, and with the true height of the sensor.
     """
-    scores, refused = score_simulated(frames, config, runner, with_peer=with_peer)
+    every, refused = score_simulated(frames, config, runner, with_peer=with_peer, told_in=ROUGH)
+    told = [score for score in every if score.name == TOLD]
+    scores = [score for score in every if score.name != TOLD]
     low = [name for name in scores[0].sequences if name.split()[1] in LOW]
     rest = [name for name in scores[0].sequences if name not in low]
     tables = {'scenes': scene_table(scores, refused)}
@@ -58,7 +64,9 @@ def score_scenes(
         tables['objects'] = lost_table([score.of(*rest) for score in scores])
     if low:
         tables['low'] = low_table([score.of(*low) for score in scores])
-    return make_report(tables, scores, config)
+    if told:
+        tables['rough'] = rough_table([scores[0], *told, *scores[1:]])
+    return make_report(tables, every, config)
 
 
 def score_objects(
@@ -191,6 +199,52 @@ def low_table(scores: Sequence[MethodScore]) -> Table:
     )
     title += f'; peer: {scores[1].title}' if len(scores) > 1 else ''
     return Table(rows, title)
+
+
+def rough_table(scores: Sequence[MethodScore]) -> Table:
+    """One row for each scene that ours is told the height in; ours, told, the peer if any."""
+    names = scores[1].sequences
+    rows = []
+    for scene in dict.fromkeys(name.split()[1] for name in names):
+        own = [name for name in names if name.split()[1] == scene]
+        rows.append(_rough_row(scene, [[score.of(name) for name in own] for score in scores]))
+    means: Row = [(rows[0][0][0], ALL)]
+    for cells in itertools.islice(zip(*rows, strict=True), 1, None):
+        values = [value for _, value in cells]
+        is_count = isinstance(values[0], int)
+        means.append((cells[0][0], sum(values) if is_count else fmean(values)))
+    title = (
+        'Rough and steep ground, means over the sensors: vehicles, persons and crates as in the '
+        'other tables; IoU against exact labels [%], every point counts; RMSE of the surface '
+        f'under true ground [cm]; objects lost; told: {scores[0].title} with the true height of '
+        'the sensor'
+    )
+    title += f'; peer: {scores[2].title} with the same' if len(scores) > 2 else ''
+    return Table([*rows, means], title, n_sums=1)
+
+
+def _rough_row(scene: str, methods: Sequence[Sequence[MethodScore]]) -> Row:
+    """Cells of a scene, from the scores of each method with each sensor."""
+    counts = [sum(map(counts_of_all, scores), ObjectCount()) for scores in methods]
+    row: Row = [
+        (Column('scene'), scene),
+        (Column('scans', 'd'), sum(len(score.scans) for score in methods[0])),
+        (Column('objects', '_d'), counts[0].n_objects),
+    ]
+    measures: list[tuple[Column, list[float] | list[int]]] = [
+        (percent('IoU', 'iou'), [fmean(s.iou for s in scores) for scores in methods]),
+        (
+            centimetres('RMSE', 'rmse'),
+            [fmean(s.height.rmse for s in scores) for scores in methods],
+        ),
+        (Column('lost', '_d', 'lost'), [count.n_lost for count in counts]),
+    ]
+    for column, values in measures:
+        others = [
+            replace(column, title=who, key=f'{who}_{column.key}') for who in ('told', 'peer')
+        ]
+        row += zip([column, *others[: len(values) - 1]], values, strict=True)
+    return row
 
 
 def return_table(scores: Sequence[MethodScore]) -> Table:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -36,6 +36,8 @@ Changes = Mapping[str, ParameterValue]
 
 OBJECT_KINDS = {'vehicle': Kind.BOX, 'person': Kind.PERSON, 'cyclist': Kind.CYCLIST}
 """Kinds of objects that rays hit, by `CLASSES`; crates are boxes too, but no objects."""
+TOLD = f'{OURS} told'
+"""Ours where it is given the true height of the sensor."""
 LOWEST_OBJECT = 0.7
 """Objects of less than this height are of the nearest of `LOW_CLASSES`, of any kind [m]."""
 
@@ -99,6 +101,11 @@ def peer_of(sensor: str) -> PatchworkppMethod:
     return PatchworkppMethod(model.height, model.origin or (0.0, 0.0, 0.0))
 
 
+def told(config: Config, sensor: str) -> Config:
+    """Return parameters with the true height of a simulated sensor."""
+    return config.replace(**{'sensor.height': SENSORS[sensor].height_of_cloud})
+
+
 def refuse_changed(config: Config, names: Iterable[str], *variants: Changes) -> None:
     """Raise ConfigError if `config` changes what an experiment compares.
 
@@ -124,35 +131,44 @@ def score_variants(
 
 
 def score_simulated(
-    frames: Sequence[SimulatedFrame], config: Config, runner: Runner = HERE, *, with_peer: bool
+    frames: Sequence[SimulatedFrame],
+    config: Config,
+    runner: Runner = HERE,
+    *,
+    with_peer: bool,
+    told_in: Collection[str] = (),
 ) -> tuple[list[MethodScore], list[str]]:
     """Segment simulated scans, all sensors with the parameters `config`.
 
-    `with_peer` runs Patchwork++ on the same clouds, as `peer_of` makes it. A sensor and scene of
-    which a scan is refused is left out, and the second value says so.
+    `with_peer` runs Patchwork++ on the same clouds, as `peer_of` makes it; in the scenes `told_in`
+    ours runs once more, as `TOLD`. A sensor and scene of which a scan is refused is left out, and
+    the second value says so.
     """
     groups = [list(group) for _, group in itertools.groupby(frames, lambda f: f.sequence)]
-    parts = runner.run(partial(_score_groups, config, with_peer), groups)
+    parts = runner.run(partial(_score_groups, config, with_peer, told_in), groups)
     outcomes = list(itertools.chain(*parts))
     refused = [found for found in outcomes if isinstance(found, str)]
-    scored = [found for found in outcomes if not isinstance(found, str)]
+    scored = [score for found in outcomes if not isinstance(found, str) for score in found]
     if not scored:
         raise PointCloudError('; '.join(refused))
-    return [pool(scores[0].name, scores) for scores in zip(*scored, strict=True)], refused
+    names = dict.fromkeys(score.name for score in scored)
+    return [pool(name, [s for s in scored if s.name == name]) for name in names], refused
 
 
 def _score_groups(
     config: Config,
     with_peer: bool,
+    told_in: Collection[str],
     groups: Sequence[Sequence[SimulatedFrame]],
     progress: Progress,
 ) -> list[list[MethodScore] | str]:
     """Scores of each group of scans, of one sensor in one scene, or why one is refused."""
     outcomes: list[list[MethodScore] | str] = []
     for frames in progress(groups):
-        peers = [peer_of(frames[0].sensor)] if with_peer else []
+        sensor, scene, *_ = frames[0]
+        ours = {OURS: config} | ({TOLD: told(config, sensor)} if scene in told_in else {})
         try:
-            outcomes.append(score_variants(frames, {OURS: config}, peers))
+            outcomes.append(score_variants(frames, ours, [peer_of(sensor)] * with_peer))
         except PointCloudError as error:
             outcomes.append(f'refused: {error}')
     return outcomes
