@@ -25,6 +25,7 @@ from gp_ground_seg.lab.simulation import (
     HDL_32E,
     LOW,
     SCENES,
+    STEEP,
     semantic_kitti_labels,
     simulate_scan,
 )
@@ -67,6 +68,10 @@ CASES = {
         'scenes', 2 * 4,
     ),
     'scenes --sensors': (['vlp-16', '--scenes', 'low_boxes,flat', '--seeds', '1'], 'low', 2 * 2),
+    'scenes --scenes': (
+        ['flat,bank,ramp', '--sensors', 'vlp-16,mid-360', '--seeds', '1'],
+        'rough', 2 * (2 + 2 * 3),
+    ),
     'scenes --no-peer': (['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', '1'], 'scenes', 1),
     'objects': (
         ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
@@ -106,7 +111,7 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
     ('words', 'sensors', 'scenes', 'n_seeds'),
     [
         (['scenes', '--sensors', 'mid-360,hdl-64e'], ['mid-360', 'hdl-64e'],
-         {*DRIVES, *LOW}, 3),
+         {*DRIVES, *LOW, *STEEP}, 3),
         (['coverage', '--simulated', '--seeds', '3', '--scenes', 'flat,kerb'],
          FIVE, ['flat', 'kerb'], 3),
     ],

@@ -228,6 +228,46 @@ def test_low_things_lost_follow_their_definitions():
     assert len(lost) == 2  # heights of walls
 
 
+def test_rough_ground_is_a_mean_over_the_sensors_of_ours_with_and_without_the_height():
+    sensors = {'vlp-16': 0.8, 'hdl-64e-vehicle': 0.0}
+    frames = variants.simulated_frames([*sensors], ['flat', 'on_ramp', 'ditch'], 1, (0.0,))
+    report = scenes.score_scenes(frames, FIXED)
+    assert [row['scene'] for row in report.tables['rough'].json()] == ['on_ramp', 'ditch', 'all']
+    found = {}
+    for scene, (sensor, height) in itertools.product(('on_ramp', 'ditch'), sensors.items()):
+        made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
+        ground = made.is_ground
+        truth = np.where(ground, Label.GROUND, Label.OBSTACLE)
+        told = GroundSegmenter(FIXED.replace(**{'sensor.height': height}))
+        peer = variants.peer_of(sensor)
+        peer.run(made.points)
+        results = {
+            '': GroundSegmenter(FIXED).segment(made.points),
+            'told_': told.segment(made.points),
+            'peer_': peer.result(),
+        }
+        assert results['told_'].pose.height == height
+        for who, result in results.items():
+            iou = count_confusion(result.label, truth).iou
+            error = (result.ground_z - made.ground_z)[ground]
+            found.setdefault((scene, who), []).append((iou, np.sqrt(np.nanmean(error**2))))
+    rows = {row['scene']: row for row in report.tables['rough'].json()}
+    for (scene, who), values in found.items():
+        row = rows[scene]
+        expected = np.mean(values, axis=0)
+        assert [row[f'{who}iou'], row[f'{who}rmse']] == pytest.approx(expected, rel=1e-5)
+    for name, value in rows['all'].items():
+        own = [rows[scene][name] for scene in ('on_ramp', 'ditch')] if name != 'scene' else []
+        counted = name in ('scans', 'objects') or name.endswith('lost')
+        assert not own or value == pytest.approx(sum(own) if counted else np.mean(own))
+    assert rows['all']['scans'] == 4 and rows['all']['objects'] > 20
+
+    alone = scenes.score_scenes(frames, FIXED, with_peer=False).tables['rough'].json()
+    for row in alone:
+        assert row.items() <= rows[row['scene']].items() and 'told_iou' in row
+        assert not any(name.startswith('peer_') for name in row)
+
+
 def test_scenes_by_hand_and_behind_is_said():
     """Scores are those of each scan as `test_lost_objects_follow_their_definitions` has them."""
 

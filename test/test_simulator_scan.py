@@ -22,7 +22,7 @@ from gp_ground_seg.lab.simulation import (
     simulate_drive,
 )
 from gp_ground_seg.lab.simulation.scenes import WetPatch
-from gp_ground_seg.lab.simulation.terrain import flat
+from gp_ground_seg.lab.simulation.terrain import flat, slope
 
 COARSE = replace(HDL_64E, n_columns=240)
 EXACT = replace(COARSE, range_std=0.0, dropout=0.0)
@@ -213,13 +213,48 @@ def test_tilted_sensor_sees_the_same_world(roll, pitch, scene):
         np.testing.assert_allclose(z, scene.terrain.height(x, y), atol=tolerance)
 
 
+@pytest.mark.parametrize('heading', [0.0, 0.7, -2.0])
+def test_a_vehicle_that_leans_sees_a_slope_as_level_ground(heading):
+    hill = slope(0.3, heading, 2.0)
+    made = simulated(Scene('hill', hill, leans=True), EXACT)
+    normal = np.array([-0.3 * math.cos(heading), -0.3 * math.sin(heading), 1.0])
+    normal /= np.linalg.norm(normal)
+    np.testing.assert_allclose(made.position, [0.0, 0.0, 2.0] + 1.73 * normal, atol=1e-12)
+    np.testing.assert_allclose(made.rotation[:, 2], normal, atol=1e-12)
+    np.testing.assert_allclose(made.rotation @ made.rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(made.rotation) == pytest.approx(1.0)
+    assert made.rotation[0, 0] > 0.9 and made.rotation[1, 0] == 0.0  # it drives along x
+    np.testing.assert_allclose(made.points[:, 2], -1.73, atol=3e-5)
+    np.testing.assert_allclose(made.ground_z, -1.73, atol=1e-7)
+    level = simulated(Scene('hill', hill), EXACT)
+    np.testing.assert_array_equal(level.rotation, np.eye(3))
+    # What a level sensor sees on level ground, a leaning one sees on the slope.
+    on_flat = simulated(FLAT, EXACT).points
+    np.testing.assert_allclose(made.points[:, :3], on_flat[:, :3], atol=1e-4)
+
+
+@pytest.mark.parametrize('name', ['hills', 'on_ramp'])
+@pytest.mark.parametrize('seed', range(3))
+def test_the_scenes_of_a_leaning_vehicle_tilt_it_with_the_ground(name, seed):
+    made, terrain = simulated(name, EXACT, seed), scene_of(name, seed).terrain
+    x, y = np.random.default_rng(0).uniform(-1.2, 1.2, (2, 500))
+    plane = np.column_stack([x, y, np.ones(500)])
+    (a, b, _), *_ = np.linalg.lstsq(plane, terrain.height(x, y), rcond=None)
+    up = np.array([-a, -b, 1.0]) / math.hypot(a, b, 1.0)
+    assert math.degrees(math.acos(up @ made.rotation[:, 2])) < 4.0  # for the small waves
+    assert math.degrees(math.acos(made.rotation[2, 2])) > 2.0
+    near = made.is_ground & (np.hypot(*made.points[:, :2].T) < 5.0)
+    if near.any():
+        assert np.abs(made.points[near, 2] + 1.73).max() < 0.9
+
+
 def test_drive_moves_over_the_terrain(scene):
     scans = list(simulate_drive(scene, FEW, n_frames=2, speed=15.0, seed=5))
     np.testing.assert_allclose([s.time for s in scans], [0.0, 0.1])
-    np.testing.assert_allclose([s.position[0] for s in scans], [0.0, 1.5])
-    for s in scans:
-        ground = float(scene.terrain.height(s.position[0], s.position[1]))
-        assert s.position[2] - ground == pytest.approx(FEW.height)
+    for s, x in zip(scans, (0.0, 1.5), strict=True):
+        foot = s.position - FEW.height * s.rotation[:, 2]
+        expected = [x, 0.0, float(scene.terrain.height(x, 0.0))]
+        np.testing.assert_allclose(foot, expected, atol=1e-12)
     again, other = (next(simulate_drive(scene, FEW, 1, 15.0, seed)) for seed in (5, 6))
     assert is_same(scans[0], again)
     assert not is_same(scans[0], other)

@@ -29,6 +29,18 @@ TERRAINS = {
     'walls': polyline(2.0, [(3, -1), (10, -1), (10, 0.8), (10.3, 0.8), (10.3, 0)], -0.2),
     'rough': landforms.rough(np.random.default_rng(3), rms=0.2, wavelengths=(0.7, 9.0)),
     'road_then_rubble': landforms.smooth_then_rough(np.random.default_rng(4), 9.0, 3.0),
+    'rough_kerb': landforms.Sum(
+        (
+            landforms.kerb(4.0, 0.15),
+            landforms.rough(np.random.default_rng(5), 0.1, (0.7, 9.0)),
+        )
+    ),
+    'ditch_across_crest': landforms.Sum(
+        (
+            landforms.ditch(1.3, 8.0, 4.0, 1.5, 1.0),
+            landforms.crest(8.0, 10.0, 0.1, 6.0),
+        )
+    ),
 }
 
 
@@ -113,6 +125,17 @@ def test_slope_bend_bound_and_ceiling_hold(terrain):
 )
 def test_landform_heights(terrain, u, expected):
     np.testing.assert_allclose(terrain.height(np.array(u), np.zeros(len(u))), expected, atol=1e-12)
+
+
+def test_heights_of_a_sum_are_added_and_its_ceiling_has_no_waves():
+    parts = [TERRAINS[name] for name in ('ditch', 'rough', 'crest')]
+    x, y = np.random.default_rng(1).uniform(-40.0, 40.0, (2, 500))
+    total = landforms.Sum(tuple(parts))
+    np.testing.assert_allclose(total.height(x, y), sum(part.height(x, y) for part in parts))
+    above = total.ceiling()
+    assert above is not total and above.ceiling() is above
+    bare = landforms.Sum((parts[0], parts[2]))
+    assert bare.ceiling() is bare
 
 
 def test_waves_have_the_rms_asked_for_and_rubble_starts_where_the_road_ends():

@@ -14,6 +14,7 @@ from gp_ground_seg.lab.simulation import (
     PLACES,
     SCENES,
     SENSORS,
+    STEEP,
     VLP_16,
     Kind,
     Scene,
@@ -225,6 +226,89 @@ def test_hedges_are_low_dense_and_beside_the_path():
     assert {Kind.POLE, Kind.OVERHANG, Kind.PERSON} <= set(made.kind)
 
 
+def corners(terrain):
+    """Places [m] and heights [m] of the corners of a landform under waves."""
+    profile = terrain.parts[0]
+    across = np.array([math.cos(profile.heading), math.sin(profile.heading)])
+    return profile.edges, profile.height(*(profile.edges[:, None] * across).T)
+
+
+def along(scene):
+    """Places [m] of the objects of a scene along the heading of its landform, by kind."""
+    heading = scene.terrain.parts[0].heading
+    places = {}
+    for solid in scene.solids:
+        if solid.part_of:
+            x, y = solid.part_of
+            u = x * math.cos(heading) + y * math.sin(heading)
+            places.setdefault(solid.kind, set()).add(u)
+    return places
+
+
+@of_three_seeds
+def test_a_bank_rises_beside_the_vehicle_and_things_stand_on_it(seed):
+    scene = scene_of('bank', seed)
+    (foot, top), (low, high) = corners(scene.terrain)
+    assert 9.0 <= foot <= 14.0 and low == 0.0 and 2.5 <= high <= 4.5
+    assert math.degrees(math.atan2(high, top - foot)) == pytest.approx((15, 25, 35)[seed])
+    for kind in (Kind.BOX, Kind.PERSON):
+        assert sum(foot < u < top for u in along(scene)[kind]) >= 2
+
+
+@of_three_seeds
+def test_a_valley_and_a_dike_have_their_measures(seed):
+    edges, heights = corners(scene_of('valley', seed).terrain)
+    assert heights == pytest.approx([6.0, 0.0, 0.0, 6.0]) and edges[1] == -edges[2]
+    assert 6.0 <= edges[2] - edges[1] <= 10.0
+    assert 15.0 <= math.degrees(math.atan2(6.0, edges[3] - edges[2])) <= 25.0
+
+    scene = scene_of('dike', seed)
+    edges, heights = corners(scene.terrain)
+    assert heights[1] == heights[2] == 0.0 and -2.0 <= heights[0] == heights[3] <= -1.0
+    assert 5.0 <= edges[2] - edges[1] <= 8.0 and edges[1] == -edges[2]
+    for kind in (Kind.BOX, Kind.PERSON):
+        assert sum(abs(u) < edges[2] for u in along(scene)[kind]) >= 2
+    made = simulated(scene, EXACT)
+    assert made.rotation[2, 2] == 1.0
+    assert made.position[2] == pytest.approx(1.73, abs=0.06)  # of the waves
+
+
+@of_three_seeds
+def test_hills_and_a_ramp_under_the_vehicle_have_their_measures(seed):
+    terrain = scene_of('hills', seed).terrain
+    x, y = np.random.default_rng(0).uniform(-500.0, 500.0, (2, 20_000))
+    assert np.std(terrain.height(x, y)) == pytest.approx(0.9, rel=0.05)
+    lengths = [2.0 * np.pi / np.linalg.norm(part.wave_vectors, axis=1) for part in terrain.parts]
+    assert (lengths[0].min() >= 14.0, lengths[0].max() <= 45.0, lengths[1].max() <= 5.0) == (
+        True,
+        True,
+        True,
+    )
+    terrain = scene_of('on_ramp', seed).terrain
+    (behind, ahead), (low, high) = corners(terrain)
+    assert -8.0 <= behind <= -4.0 and 5.0 <= ahead <= 9.0
+    assert 0.15 <= high / ahead <= 0.25 and low / behind == pytest.approx(high / ahead)
+
+
+@pytest.mark.parametrize('name', STEEP)
+@of_three_seeds
+def test_steep_ground_has_cars_persons_crates_poles_and_walls_on_it(name, seed):
+    scene = scene_of(name, seed)
+    heights = objects.object_heights(scene.terrain, scene.solids)
+    numbers = objects.number_objects(scene.solids)
+    kinds = {n: solid.kind for n, solid in zip(numbers, scene.solids, strict=True) if n}
+    assert all(kind in (Kind.BOX, Kind.PERSON) for kind in kinds.values())
+    n_crates = sum(0.39 < height < 0.66 for height in heights[1:])
+    n_persons = sum(kind == Kind.PERSON for kind in kinds.values())
+    n_cars = len(kinds) - n_crates - n_persons
+    n_more = 2 if name in ('bank', 'valley', 'dike') else 0
+    assert (n_cars, n_persons, n_crates) == (4, 4 + n_more, 4 + n_more)
+    assert sum(solid.kind == Kind.POLE for solid in scene.solids) == 4
+    assert sum(solid.kind == Kind.WALL for solid in scene.solids) >= 4
+    nearest = min(math.hypot(solid.x, solid.y) - solid.radius for solid in scene.solids)
+    assert nearest > 3.0
+
+
 SIZES = {
     'low_boxes': ((0.44, 2.0), (0.44, 2.0), (0.2, 0.6)),
     'low_boxes_rough': ((0.44, 2.0), (0.44, 2.0), (0.2, 0.6)),
@@ -283,7 +367,7 @@ def test_the_height_of_an_object_is_that_of_its_highest_part_above_the_ground():
 # Mounts.
 
 
-@pytest.mark.parametrize('name', ['blind_slope', 'hedge'])
+@pytest.mark.parametrize('name', ['blind_slope', 'hedge', 'on_ramp'])
 def test_a_cloud_in_the_vehicle_frame_is_that_of_the_sensor_moved(name):
     seen, moved = (simulated(name, sensor, 3) for sensor in ('hdl-64e', 'hdl-64e-vehicle'))
     shift = np.tile([0.0, 0.0, 1.73], (len(seen.points), 1))
