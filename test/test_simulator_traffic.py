@@ -249,7 +249,7 @@ def along(scene):
 def test_a_bank_rises_beside_the_vehicle_and_things_stand_on_it(seed):
     scene = scene_of('bank', seed)
     (foot, top), (low, high) = corners(scene.terrain)
-    assert 9.0 <= foot <= 14.0 and low == 0.0 and 2.5 <= high <= 4.5
+    assert 9.0 <= foot <= 14.0 and abs(low) < 1e-9 and 2.5 <= high <= 4.5
     assert math.degrees(math.atan2(high, top - foot)) == pytest.approx((15, 25, 35)[seed])
     for kind in (Kind.BOX, Kind.PERSON):
         assert sum(foot < u < top for u in along(scene)[kind]) >= 2
@@ -264,7 +264,8 @@ def test_a_valley_and_a_dike_have_their_measures(seed):
 
     scene = scene_of('dike', seed)
     edges, heights = corners(scene.terrain)
-    assert heights[1] == heights[2] == 0.0 and -2.0 <= heights[0] == heights[3] <= -1.0
+    assert heights == pytest.approx([heights[0], 0.0, 0.0, heights[0]])
+    assert -2.0 <= heights[0] <= -1.0
     assert 5.0 <= edges[2] - edges[1] <= 8.0 and edges[1] == -edges[2]
     for kind in (Kind.BOX, Kind.PERSON):
         assert sum(abs(u) < edges[2] for u in along(scene)[kind]) >= 2
@@ -279,11 +280,8 @@ def test_hills_and_a_ramp_under_the_vehicle_have_their_measures(seed):
     x, y = np.random.default_rng(0).uniform(-500.0, 500.0, (2, 20_000))
     assert np.std(terrain.height(x, y)) == pytest.approx(0.9, rel=0.05)
     lengths = [2.0 * np.pi / np.linalg.norm(part.wave_vectors, axis=1) for part in terrain.parts]
-    assert (lengths[0].min() >= 14.0, lengths[0].max() <= 45.0, lengths[1].max() <= 5.0) == (
-        True,
-        True,
-        True,
-    )
+    assert 14.0 <= lengths[0].min() < lengths[0].max() <= 45.0
+    assert 1.0 <= lengths[1].min() < lengths[1].max() <= 5.0
     terrain = scene_of('on_ramp', seed).terrain
     (behind, ahead), (low, high) = corners(terrain)
     assert -8.0 <= behind <= -4.0 and 5.0 <= ahead <= 9.0
