@@ -214,10 +214,10 @@ def rough_table(scores: Sequence[MethodScore]) -> Table:
         is_count = isinstance(values[0], int)
         means.append((cells[0][0], sum(values) if is_count else fmean(values)))
     title = (
-        'Rough and steep ground, means over the sensors: vehicles, persons and crates as in the '
-        'other tables; IoU against exact labels [%], every point counts; RMSE of the surface '
-        f'under true ground [cm]; objects lost; told: {scores[0].title} with the true height of '
-        'the sensor'
+        'Rough and steep ground, means over the sensors: IoU against exact labels [%], every '
+        'point counts; RMSE of the surface under true ground [cm]; vehicles, persons and crates, '
+        'and how many of these objects are lost, as in the other tables; told: '
+        f'{scores[0].title} with the true height of the sensor'
     )
     title += f'; peer: {scores[2].title} with the same' if len(scores) > 2 else ''
     return Table([*rows, means], title, n_sums=1)
