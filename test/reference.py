@@ -4,6 +4,7 @@ Shapes and units are those of `gp_ground_seg.core.backend.Backend`, which `Refer
 One point, one tile or one segment at a time; each fit is made anew.
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -19,6 +20,7 @@ from gp_ground_seg.core.frame import (
     Lines,
     PseudoInputs,
 )
+from gp_ground_seg.core.pipeline.relief import Relief
 
 # Polar grid (section II)
 
@@ -37,7 +39,7 @@ def place_of(x, y, grid):
 
 
 def lowest_of_cells(scan, config):
-    """Lowest point of each cell; of equally low ones the nearest, then the first tile.
+    """Lowest point of each cell; of equally low ones the nearest, the first tile, then by place.
 
     The density is the mean over three slices of equal height of points over area.
     """
@@ -47,16 +49,19 @@ def lowest_of_cells(scan, config):
     rows, counts = [], np.zeros(scan.grid.n_segments, dtype=np.int64)
     for cell, own in sorted(members.items()):
         z = scan.xyz[own, 2].astype(np.float64)
-        low, r, tile = min(zip(z, scan.grid.r[own], scan.tiles.tile[own], strict=True))
+        x, y = scan.xyz[own, 0], scan.xyz[own, 1]
+        low, r, tile, x, y = min(zip(z, scan.grid.r[own], scan.tiles.tile[own], x, y, strict=True))
         segment, n = divmod(cell, scan.grid.n_bins)
         extent = max(max(z) - low, config.lines.min_density_extent)
         number = np.bincount(np.minimum((z - low) / extent * 3, 2).astype(int), minlength=3)
         area = np.diff(scan.grid.edges)[n] * extent / 3
-        rows.append((r, low, n, np.mean(number / area), tile))
+        rows.append((r, low, n, np.mean(number / area), tile, x, y))
         counts[segment] += 1
-    r, z, own_bin, density, tile = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+    r, z, own_bin, density, tile, x, y = np.array(rows, dtype=np.float64).reshape(-1, 7).T
     offsets = np.concatenate([[0], np.cumsum(counts)])
-    return Candidates(r, z, own_bin.astype(np.int64), density, offsets, tile.astype(np.int32))
+    return Candidates(
+        r, z, own_bin.astype(np.int64), density, offsets, tile.astype(np.int32), x, y
+    )
 
 
 # Vertical faces
@@ -197,10 +202,149 @@ def continues_line(candidates, lines, config):
     return result
 
 
+# Relief
+
+
+def find_relief(candidates, faces, height, config):
+    """Heights of the relief in the middle of each square, (60, 60)."""
+    land = np.zeros((60, 60))
+    if config.surface.look_aside:
+        reached = sorted(reached_on_foot(candidates, faces, height, config))
+        x, y, z = (value[reached] for value in (candidates.x, candidates.y, candidates.z + height))
+        known, occupied = fit_squares(x, y, z)
+        for square in raised_parts(known, occupied):
+            del known[square]
+        if any(abs(h) > 0.15 for h in known.values()):
+            fill_rings(known)
+            for square, h in known.items():
+                share = min(max((abs(h) - 0.15) / 0.3, 0.0), 1.0)
+                land[square] = h * (3.0 * share**2 - 2.0 * share**3)
+    return land
+
+
+def reached_on_foot(candidates, faces, height, config):
+    """Candidates in the groups, joined by steps, that have eight seeds."""
+    r, z, segment = candidates.r, candidates.z, candidates.segment
+    n_segments, growth = len(candidates.offsets) - 1, config.growth
+    allowed = {c for c in range(len(r)) if r[c] < 60.0 and not faces.is_face[candidates.tile[c]]}
+    beside, steep = {c: set() for c in allowed}, []
+
+    def step(a, b, longest, across):
+        rise, distance = abs(z[b] - z[a]), math.hypot(r[b] - r[a], across)
+        is_step = {a, b} <= allowed and abs(r[b] - r[a]) <= longest
+        if is_step and rise <= min(0.84 * distance + 0.06, 0.8 if across == 0.0 else 0.3):
+            if rise <= 0.3:
+                beside[a].add(b)
+                beside[b].add(a)
+            else:
+                steep.append((a, b))
+
+    for a in sorted(allowed):
+        if a + 1 < len(r) and segment[a + 1] == segment[a]:
+            step(a, a + 1, 1.0 + 0.12 * r[a + 1], 0.0)
+        for aside in (1, 2):
+            own = np.flatnonzero(segment == (segment[a] + aside) % n_segments)
+            across = aside * 2.0 * math.pi / n_segments * r[a]
+            for b in (*own[r[own] < r[a]][-1:], *own[r[own] >= r[a]][:1]):
+                step(a, int(b), 0.5 * (1.0 + 0.12 * r[a]), across)
+    groups = groups_of(allowed, lambda c: beside[c])
+    home = {c: k for k, group in enumerate(groups) for c in group}
+    width, joined = {}, {k: set() for k in range(len(groups))}
+    for a, b in steep:
+        ends = frozenset((home[a], home[b]))
+        width[ends] = width.get(ends, 0.0) + 2.0 * math.pi / n_segments * r[a]
+    for ends, wide in width.items():
+        for k in ends if wide >= 5.0 else ():
+            joined[k] |= ends
+    wholes = groups_of(joined, lambda k: joined[k])
+    groups = [{c for k in whole for c in groups[k]} for whole in wholes]
+    seeds = {
+        c
+        for c in allowed
+        if r[c] < growth.seed_range and abs(z[c] + height) < growth.seed_height_tolerance
+    }
+    return {c for group in groups if len(seeds & group) >= 8 for c in group}
+
+
+def groups_of(members, neighbours):
+    """Connected groups of the members, a set each."""
+    left, groups = set(members), []
+    while left:
+        group = front = {left.pop()}
+        while front:
+            front = {other for one in front for other in neighbours(one) if other in left}
+            left, group = left - front, group | front
+        groups.append(group)
+    return groups
+
+
+def around(square):
+    """The square and those around it, of 60 by 60."""
+    i, j = square
+    return [(a, b) for a in range(i - 1, i + 2) for b in range(j - 1, j + 2) if {a, b} <= SIDES]
+
+
+SIDES = set(range(60))
+
+
+def fit_squares(x, y, z):
+    """Height in the middle of each square that has a plane, after three fits."""
+    squares = [
+        (min(int(a // 2.0) + 30, 59), min(int(b // 2.0) + 30, 59))
+        for a, b in zip(x, y, strict=True)
+    ]
+    own = {square: np.flatnonzero([s == square for s in squares]) for square in set(squares)}
+    weight = np.array([1.0 / len(own[square]) for square in squares])
+    for _ in range(3):
+        planes = {}
+        for square in itertools.product(SIDES, SIDES):
+            near = [c for other in around(square) for c in own.get(other, ())]
+            if near:
+                planes[square] = fit_plane(x[near], y[near], z[near], weight[near])
+        for c, square in enumerate(squares):
+            residual = z[c] - planes[square](x[c], y[c])[0]
+            weight[c] = 1.0 / len(own[square]) / (1.0 + (residual / 0.15) ** 2)
+    middles = {square: [2.0 * k - 59.0 for k in square] for square in planes}
+    heights = {square: planes[square](*middles[square]) for square in planes}
+    known = {square: h for square, (h, is_determined) in heights.items() if is_determined}
+    return known, set(squares)
+
+
+def fit_plane(x, y, z, weight):
+    """Weighted least squares with 0.5 m^2 added to the variances of x and y."""
+    mean = np.average([x, y, z], axis=1, weights=weight)
+    cov = np.cov([x, y, z], aweights=weight, ddof=0) if len(x) > 1 else np.zeros((3, 3))
+    slope = np.linalg.solve(cov[:2, :2] + 0.5 * np.eye(2), cov[:2, 2])
+    spread = math.sqrt(max(np.linalg.eigvalsh(cov[:2, :2])[0], 0.0))
+    is_determined = weight.sum() >= 1.5 and spread >= 0.4
+    return lambda a, b: (mean[2] + slope @ [a - mean[0], b - mean[1]], is_determined)
+
+
+def raised_parts(known, occupied):
+    """Squares that are 0.3 m high or deep, with fewer than nine occupied ones side by side."""
+    raised = {square for square, h in known.items() if abs(h) > 0.3}
+
+    def beside(square):
+        return [s for s in around(square) if abs(s[0] - square[0]) + abs(s[1] - square[1]) == 1]
+
+    return [square for g in groups_of(raised, beside) if len(g & occupied) < 9 for square in g]
+
+
+def fill_rings(known):
+    """Give each unknown square the mean of those around it, ring by ring."""
+    while len(known) < 3600:
+        means = {}
+        for square in itertools.product(SIDES, SIDES):
+            heights = [known[other] for other in around(square) if other in known]
+            if square not in known and heights:
+                means[square] = float(np.mean(heights))
+        known.update(means)
+
+
 # Labels (Algorithm 2, line 14)
 
 
-def label_points(scan, faces, surface, config):
+def label_points(scan, faces, surface, relief, config):
     """Label each point by its height over the surface, against the band of its tile."""
     grid, label, n_points = scan.grid, config.label, len(scan.xyz)
     height, margin = np.full((2, n_points), np.nan)
@@ -210,7 +354,9 @@ def label_points(scan, faces, surface, config):
     for i in np.flatnonzero(grid.inside):
         m, n = grid.segment[i], grid.bin[i]
         r, ends = max(float(grid.r[i]), grid.edges[0]), slice(n, n + 2)
-        height[i] = scan.xyz[i, 2] - np.interp(r, surface.knots[ends], surface.mean[m, ends])
+        lift = relief.at(*scan.xyz[i : i + 1, :2].astype(np.float64).T)[0]
+        height[i] = scan.xyz[i, 2] - lift
+        height[i] -= np.interp(r, surface.knots[ends], surface.mean[m, ends])
     near = grid.inside & (height < 0.5) & (height >= -0.5)
     rough = ground_roughness(scan.tiles, height, near & ~is_face)
     for i in np.flatnonzero(grid.inside):
@@ -352,6 +498,10 @@ class Reference(NumpyBackend):
     def build_grid(self, xyz, config):
         scan = super().build_grid(xyz, config)
         return scan._replace(candidates=lowest_of_cells(scan, config))
+
+    def find_relief(self, candidates, faces, height, config):
+        relief = Relief.of(find_relief(candidates, faces, height, config))
+        return relief, candidates._replace(z=candidates.z - relief.at(candidates.x, candidates.y))
 
     def extract_lines(self, candidates, faces, config):
         shows_ground = np.array([not faces.has_occluded_base[t] for t in candidates.tile], bool)

@@ -45,7 +45,8 @@ def random_candidates(seed, n_segments, n_bins, share):
     z += np.round(rng.normal(0.0, 0.1, offsets[-1]), 1)
     own_bin = np.zeros(offsets[-1], dtype=np.int64)
     density, tile = np.zeros(offsets[-1]), np.zeros(offsets[-1], dtype=np.int32)
-    return Candidates(np.concatenate(r), z, own_bin, density, offsets, tile)
+    r = np.concatenate(r)
+    return Candidates(r, z, own_bin, density, offsets, tile, np.zeros_like(r), np.zeros_like(r))
 
 
 def slow_lowest(candidates):
@@ -79,7 +80,7 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)
 def test_no_plane(backend):
     few = random_candidates(0, 1, 40, 1.0)
-    few = Candidates(*(a[: MIN_CELLS - 1] for a in few[:4]), np.array([0, 2]), few.tile[:2])
+    few = few.first(MIN_CELLS - 1)._replace(offsets=np.array([0, MIN_CELLS - 1]))
     assert backend.fit_plane(few, 0.5, ORIGIN) is None
     above = random_candidates(1, 90, 20, 1.0)
     assert backend.fit_plane(above, 0.5, ORIGIN) is not None

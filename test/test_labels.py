@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config, Label
 from gp_ground_seg.core.frame import Faces, GroundSurface, Scan
 from gp_ground_seg.core.pipeline.labels import ground_probability
+from gp_ground_seg.core.pipeline.relief import N_SIDES, Relief
 
 CONFIG = Config().replace(
     **{
@@ -22,6 +23,7 @@ CONFIG = Config().replace(
 )
 KNOTS = np.array([2.0, 4.0, 6.0, 8.0, 10.0])
 KNOTS.setflags(write=False)
+LEVEL = Relief.of(np.zeros((N_SIDES, N_SIDES)))
 G, O, U = Label.GROUND, Label.OBSTACLE, Label.UNKNOWN  # noqa: E741
 
 
@@ -43,7 +45,7 @@ def label(backend, ranges, z, surface=None, faces=None, angle=0.1, sigma_n=0.05,
     for i, occluded in (faces or {}).items():
         marks.is_face[scan.tiles.tile[i]] = True
         marks.has_occluded_base[scan.tiles.tile[i]] = occluded
-    found = backend.label_points(scan, marks, surface or surface_of(), config)
+    found = backend.label_points(scan, marks, surface or surface_of(), LEVEL, config)
     assert found.label.dtype == np.uint8
     ground = np.nan_to_num(found.margin, nan=-1.0) >= 0.0
     np.testing.assert_array_equal(found.label == Label.GROUND, ground)
@@ -77,7 +79,7 @@ def labels_of(backend, points, r_max=12.0, **changes):
     surface = surface_of()._replace(knots=knots)
     scan = backend.build_grid(points, config)
     faces = Faces(*np.zeros((2, len(scan.tiles.extremes)), dtype=bool))
-    return backend.label_points(scan, faces, surface, config)
+    return backend.label_points(scan, faces, surface, LEVEL, config)
 
 
 @pytest.mark.parametrize('std', [0.0, 0.03])
@@ -186,17 +188,17 @@ def test_labels_are_the_reference(backend, seed, dtype):
     scan: Scan = backend.build_grid(xyz, CONFIG)
     faces = backend.find_faces(scan, CONFIG)
     assert faces.is_face.any()
-    found = backend.label_points(scan, faces, surface, CONFIG)
+    found = backend.label_points(scan, faces, surface, LEVEL, CONFIG)
     np.testing.assert_allclose(found.height, scan.xyz[:, 2] - surface.at(scan.grid)[0], atol=1e-12)
     # More tolerance moves points from obstacle to ground; none the other way, but by votes.
     is_ground = np.zeros(len(xyz), dtype=bool)
     for tolerance in (0.05, 0.1, 0.2, rng.uniform(0.2, 1.0)):
         rule = ('roughness', 'tolerance')[seed % 2]
         config = CONFIG.replace(**{'label.rule': rule, 'label.ground_tolerance': tolerance})
-        found = backend.label_points(scan, faces, surface, config)
+        found = backend.label_points(scan, faces, surface, LEVEL, config)
         assert rule == 'roughness' or not (is_ground & (found.label != Label.GROUND)).any()
         is_ground = found.label == Label.GROUND
-    expected = reference.label_points(scan, faces, surface, config)
+    expected = reference.label_points(scan, faces, surface, LEVEL, config)
     np.testing.assert_array_equal(found.label, expected.label)
     for name in ('height', 'margin'):
         ours, theirs = getattr(found, name), getattr(expected, name)

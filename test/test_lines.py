@@ -23,7 +23,8 @@ def candidates_of(r, z, density=None, offsets=None):
     n, density = len(r), np.ones(len(r)) if density is None else density
     r, z, density = (np.asarray(values, dtype=float) for values in (r, z, density))
     offsets = np.array([0, n] if offsets is None else offsets)
-    return Candidates(r, z, np.arange(n), density, offsets, np.zeros(n, dtype=np.int32))
+    tile = np.zeros(n, dtype=np.int32)
+    return Candidates(r, z, np.arange(n), density, offsets, tile, r, np.zeros(n))
 
 
 def extract(backend, candidates, changes):

@@ -149,13 +149,23 @@ def test_what_is_drawn_is_the_result():
 
     drawn = {line.get_label().split(' (')[0]: line for line in above.lines}
     inside = slice(*result.candidates.offsets[SEGMENT : SEGMENT + 2])
-    r, z = result.candidates.r[inside], result.candidates.z[inside]
+    own = result.candidates.where(result.candidates.segment == SEGMENT)
+    r, z = own.r, own.z + result.relief.at(own.x, own.y)
     inlier = result.surface.inlier[inside]
     begins = np.flatnonzero(np.diff(result.lines.line[inside])) + 1
     assert len(begins) > 0
     np.testing.assert_array_equal(drawn['critical points'].get_xdata(), r[begins])
     np.testing.assert_array_equal(drawn['candidates, inliers'].get_ydata(), z[inlier])
-    np.testing.assert_array_equal(drawn['surface'].get_ydata(), result.surface.mean[SEGMENT])
+    knots, n_segments = result.surface.knots, result.grid.n_segments
+    surface = result.surface.mean + result.relief.at_knots(knots, n_segments)
+    assert not result.relief.is_level
+    np.testing.assert_array_equal(drawn['surface'].get_ydata(), surface[SEGMENT])
+    # A line over the relief ends where its first and its last candidate are, nearly.
+    lines = [line for line in above.lines if len(line.get_xdata()) == 16]
+    assert len(lines) > 1
+    for line in lines:
+        ends = np.interp(line.get_xdata()[[0, -1]], r, z)
+        np.testing.assert_allclose(line.get_ydata()[[0, -1]], ends, atol=0.15)
 
     length_scale, pseudo = below.lines
     np.testing.assert_array_equal(

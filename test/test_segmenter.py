@@ -385,17 +385,17 @@ def test_what_a_thread_computes_of_a_result_does_not_hold_up_another_result():
         assert may_go_on.wait(60.0)
         return 'late'
 
-    compute = 'gp_ground_seg.core.result.correct_surface'
+    compute = 'gp_ground_seg.core.result.FitReport.of'
     with ThreadPoolExecutor(2) as pool:
         with patch(compute, wait):
-            late = pool.submit(lambda: results[0].corrected)
+            late = pool.submit(lambda: results[0].fit)
             assert is_asked.wait(60.0)
         with patch(compute, lambda *_: 'at once'):
-            other = pool.submit(lambda: results[1].corrected)
+            other = pool.submit(lambda: results[1].fit)
             done = concurrent.futures.wait([other], 20.0).done
         may_go_on.set()
         assert done and other.result() == 'at once'
-        assert late.result(60.0) == results[0].corrected == 'late'
+        assert late.result(60.0) == results[0].fit == 'late'
 
 
 @pytest.mark.slow

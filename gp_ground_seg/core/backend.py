@@ -23,7 +23,15 @@ from gp_ground_seg.core.frame import (
 from gp_ground_seg.core.gp import ground, likelihood
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import Config, RuntimeConfig
-from gp_ground_seg.core.pipeline import ground_plane, labels, lines, polar_grid, vertical_faces
+from gp_ground_seg.core.pipeline import (
+    ground_plane,
+    labels,
+    lines,
+    polar_grid,
+    relief,
+    vertical_faces,
+)
+from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.tilt import Direction
 
 _LOGGER = logging.getLogger('gp_ground_seg')
@@ -52,6 +60,11 @@ class Backend(Protocol):
     def find_faces(self, scan: Scan, config: Config) -> Faces:
         """See `gp_ground_seg.core.pipeline.vertical_faces.find_faces`."""
 
+    def find_relief(
+        self, candidates: Candidates, faces: Faces, height: float, config: Config
+    ) -> tuple[Relief, Candidates]:
+        """See `gp_ground_seg.core.pipeline.relief.find_relief`."""
+
     def extract_lines(
         self, candidates: Candidates, faces: Faces, config: Config
     ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
@@ -68,7 +81,7 @@ class Backend(Protocol):
         """See `gp_ground_seg.core.gp.ground.estimate_surface`."""
 
     def label_points(
-        self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
+        self, scan: Scan, faces: Faces, surface: GroundSurface, relief: Relief, config: Config
     ) -> Labelled:
         """See `gp_ground_seg.core.pipeline.labels.label_points`."""
 
@@ -80,6 +93,7 @@ class NumpyBackend:
     build_grid = staticmethod(polar_grid.build_scan)
     fit_plane = staticmethod(ground_plane.fit_plane)
     find_faces = staticmethod(vertical_faces.find_faces)
+    find_relief = staticmethod(relief.find_relief)
     extract_lines = staticmethod(lines.find_lines)
     log_likelihood = staticmethod(likelihood.log_likelihood)
     estimate_surface = staticmethod(ground.estimate_surface)

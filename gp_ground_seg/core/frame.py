@@ -113,6 +113,8 @@ class Candidates(NamedTuple):
     density: FloatArray  # (C,) vertical density of each candidate's bin [points/m^2]
     offsets: IntArray  # (M + 1,) candidates of segment m are ``offsets[m]:offsets[m + 1]``
     tile: CellArray  # (C,) tile of each candidate
+    x: FloatArray  # (C,) place of each candidate [m]
+    y: FloatArray  # (C,) the same [m]
 
     @property
     def segment(self) -> IntArray:
@@ -141,12 +143,21 @@ class Candidates(NamedTuple):
             density=np.empty(n),
             offsets=np.empty(n_segments + 1, np.int64),
             tile=np.empty(n, np.int32),
+            x=np.empty(n),
+            y=np.empty(n),
         )
 
     def first(self, n: int) -> Candidates:
         """First `n`, to which `offsets` refer already."""
         return Candidates(
-            self.r[:n], self.z[:n], self.bin[:n], self.density[:n], self.offsets, self.tile[:n]
+            self.r[:n],
+            self.z[:n],
+            self.bin[:n],
+            self.density[:n],
+            self.offsets,
+            self.tile[:n],
+            self.x[:n],
+            self.y[:n],
         )
 
     def where(self, kept: BoolArray) -> Candidates:
@@ -159,6 +170,8 @@ class Candidates(NamedTuple):
             self.density[kept],
             before[self.offsets],
             self.tile[kept],
+            self.x[kept],
+            self.y[kept],
         )
 
 

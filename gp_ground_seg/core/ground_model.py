@@ -153,8 +153,9 @@ class GroundModel:
         """Height of the ground along the z axis, and its standard deviation, at any place.
 
         Linear in range between the knots of the segment that the place lies in; nearer
-        than the first knot it is the first knot's. The same rule gives
-        ``Segmentation.ground_z`` and ``ground_std``. In a tilted frame this is where the
+        than the first knot it is the first knot's. The same rule gives ``ground_std`` of a
+        `Segmentation`, and its ``ground_z`` but for the relief: that is here the one in the
+        middle of the segment, there that at each point. In a tilted frame this is where the
         line through the place along z meets the ground, on any slope.
 
         Parameters

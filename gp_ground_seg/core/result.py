@@ -17,6 +17,7 @@ from gp_ground_seg.core.frame import (
     Label,
     Labelled,
     Lines,
+    PointArray,
     PolarGrid,
     PseudoInputs,
     at_points,
@@ -24,6 +25,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.gp.learning import Learned, theta_names
 from gp_ground_seg.core.pipeline.labels import ground_probability
+from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.residuals import CorrectedSurface, correct_surface
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
@@ -165,9 +167,10 @@ class Segmentation:
     pose : SensorPose
         Height and tilt of the sensor that were used, and what the scan says of them;
         ``pose.level(xyz)`` gives points in the level frame.
-    tilted_z : (N,) float64 or None
-        Height of `surface` under each point along the sensor's z axis where `pose` has a
-        tilt, sensor frame [m].
+    relief : Relief
+        Height of the land in plan, over which the heights of `frame` and `surface` are.
+    z : (N,) float32 or float64
+        Height of each point in the sensor frame [m].
     slope_std : float
         ``observation.slope_std`` of the frame.
     """
@@ -181,7 +184,8 @@ class Segmentation:
     theta: FloatArray
     log_length_scale: FloatArray
     pose: SensorPose
-    tilted_z: FloatArray | None
+    relief: Relief
+    z: PointArray
     slope_std: float
 
     @property
@@ -236,12 +240,15 @@ class Segmentation:
 
     @cached_property
     def corrected(self) -> CorrectedSurface:
-        """The surface without the bias of lowest points, as uncertain as its residuals say.
+        """The ground without the bias of lowest points, as uncertain as its residuals say.
 
-        See `gp_ground_seg.core.pipeline.residuals.correct_surface`.
+        See `gp_ground_seg.core.pipeline.residuals.correct_surface`. The relief is that in the
+        middle of each segment.
         """
-        noise_std = np.exp(self.theta[:, 1:2])
-        return correct_surface(self.surface, self.labelled, self.grid, noise_std, self.slope_std)
+        noise_std, labelled = np.exp(self.theta[:, 1:2]), self.labelled
+        found = correct_surface(self.surface, labelled, self.grid, noise_std, self.slope_std)
+        relief = self.relief.at_knots(found.knots, self.grid.n_segments)
+        return found._replace(mean=found.mean + relief)
 
     @cached_property
     def height(self) -> FloatArray:
@@ -261,9 +268,7 @@ class Segmentation:
         with it ``z - height / cos(tilt)``, exact where the ground is level (see
         `gp_ground_seg.core.pipeline.sensor_pose.SensorPose.ground_z`).
         """
-        if self.tilted_z is not None:
-            return self.pose.ground_z(self.tilted_z, -self._correction)
-        return self._at_points(self.corrected.mean)
+        return self.pose.ground_z(self.z, self.height)
 
     @cached_property
     def ground_std(self) -> FloatArray:

@@ -114,10 +114,10 @@ class GroundSegmenter:
         # 3. Vertical faces: walls, fences, sides of cars.
         faces = backend.find_faces(scan, config)
         timer.mark('faces')
-        # 4. Lines along each segment, and pseudo-inputs on them. Lowest points of faces with
-        #    occluded base are left out. Heights are relative to the sensor: the prior mean is
-        #    the ground below it.
-        extracted = backend.extract_lines(scan.candidates, faces, config)
+        # 4. Relief of the land. Lines along each segment, over it, without lowest points of faces
+        #    with occluded base, and pseudo-inputs. The prior mean is the ground below the sensor.
+        relief, candidates = backend.find_relief(scan.candidates, faces, pose.height, config)
+        extracted = backend.extract_lines(candidates, faces, config)
         sensor_height = pose.low_sensor(sensor, config.growth.seed_height_tolerance)
         frame = Frame(*extracted, scan.grid.edges, -pose.height, sensor_height)
         timer.mark('lines')
@@ -130,8 +130,7 @@ class GroundSegmenter:
         timer.mark('surface')
         # 6. Labels: a point is ground up to the tolerance over the surface, or higher where the
         #    ground about it is rough.
-        labelled = backend.label_points(scan, faces, surface, config)
-        tilted_z = None if pose.is_level else pose.ground_z(xyz[:, 2], labelled.height)
+        labelled = backend.label_points(scan, faces, surface, relief, config)
         timer.mark('label')
         return Segmentation(
             labelled=labelled,
@@ -143,7 +142,8 @@ class GroundSegmenter:
             theta=theta,
             log_length_scale=log_length_scale,
             pose=pose,
-            tilted_z=tilted_z,
+            relief=relief,
+            z=xyz[:, 2].copy(),
             slope_std=config.observation.slope_std,
         )
 

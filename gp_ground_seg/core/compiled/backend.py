@@ -17,6 +17,7 @@ from gp_ground_seg.core.compiled import (
     polar_grid,
 )
 from gp_ground_seg.core.compiled import latent as latent_
+from gp_ground_seg.core.compiled import relief as relief_
 from gp_ground_seg.core.compiled import roughness as roughness_
 from gp_ground_seg.core.compiled import vertical_faces as faces_
 from gp_ground_seg.core.compiled.buffers import Buffers
@@ -46,6 +47,7 @@ from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, sum_u
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
+from gp_ground_seg.core.pipeline.relief import N_SIDES, Relief
 from gp_ground_seg.core.pipeline.roughness import N_LEVELS
 from gp_ground_seg.core.pipeline.tilt import Direction
 
@@ -74,7 +76,7 @@ class NumbaBackend:
         cell, r = np.empty(n_points, dtype=np.int32), np.empty(n_points, dtype=dtype)
         tile = take('tile', (n_points,), np.int32)
         cells = polar_grid.CellTable(
-            take('extremes', (n_cells + 1, 3), dtype),
+            take('extremes', (n_cells + 1, 5), dtype),
             take('numbers', (n_cells + 1, 2), np.int32),
         )
         tiles = self._buffers.tile_table(geometry.n_sides**2, dtype)
@@ -111,6 +113,19 @@ class NumbaBackend:
         result = Faces(*take('faces', (2, n_tiles), np.bool_))
         faces_.decide_faces(n_tall, thresholds, heights, buffers, result)
         return result
+
+    def find_relief(
+        self, candidates: Candidates, faces: Faces, height: float, config: Config
+    ) -> tuple[Relief, Candidates]:
+        """Relief of the land, and the candidates over it."""
+        growth = numbers_of(config.growth)
+        relief = Relief(np.zeros((N_SIDES - 1, N_SIDES - 1, 4)))
+        z = np.empty_like(candidates.z)
+        if not config.surface.look_aside or relief_.find_relief(
+            candidates, faces.is_face, height, growth, relief.pieces, z
+        ):
+            return relief, candidates
+        return relief, candidates._replace(z=z)
 
     def extract_lines(
         self, candidates: Candidates, faces: Faces, config: Config
@@ -184,7 +199,7 @@ class NumbaBackend:
         return u, knot_u
 
     def label_points(
-        self, scan: Scan, faces: Faces, surface: GroundSurface, config: Config
+        self, scan: Scan, faces: Faces, surface: GroundSurface, relief: Relief, config: Config
     ) -> Labelled:
         """Height, label and margin of each point."""
         take, label = self._buffers.take, numbers_of(config.label)
@@ -197,7 +212,9 @@ class NumbaBackend:
         roughness = take('roughness', (n_tiles + 1,), np.float64)
         result = Labelled(np.empty(n_points, np.uint8), np.empty(n_points), np.empty(n_points))
         labels.fit_pieces(surface, pieces)
-        labels.survey(scan, faces.is_face, pieces, units, result.height, sums)
+        labels.survey(
+            scan, faces.is_face, pieces, relief, relief.is_level, units, result.height, sums
+        )
         roughness_.set_roughness(scan.tiles, sums, units, blocks, counts, roughness)
         depth, has_obstacle = depth_of_ground(config.label), take('has_obstacle', (n_tiles,), bool)
         has_obstacle.fill(False)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gp_ground_seg.core.compiled.relief import height_at
 from gp_ground_seg.core.frame import (
     NOT_FINITE,
     BoolArray,
@@ -40,6 +41,7 @@ from gp_ground_seg.core.pipeline.labels import (
     vote_of,
     whole_units,
 )
+from gp_ground_seg.core.pipeline.relief import Relief
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
@@ -67,6 +69,8 @@ def survey(
     scan: Scan,
     is_face: BoolArray,
     pieces: FloatArray,
+    relief: Relief,
+    is_level: bool,
     units: float,
     height: FloatArray,
     sums: IntArray,
@@ -78,11 +82,15 @@ def survey(
     nearest, outside = scan.grid.edges[0], len(sums) - 1
     for occupied in scan.tiles.occupied:
         sums[np.uintp(occupied), 0] = sums[np.uintp(occupied), 1] = 0
-    z, tile, cell, r = scan.xyz.T[2], scan.tiles.tile, scan.grid.cell, scan.grid.r
+    x, y, z = scan.xyz.T[0], scan.xyz.T[1], scan.xyz.T[2]
+    tile, cell, r = scan.tiles.tile, scan.grid.cell, scan.grid.r
     for i in range(len(cell)):
         c = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
         away = max(np.float64(r[i]), nearest)
-        h = np.float64(z[i]) - (pieces[c, 0] + pieces[c, 1] * away)
+        over = np.float64(z[i])
+        if not is_level and cell[i] >= 0:
+            over -= height_at(relief.pieces, np.float64(x[i]), np.float64(y[i]))
+        h = over - (pieces[c, 0] + pieces[c, 1] * away)
         height[i] = h
         t = np.uintp(tile[i] if tile[i] >= 0 else outside)
         if is_near(h) and not is_face[t]:

@@ -20,6 +20,7 @@ def keep_visible(candidates: Candidates, has_occluded_base: BoolArray, kept: Can
                 kept.r[n], kept.z[n] = candidates.r[c], candidates.z[c]
                 kept.density[n] = candidates.density[c]
                 kept.bin[n], kept.tile[n] = candidates.bin[c], candidates.tile[c]
+                kept.x[n], kept.y[n] = candidates.x[c], candidates.y[c]
                 n += 1
         kept.offsets[m + 1] = n
     return n

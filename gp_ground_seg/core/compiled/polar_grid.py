@@ -37,9 +37,9 @@ class CellTable(NamedTuple):
 
     Attributes
     ----------
-    extremes : (M * n_bins + 1, 3) float32 or float64
-        Height of the lowest point, its range, and height of the highest point [m]. The last
-        row is for points in no cell.
+    extremes : (M * n_bins + 1, 5) float32 or float64
+        Height of the lowest point, its range, height of the highest point, x and y of the lowest
+        point [m]. The last row is for points in no cell.
     numbers : (M * n_bins + 1, 2) int32
         Number of points; tile of the lowest point.
     """
@@ -83,7 +83,7 @@ def sort_points(
         _widen(z, cell[block], tile[block], extremes, numbers, tiles.extremes, tiles.occupied)
     for first in range(0, len(r), BLOCK):
         block = slice(first, min(first + BLOCK, len(r)))
-        _resolve_lowest(columns[2, block], r[block], cell[block], tile[block], extremes, numbers)
+        _resolve_lowest(columns[:, block], r[block], cell[block], tile[block], extremes, numbers)
 
 
 @jit(part=True)
@@ -222,15 +222,16 @@ def _widen(
 
 @jit()
 def _resolve_lowest(
-    z: PointArray,
+    columns: PointArray,
     r: PointArray,
     cell: CellArray,
     tile: CellArray,
     extremes: PointArray,
     numbers: CellArray,
 ) -> None:
-    """Range and tile of the lowest point of each cell, once it is known which one that is."""
+    """Range, tile and place of the lowest point of each cell, once its height is known."""
     outside = len(numbers) - 1
+    x, y, z = columns[0], columns[1], columns[2]
     # Listed in any case, counted only where it is the lowest: no branch to predict.
     found = np.empty(BLOCK + 1, dtype=np.int64)
     n_found = 0
@@ -243,8 +244,15 @@ def _resolve_lowest(
             continue
         k = np.uintp(cell[i])
         r_i, nearest = r[i], extremes[k, 1]
-        if r_i < nearest or (r_i == nearest and tile[i] < numbers[k, 1]):
+        is_first = r_i < nearest
+        if r_i == nearest:
+            is_first = tile[i] < numbers[k, 1]
+            if tile[i] == numbers[k, 1]:
+                is_first = x[i] < extremes[k, 3]
+                is_first |= x[i] == extremes[k, 3] and y[i] < extremes[k, 4]
+        if is_first:
             extremes[k, 1], numbers[k, 1] = r_i, tile[i]
+            extremes[k, 3], extremes[k, 4] = x[i], y[i]
 
 
 @jit(entry=True)
@@ -268,6 +276,7 @@ def take_candidates(
             low, high = np.float64(extremes[k, 0]), np.float64(extremes[k, 2])
             candidates.z[c], candidates.r[c], candidates.bin[c] = low, extremes[k, 1], n
             candidates.tile[c] = numbers[k, 1]
+            candidates.x[c], candidates.y[c] = extremes[k, 3], extremes[k, 4]
             candidates.density[c] = vertical_density(
                 count, edges[n + 1] - edges[n], low, high, min_extent
             )

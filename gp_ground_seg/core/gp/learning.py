@@ -217,6 +217,8 @@ def every_segment(frame: Frame, step: int) -> Frame:
             candidates.density[kept],
             offsets,
             candidates.tile[kept],
+            candidates.x[kept],
+            candidates.y[kept],
         ),
         lines=frame.lines._replace(line=frame.lines.line[kept]),
         pseudo=PseudoInputs(

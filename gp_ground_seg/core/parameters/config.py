@@ -195,8 +195,8 @@ class SurfaceConfig:
     """From the segments' surfaces to the surface of the frame."""
 
     look_aside: bool = advanced(True, (),
-        'whether neighbouring segments are evidence for the ground of a segment; false = each '
-        'segment by itself')
+        'whether neighbouring segments are evidence for the ground of a segment, and show the '
+        'relief of the land; false = each segment by itself')
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from gp_ground_seg.core.frame import (
 )
 from gp_ground_seg.core.jit import choose, shared
 from gp_ground_seg.core.parameters.config import Config, LabelConfig
+from gp_ground_seg.core.pipeline.relief import Relief, over_relief
 from gp_ground_seg.core.pipeline.roughness import ground_roughness
 
 FINEST_UNITS = 2.0**40
@@ -48,7 +49,9 @@ VOTE_UNITS = 2.0**12
 """Whole units of a vote: the order in which they are added does not matter."""
 
 
-def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Config) -> Labelled:
+def label_points(
+    scan: Scan, faces: Faces, surface: GroundSurface, relief: Relief, config: Config
+) -> Labelled:
     """Label points by their height over the surface (paper, Algorithm 2, line 14).
 
     A point within the paper's tolerance is ground; above it, the roughness of the ground about it
@@ -59,7 +62,7 @@ def label_points(scan: Scan, faces: Faces, surface: GroundSurface, config: Confi
     grid, tiles, label = scan.grid, scan.tiles, config.label
     z = scan.xyz[:, 2].astype(np.float64)
     # NaN outside, as is what follows; tiles there are negative, which index something.
-    height = z - at_points(surface.knots, surface.mean, grid)
+    height = over_relief(scan, relief) - at_points(surface.knots, surface.mean, grid)
     tile = as_index(tiles.tile)
     in_face = faces.is_face[tile] & grid.inside
     units = sum_units(len(z))

@@ -44,7 +44,7 @@ def build_scan(xyz: PointArray, config: Config) -> Scan:
     geometry = grid_geometry(config.grid, config.faces.cell_size, xyz.dtype)
     grid = build_polar_grid(xyz, geometry)
     tiles = build_tiles(xyz, grid, geometry)
-    extremes, numbers = reduce_cells(grid, xyz[:, 2], tiles.tile)
+    extremes, numbers = reduce_cells(grid, xyz, tiles.tile)
     candidates = ground_candidates(extremes, numbers, grid.edges, config.lines.min_density_extent)
     return Scan(xyz, grid, tiles, candidates)
 
@@ -228,21 +228,24 @@ def build_tiles(xyz: PointArray, grid: PolarGrid, geometry: GridGeometry) -> Til
     return Tiles(tile, extremes.T, occupied)
 
 
-def reduce_cells(grid: PolarGrid, z: PointArray, tile: CellArray) -> tuple[PointArray, CellArray]:
+def reduce_cells(
+    grid: PolarGrid, xyz: PointArray, tile: CellArray
+) -> tuple[PointArray, CellArray]:
     """Lowest and highest point of each cell, and the number of its points.
 
-    Of equally low points the nearest counts, then the one in the first tile, so that the
-    order of the points does not matter.
+    Of equally low points the nearest counts, then the one in the first tile, then the one of the
+    least x, then of the least y, so that the order of the points does not matter.
 
-    Returns, for heights `z` (N,) [m] and the `tile` (N,) of each point:
+    Returns, for points `xyz` (N, 3) [m] and the `tile` (N,) of each:
 
-    extremes, (M * n_bins, 3), in the precision of the points: height of the lowest point, its
-    range, and height of the highest point [m]; infinite, infinite, minus infinite in empty cells;
+    extremes, (M * n_bins, 5), in the precision of the points: height of the lowest point, its
+    range, height of the highest point, x and y of the lowest point [m]; infinite, but minus
+    infinite for the highest point, in empty cells;
     numbers, (M * n_bins, 2): number of points; tile of the lowest point, or `NO_TILE`.
     """
     size = grid.n_segments * grid.n_bins
     inside = np.flatnonzero(grid.inside)
-    cell = as_index(grid.cell[inside])
+    cell, z = as_index(grid.cell[inside]), xyz[:, 2]
     z_inside, r_inside = z[inside], grid.r[inside]
     lowest_z, lowest_r = np.full((2, size), np.inf, dtype=z.dtype)
     highest_z = np.full(size, -np.inf, dtype=z.dtype)
@@ -251,11 +254,18 @@ def reduce_cells(grid: PolarGrid, z: PointArray, tile: CellArray) -> tuple[Point
     lowest = np.flatnonzero(z_inside == lowest_z[cell])
     np.minimum.at(lowest_r, cell[lowest], r_inside[lowest])
     lowest = lowest[r_inside[lowest] == lowest_r[cell[lowest]]]
+    # What is left is mostly one point of each cell.
+    places = cell[lowest]
     lowest_tile = np.full(size, NO_TILE, dtype=np.int32)
-    np.minimum.at(lowest_tile, cell[lowest], tile[inside[lowest]])
+    np.minimum.at(lowest_tile, places, tile[inside[lowest]])
+    lowest = lowest[tile[inside[lowest]] == lowest_tile[places]]
+    x, y = xyz[:, 0][inside[lowest]], xyz[:, 1][inside[lowest]]
+    order = np.lexsort((y, x))[::-1]  # the first one is written last
+    lowest_x, lowest_y = np.full((2, size), np.inf, dtype=z.dtype)
+    lowest_x[cell[lowest[order]]], lowest_y[cell[lowest[order]]] = x[order], y[order]
     number = np.bincount(cell, minlength=size).astype(np.int32)
     return (
-        np.column_stack([lowest_z, lowest_r, highest_z]),
+        np.column_stack([lowest_z, lowest_r, highest_z, lowest_x, lowest_y]),
         np.column_stack([number, lowest_tile]),
     )
 
@@ -275,7 +285,7 @@ def ground_candidates(
     n_bins = len(edges) - 1
     occupied = np.flatnonzero(numbers[:, 0])
     bins = occupied % n_bins
-    lowest_z, lowest_r, highest_z = extremes[occupied].astype(np.float64).T
+    lowest_z, lowest_r, highest_z, x, y = extremes[occupied].astype(np.float64).T
     widths = np.diff(edges)[bins]
     per_segment = np.bincount(occupied // n_bins, minlength=len(numbers) // n_bins)
     return Candidates(
@@ -285,4 +295,6 @@ def ground_candidates(
         density=vertical_density(numbers[occupied, 0], widths, lowest_z, highest_z, min_extent),
         offsets=np.concatenate([[0], np.cumsum(per_segment)]),
         tile=numbers[occupied, 1],
+        x=x.copy(),
+        y=y.copy(),
     )

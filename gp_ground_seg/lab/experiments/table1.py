@@ -100,14 +100,14 @@ def _rows(
     # Grid, candidates and pseudo-inputs do not depend on the length-scale model.
     common = results['Z-L']
     candidates = common.candidates
-    # A candidate is the point of its segment with the same range and height.
-    place = common.grid.r + 1j * common.pose.level(scan.points[:, :3])[:, 2]
+    # A candidate is the point at the same place.
+    x, y, _ = common.pose.level(scan.points[:, :3]).T
     modelled = scan.is_ground & (common.grid.bin != OUTSIDE)
     rows = []
     for segment in segments:
         part = slice(*candidates.offsets[segment : segment + 2])
         held_out = modelled & (common.grid.segment == segment)
-        held_out &= ~np.isin(place, candidates.r[part] + 1j * candidates.z[part])
+        held_out &= ~np.isin(x + 1j * y, candidates.x[part] + 1j * candidates.y[part])
         variances = np.exp(2.0 * common.theta[segment, : len(VARIANCES)])
         in_sample = {name: _in_sample(result, segment) for name, result in results.items()}
         rows.append(

@@ -33,6 +33,7 @@ PSEUDO_INPUT_COLOUR = style.VIOLET
 # Metres kept free below and above the ground, and beyond the last candidate; and the distance
 # from the ground up to which a candidate is always in the picture.
 BELOW, ABOVE, BEYOND, NEAR_GROUND = 0.25, 0.9, 2.0, 1.0
+N_OF_LINE = 16  # places at which a line is drawn over the relief
 
 
 def segment_at(azimuth: float, n_segments: int) -> int:
@@ -122,11 +123,13 @@ class SegmentView:
             raise ConfigError(f'segment {segment}: must be in [0, {n_segments - 1}]')
         self._result, self._segment = result, segment
         first, last = result.candidates.offsets[segment : segment + 2].tolist()
-        self._r, self._z = result.candidates.r[first:last], result.candidates.z[first:last]
+        own = result.candidates.where(result.candidates.segment == segment)
+        self._r, self._z = own.r, own.z + result.relief.at(own.x, own.y)
         self._inlier = result.surface.inlier[first:last]
         self._lines = np.unique(result.lines.line[first:last])
         self._knots = result.surface.knots
-        self._mean, self._std = result.surface.mean[segment], result.surface.std[segment]
+        self._std = result.surface.std[segment]
+        self._mean = result.surface.mean[segment] + self._relief(self._knots)
 
     @property
     def name(self) -> str:
@@ -135,6 +138,11 @@ class SegmentView:
         first, last = (width * (self._segment + k) - 180.0 for k in (0, 1))
         model = '' if np.isfinite(self._mean).any() else ': no ground model'
         return f'segment {self._segment}, azimuth {first:g}° to {last:g}°{model}'
+
+    def _relief(self, r: FloatArray) -> FloatArray:
+        """Height of the relief at ranges (K,) in the middle of the segment, (K,) [m]."""
+        heights = self._result.relief.at_knots(r, self._result.grid.n_segments)
+        return np.asarray(heights[self._segment])
 
     def reach(self, point_r: FloatArray) -> float:
         """Return the range that holds all candidates, or if none all points [m]."""
@@ -177,14 +185,18 @@ class SegmentView:
         drawn = [q for q in self._lines if lines.start[q + 1] - lines.start[q] > 1]
         for q in drawn:
             points = slice(lines.start[q], lines.start[q + 1])
+            r, z = candidates.r[points], candidates.z[points]
+            share = np.linspace(0.0, 1.0, N_OF_LINE)
+            r, z = (a + share * (b - a) for a, b in line_ends(r, z, float(lines.slope[q])))
             axes.plot(
-                *line_ends(candidates.r[points], candidates.z[points], float(lines.slope[q])),
+                r, z + self._relief(r),
                 color=LINE_COLOUR, lw=3.2, alpha=0.75, solid_capstyle='butt', zorder=4,
                 label=f'lines ({len(self._lines)})' if q == drawn[0] else None,
             )  # fmt: skip
         critical = lines.start[self._lines[1:]]
+        first = self._result.candidates.offsets[self._segment]
         axes.plot(
-            candidates.r[critical], candidates.z[critical], 'd', ms=9, mfc='none',
+            self._r[critical - first], self._z[critical - first], 'd', ms=9, mfc='none',
             mec=LINE_COLOUR, mew=1.2, zorder=8, label=f'critical points ({len(critical)})',
         )  # fmt: skip
 

@@ -1,0 +1,329 @@
+"""Compiled twin of `gp_ground_seg.core.pipeline.relief`.
+
+Tables of squares have one more at each side, so that each square has eight around it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
+from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.parameters.config import GrowthConfig
+from gp_ground_seg.core.pipeline.relief import (
+    FADED,
+    GENTLE,
+    MIN_RAISED,
+    MIN_SEEDS,
+    MIN_WIDTH,
+    N_ASIDE,
+    N_ROUNDS,
+    N_SIDES,
+    RAISED,
+    REACH,
+    STEEP,
+    arc_of,
+    can_step,
+    faded,
+    from_first_middle,
+    height_in,
+    height_of,
+    largest_gap,
+    middle_of,
+    piece_of,
+    plane_of,
+    robust_weight,
+    square_of,
+)
+
+_WIDTH = N_SIDES + 2
+_N_SQUARES = _WIDTH * _WIDTH
+_N_SUMS = 9
+
+
+@jit(entry=True)
+def find_relief(
+    candidates: Candidates,
+    is_face: BoolArray,
+    height: float,
+    growth: GrowthConfig,
+    pieces: FloatArray,
+    z: FloatArray,
+) -> bool:
+    """Set the pieces of the relief, and heights of candidates over it; return whether it is level.
+
+    Where it is, nothing is set.
+    """
+    reached = _reachable(candidates, is_face, height, growth)
+    land, is_known, number = _fit_planes(candidates, reached, height)
+    _leave_out_small(land, is_known, number)
+    highest = 0.0
+    for k in range(_N_SQUARES):
+        highest = max(highest, abs(land[k])) if is_known[k] else highest
+    if highest <= FADED:
+        return True
+    _fill(land, is_known)
+    for k in range(_N_SQUARES):
+        land[k] = faded(land[k])
+    for i in range(N_SIDES - 1):
+        for j in range(N_SIDES - 1):
+            k, piece = _place(i, j), pieces[i, j]
+            corners = land[k], land[k + _WIDTH], land[k + 1], land[k + 1 + _WIDTH]
+            level, along_u, along_v, twist = piece_of(*corners, i, j)
+            piece[0], piece[1], piece[2], piece[3] = level, along_u, along_v, twist
+    for c in range(len(z)):
+        z[c] = candidates.z[c] - height_at(pieces, candidates.x[c], candidates.y[c])
+    return False
+
+
+@jit()
+def height_at(pieces: FloatArray, x: float, y: float) -> float:
+    """Height of the relief at a place [m]."""
+    u, v = from_first_middle(x), from_first_middle(y)
+    height: float = height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
+    return height
+
+
+@jit()
+def _place(i: int, j: int) -> int:
+    return (i + 1) * _WIDTH + j + 1
+
+
+@jit()
+def _reachable(
+    candidates: Candidates, is_face: BoolArray, height: float, growth: GrowthConfig
+) -> BoolArray:
+    """See the plain `reachable`."""
+    r, n = candidates.r, len(candidates.r)
+    allowed, parent, n_seeds = np.empty(n, np.bool_), np.arange(n), np.zeros(n, np.int64)
+    for c in range(n):
+        allowed[c] = r[c] < REACH and not is_face[np.uintp(candidates.tile[c])]
+    steep = _step_along(candidates, allowed, parent)
+    for aside in range(1, N_ASIDE + 1):
+        _step_aside(candidates, allowed, aside, parent)
+    _step_up(candidates, steep, parent)
+    for c in range(n):
+        parent[c] = _root(parent, c)
+        is_near = allowed[c] and r[c] < growth.seed_range
+        if is_near and abs(candidates.z[c] + height) < growth.seed_height_tolerance:
+            n_seeds[parent[c]] += 1
+    for c in range(n):
+        allowed[c] &= n_seeds[parent[c]] >= MIN_SEEDS
+    return allowed
+
+
+@jit()
+def _step_along(candidates: Candidates, allowed: BoolArray, parent: IntArray) -> IntArray:
+    """Join neighbours of a segment; return the candidates at the far ends of steep steps."""
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    steep, n = np.empty(len(r), np.int64), 0
+    for m in range(len(offsets) - 1):
+        for c in range(offsets[m] + 1, offsets[m + 1]):
+            dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
+            is_taken = allowed[c] and allowed[c - 1] and dr <= largest_gap(r[c])
+            if is_taken and can_step(dr, rise, STEEP):
+                if abs(rise) <= GENTLE:
+                    _join(parent, c - 1, c)
+                else:
+                    steep[n] = c
+                    n += 1
+    return steep[:n]
+
+
+@jit()
+def _step_up(candidates: Candidates, steep: IntArray, parent: IntArray) -> None:
+    """Join groups between which steep steps lead over a width."""
+    n, n_segments = len(parent), len(candidates.offsets) - 1
+    pair = np.empty(len(steep), np.int64)
+    for k in range(len(steep)):
+        a, b = _root(parent, steep[k] - 1), _root(parent, steep[k])
+        pair[k] = min(a, b) * n + max(a, b)
+    order = np.argsort(pair, kind='mergesort')
+    first = 0
+    while first < len(order):
+        stop, width = first, 0.0
+        while stop < len(order) and pair[order[stop]] == pair[order[first]]:
+            width += arc_of(candidates.r[steep[order[stop]] - 1], n_segments)
+            stop += 1
+        if width >= MIN_WIDTH:
+            _join(parent, steep[order[first]] - 1, steep[order[first]])
+        first = stop
+
+
+@jit()
+def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, parent: IntArray) -> None:
+    """Join each candidate with the next ones in range of the segment so many further on."""
+    r, z, offsets = candidates.r, candidates.z, candidates.offsets
+    n_segments = len(offsets) - 1
+    for m in range(n_segments):
+        beside = (m + aside) % n_segments
+        first, stop = offsets[beside], offsets[beside + 1]
+        behind = first
+        for c in range(offsets[m], offsets[m + 1]):
+            while behind < stop and r[behind] < r[c]:
+                behind += 1
+            if not allowed[c]:
+                continue
+            across, gap = aside * arc_of(r[c], n_segments), 0.5 * largest_gap(r[c])
+            for there in range(max(behind - 1, first), min(behind + 1, stop)):
+                dr = abs(r[there] - r[c])
+                if allowed[there] and dr <= gap:
+                    distance = math.sqrt(dr * dr + across * across)
+                    if can_step(distance, z[there] - z[c], GENTLE):
+                        _join(parent, c, there)
+
+
+@jit()
+def _root(parent: IntArray, c: int) -> int:
+    while parent[c] != c:
+        parent[c] = parent[parent[c]]
+        c = parent[c]
+    return c
+
+
+@jit()
+def _join(parent: IntArray, a: int, b: int) -> None:
+    a, b = _root(parent, a), _root(parent, b)
+    parent[max(a, b)] = min(a, b)
+
+
+@jit()
+def _fit_planes(
+    candidates: Candidates, reached: BoolArray, height: float
+) -> tuple[FloatArray, BoolArray, IntArray]:
+    """Heights of the land, which are known, and numbers of candidates, of all squares.
+
+    See the plain `fit_planes`.
+    """
+    x, y, z = candidates.x, candidates.y, candidates.z
+    square, number = np.empty(len(x), np.int64), np.zeros(_N_SQUARES, np.int64)
+    for c in range(len(x)):
+        square[c] = _place(int(square_of(x[c])), int(square_of(y[c])))
+        number[square[c]] += reached[c]
+    weight, plane = np.empty(len(x)), np.zeros((_N_SQUARES, 5))
+    for c in range(len(x)):
+        weight[c] = 1.0 / number[square[c]] if reached[c] else 0.0
+    land, is_known = np.zeros(_N_SQUARES), np.zeros(_N_SQUARES, np.bool_)
+    for _ in range(N_ROUNDS):
+        sums = _sums_around(x, y, z, height, weight, square)
+        for k in range(_N_SQUARES):
+            if number[k] > 0:
+                is_known[k] = _set_plane(sums[k], plane[k])
+        for c in range(len(x)):
+            if reached[c]:
+                there = height_of(plane[square[c]], x[c], y[c])
+                weight[c] = robust_weight(z[c] + height - there) / number[square[c]]
+    for i in range(N_SIDES):
+        for j in range(N_SIDES):
+            k = _place(i, j)
+            is_known[k] = _set_plane(sums[k], plane[k])
+            land[k] = height_of(plane[k], middle_of(i), middle_of(j))
+    return land, is_known, number
+
+
+@jit()
+def _set_plane(sums: FloatArray, plane: FloatArray) -> bool:
+    """Set mean and slopes of a plane by its sums (9,); return whether they determine it."""
+    x, y, z, slope_x, slope_y, is_determined = plane_of(sums)
+    plane[0], plane[1], plane[2], plane[3], plane[4] = x, y, z, slope_x, slope_y
+    return bool(is_determined)
+
+
+@jit()
+def _sums_around(
+    x: FloatArray,
+    y: FloatArray,
+    z: FloatArray,
+    height: float,
+    weight: FloatArray,
+    square: IntArray,
+) -> FloatArray:
+    """Weighted sums of `plane_of` over each square and the eight around it, (squares, 9)."""
+    own = np.zeros(_N_SQUARES * _N_SUMS)
+    for c in range(len(x)):
+        w, over, first = weight[c], z[c] + height, square[c] * _N_SUMS
+        if w > 0.0:
+            own[first] += w
+            own[first + 1] += w * x[c]
+            own[first + 2] += w * y[c]
+            own[first + 3] += w * over
+            own[first + 4] += w * (x[c] * x[c])
+            own[first + 5] += w * (x[c] * y[c])
+            own[first + 6] += w * (y[c] * y[c])
+            own[first + 7] += w * (x[c] * over)
+            own[first + 8] += w * (y[c] * over)
+    rows, around, column = np.zeros_like(own), np.zeros_like(own), _WIDTH * _N_SUMS
+    for k in range(column, len(own) - column):
+        rows[k] = own[k - column] + own[k] + own[k + column]
+    for k in range(column, len(own) - column):
+        around[k] = rows[k - _N_SUMS] + rows[k] + rows[k + _N_SUMS]
+    return around.reshape(_N_SQUARES, _N_SUMS)
+
+
+@jit()
+def _leave_out_small(land: FloatArray, is_known: BoolArray, number: IntArray) -> None:
+    """See the plain `leave_out_small`."""
+    is_seen, part = np.zeros(_N_SQUARES, np.bool_), np.empty(_N_SQUARES, np.int64)
+    for start in range(_N_SQUARES):
+        n = stop = 0
+        if is_known[start] and abs(land[start]) > RAISED and not is_seen[start]:
+            part[0], is_seen[start], stop = start, True, 1
+        while n < stop:
+            for step in (-_WIDTH, -1, 1, _WIDTH):
+                k = part[n] + step
+                if is_known[k] and abs(land[k]) > RAISED and not is_seen[k]:
+                    part[stop], is_seen[k] = k, True
+                    stop += 1
+            n += 1
+        n_occupied = 0
+        for n in range(stop):
+            n_occupied += number[part[n]] > 0
+        if n_occupied < MIN_RAISED:
+            for n in range(stop):
+                is_known[part[n]] = False
+
+
+@jit()
+def _fill(land: FloatArray, is_known: BoolArray) -> None:
+    """See the plain `filled`."""
+    ring, following = np.empty(_N_SQUARES, np.int64), np.empty(_N_SQUARES, np.int64)
+    is_waiting, mean = np.zeros(_N_SQUARES, np.bool_), np.empty(_N_SQUARES)
+    n = 0
+    for i in range(N_SIDES):
+        for j in range(N_SIDES):
+            k = _place(i, j)
+            is_waiting[k] = not is_known[k]
+            if is_known[k]:
+                ring[n] = k
+                n += 1
+            else:
+                land[k] = 0.0
+    while n > 0:
+        n_following = 0
+        for q in range(n):
+            for step in range(-_WIDTH, _WIDTH + 1, _WIDTH):
+                for k in range(ring[q] + step - 1, ring[q] + step + 2):
+                    if is_waiting[k]:
+                        is_waiting[k] = False
+                        following[n_following] = k
+                        n_following += 1
+        for q in range(n_following):
+            mean[q] = _mean_around(land, is_known, following[q])
+        for q in range(n_following):
+            land[following[q]], is_known[following[q]] = mean[q], True
+        ring, following, n = following, ring, n_following
+
+
+@jit()
+def _mean_around(land: FloatArray, is_known: BoolArray, k: int) -> float:
+    """Mean of the known heights in the eight squares around one."""
+    number, rows = 0, np.zeros(3)
+    for j in range(3):
+        here = k + j - 1
+        for there in (here - _WIDTH, here, here + _WIDTH):
+            rows[j] += land[there]
+            number += is_known[there]
+    mean: float = (rows[0] + rows[1] + rows[2]) / number
+    return mean

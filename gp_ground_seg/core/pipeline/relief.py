@@ -1,0 +1,347 @@
+"""Stage 4: the relief of the land, over which lines and surfaces are found.
+
+The surface of a segment is a function of range with a level prior. Along one segment the foot of
+a bank is like that of a wall; in plan it is not, as a bank is wide and deep. So candidates that
+can be reached on foot from the ground near the sensor are found first, in steps along segments and
+between them. Planes through those in 3 by 3 squares, each fitted robustly, are the relief: it has
+the height of banks and hills, and fades where the land is as high as the prior mean.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gp_ground_seg.core.frame import (
+    BoolArray,
+    Candidates,
+    Faces,
+    FloatArray,
+    IntArray,
+    PointArray,
+    Scan,
+    Values,
+)
+from gp_ground_seg.core.jit import shared
+from gp_ground_seg.core.parameters.config import Config
+
+REACH = 60.0
+"""Half the side of the relief, and range up to which it follows the land [m]; beyond, it has the
+height of its border."""
+SIDE = 2.0
+"""Side of a square [m]."""
+N_SIDES = round(2.0 * REACH / SIDE)
+"""Squares along a side of the relief."""
+
+GAP, GAP_GROWTH = 1.0, 0.12
+"""Longest step along a segment next to the sensor [m], and its growth with range [m/m]; half as
+long between segments."""
+MAX_SLOPE, STEP_TOLERANCE = 0.84, 0.06
+"""Steepest step, of 40 degrees, and what it may rise beyond that by roughness and noise [m]."""
+GENTLE, STEEP, MIN_WIDTH = 0.3, 0.8, 5.0
+"""Largest rise or fall of a step; that of one along a segment which is taken where others beside
+it lead up over a width, and this width: more than that of the front of a car [m]."""
+N_ASIDE = 2
+"""Segments on each side that a step may lead to."""
+MIN_SEEDS = 8
+"""Candidates near the sensor, at the expected height, from which others can be reached."""
+
+N_ROUNDS = 3
+"""Fits of the planes, each weighted by the residuals of the one before."""
+ROBUST_SCALE = 0.15
+"""Residual at which a candidate counts half [m]."""
+RIDGE = 0.5
+"""Variance that is added to those of x and y [m^2]: planes through few places are more level."""
+MIN_WEIGHT, MIN_SCATTER = 1.5, 0.4
+"""Least weight of a plane, a square with candidates counting one, and least scatter of its
+candidates, across the direction in which they lie in a row [m]."""
+RAISED, MIN_RAISED = 0.3, 9
+"""Height from which the squares side by side with candidates in them must be as many [m]: more
+than those of a truck."""
+FADED, FADE_WIDTH = 0.15, 0.3
+"""Height of the land up to which the relief is level, and over which it then grows to it [m]."""
+
+
+class Relief(NamedTuple):
+    """Height of the land over the prior mean, in plan."""
+
+    # (N_SIDES - 1, N_SIDES - 1, 4) pieces between the middles of four squares, see `piece_of`
+    pieces: FloatArray
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the height is 0 everywhere."""
+        return not self.pieces.any()
+
+    @classmethod
+    def of(cls, height: FloatArray) -> Relief:
+        """Relief by its height in the middle of each square, (N_SIDES, N_SIDES) [m]."""
+        corners = height[:-1, :-1], height[1:, :-1], height[:-1, 1:], height[1:, 1:]
+        u, v = np.indices(corners[0].shape).astype(np.float64)
+        return cls(np.stack(piece_of(*corners, u, v), axis=-1))
+
+    def at(self, x: PointArray, y: PointArray) -> FloatArray:
+        """Height at places (P,) that are finite, (P,) [m]."""
+        u, v = (from_first_middle(place.astype(np.float64)) for place in (x, y))
+        piece = self.pieces[u.astype(np.int64), v.astype(np.int64)]
+        result: FloatArray = height_in(piece.T, u, v)
+        return result
+
+    def at_knots(self, knots: FloatArray, n_segments: int) -> FloatArray:
+        """Height at ranges `knots` (K,) in the middle of each segment, (M, K) [m]."""
+        azimuth = 2.0 * np.pi * (np.arange(n_segments)[:, None] + 0.5) / n_segments - np.pi
+        x, y = (knots * np.cos(azimuth)).ravel(), (knots * np.sin(azimuth)).ravel()
+        return self.at(x, y).reshape(n_segments, len(knots))
+
+
+def find_relief(
+    candidates: Candidates, faces: Faces, height: float, config: Config
+) -> tuple[Relief, Candidates]:
+    """Relief of the land over a plane `height` [m] below the origin; candidates over the relief.
+
+    Vertical faces are no land.
+    """
+    growth, z = config.growth, candidates.z + height
+    allowed = ~faces.is_face[candidates.tile] & (candidates.r < REACH)
+    allowed &= config.surface.look_aside
+    is_seed = allowed & (candidates.r < growth.seed_range)
+    is_seed &= np.abs(z) < growth.seed_height_tolerance
+    reached = reachable(candidates, allowed, is_seed)
+    places = candidates.x[reached], candidates.y[reached], z[reached]
+    land, is_known, is_occupied = fit_planes(*places)
+    leave_out_small(land, is_known, is_occupied)
+    if not (np.abs(land[is_known]) > FADED).any():
+        return Relief.of(np.zeros_like(land)), candidates
+    relief = Relief.of(faded(filled(land, is_known)))
+    return relief, candidates._replace(z=candidates.z - relief.at(candidates.x, candidates.y))
+
+
+def reachable(candidates: Candidates, allowed: BoolArray, is_seed: BoolArray) -> BoolArray:
+    """Which of the candidates can be reached from enough seeds in steps over `allowed` ones, (C,).
+
+    Gentle steps make groups of candidates. Two groups are one where steep steps lead from one to
+    the other over a width: those to a car are few.
+    """
+    first, second = _steps(candidates)
+    taken = allowed[first] & allowed[second]
+    first, second = first[taken], second[taken]
+    is_gentle = np.abs(candidates.z[second] - candidates.z[first]) <= GENTLE
+    group = _groups(len(allowed), first[is_gentle], second[is_gentle])
+    first, second = first[~is_gentle], second[~is_gentle]
+    ends = np.sort(np.stack([group[first], group[second]]), axis=0)
+    pairs, pair = np.unique(ends, axis=1, return_inverse=True)
+    arc = arc_of(candidates.r[first], len(candidates.offsets) - 1)
+    is_wide = np.bincount(pair.ravel(), arc, pairs.shape[1]) >= MIN_WIDTH
+    group = _groups(int(group.max(initial=-1)) + 1, *pairs[:, is_wide])[group]
+    result: BoolArray = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
+    return result & allowed
+
+
+def _groups(n: int, first: IntArray, second: IntArray) -> IntArray:
+    """Group of each of `n` members, (n,), of which those of a pair are in one group."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(first), dtype=np.bool_), (first, second)), shape=(n, n))
+    group: IntArray = connected_components(graph, directed=False)[1]
+    return group
+
+
+def _steps(candidates: Candidates) -> tuple[IntArray, IntArray]:
+    """Candidates at both ends of all possible steps.
+
+    They lead to the next candidate of the segment, and to the two in range next to it in each
+    segment beside; there none is steep.
+    """
+    r, z, segment = candidates.r, candidates.z, candidates.segment
+    n_segments, n = len(candidates.offsets) - 1, len(r)
+    along = np.arange(n - 1)
+    dr = np.diff(r)
+    is_step = (segment[1:] == segment[:-1]) & (dr <= largest_gap(r[1:]))
+    is_step &= can_step(dr, np.diff(z), STEEP)
+    first, second = [along[is_step]], [along[is_step] + 1]
+    apart = 2.0 * float(r.max(initial=0.0)) + 1.0  # of one segment's ranges and the next one's
+    key, here = segment * apart + r, np.arange(n)
+    for aside in range(1, N_ASIDE + 1):
+        beside = (segment + aside) % n_segments
+        behind = np.searchsorted(key, beside * apart + r)
+        across = aside * arc_of(r, n_segments)
+        for there in (behind - 1, np.minimum(behind, n - 1)):
+            dr = np.abs(r[there] - r)
+            is_step = (segment[there] == beside) & (dr <= 0.5 * largest_gap(r))
+            distance = np.sqrt(dr * dr + across * across)
+            is_step &= can_step(distance, z[there] - z, GENTLE)
+            first.append(here[is_step])
+            second.append(there[is_step])
+    return np.concatenate(first), np.concatenate(second)
+
+
+@shared
+def largest_gap(r: Values) -> Values:
+    """Longest step along a segment at a range [m]."""
+    return GAP + GAP_GROWTH * r
+
+
+@shared
+def arc_of(r: Values, n_segments: int) -> Values:
+    """Width of a segment at a range [m]."""
+    return 2.0 * math.pi / n_segments * r
+
+
+@shared
+def can_step(distance: Values, rise: Values, most: float) -> Values:
+    """Whether a step of this length and rise [m] is one on foot."""
+    return np.abs(rise) <= np.minimum(MAX_SLOPE * distance + STEP_TOLERANCE, most)
+
+
+def fit_planes(
+    x: FloatArray, y: FloatArray, z: FloatArray
+) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Height of the land in the middle of each square, by the places (P,) in and around it.
+
+    The places in a square share a weight of one, so that those near the sensor are not all. Then
+    each counts less with its distance to the plane of its own square.
+
+    Returns the heights [m], which of them are determined, and which squares have places, three
+    (N_SIDES, N_SIDES); heights that are not determined are arbitrary.
+    """
+    i, j = square_of(x).astype(np.int64), square_of(y).astype(np.int64)
+    square, shape = i * N_SIDES + j, (N_SIDES, N_SIDES)
+    in_square = np.bincount(square, minlength=N_SIDES * N_SIDES)
+    number = in_square[square]
+    weight, products = 1.0 / number, (np.ones_like(x), x, y, z, x * x, x * y, y * y, x * z, y * z)
+    for _ in range(N_ROUNDS):
+        sums = (np.bincount(square, weight * p, N_SIDES * N_SIDES) for p in products)
+        around = [three_by_three(total.reshape(shape)) for total in sums]
+        *plane, is_determined = plane_of(around)
+        there = [table[i, j] for table in plane]
+        weight = robust_weight(z - height_of(there, x, y)) / number
+    middle = middle_of(np.arange(N_SIDES))
+    land: FloatArray = height_of(plane, middle[:, None], middle)
+    return land, is_determined, in_square.reshape(shape) > 0
+
+
+def three_by_three(table: npt.NDArray[Any]) -> FloatArray:
+    """Sum over each square and the eight around it, (N_SIDES, N_SIDES)."""
+    padded = np.pad(table.astype(np.float64), 1)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    result: FloatArray = rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
+    return result
+
+
+def leave_out_small(land: FloatArray, is_known: BoolArray, is_occupied: BoolArray) -> None:
+    """Set heights to be unknown where few squares side by side are raised or lowered."""
+    from scipy.ndimage import label
+
+    part, n_parts = label(is_known & (np.abs(land) > RAISED))
+    number = np.bincount(part.ravel(), is_occupied.ravel(), minlength=n_parts + 1)
+    is_small = number < MIN_RAISED
+    is_small[0] = False
+    is_known &= ~is_small[part]
+
+
+def filled(land: FloatArray, is_known: BoolArray) -> FloatArray:
+    """Land with each unknown height the mean of those known around it, ring by ring."""
+    land = np.where(is_known, land, 0.0)
+    while not is_known.all():
+        number = three_by_three(is_known)
+        mean = three_by_three(land) / np.maximum(number, 1.0)
+        is_next = ~is_known & (number > 0.0)
+        land[is_next] = mean[is_next]
+        is_known = is_known | is_next
+    return land
+
+
+def over_relief(scan: Scan, relief: Relief) -> FloatArray:
+    """Height of the points of a scan over the relief, (N,) [m]; arbitrary outside the grid."""
+    z: FloatArray = scan.xyz[:, 2].astype(np.float64)
+    if not relief.is_level:
+        inside = np.flatnonzero(scan.grid.inside)
+        z[inside] -= relief.at(scan.xyz[:, 0][inside], scan.xyz[:, 1][inside])
+    return z
+
+
+@shared
+def square_of(place: Values) -> Values:
+    """Square along x or y in which a place [m] lies, at most the last; a float."""
+    beyond = np.floor((place + REACH) / SIDE)
+    return np.minimum(np.maximum(beyond, 0.0), N_SIDES - 1.0)
+
+
+@shared
+def middle_of(square: Values) -> Values:
+    """Where the middle of a square lies along x or y [m]."""
+    return (square + 0.5) * SIDE - REACH
+
+
+@shared
+def from_first_middle(place: Values) -> Values:
+    """Squares from the middle of the first one to a place [m], along x or y, within the relief."""
+    beyond = (place + REACH) / SIDE - 0.5
+    return np.minimum(np.maximum(beyond, 0.0), N_SIDES - 1.0 - 1e-6)
+
+
+@shared
+def piece_of(
+    a: Values, b: Values, c: Values, d: Values, u: Values, v: Values
+) -> tuple[Values, Values, Values, Values]:
+    """Factors of 1, u, v and u v in the height between four middles, `u` and `v` at the first.
+
+    That height is `a` there, `b` one square on along u, `c` along v, and `d` along both.
+    """
+    twist = (a - b) - (c - d)
+    along_u, along_v = (b - a) - twist * v, (c - a) - twist * u
+    return a - along_u * u - along_v * v - twist * u * v, along_u, along_v, twist
+
+
+@shared
+def height_in(piece: Values, u: Values, v: Values) -> Values:
+    """Height at a place in the four factors of `piece_of` [m]."""
+    return piece[0] + piece[1] * u + (piece[2] + piece[3] * u) * v
+
+
+@shared
+def plane_of(sums: Values) -> tuple[Values, Values, Values, Values, Values, Values]:
+    """Plane through places, by weighted sums of 1, x, y, z, xx, xy, yy, xz and yz.
+
+    Returns their mean (three), slopes along x and y, and whether they determine it.
+    """
+    n, x, y, z = sums[0], sums[1], sums[2], sums[3]
+    xx, xy, yy, xz, yz = sums[4], sums[5], sums[6], sums[7], sums[8]
+    safe = np.maximum(n, 1e-9)
+    mean_x, mean_y, mean_z = x / safe, y / safe, z / safe
+    var_x, var_y = xx / safe - mean_x * mean_x, yy / safe - mean_y * mean_y
+    var_xy = xy / safe - mean_x * mean_y
+    var_xz, var_yz = xz / safe - mean_x * mean_z, yz / safe - mean_y * mean_z
+    apart = 0.5 * (var_x - var_y)
+    least = 0.5 * (var_x + var_y) - np.sqrt(apart * apart + var_xy * var_xy)
+    is_determined = (n >= MIN_WEIGHT) & (least >= MIN_SCATTER * MIN_SCATTER)
+    var_x, var_y = var_x + RIDGE, var_y + RIDGE
+    determinant = var_x * var_y - var_xy * var_xy
+    slope_x = (var_xz * var_y - var_yz * var_xy) / determinant
+    slope_y = (var_yz * var_x - var_xz * var_xy) / determinant
+    return mean_x, mean_y, mean_z, slope_x, slope_y, is_determined
+
+
+@shared
+def height_of(plane: Values, x: Values, y: Values) -> Values:
+    """Height at a place of the plane, the first five values that `plane_of` gives [m]."""
+    return plane[2] + plane[3] * (x - plane[0]) + plane[4] * (y - plane[1])
+
+
+@shared
+def robust_weight(residual: Values) -> Values:
+    """Weight of a place at a distance [m] from its plane: Cauchy's."""
+    share = residual / ROBUST_SCALE
+    return 1.0 / (1.0 + share * share)
+
+
+@shared
+def faded(land: Values) -> Values:
+    """Height of the relief where the land is so high [m]: level where it is low."""
+    share = (np.abs(land) - FADED) / FADE_WIDTH
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
+    return land * share * share * (3.0 - 2.0 * share)

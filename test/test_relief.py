@@ -1,0 +1,180 @@
+"""The relief of the land: both backends against loops, and what it does and does not follow."""
+
+import math
+
+import numpy as np
+import pytest
+import reference
+from conftest import fewer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gp_ground_seg import Config
+from gp_ground_seg.core.frame import Candidates, Faces
+from gp_ground_seg.core.pipeline.relief import N_SIDES, Relief
+
+HEIGHT, N_TILES = 1.8, 50
+MIDDLES = 2.0 * np.arange(N_SIDES) - 59.0
+NO_FACES = Faces(*np.zeros((2, N_TILES), dtype=bool))
+
+
+def candidates_on(height, ranges, n_segments=180, seed=0, share=1.0, spread=0.3):
+    """Candidates on ground of a `height` over x and y, or a share of them."""
+    rng = np.random.default_rng(seed)
+    segment, r = (
+        grid.ravel() for grid in np.meshgrid(np.arange(n_segments), ranges, indexing='ij')
+    )
+    kept = rng.uniform(size=len(r)) < share
+    segment, r = segment[kept], r[kept]
+    azimuth = (
+        2.0 * np.pi * (segment + 0.5 + spread * rng.uniform(-1.0, 1.0, len(r))) / n_segments
+        - np.pi
+    )
+    x, y = r * np.cos(azimuth), r * np.sin(azimuth)
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(segment, minlength=n_segments))])
+    tile = rng.integers(0, N_TILES, len(r)).astype(np.int32)
+    z = height(x, y) - HEIGHT
+    return Candidates(r, z, np.arange(len(r)), np.ones(len(r)), offsets, tile, x, y)
+
+
+RINGS = np.concatenate([np.arange(3.0, 20.0, 0.5), np.arange(20.0, 40.0, 1.0)])
+
+
+def heights_of(relief):
+    """Heights in the middle of the squares, by x and y."""
+    x, y = np.meshgrid(MIDDLES, MIDDLES, indexing='ij')
+    return relief.at(x.ravel(), y.ravel()).reshape(x.shape)
+
+
+@settings(max_examples=fewer(8, 3), deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([4, 45, 90]), st.booleans())
+def test_relief_is_the_reference(backend, seed, n_segments, looks_aside):
+    rng = np.random.default_rng(seed)
+    steep, foot, turn, noise = rng.uniform((0.1, 5.0, -3.0, 0.0), (0.8, 15.0, 3.0, 0.1))
+
+    def land(x, y):
+        along = x * math.cos(turn) + y * math.sin(turn)
+        bank = np.clip(steep * (along - foot), 0.0, 3.0)
+        thing = 1.5 * (rng.uniform(size=len(x)) < 0.05)
+        return bank + thing + noise * rng.normal(size=len(x))
+
+    ranges = np.sort(rng.uniform(2.0, 65.0, 24))
+    candidates = candidates_on(land, ranges, n_segments, seed, share=0.7)
+    faces = Faces(*(rng.uniform(size=(2, N_TILES)) < 0.1))
+    config = Config().replace(**{'surface.look_aside': looks_aside})
+    relief, over = backend.find_relief(candidates, faces, HEIGHT, config)
+    expected, expected_over = reference.Reference().find_relief(candidates, faces, HEIGHT, config)
+    np.testing.assert_allclose(relief.pieces, expected.pieces, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(over.z, expected_over.z, rtol=1e-7, atol=1e-7)
+    for ours, theirs in zip(over._replace(z=0), candidates._replace(z=0), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def bank(degrees, foot, high=3.0):
+    """Land that rises from x = `foot` [m] on."""
+    return lambda x, y: np.clip(math.tan(math.radians(degrees)) * (x - foot), 0.0, high)
+
+
+@pytest.mark.parametrize('degrees', [15, 25, 35, -20])
+def test_the_relief_is_that_of_a_bank(backend, degrees):
+    side = math.copysign(1.0, degrees)
+
+    def land(x, y):
+        return side * bank(abs(degrees), 10.0)(x, y)
+
+    candidates = candidates_on(land, RINGS)
+    relief, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
+    missed = over.z + HEIGHT
+    assert np.abs(candidates.z + HEIGHT).max() == pytest.approx(3.0)
+    assert np.mean(np.abs(missed) < 0.3) > 0.92
+    assert np.sqrt(np.mean(missed**2)) < 0.15
+    # Behind the last return it stays as high; ground as low as this, and the road, are level.
+    far = relief.at(np.array([45.0, 500.0]), np.array([0.0, 20.0]))
+    np.testing.assert_allclose(far, 3.0 * side, atol=0.1)
+    assert (relief.at(np.array([-30.0, 5.0]), np.zeros(2)) == 0.0).all()
+
+
+def box(x0, x1, y0, y1, high):
+    """Level ground with a box on it."""
+
+    def land(x, y):
+        return high * ((x > x0) & (x < x1) & (y > y0) & (y < y1))
+
+    return land
+
+
+LEVEL_LAND = {
+    'road': lambda x, y: 0.0 * x,
+    'camber': lambda x, y: -0.1 * np.abs(y / 40.0),
+    'car': box(6.0, 10.5, 2.0, 3.8, 1.5),
+    'bonnet': lambda x, y: box(6.0, 10.0, 2.0, 3.8, 0.9)(x, y) * (1.0 - 0.1 * (x - 6.0)),
+    'truck': box(8.0, 20.0, 3.0, 5.5, 3.2),
+    'pallets': box(5.0, 9.0, -2.0, 2.0, 0.2),
+    'wall': box(12.0, 12.6, -30.0, 30.0, 2.5),
+    'hole': box(8.0, 11.0, 0.0, 4.0, -1.5),
+    'terrace': lambda x, y: 1.2 * (x > 9.0),
+}
+
+
+@pytest.mark.parametrize('name', LEVEL_LAND)
+@pytest.mark.parametrize('share', [1.0, 0.5])
+def test_no_relief_is_what_cannot_be_climbed(backend, name, share):
+    candidates = candidates_on(LEVEL_LAND[name], RINGS, share=share)
+    relief, over = backend.find_relief(candidates, NO_FACES, HEIGHT, Config())
+    assert relief.is_level
+    assert over is candidates
+    assert (relief.at(np.array([0.0, 9.0]), np.array([0.0, 3.0])) == 0.0).all()
+
+
+def test_nobody_walks_on_faces_or_where_each_segment_is_by_itself(backend):
+    candidates = candidates_on(bank(25, 10.0), RINGS)
+    by_itself = Config().replace(**{'surface.look_aside': False})
+    is_bank = candidates.z + HEIGHT > 0.05
+    faces = Faces(np.arange(N_TILES) == 0, np.zeros(N_TILES, dtype=bool))
+    marked = candidates._replace(tile=np.where(is_bank, 0, 1).astype(np.int32))
+    for walked, config in ((candidates, by_itself), (marked, Config())):
+        assert backend.find_relief(walked, faces, HEIGHT, config)[0].is_level
+    assert not backend.find_relief(marked, NO_FACES, HEIGHT, Config())[0].is_level
+
+
+def test_without_ground_near_the_sensor_there_is_no_relief(backend):
+    behind = candidates_on(bank(25, 10.0), RINGS[RINGS > 14.0])
+    behind = behind.where(behind.x > 13.0)
+    nothing = behind.where(behind.x > 500.0)
+    for candidates in (behind, nothing):
+        assert backend.find_relief(candidates, NO_FACES, HEIGHT, Config())[0].is_level
+
+
+@pytest.mark.parametrize('turn', [1, 2, 3])
+def test_a_turned_scan_has_the_relief_turned(backend, turn):
+    def land(x, y):
+        return bank(20, 8.0)(x, y) + 0.4 * np.sin(x / 9.0) * np.cos(y / 7.0)
+
+    def turned(x, y):
+        for _ in range(turn):
+            x, y = y, -x
+        return land(x, y)
+
+    first, second = (
+        backend.find_relief(candidates_on(f, RINGS, spread=0.0), NO_FACES, HEIGHT, Config())[0]
+        for f in (land, turned)
+    )
+    heights = heights_of(first)
+    assert np.ptp(heights) > 2.0
+    np.testing.assert_allclose(heights_of(second), np.rot90(heights, turn), atol=1e-5)
+
+
+def test_between_middles_it_is_linear_and_beyond_the_border_constant():
+    height = np.random.default_rng(0).normal(size=(N_SIDES, N_SIDES))
+    relief = Relief.of(height)
+    np.testing.assert_allclose(heights_of(relief), height, atol=1e-4)
+    x, y = MIDDLES[10] + 0.5, MIDDLES[20] + 1.5
+    corners = height[10:12, 20:22]
+    expected = np.array([0.75, 0.25]) @ corners @ np.array([0.25, 0.75])
+    found = relief.at(np.array([x, -500.0, 80.0]), np.array([y, MIDDLES[0], 70.0]))
+    np.testing.assert_allclose(found, [expected, height[0, 0], height[-1, -1]], atol=1e-4)
+    knots = np.array([2.0, 10.0])
+    at_knots = relief.at_knots(knots, 4)
+    assert at_knots.shape == (4, 2)
+    half = math.sqrt(0.5) * knots
+    np.testing.assert_allclose(at_knots[2], relief.at(half, half))
