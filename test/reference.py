@@ -247,23 +247,34 @@ def reached_on_foot(candidates, faces, height, config):
             across = aside * 2.0 * math.pi / n_segments * r[a]
             for b in (*own[r[own] < r[a]][-1:], *own[r[own] >= r[a]][:1]):
                 step(a, int(b), 0.5 * (1.0 + 0.12 * r[a]), across)
+    for front in fronts_of(steep, r, z, segment, n_segments):
+        if sum(2.0 * math.pi / n_segments * r[a] for a, _ in front) >= 6.0:
+            for a, b in front:
+                beside[a].add(b)
+                beside[b].add(a)
     groups = groups_of(allowed, lambda c: beside[c])
-    home = {c: k for k, group in enumerate(groups) for c in group}
-    width, joined = {}, {k: set() for k in range(len(groups))}
-    for a, b in steep:
-        ends = frozenset((home[a], home[b]))
-        width[ends] = width.get(ends, 0.0) + 2.0 * math.pi / n_segments * r[a]
-    for ends, wide in width.items():
-        for k in ends if wide >= 5.0 else ():
-            joined[k] |= ends
-    wholes = groups_of(joined, lambda k: joined[k])
-    groups = [{c for k in whole for c in groups[k]} for whole in wholes]
     seeds = {
         c
         for c in allowed
         if r[c] < growth.seed_range and abs(z[c] + height) < growth.seed_height_tolerance
     }
     return {c for group in groups if len(seeds & group) >= 8 for c in group}
+
+
+def fronts_of(steep, r, z, segment, n_segments):
+    """Steps, pairs of candidates, in groups of those side by side."""
+    beside = {step: set() for step in steep}
+    for a, b in steep:
+        for aside in (1, 2):
+            own = [s for s in steep if segment[s[0]] == (segment[a] + aside) % n_segments]
+            for c, d in sorted(s for s in own if r[s[1]] >= r[a])[:2]:
+                overlap = max(min(z[a], z[b]), min(z[c], z[d])) <= min(
+                    max(z[a], z[b]), max(z[c], z[d])
+                )
+                if overlap and r[c] <= r[b]:
+                    beside[a, b].add((c, d))
+                    beside[c, d].add((a, b))
+    return groups_of(steep, lambda step: beside[step])
 
 
 def groups_of(members, neighbours):

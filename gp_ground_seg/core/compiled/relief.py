@@ -134,22 +134,43 @@ def _step_along(candidates: Candidates, allowed: BoolArray, parent: IntArray) ->
 
 @jit()
 def _step_up(candidates: Candidates, steep: IntArray, parent: IntArray) -> None:
-    """Join groups between which steep steps lead over a width."""
-    n, n_segments = len(parent), len(candidates.offsets) - 1
-    pair = np.empty(len(steep), np.int64)
+    """Take the steep steps that are in a front; `steep` (S,) are their far ends, in order."""
+    offsets, n_segments = candidates.offsets, len(candidates.offsets) - 1
+    starts, segment = np.zeros(n_segments + 1, np.int64), np.empty(len(steep), np.int64)
+    k = 0
+    for m in range(n_segments):
+        while k < len(steep) and steep[k] < offsets[m + 1]:
+            segment[k] = m
+            k += 1
+        starts[m + 1] = k
+    front = np.arange(len(steep))
+    for aside in range(1, N_ASIDE + 1):
+        for k in range(len(steep)):
+            beside = (segment[k] + aside) % n_segments
+            _join_front(candidates, steep, k, starts[beside], starts[beside + 1], front)
+    width = np.zeros(len(steep))
     for k in range(len(steep)):
-        a, b = _root(parent, steep[k] - 1), _root(parent, steep[k])
-        pair[k] = min(a, b) * n + max(a, b)
-    order = np.argsort(pair, kind='mergesort')
-    first = 0
-    while first < len(order):
-        stop, width = first, 0.0
-        while stop < len(order) and pair[order[stop]] == pair[order[first]]:
-            width += arc_of(candidates.r[steep[order[stop]] - 1], n_segments)
-            stop += 1
-        if width >= MIN_WIDTH:
-            _join(parent, steep[order[first]] - 1, steep[order[first]])
-        first = stop
+        front[k] = _root(front, k)
+        width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
+    for k in range(len(steep)):
+        if width[front[k]] >= MIN_WIDTH:
+            _join(parent, steep[k] - 1, steep[k])
+
+
+@jit()
+def _join_front(
+    candidates: Candidates, steep: IntArray, k: int, first: int, stop: int, front: IntArray
+) -> None:
+    """Join step `k` with those of `first` to `stop` that are side by side with it."""
+    r, z, near, far = candidates.r, candidates.z, steep[k] - 1, steep[k]
+    while first < stop and r[steep[first]] < r[near]:
+        first += 1
+    for other in range(first, min(first + 2, stop)):
+        a, b = steep[other] - 1, steep[other]
+        overlaps = min(z[a], z[b]) <= max(z[near], z[far])
+        overlaps &= min(z[near], z[far]) <= max(z[a], z[b])
+        if overlaps and r[a] <= r[far]:
+            _join(front, k, other)
 
 
 @jit()

@@ -41,9 +41,9 @@ GAP, GAP_GROWTH = 1.0, 0.12
 long between segments."""
 MAX_SLOPE, STEP_TOLERANCE = 0.84, 0.06
 """Steepest step, of 40 degrees, and what it may rise beyond that by roughness and noise [m]."""
-GENTLE, STEEP, MIN_WIDTH = 0.3, 0.8, 5.0
-"""Largest rise or fall of a step; that of one along a segment which is taken where others beside
-it lead up over a width, and this width: more than that of the front of a car [m]."""
+GENTLE, STEEP, MIN_WIDTH = 0.3, 0.8, 6.0
+"""Largest rise or fall of a step; that of one along a segment which is taken where others are side
+by side with it over a width, and this width: more than the length of a car [m]."""
 N_ASIDE = 2
 """Segments on each side that a step may lead to."""
 MIN_SEEDS = 8
@@ -122,22 +122,45 @@ def find_relief(
 def reachable(candidates: Candidates, allowed: BoolArray, is_seed: BoolArray) -> BoolArray:
     """Which of the candidates can be reached from enough seeds in steps over `allowed` ones, (C,).
 
-    Gentle steps make groups of candidates. Two groups are one where steep steps lead from one to
-    the other over a width: those to a car are few.
+    Gentle steps are taken in any case, steep ones where they form a front, side by side: those to
+    a car are few.
     """
     first, second = _steps(candidates)
     taken = allowed[first] & allowed[second]
     first, second = first[taken], second[taken]
-    is_gentle = np.abs(candidates.z[second] - candidates.z[first]) <= GENTLE
-    group = _groups(len(allowed), first[is_gentle], second[is_gentle])
-    first, second = first[~is_gentle], second[~is_gentle]
-    ends = np.sort(np.stack([group[first], group[second]]), axis=0)
-    pairs, pair = np.unique(ends, axis=1, return_inverse=True)
-    arc = arc_of(candidates.r[first], len(candidates.offsets) - 1)
-    is_wide = np.bincount(pair.ravel(), arc, pairs.shape[1]) >= MIN_WIDTH
-    group = _groups(int(group.max(initial=-1)) + 1, *pairs[:, is_wide])[group]
+    taken = np.abs(candidates.z[second] - candidates.z[first]) <= GENTLE
+    steep = np.flatnonzero(~taken)
+    taken[steep] = _in_front(candidates, first[steep])
+    group = _groups(len(allowed), first[taken], second[taken])
     result: BoolArray = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
     return result & allowed
+
+
+def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
+    """Which steep steps, from the candidates `near` (S,) to the next, are in a front, (S,).
+
+    Two steps are side by side if they are in segments at most `N_ASIDE` apart and overlap in range
+    and in height: of a segment, the first that ends no nearer than the other begins, or the one
+    behind it.
+    """
+    n_segments, segment = len(candidates.offsets) - 1, candidates.segment[near]
+    r, z = candidates.r, candidates.z
+    begin, end = r[near], r[near + 1]
+    low, high = np.minimum(z[near], z[near + 1]), np.maximum(z[near], z[near + 1])
+    apart = 2.0 * float(r.max(initial=0.0)) + 1.0
+    key, n, pairs = segment * apart + end, len(near), []
+    for aside in range(1, N_ASIDE + 1):
+        beside = (segment + aside) % n_segments
+        first = np.searchsorted(key, beside * apart + begin)
+        for place in (first, first + 1):
+            other = np.minimum(place, n - 1)
+            is_beside = (place < n) & (segment[other] == beside) & (begin[other] <= end)
+            is_beside &= (low[other] <= high) & (low <= high[other])
+            pairs.append(np.stack([np.arange(n), other])[:, is_beside])
+    front = _groups(n, *np.concatenate(pairs, axis=1))
+    width = np.bincount(front, arc_of(begin, n_segments))
+    result: BoolArray = width[front] >= MIN_WIDTH
+    return result
 
 
 def _groups(n: int, first: IntArray, second: IntArray) -> IntArray:
