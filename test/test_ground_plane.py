@@ -1,5 +1,7 @@
 """The plane of the ground near the sensor: both backends on clutter and on anything."""
 
+import math
+
 import numpy as np
 import pytest
 from conftest import fewer
@@ -8,10 +10,17 @@ from hypothesis import strategies as st
 
 from gp_ground_seg import Config
 from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.compiled import ground_plane as compiled
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import Candidates
 from gp_ground_seg.core.pipeline import ground_plane
-from gp_ground_seg.core.pipeline.ground_plane import MIN_CELLS, N_SECTORS, RING_EDGES, solve_plane
+from gp_ground_seg.core.pipeline.ground_plane import (
+    MIN_CELLS,
+    N_RINGS,
+    N_SECTORS,
+    RING_EDGES,
+    solve_plane,
+)
 from gp_ground_seg.core.pipeline.tilt import rotation
 
 BACKENDS = NumpyBackend(), NumbaBackend()
@@ -51,12 +60,20 @@ def random_candidates(seed, n_segments, n_bins, share):
 
 def slow_lowest(candidates):
     """Sector, z, r and segment of the lowest candidate of each cell, one by one."""
-    lowest, n_segments = {}, len(candidates.offsets) - 1
+    members, n_segments = {}, len(candidates.offsets) - 1
     for m, r, z in zip(candidates.segment, candidates.r, candidates.z, strict=True):
         if RING_EDGES[0] <= r < RING_EDGES[-1] and abs(z) < 65.0:
             ring = sum(r >= edge for edge in RING_EDGES) - 1
-            cell = (m * N_SECTORS // n_segments, ring)
-            lowest[cell] = min(lowest.get(cell, (np.inf,)), (z, r, m))
+            members.setdefault((m * N_SECTORS // n_segments, ring), []).append((z, r, m))
+    lowest = {}
+    for cell, found in members.items():
+        found.sort()
+        for k, (z, r, _) in enumerate(found):
+            if sum(above - z <= 0.08 + 0.015 * r for above, _, _ in found[k:]) >= 3:
+                lowest[cell] = found[k]
+                break
+        else:
+            lowest[cell] = found[0]
     return [(cell[0], *lowest[cell]) for cell in sorted(lowest)]
 
 
@@ -68,13 +85,135 @@ def test_backends_agree_on_anything(seed, n_segments, n_bins, share):
     cells = ground_plane.lowest_points(candidates)
     cosine, sine = ground_plane.segment_directions(n_segments)
     expected = [(s, z, r, r * cosine[m], r * sine[m]) for s, z, r, m in slow_lowest(candidates)]
-    assert list(zip(cells.sector, cells.z, cells.r, cells.x, cells.y, strict=True)) == expected
+    assert (
+        list(zip(cells.cell // N_RINGS, cells.z, cells.r, cells.x, cells.y, strict=True))
+        == expected
+    )
     a, b = (backend.fit_plane(candidates, 0.577, origin) for backend in BACKENDS)
     assert (a is None) == (b is None)
     if a is not None:
         np.testing.assert_allclose(a, b, atol=1e-9)
-        assert 0.0 < a.support <= 1.0
+        assert 0.0 < a.support <= 1.0 and 0.0 < a.near_support <= 1.0
         assert a.n_support <= a.n_cells <= N_SECTORS * ground_plane.N_RINGS
+
+
+def test_a_lowest_point_alone_is_left_out():
+    """Of one cell: noise below the ground, or a few points, all alone."""
+
+    def lowest(z):
+        r = np.linspace(10.0, 11.0, len(z))
+        zero, number = np.zeros(len(z), np.int64), np.zeros(len(z))
+        one = Candidates(r, np.array(z), zero, number, np.array([0, len(z)]), zero, r, number)
+        assert all(backend.fit_plane(one, 0.5, ORIGIN) is None for backend in BACKENDS)
+        cells = ground_plane.lowest_points(one)
+        assert cells.lowest_z == min(z)
+        return cells.z
+
+    assert lowest([-1.0, -2.5, -1.1, -1.05, -0.4]) == -1.1
+    assert lowest([-1.0, -2.5, -1.1, -2.4, -1.05, -0.4]) == -1.1
+    assert lowest([-1.0, -2.5, -0.2]) == -2.5
+
+
+def test_floor_at_the_foot_of_a_wall_lies_on_the_plane_of_the_floor():
+    """Of its cells, one point is floor, and nine are wall."""
+    m, r = (
+        grid.ravel()
+        for grid in np.meshgrid(np.arange(180), np.arange(2.0, 6.0, 0.5), indexing='ij')
+    )
+    z = np.where(r < 5.0, -1.0, -0.5)
+    z[(r == 5.0) & (m % 5 == 0)] = -1.0
+    zero, offsets = np.zeros(len(r), np.int32), np.arange(181) * 8
+    candidates = Candidates(r, z, zero.astype(np.int64), 1.0 + zero, offsets, zero, r, z)
+    cells = ground_plane.lowest_points(candidates)
+    at_wall = cells.z == -0.5
+    assert at_wall.sum() == 36 and (cells.lowest_z == -1.0).all()
+    for backend in BACKENDS:
+        plane = backend.fit_plane(candidates, 0.5, ORIGIN)
+        assert plane.height == pytest.approx(1.0, abs=1e-6)
+        assert plane.n_support == plane.n_cells == len(cells.z)
+
+
+def slow_weight(r):
+    return (r / 4.0 if r < 4.0 else 4.0 / r) ** 2
+
+
+def slow_support(plane, cells):
+    """Support of a plane, cell by cell."""
+    height, slope_x, slope_y = plane
+    total = 0
+    for x, y, z, r, tolerance, *_ in zip(*cells, strict=True):
+        d = (z + height - slope_x * x - slope_y * y) / tolerance
+        if abs(d) < 1.0:
+            total += math.floor(4096.0 * slow_weight(r) * (1.0 - d**2))
+    return total / (1.0 + slope_x**2 + slope_y**2) ** 2
+
+
+def slow_refutation(plane, cells, origin):
+    """Refutation of a plane, ray by ray."""
+    height, slope_x, slope_y = plane
+    above = origin[2] + height - slope_x * origin[0] - slope_y * origin[1]
+    d = cells.z + height - slope_x * cells.x - slope_y * cells.y
+    stopped = {
+        int(c) for c, e, t in zip(cells.cell, d, cells.tolerance, strict=True) if abs(e) < t
+    }
+    total = 0
+    for r, depth, tolerance, cell in zip(cells.r, -d, cells.tolerance, cells.cell, strict=True):
+        if depth <= 2.0 * tolerance:
+            continue
+        crossing = r * above / (above + depth) if above > 0.0 else 0.0
+        sector = cell // N_RINGS
+        on_it = [cells.r[cells.cell == c].item() for c in stopped if c // N_RINGS == sector]
+        ring = sum(crossing >= edge for edge in RING_EDGES[1:-1])
+        if crossing < max([3.0, *on_it]) and sector * N_RINGS + ring not in stopped:
+            total += math.floor(8.0 * 4096.0 * slow_weight(crossing))
+    return total
+
+
+@settings(max_examples=fewer(60, 10))
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 1.0), st.floats(-2.0, 3.0))
+def test_score_of_a_plane_by_loops(seed, share, lift):
+    rng = np.random.default_rng(seed)
+    cells = ground_plane.lowest_points(random_candidates(seed, 60, 30, share))
+    n, origin = len(cells.z), (0.2, -0.3, lift)
+    planes = np.column_stack([rng.uniform(-1.0, 2.5, 20), *rng.normal(0.0, 0.05, (2, 20))])
+    supports = [slow_support(plane, cells) for plane in planes]
+    np.testing.assert_allclose(ground_plane.supports_of(planes, cells), supports, rtol=1e-12)
+    np.testing.assert_allclose(compiled.supports_of(planes, cells), supports, rtol=1e-12)
+    refutations = [slow_refutation(plane, cells, origin) for plane in planes]
+    for form in (ground_plane.refutation_of, compiled.refutation_of):
+        assert [form(tuple(plane), cells, n, origin) for plane in planes] == refutations
+    # The plane with the best score is found without the refutation of each.
+    scores = np.square(supports) / np.maximum(np.add(supports, refutations), 1.0)
+    best = ground_plane.best_of(planes, cells, n, origin)
+    assert scores[planes.tolist().index(list(best))] == pytest.approx(scores.max(), rel=1e-12)
+
+
+def test_what_refutes_a_plane():
+    """Of one sector: points of a plane 1 m below the sensor, and one point far below it."""
+
+    def refutation(r_of_plane, r, depth):
+        r_all = np.array([*r_of_plane, r])
+        z = np.array([-1.0] * len(r_of_plane) + [-1.0 - depth])
+        zero, number = np.zeros(len(z), np.int64), np.zeros(len(z))
+        offsets = np.array([0, len(z)])
+        one = Candidates(r_all, z, zero, number, offsets, zero, r_all, number)
+        cells = ground_plane.lowest_points(one)
+        return ground_plane.refutation_of((1.0, 0.0, 0.0), cells, len(cells.z), ORIGIN)
+
+    def at(crossing):
+        return math.floor(8.0 * 4096.0 * slow_weight(crossing))
+
+    # The street between cars: its rays cross the plane of their roofs before it begins.
+    assert refutation([5.0, 7.0], 9.0, 2.0) == at(3.0)
+    # Land beside a dike: over its edge rays pass.
+    assert refutation([5.0, 7.0], 30.0, 2.0) == 0.0
+    # A mirror image on a wet road: where its ray crosses the road, the road is seen.
+    assert refutation([5.0, 7.0], 15.0, 2.0) == 0.0
+    # A hole in the plane, between its points.
+    assert refutation([5.0, 12.0], 24.0, 2.0) == at(8.0)
+    # Without a point on it in this direction, only near: that is the robot's own body.
+    assert refutation([], 6.0, 2.0) == at(2.0)
+    assert refutation([], 12.0, 2.0) == 0.0
 
 
 @pytest.mark.parametrize('backend', BACKENDS, ids=lambda b: b.name)

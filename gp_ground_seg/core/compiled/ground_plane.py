@@ -4,28 +4,37 @@ from __future__ import annotations
 
 import numpy as np
 
-from gp_ground_seg.core.frame import Candidates, FloatArray
+from gp_ground_seg.core.frame import Candidates, FloatArray, IntArray
 from gp_ground_seg.core.jit import compiled_form, jit
 from gp_ground_seg.core.pipeline import ground_plane
 from gp_ground_seg.core.pipeline.ground_plane import (
+    CLEARLY_BELOW,
+    LEAST_REACH,
     MAX_Z,
     N_RINGS,
     N_SECTORS,
+    N_TOGETHER,
     RING_EDGES,
     GroundPlane,
     LowestPoints,
     Moments,
     Plane,
-    gain,
+    crossed_at,
+    distance,
+    levelness,
+    refutation_by,
     segment_directions,
+    support_by,
     tolerance_at,
     tukey_weight,
+    weight_at,
 )
 from gp_ground_seg.core.pipeline.tilt import Direction
 
 WIDTH = 32
 """The number of points ends at a multiple of it, so that no loop over them has a remainder."""
-N_LARGEST = -(-N_SECTORS * N_RINGS // WIDTH) * WIDTH
+N_CELLS = N_SECTORS * N_RINGS
+N_LARGEST = -(-N_CELLS // WIDTH) * WIDTH
 _OUT_OF_REACH = 1e6
 
 # Ring at the start of each stretch of range, a little early because of rounding: a range in the
@@ -40,9 +49,9 @@ _fit_cells = jit(entry=True)(ground_plane.fit_cells)
 def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
     """Do what `gp_ground_seg.core.pipeline.ground_plane.fit_plane` does, to rounding."""
     directions = segment_directions(len(candidates.offsets) - 1)
-    columns, sectors = np.empty((6, N_LARGEST)), np.empty(N_LARGEST, dtype=np.int64)
-    x, y, z, r, tolerance, inverse = columns
-    cells = LowestPoints(x, y, z, r, tolerance, inverse, sectors)
+    x, y, z, r, tolerance, inverse, weight, lowest_z = np.empty((8, N_LARGEST))
+    number = np.empty(N_LARGEST, dtype=np.int64)
+    cells = LowestPoints(x, y, z, r, tolerance, inverse, weight, number, lowest_z)
     n = _tabulate(candidates, directions, cells)
     cells = LowestPoints._make(column[: -(-n // WIDTH) * WIDTH] for column in cells)
     numbers = _fit_cells(cells, n, max_slope, origin)
@@ -54,57 +63,116 @@ def _tabulate(candidates: Candidates, directions: FloatArray, cells: LowestPoint
     """Set the lowest points, and those behind them to count for nothing; return their number."""
     offsets, r, z = candidates.offsets, candidates.r, candidates.z
     n_segments = len(offsets) - 1
-    lowest, cell_of = np.empty(N_SECTORS * N_RINGS), np.empty(len(r), dtype=np.int16)
-    index, home = np.empty(len(lowest), dtype=np.int64), np.empty(len(lowest), dtype=np.int64)
-    for cell in range(len(lowest)):
-        lowest[cell], index[cell], home[cell] = MAX_Z, -1, 0
-    # Heights first, without a branch: which of two points is lower is unpredictable.
+    cell_of, starts = np.empty(len(r), dtype=np.int16), np.zeros(N_CELLS + 1, dtype=np.int64)
     for m in range(n_segments):
         first = (m * N_SECTORS // n_segments) * N_RINGS
         for c in range(offsets[m], offsets[m + 1]):
             cell_of[c] = -1
             if RING_EDGES[0] <= r[c] < RING_EDGES[N_RINGS] and abs(z[c]) < MAX_Z:
                 ring = _RING_TABLE[int((r[c] - RING_EDGES[0]) * _PER_METRE)]
-                cell = first + ring + (1 if r[c] >= RING_EDGES[ring + 1] else 0)
-                lowest[cell] = z[c] if z[c] < lowest[cell] else lowest[cell]
-                cell_of[c] = cell
+                cell_of[c] = first + ring + (1 if r[c] >= RING_EDGES[ring + 1] else 0)
+                starts[cell_of[c] + 1] += 1
+    for cell in range(N_CELLS):
+        starts[cell + 1] += starts[cell]
+    # Candidates cell by cell, in order of their segments.
+    members, homes = np.empty((2, starts[N_CELLS]), dtype=np.int64)
+    ends = starts[:N_CELLS].copy()
     for m in range(n_segments):
         for c in range(offsets[m], offsets[m + 1]):
-            cell = cell_of[c]
-            is_lowest = cell >= 0 and z[c] == lowest[cell]
-            if is_lowest and (index[cell] < 0 or r[c] < r[index[cell]]):
-                index[cell], home[cell] = c, m
+            if cell_of[c] >= 0:
+                members[ends[cell_of[c]]], homes[ends[cell_of[c]]] = c, m
+                ends[cell_of[c]] += 1
     n = 0
-    for cell in range(len(lowest)):
-        if index[cell] >= 0:
-            range_, m = r[index[cell]], home[cell]
+    for cell in range(N_CELLS):
+        if starts[cell] < ends[cell]:
+            lowest, k = _lowest(members, starts[cell], ends[cell], r, z)
+            cells.lowest_z[n] = z[members[lowest]]
+            range_, height, m = r[members[k]], z[members[k]], homes[k]
             cells.x[n], cells.y[n] = range_ * directions[0, m], range_ * directions[1, m]
-            cells.z[n], cells.r[n] = lowest[cell], range_
+            cells.z[n], cells.r[n] = height, range_
             cells.tolerance[n] = tolerance_at(range_)
             cells.inverse[n] = 1.0 / cells.tolerance[n]
-            cells.sector[n] = cell // N_RINGS
+            cells.weight[n], cells.cell[n] = weight_at(range_), cell
             n += 1
     for c in range(n, -(-n // WIDTH) * WIDTH):
-        cells.x[c], cells.y[c], cells.z[c], cells.inverse[c] = 0.0, 0.0, _OUT_OF_REACH, 1.0
+        cells.x[c], cells.y[c], cells.z[c] = 0.0, 0.0, _OUT_OF_REACH
+        cells.inverse[c], cells.weight[c] = 1.0, 0.0
     return n
 
 
-@compiled_form(ground_plane.scores_of)
-def scores_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
-    """Support less penalty of planes (P, 3), (P,)."""
-    scores = np.empty(len(planes))
+@jit()
+def _lowest(
+    members: IntArray, start: int, end: int, r: FloatArray, z: FloatArray
+) -> tuple[int, int]:
+    """Which of the members from `start` to `end` is the lowest, and the lowest not by itself."""
+    lowest = last = -1
+    for _ in range(end - start):
+        best = -1
+        for k in range(start, end):
+            is_next = last < 0 or _is_before(members[last], members[k], r, z)
+            if is_next and (best < 0 or _is_before(members[k], members[best], r, z)):
+                best = k
+        if lowest < 0:
+            lowest = best
+        n_above, c = 0, members[best]
+        for k in range(start, end):
+            if _is_before(c, members[k], r, z) and z[members[k]] - z[c] <= tolerance_at(r[c]):
+                n_above += 1
+        if n_above >= N_TOGETHER - 1:
+            return lowest, best
+        last = best
+    return lowest, lowest
+
+
+@jit()
+def _is_before(a: int, b: int, r: FloatArray, z: FloatArray) -> bool:
+    """Whether candidate `a` is the lower one, of equally low ones the nearer, then the first."""
+    if z[a] != z[b]:
+        is_lower: bool = z[a] < z[b]
+        return is_lower
+    return r[a] < r[b] or (r[a] == r[b] and a < b)
+
+
+@compiled_form(ground_plane.supports_of)
+def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
+    """Support of planes (P, 3) by the points near them, (P,)."""
+    supports = np.empty(len(planes))
     for p in range(len(planes)):
-        scores[p] = _score_of((planes[p, 0], planes[p, 1], planes[p, 2]), cells)
-    return scores
+        plane = (planes[p, 0], planes[p, 1], planes[p, 2])
+        supports[p] = levelness(planes[p, 1], planes[p, 2]) * _support_of(plane, cells)
+    return supports
 
 
 @jit(fastmath=True)
-def _score_of(plane: Plane, cells: LowestPoints) -> float:
-    """Support less penalty of a plane; a loop that adds in any order."""
-    x, y, z, inverse = cells.x, cells.y, cells.z, cells.inverse
+def _support_of(plane: Plane, cells: LowestPoints) -> float:
+    """Support of a plane by the points near it; a loop that adds in any order."""
+    x, y, z, inverse, weight = cells.x, cells.y, cells.z, cells.inverse, cells.weight
     total = 0.0
     for c in range(len(x)):
-        total += gain(x[c], y[c], z[c], inverse[c], plane)
+        total += support_by(x[c], y[c], z[c], inverse[c], weight[c], plane)
+    return total
+
+
+@compiled_form(ground_plane.refutation_of)
+def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) -> float:
+    """Weight of the rays from `origin` that cross a plane where it should have stopped them."""
+    x, y, z = origin
+    clearance, total = max(distance(x, y, z, plane), 0.0), 0.0
+    is_seen, reach = np.zeros(N_CELLS, dtype=np.bool_), np.full(N_SECTORS, LEAST_REACH)
+    heights = np.empty(n)
+    for c in range(n):
+        heights[c] = distance(cells.x[c], cells.y[c], cells.z[c], plane)
+        if abs(heights[c] * cells.inverse[c]) < 1.0:
+            sector = cells.cell[c] // N_RINGS
+            is_seen[cells.cell[c]], reach[sector] = True, max(reach[sector], cells.r[c])
+    for c in range(n):
+        if heights[c] * cells.inverse[c] < -CLEARLY_BELOW:
+            sector = cells.cell[c] // N_RINGS
+            crossing = crossed_at(cells.r[c], heights[c], clearance)
+            if crossing < reach[sector]:
+                ring = np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
+                if not is_seen[sector * N_RINGS + ring]:
+                    total += refutation_by(crossing)
     return total
 
 

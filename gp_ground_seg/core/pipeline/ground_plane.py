@@ -23,6 +23,9 @@ sensor, and near ground weighs more than far."""
 TOLERANCE, TOLERANCE_GROWTH = 0.08, 0.015
 """Distance to a plane that a point still supports [m], and its growth with range: noise,
 kerbs and camber bring ground off a plane."""
+N_TOGETHER = 3
+"""Candidates of a cell within the tolerance over its lowest point, itself included: noise and
+mirror images below the ground lie alone."""
 MAX_Z = 65.0
 """Height above or below the sensor from which a point is not the ground near it [m]."""
 
@@ -39,15 +42,20 @@ MIN_HEIGHT, MAX_HEIGHT = SENSOR_HEIGHTS
 """Heights of the origin over a plane that can be the ground [m]; in the frame of a vehicle the
 ground may lie above it."""
 CLEARLY_BELOW = 2.0
-"""Distance below the plane, in tolerances, from which a point is evidence against it."""
-PENALTY = 1.0
-"""Loss of score for each point clearly below the plane: of a street and the roofs of cars,
-or of a floor and tables, the ground is the lower one."""
+"""Distance below the plane, in tolerances, from which a point may be evidence against it."""
+MIDDLE = 4.0
+"""Range of the points with the most weight [m]: nearer ones may be the robot's own body, and
+farther ones another level than the one that it stands on."""
+LEAST_REACH = 3.0
+"""Range to which rays may not cross the ground in any direction [m]: edges of a dock or a dike
+may be that near, and the robot's own body does not reach much farther."""
+REFUTATION = 8.0
+"""Weight of a ray that crosses the plane over that of a point on it, at the same range."""
 
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
 NumbersOfPlane = tuple[
-    float, float, float, float, float, float, float, float, float, float, int, int
+    float, float, float, float, float, float, float, float, float, float, float, int, int
 ]
 """Fields of a `GroundPlane`."""
 
@@ -60,7 +68,8 @@ MIN_AREA = 0.1
 LOOSER = 1.1
 """Largest slope of a refined plane over that of the hypotheses."""
 RESOLUTION = 4096.0
-"""Score of a point exactly on a plane; scores are whole numbers, whose sum is exact."""
+"""Support by a point at `MIDDLE` exactly on a plane; that of each is a whole number, so that sums
+are exact."""
 N_REFINEMENTS = 12
 MIN_CELLS = 3
 
@@ -77,7 +86,10 @@ class LowestPoints(NamedTuple):
     r: FloatArray  # (C,) horizontal range [m]
     tolerance: FloatArray  # (C,) distance to the plane that the point still supports [m]
     inverse: FloatArray  # (C,) one over the tolerance [1/m]
-    sector: IntArray  # (C,) sector of each cell, 0 to `N_SECTORS` - 1
+    weight: FloatArray  # (C,) see `weight_at`
+    cell: IntArray  # (C,) number of the cell: sector times `N_RINGS`, plus ring
+    # (C,) height of the lowest of all [m], which may lie alone: floor at the foot of a wall
+    lowest_z: FloatArray
 
 
 @lru_cache(maxsize=4)
@@ -92,18 +104,20 @@ def segment_directions(n_segments: int) -> FloatArray:
 def lowest_points(candidates: Candidates) -> LowestPoints:
     """Lowest ground candidate of each cell, in sectors by rings.
 
-    Of equally low ones the nearest counts, then that of the first segment, so that the
-    order of the points does not matter. A point's azimuth is taken to be that of the middle of
-    its segment.
+    It is the lowest that has `N_TOGETHER` - 1 more within its tolerance above it; where there is
+    none, the lowest. Of equally low ones the nearest comes first, then that of the first segment,
+    so that the order of the points does not matter. A point's azimuth is taken to be that of the
+    middle of its segment.
     """
-    lowest = _lowest(candidates.offsets, candidates.r, candidates.z)
-    cell = np.flatnonzero(lowest != _NONE)
-    index = lowest[cell]
+    alone, together = _lowest(candidates.offsets, candidates.r, candidates.z)
+    cell = np.flatnonzero(alone != _NONE)
+    index = np.where(together == _NONE, alone, together)[cell]
     segment = np.searchsorted(candidates.offsets, index, side='right') - 1
     cosine, sine = segment_directions(len(candidates.offsets) - 1)
     r = candidates.r[index]
     x, y, tolerance = r * cosine[segment], r * sine[segment], tolerance_at(r)
-    return LowestPoints(x, y, candidates.z[index], r, tolerance, 1.0 / tolerance, cell // N_RINGS)
+    z, weight, lowest_z = candidates.z[index], weight_at(r), candidates.z[alone[cell]]
+    return LowestPoints(x, y, z, r, tolerance, 1.0 / tolerance, weight, cell, lowest_z)
 
 
 @shared
@@ -112,22 +126,34 @@ def tolerance_at(r: Values) -> Values:
     return TOLERANCE + TOLERANCE_GROWTH * r
 
 
-def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> IntArray:
-    """Index of the lowest candidate of each cell, sector by sector, or `_NONE`."""
+@shared
+def weight_at(r: Values) -> Values:
+    """Weight of a point at range `r`: largest, one, at `MIDDLE`."""
+    share = choose(r < MIDDLE, r, MIDDLE) / choose(r < MIDDLE, MIDDLE, r)
+    return share * share
+
+
+def _lowest(offsets: IntArray, r: FloatArray, z: FloatArray) -> tuple[IntArray, IntArray]:
+    """Index of the lowest candidate of each cell, sector by sector, or `_NONE`.
+
+    First of all, then of those that have `N_TOGETHER` - 1 more above them.
+    """
     near = np.flatnonzero((r >= RING_EDGES[0]) & (r < RING_EDGES[-1]) & (np.abs(z) < MAX_Z))
     n_segments = len(offsets) - 1
     segment = np.repeat(np.arange(n_segments), np.diff(offsets))[near]
     ring = np.searchsorted(RING_EDGES, r[near], side='right') - 1
     cell = (segment * N_SECTORS // n_segments) * N_RINGS + ring
-    lowest_z, lowest = np.full(N_SECTORS * N_RINGS, np.inf), np.full(N_SECTORS * N_RINGS, _NONE)
-    np.minimum.at(lowest_z, cell, z[near])
-    is_lowest = z[near] == lowest_z[cell]
-    near, cell = near[is_lowest], cell[is_lowest]
-    # Equally near ones stay in order of their segments.
-    order = np.lexsort((r[near], cell))
-    occupied, first = np.unique(cell[order], return_index=True)
-    lowest[occupied] = near[order[first]]
-    return lowest
+    # Equally low and near ones stay in order of their segments.
+    order = np.lexsort((r[near], z[near], cell))
+    near, cell = near[order], cell[order]
+    k = N_TOGETHER - 1
+    low, high = near[:-k], near[k:]
+    is_together = (cell[:-k] == cell[k:]) & (z[high] - z[low] <= tolerance_at(r[low]))
+    alone, together = np.full((2, N_SECTORS * N_RINGS), _NONE)
+    for lowest, found in ((alone, np.arange(len(cell))), (together, np.flatnonzero(is_together))):
+        occupied, first = np.unique(cell[found], return_index=True)
+        lowest[occupied] = near[found[first]]
+    return alone, together
 
 
 class GroundPlane(NamedTuple):
@@ -139,6 +165,7 @@ class GroundPlane(NamedTuple):
     # as `height`, for the parallel plane through the middle of the near cells [m]
     near_height: float
     support: float  # share of the cells that lie on it
+    near_support: float  # the same of their weights, see `weight_at`
     coverage: float  # share of all sectors around the sensor with such a cell
     far_coverage: float  # share of the sectors with any cell that have such a cell `FAR` away
     reach: float  # range within which nine of ten of these cells are [m]
@@ -172,7 +199,7 @@ class GroundPlane(NamedTuple):
 
 
 def fit_plane(candidates: Candidates, max_slope: float, origin: Direction) -> GroundPlane | None:
-    """Fit the plane that most of the lowest points lie on and few below; None without one.
+    """Fit the plane that most of the lowest points lie on and few rays cross; None without one.
 
     Consensus (Fischler & Bolles, CACM 1981) over planes through a fixed, evenly spread
     choice of three cells and level planes through one, then a redescending M-estimator
@@ -189,9 +216,9 @@ def fit_cells(cells: LowestPoints, n: int, max_slope: float, origin: Direction) 
     """Fit a plane to the first `n` points; its last number is 0 if there is none."""
     is_found, best = False, (0.0, 0.0, 0.0)
     if n >= MIN_CELLS:
-        is_found, best = best_hypothesis(cells, n, max_slope)
+        is_found, best = best_hypothesis(cells, n, max_slope, origin)
     if not is_found:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
     plane = refined(cells, best)
     if not is_possible(plane, LOOSER * max_slope):
         # The refinement has drifted off to a plane that cannot be the ground.
@@ -215,8 +242,10 @@ SPREAD = _spread(N_TRIPLES)
 
 
 @shared
-def best_hypothesis(cells: LowestPoints, n: int, max_slope: float) -> tuple[bool, Plane]:
-    """First of the planes with the best score, and whether there is one."""
+def best_hypothesis(
+    cells: LowestPoints, n: int, max_slope: float, origin: Direction
+) -> tuple[bool, Plane]:
+    """Plane with the best score, and whether there is one."""
     n_level, n_planes = min(n, N_LEVEL), 0
     planes = np.empty((n_level + len(SPREAD), 3))
     for t in range(len(planes)):
@@ -230,8 +259,7 @@ def best_hypothesis(cells: LowestPoints, n: int, max_slope: float) -> tuple[bool
             n_planes += 1
     if n_planes == 0:
         return False, (0.0, 0.0, 0.0)
-    height, slope_x, slope_y = planes[np.argmax(scores_of(planes[:n_planes], cells))]
-    return True, (height, slope_x, slope_y)
+    return True, best_of(planes[:n_planes], cells, n, origin)
 
 
 @shared
@@ -254,22 +282,105 @@ def is_possible(plane: Plane, max_slope: float) -> bool:
     return MIN_HEIGHT <= height <= MAX_HEIGHT and not steep
 
 
-def scores_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
-    """Support less penalty of planes (P, 3), (P,)."""
+@shared
+def best_of(planes: FloatArray, cells: LowestPoints, n: int, origin: Direction) -> Plane:
+    """Plane with the best score: its support, times the share of it in all evidence.
+
+    The score is at most the support, so that few planes need their refutation.
+    """
+    supports, best, best_score = supports_of(planes, cells), (0.0, 0.0, 0.0), -1.0
+    while True:
+        p = np.argmax(supports)
+        support = supports[p]
+        if support <= best_score:
+            return best
+        plane = (planes[p, 0], planes[p, 1], planes[p, 2])
+        evidence = support + refutation_of(plane, cells, n, origin)
+        score = support * support / evidence if evidence > 0.0 else 0.0
+        if score > best_score:
+            best, best_score = plane, score
+        supports[p] = -1.0
+
+
+def supports_in(candidates: Candidates, planes: list[Plane]) -> FloatArray:
+    """Support of planes by a scan, (P,)."""
+    return supports_of(np.array(planes), lowest_points(candidates))
+
+
+def plane_across(up: Direction, depth: float) -> Plane:
+    """Plane across a unit vector, whose `z` is not 0, at a distance below the origin [m]."""
+    return depth / up[2], -up[0] / up[2], -up[1] / up[2]
+
+
+def supports_of(planes: FloatArray, cells: LowestPoints) -> FloatArray:
+    """Support of planes (P, 3) by the points near them, (P,)."""
     height, slope_x, slope_y = planes.T[:, :, None]
     plane = height, slope_x, slope_y
-    scores: FloatArray = gain(cells.x, cells.y, cells.z, cells.inverse, plane).sum(axis=1)
-    return scores
+    support = support_by(cells.x, cells.y, cells.z, cells.inverse, cells.weight, plane)
+    supports: FloatArray = levelness(planes[:, 1], planes[:, 2]) * support.sum(axis=1)
+    return supports
 
 
 @shared
-def gain(x: Values, y: Values, z: Values, inverse: Values, plane: Plane) -> Values:
-    """Score of a point; of whole numbers, whose sum is exact in any order."""
+def levelness(slope_x: Values, slope_y: Values) -> Values:
+    """Fourth power of the cosine of a plane's tilt: a hillside is not better than the valley."""
+    square = 1.0 / (1.0 + slope_x * slope_x + slope_y * slope_y)
+    return square * square
+
+
+@shared
+def distance(x: Values, y: Values, z: Values, plane: Plane) -> Values:
+    """Height of a point over a plane, along z [m]."""
     height, slope_x, slope_y = plane
-    d = (z - (slope_x * x + slope_y * y - height)) * inverse
-    support = RESOLUTION * (1.0 - d * d)
-    support = choose(support > 0.0, support, 0.0)
-    return np.floor(choose(d < -CLEARLY_BELOW, -PENALTY * RESOLUTION, support))
+    return z - (slope_x * x + slope_y * y - height)
+
+
+@shared
+def support_by(
+    x: Values, y: Values, z: Values, inverse: Values, weight: Values, plane: Plane
+) -> Values:
+    """Support of a plane by a point; a whole number, so that sums are exact in any order."""
+    d = distance(x, y, z, plane) * inverse
+    support = RESOLUTION * weight * (1.0 - d * d)
+    return np.floor(choose(support > 0.0, support, 0.0))
+
+
+def refutation_of(plane: Plane, cells: LowestPoints, n: int, origin: Direction) -> float:
+    """Weight of the rays from `origin` that cross a plane where it should have stopped them.
+
+    These are rays to points clearly below. In a sector the plane is taken to reach as far as
+    its farthest point, at least `LEAST_REACH`: over the edge of a dike or a dock rays pass. A
+    cell with a point on the plane has stopped rays: what crosses there is a mirror image on a wet
+    road. The plane of roofs of cars, or of tables, is crossed near the sensor, before it begins.
+    """
+    height = distance(cells.x, cells.y, cells.z, plane)
+    d, sector = height * cells.inverse, cells.cell // N_RINGS
+    is_on, is_below = np.abs(d) < 1.0, d < -CLEARLY_BELOW
+    is_seen, reach = np.zeros(N_SECTORS * N_RINGS, dtype=bool), np.full(N_SECTORS, LEAST_REACH)
+    is_seen[cells.cell[is_on]] = True
+    np.maximum.at(reach, sector[is_on], cells.r[is_on])
+    sector = sector[is_below]
+    clearance = max(distance(*origin, plane), 0.0)
+    crossing = crossed_at(cells.r[is_below], height[is_below], clearance)
+    crossed = sector * N_RINGS + np.searchsorted(RING_EDGES[1:-1], crossing, side='right')
+    counts = (crossing < reach[sector]) & ~is_seen[crossed]
+    return float(refutation_by(crossing[counts]).sum())
+
+
+@shared
+def crossed_at(r: Values, height: Values, clearance: Values) -> Values:
+    """Range where the ray to a point below a plane crosses it, from `clearance` above [m].
+
+    `height` is that of the point, negative. Of a plane that is not below the sensor it is 0, where
+    a ray has no weight.
+    """
+    return r * clearance / (clearance - height)
+
+
+@shared
+def refutation_by(crossing: Values) -> Values:
+    """Refutation of a plane by a ray that crosses it at a range; a whole number."""
+    return np.floor(REFUTATION * RESOLUTION * weight_at(crossing))
 
 
 @shared
@@ -296,8 +407,7 @@ def weighted_moments(cells: LowestPoints, plane: Plane) -> Moments:
 @shared
 def tukey_weight(x: Values, y: Values, z: Values, inverse: Values, plane: Plane) -> Values:
     """Weight of a point by its distance from a plane."""
-    height, slope_x, slope_y = plane
-    d = (z - (slope_x * x + slope_y * y - height)) * inverse
+    d = distance(x, y, z, plane) * inverse
     root = 1.0 - 0.5 * d * d
     root = choose(root > 0.0, root, 0.0) * inverse
     return root * root
@@ -326,36 +436,41 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
     """Fields of the `GroundPlane`; the last is 0 if no point lies on it."""
     height, slope_x, slope_y = plane
     ranges, drops, near = np.empty(n), np.empty(n), np.empty(n)
-    n_on_it, n_near, squares = 0, 0, 0.0
+    n_on_it, n_near, squares, weight, whole = 0, 0, 0.0, 0.0, 0.0
     n_seen = n_covered = n_far = 0
     last_seen = last_covered = last_far = -1
     for c in range(n):
-        sector, r = cells.sector[c], cells.r[c]
+        sector, r = cells.cell[c] // N_RINGS, cells.r[c]
+        whole += cells.weight[c]
         # Cells come sector by sector: one that differs from the last is new.
         if sector != last_seen:
             n_seen, last_seen = n_seen + 1, sector
-        distance = cells.z[c] - (slope_x * cells.x[c] + slope_y * cells.y[c] - height)
-        if not abs(distance) <= cells.tolerance[c]:
+        z = cells.z[c]
+        d = distance(cells.x[c], cells.y[c], z, plane)
+        if not abs(d) <= cells.tolerance[c]:
+            z = cells.lowest_z[c]
+            d = distance(cells.x[c], cells.y[c], z, plane)
+        if not abs(d) <= cells.tolerance[c]:
             continue
         away = math.hypot(cells.x[c] - origin[0], cells.y[c] - origin[1])
-        ranges[n_on_it], drops[n_on_it] = r, math.atan2(origin[2] - cells.z[c], away)
+        ranges[n_on_it], drops[n_on_it] = r, math.atan2(origin[2] - z, away)
         n_on_it += 1
-        squares += distance * distance
+        squares, weight = squares + d * d, weight + cells.weight[c]
         if r < NEAR:
-            near[n_near] = distance
+            near[n_near] = d
             n_near += 1
         if sector != last_covered:
             n_covered, last_covered = n_covered + 1, sector
         if r >= FAR and sector != last_far:
             n_far, last_far = n_far + 1, sector
     if n_on_it == 0:
-        return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+        return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
     few, most = n_on_it // 10, (9 * n_on_it) // 10
     lift = ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
     spread = ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few)
     return (
-        height, slope_x, slope_y, height - lift, n_on_it / n, n_covered / N_SECTORS,
-        n_far / n_seen, ranked(ranges[:n_on_it], most), spread,
+        height, slope_x, slope_y, height - lift, n_on_it / n, weight / whole,
+        n_covered / N_SECTORS, n_far / n_seen, ranked(ranges[:n_on_it], most), spread,
         math.sqrt(squares / n_on_it), n, n_on_it,
     )  # fmt: skip
 

@@ -14,7 +14,13 @@ from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.frame import Candidates, FloatArray, PointArray, Scan, usual_errors
 from gp_ground_seg.core.parameters.config import SensorConfig
 from gp_ground_seg.core.parameters.schema import AUTO
-from gp_ground_seg.core.pipeline.ground_plane import FARTHEST, GroundPlane
+from gp_ground_seg.core.pipeline.ground_plane import (
+    FARTHEST,
+    GroundPlane,
+    Plane,
+    plane_across,
+    supports_in,
+)
 from gp_ground_seg.core.pipeline.tilt import (
     Direction,
     angles_of,
@@ -27,11 +33,11 @@ from gp_ground_seg.core.pipeline.tilt import (
 from gp_ground_seg.core.pipeline.up_axis import (
     MIN_CLEARANCE,
     MIN_SPREAD,
-    MIN_SUPPORT,
     UP_MAX_TILT,
     View,
     find_up_axis,
     is_up_axis_doubtful,
+    is_well_supported,
     refusal,
 )
 
@@ -57,6 +63,9 @@ LEAST_COSINE = 0.1
 """Cosine of the tilt from which the sensor's z axis meets the ground."""
 HEIGHT_CONTRADICTION = 0.3
 """Difference to a given height from which the scan contradicts it [m]."""
+ALSO_SEEN = 0.2
+"""Support of the level plane at a given height, over that of the plane found, from which the scan
+does not contradict it: it shows two levels, and which of them is the own one may be unclear."""
 TILT_CONTRADICTION = 0.15
 """Tilt left under given angles from which the scan contradicts them [rad]: no usual slope."""
 
@@ -190,6 +199,7 @@ def estimate_pose(
     height = rounded(plane.near_height * plane.normal[2] / along)
     measured = MeasuredPose(height, *angles_of(up), tells_height, tells_tilt, plane)
     estimates_height = sensor.height == AUTO and tells_height
+    level = turned_back(vertical(roll, pitch), given.rotation.T)
     return SensorPose(
         height=height if estimates_height else given.height,
         roll=roll,
@@ -198,7 +208,7 @@ def estimate_pose(
         roll_estimated=sensor.roll == AUTO and corrects,
         pitch_estimated=sensor.pitch == AUTO and corrects,
         measured=measured,
-        contradictions=contradictions or _contradictions(sensor, measured, view.up),
+        contradictions=contradictions or _contradictions(scan, sensor, measured, view, level),
         is_height_default=sensor.height == AUTO and not tells_height,
     )
 
@@ -233,6 +243,9 @@ def _find_ground(
     plane_below = None if view is None else view.plane
     found = find_up_axis(plane_below, look) if is_up_axis_doubtful(plane_below) else None
     if found is None:
+        if view is not None and not view.tells_tilt:
+            # The scan will not be levelled: the ground that matters is about level.
+            return look(None, CLEAR_TILT) or view, None
         return view, None
     if found.up[2] >= math.cos(UP_MAX_TILT):
         return found, None
@@ -265,20 +278,29 @@ def _angle(a: Direction, b: Direction) -> float:
     return math.acos(min(max(_product(a, b), -1.0), 1.0))
 
 
+def _shows_level(scan: Scan, level: Plane, view: View) -> bool:
+    """Whether a scan shows a level plane as well, beside that of `view`."""
+    found = plane_across(view.up, view.plane.near_height * view.plane.normal[2])
+    support, support_found = supports_in(scan.candidates, [level, found])
+    return bool(support >= ALSO_SEEN * support_found)
+
+
 def _contradictions(
-    sensor: SensorConfig, measured: MeasuredPose, up: Direction
+    scan: Scan, sensor: SensorConfig, measured: MeasuredPose, view: View, level: Direction
 ) -> tuple[str, ...]:
-    """Say which parameters are clearly wrong; `up` is that of the ground, as they level it."""
+    """Say which parameters are clearly wrong; `level` is the vertical of the pose used."""
     found = []
-    if measured.tells_height and measured.plane.support >= MIN_SUPPORT and sensor.height != AUTO:
+    tells_height = measured.tells_height and is_well_supported(measured.plane)
+    if tells_height and sensor.height != AUTO:
         difference = abs(sensor.height - measured.height)
-        if difference > max(HEIGHT_CONTRADICTION, 0.1 * abs(sensor.height)):
+        is_far = difference > max(HEIGHT_CONTRADICTION, 0.1 * abs(sensor.height))
+        if is_far and not _shows_level(scan, plane_across(level, sensor.height), view):
             side = 'below' if measured.height >= 0.0 else 'above'
             found.append(
                 f'sensor.height = {sensor.height:g}: the ground near the sensor is '
                 f"{abs(measured.height):.2f} m {side} the cloud's origin"
             )
-    if measured.tells_tilt and math.acos(min(up[2], 1.0)) > TILT_CONTRADICTION:
+    if measured.tells_tilt and math.acos(min(view.up[2], 1.0)) > TILT_CONTRADICTION:
         names = [n for n in ('roll', 'pitch') if getattr(sensor, n) != AUTO]
         if names:
             words = ', '.join(f'sensor.{name} = {getattr(sensor, name):g}' for name in names)

@@ -14,6 +14,8 @@ from gp_ground_seg.core.pipeline.tilt import Direction, angles_of, rotation
 
 MIN_SUPPORT = 0.35
 """Share of the lowest points on the plane from which a scan determines the tilt."""
+MIN_NEAR_SUPPORT = 0.5
+"""Share of their weight that does as well: on a dike most of them lie below it, far away."""
 MIN_CELLS = 12
 """Points on the plane from which a scan determines the height."""
 MIN_CLEARANCE, MIN_SPREAD = 0.05, 0.06
@@ -30,8 +32,8 @@ MIN_REACH = 5.0
 UP_MAX_TILT = math.radians(46.0)
 """Angle from each axis within which up is searched; these cones cover all directions. A scan whose
 up lies in that of z is levelled, another refused."""
-POOR_SUPPORT, GOOD_SUPPORT = 0.35, 0.9
-"""Support of the plane below z under which other axes are tried: near, and `TALL`."""
+GOOD_SUPPORT = 0.9
+"""Support of a `TALL` plane below z under which other axes are tried."""
 TALL = 6.0
 """Height from which the plane below z may well be a facade [m]."""
 UP_MIN_SUPPORT = 0.5
@@ -62,6 +64,11 @@ _AXES = (
 """Roll and pitch that turn each of the six axes up [rad]."""
 
 
+def is_well_supported(plane: GroundPlane) -> bool:
+    """Whether enough of the lowest points lie on a plane to level a scan by it."""
+    return plane.support >= MIN_SUPPORT or plane.near_support >= MIN_NEAR_SUPPORT
+
+
 class View(NamedTuple):
     """The plane of the ground, seen from a frame in which it is about level."""
 
@@ -89,7 +96,7 @@ class View(NamedTuple):
         plane = self.plane
         return (
             self.tells_height
-            and plane.support >= MIN_SUPPORT
+            and is_well_supported(plane)
             and plane.coverage >= MIN_COVERAGE
             and plane.reach >= MIN_REACH
         )
@@ -103,7 +110,7 @@ def is_up_axis_doubtful(plane: GroundPlane | None) -> bool:
     """Whether the plane below z is so poor, or so far away, that z may not be up."""
     return (
         plane is None
-        or plane.support < POOR_SUPPORT
+        or not is_well_supported(plane)
         or _is_steep(plane)
         or (_is_tall(plane) and plane.support < GOOD_SUPPORT)
     )
