@@ -17,6 +17,7 @@ from gp_ground_seg.core.pipeline.relief import (
     GENTLE,
     MIN_RAISED,
     MIN_SEEDS,
+    MIN_WEIGHT,
     MIN_WIDTH,
     N_ASIDE,
     N_ROUNDS,
@@ -231,7 +232,7 @@ def _fit_planes(
         sums = _sums_around(x, y, z, height, weight, square)
         for k in range(_N_SQUARES):
             if number[k] > 0:
-                is_known[k] = _set_plane(sums[k], plane[k])
+                _set_plane(sums[k], plane[k])
         for c in range(len(x)):
             if reached[c]:
                 there = height_of(plane[square[c]], x[c], y[c])
@@ -239,8 +240,10 @@ def _fit_planes(
     for i in range(N_SIDES):
         for j in range(N_SIDES):
             k = _place(i, j)
-            is_known[k] = _set_plane(sums[k], plane[k])
-            land[k] = height_of(plane[k], middle_of(i), middle_of(j))
+            # Most squares have no land about them.
+            if sums[k, 0] >= MIN_WEIGHT:
+                is_known[k] = _set_plane(sums[k], plane[k])
+                land[k] = height_of(plane[k], middle_of(i), middle_of(j))
     return land, is_known, number
 
 
@@ -275,11 +278,13 @@ def _sums_around(
             own[first + 6] += w * (y[c] * y[c])
             own[first + 7] += w * (x[c] * over)
             own[first + 8] += w * (y[c] * over)
-    rows, around, column = np.zeros_like(own), np.zeros_like(own), _WIDTH * _N_SUMS
-    for k in range(column, len(own) - column):
+    # What stays arbitrary is that of squares at the border, which nothing needs.
+    rows, around = np.empty_like(own), np.empty_like(own)
+    column, row = np.uintp(_WIDTH * _N_SUMS), np.uintp(_N_SUMS)
+    for k in range(column, np.uintp(len(own)) - column):
         rows[k] = own[k - column] + own[k] + own[k + column]
-    for k in range(column, len(own) - column):
-        around[k] = rows[k - _N_SUMS] + rows[k] + rows[k + _N_SUMS]
+    for k in range(column, np.uintp(len(own)) - column):
+        around[k] = rows[k - row] + rows[k] + rows[k + row]
     return around.reshape(_N_SQUARES, _N_SUMS)
 
 

@@ -86,8 +86,9 @@ class Relief(NamedTuple):
     def at(self, x: PointArray, y: PointArray) -> FloatArray:
         """Height at places (P,) that are finite, (P,) [m]."""
         u, v = (from_first_middle(place.astype(np.float64)) for place in (x, y))
-        piece = self.pieces[u.astype(np.int64), v.astype(np.int64)]
-        result: FloatArray = height_in(piece.T, u, v)
+        # One index: with two it takes three times as long.
+        place = u.astype(np.int64) * (N_SIDES - 1) + v.astype(np.int64)
+        result: FloatArray = height_in(self.pieces.reshape(-1, 4).take(place, axis=0).T, u, v)
         return result
 
     def at_knots(self, knots: FloatArray, n_segments: int) -> FloatArray:
