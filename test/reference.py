@@ -241,7 +241,11 @@ def reached_on_foot(candidates, faces, height, config):
 
     for a in sorted(allowed):
         if a + 1 < len(r) and segment[a + 1] == segment[a]:
-            step(a, a + 1, 1.0 + 0.12 * r[a + 1], 0.0)
+            if r[a + 1] - r[a] > 1.0 + 0.12 * r[a + 1]:
+                if {a, a + 1} <= allowed and goes_on(candidates, a):
+                    steep.append((a, a + 1))
+            else:
+                step(a, a + 1, 1.0 + 0.12 * r[a + 1], 0.0)
         for aside in (1, 2):
             own = np.flatnonzero(segment == (segment[a] + aside) % n_segments)
             across = aside * 2.0 * math.pi / n_segments * r[a]
@@ -259,6 +263,18 @@ def reached_on_foot(candidates, faces, height, config):
         if r[c] < growth.seed_range and abs(z[c] + height) < growth.seed_height_tolerance
     }
     return {c for group in groups if len(seeds & group) >= 8 for c in group}
+
+
+def goes_on(candidates, a):
+    """Whether the long step from candidate `a` to the next has the slope of the land before it."""
+    r, z, segment = candidates.r, candidates.z, candidates.segment
+    dr = r[a + 1] - r[a]
+    own = np.flatnonzero((segment == segment[a]) & (r <= r[a] - 0.5 * dr))
+    if len(own) == 0 or dr > 1.0 + 0.4 * r[a + 1]:
+        return False
+    before = (z[a] - z[own[-1]]) / (r[a] - r[own[-1]])
+    slope = (z[a + 1] - z[a]) / dr
+    return 0.06 <= abs(slope) <= 0.84 and abs(slope - before) <= 0.08
 
 
 def fronts_of(steep, r, z, segment, n_segments):

@@ -94,6 +94,23 @@ def test_the_relief_is_that_of_a_bank(backend, degrees):
     assert (relief.at(np.array([-30.0, 5.0]), np.zeros(2)) == 0.0).all()
 
 
+def test_long_steps_go_on_with_the_slope_before(backend):
+    """Few rings on a ramp; behind a gap as long, the roofs of a row of cars are not reached."""
+    rings = np.array(
+        [3.0, 4.0, 5.0, 6.0, 7.5, 9.0, 11.0, 13.0, 15.0, 16.5, 22.0, 23.5, 33.0, 35.0]
+    )
+
+    def ramp(x, y):
+        return np.clip(0.2 * (x - 6.0), 0.0, None)
+
+    def roofs(x, y):
+        return 1.4 * ((x > 18.0) & (x < 30.0))
+
+    for land, expected in ((ramp, 5.6), (roofs, 0.0)):
+        relief, _ = backend.find_relief(candidates_on(land, rings), NO_FACES, HEIGHT, Config())
+        assert relief.at(np.array([34.0]), np.zeros(1)) == pytest.approx(expected, abs=0.4)
+
+
 def box(x0, x1, y0, y1, high):
     """Level ground with a box on it."""
 

@@ -29,9 +29,11 @@ from gp_ground_seg.core.pipeline.relief import (
     can_step,
     faded,
     from_first_middle,
+    goes_on,
     height_in,
     height_of,
     largest_gap,
+    longest_gap,
     middle_of,
     piece_of,
     plane_of,
@@ -117,25 +119,43 @@ def _reachable(
 
 @jit()
 def _step_along(candidates: Candidates, allowed: BoolArray, parent: IntArray) -> IntArray:
-    """Join neighbours of a segment; return the candidates at the far ends of steep steps."""
+    """Join neighbours of a segment; return the far ends of steep and long steps."""
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     steep, n = np.empty(len(r), np.int64), 0
     for m in range(len(offsets) - 1):
         for c in range(offsets[m] + 1, offsets[m + 1]):
             dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
-            is_taken = allowed[c] and allowed[c - 1] and dr <= largest_gap(r[c])
-            if is_taken and can_step(dr, rise, STEEP):
-                if abs(rise) <= GENTLE:
+            if not (allowed[c] and allowed[c - 1] and dr <= longest_gap(r[c])):
+                continue
+            if dr > largest_gap(r[c]):
+                is_taken = _goes_on(candidates, offsets[m], c)
+            else:
+                is_taken = can_step(dr, rise, STEEP)
+                if is_taken and abs(rise) <= GENTLE:
                     _join(parent, c - 1, c)
-                else:
-                    steep[n] = c
-                    n += 1
+                    continue
+            if is_taken:
+                steep[n] = c
+                n += 1
     return steep[:n]
 
 
 @jit()
+def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
+    """Whether the step to candidate `c`, in the segment from `first` on, goes on as before."""
+    r, z, before = candidates.r, candidates.z, c - 1
+    dr = r[c] - r[c - 1]
+    while before >= first and r[before] > r[c - 1] - 0.5 * dr:
+        before -= 1
+    if before < first:
+        return False
+    slope_before = (z[c - 1] - z[before]) / (r[c - 1] - r[before])
+    return bool(goes_on((z[c] - z[c - 1]) / dr, slope_before))
+
+
+@jit()
 def _step_up(candidates: Candidates, steep: IntArray, parent: IntArray) -> None:
-    """Take the steep steps that are in a front; `steep` (S,) are their far ends, in order."""
+    """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order."""
     offsets, n_segments = candidates.offsets, len(candidates.offsets) - 1
     starts, segment = np.zeros(n_segments + 1, np.int64), np.empty(len(steep), np.int64)
     k = 0

@@ -44,6 +44,9 @@ MAX_SLOPE, STEP_TOLERANCE = 0.84, 0.06
 GENTLE, STEEP, MIN_WIDTH = 0.3, 0.8, 6.0
 """Largest rise or fall of a step; that of one along a segment which is taken where others are side
 by side with it over a width, and this width: more than the length of a car [m]."""
+LONG_GROWTH, MIN_SLOPE, SAME_SLOPE = 0.4, 0.06, 0.08
+"""Growth with range of the longest step along a segment that goes on with the slope of the land
+before it [m/m], in such a front too; least slope of one, and difference to that before."""
 N_ASIDE = 2
 """Segments on each side that a step may lead to."""
 MIN_SEEDS = 8
@@ -123,15 +126,18 @@ def find_relief(
 def reachable(candidates: Candidates, allowed: BoolArray, is_seed: BoolArray) -> BoolArray:
     """Which of the candidates can be reached from enough seeds in steps over `allowed` ones, (C,).
 
-    Gentle steps are taken in any case, steep ones where they form a front, side by side: those to
-    a car are few.
+    Gentle steps are taken in any case, steep and long ones where they form a front, side by side:
+    those to a car are few.
     """
     first, second = _steps(candidates)
     taken = allowed[first] & allowed[second]
     first, second = first[taken], second[taken]
+    is_along = second == first + 1
     taken = np.abs(candidates.z[second] - candidates.z[first]) <= GENTLE
-    steep = np.flatnonzero(~taken)
-    taken[steep] = _in_front(candidates, first[steep])
+    dr = candidates.r[second] - candidates.r[first]
+    taken &= ~is_along | (dr <= largest_gap(candidates.r[second]))
+    wanting = np.flatnonzero(~taken)
+    taken[wanting] = _in_front(candidates, first[wanting])
     group = _groups(len(allowed), first[taken], second[taken])
     result: BoolArray = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
     return result & allowed
@@ -178,17 +184,23 @@ def _steps(candidates: Candidates) -> tuple[IntArray, IntArray]:
     """Candidates at both ends of all possible steps.
 
     They lead to the next candidate of the segment, and to the two in range next to it in each
-    segment beside; there none is steep.
+    segment beside; there none is steep or long. A long step is compared with the slope from the
+    last candidate that is half of it before it.
     """
     r, z, segment = candidates.r, candidates.z, candidates.segment
     n_segments, n = len(candidates.offsets) - 1, len(r)
-    along = np.arange(n - 1)
-    dr = np.diff(r)
-    is_step = (segment[1:] == segment[:-1]) & (dr <= largest_gap(r[1:]))
-    is_step &= can_step(dr, np.diff(z), STEEP)
-    first, second = [along[is_step]], [along[is_step] + 1]
     apart = 2.0 * float(r.max(initial=0.0)) + 1.0  # of one segment's ranges and the next one's
     key, here = segment * apart + r, np.arange(n)
+    along, dr, rise = here[:-1], np.diff(r), np.diff(z)
+    before = np.searchsorted(key, key[:-1] - 0.5 * dr, side='right') - 1
+    has_before = (before >= 0) & (segment[before] == segment[:-1])
+    with np.errstate(divide='ignore', invalid='ignore'):
+        slope_before = (z[:-1] - z[before]) / (r[:-1] - r[before])
+        is_long = has_before & (dr <= longest_gap(r[1:])) & goes_on(rise / dr, slope_before)
+    is_step = (dr <= largest_gap(r[1:])) & can_step(dr, rise, STEEP)
+    is_step |= is_long & (dr > largest_gap(r[1:]))
+    is_step &= segment[1:] == segment[:-1]
+    first, second = [along[is_step]], [along[is_step] + 1]
     for aside in range(1, N_ASIDE + 1):
         beside = (segment + aside) % n_segments
         behind = np.searchsorted(key, beside * apart + r)
@@ -207,6 +219,19 @@ def _steps(candidates: Candidates) -> tuple[IntArray, IntArray]:
 def largest_gap(r: Values) -> Values:
     """Longest step along a segment at a range [m]."""
     return GAP + GAP_GROWTH * r
+
+
+@shared
+def longest_gap(r: Values) -> Values:
+    """Longest step that goes on with the slope of the land before it, at a range [m]."""
+    return GAP + LONG_GROWTH * r
+
+
+@shared
+def goes_on(slope: Values, before: Values) -> Values:
+    """Whether a step of this slope goes on with that before it."""
+    is_slope = (np.abs(slope) >= MIN_SLOPE) & (np.abs(slope) <= MAX_SLOPE)
+    return is_slope & (np.abs(slope - before) <= SAME_SLOPE)
 
 
 @shared
