@@ -58,9 +58,8 @@ ROBUST_SCALE = 0.15
 """Residual at which a candidate counts half [m]."""
 RIDGE = 0.5
 """Variance that is added to those of x and y [m^2]: planes through few places are more level."""
-MIN_WEIGHT, MIN_SCATTER = 1.5, 0.4
-"""Least weight of a plane, a square with candidates counting one, and least scatter of its
-candidates, across the direction in which they lie in a row [m]."""
+MIN_WEIGHT = 1.5
+"""Least weight of a plane, where a square with candidates counts one."""
 RAISED, MIN_RAISED = 0.3, 9
 """Height from which the squares side by side with candidates in them must be as many [m]: more
 than those of a truck."""
@@ -356,7 +355,8 @@ def height_in(piece: Values, u: Values, v: Values) -> Values:
 def plane_of(sums: Values) -> tuple[Values, Values, Values, Values, Values, Values]:
     """Plane through places, by weighted sums of 1, x, y, z, xx, xy, yy, xz and yz.
 
-    Returns their mean (three), slopes along x and y, and whether they determine it.
+    Returns their mean (three), slopes along x and y, and whether they are enough. Of a single
+    ring, the slope across it is that of level land.
     """
     n, x, y, z = sums[0], sums[1], sums[2], sums[3]
     xx, xy, yy, xz, yz = sums[4], sums[5], sums[6], sums[7], sums[8]
@@ -365,14 +365,11 @@ def plane_of(sums: Values) -> tuple[Values, Values, Values, Values, Values, Valu
     var_x, var_y = xx / safe - mean_x * mean_x, yy / safe - mean_y * mean_y
     var_xy = xy / safe - mean_x * mean_y
     var_xz, var_yz = xz / safe - mean_x * mean_z, yz / safe - mean_y * mean_z
-    apart = 0.5 * (var_x - var_y)
-    least = 0.5 * (var_x + var_y) - np.sqrt(apart * apart + var_xy * var_xy)
-    is_determined = (n >= MIN_WEIGHT) & (least >= MIN_SCATTER * MIN_SCATTER)
     var_x, var_y = var_x + RIDGE, var_y + RIDGE
     determinant = var_x * var_y - var_xy * var_xy
     slope_x = (var_xz * var_y - var_yz * var_xy) / determinant
     slope_y = (var_yz * var_x - var_xz * var_xy) / determinant
-    return mean_x, mean_y, mean_z, slope_x, slope_y, is_determined
+    return mean_x, mean_y, mean_z, slope_x, slope_y, n >= MIN_WEIGHT
 
 
 @shared
