@@ -62,7 +62,7 @@ def label_points(
     grid, tiles, label = scan.grid, scan.tiles, config.label
     z = scan.xyz[:, 2].astype(np.float64)
     # NaN outside, as is what follows; tiles there are negative, which index something.
-    height = over_relief(scan, relief) - at_points(surface.knots, surface.mean, grid)
+    height = over_relief(scan, z, relief) - at_points(surface.knots, surface.mean, grid)
     tile = as_index(tiles.tile)
     in_face = faces.is_face[tile] & grid.inside
     units = sum_units(len(z))

@@ -303,13 +303,16 @@ def filled(land: FloatArray, is_known: BoolArray) -> FloatArray:
     return land
 
 
-def over_relief(scan: Scan, relief: Relief) -> FloatArray:
-    """Height of the points of a scan over the relief, (N,) [m]; arbitrary outside the grid."""
-    z: FloatArray = scan.xyz[:, 2].astype(np.float64)
-    if not relief.is_level:
-        inside = np.flatnonzero(scan.grid.inside)
-        z[inside] -= relief.at(scan.xyz[:, 0][inside], scan.xyz[:, 1][inside])
-    return z
+def over_relief(scan: Scan, z: FloatArray, relief: Relief) -> FloatArray:
+    """Height over the relief of the points of a scan, of their heights `z`, (N,) each [m].
+
+    Points outside the grid keep theirs.
+    """
+    if relief.is_level:
+        return z
+    inside, over = np.flatnonzero(scan.grid.inside), z.copy()
+    over[inside] -= relief.at(scan.xyz[:, 0][inside], scan.xyz[:, 1][inside])
+    return over
 
 
 @shared
