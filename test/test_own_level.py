@@ -26,7 +26,7 @@ from gp_ground_seg.lab.simulation import terrain as landforms
     ids=['roof', 'cab', 'bonnet', 'trailer'],
 )
 def test_the_own_vehicle_is_not_the_ground(scene, length, width, ahead, below):
-    # The street has camber.
+    # Beside the street is a sidewalk, 0.15 m higher.
     height = pytest.approx(2.4, abs=0.1 if scene == 'urban' else 0.05)
     points = scan_of(scene, SMALL_OS1, 2.4).points[:, :3]
     body = np.random.default_rng(0).uniform(-0.5, 0.5, (20000, 3)) * (length, width, 0.02)
