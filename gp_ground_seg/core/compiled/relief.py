@@ -262,17 +262,16 @@ def _fit_planes(
             k = _place(i, j)
             # Most squares have no land about them.
             if sums[k, 0] >= MIN_WEIGHT:
-                is_known[k] = _set_plane(sums[k], plane[k])
+                _set_plane(sums[k], plane[k])
+                is_known[k] = True
                 land[k] = height_of(plane[k], middle_of(i), middle_of(j))
     return land, is_known, number
 
 
 @jit()
-def _set_plane(sums: FloatArray, plane: FloatArray) -> bool:
-    """Set mean and slopes of a plane by its sums (9,); return whether they determine it."""
-    x, y, z, slope_x, slope_y, is_determined = plane_of(sums)
-    plane[0], plane[1], plane[2], plane[3], plane[4] = x, y, z, slope_x, slope_y
-    return bool(is_determined)
+def _set_plane(sums: FloatArray, plane: FloatArray) -> None:
+    """Set mean and slopes of a plane by its sums (9,)."""
+    plane[0], plane[1], plane[2], plane[3], plane[4] = plane_of(sums)
 
 
 @jit()

@@ -107,9 +107,11 @@ def find_relief(
 
     Vertical faces are no land.
     """
+    level = Relief.of(np.zeros((N_SIDES, N_SIDES)))
+    if not config.surface.look_aside:
+        return level, candidates
     growth, z = config.growth, candidates.z + height
     allowed = ~faces.is_face[candidates.tile] & (candidates.r < REACH)
-    allowed &= config.surface.look_aside
     is_seed = allowed & (candidates.r < growth.seed_range)
     is_seed &= np.abs(z) < growth.seed_height_tolerance
     reached = reachable(candidates, allowed, is_seed)
@@ -117,7 +119,7 @@ def find_relief(
     land, is_known, is_occupied = fit_planes(*places)
     leave_out_small(land, is_known, is_occupied)
     if not (np.abs(land[is_known]) > FADED).any():
-        return Relief.of(np.zeros_like(land)), candidates
+        return level, candidates
     relief = Relief.of(faded(filled(land, is_known)))
     return relief, candidates._replace(z=candidates.z - relief.at(candidates.x, candidates.y))
 
@@ -264,12 +266,13 @@ def fit_planes(
     for _ in range(N_ROUNDS):
         sums = (np.bincount(square, weight * p, N_SIDES * N_SIDES) for p in products)
         around = [three_by_three(total.reshape(shape)) for total in sums]
-        *plane, is_determined = plane_of(around)
+        plane = plane_of(around)
         there = [table[i, j] for table in plane]
         weight = robust_weight(z - height_of(there, x, y)) / number
     middle = middle_of(np.arange(N_SIDES))
     land: FloatArray = height_of(plane, middle[:, None], middle)
-    return land, is_determined, in_square.reshape(shape) > 0
+    is_known: BoolArray = around[0] >= MIN_WEIGHT
+    return land, is_known, in_square.reshape(shape) > 0
 
 
 def three_by_three(table: npt.NDArray[Any]) -> FloatArray:
@@ -310,7 +313,8 @@ def over_relief(scan: Scan, z: FloatArray, relief: Relief) -> FloatArray:
     """
     if relief.is_level:
         return z
-    inside, over = np.flatnonzero(scan.grid.inside), z.copy()
+    over: FloatArray = z.copy()
+    inside = np.flatnonzero(scan.grid.inside)
     over[inside] -= relief.at(scan.xyz[:, 0][inside], scan.xyz[:, 1][inside])
     return over
 
@@ -355,11 +359,11 @@ def height_in(piece: Values, u: Values, v: Values) -> Values:
 
 
 @shared
-def plane_of(sums: Values) -> tuple[Values, Values, Values, Values, Values, Values]:
+def plane_of(sums: Values) -> tuple[Values, Values, Values, Values, Values]:
     """Plane through places, by weighted sums of 1, x, y, z, xx, xy, yy, xz and yz.
 
-    Returns their mean (three), slopes along x and y, and whether they are enough. Of a single
-    ring, the slope across it is that of level land.
+    Returns their mean (three), and slopes along x and y; those of one place, or across a single
+    ring, are level.
     """
     n, x, y, z = sums[0], sums[1], sums[2], sums[3]
     xx, xy, yy, xz, yz = sums[4], sums[5], sums[6], sums[7], sums[8]
@@ -372,12 +376,12 @@ def plane_of(sums: Values) -> tuple[Values, Values, Values, Values, Values, Valu
     determinant = var_x * var_y - var_xy * var_xy
     slope_x = (var_xz * var_y - var_yz * var_xy) / determinant
     slope_y = (var_yz * var_x - var_xz * var_xy) / determinant
-    return mean_x, mean_y, mean_z, slope_x, slope_y, n >= MIN_WEIGHT
+    return mean_x, mean_y, mean_z, slope_x, slope_y
 
 
 @shared
 def height_of(plane: Values, x: Values, y: Values) -> Values:
-    """Height at a place of the plane, the first five values that `plane_of` gives [m]."""
+    """Height at a place of the plane that `plane_of` gives [m]."""
     return plane[2] + plane[3] * (x - plane[0]) + plane[4] * (y - plane[1])
 
 
