@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gp_ground_seg import Config, Label
 from gp_ground_seg.core.frame import Faces, GroundSurface, Scan
 from gp_ground_seg.core.pipeline.labels import ground_probability
-from gp_ground_seg.core.pipeline.relief import N_SIDES, Relief
+from gp_ground_seg.core.pipeline.relief import Relief
 
 CONFIG = Config().replace(
     **{
@@ -23,7 +23,7 @@ CONFIG = Config().replace(
 )
 KNOTS = np.array([2.0, 4.0, 6.0, 8.0, 10.0])
 KNOTS.setflags(write=False)
-LEVEL = Relief.of(np.zeros((N_SIDES, N_SIDES)))
+LEVEL = Relief.level()
 G, O, U = Label.GROUND, Label.OBSTACLE, Label.UNKNOWN  # noqa: E741
 
 

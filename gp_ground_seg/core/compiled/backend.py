@@ -47,7 +47,7 @@ from gp_ground_seg.core.pipeline.labels import depth_of_ground, lowest_of, sum_u
 from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
-from gp_ground_seg.core.pipeline.relief import N_SIDES, Relief
+from gp_ground_seg.core.pipeline.relief import Relief
 from gp_ground_seg.core.pipeline.roughness import N_LEVELS
 from gp_ground_seg.core.pipeline.tilt import Direction
 
@@ -119,8 +119,7 @@ class NumbaBackend:
     ) -> tuple[Relief, Candidates]:
         """Relief of the land, and the candidates over it."""
         growth = numbers_of(config.growth)
-        relief = Relief(np.zeros((N_SIDES - 1, N_SIDES - 1, 4)))
-        z = np.empty_like(candidates.z)
+        relief, z = Relief.level(), np.empty_like(candidates.z)
         if not config.surface.look_aside or relief_.find_relief(
             candidates, faces.is_face, height, growth, relief.pieces, z
         ):

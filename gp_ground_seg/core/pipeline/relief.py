@@ -79,6 +79,11 @@ class Relief(NamedTuple):
         return not self.pieces.any()
 
     @classmethod
+    def level(cls) -> Relief:
+        """Relief of level land."""
+        return cls(np.zeros((N_SIDES - 1, N_SIDES - 1, 4)))
+
+    @classmethod
     def of(cls, height: FloatArray) -> Relief:
         """Relief by its height in the middle of each square, (N_SIDES, N_SIDES) [m]."""
         corners = height[:-1, :-1], height[1:, :-1], height[:-1, 1:], height[1:, 1:]
@@ -107,9 +112,8 @@ def find_relief(
 
     Vertical faces are no land.
     """
-    level = Relief.of(np.zeros((N_SIDES, N_SIDES)))
     if not config.surface.look_aside:
-        return level, candidates
+        return Relief.level(), candidates
     growth, z = config.growth, candidates.z + height
     allowed = ~faces.is_face[candidates.tile] & (candidates.r < REACH)
     is_seed = allowed & (candidates.r < growth.seed_range)
@@ -119,7 +123,7 @@ def find_relief(
     land, is_known, is_occupied = fit_planes(*places)
     leave_out_small(land, is_known, is_occupied)
     if not (np.abs(land[is_known]) > FADED).any():
-        return level, candidates
+        return Relief.level(), candidates
     relief = Relief.of(faded(filled(land, is_known)))
     return relief, candidates._replace(z=candidates.z - relief.at(candidates.x, candidates.y))
 
