@@ -234,16 +234,27 @@ class Process:
             self.popen.wait()
 
 
-def said_by(capfd, *texts):
-    """What the node in this process has written to stderr, once that holds all `texts`."""
-    said = ['']
+@contextlib.contextmanager
+def stderr_in(folder):
+    """File of what this process writes to stderr meanwhile; shown after it.
 
-    def is_said():
-        said[0] += capfd.readouterr().err
-        return all(text in said[0] for text in texts)
+    A look at what capfd has empties it, and loses the line that a thread writes just then.
+    """
+    path, kept = folder / 'stderr', os.dup(2)
+    try:
+        with path.open('a') as file:
+            os.dup2(file.fileno(), 2)
+        yield path
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        sys.stderr.write(path.read_text())
 
-    wait_for(is_said, f'{texts} on stderr')
-    return said[0]
+
+def said_by(stderr, *texts):
+    """What is in the file `stderr`, once that holds all `texts`."""
+    wait_for(lambda: all(text in stderr.read_text() for text in texts), f'{texts} on stderr')
+    return stderr.read_text()
 
 
 def values_of(status):

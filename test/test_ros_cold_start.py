@@ -99,11 +99,11 @@ def test_numpy_asked_for_meanwhile_stays(b, held_back):
     assert backend_after_a_cloud(b, 2) == 'numba'
 
 
-def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, capfd):
+def test_a_failure_is_a_warning_and_the_node_goes_on(monkeypatch, tmp_path):
     monkeypatch.setattr(warm_up, 'is_code_kept', lambda: False)
     monkeypatch.setattr(warm_up, '_COMPILE', "raise OSError('no space left')")
-    with ros.bench(settled=False) as b:
-        assert 'OSError: no space left' in ros.said_by(capfd, STAYS)
+    with ros.stderr_in(tmp_path) as stderr, ros.bench(settled=False) as b:
+        assert 'OSError: no space left' in ros.said_by(stderr, STAYS)
         b.segment(to_message(street(1000)))
         assert b.node._segmenter.backend.name == 'numpy'
 

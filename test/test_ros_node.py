@@ -100,10 +100,10 @@ MODEL_KEYS = (
 )
 
 
-def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(capfd):
+def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(tmp_path):
     points = street(3000)
     limits = '-p', 'diagnostics.stale_after:=3.0', '-p', 'diagnostics.max_latency:=10.0'
-    with ros.bench(*OFTEN, *limits) as b:
+    with ros.stderr_in(tmp_path) as stderr, ros.bench(*OFTEN, *limits) as b:
 
         def segment(*seconds):
             for second in seconds:
@@ -123,7 +123,7 @@ def test_diagnostics_of_a_stream_of_2011_that_starts_again_twice(capfd):
             'output': wait_for_counter('output', f'{NAMESPACE}/ground since startup', '6'),
         }
         # Throttled: two jumps, one message.
-        said = ros.said_by(capfd, 'time jumped back by 2.0 s')
+        said = ros.said_by(stderr, 'time jumped back by 2.0 s')
         assert said.count('time jumped back') == 1
         assert b.set('diagnostics.max_latency', 0.001).successful
         b.wait_for_status('processing', lambda _, s: s.level == DiagnosticStatus.WARN)
@@ -229,31 +229,32 @@ def b():
         yield shared
 
 
-def test_bad_clouds_among_good_ones_are_refused_with_one_message(b, capfd):
-    good = to_message(street(500), frame='lidar')
-    bad = [to_message(street(500), frame='broken') for _ in range(3)]
-    bad[0].fields[3].name = 'altitude'
-    bad[1].data, bad[2].point_step = bad[1].data[:-1], 0
-    n_answers = len(b.ground.messages)
-    for cloud in bad:
-        b.publisher.publish(cloud)
+def test_bad_clouds_among_good_ones_are_refused_with_one_message(b, tmp_path):
+    with ros.stderr_in(tmp_path) as stderr:
+        good = to_message(street(500), frame='lidar')
+        bad = [to_message(street(500), frame='broken') for _ in range(3)]
+        bad[0].fields[3].name = 'altitude'
+        bad[1].data, bad[2].point_step = bad[1].data[:-1], 0
+        n_answers = len(b.ground.messages)
+        for cloud in bad:
+            b.publisher.publish(cloud)
+            b.segment(good)
+        assert len(b.ground.messages) == n_answers + 3
+
+        def wait_for_level(level):
+            return b.wait_for_status(
+                'input', lambda v, s: (v['Refused since startup'], s.level) == ('4', level)
+            )
+
+        b.publisher.publish(bad[0])
+        status = wait_for_level(DiagnosticStatus.ERROR)
+        assert 'no field named z' in status.message
+        assert ros.values_of(status)['Frame'] == 'broken'
         b.segment(good)
-    assert len(b.ground.messages) == n_answers + 3
-
-    def wait_for_level(level):
-        return b.wait_for_status(
-            'input', lambda v, s: (v['Refused since startup'], s.level) == ('4', level)
-        )
-
-    b.publisher.publish(bad[0])
-    status = wait_for_level(DiagnosticStatus.ERROR)
-    assert 'no field named z' in status.message
-    assert ros.values_of(status)['Frame'] == 'broken'
-    b.segment(good)
-    wait_for_level(DiagnosticStatus.OK)
-    # Throttled: four clouds, one message with topic, frame and reason.
-    said = ros.said_by(capfd, f"cloud on {NAMESPACE}/points in frame 'broken' refused: ")
-    assert said.count('refused') == said.count('no field named z') == 1
+        wait_for_level(DiagnosticStatus.OK)
+        # Throttled: four clouds, one message with topic, frame and reason.
+        said = ros.said_by(stderr, f"cloud on {NAMESPACE}/points in frame 'broken' refused: ")
+        assert said.count('refused') == said.count('no field named z') == 1
 
 
 def test_error_inside_the_library_does_not_end_the_node(b, monkeypatch):

@@ -7,7 +7,7 @@ pytest.importorskip('rclpy', reason='ROS is not installed')
 
 import ros_helpers as ros
 from nav_msgs.msg import OccupancyGrid
-from ros_helpers import said_by, street, to_message, wait_for, xyz_of
+from ros_helpers import said_by, stderr_in, street, to_message, wait_for, xyz_of
 from sensor_msgs.msg import LaserScan, PointCloud2, PointField
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -46,14 +46,14 @@ def received(b, topic, message):
     return answer
 
 
-def test_names_that_the_input_has_already_are_said_once(b, capfd):
-    message = to_message(street(500))
-    message.fields[0].name = 'label'
-    capfd.readouterr()
-    for _ in range(2):
-        found = received(b, '~/labeled', message)
-        assert [field.name for field in found.fields][-6:] == ['gp_label', *FIELDS[1:]]
-    assert said_by(capfd, 'in ~/labeled ours is gp_label').count('gp_label') == 1
+def test_names_that_the_input_has_already_are_said_once(b, tmp_path):
+    with stderr_in(tmp_path) as stderr:
+        message = to_message(street(500))
+        message.fields[0].name = 'label'
+        for _ in range(2):
+            found = received(b, '~/labeled', message)
+            assert [field.name for field in found.fields][-6:] == ['gp_label', *FIELDS[1:]]
+        assert said_by(stderr, 'in ~/labeled ours is gp_label').count('gp_label') == 1
 
 
 def test_names_are_free_however_often_a_cloud_comes_round():

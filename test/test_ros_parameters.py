@@ -89,22 +89,23 @@ def n_ground(points, config):
     return int((label == Label.GROUND).sum())
 
 
-def test_a_change_takes_effect_with_the_next_cloud(b, capfd):
-    points = street(5000)
-    message = to_message(points)
-    assert b.segment(message)[0].width == n_ground(points, Config())
-    for name, value in (
-        ('label.ground_tolerance', 0.01),
-        ('grid.n_segments', 8),
-        ('runtime.backend', 'numpy'),
-    ):
-        before = b.node.config
-        assert b.set(name, value).successful
-        assert b.node.config == before.replace(**{name: value})
-        ros.said_by(capfd, f'{name}: {before[name]} -> {value}\n')
-        assert b.segment(message)[0].width == n_ground(points, b.node.config)
-    narrow = Config().replace(**{'label.ground_tolerance': 0.01})
-    assert n_ground(points, Config()) != n_ground(points, narrow)
+def test_a_change_takes_effect_with_the_next_cloud(b, tmp_path):
+    with ros.stderr_in(tmp_path) as stderr:
+        points = street(5000)
+        message = to_message(points)
+        assert b.segment(message)[0].width == n_ground(points, Config())
+        for name, value in (
+            ('label.ground_tolerance', 0.01),
+            ('grid.n_segments', 8),
+            ('runtime.backend', 'numpy'),
+        ):
+            before = b.node.config
+            assert b.set(name, value).successful
+            assert b.node.config == before.replace(**{name: value})
+            ros.said_by(stderr, f'{name}: {before[name]} -> {value}\n')
+            assert b.segment(message)[0].width == n_ground(points, b.node.config)
+        narrow = Config().replace(**{'label.ground_tolerance': 0.01})
+        assert n_ground(points, Config()) != n_ground(points, narrow)
 
 
 HEIGHT = 'must be auto or a number in [-5, 20] m'
@@ -299,7 +300,7 @@ def test_the_constructor_raises_what_is_not_accepted():
         pass
 
 
-def test_unknown_names_are_reported_and_not_declared(capfd):
+def test_unknown_names_are_reported_and_not_declared(tmp_path):
     words = {
         'lable.ground_tolerance': 0.3,
         'qos_overrides./nowhere.subscription.depth': 3,
@@ -307,14 +308,14 @@ def test_unknown_names_are_reported_and_not_declared(capfd):
         'grid.r_max': 50,
         'label.ground_tolerance': 1,
     }
-    with ros.started_node(*ros.given(words)) as node:
+    with ros.stderr_in(tmp_path) as stderr, ros.started_node(*ros.given(words)) as node:
         changes = {'sensor.height': 2.5, 'grid.r_max': 50.0, 'label.ground_tolerance': 1.0}
         assert node.config == Config().replace(**changes)
         for name, value in changes.items():
             assert node.get_parameter(name).type_ == Parameter.Type.DOUBLE
             assert node.get_parameter(name).value == value
         assert not node.has_parameter('lable.ground_tolerance')
-        log = ros.said_by(capfd, 'did you mean label.ground_tolerance?', '/nowhere')
+        log = ros.said_by(stderr, 'did you mean label.ground_tolerance?', '/nowhere')
     assert log.count('is not used') == 2
     shown = [line for line in log.splitlines() if '  (default ' in line]
     assert '  sensor.height: 2.5 m  (default auto)' in shown
@@ -322,14 +323,14 @@ def test_unknown_names_are_reported_and_not_declared(capfd):
     assert 'ros2 param dump /ground_segmentation_node' in log
 
 
-def test_what_is_removed_is_a_warning_at_the_start_and_refused_later(tmp_path, capfd):
+def test_what_is_removed_is_a_warning_at_the_start_and_refused_later(tmp_path):
     """A node with the parameter file of an earlier release starts; all else in it holds."""
     path = tmp_path / 'old.yaml'
     groups = {'learning': {'mode': 'every_k', 'period': 3, 'segment_step': 20}}
     path.write_text(yaml.safe_dump({'/**': {'ros__parameters': groups}}))
-    with ros.started_node('--params-file', str(path)) as node:
+    with ros.stderr_in(tmp_path) as stderr, ros.started_node('--params-file', str(path)) as node:
         assert node.config == Config().replace(**{'learning.segment_step': 20})
-        log = ros.said_by(capfd, 'learning.period')
+        log = ros.said_by(stderr, 'learning.period')
         for key in ('learning.mode=every_k', 'learning.period'):
             name, line = key.split('=')[0], f'{key} was removed: {REMOVED[key]}'
             assert log.count(f'parameter {name} is not used: {line}\n') == 1
@@ -339,19 +340,22 @@ def test_what_is_removed_is_a_warning_at_the_start_and_refused_later(tmp_path, c
             assert (result.successful, result.reason) == (False, line)
 
 
-def test_a_start_with_the_defaults_is_one_line_about_them(capfd):
-    with ros.started_node():
-        log = ros.said_by(capfd, 'listening to')
+def test_a_start_with_the_defaults_is_one_line_about_them(tmp_path):
+    with ros.stderr_in(tmp_path) as stderr, ros.started_node():
+        log = ros.said_by(stderr, 'listening to')
     assert 'parameters: all defaults (all values by ros2 param dump' in log
     assert '(default' not in log
     assert len(log.splitlines()) <= 4
 
 
 @pytest.mark.skipif(not HAVE_NUMBA, reason='numba is not installed')
-def test_a_given_height_is_not_doubted_before_the_first_cloud(capfd):
-    with ros.started_node(*ros.given({'sensor.height': 4.5})) as node:
+def test_a_given_height_is_not_doubted_before_the_first_cloud(tmp_path):
+    with (
+        ros.stderr_in(tmp_path) as stderr,
+        ros.started_node(*ros.given({'sensor.height': 4.5})) as node,
+    ):
         ros.wait_for(lambda: node._is_compiled, 'compiled backend')
-        log = ros.said_by(capfd, CHANGED)
+        log = ros.said_by(stderr, CHANGED)
     assert 'sensor.height: 4.5 m' in log
     assert 'is sensor.height right' not in log
 
