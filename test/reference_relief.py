@@ -24,7 +24,7 @@ def find_relief(candidates, faces, height, config):
 
 
 def reached_on_foot(candidates, faces, height, config):
-    """Candidates in the groups, joined by steps, that have eight seeds."""
+    """Candidates in the groups, joined by steps, that have eight seeds; raised parts entered."""
     r, z, segment = candidates.r, candidates.z, candidates.segment
     n_segments, growth = len(candidates.offsets) - 1, config.growth
     allowed = {c for c in range(len(r)) if r[c] < 60.0 and not faces.is_face[candidates.tile[c]]}
@@ -63,7 +63,16 @@ def reached_on_foot(candidates, faces, height, config):
         for c in allowed
         if r[c] < growth.seed_range and abs(z[c] + height) < growth.seed_height_tolerance
     }
-    return {c for group in groups if len(seeds & group) >= 8 for c in group}
+    reached = {c for group in groups if len(seeds & group) >= 8 for c in group}
+    raised = {c for c in reached if z[c] + height > 0.3}
+    for part in groups_of(raised, lambda c: beside[c] & raised):
+        entries = {c for c in part if beside[c] & (reached - raised)}
+        nearest = {
+            segment[c]: min(r[e] for e in entries if segment[e] == segment[c]) for c in entries
+        }
+        if sum(2.0 * math.pi / n_segments * r_entry for r_entry in nearest.values()) < 2.0:
+            reached -= part
+    return reached
 
 
 def goes_on(candidates, a):

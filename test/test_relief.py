@@ -143,6 +143,19 @@ def test_no_relief_is_what_cannot_be_climbed(backend, name, share):
     assert (relief.at(np.array([0.0, 9.0]), np.array([0.0, 3.0])) == 0.0).all()
 
 
+@pytest.mark.parametrize(('width', 'expected'), [(1.0, 0.0), (6.0, 1.2)])
+def test_raised_land_is_entered_over_more_than_a_car(backend, width, expected):
+    """A terrace, and a ramp up to it: of a narrow one a few steps lead up, as to roofs of cars."""
+
+    def land(x, y):
+        ramp = np.clip(0.3 * (x - 8.0), 0.0, 1.2) * (np.abs(y) < 0.5 * width)
+        return np.where(x > 12.0, 1.2, ramp)
+
+    relief, _ = backend.find_relief(candidates_on(land, RINGS), NO_FACES, HEIGHT, Config())
+    terrace = relief.at(np.array([20.0, 20.0]), np.array([-12.0, 12.0]))
+    np.testing.assert_allclose(terrace, expected, atol=0.05)
+
+
 def test_nobody_walks_on_faces_or_where_each_segment_is_by_itself(backend):
     candidates = candidates_on(bank(25, 10.0), RINGS)
     by_itself = Config().replace(**{'surface.look_aside': False})

@@ -15,6 +15,7 @@ from gp_ground_seg.core.parameters.config import GrowthConfig
 from gp_ground_seg.core.pipeline.relief import (
     FADED,
     GENTLE,
+    MIN_ENTRY,
     MIN_RAISED,
     MIN_SEEDS,
     MIN_WEIGHT,
@@ -103,10 +104,13 @@ def _reachable(
     allowed, parent, n_seeds = np.empty(n, np.bool_), np.arange(n), np.zeros(n, np.int64)
     for c in range(n):
         allowed[c] = r[c] < REACH and not is_face[np.uintp(candidates.tile[c])]
-    steep = _step_along(candidates, allowed, parent)
+    steps, steep = np.empty((n * (1 + 2 * N_ASIDE), 2), np.int64), np.empty(n, np.int64)
+    n_steps, n_steep = _step_along(candidates, allowed, steps, steep)
     for aside in range(1, N_ASIDE + 1):
-        _step_aside(candidates, allowed, aside, parent)
-    _step_up(candidates, steep, parent)
+        n_steps = _step_aside(candidates, allowed, aside, steps, n_steps)
+    n_steps = _step_up(candidates, steep[:n_steep], steps, n_steps)
+    for s in range(n_steps):
+        _join(parent, steps[s, 0], steps[s, 1])
     for c in range(n):
         parent[c] = _root(parent, c)
         is_near = allowed[c] and r[c] < growth.seed_range
@@ -114,14 +118,47 @@ def _reachable(
             n_seeds[parent[c]] += 1
     for c in range(n):
         allowed[c] &= n_seeds[parent[c]] >= MIN_SEEDS
+    _leave_out_not_entered(candidates, height, steps[:n_steps], allowed)
     return allowed
 
 
 @jit()
-def _step_along(candidates: Candidates, allowed: BoolArray, parent: IntArray) -> IntArray:
-    """Join neighbours of a segment; return the far ends of steep and long steps."""
+def _leave_out_not_entered(
+    candidates: Candidates, height: float, steps: IntArray, reached: BoolArray
+) -> None:
+    """See the plain `_entered`."""
+    r, n, offsets = candidates.r, len(reached), candidates.offsets
+    is_raised, is_entry = np.empty(n, np.bool_), np.zeros(n, np.bool_)
+    for c in range(n):
+        is_raised[c] = reached[c] and candidates.z[c] + height > RAISED
+    parent, width, last = np.arange(n), np.zeros(n), np.full(n, -1)
+    for s in range(len(steps)):
+        a, b = steps[s, 0], steps[s, 1]
+        if is_raised[a] and is_raised[b]:
+            _join(parent, a, b)
+        elif reached[a] and is_raised[a] != is_raised[b]:
+            is_entry[a if is_raised[a] else b] = True
+    for m in range(len(offsets) - 1):
+        for c in range(offsets[m], offsets[m + 1]):
+            if is_entry[c]:
+                part = _root(parent, c)
+                if last[part] != m:
+                    width[part] += arc_of(r[c], len(offsets) - 1)
+                    last[part] = m
+    for c in range(n):
+        reached[c] &= not is_raised[c] or width[_root(parent, c)] >= MIN_ENTRY
+
+
+@jit()
+def _step_along(
+    candidates: Candidates, allowed: BoolArray, steps: IntArray, steep: IntArray
+) -> tuple[int, int]:
+    """List the steps between neighbours of a segment, and the far ends of steep and long ones.
+
+    Returns the numbers of both.
+    """
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
-    steep, n = np.empty(len(r), np.int64), 0
+    n_steps = n_steep = 0
     for m in range(len(offsets) - 1):
         for c in range(offsets[m] + 1, offsets[m + 1]):
             dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
@@ -132,12 +169,13 @@ def _step_along(candidates: Candidates, allowed: BoolArray, parent: IntArray) ->
             else:
                 is_taken = can_step(dr, rise, STEEP)
                 if is_taken and abs(rise) <= GENTLE:
-                    _join(parent, c - 1, c)
+                    steps[n_steps, 0], steps[n_steps, 1] = c - 1, c
+                    n_steps += 1
                     continue
             if is_taken:
-                steep[n] = c
-                n += 1
-    return steep[:n]
+                steep[n_steep] = c
+                n_steep += 1
+    return n_steps, n_steep
 
 
 @jit()
@@ -154,8 +192,11 @@ def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
 
 
 @jit()
-def _step_up(candidates: Candidates, steep: IntArray, parent: IntArray) -> None:
-    """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order."""
+def _step_up(candidates: Candidates, steep: IntArray, steps: IntArray, n_steps: int) -> int:
+    """List the steep and long steps in a front too; `steep` (S,) are their far ends, in order.
+
+    There are `n_steps` before; returns the number with these.
+    """
     offsets, n_segments = candidates.offsets, len(candidates.offsets) - 1
     starts, segment = np.zeros(n_segments + 1, np.int64), np.empty(len(steep), np.int64)
     k = 0
@@ -175,7 +216,9 @@ def _step_up(candidates: Candidates, steep: IntArray, parent: IntArray) -> None:
         width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
     for k in range(len(steep)):
         if width[front[k]] >= MIN_WIDTH:
-            _join(parent, steep[k] - 1, steep[k])
+            steps[n_steps, 0], steps[n_steps, 1] = steep[k] - 1, steep[k]
+            n_steps += 1
+    return n_steps
 
 
 @jit()
@@ -195,8 +238,13 @@ def _join_front(
 
 
 @jit()
-def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, parent: IntArray) -> None:
-    """Join each candidate with the next ones in range of the segment so many further on."""
+def _step_aside(
+    candidates: Candidates, allowed: BoolArray, aside: int, steps: IntArray, n_steps: int
+) -> int:
+    """List the steps to the next ones in range of the segment so many further on.
+
+    There are `n_steps` before; returns the number with these.
+    """
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     n_segments = len(offsets) - 1
     for m in range(n_segments):
@@ -214,7 +262,9 @@ def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, parent: 
                 if allowed[there] and dr <= gap:
                     distance = math.sqrt(dr * dr + across * across)
                     if can_step(distance, z[there] - z[c], GENTLE):
-                        _join(parent, c, there)
+                        steps[n_steps, 0], steps[n_steps, 1] = c, there
+                        n_steps += 1
+    return n_steps
 
 
 @jit()

@@ -60,9 +60,10 @@ RIDGE = 0.5
 """Variance that is added to those of x and y [m^2]: planes through few places are more level."""
 MIN_WEIGHT = 1.5
 """Least weight of a plane, where a square with candidates counts one."""
-RAISED, MIN_RAISED = 0.3, 9
-"""Height from which the squares side by side with candidates in them must be as many [m]: more
-than those of a truck."""
+RAISED, MIN_ENTRY, MIN_RAISED = 0.3, 2.0, 9
+"""Height over which land is raised [m]; width over which steps must lead up to it [m], more than a
+car; and squares side by side with candidates in them that it, or a hollow, must have, more than
+those of a truck."""
 FADED, FADE_WIDTH = 0.15, 0.3
 """Height of the land up to which the relief is level, and over which it then grows to it [m]."""
 
@@ -114,12 +115,12 @@ def find_relief(
     """
     if not config.surface.look_aside:
         return Relief.level(), candidates
-    growth, z = config.growth, candidates.z + height
+    growth, over_plane = config.growth, candidates._replace(z=candidates.z + height)
     allowed = ~faces.is_face[candidates.tile] & (candidates.r < REACH)
     is_seed = allowed & (candidates.r < growth.seed_range)
-    is_seed &= np.abs(z) < growth.seed_height_tolerance
-    reached = reachable(candidates, allowed, is_seed)
-    places = candidates.x[reached], candidates.y[reached], z[reached]
+    is_seed &= np.abs(over_plane.z) < growth.seed_height_tolerance
+    reached = reachable(over_plane, allowed, is_seed)
+    places = candidates.x[reached], candidates.y[reached], over_plane.z[reached]
     land, is_known, is_occupied = fit_planes(*places)
     leave_out_small(land, is_known, is_occupied)
     if not (np.abs(land[is_known]) > FADED).any():
@@ -132,7 +133,7 @@ def reachable(candidates: Candidates, allowed: BoolArray, is_seed: BoolArray) ->
     """Which of the candidates can be reached from enough seeds in steps over `allowed` ones, (C,).
 
     Gentle steps are taken in any case, steep and long ones where they form a front, side by side:
-    those to a car are few.
+    those to a car are few. Heights of the candidates are over the plane near the sensor.
     """
     first, second = _steps(candidates)
     taken = allowed[first] & allowed[second]
@@ -144,8 +145,30 @@ def reachable(candidates: Candidates, allowed: BoolArray, is_seed: BoolArray) ->
     wanting = np.flatnonzero(~taken)
     taken[wanting] = _in_front(candidates, first[wanting])
     group = _groups(len(allowed), first[taken], second[taken])
-    result: BoolArray = (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
-    return result & allowed
+    reached = allowed & (np.bincount(group[is_seed], minlength=len(group)) >= MIN_SEEDS)[group]
+    return _entered(candidates, reached, first[taken], second[taken])
+
+
+def _entered(
+    candidates: Candidates, reached: BoolArray, first: IntArray, second: IntArray
+) -> BoolArray:
+    """Candidates that are `reached`, without raised ones that few of the steps lead up to, (C,).
+
+    `first` and `second` (S,) are the ends of the steps. A hillside is entered all along its foot,
+    a car, if at all, where the step to a sill or a bonnet happens to be gentle.
+    """
+    is_raised, n_segments = reached & (candidates.z > RAISED), len(candidates.offsets) - 1
+    both = is_raised[first] & is_raised[second]
+    part = _groups(len(reached), first[both], second[both])
+    leads_up = reached[first] & (is_raised[first] != is_raised[second])
+    entries = np.unique(np.where(is_raised[first], first, second)[leads_up])
+    # A segment with several entries counts once, by the nearest.
+    key = part[entries] * n_segments + candidates.segment[entries]
+    nearest = entries[np.unique(key, return_index=True)[1]]
+    arcs = arc_of(candidates.r[nearest], n_segments)
+    width = np.bincount(part[nearest], arcs, minlength=len(reached))
+    result: BoolArray = reached & (~is_raised | (width[part] >= MIN_ENTRY))
+    return result
 
 
 def _in_front(candidates: Candidates, near: IntArray) -> BoolArray:
