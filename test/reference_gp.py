@@ -64,7 +64,6 @@ def estimate_surface(frame, theta, config):
     looks_aside = config.surface.look_aside and slope_std > 0.0 and len(frame.knots) > 0
     z, first = frame.candidates.z - frame.prior_mean, frame.candidates.offsets
     seed = (frame.candidates.r <= growth.seed_range) & (abs(z) <= growth.seed_height_tolerance)
-    seed &= z < frame.sensor_height
     nothing = np.zeros((2, n, max(len(frame.knots), 1)))
     evidence, odds = nothing, 0.25
     if looks_aside:

@@ -61,7 +61,6 @@ def surface_by_the_loops(seed):
     theta += np.where(np.arange(6) < 5, 0.3, 1.0) * rng.normal(size=theta.shape)
     if rng.random() < 0.3:
         frame = frame._replace(knots=frame.knots[:0])
-    frame = frame._replace(sensor_height=rng.choice([0.1, 0.3, np.inf]))
     arguments = frame, theta, config
     return arguments, reference_gp.estimate_surface(*arguments)
 
@@ -312,15 +311,3 @@ def test_among_many_obstacles_sills_lift_less(backend):
         return surface.mean[135, np.searchsorted(frame.knots, 8.0)] + 1.73
 
     assert lifted(85) < 0.7 * lifted(0)
-
-
-def test_what_is_as_high_as_the_sensor_is_no_seed(backend):
-    frame, config = frame_of_a_sill(0)
-    config = config.replace(**{'growth.seed_height_tolerance': 0.45, 'surface.look_aside': False})
-    on_sill, lifts = frame.candidates.z > -1.5, []
-    for sensor_height, is_seed in ((np.inf, True), (0.5, True), (0.3, False)):
-        low = frame._replace(sensor_height=sensor_height)
-        assert (seeds(low, theta_of(config), config)[0] == (is_seed | ~on_sill)).all()
-        surface, *_ = backend.estimate_surface(low, theta_of(config), config)
-        lifts.append(surface.mean[135, np.searchsorted(frame.knots, 8.0)] + 1.73)
-    assert lifts[0] == lifts[1] > lifts[2] + 0.05

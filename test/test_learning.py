@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import reference_gp
 from conftest import fewer, hilly_scan
-from test_ground import frame_of_a_sill
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.backend import NumpyBackend
@@ -13,7 +12,6 @@ from gp_ground_seg.core.frame import Frame, Inliers
 from gp_ground_seg.core.gp.learning import (
     ThetaSpace,
     every_segment,
-    first_theta,
     given_theta,
     in_rows,
     maximise,
@@ -71,14 +69,6 @@ def learn(inliers, space, start, use_priors=True, max_evaluations=200):
     learned = maximise(objective, space, start, len(inliers.r), **how)
     assert learned.n_evaluations == len(values)
     return learned, values
-
-
-def test_what_is_as_high_as_the_sensor_does_not_say_where_learning_starts():
-    frame, config = frame_of_a_sill(60)
-    given = given_theta(config)[0]
-    # The ground is level: only walls of 1.5 m say more than the values given.
-    high, low = (first_theta(frame._replace(sensor_height=h), config)[0] for h in (2.0, 0.5))
-    assert low == given < high
 
 
 @pytest.mark.parametrize('seed', [0, 1, 2])

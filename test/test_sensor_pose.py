@@ -15,6 +15,7 @@ from gp_ground_seg import Config, GroundSegmenter, Label, PointCloudError
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.jit import JIT_ENABLED
+from gp_ground_seg.core.pipeline import low_sensor
 from gp_ground_seg.core.pipeline.sensor_pose import CLEAR_TILT, DEFAULT_HEIGHT
 from gp_ground_seg.core.pipeline.tilt import angles_of, rotate, rotation
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
@@ -208,20 +209,39 @@ def test_low_robots(scene, height):
         assert pose_of(moved(points, lift)).height == pytest.approx(height - lift, abs=0.04)
 
 
-def test_a_low_sensor_is_told_from_the_origin_of_a_vehicle():
-    config, highest = Config().sensor, 0.45
-    for height, lift, is_low in ((0.15, 0.0, True), (1.73, 0.0, False), (1.73, 1.53, False)):
+def test_a_low_sensor_has_narrower_gates_and_is_told_from_the_origin_of_a_vehicle():
+    config, reference = Config(), low_sensor.REFERENCE_HEIGHT
+    for height, lift, expected in (
+        (0.6, 0.0, 0.6),
+        (0.15, 0.0, 0.15),
+        (1.73, 0.0, reference),
+        (1.73, 1.53, reference),
+        (1.73, 1.73, reference),
+    ):
         pose = pose_of(moved(scan_of('kerb', SMALL_VLP, height).points, lift))
-        found = pose.low_sensor(config, highest)
-        assert found == (pose.height if is_low else math.inf)
+        assert low_sensor.sensor_height_of(pose, config.sensor) == pytest.approx(
+            expected, abs=0.04
+        )
+        own, share = low_sensor.for_sensor(config, pose, config.sensor), expected / reference
+        if share == 1.0:
+            assert own is config
+            continue
+        assert own.growth.max_std == pytest.approx(0.35 * share, rel=0.3)
+        assert own.growth.seed_height_tolerance == pytest.approx(0.45 * share, rel=0.3)
+        assert own.label.obstacle_min_height == pytest.approx(0.2 * share, rel=0.3)
+        least = max(0.1 * share, low_sensor.LEAST_TOLERANCE)
+        assert own.label.ground_tolerance == pytest.approx(least, abs=0.005)
+        # A smaller one that is given stays, and the paper's rule knows no height of the sensor.
+        fine = config.replace(**{'label.ground_tolerance': 0.02})
+        assert low_sensor.for_sensor(fine, pose, fine.sensor).label.ground_tolerance == 0.02
+        paper = config.replace(**{'label.rule': 'tolerance'})
+        assert low_sensor.for_sensor(paper, pose, paper.sensor) is paper
     # The sensor is where the origin is given to be.
-    low, given = (
-        scan_of('kerb', SMALL_VLP, 0.15).points,
-        dataclasses.replace(config, origin_z=0.15),
-    )
-    pose = pose_of(moved(low, 0.15), origin_z=0.15)
-    assert pose.low_sensor(given, highest) == pytest.approx(0.15, abs=0.04)
-    assert pose.low_sensor(given, 0.1) == math.inf
+    points = moved(scan_of('kerb', SMALL_VLP, 0.15).points, 0.15)
+    given = dataclasses.replace(config.sensor, origin_z=0.15)
+    pose = pose_of(points, origin_z=0.15)
+    assert low_sensor.sensor_height_of(pose, given) == pytest.approx(0.15, abs=0.04)
+    assert low_sensor.sensor_height_of(pose_of(points), config.sensor) == reference
 
 
 @pytest.mark.parametrize('degrees', [35, 40, 45])

@@ -6,7 +6,6 @@ values and `offsets`: those of segment m are ``offsets[m]:offsets[m + 1]``.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -229,9 +228,6 @@ class Frame(NamedTuple):
     in_face: BoolArray  # (C,) candidates in vertical faces, which they may be a part of
     knots: FloatArray  # (K,) ranges where the surface is wanted [m], read-only
     prior_mean: float  # prior mean of the ground's height [m]
-    # height of the sensor over the prior mean [m] where that is less than seeds may have, else
-    # infinite
-    sensor_height: float = math.inf
 
 
 class Inliers(NamedTuple):

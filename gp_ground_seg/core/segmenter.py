@@ -23,6 +23,7 @@ from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_
 from gp_ground_seg.core.gp.learning import given_theta, in_rows, learn_frame
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
+from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose, estimate_pose, given_pose
 from gp_ground_seg.core.pipeline.tilt import rotate_sample
@@ -109,8 +110,9 @@ class GroundSegmenter:
         config, backend = self._config, self._backend
         # 1. Polar grid: the lowest point of each cell is a ground candidate.
         # 2. Sensor pose: height and tilt, from a plane through the candidates near the
-        #    sensor; a tilted scan is levelled and sorted again.
+        #    sensor; a tilted scan is levelled and sorted again. A low sensor has narrower gates.
         scan, pose = self._level(xyz, sensor, timer)
+        config = for_sensor(config, pose, sensor)
         # 3. Vertical faces: walls, fences, sides of cars.
         faces = backend.find_faces(scan, config)
         timer.mark('faces')
@@ -118,8 +120,7 @@ class GroundSegmenter:
         #    with occluded base, and pseudo-inputs. The prior mean is the ground below the sensor.
         relief, candidates = backend.find_relief(scan.candidates, faces, pose.height, config)
         extracted = backend.extract_lines(candidates, faces, config)
-        sensor_height = pose.low_sensor(sensor, config.growth.seed_height_tolerance)
-        frame = Frame(*extracted, scan.grid.edges, -pose.height, sensor_height)
+        frame = Frame(*extracted, scan.grid.edges, -pose.height)
         timer.mark('lines')
         # 5. Observation process (height over range) and latent process (its log length-scale):
         #    hyper-parameters theta, in log space, then inliers and surface.

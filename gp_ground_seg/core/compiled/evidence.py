@@ -39,7 +39,7 @@ def find_seeds(
     n_bins = 0
     for i in range(len(seed)):
         z = candidates.z[i] - frame.prior_mean
-        seed[i] = is_low_and_near(candidates.r[i], z, frame.sensor_height, growth)
+        seed[i] = is_low_and_near(candidates.r[i], z, growth)
         if seed[i]:
             n_bins = max(n_bins, candidates.bin[i] + 1)
     if max_slope < 0.0 or n_bins == 0:

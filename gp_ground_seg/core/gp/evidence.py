@@ -115,14 +115,9 @@ def between_knots(r: Values, near: Values, far: Values, a: Values, b: Values) ->
 
 
 @shared
-def is_low_and_near(r: Values, z: Values, sensor_height: float, growth: GrowthConfig) -> Values:
-    """Whether candidates at ranges and heights may be seeds [m].
-
-    Rays that do not point down to the candidate meet objects: of a sensor that is lower than the
-    tolerance of seeds, what is as high as itself is no seed.
-    """
-    is_low = (np.abs(z) <= growth.seed_height_tolerance) & (z < sensor_height)
-    return (r <= growth.seed_range) & is_low
+def is_low_and_near(r: Values, z: Values, growth: GrowthConfig) -> Values:
+    """Whether candidates at ranges and heights over the prior mean may be seeds [m]."""
+    return (r <= growth.seed_range) & (np.abs(z) <= growth.seed_height_tolerance)
 
 
 @shared
@@ -157,7 +152,7 @@ def seeds(frame: Frame, theta: FloatArray, config: Config) -> tuple[BoolArray, f
     """
     candidates, growth = frame.candidates, config.growth
     z = candidates.z - frame.prior_mean
-    seed: BoolArray = is_low_and_near(candidates.r, z, frame.sensor_height, growth)
+    seed: BoolArray = is_low_and_near(candidates.r, z, growth)
     if not looks_aside_in(frame, config):
         return seed, ODDS
     max_slope = CLEARLY * config.observation.slope_std

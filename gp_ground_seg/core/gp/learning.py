@@ -101,8 +101,8 @@ def theta_space(config: Config) -> ThetaSpace:
 def first_theta(frame: Frame, config: Config) -> FloatArray:
     """Where learning begins, (T,), in log space: what the lines show, else the given values.
 
-    sigma_f is the root mean square height, over the prior mean, of the near candidates, lower than
-    a low sensor, on lines that may be ground. sigma_n follows from the distances of candidates
+    sigma_f is the root mean square height, over the prior mean, of the near candidates on
+    lines that may be ground. sigma_n follows from the distances of candidates
     to the line through the two beside them. Both are cut at ``growth.seed_height_tolerance``, and
     kept within `FARTHEST_START` of the given values: lines without any noise would make
     covariances singular.
@@ -112,7 +112,7 @@ def first_theta(frame: Frame, config: Config) -> FloatArray:
     is_ground = np.abs(lines.slope) <= growth.max_line_slope
     is_ground &= np.diff(lines.start) >= growth.min_line_size
     height = candidates.z - frame.prior_mean
-    may_show = is_ground[line] & (r <= growth.seed_range) & (height < frame.sensor_height)
+    may_show = is_ground[line] & (r <= growth.seed_range)
     height = height[may_show]
     inner = np.flatnonzero(line[2:] == line[:-2]) + 1
     share = (r[inner] - r[inner - 1]) / (r[inner + 1] - r[inner - 1])

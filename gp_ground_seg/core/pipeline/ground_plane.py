@@ -55,7 +55,7 @@ REFUTATION = 8.0
 Plane = tuple[float, float, float]
 """Height, slope_x, slope_y: the plane ``z = -height + slope_x x + slope_y y``."""
 NumbersOfPlane = tuple[
-    float, float, float, float, float, float, float, float, float, float, float, int, int
+    float, float, float, float, float, float, float, float, float, float, float, float, int, int
 ]
 """Fields of a `GroundPlane`."""
 
@@ -169,9 +169,10 @@ class GroundPlane(NamedTuple):
     coverage: float  # share of all sectors around the sensor with such a cell
     far_coverage: float  # share of the sectors with any cell that have such a cell `FAR` away
     reach: float  # range within which nine of ten of these cells are [m]
-    # Difference of the angles of depression, seen from the sensor, of these cells [rad], a tenth
-    # of them left out at either end: the lowest beam alone, on walls, makes a cone that looks
-    # like a plane.
+    # angle of depression, seen from the sensor, that nine of ten of these do not exceed [rad]
+    depression: float
+    # Difference of it to that which nine of ten exceed [rad]: the lowest beam alone, on walls,
+    # makes a cone that looks like a plane.
     spread: float
     residual: float  # root mean square of the distances along z of these cells to it [m]
     n_cells: int  # how many cells there were
@@ -218,7 +219,7 @@ def fit_cells(cells: LowestPoints, n: int, max_slope: float, origin: Direction) 
     if n >= MIN_CELLS:
         is_found, best = best_hypothesis(cells, n, max_slope, origin)
     if not is_found:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
     plane = refined(cells, best)
     if not is_possible(plane, LOOSER * max_slope):
         # The refinement has drifted off to a plane that cannot be the ground.
@@ -464,14 +465,15 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
         if r >= FAR and sector != last_far:
             n_far, last_far = n_far + 1, sector
     if n_on_it == 0:
-        return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
+        return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
     few, most = n_on_it // 10, (9 * n_on_it) // 10
     lift = ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
-    spread = ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few)
+    depression = ranked(drops[:n_on_it], most)
+    spread = depression - ranked(drops[:n_on_it], few)
     return (
         height, slope_x, slope_y, height - lift, n_on_it / n, weight / whole,
-        n_covered / N_SECTORS, n_far / n_seen, ranked(ranges[:n_on_it], most), spread,
-        math.sqrt(squares / n_on_it), n, n_on_it,
+        n_covered / N_SECTORS, n_far / n_seen, ranked(ranges[:n_on_it], most), depression,
+        spread, math.sqrt(squares / n_on_it), n, n_on_it,
     )  # fmt: skip
 
 

@@ -32,7 +32,6 @@ from gp_ground_seg.core.pipeline.tilt import (
 )
 from gp_ground_seg.core.pipeline.up_axis import (
     MIN_CLEARANCE,
-    MIN_SPREAD,
     UP_MAX_TILT,
     View,
     find_up_axis,
@@ -129,17 +128,6 @@ class SensorPose:
     def rotation(self) -> FloatArray:
         """Matrix (3, 3) from the sensor frame to the level frame."""
         return rotation(self.roll, self.pitch)
-
-    def low_sensor(self, sensor: SensorConfig, highest: float) -> float:
-        """Height of the sensor over the ground where it is less than `highest` [m], else infinite.
-
-        Also infinite where the ground is seen at nearly one angle from there: a low sensor sees it
-        near and far, and this is the origin of a vehicle, whose sensor is elsewhere.
-        """
-        origin = self.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
-        height = self.height + float(origin[2])
-        is_there = self.measured is not None and self.measured.plane.spread >= MIN_SPREAD
-        return height if is_there and 0.0 < height < highest else math.inf
 
     @usual_errors()
     def level(self, xyz: PointArray) -> PointArray:

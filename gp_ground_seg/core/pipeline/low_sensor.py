@@ -1,0 +1,55 @@
+"""Stage 2: lengths in proportion to the height of a low sensor.
+
+To a robot with its sensor at 0.4 m a thing is an obstacle that a car rolls over. And what its
+level beams meet is as high as the sensor: where the gate of the surface is wider than that, far
+from the last ring on the ground, trunks, persons and cars are ground.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from gp_ground_seg.core.parameters.config import Config, SensorConfig
+from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
+
+REFERENCE_HEIGHT = 1.2
+"""Height of a sensor over the ground from which parameters are used as they are given [m]."""
+LOWEST = 0.1
+"""Height below which the origin of a cloud is no sensor [m]."""
+LEAST_TOLERANCE = 0.04
+"""Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges."""
+MIN_DEPRESSION = 0.105
+"""Angle below the horizon at which a low sensor sees the nearest ground, at least [rad]. From the
+origin of a vehicle, at its axles, a sensor on the roof seems to see it at less."""
+
+
+def for_sensor(config: Config, pose: SensorPose, sensor: SensorConfig) -> Config:
+    """Return `config` with what depends on the height of the sensor in proportion to it.
+
+    These are the gates of the growth, the tolerance of ground and the least height of obstacles;
+    nothing for a sensor that is as high as `REFERENCE_HEIGHT`, or that is not seen to be lower.
+    """
+    share = sensor_height_of(pose, sensor) / REFERENCE_HEIGHT
+    if share >= 1.0 or config.label.rule != 'roughness':
+        return config
+    growth, label = config.growth, config.label
+    least_tolerance = min(LEAST_TOLERANCE, label.ground_tolerance)
+    growth = dataclasses.replace(
+        growth,
+        seed_height_tolerance=share * growth.seed_height_tolerance,
+        max_std=share * growth.max_std,
+    )
+    label = dataclasses.replace(
+        label,
+        ground_tolerance=max(share * label.ground_tolerance, least_tolerance),
+        obstacle_min_height=share * label.obstacle_min_height,
+    )
+    return dataclasses.replace(config, growth=growth, label=label)
+
+
+def sensor_height_of(pose: SensorPose, sensor: SensorConfig) -> float:
+    """Height of a low sensor over the ground, `REFERENCE_HEIGHT` of others [m]."""
+    origin = pose.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
+    height = pose.height + float(origin[2])
+    is_there = pose.measured is not None and pose.measured.plane.depression >= MIN_DEPRESSION
+    return min(height, REFERENCE_HEIGHT) if is_there and height >= LOWEST else REFERENCE_HEIGHT
