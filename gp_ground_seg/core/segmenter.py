@@ -24,6 +24,7 @@ from gp_ground_seg.core.gp.learning import given_theta, in_rows, learn_frame
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
+from gp_ground_seg.core.pipeline.mirror_images import MirrorImages, find_mirror_images
 from gp_ground_seg.core.pipeline.points import take_points
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose, estimate_pose, given_pose
 from gp_ground_seg.core.pipeline.tilt import rotate_sample
@@ -109,9 +110,10 @@ class GroundSegmenter:
         """Do the stages of a scan, one after the other."""
         config, backend = self._config, self._backend
         # 1. Polar grid: the lowest point of each cell is a ground candidate.
-        # 2. Sensor pose: height and tilt, from a plane through the candidates near the
-        #    sensor; a tilted scan is levelled and sorted again. A low sensor has narrower gates.
-        scan, pose = self._level(xyz, sensor, timer)
+        # 2. Sensor pose: height and tilt, from a plane through the candidates near the sensor;
+        #    a tilted scan is levelled and sorted again, and so is one of a wet road, with mirror
+        #    images raised. A low sensor has narrower gates.
+        scan, pose, images = self._level(xyz, sensor, timer)
         config = for_sensor(config, pose, sensor)
         # 3. Vertical faces: walls, fences, sides of cars.
         faces = backend.find_faces(scan, config)
@@ -132,6 +134,7 @@ class GroundSegmenter:
         # 6. Labels: a point is ground up to the tolerance over the surface, or higher where the
         #    ground about it is rough.
         labelled = backend.label_points(scan, faces, surface, relief, config)
+        labelled.height[images.points] -= images.rise
         timer.mark('label')
         return Segmentation(
             labelled=labelled,
@@ -156,7 +159,7 @@ class GroundSegmenter:
         """
         with self._exclusive():
             xyz, timer = take_points(points), StageTimer(self._clock)
-            pose = self._level(xyz, self._config.sensor, timer)[1]
+            _, pose, _ = self._level(xyz, self._config.sensor, timer)
             self._warn(pose.warnings)
             return pose
 
@@ -213,8 +216,8 @@ class GroundSegmenter:
 
     def _level(
         self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer
-    ) -> tuple[Scan, SensorPose]:
-        """Scan in the level frame, by the angles given or estimated."""
+    ) -> tuple[Scan, SensorPose, MirrorImages]:
+        """Scan in the level frame, by the angles given or estimated, with mirror images raised."""
         backend, config, given = self._backend, self._config, given_pose(sensor)
         scan = backend.build_grid(given.level(xyz), config)
         timer.mark('grid')
@@ -230,8 +233,11 @@ class GroundSegmenter:
         pose = estimate_pose(scan, sensor, backend.fit_plane, scan_rotated)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
             scan = backend.build_grid(pose.level(xyz), config)
+        images = find_mirror_images(scan, pose, sensor)
+        if len(images.points) > 0:
+            scan = backend.build_grid(images.raised(scan.xyz), config)
         timer.mark('pose')
-        return scan, pose
+        return scan, pose, images
 
 
 def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[float, ...]:

@@ -51,5 +51,10 @@ def sensor_height_of(pose: SensorPose, sensor: SensorConfig) -> float:
     """Height of a low sensor over the ground, `REFERENCE_HEIGHT` of others [m]."""
     origin = pose.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
     height = pose.height + float(origin[2])
-    is_there = pose.measured is not None and pose.measured.plane.depression >= MIN_DEPRESSION
-    return min(height, REFERENCE_HEIGHT) if is_there and height >= LOWEST else REFERENCE_HEIGHT
+    is_there = is_seen_from_sensor(pose) and height >= LOWEST
+    return min(height, REFERENCE_HEIGHT) if is_there else REFERENCE_HEIGHT
+
+
+def is_seen_from_sensor(pose: SensorPose) -> bool:
+    """Whether the ground is seen from where the sensor is taken to be, and not from elsewhere."""
+    return pose.measured is not None and pose.measured.plane.depression >= MIN_DEPRESSION

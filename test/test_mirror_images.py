@@ -1,0 +1,73 @@
+"""Mirror images on a wet road are found and are no ground; a dry scan has none."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import simulated
+
+from gp_ground_seg import Config, GroundSegmenter
+from gp_ground_seg.core.backend import NumpyBackend
+from gp_ground_seg.core.frame import Label
+from gp_ground_seg.core.pipeline.mirror_images import DEEP, find_mirror_images
+
+WET = [('hdl-64e', 0), ('vlp-16', 1), ('os1-128', 2)]
+DRY = ['flat', 'ramp', 'rough', 'ditch', 'dike', 'hills', 'bank', 'urban', 'car_park', 'low_boxes']
+
+
+def images_in(points, sensor):
+    """Which points are found to be images, and how high what they are images of is over them."""
+    config = dataclasses.replace(Config(), sensor=sensor)
+    pose = GroundSegmenter(config).estimate_pose(points)
+    scan = NumpyBackend().build_grid(pose.level(np.ascontiguousarray(points[:, :3])), config)
+    found = find_mirror_images(scan, pose, sensor)
+    is_image = np.zeros(len(points), dtype=bool)
+    is_image[found.points] = True
+    return is_image, found
+
+
+@pytest.mark.parametrize(('sensor', 'seed'), WET)
+def test_images_are_found_and_raised_to_what_they_are_images_of(sensor, seed):
+    scan = simulated('wet_road', sensor, seed)
+    height = scan.points[:, 2] - scan.ground_z
+    is_image, found = images_in(scan.points, Config().sensor)
+    is_deep = ~scan.is_ground & (height < -DEEP - 0.1)
+    assert is_deep.sum() > 300
+    assert is_image[is_deep].mean() > 0.8
+    assert not is_image[scan.is_ground | (height > 0.0)].any()
+    raised = found.raised(scan.points[:, :3]) - scan.points[:, :3]
+    np.testing.assert_array_equal(np.flatnonzero(raised.any(axis=1)), found.points)
+    # The plane is up to 0.17 m off where images are told, and so twice that what is raised.
+    mirrored = height[found.points] + found.rise
+    np.testing.assert_allclose(mirrored, -height[found.points], atol=0.35)
+
+
+@pytest.mark.parametrize(('sensor', 'seed'), WET)
+def test_a_wet_road_is_ground_and_its_images_are_not(backend, sensor, seed):
+    scan = simulated('wet_road', sensor, seed)
+    result = GroundSegmenter(backend=backend).segment(scan.points)
+    is_ground, truth = result.label == Label.GROUND, scan.is_ground
+    assert (is_ground & truth).sum() / (is_ground | truth).sum() > 0.83
+    below = ~truth & (scan.points[:, 2] - scan.ground_z < -0.3)
+    assert is_ground[below].mean() < 0.1
+    # The ground at an image is above it.
+    missed = (result.ground_z - scan.ground_z)[below]
+    assert np.nanmedian(np.abs(missed)) < 0.05
+
+
+@pytest.mark.parametrize('sensor', ['hdl-64e', 'vlp-16', 'vlp-16-low'])
+@pytest.mark.parametrize('scene', DRY)
+def test_a_dry_scan_has_no_images(scene, sensor):
+    assert not images_in(simulated(scene, sensor).points, Config().sensor)[0].any()
+
+
+def test_images_are_told_by_where_rays_start():
+    points = simulated('wet_road', 'hdl-64e', 0).points
+    expected = images_in(points, Config().sensor)[0]
+    lifted = points[:, :3] + np.float32([0.0, 0.0, 1.5])
+    told = Config().replace(**{'sensor.origin_z': 1.5}).sensor
+    assert (images_in(lifted, told)[0] != expected).mean() < 1e-3
+    # In the frame of a vehicle that does not say where its sensor is, nothing is known.
+    assert not images_in(lifted, Config().sensor)[0].any()
+    aside = Config().replace(**{'sensor.origin_x': 0.5}).sensor
+    assert not images_in(points, aside)[0].any()
