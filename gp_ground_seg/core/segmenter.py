@@ -110,9 +110,8 @@ class GroundSegmenter:
         """Do the stages of a scan, one after the other."""
         config, backend = self._config, self._backend
         # 1. Polar grid: the lowest point of each cell is a ground candidate.
-        # 2. Sensor pose: height and tilt, from a plane through the candidates near the sensor;
-        #    a tilted scan is levelled and sorted again, and so is one of a wet road, with mirror
-        #    images raised. A low sensor has narrower gates.
+        # 2. Sensor pose, from a plane through the candidates near the sensor: a tilted scan is
+        #    levelled, mirror images are raised, and a low sensor has narrower gates.
         scan, pose, images = self._level(xyz, sensor, timer)
         config = for_sensor(config, pose, sensor)
         # 3. Vertical faces: walls, fences, sides of cars.
@@ -125,14 +124,13 @@ class GroundSegmenter:
         frame = Frame(*extracted, scan.grid.edges, -pose.height)
         timer.mark('lines')
         # 5. Observation process (height over range) and latent process (its log length-scale):
-        #    hyper-parameters theta, in log space, then inliers and surface.
+        #    hyper-parameters theta, then inliers and surface.
         learned = learn_frame(frame, config, backend)
         theta = in_rows(learned.theta if learned else given_theta(config), frame)
         timer.mark('learning')
         surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
         timer.mark('surface')
-        # 6. Labels: a point is ground up to the tolerance over the surface, or higher where the
-        #    ground about it is rough.
+        # 6. Labels: ground is up to the tolerance over the surface, or the roughness about it.
         labelled = backend.label_points(scan, faces, surface, relief, config)
         labelled.height[images.points] -= images.rise
         timer.mark('label')
