@@ -24,7 +24,12 @@ from gp_ground_seg.core.gp.learning import given_theta, in_rows, learn_frame
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.pipeline.points import take_points
-from gp_ground_seg.core.pipeline.sensor_pose import SensorPose, estimate_pose, given_pose
+from gp_ground_seg.core.pipeline.sensor_pose import (
+    SensorPose,
+    estimate_pose,
+    given_pose,
+    with_fallback,
+)
 from gp_ground_seg.core.pipeline.tilt import rotate_sample
 from gp_ground_seg.core.result import Fitting, Segmentation
 
@@ -71,6 +76,7 @@ class GroundSegmenter:
         points: npt.ArrayLike,
         tilt: tuple[float, float] | None = None,
         origin: tuple[float, float, float] | None = None,
+        fallback: SensorPose | None = None,
     ) -> Segmentation:
         """Label every point of a scan (paper, Algorithm 2).
 
@@ -84,13 +90,17 @@ class GroundSegmenter:
         origin : tuple of float, optional
             Where the sensor was in the frame of this scan [m], instead of ``sensor.origin_x``,
             ``sensor.origin_y`` and ``sensor.origin_z``.
+        fallback : SensorPose, optional
+            Pose of the sensor in an earlier scan: where ``sensor.height`` is auto and this scan
+            does not show the ground well, its height, and its angles where they are auto.
 
         Raises
         ------
         PointCloudError
             If the array has another shape or type, or z clearly does not point up.
         ConfigError
-            If `tilt` or `origin` has another number of values, or one that is not finite.
+            If `tilt` or `origin` has another number of values, or one that is not finite, or
+            `fallback` is no `SensorPose`.
         """
         with self._exclusive():
             timer, sensor = StageTimer(self._clock), self._config.sensor
@@ -100,17 +110,25 @@ class GroundSegmenter:
             if origin is not None:
                 x, y, z = _finite_numbers('origin', origin, 3)
                 sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
-            result = self._segment(take_points(points), sensor, timer)
+            if not (fallback is None or isinstance(fallback, SensorPose)):
+                raise ConfigError(f'fallback = {_shortened(fallback)}: must be a SensorPose')
+            result = self._segment(take_points(points), sensor, timer, fallback)
             self._warn(result.warnings)
             return result
 
-    def _segment(self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer) -> Segmentation:
+    def _segment(
+        self,
+        xyz: PointArray,
+        sensor: SensorConfig,
+        timer: StageTimer,
+        fallback: SensorPose | None,
+    ) -> Segmentation:
         """Do the stages of a scan, one after the other."""
         config, backend = self._config, self._backend
         # 1. Polar grid: the lowest point of each cell is a ground candidate.
         # 2. Sensor pose: height and tilt, from a plane through the candidates near the
         #    sensor; a tilted scan is levelled and sorted again.
-        scan, pose = self._level(xyz, sensor, timer)
+        scan, pose = self._level(xyz, sensor, timer, fallback)
         # 3. Vertical faces: walls, fences, sides of cars.
         faces = backend.find_faces(scan, config)
         timer.mark('faces')
@@ -211,9 +229,13 @@ class GroundSegmenter:
         return self._lock
 
     def _level(
-        self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer
+        self,
+        xyz: PointArray,
+        sensor: SensorConfig,
+        timer: StageTimer,
+        fallback: SensorPose | None = None,
     ) -> tuple[Scan, SensorPose]:
-        """Scan in the level frame, by the angles given or estimated."""
+        """Scan in the level frame, by the angles given, estimated or those of `fallback`."""
         backend, config, given = self._backend, self._config, given_pose(sensor)
         scan = backend.build_grid(given.level(xyz), config)
         timer.mark('grid')
@@ -227,6 +249,8 @@ class GroundSegmenter:
             return self._sample_backend.build_grid(sample, config)
 
         pose = estimate_pose(scan, sensor, backend.fit_plane, scan_rotated)
+        if fallback is not None:
+            pose = with_fallback(pose, fallback, sensor)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
             scan = backend.build_grid(pose.level(xyz), config)
         timer.mark('pose')
@@ -240,8 +264,11 @@ def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[flo
         are_numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in given)
         if are_numbers and len(given) == count and all(map(math.isfinite, given)):
             return tuple(map(float, given))
-    text = textwrap.shorten(repr(values), 100, placeholder=' ...')
-    raise ConfigError(f'{name} = {text}: must be {count} finite numbers')
+    raise ConfigError(f'{name} = {_shortened(values)}: must be {count} finite numbers')
+
+
+def _shortened(value: object) -> str:
+    return textwrap.shorten(repr(value), 100, placeholder=' ...')
 
 
 def warm_up(config: Config | None = None) -> Backend:
