@@ -530,5 +530,5 @@ def test_the_pose_of_an_earlier_scan_replaces_nothing_that_is_given():
     tilted_so = SEGMENTER.segment(part, tilt=(0.2, 0.05), fallback=earlier).pose
     assert (tilted_so.roll, tilted_so.pitch) == (0.2, 0.05)
     assert (tilted_so.height, tilted_so.is_fallback) == (earlier.height, True)
-    with pytest.raises(ConfigError, match='fallback = 1.2: must be a SensorPose'):
+    with pytest.raises(ConfigError, match=r'fallback = 1\.2: must be a SensorPose'):
         SEGMENTER.segment(part, fallback=1.2)
