@@ -303,7 +303,7 @@ def correct_surface(surface, labelled, grid, noise_std, slope_std, takes_first=T
     cells = {}
     for i in ground:
         cells.setdefault((grid.segment[i], grid.bin[i]), []).append(labelled.height[i])
-    result = np.full((3, n_segments, n_knots), np.nan)
+    result, noises = np.full((3, n_segments, n_knots), np.nan), {}
     seen = []
     for m, k in np.ndindex(n_segments, n_knots):
         if np.isnan(surface.mean[m, k]) or not {(m, k - 1), (m, k)} & set(cells):
@@ -313,9 +313,12 @@ def correct_surface(surface, labelled, grid, noise_std, slope_std, takes_first=T
         heights = np.concatenate(own)
         means = np.concatenate([np.full(len(one), np.mean(one)) for one in own])
         between, whole = np.var(means), np.var(heights)
+        ground, noise = _ground_variance(own, between, whole), whole - between
         if len(own) == 1:
-            between, whole = surface.std[m, k] ** 2, surface.std[m, k] ** 2 + noise_std[m, 0] ** 2
-        result[:, m, k] = heights.mean(), between, whole
+            ground, noise = surface.std[m, k] ** 2, noise_std[m, 0] ** 2
+            whole = ground + noise
+        result[:, m, k] = heights.mean(), ground, max(whole, ground)
+        noises[m, k] = noise
         seen.append((m, k))
     for m, k in np.ndindex(n_segments, n_knots):
         if np.isnan(surface.mean[m, k]) or (m, k) in seen:
@@ -329,15 +332,24 @@ def correct_surface(surface, labelled, grid, noise_std, slope_std, takes_first=T
         apart = min(far)
         equal = [at for at, its in zip(seen, far, strict=True) if its == apart]
         s, j = equal[0 if takes_first else -1]
-        mean, between, whole = result[:, s, j]
-        near = between + (slope_std * apart) ** 2
+        mean, ground, _ = result[:, s, j]
+        near = ground + (slope_std * apart) ** 2
         heights = np.array([surface.mean[m, k] + mean, surface.mean[s, j] + mean])
         share = np.array([near, own]) / (near + own)
         fused = share @ heights
         spread = share @ (heights - fused) ** 2
-        variance = max(between, own) + (slope_std * apart) ** 2 + spread
-        result[:, m, k] = fused - surface.mean[m, k], variance, variance + whole - between
+        variance = max(ground, own) + (slope_std * apart) ** 2 + spread
+        result[:, m, k] = fused - surface.mean[m, k], variance, variance + noises[s, j]
     return result[0], np.sqrt(result[1]), np.sqrt(result[2])
+
+
+def _ground_variance(cells, between, whole):
+    """Variance of the ground, without bias, from that between the means of its cells."""
+    numbers = np.array([len(one) for one in cells])
+    n = numbers.sum()
+    effective, noise = n**2 / np.sum(numbers**2), (whole - between) / n
+    own = max(between - (len(cells) - 1) * noise, 0.0)
+    return (effective * own + 0.05 * whole) / (effective - 1 + 0.05) + noise
 
 
 def _between_knots(knots, one, other, n_segments):

@@ -311,6 +311,21 @@ def test_model_reports_where_the_sensor_is(height):
     assert ('sensor.height' in status.message) == (height == 3.5)
 
 
+def test_model_warns_of_a_height_that_is_assumed_or_of_an_earlier_cloud():
+    points, segmenter, statistics = hilly_scan(20_000), GroundSegmenter(), ModelTask()
+    part = points[np.abs(np.arctan2(points[:, 1], points[:, 0])) < 0.1]
+    whole, alone = segmenter.segment(points), segmenter.segment(part)
+    statistics.segmented(alone)
+    status = statistics.report(LIMITS)
+    assert (status.level, status.message) == (Level.WARN, alone.pose.warnings[0])
+    statistics.segmented(segmenter.segment(part, fallback=whole.pose))
+    status = statistics.report(LIMITS)
+    assert status.level == Level.WARN
+    assert f'{whole.pose.height:.2f} m of an earlier one is kept' in status.message
+    statistics.segmented(whole)
+    assert statistics.report(LIMITS).level == Level.OK
+
+
 @pytest.mark.parametrize('points', [np.zeros((0, 3)), np.full((9, 3), np.nan)])
 def test_a_scan_without_ground_is_a_warning(points):
     _, status = status_of(points)

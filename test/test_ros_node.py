@@ -1,5 +1,8 @@
 """The node in this process: what goes in, what comes out, what it says of itself."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 import yaml
 
@@ -14,6 +17,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from gp_ground_seg import GroundSegmenter
+from gp_ground_seg.core.pipeline.sensor_pose import LITTLE_GROUND, NO_HEIGHT
+from gp_ground_seg.lab.simulation import HDL_64E, SCENES, simulate_scan
 
 OFTEN = ('-p', 'diagnostics.period:=0.1', '-p', 'diagnostics.recover_after:=0.3')
 
@@ -218,6 +223,80 @@ def test_nothing_is_loaded_for_numpy():
     with ros.bench('-p', 'runtime.backend:=numpy') as b:
         b.segment(to_message(street(1000)))
         assert not b.node._loader.is_started
+
+
+def turn_of_packets(width=10):
+    """A cloud of a sensor 1.2 m up, and the parts of it in sectors [degrees], as points."""
+    sensor = dataclasses.replace(HDL_64E, height=1.2, n_columns=600)
+    made = simulate_scan(SCENES['urban'](0), sensor, np.random.default_rng(0)).points
+    points = np.zeros(len(made), ros.POINT)
+    points['intensity'] = np.arange(len(made))
+    for k, axis in enumerate('xyz'):
+        points[axis] = made[:, k]
+    sector = np.degrees(np.arctan2(made[:, 1], made[:, 0])) % 360.0 // width
+    return points, [points[sector == k] for k in range(360 // width)]
+
+
+def numbers_in(message):
+    """Numbers of the points of a cloud, which are their intensity."""
+    return {row[:4] for row in ros.rows_of(message)}
+
+
+KEPT = 'of an earlier one is kept'
+
+
+def test_packets_have_the_height_of_the_last_cloud_that_showed_the_ground(tmp_path):
+    points, packets = turn_of_packets()
+    with ros.stderr_in(tmp_path) as stderr, ros.bench(*OFTEN) as b:
+        ground, _ = b.segment(to_message(points, frame='lidar'))
+        whole = numbers_in(ground)
+        status = b.wait_for_status('model', lambda *_: True)
+        assert status.level == DiagnosticStatus.OK
+        parts = set()
+        for packet in packets:
+            parts |= numbers_in(b.segment(to_message(packet, frame='lidar'))[0])
+        assert len(whole & parts) / len(whole | parts) >= 0.95
+        status = b.wait_for_status('model', lambda _, s: KEPT in s.message)
+        assert status.level == DiagnosticStatus.WARN
+        height = float(ros.values_of(status)['Sensor height (m)'])
+        assert height == pytest.approx(1.2, abs=0.05)
+        assert f'the height of {height:.2f} m' in status.message
+        assert ros.values_of(status)['Taken from the scan'] == 'nothing'
+        # Once, not for each packet.
+        assert ros.said_by(stderr, KEPT).count(KEPT) == 1
+        # A cloud that shows the ground takes its place.
+        points['z'] -= 0.5
+        b.segment(to_message(points, frame='lidar'))
+        b.segment(to_message(packets[0], frame='lidar'))
+        b.wait_for_status('model', lambda v, _: float(v['Sensor height (m)']) > height + 0.4)
+
+
+def test_the_height_of_an_earlier_cloud_is_forgotten():
+    """With another frame, other parameters, or when time jumps back: as at the start."""
+    points, packets = turn_of_packets()
+    packet = max(packets, key=len)
+    with ros.bench(*OFTEN) as b:
+
+        def ground_of(cloud, frame='lidar', second=100):
+            return numbers_in(b.segment(to_message(cloud, (second, 0), frame))[0])
+
+        def after_the_whole(**where):
+            ground_of(points)
+            return ground_of(packet, **where)
+
+        at_start = ground_of(packet)
+        b.wait_for_status('model', lambda _, s: s.message.startswith((LITTLE_GROUND, NO_HEIGHT)))
+        kept = after_the_whole()
+        assert kept != at_start
+        assert after_the_whole(second=101) == kept
+        assert after_the_whole(frame='other') == at_start
+        # Back in the first frame nothing has been seen yet.
+        assert ground_of(packet) == at_start
+        assert after_the_whole(second=99) == at_start
+        assert after_the_whole() == kept
+        assert b.set('output.min_height', 0.01).successful
+        assert b.set('output.min_height', 0.0).successful
+        assert ground_of(packet) == at_start
 
 
 # One node for all that follows: it would hear the clouds of others

@@ -26,7 +26,12 @@ from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
 from gp_ground_seg.core.pipeline.mirror_images import MirrorImages, find_mirror_images
 from gp_ground_seg.core.pipeline.points import take_points
-from gp_ground_seg.core.pipeline.sensor_pose import SensorPose, estimate_pose, given_pose
+from gp_ground_seg.core.pipeline.sensor_pose import (
+    SensorPose,
+    estimate_pose,
+    given_pose,
+    with_fallback,
+)
 from gp_ground_seg.core.pipeline.tilt import rotate_sample
 from gp_ground_seg.core.result import Fitting, Segmentation
 
@@ -73,6 +78,7 @@ class GroundSegmenter:
         points: npt.ArrayLike,
         tilt: tuple[float, float] | None = None,
         origin: tuple[float, float, float] | None = None,
+        fallback: SensorPose | None = None,
     ) -> Segmentation:
         """Label every point of a scan (paper, Algorithm 2).
 
@@ -86,13 +92,17 @@ class GroundSegmenter:
         origin : tuple of float, optional
             Where the sensor was in the frame of this scan [m], instead of ``sensor.origin_x``,
             ``sensor.origin_y`` and ``sensor.origin_z``.
+        fallback : SensorPose, optional
+            Pose of the sensor in an earlier scan: where ``sensor.height`` is auto and this scan
+            does not show the ground well, its height, and its angles where they are auto.
 
         Raises
         ------
         PointCloudError
             If the array has another shape or type, or z clearly does not point up.
         ConfigError
-            If `tilt` or `origin` has another number of values, or one that is not finite.
+            If `tilt` or `origin` has another number of values, or one that is not finite, or
+            `fallback` is no `SensorPose`.
         """
         with self._exclusive():
             timer, sensor = StageTimer(self._clock), self._config.sensor
@@ -102,17 +112,25 @@ class GroundSegmenter:
             if origin is not None:
                 x, y, z = _finite_numbers('origin', origin, 3)
                 sensor = dataclasses.replace(sensor, origin_x=x, origin_y=y, origin_z=z)
-            result = self._segment(take_points(points), sensor, timer)
+            if not (fallback is None or isinstance(fallback, SensorPose)):
+                raise ConfigError(f'fallback = {_shortened(fallback)}: must be a SensorPose')
+            result = self._segment(take_points(points), sensor, timer, fallback)
             self._warn(result.warnings)
             return result
 
-    def _segment(self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer) -> Segmentation:
+    def _segment(
+        self,
+        xyz: PointArray,
+        sensor: SensorConfig,
+        timer: StageTimer,
+        fallback: SensorPose | None,
+    ) -> Segmentation:
         """Do the stages of a scan, one after the other."""
         config, backend = self._config, self._backend
         # 1. Polar grid: the lowest point of each cell is a ground candidate.
         # 2. Sensor pose, from a plane through the candidates near the sensor: a tilted scan is
         #    levelled, mirror images are raised, and a low sensor has narrower gates.
-        scan, pose, images = self._level(xyz, sensor, timer)
+        scan, pose, images = self._level(xyz, sensor, timer, fallback)
         config = for_sensor(config, pose, sensor)
         # 3. Vertical faces: walls, fences, sides of cars.
         faces = backend.find_faces(scan, config)
@@ -213,9 +231,16 @@ class GroundSegmenter:
         return self._lock
 
     def _level(
-        self, xyz: PointArray, sensor: SensorConfig, timer: StageTimer
+        self,
+        xyz: PointArray,
+        sensor: SensorConfig,
+        timer: StageTimer,
+        fallback: SensorPose | None = None,
     ) -> tuple[Scan, SensorPose, MirrorImages]:
-        """Scan in the level frame, by the angles given or estimated, with mirror images raised."""
+        """Scan in the level frame, with mirror images raised.
+
+        Its angles are those given, estimated or of `fallback`.
+        """
         backend, config, given = self._backend, self._config, given_pose(sensor)
         scan = backend.build_grid(given.level(xyz), config)
         timer.mark('grid')
@@ -229,6 +254,8 @@ class GroundSegmenter:
             return self._sample_backend.build_grid(sample, config)
 
         pose = estimate_pose(scan, sensor, backend.fit_plane, scan_rotated)
+        if fallback is not None:
+            pose = with_fallback(pose, fallback, sensor)
         if (pose.roll, pose.pitch) != (given.roll, given.pitch):
             scan = backend.build_grid(pose.level(xyz), config)
         images = find_mirror_images(scan, pose, sensor)
@@ -245,8 +272,11 @@ def _finite_numbers(name: str, values: Iterable[float], count: int) -> tuple[flo
         are_numbers = all(isinstance(v, Real) and not isinstance(v, bool) for v in given)
         if are_numbers and len(given) == count and all(map(math.isfinite, given)):
             return tuple(map(float, given))
-    text = textwrap.shorten(repr(values), 100, placeholder=' ...')
-    raise ConfigError(f'{name} = {text}: must be {count} finite numbers')
+    raise ConfigError(f'{name} = {_shortened(values)}: must be {count} finite numbers')
+
+
+def _shortened(value: object) -> str:
+    return textwrap.shorten(repr(value), 100, placeholder=' ...')
 
 
 def warm_up(config: Config | None = None) -> Backend:

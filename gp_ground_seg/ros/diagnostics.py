@@ -303,8 +303,9 @@ class ModelTask:
 
 def _judge_model(scan: Segmentation, quality: float, limits: DiagnosticsConfig) -> Finding:
     message = f'frame quality {quality:.2f}'
-    if scan.pose.contradictions:
-        message = '; '.join(scan.pose.contradictions)
+    doubtful = (*scan.pose.contradictions, *_pose_warnings(scan))
+    if doubtful:
+        message = '; '.join(doubtful)
     elif not scan.fit.n_segments:
         message = 'no ground found in the newest cloud'
     elif scan.fit.status == 'failed':
@@ -314,6 +315,21 @@ def _judge_model(scan: Segmentation, quality: float, limits: DiagnosticsConfig) 
     else:
         return Level.OK, message
     return Level.WARN, message
+
+
+def kept_height(pose: SensorPose) -> str:
+    """Say that a cloud has the pose of an earlier one."""
+    return (
+        'the cloud does not show the ground near the sensor well: the height of '
+        f'{pose.height:.2f} m of an earlier one is kept; set sensor.height'
+    )
+
+
+def _pose_warnings(scan: Segmentation) -> tuple[str, ...]:
+    """Warnings of the pose used; an empty cloud has none."""
+    if not scan.label.any():
+        return ()
+    return (kept_height(scan.pose),) if scan.pose.is_fallback else scan.pose.warnings
 
 
 def _pose_values(pose: SensorPose) -> dict[str, str]:

@@ -26,11 +26,11 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.costmap import SegmentedCloud
 from gp_ground_seg.data.point_cloud2 import read_xyz
 from gp_ground_seg.ros import start_stop
-from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts
+from gp_ground_seg.ros.diagnostics import Diagnostics, InputFacts, kept_height
 from gp_ground_seg.ros.input import THROTTLED, CloudSubscription, TimeJumps
 from gp_ground_seg.ros.outputs import OutputPublishers
 from gp_ground_seg.ros.parameters import ConfiguredNode, describe
-from gp_ground_seg.ros.transforms import TfListener, is_tf_used, require_tf2
+from gp_ground_seg.ros.transforms import KeptPose, TfListener, is_tf_used, require_tf2
 from gp_ground_seg.ros.warm_up import CHANGED, FOLLOWS, STAYS, BackendLoader
 
 
@@ -40,8 +40,9 @@ class GroundSegmentationNode(ConfiguredNode):
     Each output keeps the header and every field of the input, bit for bit; a finite point
     is in exactly one of the two clouds, any other in neither. The first clouds are segmented
     with numpy; the compiled backend, if wanted, is made meanwhile. A changed parameter takes
-    effect with the next cloud. Options are those of `rclpy.node.Node`. Raises a ConfigError if
-    a given parameter is not accepted.
+    effect with the next cloud. Where the height of the sensor is estimated, a cloud that does
+    not show the ground well has the pose of the last one that did. Options are those of
+    `rclpy.node.Node`. Raises a ConfigError if a given parameter is not accepted.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -61,6 +62,7 @@ class GroundSegmentationNode(ConfiguredNode):
     def _make_segmenter(self) -> None:
         self._segmenter = GroundSegmenter(self.config, backend=NumpyBackend())
         self._is_compiled = False
+        self._kept = KeptPose()
         self._loader = BackendLoader(self._loaded.trigger)
 
     def _start(self) -> None:
@@ -133,8 +135,13 @@ class GroundSegmentationNode(ConfiguredNode):
             )
         # Code for the other precision would have to be compiled at the first start too.
         points = single_precision(read_xyz(cloud))
-        pose = self._tf.look_up(cloud.header, self.config) if self._tf else ()
-        return self._segmenter.segment(points, *pose)
+        tilt, origin = self._tf.look_up(cloud.header, self.config) if self._tf else (None, None)
+        fallback = self._kept.fallback(cloud.header.frame_id)
+        segmentation = self._segmenter.segment(points, tilt, origin, fallback)
+        if self._kept.note(segmentation.pose):
+            text = f'on {self._input.topic}, {kept_height(segmentation.pose)}'
+            self.get_logger().warning(text, **THROTTLED)
+        return segmentation
 
     def _refuse(self, cloud: PointCloud2, reason: str) -> None:
         if not self.context.ok():
@@ -157,6 +164,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._load_backend(config)
         runtime = config.runtime if self._is_compiled else self._segmenter.config.runtime
         self._segmenter.configure(dataclasses.replace(config, runtime=runtime))
+        self._kept.forget()
         self._follow_tf(config)
         self._diagnostics.configure(config.diagnostics)
 
@@ -209,6 +217,7 @@ class GroundSegmentationNode(ConfiguredNode):
         self._library_log.close()
 
     def _on_time_jump(self, seconds: float) -> None:
+        self._kept.forget()
         if self._tf is not None:
             self._tf.time_jumped(seconds)
         self._diagnostics.input.time_jumped()

@@ -1,4 +1,4 @@
-"""Tilt and place of the sensor, and the frame of the outputs, by TF at the stamp of each cloud."""
+"""Where the sensor and the outputs are: by TF at the stamp of each cloud, or by earlier clouds."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from std_msgs.msg import Header
 from gp_ground_seg.core.errors import MissingDependencyError, PointCloudError
 from gp_ground_seg.core.frame import FloatArray
 from gp_ground_seg.core.parameters.config import NO_FRAME, Config
+from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 from gp_ground_seg.core.pipeline.tilt import angles_of
 from gp_ground_seg.data.costmap import Placement
 from gp_ground_seg.ros.input import STEADY_CLOCK
@@ -182,3 +183,31 @@ class TfListener:
         self._waiting.clear()
         self._node.destroy_timer(self._timer)
         self._listener.unregister()
+
+
+class KeptPose:
+    """Pose of the newest cloud of one frame that showed the ground well, until it is forgotten."""
+
+    def __init__(self) -> None:
+        self._frame = ''
+        self.forget()
+
+    def forget(self) -> None:
+        """Have no pose, as after the start."""
+        self._pose: SensorPose | None = None
+        self._is_in_use = False
+
+    def fallback(self, frame: str) -> SensorPose | None:
+        """Return the pose for a cloud in `frame`, or None; that of another frame is forgotten."""
+        if frame != self._frame:
+            self._frame = frame
+            self.forget()
+        return self._pose
+
+    def note(self, pose: SensorPose) -> bool:
+        """Take the pose used for that cloud; return whether use of the one kept begins with it."""
+        begins = pose.is_fallback and not self._is_in_use
+        self._is_in_use = pose.is_fallback
+        if pose.is_well_seen:
+            self._pose = pose
+        return begins

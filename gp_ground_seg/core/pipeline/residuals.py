@@ -6,10 +6,21 @@ knot they lie in up to six cells: the two of its segment that meet there, and th
 segments beside it. With ``n_i`` returns of mean residual ``e_i`` in cell i, n in all, the mean of
 the residuals is ``e = sum n_i e_i / n``, and by the law of total variance their variance is::
 
-    sum n_i (e_i - e)^2 / n  +  sum n_i Var_i / n,
+    V = B + W,  B = sum n_i (e_i - e)^2 / n,  W = sum n_i Var_i / n,
 
-that between the cells and that within them. The first is how far the ground departs from the
-corrected surface from cell to cell; the second is range noise, and roughness finer than a cell.
+B between the cells and W within them. W is range noise, and roughness finer than a cell. V is the
+variance of a return about the corrected surface. B is not yet that of the ground, as few cells
+vary less about their own mean than about the ground, and their means are noisy. With ground of
+variance G from cell to cell, and returns of variance W in C cells::
+
+    E[B] = G (k - 1) / k + (C - 1) W / n,  k = n^2 / sum n_i^2,
+
+where k is the effective number of cells. Where nearly all returns lie in one cell, k - 1 is near
+0: V is then the first guess, as if ``PRIOR_CELLS`` more cells had it::
+
+    G = (k max(B - (C - 1) W / n, 0) + PRIOR_CELLS V) / (k - 1 + PRIOR_CELLS).
+
+The variance of the ground about the corrected surface is G and that of the mean, ``W / n``.
 """
 
 from __future__ import annotations
@@ -28,6 +39,8 @@ from gp_ground_seg.core.frame import (
     PolarGrid,
 )
 
+PRIOR_CELLS = 0.05
+"""Cells that the first guess of the ground's variance counts as much as."""
 UNITS = 2.0**20
 """Units that residuals are rounded to [1/m], as the order of whole numbers in a sum is free."""
 
@@ -52,7 +65,7 @@ def correct_surface(
     """Correct a surface by the residuals of the returns called ground.
 
     One cell does not show how ground varies from cell to cell: where the window has no other, the
-    standard deviations are those of the process.
+    standard deviations are those of the process, without and with its noise.
 
     A knot is seen if one of the two cells that touch it has returns. The height at any other is
     estimated twice: by the process, and by the nearest knot that is seen, whose variance grows by
@@ -64,15 +77,19 @@ def correct_surface(
     deviation of the ground's slope.
     """
     has_model = np.isfinite(surface.mean)
-    is_touched, (n_cells, n_returns, total, squares, squared_means) = _sums(labelled, grid)
+    is_touched, sums = _sums(labelled, grid)
+    n_cells, n_returns, squared_numbers, total, squares, squared_means = sums
     seen, unseen = is_touched & has_model, ~is_touched & has_model
     number = np.maximum(n_returns, 1.0)
     correction = np.where(seen, total / number, np.where(has_model, 0.0, np.nan))
 
     alone, tells = surface.std**2, seen & (n_cells >= 2.0)
     between = np.maximum(squared_means / number - correction**2, 0.0)
-    variance = np.where(tells, between, alone)
     noise = np.where(tells, np.maximum(squares - squared_means, 0.0) / number, noise_std**2)
+    whole = np.where(tells, between, alone) + noise
+    effective = np.where(tells, number**2 / np.maximum(squared_numbers, 1.0), 1.0)
+    unbiased = _unbiased_variance(between, noise / number, whole, n_cells, effective)
+    variance = np.where(tells, unbiased, alone)
     if seen.any() and unseen.any():
         distance, nearest = _nearest(surface.knots, seen, unseen)
         alone, apart = alone[unseen], (slope_std * distance) ** 2
@@ -84,15 +101,36 @@ def correct_surface(
         correction[unseen] += weight * difference
         variance[unseen] = np.maximum(variance[unseen], alone) + apart
         variance[unseen] += weight * (1.0 - weight) * difference**2
+        whole[unseen] = variance[unseen] + noise[unseen]
+    # Returns lie on the ground: they depart from the surface no less than it.
+    return_std = np.sqrt(np.maximum(whole, variance))
     mean, std = surface.mean + correction, np.sqrt(variance)
-    return CorrectedSurface(surface.knots, correction, mean, std, np.sqrt(variance + noise))
+    return CorrectedSurface(surface.knots, correction, mean, std, return_std)
+
+
+def _unbiased_variance(
+    between: FloatArray,
+    noise_of_mean: FloatArray,
+    whole: FloatArray,
+    n_cells: FloatArray,
+    effective: FloatArray,
+) -> FloatArray:
+    """Variance of the ground about the mean residual of cells [m^2], (M, K) as its arguments.
+
+    B, W / n, V, C and k of the module's docstring.
+    """
+    own = np.maximum(between - (n_cells - 1.0) * noise_of_mean, 0.0)
+    cell_to_cell = (effective * own + PRIOR_CELLS * whole) / (effective - 1.0 + PRIOR_CELLS)
+    variance: FloatArray = cell_to_cell + noise_of_mean
+    return variance
 
 
 def _sums(labelled: Labelled, grid: PolarGrid) -> tuple[BoolArray, tuple[FloatArray, ...]]:
     """Which knots are touched by a cell with returns called ground, and sums about them, (M, K).
 
-    The sums are over six cells: cells with such returns, their number, the sum of their residuals
-    [m], of the squares [m^2], and over the cells of number times squared mean [m^2].
+    The sums are over six cells: cells with such returns, their number, over the cells of their
+    squared number, the sum of their residuals [m], of the squares [m^2], and over the cells of
+    number times squared mean [m^2].
     """
     is_ground = (labelled.label == Label.GROUND) & grid.inside
     cell, residual = grid.cell[is_ground], np.rint(labelled.height[is_ground] * UNITS)
@@ -104,7 +142,7 @@ def _sums(labelled: Labelled, grid: PolarGrid) -> tuple[BoolArray, tuple[FloatAr
     number, total = by_cell(None), by_cell(residual) / UNITS
     squares = by_cell(residual**2) / UNITS**2
     occupied = (number > 0.0).astype(np.float64)
-    tables = occupied, number, total, squares, total**2 / np.maximum(number, 1.0)
+    tables = occupied, number, number**2, total, squares, total**2 / np.maximum(number, 1.0)
     rings = (np.roll(table, 1, 0) + table + np.roll(table, -1, 0) for table in tables)
     return _of_both_bins(occupied) > 0.0, tuple(map(_of_both_bins, rings))
 

@@ -18,6 +18,8 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     FARTHEST,
     GroundPlane,
     Plane,
+    distance,
+    lowest_points,
     plane_across,
     supports_in,
 )
@@ -32,6 +34,7 @@ from gp_ground_seg.core.pipeline.tilt import (
 )
 from gp_ground_seg.core.pipeline.up_axis import (
     MIN_CLEARANCE,
+    MIN_COVERAGE,
     UP_MAX_TILT,
     View,
     find_up_axis,
@@ -48,6 +51,24 @@ DEFAULT_HEIGHT = 1.73
 NO_HEIGHT = (
     f'the scan does not show the ground near the sensor: sensor.height = {DEFAULT_HEIGHT:g} m is '
     'assumed; set it'
+)
+LOW = 0.2
+"""Height of the sensor below which the plane that it is over may be a table top [m]."""
+LOW_GROUND = (
+    f'the ground seems to be less than {LOW:g} m below the sensor, and may be a table top: set '
+    'sensor.height'
+)
+LEAST_DEPRESSION = 0.06
+"""Angle below the horizontal at which a sensor sees the nearest tenth of a plane that it is less
+than `LOW` above [rad]. The origin of a vehicle is as low, but its nearest ground is metres
+away: 0.03 in simulated scans, 0.04 in a real one, and 0.1 to 0.27 over table tops."""
+FEW_CELLS = 45
+"""Cells on the plane below which its height is doubtful. Whole scans that show the height have
+more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
+sectors."""
+LITTLE_GROUND = (
+    'the scan shows little ground near the sensor, and the height estimated from it may be wrong: '
+    'set sensor.height'
 )
 CLEAR_TILT = 0.05
 """Tilt from which roll and pitch that are auto level the scan [rad]: camber and a vehicle's own
@@ -102,6 +123,10 @@ class SensorPose:
         Parameters that the scan clearly contradicts, a line for each; they are used as given.
     is_height_default : bool
         Whether the height is neither given nor shown by the scan.
+    doubts : tuple of str
+        Why a height that comes from this scan may be wrong, a line for each.
+    is_fallback : bool
+        Whether what is not given, and `measured`, are those of an earlier scan.
     """
 
     height: float
@@ -113,6 +138,13 @@ class SensorPose:
     measured: MeasuredPose | None = None
     contradictions: tuple[str, ...] = ()
     is_height_default: bool = False
+    doubts: tuple[str, ...] = ()
+    is_fallback: bool = False
+
+    @property
+    def is_well_seen(self) -> bool:
+        """Whether the height comes from this scan, and nothing makes it doubtful."""
+        return self.height_estimated and not self.doubts
 
     @property
     def is_level(self) -> bool:
@@ -122,7 +154,7 @@ class SensorPose:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings for the user, a line for each."""
-        return (NO_HEIGHT,) if self.is_height_default else ()
+        return (NO_HEIGHT,) if self.is_height_default else self.doubts
 
     @property
     def rotation(self) -> FloatArray:
@@ -198,7 +230,56 @@ def estimate_pose(
         measured=measured,
         contradictions=contradictions or _contradictions(scan, sensor, measured, view, level),
         is_height_default=sensor.height == AUTO and not tells_height,
+        doubts=_doubts(scan, sensor, view) if estimates_height else (),
     )
+
+
+def with_fallback(pose: SensorPose, fallback: SensorPose, sensor: SensorConfig) -> SensorPose:
+    """Return `fallback` where `pose`, of this scan, has an estimated height that is not well seen.
+
+    Angles that `sensor` gives, and what this scan contradicts, remain.
+    """
+    if sensor.height != AUTO or pose.is_well_seen:
+        return pose
+    return SensorPose(
+        height=fallback.height,
+        roll=fallback.roll if sensor.roll == AUTO else sensor.roll,
+        pitch=fallback.pitch if sensor.pitch == AUTO else sensor.pitch,
+        measured=fallback.measured,
+        contradictions=pose.contradictions,
+        is_fallback=True,
+    )
+
+
+def _doubts(scan: Scan, sensor: SensorConfig, view: View) -> tuple[str, ...]:
+    """Say why the height of the plane of `view` may not be that of the ground."""
+    plane = view.plane
+    is_little = plane.n_support < FEW_CELLS or plane.coverage < MIN_COVERAGE
+    return (LOW_GROUND,) * _is_low(scan, sensor, view) + (LITTLE_GROUND,) * is_little
+
+
+def _is_low(scan: Scan, sensor: SensorConfig, view: View) -> bool:
+    """Whether the sensor is less than `LOW` over the plane of `view`, and sees it from there.
+
+    A sensor that low sees the nearest tenth of the plane at a clear angle. The origin of a
+    vehicle's frame is as low, but the sensor is elsewhere, and its nearest ground farther away.
+    """
+    plane = plane_across(view.up, view.plane.near_height * view.plane.normal[2])
+    origin = _origin(sensor)
+    clearance = float(distance(*origin, plane)) * view.up[2]
+    if not 0.0 < clearance < LOW:
+        return False
+    cells = lowest_points(scan.candidates)
+    is_on = np.abs(distance(cells.x, cells.y, cells.z, plane)) <= cells.tolerance
+    away = np.hypot(cells.x[is_on] - origin[0], cells.y[is_on] - origin[1])
+    return len(away) > 0 and clearance >= LEAST_DEPRESSION * float(np.percentile(away, 10.0))
+
+
+def _origin(sensor: SensorConfig) -> Direction:
+    """Place of the sensor in the frame levelled by `given_pose` [m]."""
+    place = given_pose(sensor).rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
+    x, y, z = place.tolist()
+    return x, y, z
 
 
 def _find_ground(
@@ -208,12 +289,11 @@ def _find_ground(
 
     The second says where the ground is if that axis is too far from z to be levelled.
     """
-    given = given_pose(sensor)
-    origin = given.rotation @ (sensor.origin_x, sensor.origin_y, sensor.origin_z)
+    given, origin = given_pose(sensor), _origin(sensor)
 
     def look(turn: FloatArray | None, max_tilt: float) -> View | None:
         turned = scan if turn is None else scan_rotated(turn)
-        x, y, z = (origin if turn is None else turn @ origin).tolist()
+        x, y, z = origin if turn is None else (turn @ origin).tolist()
         plane = fit_plane(turned.candidates, math.tan(max_tilt), (x, y, z))
         if plane is None:
             return None
