@@ -145,6 +145,7 @@ class GroundSegmenter:
             relief=relief,
             z=xyz[:, 2].copy(),
             slope_std=config.observation.slope_std,
+            origin=np.array([sensor.origin_x, sensor.origin_y, sensor.origin_z]),
         )
 
     @usual_errors()

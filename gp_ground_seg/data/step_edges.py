@@ -32,6 +32,8 @@ far apart to tell a drop from a descent."""
 LEAST_SHARE = 0.4
 """Least slope between the two returns of a step, over that of the line of sight: with less, the
 distance of the rings is larger than the part that the edge hides."""
+MARGIN = 1.02
+"""Ratio of ranges within which returns may be of one place."""
 
 WEAK = 0.7
 """Share of the largest step that is enough where others beside it are larger: how deep a hole is
@@ -41,9 +43,9 @@ N_ROUGHNESS = 2.5
 BEFORE, BEHIND, WIDTH = 0.4, 1.5, 3
 """Window of the ground before a step, as a share of its range; range that each of two windows
 behind it grows by; sectors on each side that the windows take in."""
-ON_SLOPE, MAX_ON_SLOPE = 0.3, 0.2
+ON_SLOPE, MIN_DESCENT, MAX_ON_SLOPE = 0.3, 0.02, 0.2
 """Slope of the ground before or behind a step, over that of the step, from which it is part of a
-descent, and largest share of such steps in an edge."""
+descent; least descent to the next ring behind [m]; largest share of such steps in an edge."""
 NEXT_RINGS = 0.97, 0.85, 0.7
 """Slopes of the line of sight at the returns that tell the slope behind, over that at the step."""
 
@@ -62,8 +64,8 @@ SAMPLES = 8
 class Edges(NamedTuple):
     """Nearest edge in each sector."""
 
-    r: FloatArray  # (SECTORS,) range of the last ground before it [m]; infinite where there is none
-    z: FloatArray  # (SECTORS,) height of that ground [m]; NaN where there is none
+    r: FloatArray  # (SECTORS,) range of the last ground before it [m]; infinite without one
+    z: FloatArray  # (SECTORS,) height of that ground [m]; NaN without one
 
     def points(self) -> FloatArray:
         """Points along the edges, (n, 3) [m]."""
@@ -108,7 +110,13 @@ class _Steps(NamedTuple):
 
     def where(self, kept: IntArray | BoolArray) -> _Steps:
         """Those of an index or a mask."""
-        return _Steps(*(values[..., kept] for values in self))
+        return _Steps(
+            self.upper[kept],
+            self.lower[kept],
+            self.fall[kept],
+            self.before[:, kept],
+            self.is_on_slope[kept],
+        )
 
 
 def find_edges(
@@ -134,7 +142,10 @@ def find_edges(
     """
     edges = Edges(np.full(SECTORS, np.inf), np.full(SECTORS, np.nan))
     returns = _sort(xyz, is_ground, stands)
-    steps = _find_steps(returns, WEAK * max_step_down)
+    falls = _falls(returns, WEAK * max_step_down)
+    if len(falls[0]) < MIN_STEPS:
+        return edges
+    steps = _steps(returns, *falls, WEAK * max_step_down)
     if len(steps.upper) < MIN_STEPS:
         return edges
     sector, near = returns.sector[steps.upper], returns.r[steps.upper]
@@ -171,39 +182,65 @@ def _sort(xyz: FloatArray, is_ground: BoolArray, stands: BoolArray) -> _Returns:
     return _Returns(key[order], sector[order], sorted_xyz, r[order], is_ground[kept], n_standing)
 
 
-def _find_steps(returns: _Returns, least: float) -> _Steps:
-    """Nearest step of each sector that is larger than `least` [m] and the roughness allows."""
-    sector, z, r, sight = returns.sector, returns.z, returns.r, returns.sight
-    stands = np.diff(returns.n_standing) > 0
-    is_step = (sector[1:] == sector[:-1]) & returns.is_ground[:-1] & ~stands[1:]
-    is_step &= (z[:-1] - z[1:] > least) & (r[1:] > r[:-1]) & (r[:-1] < REACH)
-    upper = np.flatnonzero(is_step)
-    slope = (z[upper] - z[upper + 1]) / (r[upper + 1] - r[upper])
-    enough = slope > LEAST_SHARE * sight[upper + 1]
-    upper, slope = upper[enough], slope[enough]
-    lower, ground = upper + 1, _Ground.of(returns)
+def _falls(returns: _Returns, least: float) -> tuple[IntArray, FloatArray]:
+    """Last returns of the ground before falls of more than `least` [m], and slopes of the falls.
 
+    Each ends at the next return. Its slope is positive, and not much less than that of the line of
+    sight.
+    """
+    sector, z, r = returns.sector, returns.z, returns.r
+    stands = np.diff(returns.n_standing) > 0
+    is_fall = (sector[1:] == sector[:-1]) & returns.is_ground[:-1] & ~stands[1:]
+    is_fall &= (z[:-1] - z[1:] > least) & (r[1:] > r[:-1]) & (r[:-1] < REACH)
+    upper = np.flatnonzero(is_fall)
+    slope = (z[upper] - z[upper + 1]) / (r[upper + 1] - r[upper])
+    kept = slope > LEAST_SHARE * returns.sight[upper + 1]
+    if kept.any():
+        kept &= ~_is_mirrored(returns, upper, least)
+    return upper[kept], slope[kept]
+
+
+def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, least: float) -> _Steps:
+    """Nearest step of each sector: a fall larger than `least` [m] and the roughness allow."""
+    sector, z, r = returns.sector, returns.z, returns.r
+    lower, ground = upper + 1, _Ground.of(returns)
     begin = (1.0 - BEFORE) * r[upper] - NEAREST
-    before, (slope_before, roughness) = ground.window(sector[upper], begin, 1.001 * r[upper])
+    before, slope_before, roughness = ground.window(sector[upper], begin, 1.001 * r[upper])
     runs_down = -slope_before >= ON_SLOPE * slope
     runs_down &= -slope_before * (r[upper] - np.hypot(before[0], before[1])) > roughness
     # The far wall of a trench makes one window rough: rough ground makes both so.
     begin = 1.1 * r[lower] + 0.5
-    behind = [
-        ground.window(sector[upper], begin * grown, begin * grown * BEHIND)[1][1]
-        for grown in (1.0, BEHIND)
-    ]
-    roughness = np.maximum(roughness, np.minimum(*behind))
+    _, _, near = ground.window(sector[upper], begin, BEHIND * begin)
+    _, _, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
+    roughness = np.maximum(roughness, np.minimum(near, far))
     following, known = _next_ring(returns, lower, NEXT_RINGS[0])
     descent = z[lower] - z[following]
     goes_on = known & (descent >= ON_SLOPE * slope * (r[following] - r[lower]))
-    goes_on &= descent > N_ROUGHNESS * roughness + 0.02
+    goes_on &= descent > N_ROUGHNESS * roughness + MIN_DESCENT
 
     fall = np.minimum(z[upper], before[2]) - z[lower] - N_ROUGHNESS * roughness
     steps = _Steps(upper, lower, fall, before, runs_down | goes_on).where(fall > least)
-    nearest = np.lexsort((r[steps.upper], sector[steps.upper]))
-    _, first = np.unique(sector[steps.upper[nearest]], return_index=True)
-    return steps.where(nearest[first])
+    order = np.lexsort((r[steps.upper], sector[steps.upper]))
+    _, first = np.unique(sector[steps.upper[order]], return_index=True)
+    return steps.where(order[first])
+
+
+def _is_mirrored(returns: _Returns, upper: IntArray, least: float) -> BoolArray:
+    """Which steps, by their `upper` returns, are between a wet road and a mirror image below it.
+
+    The road, or what stands on it, is then also seen between the two, or a steeper ray has gone
+    farther and still deeper.
+    """
+    r, z, start = returns.r, returns.z, returns.sector * FARTHEST
+    on_road = returns.is_ground | (np.diff(returns.n_standing) > 0)
+    seen = np.sort((start + r)[on_road])
+    begin, end = MARGIN * r[upper] + 0.05, r[upper + 1] / MARGIN - 0.05
+    first, stop = (np.searchsorted(seen, start[upper] + place) for place in (begin, end))
+    place = start + r
+    farthest = np.where(place == np.maximum.accumulate(place), np.arange(len(r)), 0)
+    before = np.maximum.accumulate(farthest)[upper]
+    result: BoolArray = stop > first
+    return result | ((r[before] > begin) & (z[before] < z[upper + 1] - least))
 
 
 def _next_ring(returns: _Returns, index: IntArray, share: float) -> tuple[IntArray, BoolArray]:
@@ -239,7 +276,7 @@ class _Ground(NamedTuple):
 
     def window(
         self, sector: IntArray, begin: FloatArray, end: FloatArray
-    ) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Ground at ranges from `begin` to `end` [m] in and beside each sector, (S,) each.
 
         Mean place, (3, S) [m]; slope dz/dr of the line through it, and standard deviation about
@@ -255,7 +292,7 @@ class _Ground(NamedTuple):
         spread, both = np.maximum(rr - r * r, 0.0), rz - r * z
         slope = np.where(spread > 0.01, both / np.maximum(spread, 0.01), 0.0)
         std = np.sqrt(np.maximum(zz - z * z - slope * both, 0.0))
-        return np.stack([x, y, z]), (slope, std)
+        return np.stack([x, y, z]), slope, std
 
 
 def _group(sector: IntArray, near: FloatArray, far: FloatArray) -> tuple[IntArray, IntArray]:
