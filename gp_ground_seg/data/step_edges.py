@@ -43,7 +43,7 @@ N_ROUGHNESS = 2.5
 BEFORE, BEHIND, WIDTH = 0.4, 1.5, 3
 """Window of the ground before a step, as a share of its range; range that each of two windows
 behind it grows by; sectors on each side that the windows take in."""
-ON_SLOPE, MIN_DESCENT, MAX_ON_SLOPE = 0.3, 0.02, 0.2
+ON_SLOPE, MIN_DESCENT, MAX_ON_SLOPE = 0.35, 0.02, 0.2
 """Slope of the ground before or behind a step, over that of the step, from which it is part of a
 descent; least descent to the next ring behind [m]; largest share of such steps in an edge."""
 NEXT_RINGS = 0.97, 0.85, 0.7
