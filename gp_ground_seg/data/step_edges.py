@@ -41,8 +41,10 @@ seen depends on which ring just passes its edge."""
 N_ROUGHNESS = 2.5
 """Times the roughness of the ground that a fall is larger than the least one."""
 BEFORE, BEHIND, WIDTH = 0.4, 1.5, 3
-"""Window of the ground before a step, as a share of its range; range that each of two windows
-behind it grows by; sectors on each side that the windows take in."""
+"""Window of the ground before a step, as a share of its range; factor from the beginning of a
+window behind it to the end; sectors on each side that the windows take in."""
+WINDOWS = 2.0, 3.0, 4.5, 6.75, 10.0
+"""Where windows about the sensor begin [m]: where it is rough, a step must be larger."""
 ON_SLOPE, MIN_DESCENT, MAX_ON_SLOPE = 0.35, 0.02, 0.2
 """Slope of the ground before or behind a step, over that of the step, from which it is part of a
 descent; least descent to the next ring behind [m]; largest share of such steps in an edge."""
@@ -57,8 +59,9 @@ MIN_STEPS, MIN_WIDTH, MIN_STRONG = 3, 1.0, 0.25
 PLANE_STD, SLOPE_STD, N_STD = 0.05, 0.15, 2.0
 """Standard deviations of heights about a plane [m] and of its slope before any is seen, and how
 many of its own make a fall certain."""
-SAMPLES = 8
-"""Points along an edge in each sector: at `REACH` closer than the smallest cells of a map."""
+SAMPLES, SPACING = 8, 0.04
+"""Points along an edge in a sector, and their distance along the line between two of them [m]: at
+`REACH` both are closer than the smallest cells of a map."""
 
 
 class Edges(NamedTuple):
@@ -66,14 +69,25 @@ class Edges(NamedTuple):
 
     r: FloatArray  # (SECTORS,) range of the last ground before it [m]; infinite without one
     z: FloatArray  # (SECTORS,) height of that ground [m]; NaN without one
+    goes_on: BoolArray  # (SECTORS,) whether it goes on in the next sector
 
     def points(self) -> FloatArray:
-        """Points along the edges, (n, 3) [m]."""
+        """Points along the edges, closer to each other than cells of a map are, (n, 3) [m]."""
         sector = np.flatnonzero(np.isfinite(self.r))
-        turn = sector[:, None] + (np.arange(SAMPLES) + 0.5) / SAMPLES
-        azimuth = turn * (2.0 * math.pi / SECTORS) - math.pi
-        r, z = (np.broadcast_to(v[sector, None], turn.shape) for v in (self.r, self.z))
-        return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=-1).reshape(-1, 3)
+        across = np.repeat(sector, SAMPLES)
+        turn = across + np.tile((np.arange(SAMPLES) + 0.5) / SAMPLES, len(sector))
+        # Where an edge goes on nearer or farther, along the line between the two sectors.
+        before = np.flatnonzero(self.goes_on)
+        jump = self.r[(before + 1) % SECTORS] - self.r[before]
+        number = (np.abs(jump) / SPACING).astype(np.int64)
+        along, jump = np.repeat(before, number), np.repeat(jump, number)
+        first = np.repeat(np.cumsum(number) - number, number)
+        moved = (np.arange(len(along)) - first + 1.0) * np.copysign(SPACING, jump)
+
+        azimuth = np.append(turn, along + 1.0) * (2.0 * math.pi / SECTORS) - math.pi
+        r = np.append(self.r[across], self.r[along] + moved)
+        z = np.append(self.z[across], self.z[along])
+        return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=-1)
 
 
 class _Returns(NamedTuple):
@@ -140,7 +154,8 @@ def find_edges(
     Edges
         In each sector the range up to which the ground is seen to go on before its nearest edge.
     """
-    edges = Edges(np.full(SECTORS, np.inf), np.full(SECTORS, np.nan))
+    nowhere = np.zeros(SECTORS, dtype=np.bool_)
+    edges = Edges(np.full(SECTORS, np.inf), np.full(SECTORS, np.nan), nowhere)
     returns = _sort(xyz, is_ground, stands)
     falls = _falls(returns, WEAK * max_step_down)
     if len(falls[0]) < MIN_STEPS:
@@ -158,10 +173,11 @@ def find_edges(
             continue
         for a in members:
             # Up to the next step of the edge, as near as the nearer of the two.
-            between = (sector[a] + np.arange(gap[a])) % SECTORS
+            between = (sector[a] + np.arange(max(gap[a], 1))) % SECTORS
             edges.r[between] = min(near[a], near[(a + 1) % len(near)])
             edges.r[sector[a]] = near[a]
             edges.z[between] = returns.z[steps.upper[a]]
+            edges.goes_on[between] = gap[a] > 0
     return edges
 
 
@@ -212,7 +228,7 @@ def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, least: float) 
     begin = 1.1 * r[lower] + 0.5
     _, _, near = ground.window(sector[upper], begin, BEHIND * begin)
     _, _, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
-    roughness = np.maximum(roughness, np.minimum(near, far))
+    roughness = np.maximum(np.maximum(roughness, np.minimum(near, far)), ground.roughness())
     following, known = _next_ring(returns, lower, NEXT_RINGS[0])
     descent = z[lower] - z[following]
     goes_on = known & (descent >= ON_SLOPE * slope * (r[following] - r[lower]))
@@ -274,6 +290,12 @@ class _Ground(NamedTuple):
         terms = np.stack([np.ones(len(r)), x, y, z, z * z, r, r * r, r * z])
         return cls(key[order], np.pad(np.cumsum(terms, axis=1), ((0, 0), (1, 0))))
 
+    def roughness(self) -> float:
+        """Median of the standard deviations in windows all around the sensor [m]."""
+        begin, sector = np.meshgrid(WINDOWS, np.arange(0, SECTORS, 2 * WIDTH + 1))
+        std = self.window(sector.ravel(), begin.ravel(), BEHIND * begin.ravel())[2]
+        return float(np.median(std[std > 0.0])) if std.any() else 0.0
+
     def window(
         self, sector: IntArray, begin: FloatArray, end: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -296,7 +318,7 @@ class _Ground(NamedTuple):
 
 
 def _group(sector: IntArray, near: FloatArray, far: FloatArray) -> tuple[IntArray, IntArray]:
-    """Sectors from each step to the next of its edge, or 1 at its end; number of its edge.
+    """Sectors from each step to the next of its edge, or 0 at its end; number of its edge.
 
     Steps are by sector. The edge is between `near` and `far` [m]: those of an edge overlap, but
     for what it recedes from sector to sector.
@@ -308,7 +330,7 @@ def _group(sector: IntArray, near: FloatArray, far: FloatArray) -> tuple[IntArra
     # Numbers go up behind each end; what follows the last one belongs to the first edge.
     group = np.cumsum(np.roll(~joined, 1))
     group = (group - group[0]) % max(len(ends), 1)
-    return np.where(joined, gap, 1), group
+    return np.where(joined, gap, 0), group
 
 
 def _is_edge(returns: _Returns, steps: _Steps, max_step_down: float) -> bool:
