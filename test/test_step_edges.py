@@ -24,12 +24,16 @@ OS1_64 = dataclasses.replace(
     range_std=0.02,
     height=0.8,
 )
+# With fewer columns: the simulation takes most of the time of these tests.
 MOUNTED = {
-    'hdl-64e': SENSORS['hdl-64e'],
-    'os1-64': OS1_64,
-    'vlp-16': SENSORS['vlp-16'],
-    'os1-128': SENSORS['os1-128'],
-    'os1-128 low': dataclasses.replace(SENSORS['os1-128'], height=0.5),
+    name: dataclasses.replace(sensor, n_columns=900)
+    for name, sensor in {
+        'hdl-64e': SENSORS['hdl-64e'],
+        'os1-64': OS1_64,
+        'vlp-16': SENSORS['vlp-16'],
+        'os1-128': SENSORS['os1-128'],
+        'os1-128 low': dataclasses.replace(SENSORS['os1-128'], height=0.5),
+    }.items()
 }
 MIDDLE = (np.arange(SECTORS) + 0.5) * (2.0 * np.pi / SECTORS) - np.pi
 
@@ -97,19 +101,18 @@ def sees_behind(sensor, at, depth):
     return (sensor.height + depth) * at / sensor.height < 0.9 * min(farthest, 60.0)
 
 
+# Headings about the middle of the sectors, and about the seam between the last and the first.
 DROPS = [
-    (name, at, depth)
+    (name, at, depth, heading)
     for name, sensor in MOUNTED.items()
-    for at in (4.5, 6.0, 9.0)
+    for at, heading in ((4.5, 0.4), (6.0, math.pi), (9.0, -1.0))
     for depth in (0.3, 0.6, 1.2)
     if sees_behind(sensor, at, depth)
 ]
 
 
-@pytest.mark.parametrize('heading', [0.4, math.pi])
-@pytest.mark.parametrize(('name', 'at', 'depth'), DROPS)
+@pytest.mark.parametrize(('name', 'at', 'depth', 'heading'), DROPS)
 def test_drops_are_marked_at_the_last_ring_before_them(name, at, depth, heading):
-    """Headings about the middle of the sectors and about the seam between first and last."""
     sensor = MOUNTED[name]
     r, distance = edges_of(drop(at, depth, heading), sensor), distance_to(at, heading)
     # Directions in which the edge is within 10 m, and ground before it is seen at all.
@@ -139,7 +142,7 @@ def test_only_the_depth_that_is_seen_counts():
     assert np.isfinite(r[distance <= 10.0]).mean() >= 0.95
 
 
-@pytest.mark.parametrize('at', [2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
+@pytest.mark.parametrize('at', [2.0, 4.0, 6.0, 10.0])
 @pytest.mark.parametrize('name', MOUNTED)
 def test_long_ramps_are_no_edges(name, at):
     for degrees in (5.0, 10.0, 15.0):
@@ -161,9 +164,8 @@ def test_a_ramp_that_its_edge_hides_looks_like_a_drop():
 
 @pytest.mark.parametrize('name', MOUNTED)
 def test_kerbs_level_ground_and_steps_up_are_no_edges(name):
-    for depth in (0.15, 0.1, 0.0, -0.3):
-        assert n_edges(drop(5.0, depth), MOUNTED[name]) == 0
-        assert n_edges(drop(8.0, depth, 2.0), MOUNTED[name]) == 0
+    for at, depth in ((5.0, 0.15), (8.0, 0.15), (5.0, 0.0), (6.0, -0.3)):
+        assert n_edges(drop(at, depth, 2.0), MOUNTED[name]) == 0
 
 
 @pytest.mark.parametrize('name', ['hdl-64e', 'os1-64'])

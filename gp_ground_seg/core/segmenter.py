@@ -128,8 +128,7 @@ class GroundSegmenter:
         timer.mark('learning')
         surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
         timer.mark('surface')
-        # 6. Labels: a point is ground up to the tolerance over the surface, or higher where the
-        #    ground about it is rough.
+        # 6. Labels: ground up to the tolerance over the surface, or higher where it is rough.
         labelled = backend.label_points(scan, faces, surface, relief, config)
         timer.mark('label')
         return Segmentation(

@@ -224,11 +224,13 @@ def _steps(returns: _Returns, upper: IntArray, slope: FloatArray, least: float) 
     before, slope_before, roughness = ground.window(sector[upper], begin, 1.001 * r[upper])
     runs_down = -slope_before >= ON_SLOPE * slope
     runs_down &= -slope_before * (r[upper] - np.hypot(before[0], before[1])) > roughness
-    # The far wall of a trench makes one window rough: rough ground makes both so.
+    # The far wall of a trench makes one window rough: rough ground makes both so. Where one ring
+    # is all that is seen before the step, it tells neither slope nor roughness.
     begin = 1.1 * r[lower] + 0.5
     _, _, near = ground.window(sector[upper], begin, BEHIND * begin)
     _, _, far = ground.window(sector[upper], BEHIND * begin, BEHIND**2 * begin)
-    roughness = np.maximum(np.maximum(roughness, np.minimum(near, far)), ground.roughness())
+    behind = np.where(slope_before == 0.0, np.maximum(near, far), np.minimum(near, far))
+    roughness = np.maximum(np.maximum(roughness, behind), ground.roughness())
     following, known = _next_ring(returns, lower, NEXT_RINGS[0])
     descent = z[lower] - z[following]
     goes_on = known & (descent >= ON_SLOPE * slope * (r[following] - r[lower]))
