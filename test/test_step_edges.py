@@ -178,7 +178,7 @@ def test_the_parameter_is_the_step(name):
 @pytest.mark.parametrize('seed', [1, 2, 3])
 @pytest.mark.parametrize('name', ['hdl-64e', 'os1-128', 'vlp-16'])
 def test_rough_ground_is_no_edge(name, seed):
-    rubble = rough(np.random.default_rng(seed), 0.14, (0.6, 5.0))
+    rubble = rough(np.random.default_rng(seed), 0.1, (0.6, 5.0))
     assert n_edges(rubble, MOUNTED[name], seed) == 0
     assert n_edges(SCENES['road_then_rubble'](seed), MOUNTED[name], seed) == 0
 
