@@ -192,6 +192,40 @@ def test_occupancy_is_what_a_costmap_takes(b, reduced):
         assert np.isin(at, (value, 100)).all() and (at == value).mean() > 0.9
 
 
+def test_scan_and_occupancy_end_at_the_edge_of_a_drop(b):
+    """Ground that goes on 0.6 m lower from x = 6 m on; without the parameter nothing is there."""
+    rings, azimuth = np.meshgrid(np.geomspace(3.5, 30.0, 60), np.linspace(-np.pi, np.pi, 1440))
+    behind = rings * np.cos(azimuth) > 6.0
+    scale = np.where(behind, (1.73 + 0.6) / 1.73, 1.0).ravel()
+    points = street(scale.size)
+    points['x'] = scale * (rings * np.cos(azimuth)).ravel()
+    points['y'] = scale * (rings * np.sin(azimuth)).ravel()
+    points['z'] = -1.73 * scale
+    message = to_message(points, stamp=(17, 23), frame='velo_link')
+
+    ahead = abs(np.linspace(-np.pi, np.pi, 721)[:-1] + np.pi / 720.0) < 0.8
+    nothing = np.array(received(b, '~/scan', message).ranges)
+    assert np.isinf(nothing[ahead]).all()
+    rows = slice(140, 260)  # y from -6 to 6 m, in cells of 0.1 m
+    cells = np.array(received(b, '~/occupancy', message).data, np.int8).reshape(400, 400)
+    assert (cells[rows] != 100).all()
+    assert all(result.successful for result in b.load({'output.max_step_down': 0.2}))
+    try:
+        scan, grid = (received(b, topic, message) for topic in ('~/scan', '~/occupancy'))
+    finally:
+        assert all(result.successful for result in b.load({'output.max_step_down': 0.0}))
+    turn = scan.angle_min + scan.angle_increment * np.flatnonzero(ahead)
+    x = np.array(scan.ranges)[ahead] * np.cos(turn)
+    assert x.max() <= 6.1 and x.min() > 5.5  # an arc of one degree
+    is_edge = np.array(grid.data, np.int8).reshape(400, 400)[rows] == 100
+    column = is_edge.argmax(axis=1)
+    assert is_edge.any(axis=1).all() and column.min() >= 255
+    assert not is_edge[:, 261:].any() and not is_edge[:, :255].any()
+    # The ground before it stays free.
+    free = np.array(grid.data, np.int8).reshape(400, 400)[180:220, 240:254]
+    assert (free == 0).all()
+
+
 def test_nothing_is_built_that_nobody_subscribes_to(b, monkeypatch):
     built = []
 

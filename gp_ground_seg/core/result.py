@@ -173,6 +173,8 @@ class Segmentation:
         Height of each point in the sensor frame [m].
     slope_std : float
         ``observation.slope_std`` of the frame.
+    origin : (3,) float64
+        Where the sensor was, in the frame of the scan [m].
     """
 
     labelled: Labelled
@@ -187,6 +189,7 @@ class Segmentation:
     relief: Relief
     z: PointArray
     slope_std: float
+    origin: FloatArray
 
     @property
     def candidates(self) -> Candidates:

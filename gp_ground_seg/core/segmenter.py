@@ -126,12 +126,12 @@ class GroundSegmenter:
         fallback: SensorPose | None,
     ) -> Segmentation:
         """Do the stages of a scan, one after the other."""
-        config, backend = self._config, self._backend
+        backend = self._backend
         # 1. Polar grid: the lowest point of each cell is a ground candidate.
         # 2. Sensor pose, from a plane through the candidates near the sensor: a tilted scan is
         #    levelled, mirror images are raised, and a low sensor has narrower gates.
         scan, pose, images = self._level(xyz, sensor, timer, fallback)
-        config = for_sensor(config, pose, sensor)
+        config = for_sensor(self._config, pose, sensor)
         # 3. Vertical faces: walls, fences, sides of cars.
         faces = backend.find_faces(scan, config)
         timer.mark('faces')
@@ -141,14 +141,13 @@ class GroundSegmenter:
         extracted = backend.extract_lines(candidates, faces, config)
         frame = Frame(*extracted, scan.grid.edges, -pose.height)
         timer.mark('lines')
-        # 5. Observation process (height over range) and latent process (its log length-scale):
-        #    hyper-parameters theta, then inliers and surface.
+        # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
         learned = learn_frame(frame, config, backend)
         theta = in_rows(learned.theta if learned else given_theta(config), frame)
         timer.mark('learning')
         surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)
         timer.mark('surface')
-        # 6. Labels: ground is up to the tolerance over the surface, or the roughness about it.
+        # 6. Labels: ground up to the tolerance over the surface, or higher where it is rough.
         labelled = backend.label_points(scan, faces, surface, relief, config)
         labelled.height[images.points] -= images.rise
         timer.mark('label')
@@ -165,6 +164,7 @@ class GroundSegmenter:
             relief=relief,
             z=xyz[:, 2].copy(),
             slope_std=config.observation.slope_std,
+            origin=np.array([sensor.origin_x, sensor.origin_y, sensor.origin_z]),
         )
 
     @usual_errors()

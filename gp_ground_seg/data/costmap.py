@@ -26,6 +26,7 @@ from gp_ground_seg.core.parameters.config import ANY_HEIGHT, Config
 from gp_ground_seg.core.pipeline.sensor_pose import LEAST_COSINE
 from gp_ground_seg.core.result import Segmentation, cached_property
 from gp_ground_seg.data.point_cloud2 import read_xyz
+from gp_ground_seg.data.step_edges import find_edges
 
 DIRECTIONS = 720
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -128,7 +129,43 @@ class SegmentedCloud:
         Without an output frame, where verticals through them meet z = 0 of the cloud.
         """
         index = np.flatnonzero(chosen)
-        x, y, z = (values.take(index) for values in self.points.T)
+        return self._in_plane(*(values.take(index) for values in self.points.T))
+
+    @cached_property
+    def blocked(self) -> Places:
+        """Places of the obstacles, and of edges of drops if ``output.max_step_down`` is not 0."""
+        obstacles, edges = self.places(self.is_obstacle), self.edges
+        if len(edges) == 0:
+            return obstacles
+        x, y = (
+            np.concatenate([a, b.astype(a.dtype)])
+            for a, b in zip(obstacles, self._in_plane(*edges.T), strict=True)
+        )
+        return x, y
+
+    @cached_property
+    def edges(self) -> FloatArray:
+        """Points along the edges of drops within the range, (n, 3) in the frame of the cloud [m].
+
+        Where ``output.max_step_down`` is 0, none are looked for.
+        """
+        output, found = self.config.output, self.segmentation
+        if output.max_step_down == 0.0:
+            return np.empty((0, 3))
+        # What lies below the surface does not stand on it, and tells how deep a drop is.
+        stands = (found.label == _OBSTACLE) & ~(found.labelled.height < 0.0)
+        # Rays begin at the sensor, which is not the origin of a cloud in the frame of a vehicle.
+        with np.errstate(over='ignore', invalid='ignore'):
+            xyz = (self.points - found.origin) @ found.pose.rotation.T
+        edges = find_edges(xyz, found.label == _GROUND, stands, output.max_step_down)
+        points = edges.points() @ found.pose.rotation + found.origin
+        if output.max_range > 0.0:
+            level = points @ found.pose.rotation.T
+            points = points[np.hypot(level[:, 0], level[:, 1]) <= output.max_range]
+        return points
+
+    def _in_plane(self, x: PointArray, y: PointArray, z: PointArray) -> Places:
+        """Places of points of the cloud, (n,) each, as `places` gives them."""
         with np.errstate(over='ignore', invalid='ignore'):
             x, y = (a * x + b * y + c * z for a, b, c in self._to_plane().tolist())
         return x, y
@@ -214,7 +251,7 @@ def scan_ranges(obstacles: Places, returns: Places) -> Ranges:
     Infinite where there are other `returns` only, NaN where there is no return at all.
     """
     ranges, _ = ranges_of(*obstacles)
-    is_seen = np.zeros(DIRECTIONS, dtype=np.bool_)
+    is_seen = np.isfinite(ranges)
     is_seen[direction_of(*returns)] = True
     ranges[~is_seen] = np.nan
     return ranges

@@ -175,14 +175,15 @@ def _header(segmented: SegmentedCloud) -> Header:
 def scan(segmented: SegmentedCloud) -> LaserScan:
     """Return the nearest obstacle in each direction about the origin of the output frame.
 
-    Infinite where the direction has returns and no obstacle, NaN where it has no return.
+    Edges of drops are obstacles if ``output.max_step_down`` is not 0. Infinite where the direction
+    has returns and no obstacle, NaN where it has no return.
     """
     (x, y), config, step = segmented.offset, segmented.config, 2.0 * math.pi / DIRECTIONS
     message = LaserScan(header=_header(segmented), angle_increment=step)
     message.angle_min, message.angle_max = 0.5 * step - math.pi, math.pi - 0.5 * step
     message.range_max = (config.output.max_range or config.grid.r_max) + math.hypot(x, y)
-    seen = segmented.is_obstacle, segmented.segmentation.grid.cell != NOT_FINITE
-    moved = [(px + x, py + y) for px, py in map(segmented.places, seen)]
+    returns = segmented.places(segmented.segmentation.grid.cell != NOT_FINITE)
+    moved = [(px + x, py + y) for px, py in (segmented.blocked, returns)]
     message.ranges = message_data(scan_ranges(*moved), 'f')
     return message
 
@@ -190,7 +191,7 @@ def scan(segmented: SegmentedCloud) -> LaserScan:
 def occupancy_grid(segmented: SegmentedCloud) -> OccupancyGrid:
     """Return the cells about the sensor, in the output frame: free, occupied or unknown."""
     output, ground_std = segmented.config.output, segmented.config.label.ground_tolerance
-    ground, obstacles = map(segmented.places, (segmented.is_ground, segmented.is_obstacle))
+    ground, obstacles = segmented.places(segmented.is_ground), segmented.blocked
     reach = reach_of_model(segmented.segmentation.surface, segmented.heading, ground_std)
     cells = occupancy(ground, obstacles, reach, output.cell_size, output.grid_size)
     message = OccupancyGrid(header=_header(segmented))

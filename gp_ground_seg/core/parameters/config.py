@@ -88,6 +88,9 @@ class OutputConfig:
     obstacle_voxel: float = advanced(0.0, (0.0, 10.0), 'the same for obstacles', 'm')
     cell_size: float = advanced(0.1, (0.05, 5.0), 'side of a cell of occupancy', 'm')
     grid_size: float = advanced(40.0, (1.0, 100.0), 'side of the square of occupancy', 'm')
+    max_step_down: float = advanced(0.0, (0.0, 10.0),
+        'step down between two rings from which scan ends at its edge and occupancy has the edge '
+        'as an obstacle, up to 20 m; 0 = none', 'm')
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,345 @@
+"""Edges of drops: constructed ground, exact rays, several sensors; and what is no edge."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from gp_ground_seg import Config, GroundSegmenter, Label
+from gp_ground_seg.core.pipeline.tilt import rotation
+from gp_ground_seg.data import costmap, step_edges
+from gp_ground_seg.data.costmap import DIRECTIONS, OCCUPIED, Placement, SegmentedCloud
+from gp_ground_seg.data.step_edges import SECTORS, find_edges
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, simulate_scan
+from gp_ground_seg.lab.simulation.objects import car, wall
+from gp_ground_seg.lab.simulation.scenes import Scene
+from gp_ground_seg.lab.simulation.terrain import Sum, polyline, ramp, rough
+
+MAX_STEP_DOWN = 0.2
+OS1_64 = dataclasses.replace(
+    SENSORS['os1-128'],
+    name='os1-64',
+    elevations=tuple(np.radians(np.linspace(22.5, -22.5, 64)).tolist()),
+    range_std=0.02,
+    height=0.8,
+)
+# With fewer columns: the simulation takes most of the time of these tests.
+MOUNTED = {
+    name: dataclasses.replace(sensor, n_columns=900)
+    for name, sensor in {
+        'hdl-64e': SENSORS['hdl-64e'],
+        'os1-64': OS1_64,
+        'vlp-16': SENSORS['vlp-16'],
+        'os1-128': SENSORS['os1-128'],
+        'os1-128 low': dataclasses.replace(SENSORS['os1-128'], height=0.5),
+    }.items()
+}
+MIDDLE = (np.arange(SECTORS) + 0.5) * (2.0 * np.pi / SECTORS) - np.pi
+
+
+def drop(at, depth, heading=0.0):
+    """Level ground that ends `at` [m] along `heading`, and goes on `depth` [m] lower."""
+    return polyline(heading, [(at, 0.0), (at, -depth)])
+
+
+def trench(at, depth, width, heading=0.0):
+    far = at + width
+    return polyline(heading, [(at, 0.0), (at, -depth), (far, -depth), (far, 0.0)])
+
+
+def descent(at, degrees, fall, heading=0.0):
+    slope = math.tan(math.radians(degrees))
+    return polyline(heading, [(at, 0.0), (at + fall / slope, -fall)])
+
+
+class Segmented(SegmentedCloud):
+    """Of points instead of a message."""
+
+    points = property(lambda self: self.cloud)
+
+
+def segmented(scene, sensor, seed=0, placement=None, **values):
+    """Simulated scan of terrain or a scene, and what is published of it."""
+    scene = scene if isinstance(scene, Scene) else Scene('', scene)
+    scan = simulate_scan(scene, sensor, np.random.default_rng(seed))
+    config = Config().replace(**{'output.max_step_down': MAX_STEP_DOWN, **values})
+    xyz = scan.points[:, :3]
+    return Segmented(xyz, GroundSegmenter(config).segment(xyz), config, placement)
+
+
+def inputs_of(cloud):
+    """Arguments of `find_edges` for a cloud in the level frame of its sensor."""
+    found = cloud.segmentation
+    stands = (found.label == Label.OBSTACLE) & ~(found.labelled.height < 0.0)
+    return cloud.points.astype(np.float64), found.label == Label.GROUND, stands
+
+
+def edges_of(scene, sensor, seed=0, max_step_down=MAX_STEP_DOWN):
+    return find_edges(*inputs_of(segmented(scene, sensor, seed)), max_step_down).r
+
+
+def n_edges(*arguments, **named):
+    return np.count_nonzero(np.isfinite(edges_of(*arguments, **named)))
+
+
+def distance_to(at, heading=0.0):
+    """Range of a straight edge `at` [m] along `heading`, in each sector."""
+    ahead = np.cos(MIDDLE - heading)
+    return np.where(ahead > 0.05, at / np.maximum(ahead, 0.05), np.inf)
+
+
+def rings_on_level_ground(sensor):
+    """Ranges of the rings, near to far [m]."""
+    down = np.sort([-elevation for elevation in sensor.elevations if elevation < -1e-3])[::-1]
+    return sensor.height / np.tan(down)
+
+
+def sees_behind(sensor, at, depth):
+    """Whether rings of the sensor reach the lower ground."""
+    farthest = rings_on_level_ground(sensor)[-1]
+    return (sensor.height + depth) * at / sensor.height < 0.9 * min(farthest, 60.0)
+
+
+# Headings about the middle of the sectors, and about the seam between the last and the first.
+DROPS = [
+    (name, at, depth, heading)
+    for name, sensor in MOUNTED.items()
+    for at, heading in ((4.5, 0.4), (6.0, math.pi), (9.0, -1.0))
+    for depth in (0.3, 0.6, 1.2)
+    if sees_behind(sensor, at, depth)
+]
+
+
+@pytest.mark.parametrize(('name', 'at', 'depth', 'heading'), DROPS)
+def test_drops_are_marked_at_the_last_ring_before_them(name, at, depth, heading):
+    sensor = MOUNTED[name]
+    r, distance = edges_of(drop(at, depth, heading), sensor), distance_to(at, heading)
+    # Directions in which the edge is within 10 m, and ground before it is seen at all.
+    rings = rings_on_level_ground(sensor)
+    towards = (distance <= 10.0) & (distance > 1.05 * rings[0])
+    assert towards.sum() > 40
+    last = np.append(0.0, rings)[np.searchsorted(rings, 0.9 * distance)]
+    is_marked = (r <= 1.02 * distance + 0.1) & (r >= 0.85 * last)
+    assert is_marked[towards].mean() >= 0.95
+    # None is marked on the side where the ground goes on.
+    assert np.isinf(r[np.cos(MIDDLE - heading) < 0.0]).all()
+
+
+@pytest.mark.parametrize('depth', [0.3, 0.6, 1.2])
+@pytest.mark.parametrize('name', ['hdl-64e', 'os1-128'])
+def test_a_trench_is_marked_at_its_near_edge_only(name, depth):
+    r, distance = edges_of(trench(8.0, depth, 1.5), MOUNTED[name]), distance_to(8.0)
+    towards = distance <= 12.0
+    assert (r[towards] <= distance[towards] + 0.2).mean() >= 0.95
+    assert (r[towards] >= 0.85 * distance[towards]).mean() >= 0.95
+
+
+def test_only_the_depth_that_is_seen_counts():
+    """From 0.8 m, 0.15 m of the far wall of a trench 1.5 m wide at 8 m; 0.3 m of one of 3 m."""
+    assert n_edges(trench(8.0, 1.2, 1.5), OS1_64) == 0
+    r, distance = edges_of(trench(8.0, 1.2, 3.0), OS1_64), distance_to(8.0)
+    assert np.isfinite(r[distance <= 10.0]).mean() >= 0.95
+
+
+@pytest.mark.parametrize('at', [2.0, 4.0, 6.0, 10.0])
+@pytest.mark.parametrize('name', MOUNTED)
+def test_long_ramps_are_no_edges(name, at):
+    for degrees in (5.0, 10.0, 15.0):
+        assert n_edges(ramp(at, -math.tan(math.radians(degrees))), MOUNTED[name]) == 0
+
+
+@pytest.mark.parametrize('fall', [0.6, 1.0, 2.0])
+def test_short_ramps_that_are_seen_are_no_edges(fall):
+    """From 1.73 m ramps of 15 degrees are seen that begin before 6.5 m, of 10 before 9.8 m."""
+    for degrees, places in ((5.0, (3.0, 5.0, 8.0)), (10.0, (3.0, 5.0, 8.0)), (15.0, (3.0, 5.0))):
+        for at in places:
+            assert n_edges(descent(at, degrees, fall), MOUNTED['hdl-64e']) == 0
+
+
+def test_a_ramp_that_its_edge_hides_looks_like_a_drop():
+    """The limit: where a ramp is steeper than the line of sight, a scan is that of a drop."""
+    assert n_edges(descent(8.0, 15.0, 1.0), MOUNTED['hdl-64e']) > 100
+
+
+@pytest.mark.parametrize('name', MOUNTED)
+def test_kerbs_level_ground_and_steps_up_are_no_edges(name):
+    for at, depth in ((5.0, 0.15), (8.0, 0.15), (5.0, 0.0), (6.0, -0.3)):
+        assert n_edges(drop(at, depth, 2.0), MOUNTED[name]) == 0
+
+
+@pytest.mark.parametrize('name', ['hdl-64e', 'os1-64'])
+def test_the_parameter_is_the_step(name):
+    assert n_edges(drop(5.0, 0.15), MOUNTED[name], max_step_down=0.1) > 100
+    assert n_edges(drop(5.0, 0.45), MOUNTED[name], max_step_down=0.5) == 0
+    assert n_edges(drop(5.0, 0.6), MOUNTED[name], max_step_down=0.5) > 100
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+@pytest.mark.parametrize('name', ['hdl-64e', 'os1-128', 'vlp-16'])
+def test_rough_ground_is_no_edge(name, seed):
+    rubble = rough(np.random.default_rng(seed), 0.1, (0.6, 5.0))
+    assert n_edges(rubble, MOUNTED[name], seed) == 0
+    assert n_edges(SCENES['road_then_rubble'](seed), MOUNTED[name], seed) == 0
+
+
+def test_a_drop_in_uneven_ground_is_found():
+    uneven = rough(np.random.default_rng(3), 0.03, (0.6, 6.0))
+    r, distance = edges_of(Sum((drop(6.0, 0.6), uneven)), MOUNTED['hdl-64e']), distance_to(6.0)
+    towards = distance <= 10.0
+    assert (r[towards] <= distance[towards] + 0.3).mean() >= 0.9
+
+
+@pytest.mark.parametrize('name', ['hdl-64e', 'os1-128', 'vlp-16'])
+def test_streets_and_wet_roads_have_no_edges(name):
+    for scene in ('urban', 'car_park', 'traffic_jam', 'wet_road'):
+        assert n_edges(SCENES[scene](1), MOUNTED[name], 1) == 0
+
+
+def test_what_stands_before_lower_ground_is_no_edge():
+    """A car before a street that goes on 0.4 m lower; a wall hides where it falls."""
+    terrain = descent(5.5, 4.0, 0.4)
+    solids = tuple(car(terrain, 7.0, 0.0, math.pi / 2)) + tuple(car(terrain, 7.0, -6.0))
+    assert n_edges(Scene('', terrain, solids), MOUNTED['hdl-64e']) == 0
+    terrain = drop(6.05, 0.6)
+    hidden = wall(terrain, (5.9, -4.0), (5.9, 4.0), 0.5)
+    r = edges_of(Scene('', terrain, hidden), MOUNTED['hdl-64e'])
+    assert np.isinf(r[np.abs(MIDDLE) < 0.5]).all()
+    assert np.isfinite(r[(np.abs(MIDDLE) > 0.7) & (np.abs(MIDDLE) < 0.9)]).mean() > 0.9
+
+
+def level_scan(lower=()):
+    """Level ground 1.73 m below in 12 rings; in the sectors `lower` 0.5 m lower from 8 m on."""
+    sector, rings = np.arange(SECTORS), np.geomspace(4.0, 16.0, 24)
+    r, azimuth = np.meshgrid(rings, MIDDLE)
+    is_low = np.isin(sector, lower)[:, None] & (r > 8.0)
+    scale = np.where(is_low, (1.73 + 0.5) / 1.73, 1.0)
+    r, z = r * scale, -1.73 * scale
+    xyz = np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], axis=-1).reshape(-1, 3)
+    return xyz, np.ones(len(xyz), bool), np.zeros(len(xyz), bool)
+
+
+@pytest.mark.parametrize(
+    ('lower', 'expected'),
+    [
+        ([], []),
+        ([7], []),
+        ([7, 9], []),
+        (range(100, 104), []),  # 0.56 m wide
+        (range(100, 110), range(100, 110)),
+        ([100, 101, 102, 105, 106, 107, 108, 109], range(100, 110)),
+        ([*range(355, 360), *range(5)], [*range(355, 360), *range(5)]),
+        (range(360), range(360)),
+    ],
+)
+def test_neighbours_must_agree(lower, expected):
+    edges = find_edges(*level_scan(list(lower)), MAX_STEP_DOWN)
+    assert set(np.flatnonzero(np.isfinite(edges.r))) == set(expected)
+    np.testing.assert_array_equal(np.isfinite(edges.z), np.isfinite(edges.r))
+    points = edges.points()
+    assert len(points) == step_edges.SAMPLES * len(expected)
+    if len(expected):
+        r = np.hypot(points[:, 0], points[:, 1])
+        last = np.geomspace(4.0, 16.0, 24)
+        np.testing.assert_allclose(r, last[last <= 8.0].max())
+        np.testing.assert_allclose(points[:, 2], -1.73)
+        turn = np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5
+        assert set((turn * SECTORS).astype(int)) == set(expected)
+
+
+def test_order_and_strange_points_do_not_matter():
+    xyz, is_ground, stands = level_scan(range(50, 70))
+    expected = find_edges(xyz, is_ground, stands, MAX_STEP_DOWN)
+    order = np.random.default_rng(0).permutation(len(xyz))
+    found = find_edges(xyz[order], is_ground[order], stands[order], MAX_STEP_DOWN)
+    np.testing.assert_array_equal(found.r, expected.r)
+    strange = np.array([[np.nan] * 3, [np.inf, 0, -1], [1, 1, -np.inf], [0, 0, 0], [1e38] * 3])
+    more = np.concatenate([xyz, strange])
+    for value in (False, True):
+        masks = (np.append(mask, np.full(5, value)) for mask in (is_ground, stands))
+        np.testing.assert_array_equal(find_edges(more, *masks, MAX_STEP_DOWN).r, expected.r)
+    for n in (0, 1, 2, 3):
+        found = find_edges(xyz[:n], is_ground[:n], stands[:n], MAX_STEP_DOWN)
+        assert np.isinf(found.r).all()
+    assert np.isinf(find_edges(xyz, ~is_ground, stands, MAX_STEP_DOWN).r).all()
+
+
+def marked(cloud):
+    """Ranges of the scan without obstacles, and the cells that are occupied."""
+    returns = cloud.places(np.isfinite(cloud.points).all(axis=1))
+    reach = np.full(DIRECTIONS, 100.0, np.float32)
+    ground = cloud.places(cloud.is_ground)
+    return (
+        costmap.scan_ranges(cloud.blocked, returns),
+        costmap.occupancy(ground, cloud.blocked, reach, 0.1, 20.0) == OCCUPIED,
+    )
+
+
+def test_scan_ends_at_the_edge_and_occupancy_has_it():
+    ranges, occupied = marked(segmented(drop(6.0, 0.6), MOUNTED['hdl-64e']))
+    towards = (np.arange(DIRECTIONS) + 0.5) * 2.0 * np.pi / DIRECTIONS - np.pi
+    distance = 6.0 / np.maximum(np.cos(towards), 1e-6)
+    near = distance < 9.0
+    assert (ranges[near] <= distance[near] + 0.1).mean() > 0.98
+    assert (ranges[near] >= 0.9 * distance[near]).mean() > 0.98
+    assert not np.isfinite(ranges[np.cos(towards) < 0.0]).any()
+    # A line of cells without holes: in every row about the x axis one before 6 m.
+    rows = occupied[100 - 60 : 100 + 60]
+    column = 100 + rows[:, 100:].argmax(axis=1)
+    assert rows.any(axis=1).all()
+    assert (column >= 100 + 52).all() and (column <= 100 + 60).all()
+
+
+def test_off_nothing_is_looked_for(monkeypatch):
+    off = segmented(drop(6.0, 0.6), MOUNTED['hdl-64e'], **{'output.max_step_down': 0.0})
+    monkeypatch.setattr(costmap, 'find_edges', None)
+    assert Config().output.max_step_down == 0.0
+    assert off.edges.shape == (0, 3)
+    for place, obstacle in zip(off.blocked, off.places(off.is_obstacle), strict=True):
+        np.testing.assert_array_equal(place, obstacle)
+
+
+def test_edges_beyond_the_range_are_none():
+    terrain, sensor = drop(6.0, 0.6), MOUNTED['hdl-64e']
+    every, near = segmented(terrain, sensor), segmented(terrain, sensor, **{'output.max_range': 8})
+    distance = np.hypot(*every.edges.T[:2])
+    np.testing.assert_array_equal(near.edges, every.edges[distance <= 8.0])
+    assert 0 < len(near.edges) < len(every.edges)
+
+
+def test_edges_lie_where_the_ground_ends_in_any_frame():
+    """A tilted sensor, a cloud in the frame of the vehicle on the ground, an output frame."""
+    terrain, sensor = drop(6.0, 0.6, 0.3), MOUNTED['hdl-64e']
+
+    def along(cloud, matrix=None):
+        x, y = cloud.blocked
+        if matrix is not None:
+            x, y = (np.stack([x, y, 0.0 * x], axis=-1) @ matrix.T)[:, :2].T
+        is_edge = np.arange(len(x)) >= np.count_nonzero(cloud.is_obstacle)
+        assert is_edge.sum() > 800
+        return (x * math.cos(0.3) + y * math.sin(0.3))[is_edge]
+
+    level = segmented(terrain, sensor)
+    expected = along(level)
+    assert np.median(expected) == pytest.approx(5.85, abs=0.15)
+
+    matrix = rotation(0.15, -0.2)
+    values = {'sensor.roll': 0.15, 'sensor.pitch': -0.2, 'output.max_step_down': MAX_STEP_DOWN}
+    config = Config().replace(**values)
+    xyz = level.points @ matrix.astype(np.float32)
+    placement = Placement(matrix, np.array([3.0, 4.0, 5.0]))
+    found = GroundSegmenter(config).segment(xyz)
+    tilted = along(Segmented(xyz, found, config), matrix)
+    for places in (tilted, along(Segmented(xyz, found, config, placement))):
+        assert np.median(places) == pytest.approx(np.median(expected), abs=0.05)
+        assert len(places) == pytest.approx(len(expected), rel=0.05)
+
+    vehicle = segmented(
+        terrain,
+        dataclasses.replace(sensor, origin=(1.0, 0.0, sensor.height)),
+        **{'sensor.height': 0.0, 'sensor.origin_x': 1.0, 'sensor.origin_z': sensor.height},
+    )
+    places = along(vehicle)
+    ahead = 1.0 * math.cos(0.3)
+    assert np.median(places) == pytest.approx(np.median(expected) + ahead, abs=0.1)
+    assert np.median(vehicle.edges[:, 2]) == pytest.approx(0.0, abs=0.1)
