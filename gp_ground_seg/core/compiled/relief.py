@@ -6,6 +6,7 @@ Tables of squares have one more at each side, so that each square has eight arou
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,6 +46,27 @@ from gp_ground_seg.core.pipeline.relief import (
 _WIDTH = N_SIDES + 2
 _N_SQUARES = _WIDTH * _WIDTH
 _N_SUMS = 9
+
+
+class _Walk(NamedTuple):
+    """What the steps taken so far lead to.
+
+    Attributes
+    ----------
+    parent : (C,) int64
+        A tree for each group of candidates that steps join.
+    is_raised : (C,) bool
+        Candidates that are raised.
+    part : (C,) int64
+        As `parent`, by steps between raised candidates alone.
+    is_entry : (C,) bool
+        Raised candidates that a step from one that is not leads to.
+    """
+
+    parent: IntArray
+    is_raised: BoolArray
+    part: IntArray
+    is_entry: BoolArray
 
 
 @jit(entry=True)
@@ -101,16 +123,16 @@ def _reachable(
 ) -> BoolArray:
     """See the plain `reachable`."""
     r, n = candidates.r, len(candidates.r)
-    allowed, parent, n_seeds = np.empty(n, np.bool_), np.arange(n), np.zeros(n, np.int64)
+    allowed, is_raised = np.empty(n, np.bool_), np.empty(n, np.bool_)
     for c in range(n):
         allowed[c] = r[c] < REACH and not is_face[np.uintp(candidates.tile[c])]
-    steps, steep = np.empty((n * (1 + 2 * N_ASIDE), 2), np.int64), np.empty(n, np.int64)
-    n_steps, n_steep = _step_along(candidates, allowed, steps, steep)
+        is_raised[c] = candidates.z[c] + height > RAISED
+    walk = _Walk(np.arange(n), is_raised, np.arange(n), np.zeros(n, np.bool_))
+    steep = _step_along(candidates, allowed, walk)
     for aside in range(1, N_ASIDE + 1):
-        n_steps = _step_aside(candidates, allowed, aside, steps, n_steps)
-    n_steps = _step_up(candidates, steep[:n_steep], steps, n_steps)
-    for s in range(n_steps):
-        _join(parent, steps[s, 0], steps[s, 1])
+        _step_aside(candidates, allowed, aside, walk)
+    _step_up(candidates, steep, walk)
+    parent, n_seeds = walk.parent, np.zeros(n, np.int64)
     for c in range(n):
         parent[c] = _root(parent, c)
         is_near = allowed[c] and r[c] < growth.seed_range
@@ -118,47 +140,43 @@ def _reachable(
             n_seeds[parent[c]] += 1
     for c in range(n):
         allowed[c] &= n_seeds[parent[c]] >= MIN_SEEDS
-    _leave_out_not_entered(candidates, height, steps[:n_steps], allowed)
+    _leave_out_not_entered(candidates, walk, allowed)
     return allowed
 
 
 @jit()
-def _leave_out_not_entered(
-    candidates: Candidates, height: float, steps: IntArray, reached: BoolArray
-) -> None:
-    """See the plain `_entered`."""
+def _step(walk: _Walk, a: int, b: int) -> None:
+    """Take a step between two candidates."""
+    _join(walk.parent, a, b)
+    if walk.is_raised[a] and walk.is_raised[b]:
+        _join(walk.part, a, b)
+    elif walk.is_raised[a]:
+        walk.is_entry[a] = True
+    elif walk.is_raised[b]:
+        walk.is_entry[b] = True
+
+
+@jit()
+def _leave_out_not_entered(candidates: Candidates, walk: _Walk, reached: BoolArray) -> None:
+    """See the plain `_entered`. A part of raised land is reached as a whole, or not at all."""
     r, n, offsets = candidates.r, len(reached), candidates.offsets
-    is_raised, is_entry = np.empty(n, np.bool_), np.zeros(n, np.bool_)
-    for c in range(n):
-        is_raised[c] = reached[c] and candidates.z[c] + height > RAISED
-    parent, width, last = np.arange(n), np.zeros(n), np.full(n, -1)
-    for s in range(len(steps)):
-        a, b = steps[s, 0], steps[s, 1]
-        if is_raised[a] and is_raised[b]:
-            _join(parent, a, b)
-        elif reached[a] and is_raised[a] != is_raised[b]:
-            is_entry[a if is_raised[a] else b] = True
+    width, last = np.zeros(n), np.full(n, -1)
     for m in range(len(offsets) - 1):
         for c in range(offsets[m], offsets[m + 1]):
-            if is_entry[c]:
-                part = _root(parent, c)
+            if walk.is_entry[c]:
+                part = _root(walk.part, c)
                 if last[part] != m:
                     width[part] += arc_of(r[c], len(offsets) - 1)
                     last[part] = m
     for c in range(n):
-        reached[c] &= not is_raised[c] or width[_root(parent, c)] >= MIN_ENTRY
+        reached[c] &= not walk.is_raised[c] or width[_root(walk.part, c)] >= MIN_ENTRY
 
 
 @jit()
-def _step_along(
-    candidates: Candidates, allowed: BoolArray, steps: IntArray, steep: IntArray
-) -> tuple[int, int]:
-    """List the steps between neighbours of a segment, and the far ends of steep and long ones.
-
-    Returns the numbers of both.
-    """
+def _step_along(candidates: Candidates, allowed: BoolArray, walk: _Walk) -> IntArray:
+    """Step between neighbours of a segment; return the far ends of steep and long steps."""
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
-    n_steps = n_steep = 0
+    steep, n = np.empty(len(r), np.int64), 0
     for m in range(len(offsets) - 1):
         for c in range(offsets[m] + 1, offsets[m + 1]):
             dr, rise = r[c] - r[c - 1], z[c] - z[c - 1]
@@ -169,13 +187,12 @@ def _step_along(
             else:
                 is_taken = can_step(dr, rise, STEEP)
                 if is_taken and abs(rise) <= GENTLE:
-                    steps[n_steps, 0], steps[n_steps, 1] = c - 1, c
-                    n_steps += 1
+                    _step(walk, c - 1, c)
                     continue
             if is_taken:
-                steep[n_steep] = c
-                n_steep += 1
-    return n_steps, n_steep
+                steep[n] = c
+                n += 1
+    return steep[:n]
 
 
 @jit()
@@ -192,11 +209,8 @@ def _goes_on(candidates: Candidates, first: int, c: int) -> bool:
 
 
 @jit()
-def _step_up(candidates: Candidates, steep: IntArray, steps: IntArray, n_steps: int) -> int:
-    """List the steep and long steps in a front too; `steep` (S,) are their far ends, in order.
-
-    There are `n_steps` before; returns the number with these.
-    """
+def _step_up(candidates: Candidates, steep: IntArray, walk: _Walk) -> None:
+    """Take the steep and long steps in a front; `steep` (S,) are their far ends, in order."""
     offsets, n_segments = candidates.offsets, len(candidates.offsets) - 1
     starts, segment = np.zeros(n_segments + 1, np.int64), np.empty(len(steep), np.int64)
     k = 0
@@ -216,9 +230,7 @@ def _step_up(candidates: Candidates, steep: IntArray, steps: IntArray, n_steps: 
         width[front[k]] += arc_of(candidates.r[steep[k] - 1], n_segments)
     for k in range(len(steep)):
         if width[front[k]] >= MIN_WIDTH:
-            steps[n_steps, 0], steps[n_steps, 1] = steep[k] - 1, steep[k]
-            n_steps += 1
-    return n_steps
+            _step(walk, steep[k] - 1, steep[k])
 
 
 @jit()
@@ -238,13 +250,8 @@ def _join_front(
 
 
 @jit()
-def _step_aside(
-    candidates: Candidates, allowed: BoolArray, aside: int, steps: IntArray, n_steps: int
-) -> int:
-    """List the steps to the next ones in range of the segment so many further on.
-
-    There are `n_steps` before; returns the number with these.
-    """
+def _step_aside(candidates: Candidates, allowed: BoolArray, aside: int, walk: _Walk) -> None:
+    """Step from each candidate to the next ones in range of the segment so many further on."""
     r, z, offsets = candidates.r, candidates.z, candidates.offsets
     n_segments = len(offsets) - 1
     for m in range(n_segments):
@@ -262,9 +269,7 @@ def _step_aside(
                 if allowed[there] and dr <= gap:
                     distance = math.sqrt(dr * dr + across * across)
                     if can_step(distance, z[there] - z[c], GENTLE):
-                        steps[n_steps, 0], steps[n_steps, 1] = c, there
-                        n_steps += 1
-    return n_steps
+                        _step(walk, c, there)
 
 
 @jit()
@@ -414,11 +419,11 @@ def _fill(land: FloatArray, is_known: BoolArray) -> None:
 @jit()
 def _mean_around(land: FloatArray, is_known: BoolArray, k: int) -> float:
     """Mean of the known heights in the eight squares around one."""
-    number, rows = 0, np.zeros(3)
-    for j in range(3):
-        here = k + j - 1
-        for there in (here - _WIDTH, here, here + _WIDTH):
-            rows[j] += land[there]
-            number += is_known[there]
-    mean: float = (rows[0] + rows[1] + rows[2]) / number
+    number, total = 0, 0.0
+    for here in range(k - 1, k + 2):
+        near, far = here - _WIDTH, here + _WIDTH
+        # Of one side to the other first, as in the plain `three_by_three`.
+        total += (land[near] + land[here]) + land[far]
+        number += is_known[near] + is_known[here] + is_known[far]
+    mean: float = total / number
     return mean
