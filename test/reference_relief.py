@@ -70,7 +70,7 @@ def reached_on_foot(candidates, faces, height, config):
         nearest = {
             segment[c]: min(r[e] for e in entries if segment[e] == segment[c]) for c in entries
         }
-        if sum(2.0 * math.pi / n_segments * r_entry for r_entry in nearest.values()) < 2.0:
+        if sum(2.0 * math.pi / n_segments * r_entry for r_entry in nearest.values()) < 1.5:
             reached -= part
     return reached
 
