@@ -155,7 +155,7 @@ def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
 
 
 def test_lost_objects_follow_their_definitions(monkeypatch):
-    sensor, scene = 'vlp-16-low', 'traffic_jam'
+    sensor, scene = 'vlp-16-low', 'car_park'
     score = variants.score_variants
 
     def refuse_hedges(frames, *rest):

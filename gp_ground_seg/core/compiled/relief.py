@@ -424,6 +424,7 @@ def _mean_around(land: FloatArray, is_known: BoolArray, k: int) -> float:
         near, far = here - _WIDTH, here + _WIDTH
         # Of one side to the other first, as in the plain `three_by_three`.
         total += (land[near] + land[here]) + land[far]
-        number += is_known[near] + is_known[here] + is_known[far]
+        for there in (near, here, far):
+            number += is_known[there]
     mean: float = total / number
     return mean
