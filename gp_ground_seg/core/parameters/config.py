@@ -179,10 +179,10 @@ class GrowthConfig:
         'horizontal range within which low candidates start the inlier set', 'm')
     seed_height_tolerance: float = basic(0.45, (0.01, 5.0),
         'largest height of a seed above or below the expected ground; in proportion to the height '
-        'of a sensor below 1.2 m', 'm')
+        'of a sensor below 1 m', 'm')
     max_std: float = advanced(0.35, (0.001, 10.0),
         'predictive standard deviation above which a candidate is not decided yet; in proportion '
-        'to the height of a sensor below 1.2 m', 'm')
+        'to the height of a sensor below 1 m', 'm')
     max_standardised_residual: float = advanced(3.0, (0.1, 50.0),
         'residual over predictive standard deviation above which a candidate is an outlier')
     max_standardised_depth: float = advanced(5.0, (0.1, 200.0),
@@ -226,11 +226,11 @@ class LabelConfig:
         'returns at one height then vote; tolerance = ground_tolerance alone, above and below')
     ground_tolerance: float = basic(0.1, (0.001, 5.0),
         'height above the surface up to which a return is ground in any case; more = more ground; '
-        'in proportion to the height of a sensor below 1.2 m', 'm', 'zeta_g')
+        'in proportion to the height of a sensor below 1 m', 'm', 'zeta_g')
     obstacle_min_height: float = advanced(0.2, (0.01, 10.0),
         'least height over the ground of an obstacle that matters: on rough ground, a vertical '
         'face that stands so much higher than ground_tolerance is one; in proportion to the '
-        'height of a sensor below 1.2 m', 'm')
+        'height of a sensor below 1 m', 'm')
     obstacle_max_height: float = advanced(1.0, (0.02, 50.0),
         'height above the lowest return of a tile up to which returns belong to a vertical face '
         '(higher ones overhang), and depth below the surface down to which a return is ground',

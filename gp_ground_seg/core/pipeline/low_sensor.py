@@ -12,7 +12,7 @@ import dataclasses
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.pipeline.sensor_pose import SensorPose
 
-REFERENCE_HEIGHT = 1.2
+REFERENCE_HEIGHT = 1.0
 """Height of a sensor over the ground from which parameters are used as they are given [m]."""
 LOWEST = 0.1
 """Height below which the origin of a cloud is no sensor [m]."""
