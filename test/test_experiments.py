@@ -155,7 +155,7 @@ def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
 
 
 def test_lost_objects_follow_their_definitions(monkeypatch):
-    sensor, scene = 'vlp-16-low', 'car_park'
+    sensor, scene = 'vlp-16', 'hidden_climb'
     score = variants.score_variants
 
     def refuse_hedges(frames, *rest):
@@ -170,7 +170,7 @@ def test_lost_objects_follow_their_definitions(monkeypatch):
     made = simulate_scan(SCENES[scene](0), SENSORS[sensor], np.random.default_rng(0))
     x, y, z, _ = made.points.T.astype(float)
     reach, high = np.hypot(x, y), z - made.ground_z >= 0.3
-    method = PatchworkppMethod(0.15)
+    method = PatchworkppMethod(SENSORS[sensor].height)
     method.run(made.points)
     labels = {
         '': GroundSegmenter(FIXED).segment(made.points).label,
