@@ -137,6 +137,15 @@ def test_indoors_the_floor_is_found_and_not_the_ceiling(sensor, height):
 ROOM = room('room', [(-5.0, -5.0), (5.0, -5.0), (5.0, 5.0), (-5.0, 5.0)], ceiling=True)
 
 
+@pytest.mark.parametrize('seed', [0, 1])
+def test_the_little_floor_of_a_small_room_tells_the_height(seed):
+    corners = [(-4.5, -4.5), (4.5, -4.5), (4.5, 4.5), (-4.5, 4.5)]
+    small = room('room', corners, ceiling=True)
+    pose = pose_of(scan_of(small, simulation.SENSORS['mid-360'], 0.45, seed).points)
+    assert pose.height_estimated
+    assert pose.height == pytest.approx(0.45, abs=0.02)
+
+
 def moved(points, lift):
     """Points of a frame whose origin is `lift` lower [m]."""
     return points[:, :3].astype(np.float64) + np.array([0.0, 0.0, lift])

@@ -24,6 +24,9 @@ MIN_CLEARANCE, MIN_SPREAD = 0.05, 0.06
 MIN_DEPTH = 2.5
 """Points on it one behind the other (`GroundPlane.depth`) that do without both: the lowest beam on
 walls, or a scan of one beam, gives one or two, 2.3 in a corridor; ground gives three and more."""
+SHALLOW, SHALLOW_SPREAD = 2.0, 0.03
+"""The same of ground that is seen at angles so far apart [rad], as the floor of a small room: one
+beam on walls is seen at one."""
 MIN_COVERAGE = 0.25
 """Share of the sectors with ground in them from which a scan determines the tilt."""
 MIN_REACH = 5.0
@@ -81,12 +84,13 @@ class View(NamedTuple):
         """Whether it is ground for sure."""
         plane = self.plane
         is_seen_from_above = self.is_below and plane.spread >= MIN_SPREAD
+        is_floor = self.is_below and plane.spread >= SHALLOW_SPREAD and plane.depth >= SHALLOW
         return plane.n_support >= MIN_CELLS and (
             is_seen_from_above
             or (
                 plane.support >= MIN_SUPPORT
                 and plane.coverage >= MIN_COVERAGE
-                and plane.depth >= MIN_DEPTH
+                and (plane.depth >= MIN_DEPTH or is_floor)
             )
         )
 
