@@ -61,9 +61,9 @@ RIDGE = 0.5
 MIN_WEIGHT = 1.5
 """Least weight of a plane, where a square with candidates counts one."""
 RAISED, MIN_ENTRY, MIN_RAISED = 0.3, 1.5, 9
-"""Height over which land is raised [m]; width over which steps must lead up to it [m]: up to cars
-in 200 simulated scans it was less than one; and squares side by side with candidates in them that
-it, or a hollow, must have: more than those of a truck."""
+"""Height over which land is raised [m]; width over which steps must lead up to it [m]: few lead to
+a car; and squares side by side with candidates in them that it, or a hollow, must have: more than
+those of a truck."""
 FADED, FADE_WIDTH = 0.15, 0.3
 """Height of the land up to which the relief is level, and over which it then grows to it [m]."""
 

@@ -18,8 +18,6 @@ from gp_ground_seg.core.pipeline.ground_plane import (
     FARTHEST,
     GroundPlane,
     Plane,
-    distance,
-    lowest_points,
     plane_across,
     supports_in,
 )
@@ -60,8 +58,7 @@ LOW_GROUND = (
 )
 LEAST_DEPRESSION = 0.06
 """Angle below the horizontal at which a sensor sees the nearest tenth of a plane that it is less
-than `LOW` above [rad]. The origin of a vehicle is as low, but its nearest ground is metres
-away: 0.03 in simulated scans, 0.04 in a real one, and 0.1 to 0.27 over table tops."""
+than `LOW` above [rad]. The origin of a vehicle is as low, but sees no ground that near."""
 FEW_CELLS = 45
 """Cells on the plane below which its height is doubtful. Whole scans that show the height have
 more; parts of a scan, up to 60 degrees wide, have fewer, or less than `MIN_COVERAGE` of the
@@ -230,7 +227,7 @@ def estimate_pose(
         measured=measured,
         contradictions=contradictions or _contradictions(scan, sensor, measured, view, level),
         is_height_default=sensor.height == AUTO and not tells_height,
-        doubts=_doubts(scan, sensor, view) if estimates_height else (),
+        doubts=_doubts(sensor, view) if estimates_height else (),
     )
 
 
@@ -251,28 +248,13 @@ def with_fallback(pose: SensorPose, fallback: SensorPose, sensor: SensorConfig) 
     )
 
 
-def _doubts(scan: Scan, sensor: SensorConfig, view: View) -> tuple[str, ...]:
+def _doubts(sensor: SensorConfig, view: View) -> tuple[str, ...]:
     """Say why the height of the plane of `view` may not be that of the ground."""
     plane = view.plane
     is_little = plane.n_support < FEW_CELLS or plane.coverage < MIN_COVERAGE
-    return (LOW_GROUND,) * _is_low(scan, sensor, view) + (LITTLE_GROUND,) * is_little
-
-
-def _is_low(scan: Scan, sensor: SensorConfig, view: View) -> bool:
-    """Whether the sensor is less than `LOW` over the plane of `view`, and sees it from there.
-
-    A sensor that low sees the nearest tenth of the plane at a clear angle. The origin of a
-    vehicle's frame is as low, but the sensor is elsewhere, and its nearest ground farther away.
-    """
-    plane = plane_across(view.up, view.plane.near_height * view.plane.normal[2])
-    origin = _origin(sensor)
-    clearance = float(distance(*origin, plane)) * view.up[2]
-    if not 0.0 < clearance < LOW:
-        return False
-    cells = lowest_points(scan.candidates)
-    is_on = np.abs(distance(cells.x, cells.y, cells.z, plane)) <= cells.tolerance
-    away = np.hypot(cells.x[is_on] - origin[0], cells.y[is_on] - origin[1])
-    return len(away) > 0 and clearance >= LEAST_DEPRESSION * float(np.percentile(away, 10.0))
+    clearance = plane.near_height * plane.normal[2] + _product(view.up, _origin(sensor))
+    is_low = 0.0 < clearance < LOW and plane.depression >= LEAST_DEPRESSION
+    return (LOW_GROUND,) * is_low + (LITTLE_GROUND,) * is_little
 
 
 def _origin(sensor: SensorConfig) -> Direction:
