@@ -169,10 +169,12 @@ class GroundPlane(NamedTuple):
     coverage: float  # share of all sectors around the sensor with such a cell
     far_coverage: float  # share of the sectors with any cell that have such a cell `FAR` away
     reach: float  # range within which nine of ten of these cells are [m]
-    # angle of depression, seen from the sensor, that nine of ten of these do not exceed [rad]
+    # angle at which the sensor sees nine of ten of these below the plane through it that is
+    # parallel to this one, at most [rad]: on a slope not that below the horizon
     depression: float
-    # Difference of it to that which nine of ten exceed [rad]: the lowest beam alone, on walls,
-    # makes a cone that looks like a plane.
+    # Difference of the angles of depression, seen from the sensor, of these cells [rad], a tenth
+    # of them left out at either end: the lowest beam alone, on walls, makes a cone that looks
+    # like a plane.
     spread: float
     residual: float  # root mean square of the distances along z of these cells to it [m]
     n_cells: int  # how many cells there were
@@ -436,7 +438,7 @@ def solve_plane(moments: Moments, plane: Plane) -> Plane:
 def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> NumbersOfPlane:
     """Fields of the `GroundPlane`; the last is 0 if no point lies on it."""
     height, slope_x, slope_y = plane
-    ranges, drops, near = np.empty(n), np.empty(n), np.empty(n)
+    ranges, drops, near, angles = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     n_on_it, n_near, squares, weight, whole = 0, 0, 0.0, 0.0, 0.0
     n_seen = n_covered = n_far = 0
     last_seen = last_covered = last_far = -1
@@ -455,6 +457,7 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
             continue
         away = math.hypot(cells.x[c] - origin[0], cells.y[c] - origin[1])
         ranges[n_on_it], drops[n_on_it] = r, math.atan2(origin[2] - z, away)
+        angles[n_on_it] = math.atan2(distance(origin[0], origin[1], origin[2], plane) - d, away)
         n_on_it += 1
         squares, weight = squares + d * d, weight + cells.weight[c]
         if r < NEAR:
@@ -468,12 +471,11 @@ def described(cells: LowestPoints, n: int, plane: Plane, origin: Direction) -> N
         return height, slope_x, slope_y, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, n, 0
     few, most = n_on_it // 10, (9 * n_on_it) // 10
     lift = ranked(near[:n_near], n_near // 2) if n_near >= ENOUGH_NEAR else 0.0
-    depression = ranked(drops[:n_on_it], most)
-    spread = depression - ranked(drops[:n_on_it], few)
+    spread = ranked(drops[:n_on_it], most) - ranked(drops[:n_on_it], few)
     return (
         height, slope_x, slope_y, height - lift, n_on_it / n, weight / whole,
-        n_covered / N_SECTORS, n_far / n_seen, ranked(ranges[:n_on_it], most), depression,
-        spread, math.sqrt(squares / n_on_it), n, n_on_it,
+        n_covered / N_SECTORS, n_far / n_seen, ranked(ranges[:n_on_it], most),
+        ranked(angles[:n_on_it], most), spread, math.sqrt(squares / n_on_it), n, n_on_it,
     )  # fmt: skip
 
 
