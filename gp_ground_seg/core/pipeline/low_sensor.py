@@ -19,8 +19,8 @@ LOWEST = 0.1
 LEAST_TOLERANCE = 0.04
 """Least tolerance of ground that a low sensor leads to [m]: twice the noise of its ranges."""
 MIN_DEPRESSION = 0.105
-"""Angle below the horizon at which a low sensor sees the nearest ground, at least [rad]. From the
-origin of a vehicle, at its axles, a sensor on the roof seems to see it at less."""
+"""Angle to the plane of the ground at which a low sensor sees the nearest of it, at least [rad].
+From the origin of a vehicle, at its axles, a sensor on the roof seems to see it at less."""
 
 
 def for_sensor(config: Config, pose: SensorPose, sensor: SensorConfig) -> Config:
