@@ -218,8 +218,6 @@ def test_more_frames_than_wanted_are_thinned_in_runs(tmp_path):
         (('DATA', '--from', 'x.json'), 'either DATA'),
         (('nowhere',), 'no such file'),
         (('DATA', '--topic', '/points'), 'is for bags'),
-        (('DATA', '--threads', '2'), 'bench --threads was removed: leave it out'),
-        (('DATA', '--threads=2'), 'bench --threads was removed: leave it out'),
         (('DATA', '--set', 'grid.n_segments=0'), 'grid.n_segments'),
         (('--from', 'nowhere.json'), 'nowhere.json'),
         (('--from', 'OTHER'), 'not a record'),

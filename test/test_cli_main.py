@@ -15,6 +15,7 @@ from cli_runner import error_line
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.cli.experiment import EXPERIMENTS
 from gp_ground_seg.cli.options import library_notes
+from gp_ground_seg.core.parameters.removed import PROGRAM, REMOVED
 
 HEAVY = {'numba', 'scipy', 'matplotlib', 'rosbags', 'rclpy'}
 
@@ -64,12 +65,15 @@ def test_words_that_a_command_does_not_take(line, hint, capsys):
     assert said.startswith(f'{words[0]}: unrecognized arguments: ') and said.endswith(f'; {hint}')
 
 
-@pytest.mark.parametrize('name', sorted(cli.REMOVED.keys() - cli.COMMANDS.keys()))
-def test_a_removed_command_names_what_has_taken_its_place(name, capsys):
-    assert cli.main([name, 'a.bin', '--json', 'a.json']) == 2
-    line = error_line(capsys)
-    assert line == f'{name}: was removed; {cli.REMOVED[name]}'
-    for command in re.findall(r'gp-ground-seg ([\w-]+)', line):
+@pytest.mark.parametrize('name', [name for name in REMOVED if name.startswith(PROGRAM)])
+def test_a_removed_command_or_option_says_what_to_use_instead(name, capsys):
+    first, *words = name.split()[1:]
+    is_option = bool(words) and words[-1].startswith('-')
+    for given in ([*words, 'a.bin'], [*words[:-1], f'{words[-1]}=3'] if is_option else words):
+        assert cli.main([first, *given]) == 2
+        line = error_line(capsys)
+        assert line == f'{name} was removed: {REMOVED[name]}'
+    for command in re.findall(r'gp-ground-seg ([\w-]+)', REMOVED[name]):
         assert command in cli.COMMANDS
 
 

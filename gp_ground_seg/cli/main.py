@@ -19,7 +19,7 @@ from typing import NoReturn
 
 from gp_ground_seg import __version__
 from gp_ground_seg.core.errors import GroundSegError, in_one_line, reason_of, shown
-from gp_ground_seg.core.parameters.removed import removal
+from gp_ground_seg.core.parameters.removed import removal_of_words
 
 ROS_ARGS = '--ros-args'
 OF_ROS = ('-r', '--remap', '-p', '--param', '--params-file', '--log-level')
@@ -48,13 +48,6 @@ COMMANDS = {
 }
 GROUPS = {'robot': 'node', 'files': 'segment', 'laboratory': 'evaluate'}
 """Groups of commands in the help, each with its first command."""
-REMOVED = {
-    'pose': '`gp-ground-seg segment INPUT` prints height and tilt of the sensor',
-    'compare': 'use `gp-ground-seg evaluate ROOT --against FILE_OR_PRESET`',
-    'view': 'use `gp-ground-seg tune INPUT`, or Foxglove on what `gp-ground-seg segment` writes',
-    'optimise': 'use `gp-ground-seg tune`, and `gp-ground-seg evaluate ROOT --against FILE`',
-}
-"""Commands of earlier releases, and what has taken their place."""
 
 EXAMPLES = """\
 examples:
@@ -119,8 +112,8 @@ def _parse(words: list[str]) -> argparse.Namespace:
     """Parse the words before ``--ros-args``; it and what follows is ROS's to read."""
     n_before = words.index(ROS_ARGS) if ROS_ARGS in words else len(words)
     command = next((word for word in words[:n_before] if not word.startswith('-')), None)
-    if command in REMOVED:
-        raise GroundSegError(f'{command}: was removed; {REMOVED[command]}')
+    if removed := removal_of_words(words[:n_before]):
+        raise GroundSegError(removed)
     if command not in (None, *COMMANDS):
         close = get_close_matches(command or '', COMMANDS, 1)
         hint = f'did you mean {close[0]}?' if close else '--help lists them'
@@ -129,8 +122,6 @@ def _parse(words: list[str]) -> argparse.Namespace:
     arguments, unknown = parser.parse_known_args(words[:n_before])
     accepts_ros_args = getattr(arguments, 'accepts_ros_args', False)
     if unknown:
-        if line := removal(f'{command} {unknown[0].partition("=")[0]}'):
-            raise GroundSegError(line)
         hint = f'gp-ground-seg {command} --help lists what it takes'
         if accepts_ros_args and unknown[0] in OF_ROS:
             hint = f'put {ROS_ARGS} before {unknown[0]}'

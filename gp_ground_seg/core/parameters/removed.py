@@ -1,4 +1,4 @@
-"""Parameters, their values, and options of earlier releases, and what to use instead.
+"""Parameters, commands, options and topics of earlier releases, and what to use instead.
 
 Files, commands and the library refuse them with the sentence here. A node leaves them out and
 warns, for one release. A new line is all that another one needs.
@@ -6,6 +6,9 @@ warns, for one release. A new line is all that another one needs.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+PROGRAM = 'gp-ground-seg'
 REMOVED: dict[str, str] = {
     'learning.mode=every_k': 'use every_frame, or fixed, which takes less time',
     'learning.mode=first_frame': 'use every_frame, or fixed with your values in observation',
@@ -14,10 +17,15 @@ REMOVED: dict[str, str] = {
     'learning.warm_start': 'leave it out: learning starts from the lines of each frame',
     'learning.max_time': 'use learning.max_evaluations',
     'runtime.n_threads': 'leave it out: a scan takes one thread; --workers takes several scans',
-    'bench --threads': 'leave it out: a scan takes one thread',
+    f'{PROGRAM} bench --threads': 'leave it out: a scan takes one thread',
+    f'{PROGRAM} pose': f'use {PROGRAM} segment INPUT, which prints height and tilt',
+    f'{PROGRAM} compare': f'use {PROGRAM} evaluate ROOT --against FILE_OR_PRESET',
+    f'{PROGRAM} view': f'use {PROGRAM} tune INPUT, or Foxglove on what segment writes',
+    f'{PROGRAM} optimise': f'use {PROGRAM} tune, and {PROGRAM} evaluate ROOT --against FILE',
 }
-"""What to use instead, by ``NAME``, by ``NAME=VALUE`` where only a value is removed, or by the
-option of a command."""
+"""What to use instead, by the ``NAME`` of a parameter, by ``NAME=VALUE`` where only a value is
+removed, or by the first words of a command line: those of a command, of one below it, or of either
+and an option."""
 
 
 def removal(name: str, value: object = None) -> str:
@@ -26,3 +34,11 @@ def removal(name: str, value: object = None) -> str:
         if key in REMOVED:
             return f'{key} was removed: {REMOVED[key]}'
     return ''
+
+
+def removal_of_words(words: Sequence[str]) -> str:
+    """Say what to use instead of a command or option in a command line; empty if all are there."""
+    options = (word.partition('=')[0] for word in words if word.startswith('-'))
+    starts = [' '.join((PROGRAM, *words[:n])) for n in (1, 2)]
+    names = starts + [f'{start} {option}' for option in options for start in starts]
+    return next((line for name in names if (line := removal(name))), '')
