@@ -11,12 +11,12 @@ from conftest import REPOSITORY
 from evaluation_samples import write_frame, write_streets
 
 from gp_ground_seg import Config, GroundSegmenter
-from gp_ground_seg.cli.experiment import EXPERIMENTS, FIVE
+from gp_ground_seg.cli.experiment import EXPERIMENTS, THREE
 from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_labels, read_points
-from gp_ground_seg.lab.experiments import ablation, sensor_pose
+from gp_ground_seg.lab.experiments import ablation
 from gp_ground_seg.lab.experiments import table1 as paper_table
 from gp_ground_seg.lab.experiments.table1 import CHOICES, VARIANCES, table1
 from gp_ground_seg.lab.scoring import evaluate as runner
@@ -43,7 +43,6 @@ def few_places(monkeypatch):
     for name in ('ablation', 'scenes'):
         fewer = EXPERIMENTS[name]._replace(places=(12.0 * (name == 'ablation'),))
         monkeypatch.setitem(EXPERIMENTS, name, fewer)
-    monkeypatch.setattr(sensor_pose, 'TURNS', sensor_pose.TURNS[:2])
     monkeypatch.setattr(ablation, 'DEPARTURES', {'near': {'grid.r_max': 15.0}})
     some = {'a wider gate': {'growth.max_standardised_residual': 4.0}}
     monkeypatch.setattr(ablation, 'ALTERNATIVES', some)
@@ -57,12 +56,7 @@ CASES = {
     'ablation --simulated': (['--seeds', '1', *SMALL], 'models', 7),
     'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
     'pseudo-inputs': (['ROOT', '--frame-step', '3', *SMALL], 'pseudo_inputs', 7 * 2),
-    'wrong-values': (['ROOT', '--frame-step', '3', *SMALL], 'values', 26 * 2),
     'departures': (['ROOT', *SMALL], 'departures', 3 * 4),
-    'coverage': (['ROOT', *SMALL], 'sequence', 4),
-    'coverage --simulated': (
-        ['--sensors', 'vlp-16,mid-360', '--scenes', 'kerb', '--seeds', '1'], 'sensor', 2,
-    ),
     'scenes': (
         ['--sensors', 'vlp-16,os1-128', '--scenes', 'flat,slope', '--seeds', '1'],
         'scenes', 2 * 4,
@@ -75,9 +69,6 @@ CASES = {
     'scenes --no-peer': (['--sensors', 'vlp-16', '--scenes', 'kerb', '--seeds', '1'], 'scenes', 1),
     'objects': (
         ['--sensors', 'vlp-16', '--scenes', 'hidden_climb,hedge', '--seeds', '1'], 'vehicles', 4,
-    ),
-    'sensor-pose': (
-        ['ROOT', '--sequences', '08', '--set', 'learning.mode=fixed'], 'poses', 2 * 3,
     ),
     'table1': (['ROOT'], 'errors', 3),
     'table1 --preset': (['paper', 'ROOT', '--set', 'learning.max_evaluations=4'], 'errors', 3),
@@ -112,8 +103,7 @@ def test_record_terminal_and_markdown_say_the_same(case, root, tmp_path, capsys)
     [
         (['scenes', '--sensors', 'mid-360,hdl-64e'], ['mid-360', 'hdl-64e'],
          {*DRIVES, *LOW, *STEEP}, 3),
-        (['coverage', '--simulated', '--seeds', '3', '--scenes', 'flat,kerb'],
-         FIVE, ['flat', 'kerb'], 3),
+        (['scenes', '--seeds', '2', '--scenes', 'flat,kerb'], THREE, ['flat', 'kerb'], 2),
     ],
 )  # fmt: skip
 def test_scans_and_parameters_are_those_of_the_options(
@@ -146,15 +136,11 @@ def test_scans_and_parameters_are_those_of_the_options(
         (['ablation', '--simulated', '--frame-step', '2'], '--frame-step: is for labelled frames'),
         (['ablation', 'ROOT', '--sequences', '07'], 'no sequence 07; sequences here: 00, 08'),
         (['ablation', 'ROOT', '--set', 'learning.mode=fixed'], 'leave it out'),
-        (['wrong-values', 'ROOT', '--set', 'observation.sigma_n=0.1'], 'leave it out'),
         (['steps', 'ROOT', '--set', 'grid.n_bins=40'], 'give no parameters'),
         (['steps', 'ROOT', '--preset', 'paper'], 'give no parameters'),
         (['ablation', '--simulated', '--set', 'length_scale.model=latent2'], 'length_scale.model'),
-        (['coverage', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
-        (['coverage', 'ROOT', '--sensors', 'vlp-16'], '--sensors: is for --simulated only'),
-        (['coverage'], 'coverage: give either ROOT or --simulated'),
-        (['sensor-pose', 'ROOT', '--set', 'sensor.height=1.0'], 'sensor.height = 1.0: the exp'),
-        (['sensor-pose', 'ROOT', '--set', 'sensor.roll=1.0'], 'sensor.roll = 1.0: the exp'),
+        (['ablation', 'ROOT', '--scenes', 'flat'], '--scenes: is for --simulated only'),
+        (['ablation', 'ROOT', '--sensors', 'vlp-16'], '--sensors: is for --simulated only'),
         (['scenes', '--preset', 'papr'], 'did you mean paper?'),
         *(([name, '--json', 'MINE', *(['ROOT'] if name not in ('scenes', 'objects') else [])],
            '--force') for name in EXPERIMENTS),
@@ -194,7 +180,7 @@ def test_usage_errors(words, message, capsys):
 def test_commands_of_the_docs_are_accepted():
     """Those above the tables of the docs, and those in their text."""
     names = set()
-    for page in ('experiments', 'accuracy', 'algorithm', 'pose'):
+    for page in ('experiments', 'accuracy', 'algorithm'):
         text = (REPOSITORY / 'docs' / f'{page}.md').read_text(encoding='utf-8')
         for words in re.findall(
             r'`gp-ground-seg ((?:experiment|evaluate|plot|pose) [^`]*?)`', text
@@ -310,14 +296,3 @@ def test_default_segments_of_real_frames(kitti, monkeypatch):
         for name in ('Z-L', 'Z'):
             assert 0.0 < row[f'held out {name}'] < 0.5
             assert 0.0 < row[f'in sample {name}'] < 0.5
-
-
-def test_the_trade_off_is_drawn(root, tmp_path, capsys):
-    path = tmp_path / 'a.png'
-    words = 'experiment', 'pseudo-inputs', root, '--frame-step', '3', *SMALL, '--plot', path
-    assert run(*words) == 0
-    assert f'written to {path}' in capsys.readouterr().out
-    before = path.read_bytes()
-    assert run(*words) == 2
-    assert '--force' in error_line(capsys)
-    assert path.read_bytes() == before

@@ -1,31 +1,22 @@
-"""Variants over frames: the lists, the sums, the search; simulated scenes and sensor poses."""
+"""Variants over frames: the lists, the sums, the search; simulated scenes."""
 
-import dataclasses
 import itertools
 
 import numpy as np
 import pytest
-from evaluation_samples import write_frame, write_streets
+from evaluation_samples import write_streets
 
 from gp_ground_seg import Config, GroundSegmenter, Label
 from gp_ground_seg.core.errors import ConfigError, PointCloudError
 from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
-from gp_ground_seg.lab import simulation
-from gp_ground_seg.lab.experiments import (
-    ablation,
-    coverage,
-    interpolation,
-    scenes,
-    sensor_pose,
-    variants,
-)
+from gp_ground_seg.lab.experiments import ablation, interpolation, scenes, variants
 from gp_ground_seg.lab.experiments.ablation import MODELS
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring.evaluate import MethodScore, ScanScore
 from gp_ground_seg.lab.scoring.metrics import Confusion, count_confusion, height_error
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
-from gp_ground_seg.lab.simulation import HDL_64E, SCENES, SENSORS, Kind, simulate_scan
+from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
 FAR, NEAR = Config(), {'grid.r_max': 15.0}
@@ -126,26 +117,6 @@ def test_a_switch_that_changes_nothing_is_refused(monkeypatch):
     monkeypatch.setattr(ablation, 'DEPARTURES', {'far grid': NEAR})
     with pytest.raises(ConfigError, match="'far grid': its switch changes nothing"):
         ablation.compare_departures([], Config().replace(**NEAR))
-
-
-def test_coverage_of_labelled_frames_is_that_of_their_returns(frames):
-    report = coverage.score_coverage(frames, FIXED)
-    errors, ratios, p = [], [], []
-    for frame in frames:
-        scan = runner.load_kitti(frame)
-        found = GroundSegmenter(FIXED).segment(scan.points)
-        own = scan.is_ground & np.isfinite(found.height)
-        errors.append(-found.height[own])
-        ratios.append(np.abs(found.height[own]) / found.return_std[own])
-        p.append(runner.metrics.count_calibration(found.p_ground, scan.truths['groundgrid']))
-    row = report.tables['sequence'].json()[-1]
-    assert row['sequence'] == 'all'
-    assert row['points'] == sum(map(len, errors))
-    assert row['within_1'] == pytest.approx(np.mean(np.concatenate(ratios) <= 1.0), abs=1e-3)
-    assert row['bias'] == pytest.approx(np.mean(np.concatenate(errors)), abs=1e-6)
-    assert row['ece'] == pytest.approx(sum(p[1:], p[0]).ece)
-    assert [one['range'] for one in report.tables['range'].json()][:2] == ['0-10 m', '10-20 m']
-    assert sum(one['n_points_all'] for one in report.rows) == row['points']
 
 
 def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():
@@ -291,33 +262,6 @@ def test_scenes_by_hand_and_behind_is_said():
     assert found == pytest.approx([*(np.sqrt(11 / 3) * np.array([0.1, 0.2])), 0.1, 0.2])
     row = scenes.lost_table(scores).json()[0]
     assert [row[name] for name in ('vehicles', 'lost_vehicles', 'peer_lost_persons')] == [0, 0, 0]
-
-
-@pytest.fixture(scope='module')
-def streets(tmp_path_factory):
-    """A frame of a simulated street, from KITTI's height."""
-    root = tmp_path_factory.mktemp('streets')
-    small = dataclasses.replace(HDL_64E, n_columns=500)
-    scan = simulate_scan(SCENES['kerb'](0), small, np.random.default_rng(0))
-    write_frame(root, '00', 0, scan.points, simulation.semantic_kitti_labels(scan.kind))
-    return labelled_frames(root)
-
-
-def test_frames_turned(streets, monkeypatch):
-    monkeypatch.setattr(sensor_pose, 'TURNS', ((0, 0), (0, 3), (3, -3)))
-    report = sensor_pose.score_poses(streets, FIXED)
-    level, pitched, turned, pooled = report.tables['poses'].json()
-    assert level['told'] == level['level'] > 0.9
-    assert (level['scans'], level['levelled'], level['silent']) == (1, 0, 0)
-    for row in (level, pitched, turned):
-        assert row['told'] == pytest.approx(level['told'], abs=1e-3)
-        assert row['auto'] > level['told'] - 0.01
-        assert row['worst'] == pytest.approx(row['change'])  # of one sequence
-        assert max(abs(row['low']), abs(row['high'])) < 0.1
-    assert (turned['turn'], turned['levelled']) == ('roll +3° pitch -3°', 1)
-    assert (pooled['turn'], pooled['scans'], pooled['levelled']) == ('all', 3, 2)
-    assert [row['method'] for row in report.rows][:3] == ['given none', 'level none', 'auto none']
-    assert len(report.rows) == 3 * 3
 
 
 @pytest.mark.slow

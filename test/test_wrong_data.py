@@ -116,8 +116,6 @@ COMMANDS = {
     'evaluate': 'evaluate ROOT --json OUT.json',
     'ablation': 'experiment ablation ROOT --json OUT.json',
     'departures': 'experiment departures ROOT --json OUT.json',
-    'sensor-pose': 'experiment sensor-pose ROOT --json OUT.json',
-    'coverage': 'experiment coverage ROOT --json OUT.json',
     'demo': 'demo --kitti ROOT --output OUT',
 }
 

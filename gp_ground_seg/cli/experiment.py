@@ -9,12 +9,9 @@ from typing import Any, NamedTuple
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.cli.evaluate import OF_FRAMES, ROOT, frames_from_options
-from gp_ground_seg.cli.plot import ENDINGS, picture_path
-from gp_ground_seg.core.errors import DataError, shown
+from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.lab.experiments import ablation
-from gp_ground_seg.lab.experiments.coverage import score_coverage
 from gp_ground_seg.lab.experiments.scenes import CROWDED, score_objects, score_scenes
-from gp_ground_seg.lab.experiments.sensor_pose import score_poses
 from gp_ground_seg.lab.experiments.table1 import table1
 from gp_ground_seg.lab.experiments.variants import simulated_frames
 from gp_ground_seg.lab.scoring.report import Report, describe_environment, machine_line, written
@@ -23,14 +20,12 @@ from gp_ground_seg.lab.simulation import DRIVES, LOW, SCENES, SENSORS, STEEP
 Option = tuple[str, str, dict[str, Any]]
 
 THREE = ('hdl-64e', 'vlp-16', 'os1-128')
-FIVE = ('hdl-64e', 'hdl-32e', 'vlp-16', 'os1-128', 'mid-360')
 EXAMPLES = """\
   gp-ground-seg experiment ablation KITTI_ROOT
   gp-ground-seg experiment scenes --sensors vlp-16 --scenes kerb
   gp-ground-seg experiment NAME --help          describes one of them
 """
 SIMULATED = ('--simulated', 'simulated scans instead of ROOT', options.FLAG)
-PLOT = ('--plot', f'draw it ({ENDINGS})', {'metavar': 'FILE'})
 NO_PEER = (
     '--no-peer',
     'leave Patchwork++ out, which needs pip install pypatchworkpp',
@@ -58,20 +53,14 @@ class Experiment(NamedTuple):
         return 'with_peer' in inspect.signature(self.run).parameters
 
     @property
-    def has_plot(self) -> bool:
-        """Whether it draws a picture."""
-        return 'plot' in inspect.signature(self.run).parameters
-
-    @property
     def options(self) -> list[Option]:
-        """Options of its scans, ``--no-peer`` and ``--plot``."""
+        """Options of its scans, and ``--no-peer``."""
         found: list[Option] = []
         if self.labelled:
             optional = (*ROOT[:2], {**ROOT[2], 'nargs': '?'})
             found += [optional, SIMULATED] if self.sensors else [ROOT]
             found += OF_FRAMES
-        more = [NO_PEER] * self.has_peer + [PLOT] * self.has_plot
-        return [*found, *self.simulated_options, *more]
+        return [*found, *self.simulated_options, *[NO_PEER] * self.has_peer]
 
     @property
     def simulated_options(self) -> list[Option]:
@@ -91,15 +80,12 @@ EXPERIMENTS = {
         ablation.compare_models, ['hdl-64e'], [ablation.SCENE], 10, ablation.PLACES
     ),
     'departures': Experiment(ablation.compare_departures),
-    'coverage': Experiment(score_coverage, FIVE, n_seeds=2),
     'steps': Experiment(ablation.compare_steps),
     'pseudo-inputs': Experiment(ablation.compare_pseudo_inputs, is_timed=True),
-    'wrong-values': Experiment(ablation.compare_wrong_values),
     'scenes': Experiment(
         score_scenes, THREE, (*DRIVES, *LOW, *STEEP), 3, places=(0.0, 6.0), labelled=False
     ),
     'objects': Experiment(score_objects, [*SENSORS], CROWDED, n_seeds=2, labelled=False),
-    'sensor-pose': Experiment(score_poses),
     'table1': Experiment(table1, is_timed=True),
 }
 """Experiments by name. A new one is a row here and its function."""
@@ -138,8 +124,6 @@ def run(arguments: argparse.Namespace) -> int:
     config = options.read_config(arguments)
     more: dict[str, Any] = {'with_peer': not arguments.no_peer} if experiment.has_peer else {}
     packages = ['pypatchworkpp'] if any(more.values()) else []
-    if experiment.has_plot and arguments.plot is not None:
-        more['plot'] = picture_path(arguments.plot, force=arguments.force)
     with options.staged_options(arguments, 'json') as parts:
         with options.runner(arguments, arguments.experiment) as runner:
             report = experiment.run(_scans(arguments, experiment), config, runner, **more)
@@ -152,8 +136,6 @@ def run(arguments: argparse.Namespace) -> int:
             report.write(parts['json'], environment)
     lines = [machine_line(environment, report.fit)]
     print(written(report.tables.values(), lines, markdown=arguments.markdown))
-    if 'plot' in more:
-        print(f'time and error of the table, written to {shown(more["plot"])}')
     return 0
 
 

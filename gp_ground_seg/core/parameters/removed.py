@@ -18,6 +18,16 @@ REMOVED: dict[str, str] = {
     'learning.max_time': 'use learning.max_evaluations',
     'runtime.n_threads': 'leave it out: a scan takes one thread; --workers takes several scans',
     f'{PROGRAM} bench --threads': 'leave it out: a scan takes one thread',
+    f'{PROGRAM} experiment wrong-values': (
+        f'use {PROGRAM} evaluate ROOT --set NAME=VALUE --against default'
+    ),
+    f'{PROGRAM} experiment sensor-pose': (
+        f'use {PROGRAM} evaluate ROOT --set sensor.height=VALUE --against default'
+    ),
+    f'{PROGRAM} experiment coverage': (
+        f'use {PROGRAM} evaluate ROOT --json FILE, which has within_1 and within_2 of each frame'
+    ),
+    f'{PROGRAM} experiment pseudo-inputs --plot': 'use the table, or --json FILE',
     f'{PROGRAM} pose': f'use {PROGRAM} segment INPUT, which prints height and tilt',
     f'{PROGRAM} compare': f'use {PROGRAM} evaluate ROOT --against FILE_OR_PRESET',
     f'{PROGRAM} view': f'use {PROGRAM} tune INPUT, or Foxglove on what segment writes',

@@ -1,10 +1,9 @@
-"""Variants of the method on the same scans: models, departures, steps, wrong values."""
+"""Variants of the method on the same scans: models, departures, steps, pseudo-inputs."""
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from gp_ground_seg.core.errors import ConfigError
@@ -12,7 +11,6 @@ from gp_ground_seg.core.parameters.config import Config, find_spec
 from gp_ground_seg.core.parameters.presets import find_preset
 from gp_ground_seg.lab.experiments.interpolation import interpolation_method
 from gp_ground_seg.lab.experiments.variants import Changes, refuse_changed, score_variants
-from gp_ground_seg.lab.plotting.segment import plot_trade_off
 from gp_ground_seg.lab.scale.cluster import HERE, Runner
 from gp_ground_seg.lab.scoring.comparison import INTERVAL, interval_note, interval_text, mse_sums
 from gp_ground_seg.lab.scoring.evaluate import Method, MethodScore
@@ -92,13 +90,6 @@ STEPS = {
 
 CANDIDATES_PER_PSEUDO_INPUT = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
 """Candidates of a line for each pseudo-input; with the last, most lines have one."""
-FACTORS = (0.1, 1 / 3, 3.0, 10.0)
-GIVEN = {
-    'sigma_f': ('observation.sigma_f',),
-    'sigma_n': ('observation.sigma_n',),
-    'both': ('observation.sigma_f', 'observation.sigma_n'),
-}
-"""Hyper-parameters that are given wrong by these factors."""
 
 
 def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
@@ -224,9 +215,7 @@ def compare_steps(
     return make_report({'steps': Table(rows, title)}, scores, config)
 
 
-def compare_pseudo_inputs(
-    items: Sequence[Any], config: Config, runner: Runner = HERE, plot: Path | None = None
-) -> Report:
+def compare_pseudo_inputs(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
     """Sweep the number of pseudo-inputs: time against precision, the trade-off of Table I.
 
     All length-scales are learned.
@@ -262,42 +251,7 @@ def compare_pseudo_inputs(
         'segment, mean; medians of evaluations and times [ms]; RMSE of the height under labelled '
         f'ground, interval of it minus that of the first row; {interval_note(most)}'
     )
-    table = Table(rows, title)
-    if plot is not None:
-        plot_trade_off(table.json(), plot)
-    return make_report({'pseudo_inputs': table}, scores, config)
-
-
-def compare_wrong_values(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
-    """Give hyper-parameters that are wrong by factors of 3 and 10, with and without learning."""
-    refuse_changed(config, [*GIVEN['both'], 'learning.mode'])
-    wrong = {
-        f'{title} times {factor:.2g}': {name: factor * float(config[name]) for name in names}
-        for title, names in GIVEN.items()
-        for factor in FACTORS
-    }
-    variants = {}
-    for title, changes in {'the defaults': {}, **wrong}.items():
-        variants[title] = config.replace(**changes)
-        variants[f'{title}, fixed'] = config.replace(**changes, **_FIXED)
-    scores = score_variants(items, variants, runner=runner)
-    rows: list[Row] = [
-        [
-            (Column('given'), learned.name),
-            (percent('as given', 'iou_fixed'), fixed.iou),
-            (percent('learned', 'iou'), learned.iou),
-            (percent('difference', form='+.2f'), learned.iou - fixed.iou),
-            (INTERVAL, interval_text(learned, fixed)),
-            (centimetres('RMSE as given', 'rmse_fixed'), fixed.height.rmse),
-            (centimetres('learned', 'rmse'), learned.height.rmse),
-        ]
-        for learned, fixed in zip(scores[::2], scores[1::2], strict=True)
-    ]
-    title = (
-        f'{_counted(scores[0])}; IoU [%] with hyper-parameters given wrong, as they are and '
-        f'learned from there; {interval_note(scores[0])}; RMSE of the height [cm]'
-    )
-    return make_report({'values': Table(rows, title)}, scores, config)
+    return make_report({'pseudo_inputs': Table(rows, title)}, scores, config)
 
 
 def _worst(score: MethodScore) -> Row:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -122,12 +122,11 @@ def score_variants(
     variants: Mapping[str, Config],
     peers: Sequence[Method] = (),
     *,
-    load: Callable[[Any], KnownScan] = load_scan,
     runner: Runner = HERE,
 ) -> list[MethodScore]:
     """Run variants, then `peers`, once on every scan, alternately, each scan without a past."""
     ours = [OurMethod(config, name) for name, config in variants.items()]
-    return score_methods(items, [*ours, *peers], load, each_alone=True, runner=runner)
+    return score_methods(items, [*ours, *peers], load_scan, each_alone=True, runner=runner)
 
 
 def score_simulated(

@@ -1,9 +1,9 @@
-"""The paper's figures: segments from the side (Figure 1), and the trade-off of Table I."""
+"""The paper's Figure 1: segments from the side."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -235,20 +235,3 @@ def line_ends(r: FloatArray, z: FloatArray, slope: float) -> tuple[FloatArray, F
     along = (r - r.mean()) * math.cos(angle) + (z - z.mean()) * math.sin(angle)
     ends = np.array([along.min(), along.max()])
     return r.mean() + ends * math.cos(angle), z.mean() + ends * math.sin(angle)
-
-
-def plot_trade_off(rows: Sequence[Mapping[str, Any]], path: str | Path) -> None:
-    """Draw time and RMSE over the number of pseudo-inputs, by the rows of the sweep."""
-    figure = new_figure(7.0, 4.4, DPI)
-    axes, number = figure.subplots(), [row['n_pseudo_inputs'] for row in rows]
-    figure.subplots_adjust(0.12, 0.13, 0.88, 0.95)
-    sides = (
-        (axes, LINE_COLOUR, 'o-', 1e3, 'seconds', 'time per frame [ms]'),
-        (axes.twinx(), SURFACE_COLOUR, 's-', 100.0, 'rmse', 'RMSE of the height [cm]'),
-    )
-    for side, colour, form, scale, key, title in sides:
-        side.plot(number, [scale * row[key] for row in rows], form, color=colour)
-        side.set_ylabel(title, color=colour)
-    axes.set_xlabel('pseudo-inputs per segment')
-    axes.grid(color='#E9ECEE', linewidth=0.7)
-    save(figure, path)
