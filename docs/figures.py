@@ -3,7 +3,7 @@
 A figure of a page stands between two comments. The first holds the command, and below it what
 else there is to say; what stands between the two is written here:
 
-    <!-- figure: experiment departures KITTI_ROOT
+    <!-- figure: experiment steps KITTI_ROOT
     sample: --sequences 03 --frame-step 10
     -->
     <!-- end of figure -->

@@ -16,7 +16,6 @@ from gp_ground_seg.cli.main import build_parser
 from gp_ground_seg.cli.options import read_config
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.data.semantic_kitti import labelled_frames, read_labels, read_points
-from gp_ground_seg.lab.experiments import ablation
 from gp_ground_seg.lab.experiments import table1 as paper_table
 from gp_ground_seg.lab.experiments.table1 import CHOICES, VARIANCES, table1
 from gp_ground_seg.lab.scoring import evaluate as runner
@@ -43,9 +42,6 @@ def few_places(monkeypatch):
     for name in ('ablation', 'scenes'):
         fewer = EXPERIMENTS[name]._replace(places=(12.0 * (name == 'ablation'),))
         monkeypatch.setitem(EXPERIMENTS, name, fewer)
-    monkeypatch.setattr(ablation, 'DEPARTURES', {'near': {'grid.r_max': 15.0}})
-    some = {'a wider gate': {'growth.max_standardised_residual': 4.0}}
-    monkeypatch.setattr(ablation, 'ALTERNATIVES', some)
     chosen = {('00', '000000'): (3, 4), ('00', '000001'): (5,)}
     monkeypatch.setattr(paper_table, 'CHOICES', chosen)
     monkeypatch.setattr(paper_table, 'N_REPEATS', 1)
@@ -56,7 +52,6 @@ CASES = {
     'ablation --simulated': (['--seeds', '1', *SMALL], 'models', 7),
     'steps': (['ROOT', '--frame-step', '3'], 'steps', 9 * 2),
     'pseudo-inputs': (['ROOT', '--frame-step', '3', *SMALL], 'pseudo_inputs', 7 * 2),
-    'departures': (['ROOT', *SMALL], 'departures', 3 * 4),
     'scenes': (
         ['--sensors', 'vlp-16,os1-128', '--scenes', 'flat,slope', '--seeds', '1'],
         'scenes', 2 * 4,

@@ -196,13 +196,14 @@ def share_changed(seed):
 
 
 def test_two_sets_of_parameters_are_compared(root, strict, tmp_path, capsys):
-    words = ['evaluate', root, '--config', strict]
+    settings = 'label.rule=tolerance', 'label.ground_tolerance=0.01'
+    words = ['evaluate', root, *(word for one in settings for word in ('--set', one))]
     assert run(*words, '--against', 'default', '--json', tmp_path / 'a.json') == 0
     said = capsys.readouterr().out
     assert 'default -> given:\n' in said
     assert 'label.ground_tolerance: 0.1 -> 0.01 m\n' in said
     document = json.loads((tmp_path / 'a.json').read_text())
-    assert run(*words, '--json', tmp_path / 'b.json') == 0
+    assert run('evaluate', root, '--config', strict, '--json', tmp_path / 'b.json') == 0
     alone = json.loads((tmp_path / 'b.json').read_text())['groundgrid'][-1]
     measures = {row['measure']: row for row in document['measures']}
     iou = measures['IoU [%]']

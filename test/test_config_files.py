@@ -149,6 +149,7 @@ def test_the_paper_preset_has_none_of_our_departures():
     assert len(switches) >= 7
     paper = PRESETS['paper'].config
     for name, value in switches:
+        assert str(Config()[name]).lower() not in (value, f'{value}.0'), f'{name} by default'
         assert str(paper[name]).lower() in (value, f'{value}.0'), f'{name} of the preset paper'
     growth = paper.growth
     assert paper.label.rule == 'tolerance'

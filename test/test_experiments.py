@@ -7,7 +7,7 @@ import pytest
 from evaluation_samples import write_streets
 
 from gp_ground_seg import Config, GroundSegmenter, Label
-from gp_ground_seg.core.errors import ConfigError, PointCloudError
+from gp_ground_seg.core.errors import PointCloudError
 from gp_ground_seg.core.parameters.presets import PRESETS
 from gp_ground_seg.data.semantic_kitti import labelled_frames
 from gp_ground_seg.lab.experiments import ablation, interpolation, scenes, variants
@@ -19,7 +19,6 @@ from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 from gp_ground_seg.lab.simulation import SCENES, SENSORS, Kind, simulate_scan
 
 FIXED = Config().replace(**{'learning.mode': 'fixed'})
-FAR, NEAR = Config(), {'grid.r_max': 15.0}
 
 
 @pytest.fixture(scope='module')
@@ -83,40 +82,6 @@ def test_interpolation_has_the_median_of_three_segments_and_our_labels(frames):
     np.testing.assert_allclose(surface.mean[segment][far], expected, atol=1e-9)
     assert result.fit.mode == 'fixed'
     assert count_confusion(result.label, scan.truths['groundgrid']).iou > 0.9
-
-
-@pytest.mark.parametrize('title', [*ablation.DEPARTURES, *ablation.ALTERNATIVES])
-def test_every_switch_of_the_list_is_accepted_and_turns_something(title):
-    changes = {**ablation.DEPARTURES, **ablation.ALTERNATIVES}[title]
-    switched = Config().replace(**changes)
-    for name in changes:
-        assert switched[name] != Config()[name], name
-
-
-def test_worth_is_what_having_it_adds(frames, monkeypatch):
-    monkeypatch.setattr(ablation, 'DEPARTURES', {'far grid': NEAR})
-    monkeypatch.setattr(ablation, 'ALTERNATIVES', {'near grid': NEAR})
-    report = ablation.compare_departures(frames, FAR)
-    rows = {row['departure']: row for row in report.tables['departures'].json()}
-    given, near = variants.score_variants(frames, {'given': FAR, 'near': FAR.replace(**NEAR)})
-    gain = given.iou - near.iou
-    assert gain > 0.1
-    assert list(rows) == ['as given', 'far grid', 'near grid']  # the largest worth first
-    assert [row['worth'] for row in rows.values()] == [None, gain, -gain]
-    assert [row['switch'] for row in rows.values()] == [None, 'off', 'on']
-    assert rows['far grid']['iou'] == near.iou
-    assert rows['far grid']['worst_iou'] == min(near.of(name).iou for name in ('00', '08'))
-    scans = report.rows
-    seconds = {name: [row['seconds'] for row in scans if row['method'] == name] for name in rows}
-    ratios = sorted(a / b for a, b in zip(seconds['far grid'], seconds['as given'], strict=True))
-    assert rows['far grid']['time_ratio'] == ratios[1]
-    assert rows['as given']['time_ratio'] == 1.0
-
-
-def test_a_switch_that_changes_nothing_is_refused(monkeypatch):
-    monkeypatch.setattr(ablation, 'DEPARTURES', {'far grid': NEAR})
-    with pytest.raises(ConfigError, match="'far grid': its switch changes nothing"):
-        ablation.compare_departures([], Config().replace(**NEAR))
 
 
 def test_scenes_without_a_free_lane_are_seen_from_the_origin_only():

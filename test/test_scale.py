@@ -106,7 +106,6 @@ def test_an_evaluation_is_the_same_to_the_last_digit(root, assert_same, more):
     'words',
     [
         ['ablation'],
-        ['coverage'],
         ['objects', '--sensors', 'vlp-16', '--scenes', 'urban,car_park', '--seeds', '1'],
     ],
     ids=lambda words: words[0],

@@ -115,7 +115,6 @@ COMMANDS = {
     'bench': 'bench ROOT --json OUT.json',
     'evaluate': 'evaluate ROOT --json OUT.json',
     'ablation': 'experiment ablation ROOT --json OUT.json',
-    'departures': 'experiment departures ROOT --json OUT.json',
     'demo': 'demo --kitti ROOT --output OUT',
 }
 

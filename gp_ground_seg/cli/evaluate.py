@@ -56,6 +56,7 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT
   gp-ground-seg evaluate KITTI_ROOT --sequences 00,08 --json scores.json
   gp-ground-seg evaluate KITTI_ROOT --config my.yaml --against default
+  gp-ground-seg evaluate KITTI_ROOT --set faces.max_normal_z=0 --against default
   gp-ground-seg evaluate drive.mcap --config my.yaml --against default      no labels
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
   gp-ground-seg evaluate KITTI_ROOT --worst 9 --per-frame frames.csv

@@ -79,7 +79,6 @@ EXPERIMENTS = {
     'ablation': Experiment(
         ablation.compare_models, ['hdl-64e'], [ablation.SCENE], 10, ablation.PLACES
     ),
-    'departures': Experiment(ablation.compare_departures),
     'steps': Experiment(ablation.compare_steps),
     'pseudo-inputs': Experiment(ablation.compare_pseudo_inputs, is_timed=True),
     'scenes': Experiment(

@@ -18,6 +18,9 @@ REMOVED: dict[str, str] = {
     'learning.max_time': 'use learning.max_evaluations',
     'runtime.n_threads': 'leave it out: a scan takes one thread; --workers takes several scans',
     f'{PROGRAM} bench --threads': 'leave it out: a scan takes one thread',
+    f'{PROGRAM} experiment departures': (
+        f'use {PROGRAM} evaluate ROOT --set NAME=VALUE --against default'
+    ),
     f'{PROGRAM} experiment wrong-values': (
         f'use {PROGRAM} evaluate ROOT --set NAME=VALUE --against default'
     ),

@@ -1,4 +1,4 @@
-"""Variants of the method on the same scans: models, departures, steps, pseudo-inputs."""
+"""Variants of the method on the same scans: models, steps, pseudo-inputs."""
 
 from __future__ import annotations
 
@@ -48,36 +48,6 @@ PLACES = (0.0, 6.0, 12.0)
 """Where the sensor stands on the simulated road [m]; the rubble begins at 14 to 20 m."""
 
 
-_PLAIN_BAND: Changes = {'label.rule': 'tolerance', 'label.ground_tolerance': 0.2}
-
-DEPARTURES: dict[str, Changes] = {
-    'latent length-scales (constant instead)': {'length_scale.model': 'constant'},
-    'learning in every frame': {'learning.mode': 'fixed'},
-    'objective without the latent terms': {'learning.objective': 'paper'},
-    'sloping mean': {'observation.slope_std': 0.0},
-    'segments look aside': {'surface.look_aside': False},
-    'asymmetric gate of the growth': {
-        'growth.max_standardised_residual': 2.0,
-        'growth.max_standardised_depth': 2.0,
-    },
-    'vertical faces': {'faces.max_normal_z': 0.0},
-    'vertical faces with occluded base': {'faces.max_foot_distance': 0.0},
-    'labels by local roughness': _PLAIN_BAND,
-    'bins that widen, 80 of them': {'grid.n_bins': 120, 'grid.bin_growth': 1.0},
-    'lines end at 0.1 rad': {'lines.slope_tolerance': 0.02},
-    'length-scales not learned': {'learning.fixed': 'none'},
-    'lines continued outside the gate': {'growth.max_line_slope': 0.0},
-    'lines continued past a slope break': {'growth.min_bend_extent': 1000.0},
-    'learning from every 30th segment': {'learning.segment_step': 1},
-}
-"""What the defaults have and the paper has not, and the changes that switch it off."""
-ALTERNATIVES: dict[str, Changes] = {
-    '240 segments': {'grid.n_segments': 240},
-    'a narrower gate (2)': {'growth.max_standardised_residual': 2.0},
-    'faces from 0.5 m on': {'label.obstacle_min_height': 0.4},
-}
-"""Choices that the defaults do not have, and the changes that switch them on."""
-
 STEPS = {
     'vertical faces': ('faces.',),
     'labels by local roughness': ('label.',),
@@ -119,58 +89,6 @@ def compare_models(items: Sequence[Any], config: Config, runner: Runner = HERE) 
         f'interval of the RMSE minus that of {last.name}; {interval_note(last)}'
     )
     return make_report({'models': Table(rows, title)}, scores, config, changes=MODELS)
-
-
-def compare_departures(items: Sequence[Any], config: Config, runner: Runner = HERE) -> Report:
-    """Switch off one departure from the paper after the other.
-
-    They are the rows of gp_ground_seg/lab/experiments/ablation.py; `evaluate --against` measures
-    any other change.
-    """
-    changes = {**DEPARTURES, **ALTERNATIVES}
-    variants = {title: config.replace(**changed) for title, changed in changes.items()}
-    for title, variant in variants.items():
-        if variant == config:
-            raise ConfigError(f'departure {title!r}: its switch changes nothing')
-    given, *switched = score_variants(items, {'as given': config, **variants}, runner=runner)
-
-    rows = []
-    for score in switched:
-        is_off = score.name in DEPARTURES
-        having, without = (given, score) if is_off else (score, given)
-        interval = interval_text(having, without)
-        rows.append((score, 'off' if is_off else 'on', having.iou - without.iou, interval))
-    rows.sort(key=lambda cells: -cells[2])
-    title = (
-        f'{_counted(given)}; {_rule(given)}, and gained with the departure on; '
-        f'{interval_note(given)}; RMSE of the height; time relative to the parameters as given, '
-        'median of the frames'
-    )
-    table_rows = [_departure(given, given), *(_departure(given, *cells) for cells in rows)]
-    tables = {'departures': Table(table_rows, title)}
-    return make_report(tables, [given, *switched], config, changes=changes)
-
-
-def _departure(
-    given: MethodScore,
-    score: MethodScore,
-    switch: str | None = None,
-    gain: float | None = None,
-    interval: str | None = None,
-) -> Row:
-    """Row of a departure that is switched, beside the parameters as given."""
-    pairs = zip(score.scans, given.scans, strict=True)
-    time_ratio = statistics.median(scan.seconds / base.seconds for scan, base in pairs)
-    return [
-        (Column('departure'), score.name),
-        (Column('switch'), switch),
-        (percent('IoU [%]', 'iou'), score.iou),
-        (percent('gained [%]', 'worth', '+.2f'), gain),
-        (INTERVAL, interval),
-        *_worst(score),
-        (centimetres('RMSE [cm]', 'rmse'), score.height.rmse),
-        (Column('time', '.2f', 'time_ratio'), time_ratio),
-    ]
 
 
 def paper_steps() -> dict[str, Config]:
