@@ -140,12 +140,6 @@ PANDAR64 = replace(
 QT64 = SensorModel('qt64-tilted', _beams((52.1, -52.1, 64)), 600, 0.2, 60.0, 0.02, 1.2)
 
 
-def _without_rings(sensor: SensorModel) -> tuple[float, ...]:
-    """Elevations without every fourth beam, and without three of the steep ones."""
-    n = len(sensor.elevations)
-    return tuple(up for k, up in enumerate(sensor.elevations) if k % 4 and not n - 18 < k < n - 14)
-
-
 SENSORS = {
     sensor.name: sensor
     for sensor in (
@@ -155,8 +149,6 @@ SENSORS = {
         replace(VLP_32C, name='vlp-32c-pair', origin=(1.35, 0.0, 1.9), others=(_UPSIDE_DOWN,)),
         replace(VLP_32C, name='vlp-32c-31', elevations=VLP_32C.elevations[:-1]),
         PANDAR64,
-        # Every fourth ring is missing, and three beside one another.
-        replace(HDL_64E, name='hdl-64e-gaps', elevations=_without_rings(HDL_64E)),
         AT128,
         replace(QT64, roll=math.radians(35.0), pitch=math.radians(10.0)),
         replace(VLP_16, name='vlp-16-low', height=0.15, min_range=0.1),

@@ -255,24 +255,6 @@ def _hidden_climb(seed: int) -> Scene:
     return Scene('hidden_climb', terrain, tuple(solids))
 
 
-def _rail(seed: int) -> Scene:
-    """Rails on both sides, and cars behind them, end-on: of these the bumpers are hidden."""
-    rng = np.random.default_rng(seed)
-    terrain = flat()
-    solids: list[Solid] = []
-    for side in (-1.0, 1.0):
-        size = (28.0, 0.06, 0.4)
-        solids.append(objects.floating_box(terrain, 0.0, side * 3.7, size, 0.9))
-        x = -14.0
-        while x < 14.0:
-            name = str(rng.choice(CARS))
-            length, width, *_ = traffic.MODELS[name]
-            y = side * (rng.uniform(7.0, 7.6) + 0.5 * length)
-            solids += traffic.vehicle(terrain, name, x + 0.5 * width, y, -side * 0.5 * math.pi)
-            x += width + rng.uniform(0.6, 1.2)
-    return Scene('rail', terrain, tuple(solids))
-
-
 def _wet_road(seed: int) -> Scene:
     """Traffic jam in the rain: of the near returns of ground a third is missing or mirrored."""
     dry = _traffic_jam(seed)
@@ -483,7 +465,6 @@ PLACES: dict[str, Callable[[int], Scene]] = {
     'traffic_jam': _traffic_jam,
     'car_park': _car_park,
     'hidden_climb': _hidden_climb,
-    'rail': _rail,
     'wet_road': _wet_road,
     'blind_slope': _blind_slope,
     'hedge': _hedge,
