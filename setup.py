@@ -10,8 +10,8 @@ PACKAGE = 'gp_ground_seg'
 BAGS = ['rosbags>=0.11.9']
 FORMATS = ['python-neo-lzf>=0.3']
 PLOT = ['matplotlib>=3.6']
-# 21 MB and 15 MB of cryptography, for TLS between workers; s3fs, for s3://, is 36 MB more.
-SCALE = ['cryptography>=42', 'distributed>=2025.1', 'fsspec>=2024.2']
+# 21 MB; s3fs, for s3://, is 36 MB more.
+SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']
 VISER = ['viser>=1.1']
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
@@ -29,6 +29,7 @@ DEV = [
     *SCALE,
     *VISER,
     'argcomplete>=3.1',
+    'cryptography>=42',  # keys of a Dask cluster under test
     'codespell[toml]>=2.3',
     'colcon-common-extensions',
     'flake8>=6',

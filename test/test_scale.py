@@ -1,26 +1,24 @@
 """Whole data sets: one process, workers and a scheduler alike; what dies, and how it goes on."""
 
+import ast
+import contextlib
 import csv
 import json
 import logging
 import os
-import resource
+import re
 import shutil
 import signal
 import socket
-import stat
 import subprocess
 import sys
-import tempfile
 import threading
 import time
-import urllib.error
-import urllib.request
 from functools import partial
 from pathlib import Path
 
 import pytest
-from cli_runner import children, error_line, run, start
+from cli_runner import INTERRUPTED, children, error_line, is_running, run, start
 from evaluation_samples import label_files, write_two_drives
 from hypothesis import given
 from hypothesis import strategies as st
@@ -31,27 +29,6 @@ from gp_ground_seg.lab.scale import cluster
 dask, distributed = pytest.importorskip('dask'), pytest.importorskip('distributed')
 # Dask leaves sockets and event loops to the garbage collector when its processes end.
 pytestmark = pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
-
-ATTACK = """
-import asyncio, os, sys, dask, distributed
-from distributed.protocol.pickle import dumps
-
-async def attack(address, security):
-    given = security.get_connection_args('worker') if security else {}
-    async with distributed.rpc(address, connection_args=given) as remote:
-        run = remote.run_function if address.endswith(sys.argv[1]) else remote.run
-        print((await run(function=dumps(os.getpid)))['result'])
-
-dask.config.set({'distributed.comm.timeouts.connect': '3s'})
-for scheme, security in ('tcp', None), ('tls', distributed.Security.temporary()):
-    for place in sys.argv[1:]:
-        try:
-            asyncio.run(attack(f'{scheme}://{place}', security))
-        except (OSError, ValueError) as error:
-            print(type(error).__name__, file=sys.stderr)
-"""
-"""Prints the process id of a scheduler, and of workers after it: runs code in them without their
-key."""
 
 
 @pytest.fixture(scope='module')
@@ -85,14 +62,15 @@ def everything(path):
 
 @pytest.fixture
 def assert_same(scheduler, tmp_path, capsys):
-    """Run a command here and on the cluster: the reports are equal to the last digit."""
+    """Run a command here, in processes and on a cluster: equal reports to the last digit."""
 
     def compare(said, *words):
         assert run(*words, '--json', tmp_path / 'here.json') == 0
         assert said not in capsys.readouterr().out
-        assert run(*words, '--json', tmp_path / 'there.json', '--scheduler', scheduler) == 0
-        assert everything(tmp_path / 'there.json') == everything(tmp_path / 'here.json')
-        assert said in capsys.readouterr().out
+        for more in ('--workers', '2'), ('--scheduler', scheduler):
+            assert run(*words, '--json', tmp_path / 'there.json', '--force', *more) == 0
+            assert everything(tmp_path / 'there.json') == everything(tmp_path / 'here.json')
+            assert said in capsys.readouterr().out
 
     return compare
 
@@ -147,10 +125,6 @@ def test_blocks_hold_every_item_once_and_groups_stay_whole(groups, grouped, n_wo
         assert len(blocks) >= min(len(items), n_workers)
 
 
-def _module_path():
-    return sys.path
-
-
 def _die_once(marker, block, progress):
     if 5 in block and not marker.exists():
         marker.touch()
@@ -167,95 +141,116 @@ def _log(block, progress):
     return len(block)
 
 
-def test_a_block_whose_worker_dies_is_computed_again(scheduler, tmp_path, caplog):
-    with cluster.open_runner(None, scheduler, cluster._NO_BAR) as runner:
-        found = runner.run(partial(_die_once, tmp_path / 'died'), range(40))
-        assert sum(found) == sum(range(40)) and (tmp_path / 'died').exists()
-        assert [line for line in caplog.messages if 'died; computed again: block' in line]
-        caplog.clear()
-        with pytest.raises(DataError, match=r'^00/000003: truncated\?'):
-            runner.run(_fail, range(40))
-        assert sum(runner.run(_log, range(40))) == 40
+def _die(block, progress):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _last_first(block, progress):
+    time.sleep(0.5 * (block[0] == 0))
+    return block[0]
+
+
+@pytest.fixture(params=['workers', 'scheduler'])
+def workers(request, scheduler):
+    """A runner on two processes, or on a cluster."""
+    given = (2, None) if request.param == 'workers' else (None, scheduler)
+    with cluster.open_runner(*given, cluster._NO_BAR) as runner:
+        yield runner
+
+
+def test_results_are_those_of_one_process_also_if_a_worker_dies(workers, tmp_path, caplog):
+    assert workers.n_workers == 2
+    found = workers.run(partial(_die_once, tmp_path / 'died'), range(40))
+    assert found == [sum(range(k, k + 10)) for k in range(0, 40, 10)]
+    assert (tmp_path / 'died').exists()
+    assert workers.run(_last_first, range(4)) == [0, 1, 2, 3]
+    caplog.clear()
+    assert sum(workers.run(_log, range(40))) == 40
     assert caplog.messages == ['the surface is odd']
+    with pytest.raises(DataError, match=r'^00/000003: truncated\?'):
+        workers.run(_fail, range(40))
 
 
-def attack(client):
-    """Process ids of the scheduler and workers that run another's code, and what failed."""
-    addresses = [client.scheduler.address, *client.nthreads()]
-    places = [address.split('//')[1] for address in addresses]
-    done = subprocess.run(
-        [sys.executable, '-c', ATTACK, *places], capture_output=True, text=True, check=True
+def test_a_block_that_ends_every_worker_is_named(workers):
+    with pytest.raises(DataError, match='died') as caught:
+        workers.run(_die, [7])
+    assert '7' in str(caught.value)
+
+
+def test_a_worker_that_died_is_said(tmp_path, caplog):
+    with cluster.open_runner(2, None, cluster._NO_BAR) as runner:
+        runner.run(partial(_die_once, tmp_path / 'died'), range(40))
+    (line,) = caplog.messages
+    assert re.fullmatch(r'a worker died; computed again: [1-4] blocks', line)
+
+
+def listening():
+    """Sockets of this machine that wait for connections, by inode."""
+    found = set()
+    for name in ('tcp', 'tcp6', 'unix'):
+        rows = [line.split() for line in Path(f'/proc/net/{name}').read_text().splitlines()[1:]]
+        if name == 'unix':  # flag of a listening socket, see proc(5)
+            found |= {row[6] for row in rows if int(row[3], 16) & 0x10000}
+        else:
+            found |= {row[9] for row in rows if row[3] == '0A'}
+    return found
+
+
+def sockets(pid):
+    found = set()
+    for path in Path(f'/proc/{pid}/fd').iterdir():
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+            found.add(os.readlink(path))
+    return {link[8:-1] for link in found if link.startswith('socket:[')}
+
+
+def _sockets_that_listen(block, progress):
+    # A worker looks at its parent, itself and the other workers.
+    parent = os.getppid()
+    pids = [parent, *children(parent)]
+    return len(pids), [pid for pid in pids if sockets(pid) & listening()]
+
+
+def test_nothing_listens_with_workers(scheduler):
+    assert sockets(os.getpid()) & listening()  # as that scheduler does
+    code = (
+        'from gp_ground_seg.lab.scale import cluster; import test_scale; '
+        'context = cluster.open_runner(2, None, cluster._NO_BAR); runner = context.__enter__(); '
+        'print(runner.run(test_scale._sockets_that_listen, range(8)))'
     )
-    return [int(line) for line in done.stdout.splitlines()], done.stderr.splitlines()
+    folder = Path(__file__).parent
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=folder, capture_output=True, text=True, check=True
+    )
+    found = ast.literal_eval(done.stdout)
+    assert len(found) == 4
+    assert all(n >= 3 and not pids for n, pids in found), found
 
 
-def test_workers_of_this_machine_run_the_code_of_this_process_only(
-    scheduler, monkeypatch, tmp_path
-):
-    # A cluster with pages, begun after ours were left out, adds to Dask's list of them.
-    cluster._distributed()
-    with distributed.LocalCluster(n_workers=0, dashboard_address='127.0.0.1:0'):
-        pass
-    with distributed.Client(scheduler, set_as_default=False) as client:
-        ran, _ = attack(client)
-        assert ran[0] == os.getpid() and len(ran) > 1
-    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
-    planted, target = tmp_path / 'dask-scratch-space', tmp_path / 'of_the_user'
-    planted.mkdir()
-    target.write_text('kept')
-    for name in ('global.lock', 'purge.lock'):
-        (planted / name).symlink_to(target)
-    with cluster.open_runner(1, None, cluster._NO_BAR) as runner:
-        info = runner._client.scheduler_info()
-        (worker,) = info['workers'].values()
-        (folder,) = tmp_path.glob('gp_ground_seg-*')
-        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
-        assert worker['local_directory'].startswith(str(folder))
-        ran, failed = attack(runner._client)
-        assert not ran and len(failed) == 4
-        for port in (info['services']['dashboard'], worker['services']['dashboard']):
-            for page in ('', 'health', 'info/main/workers.html', 'metrics'):
-                with pytest.raises(urllib.error.HTTPError, match='404'):
-                    urllib.request.urlopen(f'http://127.0.0.1:{port}/{page}')
-        for path in (sys.path, *runner._client.run(_module_path).values()):
-            assert not any(name.startswith(str(planted)) for name in path)
-        assert sum(runner.run(partial(_die_once, tmp_path), range(3))) == 3
-    assert target.read_text() == 'kept'
-    assert sorted(path.name for path in tmp_path.iterdir()) == [planted.name, target.name]
-
-
-@pytest.mark.parametrize(
-    ('n_workers', 'problem'),
-    [
-        ('2', 'needs 96 open files, the limit is 40'),
-        ('2', 'Dask cannot start here (Nanny failed to start worker process)'),
-        ('99999999999', 'must be 1 to'),
-    ],
-    ids=['few files', 'killed worker', 'many workers'],
-)
-def test_dask_that_cannot_start(n_workers, problem, root, tmp_path):
-    limit = {'preexec_fn': partial(resource.setrlimit, resource.RLIMIT_NOFILE, (40, 40))}
-    command = ('segment', root, '-o', tmp_path / 'out', '--workers', n_workers)
-    with start(*command, **limit if 'files' in problem else {}) as process:
-        if 'Nanny' in problem:
-            deadline, found = time.monotonic() + 60, []
-            while not found:
-                assert process.poll() is None and time.monotonic() < deadline
-                found = [one for one in children(process.pid) if is_worker(one)]
-                time.sleep(0.01)
-            os.kill(found[0], signal.SIGKILL)
-        out, err = process.communicate(timeout=60)
-    (line,) = err.splitlines()
-    assert (out, process.returncode) == ('', 2) and problem in line
+def test_more_workers_than_a_machine_has_use_for(root, tmp_path, capsys):
+    assert run('segment', root, '-o', tmp_path / 'out', '--workers', '99999999999') == 2
+    assert 'must be 1 to' in error_line(capsys)
     assert not (tmp_path / 'out').exists()
 
 
-def is_worker(pid):
-    """Whether a process is one that Dask starts."""
-    try:
-        return b'spawn_main' in Path(f'/proc/{pid}/cmdline').read_bytes()
-    except (FileNotFoundError, ProcessLookupError):
-        return False
+@pytest.mark.parametrize('delay', [0.0, 0.1, 0.3])
+def test_ctrl_c_while_workers_start(delay, root, tmp_path):
+    process = start(
+        'segment', root, '-o', tmp_path / 'out', '--workers', '2', start_new_session=True
+    )
+    deadline, started = time.monotonic() + 60, []
+    while len(started) < 2:  # the tracker of resources, and a worker
+        assert process.poll() is None and time.monotonic() < deadline
+        started = children(process.pid)
+    time.sleep(delay)
+    started = children(process.pid)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (out, err) == ('', 'gp-ground-seg: interrupted\n')
+    assert process.returncode in INTERRUPTED
+    while any(map(is_running, started)):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 @pytest.mark.parametrize(
@@ -266,10 +261,10 @@ def is_worker(pid):
         ('somewhere', 'must be tcp://HOST:PORT'),
     ],
 )
-def test_a_scheduler_that_is_not_there(address, problem, root, monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(cluster._CONFIG, 'distributed.comm.timeouts.connect', '200ms')
+def test_a_scheduler_that_is_not_there(address, problem, root, tmp_path, capsys):
     command = ['segment', root, '-o', tmp_path / 'out']
-    assert run(*command, '--scheduler', address) == 2
+    with dask.config.set({'distributed.comm.timeouts.connect': '200ms'}):
+        assert run(*command, '--scheduler', address) == 2
     assert problem in error_line(capsys)
     assert run(*command) == 0
 
@@ -282,6 +277,27 @@ def test_a_port_where_no_scheduler_speaks(root, tmp_path, capsys):
         assert run('segment', root, '-o', tmp_path / 'out', '--scheduler', address) == 2
         banner.join()
     assert 'does not answer' in error_line(capsys)
+
+
+def test_a_scheduler_that_ends_meanwhile(root, tmp_path):
+    """As the machine that it runs on may."""
+    words = [sys.executable, '-m', 'distributed.cli.dask_scheduler', '--no-dashboard', '--host']
+    with subprocess.Popen(
+        [*words, 'tcp://127.0.0.1', '--port', '0'], stderr=subprocess.PIPE, text=True
+    ) as scheduler:
+        address = next(
+            found[0] for line in scheduler.stderr if (found := re.findall(r'tcp://[\d.:]+', line))
+        )
+        process = start('segment', root, '-o', tmp_path / 'out', '--scheduler', address)
+        for line in process.stderr:
+            if 'no worker yet' in line:
+                break
+        time.sleep(1.0)
+        scheduler.kill()
+        assert process.communicate(timeout=60) == (
+            '', 'gp-ground-seg: error: the scheduler is lost\n'
+        )  # fmt: skip
+        assert process.returncode == 2
 
 
 def test_a_scheduler_that_asks_for_a_key(root, tmp_path, capsys):
@@ -303,17 +319,17 @@ def test_a_scheduler_that_asks_for_a_key(root, tmp_path, capsys):
     assert len(label_files(tmp_path)) == 12
 
 
-def test_workers_of_other_versions(monkeypatch):
+def test_workers_of_other_versions():
     here = cluster._versions()
-    found, notes = cluster._compute({**here, 'numpy': '1.0'}, _log, [1])
+    found, notes = cluster._compute_block({**here, 'numpy': '1.0'}, _log, [1])
     assert found == 1 and 'last digits may differ' in notes[0][1]
     with pytest.raises(DataError, match=r'gp_ground_seg .*, not 9\.9'):
-        cluster._compute({**here, 'gp_ground_seg': '9.9'}, _log, [1])
+        cluster._compute_block({**here, 'gp_ground_seg': '9.9'}, _log, [1])
 
 
 @pytest.mark.parametrize(
     ('package', 'words'),
-    [('distributed', ['--workers', '2']), ('fsspec', ['-o', 's3://drives/out'])],
+    [('distributed', ['--scheduler', 'tcp://127.0.0.1:1']), ('fsspec', ['-o', 's3://drives/out'])],
 )
 def test_without_the_extra(package, words, root, tmp_path, monkeypatch, capsys):
     for name in (package, f'{package}.core'):
@@ -323,12 +339,13 @@ def test_without_the_extra(package, words, root, tmp_path, monkeypatch, capsys):
     assert f'pip install {package}' in error_line(capsys)
 
 
-def test_local_paths_need_neither_dask_nor_fsspec(root, tmp_path):
+@pytest.mark.parametrize('more', [[], ['--workers', '1']])
+def test_local_paths_need_neither_dask_nor_fsspec(more, root, tmp_path):
     code = (
         'import sys; from gp_ground_seg.cli.main import main; main(sys.argv[1:]); '
         'assert not {"dask", "distributed", "fsspec"} & set(sys.modules)'
     )
-    command = [sys.executable, '-c', code, 'segment', root, '-o', tmp_path / 'out']
+    command = [sys.executable, '-c', code, 'segment', root, '-o', tmp_path / 'out', *more]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 

@@ -115,7 +115,7 @@ def add_cluster(parser: argparse._ActionsContainer) -> None:
     """Add ``--workers N`` and ``--scheduler ADDRESS``."""
     add(
         parser,
-        ('--workers', 'compute in N processes, with Dask', NUMBER),
+        ('--workers', 'compute in N processes of this machine', NUMBER),
         ('--scheduler', 'compute on the Dask cluster of this scheduler, as in tcp://HOST:8786',
          {'metavar': 'ADDRESS'}),
     )  # fmt: skip

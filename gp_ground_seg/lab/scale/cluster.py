@@ -1,29 +1,31 @@
-"""Blocks of items, computed in this process or by a Dask cluster.
+"""Blocks of items, computed here, in processes of this machine, or by a Dask cluster.
 
-The one module that imports dask and distributed, optional packages.
+The one module that imports distributed, an optional package.
 """
 
 from __future__ import annotations
 
-import asyncio
-import copy
 import importlib.metadata
 import itertools
 import logging
 import multiprocessing
 import os
 import platform
-import resource
 import signal
-import sys
 import threading
-import uuid
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    as_completed,
+)
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
-from tempfile import TemporaryDirectory
+from multiprocessing import resource_tracker
 from typing import Any
 
 from tqdm import tqdm
@@ -35,25 +37,15 @@ from gp_ground_seg.core.errors import DataError, in_one_line, require
 _LOGGER = logging.getLogger('gp_ground_seg')
 BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
-_CONFIG: dict[str, Any] = {
-    'distributed.admin.tick.limit': '1h',  # it warns where a process had to wait
-    'distributed.comm.timeouts.connect': '10s',
-    # A worker that died and takes its time to start anew is not given up.
-    'distributed.deploy.lost-worker-timeout': '1h',
-    # Dask's workers return freed memory to the system at once, and fetch it anew for each frame:
-    # a quarter of a frame's time.
-    'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': None,
-    'distributed.worker.profile.enabled': False,  # samples the stack 100 times a second
-    # Pages about the work for everyone on the machine, without a password.
-    'distributed.scheduler.http.routes': [],
-    'distributed.worker.http.routes': [],
-}
+MAX_RESTARTS = 3
+"""How often workers of this machine are started anew, if one of them dies."""
 
 _NO_BAR = partial(tqdm, disable=True)
 Progress = Callable[[Sequence[Any]], Iterable[Any]]
 """Wraps items to show how far the work is, as tqdm does."""
 Function = Callable[[Sequence[Any], Progress], Any]
 """Computes a block of items; a module's function or a `partial` of one, to be sent to workers."""
+_Notes = list[tuple[int, str]]  # what the library logs: severity and text
 
 
 class Runner:
@@ -63,17 +55,19 @@ class Runner:
     ----------
     bar : callable
         Makes the progress bar of a number of items, ``bar(total=n)``.
-    client : distributed.Client, optional
-        Of the cluster whose workers compute the blocks.
+    open_executor : callable, optional
+        Opens workers that compute the blocks, as a context.
+    n_workers : int
+        How many there are; 0 in this process.
     """
 
-    def __init__(self, bar: Callable[..., tqdm[Any]] = _NO_BAR, client: Any = None) -> None:
-        self._bar, self._client = bar, client
-
-    @property
-    def n_workers(self) -> int:
-        """Threads of the cluster's workers; 0 in this process."""
-        return sum(self._client.nthreads().values()) if self._client is not None else 0
+    def __init__(
+        self,
+        bar: Callable[..., tqdm[Any]] = _NO_BAR,
+        open_executor: Callable[[], AbstractContextManager[Executor]] | None = None,
+        n_workers: int = 0,
+    ) -> None:
+        self._bar, self._open_executor, self.n_workers = bar, open_executor, n_workers
 
     def run(
         self,
@@ -85,57 +79,52 @@ class Runner:
 
         In this process they are one block; else `group` is as in `cut`.
         """
-        on_cluster = self._client is not None
-        blocks = cut(items, group, self.n_workers) if on_cluster else [items]
-        found = dict(self.map_blocks(function, blocks))
-        return [found[k] for k in range(len(blocks))]
+        is_here = self._open_executor is None
+        return [*self.map(function, [items] if is_here else cut(items, group, self.n_workers))]
 
-    def map_blocks(
-        self, function: Function, blocks: Sequence[Sequence[Any]]
-    ) -> Iterator[tuple[int, Any]]:
-        """Yield the number of each block and what `function` makes of it, as they are finished.
+    def map(self, function: Function, blocks: Sequence[Sequence[Any]]) -> Iterator[Any]:
+        """Yield what `function` makes of each block, in their order.
 
-        A block whose worker dies is computed again by another, and a warning says so. Raises what
-        `function` raises.
+        A block whose worker dies is computed again. Raises what `function` raises, and DataError
+        if workers die again and again.
         """
         with self._bar(total=sum(map(len, blocks))) as bar:
-            if self._client is None:
-                for k, block in enumerate(blocks):
-                    yield k, function(block, partial(_count, bar))
+            if self._open_executor is None:
+                for block in blocks:
+                    yield function(block, partial(_count, bar))
                 return
-            for k, found in self._submit(partial(_compute, _versions(), function), blocks):
+            found, n_yielded = dict[int, Any](), 0
+            for k, result in self._compute(function, dict(enumerate(blocks))):
                 bar.update(len(blocks[k]))
-                yield k, found
+                found[k] = result
+                while n_yielded in found:
+                    yield found.pop(n_yielded)
+                    n_yielded += 1
 
-    def _submit(
-        self, compute: Callable[..., Any], blocks: Sequence[Sequence[Any]]
+    def _compute(
+        self, function: Function, left: dict[int, Sequence[Any]]
     ) -> Iterator[tuple[int, Any]]:
-        from distributed import as_completed
-
-        run, said = f'gp_ground_seg-{uuid.uuid4().hex}', set()
-        if not self.n_workers:
-            _LOGGER.warning('the scheduler has no worker yet, waiting for one')
-
-        self._client.subscribe_topic('all', partial(_tell_loss, run))
-        try:
-            # A list of futures that is kept would keep their results on the cluster.
-            finished = as_completed(
-                [
-                    self._client.submit(compute, block, key=(run, k), pure=False)
-                    for k, block in enumerate(blocks)
-                ],
-                loop=self._client.loop,
-            )
-            for future in finished:
-                k = future.key[1]
-                found, notes = _result(future, blocks[k])
-                for level, line in notes:
-                    if line not in said:
-                        said.add(line)
-                        _LOGGER.log(level, '%s', line)
-                yield k, found
-        finally:
-            self._client.unsubscribe_topic('all')
+        """Yield the number and the result of each block when it is finished."""
+        assert self._open_executor is not None
+        said = set[str]()
+        for n_restarts in itertools.count():
+            with self._open_executor() as executor:
+                for k, (result, notes) in _completed(executor, function, left):
+                    del left[k]
+                    for level, line in notes:
+                        if line not in said:
+                            said.add(line)
+                            _LOGGER.log(level, '%s', line)
+                    yield k, result
+            if not left:
+                return
+            if n_restarts == MAX_RESTARTS:
+                first = next(iter(left.values()))[0]
+                raise DataError(
+                    f'workers died {n_restarts + 1} times, as where memory is short: fewer '
+                    f'--workers have more of it each; the first item that is left is {first}'
+                )
+            _LOGGER.warning('a worker died; computed again: %d blocks', len(left))
 
 
 HERE = Runner()
@@ -148,33 +137,56 @@ def _count(bar: tqdm[Any], items: Iterable[Any]) -> Iterator[Any]:
         bar.update()
 
 
-def _result(future: Any, block: Sequence[Any]) -> tuple[Any, list[tuple[int, str]]]:
-    """Return what `_compute` returned for a block; DataError where the cluster failed."""
-    from distributed import KilledWorker
+def _completed(
+    executor: Executor, function: Function, blocks: dict[int, Sequence[Any]]
+) -> Iterator[tuple[int, tuple[Any, _Notes]]]:
+    """Yield the number of each block and what `_compute_block` returns, when it is finished.
 
+    Those of processes that died are left out. Raises DataError if the cluster fails.
+    """
+    compute = partial(_compute_block, _versions(), function)
+    with _ctrl_c_kept():  # processes are started by the first items
+        futures: dict[Future[tuple[Any, _Notes]], int] = {
+            executor.submit(compute, block): k for k, block in blocks.items()
+        }
+    for future in as_completed(futures):
+        k = futures.pop(future)  # or the cluster would keep the result
+        try:
+            yield k, future.result()
+        except BrokenExecutor:
+            continue
+        except CancelledError as error:
+            raise DataError('the scheduler is lost') from error
+        except Exception as error:
+            if type(error).__name__ != 'KilledWorker':  # of distributed, which may be missing
+                raise
+            first, last = blocks[k][0], blocks[k][-1]
+            raise DataError(
+                f'{first} to {last}: each worker that computed this block died, as where memory '
+                'is short'
+            ) from error
+
+
+@contextmanager
+def _ctrl_c_kept() -> Iterator[None]:
+    """Keep Ctrl-C, which all processes of a terminal get, from those that are started.
+
+    They inherit the mask of signals. Here it takes effect when they are started.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    resource_tracker.ensure_running()  # its start would change the mask
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        found: tuple[Any, list[tuple[int, str]]] = future.result()
-    except KilledWorker as error:
-        raise DataError(
-            f'{block[0]} to {block[-1]}: each worker that computed this block died, as where '
-            'memory is short; fewer --workers have more of it each'
-        ) from error
-    except (CancelledError, OSError, RuntimeError) as error:  # RuntimeError: no further thread
-        if future.status == 'error':  # raised by the function
-            raise
-        raise DataError(f'the scheduler is lost ({error})') from error
-    return found
-
-
-def _tell_loss(run: str, event: tuple[float, Any]) -> None:
-    """Log the blocks of a run that a worker was computing when it died."""
-    _, about = event
-    if isinstance(about, dict) and about.get('action') == 'remove-worker':
-        keys = [*about['processing-tasks'], *about.get('lost-computed-tasks', ())]
-        lost = sorted(key[1] for key in keys if key[0] == run)
-        if lost and not about['expected']:
-            numbers = ', '.join(map(str, lost))
-            _LOGGER.warning('worker %s died; computed again: block %s', about['worker'], numbers)
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.signal(signal.SIGINT, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 def cut(
@@ -207,11 +219,11 @@ def _versions() -> dict[str, str | None]:
     return {**package_versions(), 'Python': platform.python_version()}
 
 
-def _compute(
+def _compute_block(
     expected: dict[str, str | None], function: Function, block: Sequence[Any]
-) -> tuple[Any, list[tuple[int, str]]]:
+) -> tuple[Any, _Notes]:
     """Compute a block in a worker; return the result and what the library logged meanwhile."""
-    here, notes = _versions(), list[tuple[int, str]]()
+    here, notes = _versions(), _Notes()
     other = [
         f'{name} {v}, not {expected[name]}' for name, v in here.items() if v != expected[name]
     ]
@@ -225,29 +237,6 @@ def _compute(
 
 
 @contextmanager
-def _interrupt_kept() -> Iterator[None]:
-    """Keep Ctrl-C, which all processes of a terminal get, from those that are started.
-
-    They inherit the mask of signals. Here it takes effect when they are started.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    # Starts the resource tracker of multiprocessing, which changes the mask of this thread.
-    multiprocessing.get_context('spawn').Lock()
-    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-        signal.signal(signal.SIGINT, before)
-        if came:
-            signal.raise_signal(signal.SIGINT)
-
-
-@contextmanager
 def open_runner(
     workers: int | None, scheduler: str | None, bar: Callable[..., tqdm[Any]]
 ) -> Iterator[Runner]:
@@ -255,104 +244,76 @@ def open_runner(
 
     Raises DataError if the scheduler does not answer, MissingDependencyError without distributed.
     """
-    with ExitStack() as stack:
-        client = None
-        with _interrupt_kept():
-            if scheduler is not None:
-                client = stack.enter_context(_connect(scheduler))
-                _LOGGER.info('dashboard: %s', client.dashboard_link)
-            elif workers is not None:
-                client = stack.enter_context(_start(workers, stack))
-        yield Runner(bar, client)
-
-
-def _start(n_workers: int, stack: ExitStack) -> Any:
-    """Start workers of one thread on this machine, for this process alone; return their client.
-
-    They run what reaches their ports, as does the scheduler, and every user of the machine reaches
-    these: TLS with a key of this run keeps others out. Their files are in a private folder, gone
-    afterwards: Dask's own is at a known place in /tmp, where others can plant links, and modules,
-    as Dask imports from there.
-    """
-    distributed = _distributed()
-    require('cryptography', 'cryptography')
-    most = 4 * (os.cpu_count() or 1)
-    if n_workers > most:
-        raise DataError(
-            f'--workers {n_workers}: must be 1 to {most} here, four for each processor'
-        )
-    n_files, needed = resource.getrlimit(resource.RLIMIT_NOFILE)[0], 64 + 16 * n_workers
-    if n_files < needed:  # Dask may wait forever
-        raise DataError(
-            f'--workers {n_workers}: needs {needed} open files, the limit is {n_files} (ulimit -n)'
-        )
-    try:
-        with _silent():
-            folder = stack.enter_context(TemporaryDirectory(prefix='gp_ground_seg-'))
-            config = require('dask.config', 'distributed').set({'temporary-directory': folder})
-            stack.enter_context(config)
-            cluster = distributed.LocalCluster(
-                n_workers=n_workers, threads_per_worker=1,
-                security=distributed.Security.temporary(),
-                dashboard_address='127.0.0.1:0', scheduler_kwargs={'dashboard': False},
-                silence_logs=logging.CRITICAL,
-            )  # fmt: skip
-            return distributed.Client(stack.enter_context(cluster), set_as_default=False)
-    except Exception as error:  # of any type: what was not ready fails again while it is closed
-        first: BaseException = error
-        while before := first.__cause__ or first.__context__:
-            first = before
-        raise DataError(
-            f'--workers {n_workers}: Dask cannot start here ({in_one_line(first)}); '
-            'fewer workers take less memory'
-        ) from error
+    if scheduler is not None:
+        with _connect(scheduler) as client:
+            _LOGGER.info('dashboard: %s', client.dashboard_link)
+            n_workers = sum(client.nthreads().values())
+            if not n_workers:
+                _LOGGER.warning('the scheduler has no worker yet, waiting for one')
+            yield Runner(bar, partial(_tasks, client), n_workers)
+    elif workers is not None:
+        most = 4 * (os.cpu_count() or 1)
+        if workers > most:
+            raise DataError(
+                f'--workers {workers}: must be 1 to {most} here, four for each processor'
+            )
+        yield Runner(bar, partial(_processes, workers), workers)
+    else:
+        yield Runner(bar)
 
 
 @contextmanager
-def _silent() -> Iterator[None]:
-    """Drop what this process and those that it starts in the block print on standard error.
+def _processes(n_workers: int) -> Iterator[Executor]:
+    """Start processes when there is work, and end them, at once if the block fails.
 
-    Dask's event loop and a worker that dies while it starts print tracebacks there.
+    They are spawned: a fork of a process with threads, as of numba or BLAS, may hang.
     """
-    sys.stderr.flush()
-    with open(os.devnull, 'wb') as nothing, os.fdopen(os.dup(2), 'wb') as before:
-        os.dup2(nothing.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(before.fileno(), 2)
+    context = multiprocessing.get_context('spawn')
+    executor = ProcessPoolExecutor(n_workers, context, _end_with_parent)
+    try:
+        yield executor
+    except BaseException:
+        for process in [*executor._processes.values()]:
+            process.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it ends, in whatever way."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end, daemon=True).start()
+
+
+@contextmanager
+def _tasks(client: Any) -> Iterator[Executor]:
+    """Submit to a Dask cluster, and cancel what is left if the block fails."""
+    executor = client.get_executor(pure=False)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(wait=False)
 
 
 def _connect(address: str) -> Any:
+    """Connect to a scheduler, with the keys of Dask's configuration."""
     if not address.startswith(('tcp://', 'tls://')):
         raise DataError(f'--scheduler {address}: must be tcp://HOST:PORT, or tls://')
-    distributed = _distributed()
+    distributed = require('distributed', 'distributed')
+    for name in ('distributed', 'distributed.client'):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # said here in one line
     try:
-        # A client that cannot connect is left half made: it closes when it is collected, and where
-        # that falls into the start of the next one, both wait for one lock for ever.
-        asyncio.run(_greet(address))
         with warnings.catch_warnings():
-            # Versions are compared by `_compute`, which says in one line what differs.
+            # Versions are compared by `_compute_block`, which says in one line what differs.
             warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
             return distributed.Client(address, set_as_default=False)
     except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask speaks there
-        raise DataError(f'--scheduler {address}: does not answer ({error})') from error
-
-
-async def _greet(address: str) -> None:
-    """Connect to a scheduler with the keys of Dask's configuration, and hang up."""
-    from distributed import Security
-    from distributed.comm import connect
-
-    comm = await connect(address, **Security().get_connection_args('client'))
-    await comm.close()
-
-
-def _distributed() -> Any:
-    """Import distributed; it says nothing but by way of what we do."""
-    distributed = require('distributed', 'distributed')
-    # A copy, as Dask adds to the lists that it is given.
-    require('dask.config', 'distributed').set(copy.deepcopy(_CONFIG))
-    for name in ('distributed', 'distributed.client'):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    return distributed
+        text = f'--scheduler {address}: does not answer ({in_one_line(error)})'
+        raise DataError(text) from error

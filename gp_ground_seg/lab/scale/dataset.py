@@ -255,8 +255,8 @@ def run_blocks(
     left = [item for item in items if item.name not in done]
     blocks = cut(left, group, runner.n_workers)
     found = []
-    for k, outcome in runner.map_blocks(partial(function, config), blocks):
-        manifest.add([item.name for item in blocks[k]], outcome.sizes)
+    for block, outcome in zip(blocks, runner.map(partial(function, config), blocks), strict=True):
+        manifest.add([item.name for item in block], outcome.sizes)
         found.append(outcome)
     return pool(found)
 
