@@ -261,10 +261,10 @@ def test_ctrl_c_while_workers_start(delay, root, tmp_path):
         ('somewhere', 'must be tcp://HOST:PORT'),
     ],
 )
-def test_a_scheduler_that_is_not_there(address, problem, root, tmp_path, capsys):
+def test_a_scheduler_that_is_not_there(address, problem, root, monkeypatch, tmp_path, capsys):
     command = ['segment', root, '-o', tmp_path / 'out']
-    with dask.config.set({'distributed.comm.timeouts.connect': '200ms'}):
-        assert run(*command, '--scheduler', address) == 2
+    monkeypatch.setattr(cluster, 'CONNECT_TIMEOUT', 0.2)
+    assert run(*command, '--scheduler', address) == 2
     assert problem in error_line(capsys)
     assert run(*command) == 0
 

@@ -5,6 +5,7 @@ The one module that imports distributed, an optional package.
 
 from __future__ import annotations
 
+import asyncio
 import importlib.metadata
 import itertools
 import logging
@@ -39,6 +40,8 @@ BLOCK_SIZE = 64
 """Items of a block, where there are enough for all workers: they share what a task costs."""
 MAX_RESTARTS = 3
 """How often workers of this machine are started anew, if one of them dies."""
+CONNECT_TIMEOUT = 10
+"""Time in which a scheduler must answer [s]."""
 
 _NO_BAR = partial(tqdm, disable=True)
 Progress = Callable[[Sequence[Any]], Iterable[Any]]
@@ -310,6 +313,9 @@ def _connect(address: str) -> Any:
     for name in ('distributed', 'distributed.client'):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # said here in one line
     try:
+        # A client that cannot connect is left half made: it closes when it is collected, and where
+        # that falls into the start of the next one, both wait for one lock for ever.
+        asyncio.run(_greet(address))
         with warnings.catch_warnings():
             # Versions are compared by `_compute_block`, which says in one line what differs.
             warnings.simplefilter('ignore', distributed.versions.VersionMismatchWarning)
@@ -317,3 +323,13 @@ def _connect(address: str) -> Any:
     except (OSError, ValueError, TypeError, MemoryError) as error:  # memory: no Dask speaks there
         text = f'--scheduler {address}: does not answer ({in_one_line(error)})'
         raise DataError(text) from error
+
+
+async def _greet(address: str) -> None:
+    """Connect to a scheduler with the keys of Dask's configuration, and hang up."""
+    from distributed import Security
+    from distributed.comm import connect
+
+    keys = Security().get_connection_args('client')
+    comm = await connect(address, timeout=CONNECT_TIMEOUT, **keys)
+    await comm.close()
