@@ -14,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import BrokenExecutor
 from functools import partial
 from pathlib import Path
 
@@ -182,6 +183,23 @@ def test_a_worker_that_died_is_said(tmp_path, caplog):
         runner.run(partial(_die_once, tmp_path / 'died'), range(40))
     (line,) = caplog.messages
     assert re.fullmatch(r'a worker died; computed again: [1-4] blocks', line)
+
+
+def test_a_worker_that_dies_before_the_work_begins(caplog):
+    is_first = True
+
+    @contextlib.contextmanager
+    def opened():
+        nonlocal is_first
+        with cluster._processes(1) as executor:
+            if is_first:
+                is_first = False
+                assert isinstance(executor.submit(_die, [0], iter).exception(), BrokenExecutor)
+            yield executor
+
+    runner = cluster.Runner(open_executor=opened, n_workers=1)
+    assert runner.run(_last_first, range(3)) == [0, 2]
+    assert caplog.messages == ['a worker died; computed again: 2 blocks']
 
 
 def listening():

@@ -24,7 +24,7 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     as_completed,
 )
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import partial
 from multiprocessing import resource_tracker
 from typing import Any
@@ -148,10 +148,10 @@ def _completed(
     Those of processes that died are left out. Raises DataError if the cluster fails.
     """
     compute = partial(_compute_block, _versions(), function)
-    with _ctrl_c_kept():  # processes are started by the first items
-        futures: dict[Future[tuple[Any, _Notes]], int] = {
-            executor.submit(compute, block): k for k, block in blocks.items()
-        }
+    futures: dict[Future[tuple[Any, _Notes]], int] = {}
+    with _ctrl_c_kept(), suppress(BrokenExecutor):  # processes start here, and may die here
+        for k, block in blocks.items():
+            futures[executor.submit(compute, block)] = k
     for future in as_completed(futures):
         k = futures.pop(future)  # or the cluster would keep the result
         try:
