@@ -315,7 +315,7 @@ def correct_surface(surface, labelled, grid, noise_std, slope_std, takes_first=T
         between, whole = np.var(means), np.var(heights)
         ground, noise = _ground_variance(own, between, whole), whole - between
         if len(own) == 1:
-            ground, noise = surface.std[m, k] ** 2, noise_std[m, 0] ** 2
+            ground, noise = surface.std[m, k] ** 2, noise_std**2
             whole = ground + noise
         result[:, m, k] = heights.mean(), ground, max(whole, ground)
         noises[m, k] = noise
@@ -325,7 +325,7 @@ def correct_surface(surface, labelled, grid, noise_std, slope_std, takes_first=T
             continue
         own = surface.std[m, k] ** 2
         if not seen:
-            result[:, m, k] = 0.0, own, own + noise_std[m, 0] ** 2
+            result[:, m, k] = 0.0, own, own + noise_std**2
             continue
         # Of several that are equally far the first or the last one.
         far = [round(_between_knots(surface.knots, (m, k), at, n_segments), 9) for at in seen]

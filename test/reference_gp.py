@@ -45,9 +45,9 @@ def log_length_scales(frame, theta, config, m):
     r = frame.candidates.r[own]
     knots = frame.knots[: frame.candidates.bin[own][-1] + 2]
     if config.length_scale.model == 'latent':
-        l_bar = theta[m, 5 + frame.pseudo.kind[bar]] + frame.pseudo.log_extent[bar]
+        l_bar = theta[5 + frame.pseudo.kind[bar]] + frame.pseudo.log_extent[bar]
         both = np.concatenate([r, knots])
-        u = log_length_scale(frame.pseudo.r_bar[bar], l_bar, both, *np.exp(theta[m, 2:5]))
+        u = log_length_scale(frame.pseudo.r_bar[bar], l_bar, both, *np.exp(theta[2:5]))
         return u[: len(r)], u[len(r) :]
     limits = config.length_scale
     slope = frame.lines.slope[frame.lines.line[own]]
@@ -60,14 +60,15 @@ def log_length_scales(frame, theta, config, m):
 
 def estimate_surface(frame, theta, config):
     """Inliers that join until none does, and the surface, with what the segments beside show."""
-    growth, slope_std, n = config.growth, config.observation.slope_std, len(theta)
+    growth, slope_std = config.growth, config.observation.slope_std
+    n = frame.candidates.n_segments
     looks_aside = config.surface.look_aside and slope_std > 0.0 and len(frame.knots) > 0
     z, first = frame.candidates.z - frame.prior_mean, frame.candidates.offsets
     seed = (frame.candidates.r <= growth.seed_range) & (abs(z) <= growth.seed_height_tolerance)
     nothing = np.zeros((2, n, max(len(frame.knots), 1)))
     evidence, odds = nothing, 0.25
     if looks_aside:
-        seed, odds = unlifted(frame, z, seed, np.exp(theta[:, 1]), config)
+        seed, odds = unlifted(frame, z, seed, np.exp(theta[1]), config)
         rows = [(m, grow(frame, theta, config, m, z, seed, odds, nothing)) for m in range(0, n, 4)]
         evidence = evidence_beside(dict(rows), theta, frame.knots, slope_std, n)
     own = {m: grow(frame, theta, config, m, z, seed, odds, evidence) for m in range(n)}
@@ -81,7 +82,7 @@ def estimate_surface(frame, theta, config):
         for j in range(len(u_star)):
             known = [(height[j], deviation[j] ** 2)] if chosen.any() else []
             if looks_aside and evidence[1, m, j] > 0.0:
-                prior = 0.0, np.exp(2 * theta[m, 0]) + (slope_std * frame.knots[j]) ** 2
+                prior = 0.0, np.exp(2 * theta[0]) + (slope_std * frame.knots[j]) ** 2
                 known = (known or [prior]) + [(evidence[0, m, j], 1 / evidence[1, m, j])]
             if known:
                 weights = [1 / max(variance, 1e-6) for _, variance in known]
@@ -110,7 +111,7 @@ def unlifted(frame, z, seed, sigma_n, config):
                 for at in frame.knots[: candidates.bin[seed].max() + 1]
             )
             lowest = min(lowest, z[k] + slope * min(arcs))
-        stands[i] = z[i] > lowest + noise[segment[i]]
+        stands[i] = z[i] > lowest + noise
     n_ground, n_standing = (
         int((near & ~frame.in_face & is_it).sum()) for is_it in (~stands, stands)
     )
@@ -125,7 +126,7 @@ def grow(frame, theta, config, m, z, seed, odds, evidence):
     if len(r) == 0:
         return np.zeros(0, dtype=bool), [], [], [], []
     u, u_star = log_length_scales(frame, theta, config, m)
-    sigma_f, sigma_n = np.exp(theta[m, :2])
+    sigma_f, sigma_n = np.exp(theta[:2])
     shown, weight = np.zeros((2, len(r)))
     if evidence.any():
         shown, weight = (np.interp(r, frame.knots, row) for row in evidence[:, m])
@@ -135,7 +136,7 @@ def grow(frame, theta, config, m, z, seed, odds, evidence):
     ], bool)  # fmt: skip
     in_face, continues = frame.in_face[own], frame.continues_line[own] & ~is_above
     # Candidates within sigma_l_bar of each other show together as much as one.
-    reach = np.exp(theta[m, 3]) if config.label.rule == 'roughness' else 0.0
+    reach = np.exp(theta[3]) if config.label.rule == 'roughness' else 0.0
     noise = np.array([sigma_n * math.sqrt(sum(abs(r - own) <= reach)) for own in r])
     chosen = np.zeros(len(r), dtype=bool)
     joining, in_doubt = seed & ~is_above, seed & in_face
@@ -183,7 +184,7 @@ def evidence_beside(own, theta, knots, slope_std, n):
     for m, (chosen, _, _, height, deviation) in own.items():
         for j in range(len(height) if chosen.any() else 0):
             square = max(deviation[j], 1e-3) ** 2
-            precision = 1 / square - 1 / (np.exp(2 * theta[m, 0]) + (slope_std * knots[j]) ** 2)
+            precision = 1 / square - 1 / (np.exp(2 * theta[0]) + (slope_std * knots[j]) ** 2)
             if precision > 1e-3:
                 shown[m, j] = height[j] / square / precision, precision**-0.5
     result = np.zeros((2, n, len(knots)))

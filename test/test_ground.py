@@ -18,11 +18,6 @@ from gp_ground_seg.core.gp.ground import ODDS_IN_FACE, noise_in_doubt
 from gp_ground_seg.core.gp.learning import given_theta
 
 
-def theta_of(config):
-    """Given theta of every segment."""
-    return np.tile(given_theta(config), (config.grid.n_segments, 1))
-
-
 def frame_of(xyz, config):
     scan = NumpyBackend().build_grid(np.asarray(xyz, dtype=float), config)
     faces = NumpyBackend().find_faces(scan, config)
@@ -57,7 +52,7 @@ def surface_by_the_loops(seed):
     )
     xyz = hilly_scan(int(rng.choice([0, 30, 900])), seed)
     frame = frame_of(xyz[rng.random() * xyz[:, 1] > -5.0], config)
-    theta = theta_of(config)
+    theta = given_theta(config)
     theta += np.where(np.arange(6) < 5, 0.3, 1.0) * rng.normal(size=theta.shape)
     if rng.random() < 0.3:
         frame = frame._replace(knots=frame.knots[:0])
@@ -113,8 +108,8 @@ def test_noise_free_candidates_are_interpolated_with_no_uncertainty(backend):
         continues_line=np.ones(len(r), dtype=bool),
         in_face=np.zeros(len(r), dtype=bool),
     )
-    theta = theta_of(config)
-    theta[:, 1] = np.log(1e-6)
+    theta = given_theta(config)
+    theta[1] = np.log(1e-6)
     surface, *_ = backend.estimate_surface(frame, theta, config)
     m = frame.candidates.segment[0]
     assert surface.inlier.all()
@@ -127,11 +122,11 @@ def test_candidates_close_together_show_as_much_as_one(backend, rule, n_shown):
     config = config_of('constant', slope_std=0.0).replace(
         **{'length_scale.constant': 50.0, 'label.rule': rule}
     )
-    sigma_f, sigma_n = np.exp(theta_of(config)[0, :2])
+    sigma_f, sigma_n = np.exp(given_theta(config)[:2])
     for r, n in ([4.0, 4.75, 5.5], n_shown), ([4.0, 8.0, 12.0], 3):
         r = np.array(r)
         frame = frame_of(np.column_stack([r, 0.01 * r, np.full(3, -1.73)]), config)
-        surface, *_ = backend.estimate_surface(frame, theta_of(config), config)
+        surface, *_ = backend.estimate_surface(frame, given_theta(config), config)
         assert surface.inlier.all() and len(surface.inlier) == 3
         expected = (1.0 / sigma_f**2 + n / sigma_n**2) ** -0.5
         std = surface.std[frame.candidates.segment[0]]
@@ -149,8 +144,8 @@ def test_rounding_beside_little_noise_is_no_fault(backend):
     )
     r = np.arange(3.0, 499.0)
     frame = frame_of(np.column_stack([r, 0.01 * r, np.full_like(r, -1.73)]), config)
-    theta = theta_of(config)
-    theta[:, 1] = np.log(1e-5)
+    theta = given_theta(config)
+    theta[1] = np.log(1e-5)
     surface, *_ = backend.estimate_surface(frame, theta, config)
     m = frame.candidates.segment[0]
     assert surface.inlier.all()
@@ -164,7 +159,7 @@ def grow_line(backend, z, r=None, continues=(), slope_std=0.05, **bounds):
     config = config_of('constant', slope_std, **{**seeds, **bounds})
     frame = frame_of(np.column_stack([r, 0.01 * r, np.asarray(z) - 1.73]), config)
     frame = frame._replace(continues_line=np.isin(np.arange(len(z)), continues))
-    surface, *_ = backend.estimate_surface(frame, theta_of(config), config)
+    surface, *_ = backend.estimate_surface(frame, given_theta(config), config)
     m, known = frame.candidates.segment[0], np.isfinite(surface.mean[frame.candidates.segment[0]])
     values = frame.knots[known], surface.mean[m, known] + 1.73, surface.std[m, known]
     return list(np.flatnonzero(surface.inlier)), *values
@@ -236,7 +231,7 @@ def ring_of_ground(backend, lift, **values):
     seen = ~is_car | (r < 7.0)
     r, azimuth, z = r[seen], azimuth[seen], np.where(is_car, lift - 1.73, -1.73)[seen]
     frame = frame_of(np.column_stack([r * np.cos(azimuth), r * np.sin(azimuth), z]), config)
-    surface = backend.estimate_surface(frame, theta_of(config), config)[0]
+    surface = backend.estimate_surface(frame, given_theta(config), config)[0]
     return frame.knots, surface, frame.candidates.z > 0.5 * lift - 1.73
 
 
@@ -299,7 +294,7 @@ def frame_of_a_sill(n_walls):
 def test_the_odds_of_an_obstacle_are_those_of_the_frame(n_walls):
     frame, config = frame_of_a_sill(n_walls)
     stands = frame.candidates.z > -1.0
-    odds = seeds(frame, theta_of(config), config)[1]
+    odds = seeds(frame, given_theta(config), config)[1]
     assert odds == pytest.approx(max(stands.sum() / (~stands).sum(), ODDS), rel=0.02)
 
 
@@ -307,7 +302,7 @@ def test_among_many_obstacles_sills_lift_less(backend):
     def lifted(n_walls):
         frame, config = frame_of_a_sill(n_walls)
         config = config.replace(**{'observation.sigma_f': 0.35})
-        surface = backend.estimate_surface(frame, theta_of(config), config)[0]
+        surface = backend.estimate_surface(frame, given_theta(config), config)[0]
         return surface.mean[135, np.searchsorted(frame.knots, 8.0)] + 1.73
 
     assert lifted(85) < 0.7 * lifted(0)

@@ -26,7 +26,7 @@ def correct(cells, residuals, surface, noise=0.02, slope_std=0.05, find=correct_
     label = np.full(len(cells), Label.GROUND, np.uint8)
     grid = PolarGrid(cells, np.ones(len(cells)), KNOTS, N_SEGMENTS)
     labelled = Labelled(label, residuals, residuals)
-    return find(surface, labelled, grid, np.full((N_SEGMENTS, 1), noise), slope_std)
+    return find(surface, labelled, grid, noise, slope_std)
 
 
 def flat(std=0.03, z=-1.7):

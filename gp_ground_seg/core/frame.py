@@ -121,6 +121,11 @@ class Candidates(NamedTuple):
         return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
 
     @property
+    def n_segments(self) -> int:
+        """Number of segments, M."""
+        return len(self.offsets) - 1
+
+    @property
     def n_edges(self) -> IntArray:
         """Bin edges up to the far one of the last bin with a candidate, (M,) int64, or 0."""
         first, stop = self.offsets[:-1], self.offsets[1:]

@@ -121,7 +121,7 @@ class FitReport:
     def of(cls, frame: Segmentation) -> FitReport:
         """Sum up one frame."""
         learned = frame.fitting.learned
-        values, names = np.exp(frame.theta.mean(axis=0)), theta_names(frame.theta.shape[1])
+        values, names = np.exp(frame.theta), theta_names(len(frame.theta))
         at_bound = learned.at_bound if learned else np.zeros(len(names), np.bool_)
         n_inliers = int(frame.surface.inlier.sum())
         return cls(
@@ -158,8 +158,8 @@ class Segmentation:
     grid, frame, surface
         Intermediate results, for plots and diagnostics; in the level frame. `surface` is the
         process's own, which the labels follow from; `corrected` is what users are given.
-    theta : (M, T) float64
-        Logarithms of the hyper-parameters of each segment, named by
+    theta : (T,) float64
+        Logarithms of the hyper-parameters, named by
         `gp_ground_seg.core.gp.learning.theta_names`.
     log_length_scale : (M, knots) float64
         Log length-scale at the knots of the surface [log m]; NaN in segments
@@ -248,7 +248,7 @@ class Segmentation:
         See `gp_ground_seg.core.pipeline.residuals.correct_surface`. The relief is that in the
         middle of each segment.
         """
-        noise_std, labelled = np.exp(self.theta[:, 1:2]), self.labelled
+        noise_std, labelled = float(np.exp(self.theta[1])), self.labelled
         found = correct_surface(self.surface, labelled, self.grid, noise_std, self.slope_std)
         relief = self.relief.at_knots(found.knots, self.grid.n_segments)
         return found._replace(mean=found.mean + relief)

@@ -152,7 +152,8 @@ class NumbaBackend:
         """Inliers, the surface, and log length-scales at the knots and at the candidates."""
         take, knots, slope_std = self._buffers.take, frame.knots, config.observation.slope_std
         observation, growth = numbers_of(config.observation), numbers_of(config.growth)
-        shape, n_candidates = (len(theta), len(knots)), len(frame.candidates.r)
+        shape = (frame.candidates.n_segments, len(knots))
+        n_candidates = len(frame.candidates.r)
         u, knot_u = self._log_length_scales(frame, theta, config)
         alone = ground.SegmentSurfaces(
             u,
@@ -193,7 +194,7 @@ class NumbaBackend:
         if config.length_scale.model != 'latent':
             return given_log_length_scales(frame, config.length_scale)
         u = self._buffers.take('u', (len(frame.candidates.r),), np.float64)
-        knot_u = np.empty((len(theta), len(frame.knots)))
+        knot_u = np.empty((frame.candidates.n_segments, len(frame.knots)))
         latent_.latent_log_length_scales(frame, theta, u, knot_u)
         return u, knot_u
 

@@ -61,8 +61,8 @@ def find_seeds(
         rise_from(table[m % n_segments], table[(m + 1) % n_segments], rise)
     rise_along(table, n_bins, max_slope, knots)
     n_standing = n_near = 0
+    sigma_n = math.exp(theta[1])
     for m in range(n_segments):
-        sigma_n = math.exp(theta[m, 1])
         for i in range(candidates.offsets[m], candidates.offsets[m + 1]):
             if candidates.bin[i] < n_bins:
                 z = candidates.z[i] - frame.prior_mean
@@ -114,8 +114,8 @@ def find_evidence(
     nearest, nearest_std, rise = np.empty(n_knots), np.empty(n_knots), np.empty(n_knots)
     for j in range(start, end):
         rise[j] = slope_std * 2.0 * math.pi / n_segments * knots[j]
+    sill = math.exp(theta[0]) ** 2
     for m in range(n_segments):
-        sill = math.exp(theta[m, 0]) ** 2
         mean_m, std_m, height, deviation = mean[m], std[m], shown[0, m], shown[1, m]
         for j in range(start, end):
             prior = prior_variance(sill, slope_std, knots[j])
@@ -160,8 +160,8 @@ def combine(
 
     `aside` (2, M, K) is the evidence, (2, 0, 0) if none is wanted.
     """
+    sill = math.exp(theta[0]) ** 2
     for m in range(len(mean)):
-        sill = math.exp(theta[m, 0]) ** 2
         for j in range(len(knots)):
             mean[m, j], std[m, j] = alone.mean[m, j], alone.std[m, j]
             if aside.shape[1] > 0 and not math.isnan(alone.knot_log_length_scale[m, j]):

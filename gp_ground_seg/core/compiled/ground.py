@@ -121,11 +121,11 @@ def grow_surfaces(
         np.empty((most, width)),
     )
     slope = observation.slope_std**2
+    sill, noise = math.exp(theta[0]) ** 2, math.exp(theta[1]) ** 2
+    reach = math.exp(theta[3]) if odds > 0.0 else 0.0
     for m in range(0, len(mean), step):
-        sill, noise = math.exp(theta[m, 0]) ** 2, math.exp(theta[m, 1]) ** 2
         for j in range(len(frame.knots)):
             mean[m, j] = std[m, j] = np.nan
-        reach = math.exp(theta[m, 3]) if odds > 0.0 else 0.0
         n, n_new, has_aside = _begin(frame, m, noise, reach, aside, alone, columns)
         if n_new == 0 and not has_aside:
             continue

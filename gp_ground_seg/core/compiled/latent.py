@@ -27,6 +27,7 @@ def latent_log_length_scales(
     wanted, value = np.empty(width), np.empty(width)
     width = (most_bar + LANES - 1) & -LANES
     matrix, weight, centres = np.empty((most_bar, width)), np.empty(width), np.empty(width)
+    variance, sharpness = math.exp(2.0 * theta[2]), 0.5 * math.exp(-2.0 * theta[3])
     for m in range(len(at_knots)):
         for j in range(len(knots)):
             at_knots[m, j] = np.nan
@@ -36,9 +37,7 @@ def latent_log_length_scales(
             continue
         # Behind the bin of the last candidate nothing is known of the ground.
         n_wanted = min(candidates.bin[first + n - 1] + 2, len(knots))
-        variance = math.exp(2.0 * theta[m, 2])
-        sharpness = 0.5 * math.exp(-2.0 * theta[m, 3])
-        mean = _weigh(frame, m, theta[m], matrix, weight, centres)
+        mean = _weigh(frame, m, theta, matrix, weight, centres)
         # Element by element: assigned slices take as long, and seconds to compile.
         for i in range(n):
             wanted[i] = candidates.r[first + i]

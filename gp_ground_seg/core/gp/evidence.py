@@ -157,7 +157,7 @@ def seeds(frame: Frame, theta: FloatArray, config: Config) -> tuple[BoolArray, f
         return seed, ODDS
     max_slope = CLEARLY * config.observation.slope_std
     highest = highest_ground(frame, z, seed, max_slope)
-    stands = stands_on(z, highest, np.exp(theta[candidates.segment, 1]))
+    stands = stands_on(z, highest, np.exp(theta[1]))
     counts = np.isfinite(highest) & ~frame.in_face
     n_standing, n_candidates = np.count_nonzero(stands & counts), np.count_nonzero(counts)
     return seed & ~stands, float(odds_of(n_standing, n_candidates))

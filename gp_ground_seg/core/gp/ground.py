@@ -63,8 +63,8 @@ def estimate_surface(
     ----------
     frame : Frame
         Candidates, lines, pseudo-inputs, knots.
-    theta : (M, T) float64
-        Hyper-parameters of each segment (see `gp_ground_seg.core.gp.learning`).
+    theta : (T,) float64
+        Hyper-parameters of the frame (see `gp_ground_seg.core.gp.learning`).
     config : Config
         Model of the length-scale, prior slope, gates.
 
@@ -83,20 +83,20 @@ def estimate_surface(
     else:
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
-    noise = np.exp(2.0 * theta[candidates.segment, 1])
+    noise = np.full(len(z), np.exp(2.0 * theta[1]))
     alone = SegmentSurfaces.empty(len(z), knot_u.shape)
     seed, odds = seeds(frame, theta, config)
     if config.label.rule == 'roughness':
-        n_near = _count_near(candidates, np.exp(theta[candidates.segment, 3]))
+        n_near = _count_near(candidates, np.exp(theta[3]))
         noise = noise_among(n_near, noise)
     else:
         odds = 0.0
     model = _Model(
         frame, theta, z, noise, np.exp(u), np.exp(knot_u), seed, frame.continues_line, odds
     )
-    everywhere = np.arange(len(theta))
+    everywhere = np.arange(candidates.n_segments)
     looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
-    prior = prior_variance(np.exp(theta[:, :1]) ** 2, slope_std, knots)
+    prior = prior_variance(np.exp(theta[0]) ** 2, slope_std, knots)
 
     def aside() -> Evidence:
         return evidence_aside(alone.mean, alone.std, prior, knots, slope_std)
@@ -144,7 +144,7 @@ class _Model(NamedTuple):
     """Values that the segments grow from."""
 
     frame: Frame
-    theta: FloatArray  # (M, T)
+    theta: FloatArray  # (T,)
     z: FloatArray  # (C,) about the prior mean [m]
     # (C,) variance of the noise with which a candidate is observed, unless it joins in doubt
     noise: FloatArray
@@ -186,12 +186,12 @@ def noise_among(n: Values, noise: Values) -> Values:
     return n * noise
 
 
-def _count_near(candidates: Candidates, reach: FloatArray) -> IntArray:
-    """Count the candidates of its segment within `reach` (C,) [m] of each, itself as well."""
+def _count_near(candidates: Candidates, reach: float) -> IntArray:
+    """Count the candidates of its segment within `reach` [m] of each, itself as well."""
     r, segment = candidates.r, candidates.segment
     number = np.ones(len(r), dtype=np.int64)
     for n in range(1, len(r)):
-        is_near = (r[n:] - r[:-n] <= reach[n:]) & (segment[n:] == segment[:-n])
+        is_near = (r[n:] - r[:-n] <= reach) & (segment[n:] == segment[:-n])
         if not is_near.any():
             break
         number[n:] += is_near
@@ -224,8 +224,8 @@ def _grow_segments(
 ) -> None:
     """Inliers and surface of `segments`, into `alone`; `aside` is the evidence at candidates."""
     alone.mean[segments] = alone.std[segments] = np.nan
-    offsets, segment = model.frame.candidates.offsets, model.frame.candidates.segment
-    is_below = ~contradicts(*aside, model.z, np.exp(2.0 * model.theta[segment, 1]))
+    offsets = model.frame.candidates.offsets
+    is_below = ~contradicts(*aside, model.z, np.exp(2.0 * model.theta[1]))
     model = model._replace(
         seed=model.seed & is_below, continues_line=model.continues_line & is_below
     )
@@ -237,9 +237,9 @@ def _grow_segments(
 def _grow_batch(
     segments: IntArray, model: _Model, aside: Evidence, config: Config, alone: SegmentSurfaces
 ) -> None:
-    frame, theta, slope_std = model.frame, model.theta[segments], config.observation.slope_std
+    frame, slope_std = model.frame, config.observation.slope_std
     layout = Padded.of(segments, frame.candidates.offsets)
-    sill, noise = np.exp(theta[:, :2]).T[:, :, None] ** 2
+    sill, noise = np.exp(model.theta[:2]) ** 2
     r = layout.take(frame.candidates.r)
     is_wanted = np.isfinite(model.knot_length_scale[segments])
     n_knots = int(is_wanted.sum(axis=1).max())
@@ -274,10 +274,10 @@ class _Batch(NamedTuple):
 
     r: FloatArray  # (S, N)
     length_scale: FloatArray  # (S, N)
-    sill: FloatArray  # (S, 1)
+    sill: float
     slope_std: float
     z: FloatArray  # (S, n) about the prior mean
-    gate_noise: FloatArray  # (S, 1) variance of the noise of a candidate
+    gate_noise: float  # variance of the noise of a candidate
     # (S, n) variance of that with which it is observed; grows where it joins in doubt
     noise: FloatArray
     mask: BoolArray  # (S, n)
@@ -330,7 +330,7 @@ def _prior_rows(batch: _Batch, segment: IntArray, place: IntArray) -> FloatArray
     """Prior covariance of places (P,), of segments (P,), with all places, (P, N)."""
     r, length_scale = batch.r[segment], batch.length_scale[segment]
     own_r, own_l = batch.r[segment, place][:, None], batch.length_scale[segment, place][:, None]
-    rows: FloatArray = paciorek(own_r, own_l, r, length_scale, batch.sill[segment])
+    rows: FloatArray = paciorek(own_r, own_l, r, length_scale, batch.sill)
     rows += batch.slope_std**2 * own_r * r
     return rows
 
@@ -357,7 +357,7 @@ def _condition(
     if whitened.size:
         rows -= np.matmul(whitened[own, :, place], whitened)
     within = rows[own, :, place]
-    prior = prior_variance(batch.sill[active], batch.slope_std, batch.r[segment, place])
+    prior = prior_variance(batch.sill, batch.slope_std, batch.r[segment, place])
     add_noise(within, observed_noise(batch.noise[segment, place], prior), is_new)
     unit = inverse_of_lower(np.linalg.cholesky(within)) * is_new[:, :, None]
     rows = np.matmul(unit, rows)

@@ -30,26 +30,25 @@ def latent_log_length_scales(frame: Frame, theta: FloatArray) -> tuple[FloatArra
     The pseudo-inputs are centred on their mean, so that equal ones give that very value
     everywhere.
 
-    `theta`, (M, T), are the hyper-parameters of each segment (see
-    `gp_ground_seg.core.gp.learning`).
+    `theta`, (T,), are the hyper-parameters (see `gp_ground_seg.core.gp.learning`).
     Returns log length-scales at the candidates, (C,), and at the knots, (M, K) [log m]; NaN there
     behind the bin of the last candidate.
     """
     candidates, pseudo = frame.candidates, frame.pseudo
     n_knots = n_wanted_knots(frame)
+    sill_bar, square_l_bar, noise_bar = np.exp(2.0 * theta[2:5])
+    kernel = sill_bar, 0.5 / square_l_bar
     at_candidates = np.empty(len(candidates.r))
-    at_knots = np.full((len(theta), len(frame.knots)), np.nan)
+    at_knots = np.full((candidates.n_segments, len(frame.knots)), np.nan)
     for segments in batches(candidates.offsets):
         layout = Padded.of(segments, candidates.offsets)
         bar = Padded.of(segments, pseudo.offsets)
         r, r_bar = layout.take(candidates.r)[:, :, None], bar.take(pseudo.r_bar)
-        sill_bar, square_l_bar, noise_bar = np.exp(2.0 * theta[segments, 2:5]).T
-        kernel = sill_bar[:, None, None], 0.5 / square_l_bar[:, None, None]
-        factor = np.take_along_axis(theta[segments, 5:], pseudo.kind[bar.place], axis=1)
-        l_bar = np.where(bar.mask, bar.take(pseudo.log_extent) + factor, 0.0)
+        l_bar = bar.take(pseudo.log_extent) + theta[5 + pseudo.kind[bar.place]]
+        l_bar = np.where(bar.mask, l_bar, 0.0)
         mean = l_bar.sum(axis=1, keepdims=True) / bar.mask.sum(axis=1, keepdims=True)
         covariance = squared_exponential(r_bar[:, :, None], r_bar[:, None, :], *kernel)
-        add_noise(covariance, noise_bar[:, None], bar.mask)
+        add_noise(covariance, np.full((1, 1), noise_bar), bar.mask)
         centred = np.where(bar.mask, l_bar - mean, 0.0)
         weight = np.linalg.solve(covariance, centred[:, :, None])
         cross = squared_exponential(r, r_bar[:, None, :], *kernel)

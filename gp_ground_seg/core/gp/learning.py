@@ -2,7 +2,7 @@
 
 Theta is a vector of logarithms: sigma_f, sigma_n, sigma_f_bar, sigma_l_bar, sigma_n_bar, then a
 factor on the length-scales that the lines suggest, or with ``learning.length_scale = classes`` one
-for each class of lines. It is learned over the whole frame: the rows of its segments are equal.
+for each class of lines. All segments of a frame share it.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def learn_frame(frame: Frame, config: Config, model: Model) -> Learned | None:
     numbers: list[int] = []
     budget = max(learning.max_evaluations // 2, 1)
     while budget > 0:
-        surface, _, u = model.estimate_surface(thin, in_rows(learned.theta, thin), config)
+        surface, _, u = model.estimate_surface(thin, learned.theta, config)
         numbers.append(int(surface.inlier.sum()))
         if len(numbers) > 2 and numbers[-1] <= numbers[-2]:
             break
@@ -187,11 +187,6 @@ def learn_frame(frame: Frame, config: Config, model: Model) -> Learned | None:
         learned = found._replace(n_evaluations=learned.n_evaluations + found.n_evaluations)
         budget = learning.max_evaluations - learned.n_evaluations
     return learned
-
-
-def in_rows(theta: FloatArray, frame: Frame) -> FloatArray:
-    """Return the same theta for each segment of a frame, (M, T)."""
-    return np.repeat(theta[None], len(frame.candidates.offsets) - 1, axis=0)
 
 
 def every_segment(frame: Frame, step: int) -> Frame:

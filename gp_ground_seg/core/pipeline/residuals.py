@@ -59,7 +59,7 @@ def correct_surface(
     surface: GroundSurface,
     labelled: Labelled,
     grid: PolarGrid,
-    noise_std: FloatArray,
+    noise_std: float,
     slope_std: float,
 ) -> CorrectedSurface:
     """Correct a surface by the residuals of the returns called ground.
@@ -73,7 +73,7 @@ def correct_surface(
     variances. The result is as uncertain as evidence so far away, or as the process where that is
     more, plus the variance between the two.
 
-    `noise_std`, (M, 1), is that of the process in each segment [m], `slope_std` the prior standard
+    `noise_std` is that of the process [m], `slope_std` the prior standard
     deviation of the ground's slope.
     """
     has_model = np.isfinite(surface.mean)

@@ -108,7 +108,7 @@ def _rows(
         part = slice(*candidates.offsets[segment : segment + 2])
         held_out = modelled & (common.grid.segment == segment)
         held_out &= ~np.isin(x + 1j * y, candidates.x[part] + 1j * candidates.y[part])
-        variances = np.exp(2.0 * common.theta[segment, : len(VARIANCES)])
+        variances = np.exp(2.0 * common.theta[: len(VARIANCES)])
         in_sample = {name: _in_sample(result, segment) for name, result in results.items()}
         rows.append(
             {

@@ -211,7 +211,7 @@ class SegmentView:
         first, last = result.pseudo.offsets[self._segment : self._segment + 2]
         if with_pseudo_inputs and last > first:
             r_bar = result.pseudo.r_bar[first:last]
-            shared = result.theta[self._segment, 5 + result.pseudo.kind[first:last]]
+            shared = result.theta[5 + result.pseudo.kind[first:last]]
             l_bar = np.exp(result.pseudo.log_extent[first:last] + shared)
             look = {'ms': 5, 'color': PSEUDO_INPUT_COLOUR, 'mew': 0.0}
             axes.plot(r_bar, l_bar, 's', label=f'pseudo-inputs ({last - first})', **look)
