@@ -13,7 +13,6 @@ from gp_ground_seg.core.gp.learning import (
     ThetaSpace,
     every_segment,
     given_theta,
-    in_rows,
     maximise,
     theta_space,
 )
@@ -202,7 +201,7 @@ def test_every_nth_segment_by_itself_has_the_inliers_it_has_in_the_frame(step):
     (whole, whole_u), (alone, alone_u) = (
         (surface.inlier, u.copy())
         for one in (frame, own)
-        for surface, _, u in [MODEL.estimate_surface(one, in_rows(theta, one), config)]
+        for surface, _, u in [MODEL.estimate_surface(one, theta, config)]
     )
     np.testing.assert_array_equal(own.candidates.r, frame.candidates.r[kept])
     np.testing.assert_array_equal(alone, whole[kept])

@@ -1,4 +1,4 @@
-"""Log marginal likelihood of a whole frame and its gradient, in batches of segments."""
+"""Log marginal likelihood of a whole frame and its gradient, segment by segment."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray, Values
+from gp_ground_seg.core.frame import FloatArray, Inliers, IntArray
 from gp_ground_seg.core.gp.kernels import paciorek, squared_exponential
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
-from gp_ground_seg.core.gp.linalg import Padded, add_noise, batches, single_threaded_blas
+from gp_ground_seg.core.gp.linalg import single_threaded_blas
 
 _LOG_2PI = math.log(2.0 * math.pi)
 
@@ -33,8 +33,8 @@ def log_likelihood(
     """
     value, gradient = 0.0, np.zeros(len(theta))
     try:
-        for segments in batches(inliers.offsets):
-            value += _add_batch(theta, gradient, inliers, segments, slope_std, latent_terms)
+        for m in np.flatnonzero(np.diff(inliers.offsets)).tolist():
+            value += _add_segment(theta, gradient, inliers, m, slope_std, latent_terms)
     except np.linalg.LinAlgError:
         value = -math.inf
     if not math.isfinite(value):
@@ -42,136 +42,122 @@ def log_likelihood(
     return value, gradient
 
 
-def _add_batch(
+def _add_segment(
     theta: FloatArray,
     gradient: FloatArray,
     inliers: Inliers,
-    segments: IntArray,
+    m: int,
     slope_std: float,
     latent_terms: bool,
 ) -> float:
-    """Value of some segments; adds to `gradient`. Letters are those of the paper."""
-    layout = Padded.of(segments, inliers.offsets)
-    r, z = layout.take(inliers.r), layout.take(inliers.z)
-    bar = Padded.of(segments, inliers.bar_offsets)
-    u = layout.take(inliers.log_length_scale)
-    has_latent = bar.mask.any(axis=1, keepdims=True)
-    latent = _Latent.of(theta, inliers, bar, r) if has_latent.any() else None
+    """Value of segment `m`; adds to `gradient`. Letters are those of the paper."""
+    own = slice(inliers.offsets[m], inliers.offsets[m + 1])
+    r, z, u = inliers.r[own], inliers.z[own], inliers.log_length_scale[own]
+    has_latent = inliers.bar_offsets[m + 1] > inliers.bar_offsets[m]
+    latent = _Latent.of(theta, inliers, m, r) if has_latent else None
     if latent is not None:
-        u = np.where(has_latent, latent.u, u)
+        u = latent.u
 
     sigma_f, sigma_n = np.exp(theta[:2])
-    length_scale = np.where(layout.mask, np.exp(u), 1.0)
-    a, b = (r[:, :, None], length_scale[:, :, None]), (r[:, None, :], length_scale[:, None, :])
-    k = paciorek(*a, *b, sigma_f**2)
-    k *= layout.mask[:, :, None] & layout.mask[:, None, :]
-    covariance = k + slope_std**2 * r[:, :, None] * r[:, None, :]
-    add_noise(covariance, np.full((1, 1), sigma_n**2), layout.mask)
+    length_scale = np.exp(u)
+    k = paciorek(r[:, None], length_scale[:, None], r, length_scale, sigma_f**2)
+    covariance = k + slope_std**2 * np.outer(r, r) + sigma_n**2 * np.eye(len(r))
     factor = np.linalg.cholesky(covariance)
     a_inverse = np.linalg.inv(covariance)
-    alpha = (a_inverse @ z[:, :, None])[:, :, 0]
-    value = -0.5 * float(
-        np.sum(z * alpha)
-        + 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
-        + layout.mask.sum() * _LOG_2PI
-    )
+    alpha = a_inverse @ z
+    log_determinant = 2.0 * np.log(np.diagonal(factor)).sum()
+    value = -0.5 * float(z @ alpha + log_determinant + len(r) * _LOG_2PI)
 
     # G = (alpha alpha^T - A^-1) / 2 is the derivative of the value in A.
-    g = 0.5 * (alpha[:, :, None] * alpha[:, None, :] - a_inverse)
-    gradient[1] += 2.0 * sigma_n**2 * np.diagonal(g, axis1=1, axis2=2)[layout.mask].sum()
+    g = 0.5 * (np.outer(alpha, alpha) - a_inverse)
+    gradient[1] += 2.0 * sigma_n**2 * np.trace(g)
     g *= k
-    row_sum = g.sum(axis=2)
+    row_sum = g.sum(axis=1)
     gradient[0] += 2.0 * row_sum.sum()
     if latent is None:
         return value
-    is_bounded = np.abs(u) >= MAX_ABS_LOG_LENGTH_SCALE
-    is_free = layout.mask & has_latent & ~is_bounded
+    is_free = np.abs(u) < MAX_ABS_LOG_LENGTH_SCALE
     g_u = np.where(is_free, row_sum - _curvature(g, r, length_scale), 0.0)
     return value + latent.add_gradient(gradient, g_u, latent_terms)
 
 
-def _curvature(g: Values, r: FloatArray, length_scale: FloatArray) -> FloatArray:
+def _curvature(g: FloatArray, r: FloatArray, length_scale: FloatArray) -> FloatArray:
     """Part of the derivative in u that depends on the distances; `g` is that in log k.
 
     dk/du_i = k (1/2 - l_i^2 / s (1 - 2 d^2 / s)), s = l_i^2 + l_j^2, in rows and columns.
     """
     square = length_scale**2
-    inverse_spread = 1.0 / (square[:, :, None] + square[:, None, :])
-    distance2 = (r[:, :, None] - r[:, None, :]) ** 2
-    weighted = g * (1.0 - 2.0 * distance2 * inverse_spread) * inverse_spread
-    result: FloatArray = 2.0 * square * weighted.sum(axis=2)
+    inverse_spread = 1.0 / (square[:, None] + square)
+    weighted = g * (1.0 - 2.0 * _square_distance(r, r) * inverse_spread) * inverse_spread
+    result: FloatArray = 2.0 * square * weighted.sum(axis=1)
+    return result
+
+
+def _square_distance(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Squares of the distances between places, (A, B) [m^2]."""
+    result: FloatArray = (a[:, None] - b) ** 2
     return result
 
 
 class _Latent(NamedTuple):
-    """Latent process of S segments with p pseudo-inputs at the ranges of n inliers."""
+    """Latent process of a segment with p pseudo-inputs at the ranges of its n inliers."""
 
-    u: FloatArray  # (S, n) log length-scale
+    u: FloatArray  # (n,) log length-scale
     sigma_l_bar: float
     sigma_n_bar: float
-    bar: Padded
-    kind: IntArray  # (S, p) entry of L-bar of each pseudo-input
-    k_bar: FloatArray  # (S, p, p) without noise
-    k_star: FloatArray  # (S, n, p)
-    distance2: FloatArray  # (S, p, p)
-    star_distance2: FloatArray  # (S, n, p)
-    factor: FloatArray  # (S, p, p) Cholesky factor of B
-    inverse: FloatArray  # (S, p, p) of B
-    beta: FloatArray  # (S, p)
+    kind: IntArray  # (p,) entry of L-bar of each pseudo-input
+    k_bar: FloatArray  # (p, p) without noise
+    k_star: FloatArray  # (n, p)
+    distance2: FloatArray  # (p, p)
+    star_distance2: FloatArray  # (n, p)
+    factor: FloatArray  # (p, p) Cholesky factor of B
+    inverse: FloatArray  # (p, p) of B
+    beta: FloatArray  # (p,)
 
     @classmethod
-    def of(cls, theta: FloatArray, inliers: Inliers, bar: Padded, r: FloatArray) -> _Latent:
+    def of(cls, theta: FloatArray, inliers: Inliers, m: int, r: FloatArray) -> _Latent:
         sigma_f_bar, sigma_l_bar, sigma_n_bar = np.exp(theta[2:5])
-        r_bar = bar.take(inliers.r_bar)
-        kind = inliers.kind[bar.place]
-        l_bar = np.where(bar.mask, bar.take(inliers.log_extent) + theta[5 + kind], 0.0)
-        mean = l_bar.sum(axis=1, keepdims=True) / np.maximum(bar.mask.sum(axis=1), 1)[:, None]
+        bar = slice(inliers.bar_offsets[m], inliers.bar_offsets[m + 1])
+        r_bar, kind = inliers.r_bar[bar], inliers.kind[bar]
+        l_bar = inliers.log_extent[bar] + theta[5 + kind]
         kernel = sigma_f_bar**2, 0.5 / sigma_l_bar**2
-        k_bar = squared_exponential(r_bar[:, :, None], r_bar[:, None, :], *kernel)
-        k_bar *= bar.mask[:, :, None] & bar.mask[:, None, :]
-        k_star = squared_exponential(r[:, :, None], r_bar[:, None, :], *kernel)
-        k_star *= bar.mask[:, None, :]
-        b = add_noise(k_bar.copy(), np.full((1, 1), sigma_n_bar**2), bar.mask)
-        inverse = np.linalg.inv(b).astype(np.float64, copy=False)
-        factor = np.linalg.cholesky(b).astype(np.float64, copy=False)
-        beta: FloatArray = (inverse @ np.where(bar.mask, l_bar - mean, 0.0)[:, :, None])[:, :, 0]
-        u = mean + (k_star @ beta[:, :, None])[:, :, 0]
+        k_bar = squared_exponential(r_bar[:, None], r_bar, *kernel)
+        k_star = squared_exponential(r[:, None], r_bar, *kernel)
+        b = k_bar + sigma_n_bar**2 * np.eye(len(r_bar))
+        inverse = np.linalg.inv(b)
+        beta = inverse @ (l_bar - l_bar.mean())
+        u = l_bar.mean() + k_star @ beta
         return cls(
             u=np.clip(u, -MAX_ABS_LOG_LENGTH_SCALE, MAX_ABS_LOG_LENGTH_SCALE),
             sigma_l_bar=sigma_l_bar,
             sigma_n_bar=sigma_n_bar,
-            bar=bar,
             kind=kind,
             k_bar=k_bar,
             k_star=k_star,
-            distance2=(r_bar[:, :, None] - r_bar[:, None, :]) ** 2,
-            star_distance2=(r[:, :, None] - r_bar[:, None, :]) ** 2,
-            factor=factor,
+            distance2=_square_distance(r_bar, r_bar),
+            star_distance2=_square_distance(r, r_bar),
+            factor=np.linalg.cholesky(b),
             inverse=inverse,
             beta=beta,
         )
 
     def add_gradient(self, gradient: FloatArray, g_u: FloatArray, latent_terms: bool) -> float:
         """Propagate the derivatives in u to theta; return the latent terms of the value."""
-        bar, beta = self.bar, self.beta
-        weight = (self.inverse @ (g_u[:, None, :] @ self.k_star).swapaxes(1, 2))[:, :, 0]
+        beta, weight = self.beta, self.inverse @ (g_u @ self.k_star)
         # u is the mean of L-bar and what the process makes of the differences from it.
-        share = (g_u.sum(axis=1) - weight.sum(axis=1)) / np.maximum(bar.mask.sum(axis=1), 1)
-        g_l_bar = (weight + share[:, None])[bar.mask]
-        gradient[5:] += np.bincount(self.kind[bar.mask], g_l_bar, minlength=len(gradient) - 5)
+        g_l_bar = weight + (g_u.sum() - weight.sum()) / len(beta)
+        gradient[5:] += np.bincount(self.kind, g_l_bar, minlength=len(gradient) - 5)
 
         # Adjoints of k_star and of B: every derivative is contracted with them.
-        star = g_u[:, :, None] * self.k_star * beta[:, None, :]
-        adjoint = -weight[:, :, None] * beta[:, None, :]
+        star = g_u[:, None] * self.k_star * beta
+        adjoint = -np.outer(weight, beta)
         if latent_terms:
             adjoint -= 0.5 * self.inverse
-        on_diagonal = np.diagonal(adjoint, axis1=1, axis2=2)[bar.mask].sum()
-        gradient[4] += 2.0 * self.sigma_n_bar**2 * on_diagonal
+        gradient[4] += 2.0 * self.sigma_n_bar**2 * np.trace(adjoint)
         adjoint *= self.k_bar
         gradient[2] += 2.0 * (star.sum() + adjoint.sum())
         contracted = np.sum(star * self.star_distance2) + np.sum(adjoint * self.distance2)
         gradient[3] += contracted / self.sigma_l_bar**2
         if not latent_terms:
             return 0.0
-        log_determinant = 2.0 * np.log(np.diagonal(self.factor, axis1=1, axis2=2)).sum()
-        return -0.5 * float(log_determinant + bar.mask.sum() * _LOG_2PI)
+        return -float(np.log(np.diagonal(self.factor)).sum() + 0.5 * len(beta) * _LOG_2PI)
