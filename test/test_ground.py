@@ -1,5 +1,6 @@
 """Length-scales, inlier growth and the surface: both backends against loops."""
 
+import math
 from functools import cache
 
 import numpy as np
@@ -14,7 +15,7 @@ from gp_ground_seg import Config
 from gp_ground_seg.core.backend import NumpyBackend
 from gp_ground_seg.core.frame import Frame
 from gp_ground_seg.core.gp.evidence import ODDS, seeds
-from gp_ground_seg.core.gp.ground import ODDS_IN_FACE, noise_in_doubt
+from gp_ground_seg.core.gp.ground import ODDS_IN_FACE, ROUNDING, noise_in_doubt
 from gp_ground_seg.core.gp.learning import given_theta
 
 
@@ -67,8 +68,9 @@ def test_surfaces_are_the_reference(backend, seed):
     np.testing.assert_array_equal(found.inlier, expected.inlier)
     np.testing.assert_allclose(knot_u, expected_knot_u, atol=1e-9)
     np.testing.assert_allclose(u, expected_u, atol=1e-9)
-    np.testing.assert_allclose(found.mean, expected.mean, atol=1e-7)
-    np.testing.assert_allclose(found.std, expected.std, atol=1e-5)
+    # Compiled code has the covariance in single precision.
+    np.testing.assert_allclose(found.mean, expected.mean, rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(found.std, expected.std, rtol=0.0, atol=1e-5)
 
 
 @settings(max_examples=30)
@@ -113,8 +115,10 @@ def test_noise_free_candidates_are_interpolated_with_no_uncertainty(backend):
     surface, *_ = backend.estimate_surface(frame, theta, config)
     m = frame.candidates.segment[0]
     assert surface.inlier.all()
-    np.testing.assert_allclose(surface.mean[m, :-1], z - 1.73, atol=1e-6)
-    np.testing.assert_allclose(surface.std[m, :-1], 0.0, atol=1e-4)
+    # Up to the rounding that is taken for noise.
+    rounding = math.sqrt(ROUNDING) * config.observation.sigma_f
+    np.testing.assert_allclose(surface.mean[m, :-1], z - 1.73, atol=rounding)
+    assert (surface.std[m, :-1] < 2.0 * rounding).all()
 
 
 @pytest.mark.parametrize(('rule', 'n_shown'), [('roughness', 1), ('tolerance', 3)])
@@ -149,7 +153,8 @@ def test_rounding_beside_little_noise_is_no_fault(backend):
     surface, *_ = backend.estimate_surface(frame, theta, config)
     m = frame.candidates.segment[0]
     assert surface.inlier.all()
-    np.testing.assert_allclose(surface.mean[m], -1.73, atol=1e-3)
+    rounding = math.sqrt(ROUNDING) * config.observation.sigma_f
+    np.testing.assert_allclose(surface.mean[m], -1.73, atol=rounding)
 
 
 def grow_line(backend, z, r=None, continues=(), slope_std=0.05, **bounds):

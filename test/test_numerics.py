@@ -5,6 +5,8 @@ from hypothesis import strategies as st
 
 from gp_ground_seg.core.compiled import numerics
 from gp_ground_seg.core.compiled.numerics import exp_neg, factorise, invert, solve_in_place
+from gp_ground_seg.core.gp import kernels
+from gp_ground_seg.core.jit import JIT_ENABLED, jit
 
 
 @given(st.floats(0.0, 1e300), st.floats(-10.0, 0.0))
@@ -12,6 +14,25 @@ def test_exp_neg_is_the_exponential(x, negative):
     assert abs(exp_neg(x) - np.exp(-x)) <= 1e-14
     assert (exp_neg(x) == 0.0) == (x > numerics.NEGLIGIBLE_EXPONENT)
     np.testing.assert_allclose(exp_neg(negative), np.exp(-negative), rtol=1e-11)
+
+
+@given(st.floats(0.0, 2.0**100, width=32))
+def test_exp_neg_in_single_precision(x):
+    found = numerics.exp_neg_single(np.float32(x))
+    assert type(found) is np.float32
+    # Next to 1 it is as exact as single precision is.
+    expected = np.exp(-np.float64(x))
+    assert abs(found - expected) <= 6e-8 + 1.5e-7 * (1.0 - expected)
+    assert (found == 0.0) == (x >= 18.0)
+
+
+def test_compiled_code_takes_the_form_of_the_precision_at_hand():
+    exponential = jit()(lambda x: kernels.exp_neg(x))
+    for x in (0.3, 2.0, 17.0):
+        single = exponential(np.float32(x))
+        assert exponential(x) == pytest.approx(np.exp(-x), rel=1e-14)
+        assert single == pytest.approx(np.exp(-np.float64(np.float32(x))), abs=2e-7)
+        assert not JIT_ENABLED or single == numerics.exp_neg_single(np.float32(x)) != exponential(x)
 
 
 def positive_definite(n, seed):

@@ -57,18 +57,27 @@ def choose(condition: Any, a: Any, b: Any) -> Any:
     return np.where(condition, a, b)
 
 
-def compiled_form(plain: Callable[..., Any], *, fastmath: bool = False) -> _Decorator:
+def compiled_form(
+    plain: Callable[..., Any],
+    *,
+    fastmath: bool = False,
+    single: Callable[..., Any] | None = None,
+) -> _Decorator:
     """Return a decorator for what runs in compiled code where it calls `plain`.
 
     For functions that are a call of numpy to arrays, and a loop or a branch to compiled code.
+    Where the first argument is of single precision, `single` runs instead, if there is one.
     """
 
     def decorate(function: _Function) -> _Function:
         if JIT_ENABLED:
+            from numba import types
             from numba.extending import overload
 
-            options = _options(fastmath)
-            overload(plain, jit_options=options, strict=False)(lambda *arguments: function)
+            def choose_form(*arguments: Any) -> Callable[..., Any]:
+                return single if single and arguments[0] is types.float32 else function
+
+            overload(plain, jit_options=_options(fastmath), strict=False)(choose_form)
         return function
 
     return decorate

@@ -4,6 +4,10 @@ Row k of `whitened` is that of ``L^-1 K(inliers, candidates and knots)``. Adding
 inlier appends one row, after which means and variances everywhere follow by one
 multiplication: a whole segment costs one factorisation. Inliers join from near to far,
 mostly: columns nearer than the first candidate that is no inlier need no more rows.
+
+The slope of the mean line is an unknown of its own (Rasmussen and Williams 2006, section 2.7), not
+a part of the covariance, so that single precision is enough for that: ``slope_std^2 r r'`` would
+be a thousand times the rest far away.
 """
 
 from __future__ import annotations
@@ -16,8 +20,8 @@ import numpy as np
 from gp_ground_seg.core.compiled.numerics import LANES
 from gp_ground_seg.core.frame import BoolArray, FloatArray, Frame, IntArray
 from gp_ground_seg.core.gp.evidence import between_knots, combined, contradicts
-from gp_ground_seg.core.gp.ground import fits, noise_among, noise_in_doubt, observed_noise
-from gp_ground_seg.core.gp.kernels import exp_neg, paciorek
+from gp_ground_seg.core.gp.ground import fits, noise_among, noise_in_doubt, variances_of
+from gp_ground_seg.core.gp.kernels import paciorek
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
 
@@ -53,20 +57,24 @@ class _Columns(NamedTuple):
 
     Attributes
     ----------
-    r, length_scale : (size,) float64
+    r, length_scale : (size,) float32
         Ranges and length-scales [m].
-    height, variance : (size,) float64
-        Prediction about the prior mean [m], and its variance [m^2].
-    z, noise : (size,) float64
+    height, variance : (size,) float32
+        Prediction about the prior mean [m], and its variance [m^2], if the slope is 0.
+    lever : (size,) float32
+        How much the prediction changes with the slope [m].
+    slope : (2,) float64
+        What the inliers show of the slope: precision, and precision times slope.
+    z, noise : (n,) float64
         Heights of the candidates about the prior mean [m], and variances of the noise with which
         they are observed [m^2].
-    aside_height, aside_precision : (size,) float64
+    aside_height, aside_precision : (n,) float64
         Evidence at the candidates.
     above : (n,) bool
         Candidates that the evidence contradicts.
     new : (n,) int64
         Candidates that join in this round.
-    whitened : (n, size) float64
+    whitened : (n, size) float32
         One row for each inlier.
     """
 
@@ -74,6 +82,8 @@ class _Columns(NamedTuple):
     length_scale: FloatArray
     height: FloatArray
     variance: FloatArray
+    lever: FloatArray
+    slope: FloatArray
     z: FloatArray
     noise: FloatArray
     aside_height: FloatArray
@@ -105,23 +115,25 @@ def grow_surfaces(
     for m in range(0, len(mean), step):
         most = max(most, offsets[m + 1] - offsets[m])
     width = (most + len(frame.knots) + LANES - 1) & -LANES
-    table = np.empty((8, width))
+    single, table = np.empty((5, width), np.float32), np.empty((4, most))
     # One by one, so that the compiler knows them to be contiguous.
     columns = _Columns(
+        single[0],
+        single[1],
+        single[2],
+        single[3],
+        single[4],
+        np.empty(2),
         table[0],
         table[1],
         table[2],
         table[3],
-        table[4],
-        table[5],
-        table[6],
-        table[7],
         np.zeros(most, np.bool_),
         np.empty(most, np.int64),
-        np.empty((most, width)),
+        np.empty((most, width), np.float32),
     )
     slope = observation.slope_std**2
-    sill, noise = math.exp(theta[0]) ** 2, math.exp(theta[1]) ** 2
+    sill, noise = variances_of(theta)
     reach = math.exp(theta[3]) if odds > 0.0 else 0.0
     for m in range(0, len(mean), step):
         for j in range(len(frame.knots)):
@@ -134,13 +146,22 @@ def grow_surfaces(
         while n_knots < len(knot_u) and not math.isnan(knot_u[n_knots]):
             n_knots += 1
         size = (n + n_knots + LANES - 1) & -LANES
-        _lay_out(frame, m, n_knots, size, sill, slope, alone, columns)
+        _lay_out(frame, m, n_knots, size, sill, alone, columns)
         n_inliers = _grow(frame, m, size, n_new, sill, slope, noise, growth, odds, alone, columns)
         if n_inliers == 0:
             continue
         for j in range(n_knots):
-            mean[m, j] = columns.height[n + j]
-            std[m, j] = math.sqrt(max(columns.variance[n + j], 0.0))
+            mean[m, j], variance = _predict(n + j, slope, columns)
+            std[m, j] = math.sqrt(max(variance, 0.0))
+
+
+@jit()
+def _predict(j: int, slope: float, columns: _Columns) -> tuple[float, float]:
+    """Height and variance at column `j`; `slope` is the prior variance of the slope."""
+    variance = slope / (1.0 + slope * columns.slope[0])
+    lever = np.float64(columns.lever[j])
+    height = columns.height[j] + lever * variance * columns.slope[1]
+    return height, columns.variance[j] + lever * lever * variance
 
 
 @jit(part=True)
@@ -192,7 +213,6 @@ def _lay_out(
     n_knots: int,
     size: int,
     sill: float,
-    slope: float,
     alone: SegmentSurfaces,
     columns: _Columns,
 ) -> None:
@@ -209,9 +229,9 @@ def _lay_out(
     for j in range(n + n_knots, size):
         r[j] = length_scale[j] = 0.0
     for j in range(size):
-        length_scale[j] = exp_neg(-length_scale[j])
-        columns.height[j] = 0.0
-        variance[j] = sill + slope * r[j] * r[j]
+        length_scale[j] = math.exp(length_scale[j])
+        columns.height[j], variance[j], columns.lever[j] = 0.0, sill, r[j]
+    columns.slope[:] = 0.0
 
 
 @jit(part=True)
@@ -237,7 +257,7 @@ def _grow(
         i = columns.new[a]
         if odds > 0.0 and in_face[i]:
             height, variance = combined(
-                0.0, columns.variance[i], columns.aside_height[i], columns.aside_precision[i]
+                *_predict(i, slope, columns), columns.aside_height[i], columns.aside_precision[i]
             )
             columns.noise[i] = noise_in_doubt(
                 columns.z[i], height, variance, columns.noise[i], True, odds
@@ -249,7 +269,7 @@ def _grow(
             while done < len(inlier) and inlier[done]:
                 done += 1
             # The columns before are not needed any more.
-            _observe(i, n_inliers, min(i, done) & -LANES, size, sill, slope, columns)
+            _observe(i, n_inliers, min(i, done) & -LANES, size, sill, columns)
             n_inliers += 1
         n_new = 0
         for i in range(done, len(inlier)):
@@ -260,7 +280,7 @@ def _grow(
             follows = i > 0 and inlier[i - 1] and continues_line[i] and not columns.above[i]
             if not follows:
                 height, variance = combined(
-                    columns.height[i], columns.variance[i], columns.aside_height[i], precision
+                    *_predict(i, slope, columns), columns.aside_height[i], precision
                 )
                 follows = fits(columns.z[i], height, variance, noise, growth)
                 if follows and odds > 0.0:
@@ -282,18 +302,16 @@ def _observe(
     near: int,
     size: int,
     sill: float,
-    slope: float,
     columns: _Columns,
 ) -> None:
     """Condition the columns from `near` on on candidate i: one more row of `whitened`."""
     r, length_scale, whitened = columns.r, columns.length_scale, columns.whitened
-    row, r_i, l_i = whitened[n_inliers], r[i], length_scale[i]
+    row, r_i, l_i, single_sill = whitened[n_inliers], r[i], length_scale[i], np.float32(sill)
     # Unsigned, as a signed index could count from the end.
     start, end = np.uintp(near), np.uintp(size)
     # Prior covariance of column i with the others (paper, eq. 8).
     for j in range(start, end):
-        value = paciorek(r_i, l_i, r[j], length_scale[j], sill)
-        row[j] = value + slope * r_i * r[j]
+        row[j] = paciorek(r_i, l_i, r[j], length_scale[j], single_sill)
     # Subtract the projection on the rows before, four rows at a time, so that the
     # new row is read and written once for all of them.
     k = 0
@@ -309,12 +327,16 @@ def _observe(
         for j in range(start, end):
             row[j] -= w_0 * row_0[j]
         k += 1
-    height, variance = columns.height, columns.variance
-    noise = observed_noise(columns.noise[i], sill + slope * r_i * r_i)
-    scale = 1.0 / math.sqrt(variance[i] + noise)
-    innovation = (columns.z[i] - height[i]) * scale
+    height, variance, lever = columns.height, columns.variance, columns.lever
+    precision = 1.0 / (max(variance[i], 0.0) + columns.noise[i])
+    missed, lever_i = columns.z[i] - height[i], np.float64(lever[i])
+    columns.slope[0] += lever_i * lever_i * precision
+    columns.slope[1] += lever_i * missed * precision
+    scale = np.float32(math.sqrt(precision))
+    innovation, turn = np.float32(missed) * scale, np.float32(lever_i) * scale
     for j in range(start, end):
         value = row[j] * scale
         row[j] = value
         height[j] += value * innovation
+        lever[j] -= value * turn
         variance[j] -= value * value

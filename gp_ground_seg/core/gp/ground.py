@@ -83,7 +83,8 @@ def estimate_surface(
     else:
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
-    noise = np.full(len(z), np.exp(2.0 * theta[1]))
+    sill, gate_noise = variances_of(theta)
+    noise = np.full(len(z), gate_noise)
     alone = SegmentSurfaces.empty(len(z), knot_u.shape)
     seed, odds = seeds(frame, theta, config)
     if config.label.rule == 'roughness':
@@ -96,7 +97,7 @@ def estimate_surface(
     )
     everywhere = np.arange(candidates.n_segments)
     looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
-    prior = prior_variance(np.exp(theta[0]) ** 2, slope_std, knots)
+    prior = prior_variance(sill, slope_std, knots)
 
     def aside() -> Evidence:
         return evidence_aside(alone.mean, alone.std, prior, knots, slope_std)
@@ -120,8 +121,9 @@ MOST_DOUBT = 30.0
 """Logarithm of odds that are as good as infinite."""
 
 
-ROUNDING = 1e-12
-"""Least noise of what is observed, in parts of the prior variance."""
+ROUNDING = 1e-6
+"""Least noise of what is observed, in parts of sigma_f^2: the rounding of single precision, which
+compiled code has for the covariance."""
 
 
 class SegmentSurfaces(NamedTuple):
@@ -167,12 +169,13 @@ def fits(
 
 
 @shared
-def observed_noise(noise: Values, prior: Values) -> Values:
-    """Variance of the noise, or of the rounding of the covariance where that is larger [m^2].
+def variances_of(theta: Values) -> tuple[Values, Values]:
+    """Variances of the process and of its noise by theta [m^2].
 
-    Else the variance of an observation may be negative; `prior` is the variance before any.
+    The noise is at least the rounding of the covariance, else a variance could be negative.
     """
-    return np.maximum(noise, ROUNDING * prior)
+    sill, noise = np.exp(2.0 * theta[0]), np.exp(2.0 * theta[1])
+    return sill, np.maximum(noise, ROUNDING * sill)
 
 
 @shared
@@ -225,7 +228,7 @@ def _grow_segments(
     """Inliers and surface of `segments`, into `alone`; `aside` is the evidence at candidates."""
     alone.mean[segments] = alone.std[segments] = np.nan
     offsets = model.frame.candidates.offsets
-    is_below = ~contradicts(*aside, model.z, np.exp(2.0 * model.theta[1]))
+    is_below = ~contradicts(*aside, model.z, variances_of(model.theta)[1])
     model = model._replace(
         seed=model.seed & is_below, continues_line=model.continues_line & is_below
     )
@@ -239,7 +242,7 @@ def _grow_batch(
 ) -> None:
     frame, slope_std = model.frame, config.observation.slope_std
     layout = Padded.of(segments, frame.candidates.offsets)
-    sill, noise = np.exp(model.theta[:2]) ** 2
+    sill, noise = variances_of(model.theta)
     r = layout.take(frame.candidates.r)
     is_wanted = np.isfinite(model.knot_length_scale[segments])
     n_knots = int(is_wanted.sum(axis=1).max())
@@ -357,8 +360,7 @@ def _condition(
     if whitened.size:
         rows -= np.matmul(whitened[own, :, place], whitened)
     within = rows[own, :, place]
-    prior = prior_variance(batch.sill, batch.slope_std, batch.r[segment, place])
-    add_noise(within, observed_noise(batch.noise[segment, place], prior), is_new)
+    add_noise(within, batch.noise[segment, place], is_new)
     unit = inverse_of_lower(np.linalg.cholesky(within)) * is_new[:, :, None]
     rows = np.matmul(unit, rows)
     innovation = batch.z[segment, place] - height[segment, place]

@@ -23,12 +23,13 @@ def paciorek(r_a: Values, l_a: Values, r_b: Values, l_b: Values, variance: Value
 
     ``sigma_f^2 sqrt(2 l_a l_b / (l_a^2 + l_b^2)) exp(-(r_a - r_b)^2 / (l_a^2 + l_b^2))``
 
-    Of ranges and length-scales [m], and the prior variance ``sigma_f^2`` [m^2].
+    Of ranges and length-scales [m], and the prior variance ``sigma_f^2`` [m^2]. As precise as
+    these: there is no constant, which in compiled code would be of double precision.
     """
-    inverse = 1.0 / (l_a * l_a + l_b * l_b)
+    spread, product = l_a * l_a + l_b * l_b, l_a * l_b
     distance = r_a - r_b
-    root = np.sqrt(2.0 * l_a * l_b * inverse)
-    return variance * root * exp_neg(distance * distance * inverse)
+    root = np.sqrt((product + product) / spread)
+    return variance * root * exp_neg(distance * distance / spread)
 
 
 @shared
