@@ -66,9 +66,9 @@ def test_surfaces_are_the_reference(backend, seed):
     arguments, (expected, expected_knot_u, expected_u) = surface_by_the_loops(seed)
     found, knot_u, u = backend.estimate_surface(*arguments)
     np.testing.assert_array_equal(found.inlier, expected.inlier)
-    np.testing.assert_allclose(knot_u, expected_knot_u, atol=1e-9)
-    np.testing.assert_allclose(u, expected_u, atol=1e-9)
-    # Compiled code has the covariance in single precision.
+    # Compiled code predicts in single precision.
+    np.testing.assert_allclose(knot_u, expected_knot_u, rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(u, expected_u, rtol=0.0, atol=1e-5)
     np.testing.assert_allclose(found.mean, expected.mean, rtol=0.0, atol=1e-5)
     np.testing.assert_allclose(found.std, expected.std, rtol=0.0, atol=1e-5)
 

@@ -24,10 +24,12 @@ def latent_log_length_scales(
         most = max(most, candidates.offsets[m + 1] - candidates.offsets[m])
         most_bar = max(most_bar, pseudo.offsets[m + 1] - pseudo.offsets[m])
     width = (most + len(knots) + LANES - 1) & -LANES
-    wanted, value = np.empty(width), np.empty(width)
+    wanted, value = np.empty(width, np.float32), np.empty(width, np.float32)
+    bound = np.float32(MAX_ABS_LOG_LENGTH_SCALE)
     width = (most_bar + LANES - 1) & -LANES
     matrix, weight, centres = np.empty((most_bar, width)), np.empty(width), np.empty(width)
-    variance, sharpness = math.exp(2.0 * theta[2]), 0.5 * math.exp(-2.0 * theta[3])
+    variance = math.exp(2.0 * theta[2])
+    single_sharpness = np.float32(0.5 * math.exp(-2.0 * theta[3]))
     for m in range(len(at_knots)):
         for j in range(len(knots)):
             at_knots[m, j] = np.nan
@@ -50,11 +52,11 @@ def latent_log_length_scales(
             value[i] = mean
         # Pseudo-inputs in the outer loop, so that the inner loop runs along a row.
         for j in range(p):
-            centre, scaled = centres[j], weight[j] * variance
+            centre, scaled = np.float32(centres[j]), np.float32(weight[j] * variance)
             for i in range(size):
-                value[i] += squared_exponential(wanted[i], centre, scaled, sharpness)
+                value[i] += squared_exponential(wanted[i], centre, scaled, single_sharpness)
         for i in range(size):
-            value[i] = min(max(value[i], -MAX_ABS_LOG_LENGTH_SCALE), MAX_ABS_LOG_LENGTH_SCALE)
+            value[i] = min(max(value[i], -bound), bound)
         for i in range(n):
             at_candidates[first + i] = value[i]
         for i in range(n_wanted):
