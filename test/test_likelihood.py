@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import reference_gp
+from conftest import compiled_log_likelihood
 
-from gp_ground_seg.core.compiled.backend import NumbaBackend
 from gp_ground_seg.core.frame import Inliers
 from gp_ground_seg.core.gp.latent import MAX_ABS_LOG_LENGTH_SCALE
 
@@ -68,9 +68,9 @@ def expected(name, latent_terms, bars):
 @pytest.mark.parametrize('latent_terms', [False, True])
 @pytest.mark.parametrize('name', THETAS)
 @pytest.mark.parametrize('bars', ['all', 'some', 'none'])
-def test_value_and_gradient_are_those_of_the_reference(backend, name, latent_terms, bars):
+def test_value_and_gradient_are_those_of_the_reference(likelihood, name, latent_terms, bars):
     inliers = random_inliers(7, bars)
-    value, gradient = backend.log_likelihood(THETAS[name], inliers, 0.05, latent_terms)
+    value, gradient = likelihood(THETAS[name], inliers, 0.05, latent_terms)
     expected_value, numeric = expected(name, latent_terms, bars)
     assert value == pytest.approx(expected_value, rel=1e-8, abs=1e-6)
     # A component far smaller than the others is only as exact as their rounding.
@@ -80,12 +80,12 @@ def test_value_and_gradient_are_those_of_the_reference(backend, name, latent_ter
     assert bars != 'none' or not gradient[2:].any()
 
 
-def test_the_printed_objective_has_no_upper_bound_and_ours_does_not_move(backend):
+def test_the_printed_objective_has_no_upper_bound_and_ours_does_not_move(likelihood):
     """Scaling the latent process changes no prediction, yet the printed objective grows."""
     inliers = random_inliers(6)
     printed, ours = (
         [
-            backend.log_likelihood(scaled(1, 1, shrink, 1, shrink), inliers, 0.05, terms)[0]
+            likelihood(scaled(1, 1, shrink, 1, shrink), inliers, 0.05, terms)[0]
             for shrink in (1.0, 1e-1, 1e-2, 1e-3)
         ]
         for terms in (True, False)
@@ -104,27 +104,27 @@ NOISELESS[:2], NOISELESS_LATENT[4] = np.log([1e8, 1e-9]), -400.0
     [(NOISELESS, {}), (TYPICAL, {'z': math.nan}), (NOISELESS_LATENT, {'r_bar': 5.0})],
 )
 def test_without_a_factor_the_value_is_minus_infinity_and_nothing_is_raised(
-    backend, theta, changes
+    likelihood, theta, changes
 ):
     inliers = random_inliers(4)
     inliers = inliers._replace(**{k: np.full_like(inliers.z, v) for k, v in changes.items()})
-    for model in (backend, reference_gp):
-        value, gradient = model.log_likelihood(theta, inliers, 0.0, False)
+    for find in (likelihood, reference_gp.log_likelihood):
+        value, gradient = find(theta, inliers, 0.0, False)
         assert value == -np.inf
         assert not gradient.any()
 
 
-def test_beyond_the_bound_of_length_scales_nothing_depends_on_the_latent_process(backend):
+def test_beyond_the_bound_of_length_scales_nothing_depends_on_the_latent_process(likelihood):
     inliers = random_inliers(5)
     beyond = TYPICAL.copy()
     beyond[5:] = MAX_ABS_LOG_LENGTH_SCALE + 10.0
-    assert not backend.log_likelihood(beyond, inliers, 0.05, False)[1][2:].any()
+    assert not likelihood(beyond, inliers, 0.05, False)[1][2:].any()
 
 
 def test_results_do_not_depend_on_where_the_arrays_lie():
     """The arrays of a small segment lie side by side."""
     pytest.importorskip('numba')
-    rng, backend = np.random.default_rng(9), NumbaBackend()
+    rng = np.random.default_rng(9)
     thread = ThreadPoolExecutor(1)
     for _ in range(100):
         n, n_bar = rng.integers(2, 9), rng.integers(8, 13)
@@ -137,12 +137,12 @@ def test_results_do_not_depend_on_where_the_arrays_lie():
         inliers = Inliers(in_one, r, z, np.zeros(n), bars_in_one, r_bar, log_extent, kind)
         # Here, and in a thread, which has memory of its own.
         arguments = TYPICAL, inliers, 0.05, False
-        value, gradient = backend.log_likelihood(*arguments)
-        other, also = thread.submit(backend.log_likelihood, *arguments).result()
+        value, gradient = compiled_log_likelihood(*arguments)
+        other, also = thread.submit(compiled_log_likelihood, *arguments).result()
         assert (value, gradient.tobytes()) == (other, also.tobytes())
 
 
-def test_with_one_length_scale_it_is_scikit_learns_regression(backend):
+def test_with_one_length_scale_it_is_scikit_learns_regression(likelihood):
     """Log marginal likelihood of the stationary case, by another's code; its posterior is that
     of the joint Gaussian in test_ground.py."""
     gaussian_process = pytest.importorskip('sklearn.gaussian_process')
@@ -158,7 +158,7 @@ def test_with_one_length_scale_it_is_scikit_learns_regression(backend):
     theta = np.log([sigma_f, sigma_n, 0.9, 2.0, 0.3, length])
     bars = np.array([0, 3]), np.array([5.0, 15.0, 30.0]), np.zeros(3), np.zeros(3, np.int64)
     inliers = Inliers(np.array([0, 25]), r, z, np.zeros(25), *bars)
-    value, gradient = backend.log_likelihood(theta, inliers, 0.0, False)
+    value, gradient = likelihood(theta, inliers, 0.0, False)
     their_value, their_gradient = theirs.log_marginal_likelihood(
         theirs.kernel_.theta, eval_gradient=True
     )

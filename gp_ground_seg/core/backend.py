@@ -13,14 +13,14 @@ from gp_ground_seg.core.frame import (
     FloatArray,
     Frame,
     GroundSurface,
-    Inliers,
     Labelled,
     Lines,
     PointArray,
     PseudoInputs,
     Scan,
 )
-from gp_ground_seg.core.gp import ground, likelihood
+from gp_ground_seg.core.gp import ground, learning
+from gp_ground_seg.core.gp.learning import Learned
 from gp_ground_seg.core.jit import HAVE_NUMBA
 from gp_ground_seg.core.parameters.config import Config, RuntimeConfig
 from gp_ground_seg.core.pipeline import (
@@ -70,10 +70,8 @@ class Backend(Protocol):
     ) -> tuple[Candidates, Lines, PseudoInputs, BoolArray, BoolArray]:
         """See `gp_ground_seg.core.pipeline.lines.find_lines`."""
 
-    def log_likelihood(
-        self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
-    ) -> tuple[float, FloatArray]:
-        """See `gp_ground_seg.core.gp.likelihood.log_likelihood`."""
+    def learn_frame(self, frame: Frame, config: Config) -> Learned:
+        """See `gp_ground_seg.core.gp.learning.learn_frame`."""
 
     def estimate_surface(
         self, frame: Frame, theta: FloatArray, config: Config
@@ -95,7 +93,7 @@ class NumpyBackend:
     find_faces = staticmethod(vertical_faces.find_faces)
     find_relief = staticmethod(relief.find_relief)
     extract_lines = staticmethod(lines.find_lines)
-    log_likelihood = staticmethod(likelihood.log_likelihood)
+    learn_frame = staticmethod(learning.learn_frame)
     estimate_surface = staticmethod(ground.estimate_surface)
     label_points = staticmethod(labels.label_points)
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from gp_ground_seg.core.backend import Backend, make_backend
 from gp_ground_seg.core.errors import ConfigError
 from gp_ground_seg.core.frame import FloatArray, Frame, PointArray, Scan, usual_errors
-from gp_ground_seg.core.gp.learning import given_theta, learn_frame
+from gp_ground_seg.core.gp.learning import given_theta
 from gp_ground_seg.core.jit import keep_code
 from gp_ground_seg.core.parameters.config import Config, SensorConfig
 from gp_ground_seg.core.pipeline.low_sensor import for_sensor
@@ -142,7 +142,7 @@ class GroundSegmenter:
         frame = Frame(*extracted, scan.grid.edges, -pose.height)
         timer.mark('lines')
         # 5. Observation and latent process: hyper-parameters theta, inliers and surface.
-        learned = learn_frame(frame, config, backend)
+        learned = backend.learn_frame(frame, config) if config.learning.mode != 'fixed' else None
         theta = learned.theta if learned else given_theta(config)
         timer.mark('learning')
         surface, log_length_scale, _ = backend.estimate_surface(frame, theta, config)

@@ -12,7 +12,7 @@ from gp_ground_seg.core.compiled import (
     ground,
     ground_plane,
     labels,
-    likelihood,
+    learning,
     lines,
     polar_grid,
 )
@@ -28,7 +28,6 @@ from gp_ground_seg.core.frame import (
     FloatArray,
     Frame,
     GroundSurface,
-    Inliers,
     Labelled,
     Lines,
     PointArray,
@@ -37,8 +36,9 @@ from gp_ground_seg.core.frame import (
     Scan,
     Tiles,
 )
-from gp_ground_seg.core.gp.evidence import CLEARLY, STEP, looks_aside_in
+from gp_ground_seg.core.gp.evidence import CLEARLY, ODDS, STEP, looks_aside_in
 from gp_ground_seg.core.gp.latent import given_log_length_scales
+from gp_ground_seg.core.gp.learning import Learned, given_theta, theta_space
 from gp_ground_seg.core.jit import announce_compiling, keep_code
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.parameters.number_tuples import numbers_of
@@ -134,17 +134,26 @@ class NumbaBackend:
         kept = buffers.first(lines.keep_visible(candidates, faces.has_occluded_base, buffers))
         return kept, *lines_through(kept, config, lines.trace), faces.is_face[kept.tile]
 
-    def log_likelihood(
-        self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
-    ) -> tuple[float, FloatArray]:
-        """Log marginal likelihood of the frame and its gradient."""
-        n_segments = len(inliers.offsets) - 1
-        values, gradients = np.empty(n_segments), np.empty((n_segments, len(theta)))
-        likelihood.log_likelihood(theta, inliers, slope_std, latent_terms, values, gradients)
-        value = float(values.sum())
-        if not np.isfinite(value):
-            return -np.inf, np.zeros(len(theta))
-        return value, gradients.sum(axis=0)
+    def learn_frame(self, frame: Frame, config: Config) -> Learned:
+        """Hyper-parameters of the frame."""
+        no_knots, space = frame._replace(knots=frame.knots[:0]), theta_space(config)
+        u, knot_u = self._given_length_scales(no_knots, config)
+        alone = self._surfaces(u, knot_u)
+        theta, outcome = given_theta(config), np.empty(2)
+        n = learning.learn_frame(
+            no_knots,
+            space,
+            numbers_of(config.observation),
+            numbers_of(config.growth),
+            numbers_of(config.learning),
+            config.learning.objective == 'map',
+            config.length_scale.model == 'latent',
+            ODDS if config.label.rule == 'roughness' else 0.0,
+            alone,
+            theta,
+            outcome,
+        )
+        return Learned.of(theta, float(outcome[0]), n, int(outcome[1]), space)
 
     def estimate_surface(
         self, frame: Frame, theta: FloatArray, config: Config
@@ -153,15 +162,10 @@ class NumbaBackend:
         take, knots, slope_std = self._buffers.take, frame.knots, config.observation.slope_std
         observation, growth = numbers_of(config.observation), numbers_of(config.growth)
         shape = (frame.candidates.n_segments, len(knots))
-        n_candidates = len(frame.candidates.r)
-        u, knot_u = self._log_length_scales(frame, theta, config)
-        alone = ground.SegmentSurfaces(
-            u,
-            knot_u,
-            take('seed', (n_candidates,), np.bool_),
-            np.empty(n_candidates, np.bool_),
-            *take('surfaces', (2, *shape), np.float64),
-        )
+        u, knot_u = self._given_length_scales(frame, config)
+        if config.length_scale.model == 'latent':
+            latent_.latent_log_length_scales(frame, theta, 1, u, knot_u)
+        alone = self._surfaces(u, knot_u)
         looks_aside = looks_aside_in(frame, config)
         max_slope = CLEARLY * slope_std if looks_aside else -1.0
         shown, beside = take('aside', (2, 2, *shape), np.float64)
@@ -187,16 +191,22 @@ class NumbaBackend:
         evidence.combine(alone, aside, theta, knots, slope_std, frame.prior_mean, mean, std)
         return GroundSurface(knots, mean, std, alone.inlier), knot_u, u
 
-    def _log_length_scales(
-        self, frame: Frame, theta: FloatArray, config: Config
-    ) -> tuple[FloatArray, FloatArray]:
-        """Log length-scales at the candidates and at the knots."""
+    def _given_length_scales(self, frame: Frame, config: Config) -> tuple[FloatArray, FloatArray]:
+        """Log length-scales at the candidates and at the knots, to be set if they are latent."""
         if config.length_scale.model != 'latent':
             return given_log_length_scales(frame, config.length_scale)
         u = self._buffers.take('u', (len(frame.candidates.r),), np.float64)
-        knot_u = np.empty((frame.candidates.n_segments, len(frame.knots)))
-        latent_.latent_log_length_scales(frame, theta, u, knot_u)
-        return u, knot_u
+        return u, np.empty((frame.candidates.n_segments, len(frame.knots)))
+
+    def _surfaces(self, u: FloatArray, knot_u: FloatArray) -> ground.SegmentSurfaces:
+        """Surfaces to be set, with these log length-scales."""
+        return ground.SegmentSurfaces(
+            u,
+            knot_u,
+            self._buffers.take('seed', u.shape, np.bool_),
+            np.empty(u.shape, np.bool_),
+            *self._buffers.take('surfaces', (2, *knot_u.shape), np.float64),
+        )
 
     def label_points(
         self, scan: Scan, faces: Faces, surface: GroundSurface, relief: Relief, config: Config

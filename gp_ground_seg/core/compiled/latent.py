@@ -15,12 +15,12 @@ from gp_ground_seg.core.jit import jit
 
 @jit(entry=True)
 def latent_log_length_scales(
-    frame: Frame, theta: FloatArray, at_candidates: FloatArray, at_knots: FloatArray
+    frame: Frame, theta: FloatArray, step: int, at_candidates: FloatArray, at_knots: FloatArray
 ) -> None:
-    """Do what the twin does, into the last two arrays."""
+    """Do what the twin does for every `step`-th segment, into the last two arrays."""
     candidates, pseudo, knots = frame.candidates, frame.pseudo, frame.knots
     most = most_bar = 0
-    for m in range(len(at_knots)):
+    for m in range(0, len(at_knots), step):
         most = max(most, candidates.offsets[m + 1] - candidates.offsets[m])
         most_bar = max(most_bar, pseudo.offsets[m + 1] - pseudo.offsets[m])
     width = (most + len(knots) + LANES - 1) & -LANES
@@ -30,7 +30,7 @@ def latent_log_length_scales(
     matrix, weight, centres = np.empty((most_bar, width)), np.empty(width), np.empty(width)
     variance = math.exp(2.0 * theta[2])
     single_sharpness = np.float32(0.5 * math.exp(-2.0 * theta[3]))
-    for m in range(len(at_knots)):
+    for m in range(0, len(at_knots), step):
         for j in range(len(knots)):
             at_knots[m, j] = np.nan
         p, first = pseudo.offsets[m + 1] - pseudo.offsets[m], candidates.offsets[m]

@@ -1,4 +1,4 @@
-"""Compiled twin of `gp_ground_seg.core.gp.likelihood`, one row of results per segment."""
+"""Compiled twin of `gp_ground_seg.core.gp.likelihood`."""
 
 from __future__ import annotations
 
@@ -27,52 +27,67 @@ class _Latent(NamedTuple):
     beta: FloatArray  # (p,)
 
 
-@jit(entry=True)
+@jit()
 def log_likelihood(
     theta: FloatArray,
     inliers: Inliers,
     slope_std: float,
     latent_terms: bool,
-    values: FloatArray,
-    gradients: FloatArray,
-) -> None:
-    """Set ``values[m]`` and ``gradients[m]`` of each segment; -inf where not defined."""
-    for m in range(len(values)):
-        first, bar_first = inliers.offsets[m], inliers.bar_offsets[m]
-        n, p = inliers.offsets[m + 1] - first, inliers.bar_offsets[m + 1] - bar_first
-        gradient, values[m] = gradients[m], 0.0
+    gradient: FloatArray,
+) -> float:
+    """Return what the twin returns, and set `gradient` (T,)."""
+    value, own = 0.0, np.empty(len(theta))
+    gradient[:] = 0.0
+    for m in range(len(inliers.offsets) - 1):
+        value += _of_segment(theta, inliers, m, slope_std, latent_terms, own)
+        if not math.isfinite(value):
+            gradient[:] = 0.0
+            return -math.inf
         for i in range(len(theta)):
-            gradient[i] = 0.0
-        if n == 0:
-            continue
-        r, z = inliers.r[first : first + n], inliers.z[first : first + n]
-        u = np.empty(n)
-        for i in range(n):
-            u[i] = inliers.log_length_scale[first + i]
-        latent = _Latent(
-            inliers.r_bar[bar_first : bar_first + p],
-            np.empty((p, p)),
-            np.empty((p, p)),
-            np.empty((p, p)),
-            np.empty((n, p)),
-            np.zeros(p),
-        )
-        l_bar, kind = np.empty(p), inliers.kind[bar_first : bar_first + p]
-        for i in range(p):
-            l_bar[i] = inliers.log_extent[bar_first + i] + theta[5 + kind[i]]
-        if p > 0 and not _predict_log_length_scales(theta, l_bar, r, latent, u):
-            values[m] = -np.inf
-            continue
-        k, factor, whitened = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-        if not _factorise_covariance(theta, slope_std, r, u, k, factor):
-            values[m] = -np.inf
-        elif p == 0:
-            values[m] = _of_given_length_scales(theta, slope_std, r, z, factor, whitened, gradient)
-        else:
-            g_u, inverse = np.zeros(n), np.empty((n, n))
-            invert(factor, n, whitened, inverse)
-            values[m] = _of_observations(theta, r, z, u, k, factor, inverse, gradient, g_u)
-            values[m] += _of_latent_process(theta, latent_terms, r, kind, latent, g_u, gradient)
+            gradient[i] += own[i]
+    return value
+
+
+@jit()
+def _of_segment(
+    theta: FloatArray,
+    inliers: Inliers,
+    m: int,
+    slope_std: float,
+    latent_terms: bool,
+    gradient: FloatArray,
+) -> float:
+    """Return the value of segment `m`, -inf where it is not defined; set its gradient."""
+    first, bar_first = inliers.offsets[m], inliers.bar_offsets[m]
+    n, p = inliers.offsets[m + 1] - first, inliers.bar_offsets[m + 1] - bar_first
+    gradient[:] = 0.0
+    if n == 0:
+        return 0.0
+    r, z = inliers.r[first : first + n], inliers.z[first : first + n]
+    u = inliers.log_length_scale[first : first + n].copy()
+    latent = _Latent(
+        inliers.r_bar[bar_first : bar_first + p],
+        np.empty((p, p)),
+        np.empty((p, p)),
+        np.empty((p, p)),
+        np.empty((n, p)),
+        np.zeros(p),
+    )
+    l_bar, kind = np.empty(p), inliers.kind[bar_first : bar_first + p]
+    for i in range(p):
+        l_bar[i] = inliers.log_extent[bar_first + i] + theta[5 + kind[i]]
+    if p > 0 and not _predict_log_length_scales(theta, l_bar, r, latent, u):
+        return -math.inf
+    k, factor, whitened = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    if not _factorise_covariance(theta, slope_std, r, u, k, factor):
+        return -math.inf
+    if p == 0:
+        value: float = _of_given_length_scales(theta, slope_std, r, z, factor, whitened, gradient)
+        return value
+    g_u, inverse = np.zeros(n), np.empty((n, n))
+    invert(factor, n, whitened, inverse)
+    value = _of_observations(theta, r, z, u, k, factor, inverse, gradient, g_u)
+    return value + _of_latent_process(theta, latent_terms, r, kind, latent, g_u, gradient)
 
 
 @jit(part=True)

@@ -58,7 +58,7 @@ def exp_neg(x: float) -> float:
     return 0.0 if x > NEGLIGIBLE_EXPONENT else value
 
 
-def exp_neg_single(x: np.float32) -> np.float32:
+def exp_neg_single(x: Any) -> Any:
     """``exp(-x)`` for x >= 0 in single precision, to an error of 2e-7; zero from 18 on.
 
     As `exp_neg`, with 16 for 128: ``exp(-18)`` is 1.5e-8, below the rounding of one. It is squared

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import lru_cache
-from typing import NamedTuple, Protocol
+from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,11 +19,15 @@ from gp_ground_seg.core.frame import (
     Candidates,
     FloatArray,
     Frame,
-    GroundSurface,
     Inliers,
     IntArray,
     PseudoInputs,
+    Values,
 )
+from gp_ground_seg.core.gp.ground import estimate_surface
+from gp_ground_seg.core.gp.likelihood import log_likelihood
+from gp_ground_seg.core.gp.search import propose, search_from, take_outcome
+from gp_ground_seg.core.jit import shared
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.pipeline.lines import N_CLASSES, class_middles
 
@@ -37,14 +41,11 @@ WIDEST = 5.0
 """Distance from the given value to the bounds, in standard deviations of the prior."""
 FARTHEST_START = 5.0
 """Distance of the start of learning from the given values, at most: a factor of 148."""
-_AT_BOUND = 1e-6
-_LEVEL = 1e-3
-"""Gradient for each datum below which the objective counts as level."""
-_NO_GAIN = 1e-7
-"""Gain for each datum below which a step was the last."""
-_LONGEST_STEP = 1.0
-_SHRINK = 0.3
-"""Factor on a step that made things worse."""
+AT_BOUND = 1e-6
+"""Distance to a bound at which an entry counts as at it."""
+BUDGET, CONVERGED, FAILED = range(3)
+STATUSES = ('budget', 'converged', 'failed')
+"""How a learning ended; failed: no finite objective was found."""
 
 
 class ThetaSpace(NamedTuple):
@@ -112,13 +113,10 @@ def first_theta(frame: Frame, config: Config) -> FloatArray:
     is_ground = np.abs(lines.slope) <= growth.max_line_slope
     is_ground &= np.diff(lines.start) >= growth.min_line_size
     height = candidates.z - frame.prior_mean
-    may_show = is_ground[line] & (r <= growth.seed_range)
-    height = height[may_show]
-    inner = np.flatnonzero(line[2:] == line[:-2]) + 1
-    share = (r[inner] - r[inner - 1]) / (r[inner + 1] - r[inner - 1])
-    z = candidates.z
-    missed = z[inner] - (1.0 - share) * z[inner - 1] - share * z[inner + 1]
-    missed /= np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
+    height = height[is_ground[line] & (r <= growth.seed_range)]
+    inner, z = np.flatnonzero(line[2:] == line[:-2]) + 1, candidates.z
+    before, behind = (r[inner - 1], z[inner - 1]), (r[inner + 1], z[inner + 1])
+    missed = missed_by_line(before, (r[inner], z[inner]), behind)
     for i, values in enumerate((height, missed)):
         values = np.minimum(np.abs(values), growth.seed_height_tolerance)
         mean_square = float(values @ values) / max(len(values), 1)
@@ -128,62 +126,66 @@ def first_theta(frame: Frame, config: Config) -> FloatArray:
     return np.clip(theta, given - FARTHEST_START, given + FARTHEST_START)
 
 
+@shared
+def missed_by_line(
+    before: tuple[Values, Values], point: tuple[Values, Values], behind: tuple[Values, Values]
+) -> Values:
+    """Distance of a height from the line through the two beside it, all with noise [m].
+
+    Divided so that its standard deviation is that of the noise. Points are range and height [m].
+    """
+    share = (point[0] - before[0]) / (behind[0] - before[0])
+    missed = point[1] - (1.0 - share) * before[1] - share * behind[1]
+    return missed / np.sqrt(1.0 + share * share + (1.0 - share) * (1.0 - share))
+
+
 class Learned(NamedTuple):
     """Outcome of one learning."""
 
     theta: FloatArray  # (T,) best hyper-parameters evaluated, log space
     objective: float  # there, with the priors if any
     n_evaluations: int  # of objective and gradient
-    status: str  # ``converged``, ``budget`` or ``failed`` (no finite objective found)
+    status: str  # one of `STATUSES`
     at_bound: BoolArray  # (T,) free entries that ended at a bound
 
-
-class Model(Protocol):
-    """The part of a backend that learning needs, see `gp_ground_seg.core.backend.Backend`."""
-
-    def estimate_surface(
-        self, frame: Frame, theta: FloatArray, config: Config
-    ) -> tuple[GroundSurface, FloatArray, FloatArray]:
-        """Inliers and log length-scales under `theta`."""
-
-    def log_likelihood(
-        self, theta: FloatArray, inliers: Inliers, slope_std: float, latent_terms: bool
-    ) -> tuple[float, FloatArray]:
-        """Log marginal likelihood and its gradient."""
+    @classmethod
+    def of(
+        cls, theta: FloatArray, objective: float, n: int, status: int, space: ThetaSpace
+    ) -> Learned:
+        """Outcome of `n` evaluations, with `status` as its place in `STATUSES`."""
+        near_bound = (theta <= space.lower + AT_BOUND) | (theta >= space.upper - AT_BOUND)
+        at_bound = space.free & near_bound & (n > 0)
+        return cls(theta, objective, n, STATUSES[status], at_bound)
 
 
-def learn_frame(frame: Frame, config: Config, model: Model) -> Learned | None:
+def learn_frame(frame: Frame, config: Config) -> Learned:
     """Learn theta on the inliers that grow under it, then on those under what was learned, ...
 
     It ends when the inliers of a later round are no more than before, or when
-    ``learning.max_evaluations`` are spent, of which the first round has half. None if
-    ``learning.mode`` is fixed.
+    ``learning.max_evaluations`` are spent, of which the first round has half. Every
+    ``learning.segment_step``-th segment is used.
     """
     learning, space = config.learning, theta_space(config)
-    if learning.mode == 'fixed':
-        return None
     thin = every_segment(frame, learning.segment_step)
     has_latent = bool(space.free[2:].any())
     is_map, slope_std = learning.objective == 'map', config.observation.slope_std
-
-    def learn(begin: FloatArray, data: Inliers, budget: int) -> Learned:
-        def objective(theta: FloatArray) -> tuple[float, FloatArray]:
-            return model.log_likelihood(theta, data, slope_std, not is_map)
-
-        return maximise(
-            objective, space, begin, len(data.r), use_priors=is_map, max_evaluations=budget
-        )
-
-    none_at_bound = np.zeros_like(space.free)
-    learned = Learned(first_theta(frame, config), -math.inf, 0, 'budget', none_at_bound)
+    learned = Learned.of(first_theta(frame, config), -math.inf, 0, BUDGET, space)
     numbers: list[int] = []
     budget = max(learning.max_evaluations // 2, 1)
     while budget > 0:
-        surface, _, u = model.estimate_surface(thin, learned.theta, config)
+        surface, _, u = estimate_surface(thin, learned.theta, config)
         numbers.append(int(surface.inlier.sum()))
         if len(numbers) > 2 and numbers[-1] <= numbers[-2]:
             break
-        found = learn(learned.theta, take_inliers(thin, surface.inlier, u, has_latent), budget)
+        inliers = take_inliers(thin, surface.inlier, u, has_latent)
+        found = maximise(
+            partial(log_likelihood, inliers=inliers, slope_std=slope_std, latent_terms=not is_map),
+            space,
+            learned.theta,
+            len(inliers.r),
+            use_priors=is_map,
+            max_evaluations=budget,
+        )
         learned = found._replace(n_evaluations=learned.n_evaluations + found.n_evaluations)
         budget = learning.max_evaluations - learned.n_evaluations
     return learned
@@ -258,72 +260,41 @@ def maximise(
 ) -> Learned:
     """Maximise objective plus log priors from `start`, within bounds and budget.
 
-    Quasi-Newton steps (BFGS). Divided by the number of data, the curvature in the logarithm of
-    a standard deviation is about one: the first step is of a sensible size (the paper's scaled
-    gradient-based optimisation). SciPy's L-BFGS-B takes longer between two evaluations than
-    most evaluations take.
-
     `objective` gives the log marginal likelihood of a theta and its gradient, ``-inf`` is allowed;
     `start` is in log space, `n_data` the number of inliers. The best theta so far is returned
     after `max_evaluations`.
     """
-    free, theta = space.free, np.clip(start, space.lower, space.upper)
-    lower, upper = space.lower[free], space.upper[free]
-    if not free.any() or n_data == 0 or max_evaluations == 0:
-        return Learned(theta, -math.inf, 0, 'converged', np.zeros_like(free))
-
-    evaluate = _of_free_entries(objective, space, theta, n_data, use_priors)
-    x = theta[free]
-    value, gradient = evaluate(x)
-    n_evaluations, status, reach = 1, 'budget' if math.isfinite(value) else 'failed', 1.0
-    unit = inverse = np.eye(len(x))
-    while status == 'budget':
-        held = ((x <= lower) & (gradient < 0.0)) | ((x >= upper) & (gradient > 0.0))
-        slope = np.where(held, 0.0, gradient)
-        step = np.where(held, 0.0, inverse @ slope)
-        longest = float(np.abs(step).max())
-        if float(np.abs(slope).max()) < _LEVEL:
-            status = 'converged'
-            break
-        if n_evaluations >= max_evaluations:
-            break
-        trial = x + step * (reach * min(1.0, _LONGEST_STEP / longest))
-        trial = np.minimum(np.maximum(trial, lower), upper)
-        trial_value, trial_gradient = evaluate(trial)
-        n_evaluations += 1
-        if not trial_value > value:
-            reach *= _SHRINK
-            # The step from here on goes along the slope if it does not get any shorter.
-            if reach < _SHRINK**3:
-                inverse, reach = _SHRINK**3 * unit, 1.0
-            continue
-        gain, moved, bent = trial_value - value, trial - x, gradient - trial_gradient
-        x, value, gradient, reach = trial, trial_value, trial_gradient, 1.0
-        if (along := float(moved @ bent)) > 0.0:
-            mixed = unit - moved[:, None] * bent / along
-            inverse = mixed @ inverse @ mixed.T + moved[:, None] * moved / along
-        if gain < _NO_GAIN:
-            status = 'converged'
-    theta[free] = x
-    near_bound = (theta <= space.lower + _AT_BOUND) | (theta >= space.upper - _AT_BOUND)
-    return Learned(theta, value * n_data, n_evaluations, status, free & near_bound)
-
-
-def _of_free_entries(
-    objective: Objective, space: ThetaSpace, theta: FloatArray, n_data: int, use_priors: bool
-) -> Objective:
-    """Objective and gradient in the free entries, for each datum; the others are as in `theta`."""
-    free = space.free
-
-    def evaluate(x: FloatArray) -> tuple[float, FloatArray]:
-        trial = theta.copy()
-        trial[free] = x
-        value, slope = objective(trial)
-        slope = slope[free]
+    free, theta = np.flatnonzero(space.free), np.clip(start, space.lower, space.upper)
+    if len(free) == 0 or n_data == 0 or max_evaluations == 0:
+        return Learned.of(theta, -math.inf, 0, CONVERGED, space)
+    search = search_from(theta[free], space.lower[free], space.upper[free])
+    centre, n_evaluations, status = space.centre[free], 0, BUDGET
+    while n_evaluations < max_evaluations:
+        theta[free] = search.trial
+        value, gradient = objective(theta)
+        gradient = gradient[free]
         if use_priors:
-            deviation = (x - space.centre[free]) / space.prior_std
-            value -= 0.5 * float(deviation @ deviation)
-            slope = slope - deviation / space.prior_std
-        return value / n_data, slope / n_data
+            value += float(log_prior(search.trial, centre, space.prior_std).sum())
+            gradient = gradient + slope_of_prior(search.trial, centre, space.prior_std)
+        n_evaluations += 1
+        if n_evaluations == 1 and not math.isfinite(value):
+            status = FAILED
+            break
+        if take_outcome(search, value / n_data, gradient / n_data) or not propose(search):
+            status = CONVERGED
+            break
+    theta[free] = search.x
+    return Learned.of(theta, search.value[0] * n_data, n_evaluations, status, space)
 
-    return evaluate
+
+@shared
+def log_prior(value: Values, centre: Values, std: float) -> Values:
+    """Log density of an entry of theta, up to a constant."""
+    deviation = (value - centre) / std
+    return -0.5 * deviation * deviation
+
+
+@shared
+def slope_of_prior(value: Values, centre: Values, std: float) -> Values:
+    """Return the derivative of `log_prior` in `value`."""
+    return (centre - value) / (std * std)

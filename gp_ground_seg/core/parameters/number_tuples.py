@@ -42,6 +42,7 @@ _TUPLE_TYPES: dict[type[Any], Any] = {
         config.ObservationConfig,
         config.LatentConfig,
         config.GrowthConfig,
+        config.LearningConfig,
         config.FacesConfig,
         config.LabelConfig,
     )

@@ -1,0 +1,179 @@
+"""Compiled twin of `gp_ground_seg.core.gp.learning`: all rounds of a frame in one call."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gp_ground_seg.core.compiled.ground import SegmentSurfaces, grow_surfaces
+from gp_ground_seg.core.compiled.latent import latent_log_length_scales
+from gp_ground_seg.core.compiled.likelihood import log_likelihood
+from gp_ground_seg.core.frame import FloatArray, Frame, Inliers, IntArray
+from gp_ground_seg.core.gp.evidence import is_low_and_near
+from gp_ground_seg.core.gp.learning import (
+    BUDGET,
+    CONVERGED,
+    FAILED,
+    FARTHEST_START,
+    ThetaSpace,
+    log_prior,
+    missed_by_line,
+    slope_of_prior,
+)
+from gp_ground_seg.core.gp.search import propose, search_from, take_outcome
+from gp_ground_seg.core.jit import jit
+from gp_ground_seg.core.parameters.config import GrowthConfig, LearningConfig, ObservationConfig
+
+
+@jit(entry=True)
+def learn_frame(
+    frame: Frame,
+    space: ThetaSpace,
+    observation: ObservationConfig,
+    growth: GrowthConfig,
+    learning: LearningConfig,
+    is_map: bool,
+    is_latent: bool,
+    odds: float,
+    alone: SegmentSurfaces,
+    theta: FloatArray,
+    outcome: FloatArray,
+) -> int:
+    """Do what the twin does, into `theta` (T,), which holds the given values.
+
+    The frame has no knots. `is_map` and `is_latent` are the objective and the model of the
+    length-scale, `odds` as of `grow_surfaces`; `alone` has no knots, and the log length-scales at
+    the candidates if these are given. Sets `outcome` (2,) to the objective and the place of the
+    status in `STATUSES`, and returns the number of evaluations.
+    """
+    _set_first_theta(frame, growth, theta)
+    free, step, nothing = np.flatnonzero(space.free), learning.segment_step, np.empty((2, 0, 0))
+    has_latent = len(free) > 0 and free[len(free) - 1] >= 2
+    outcome[0], outcome[1] = -math.inf, BUDGET
+    n_rounds = n_before = n_evaluations = 0
+    budget = max(learning.max_evaluations // 2, 1)
+    while budget > 0:
+        if is_latent:
+            at_knots = alone.knot_log_length_scale
+            latent_log_length_scales(frame, theta, step, alone.log_length_scale, at_knots)
+        _set_seeds(frame, growth, step, alone)
+        grow_surfaces(frame, theta, observation, growth, odds, nothing, step, alone)
+        inliers = _take_inliers(frame, step, has_latent, alone)
+        n_rounds += 1
+        if n_rounds > 2 and len(inliers.r) <= n_before:
+            break
+        n_before = len(inliers.r)
+        slope_std = observation.slope_std
+        n_evaluations += _maximise(space, free, inliers, slope_std, is_map, budget, theta, outcome)
+        budget = learning.max_evaluations - n_evaluations
+    return n_evaluations
+
+
+@jit()
+def _set_first_theta(frame: Frame, growth: GrowthConfig, theta: FloatArray) -> None:
+    """See the plain `first_theta`."""
+    candidates, lines = frame.candidates, frame.lines
+    r, z, line, most = candidates.r, candidates.z, lines.line, growth.seed_height_tolerance
+    numbers, squares = np.zeros(2), np.zeros(2)
+    for c in range(len(r)):
+        q = line[c]
+        is_ground = abs(lines.slope[q]) <= growth.max_line_slope
+        is_ground &= lines.start[q + 1] - lines.start[q] >= growth.min_line_size
+        if is_ground and r[c] <= growth.seed_range:
+            numbers[0] += 1.0
+            squares[0] += min(abs(z[c] - frame.prior_mean), most) ** 2
+        if 0 < c < len(r) - 1 and line[c - 1] == line[c + 1]:
+            before, behind = (r[c - 1], z[c - 1]), (r[c + 1], z[c + 1])
+            numbers[1] += 1.0
+            squares[1] += min(abs(missed_by_line(before, (r[c], z[c]), behind)), most) ** 2
+    for i in range(2):
+        if squares[i] > 0.0:
+            shown = 0.5 * math.log(squares[i] / numbers[i])
+            theta[i] = min(max(shown, theta[i] - FARTHEST_START), theta[i] + FARTHEST_START)
+
+
+@jit()
+def _set_seeds(frame: Frame, growth: GrowthConfig, step: int, alone: SegmentSurfaces) -> None:
+    """Set the seeds of every `step`-th segment: without evidence from aside, all that are low."""
+    candidates = frame.candidates
+    for m in range(0, len(candidates.offsets) - 1, step):
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            z = candidates.z[c] - frame.prior_mean
+            alone.seed[c] = is_low_and_near(candidates.r[c], z, growth)
+
+
+@jit()
+def _take_inliers(frame: Frame, step: int, has_latent: bool, alone: SegmentSurfaces) -> Inliers:
+    """Inliers of every `step`-th segment, and with `has_latent` their pseudo-inputs."""
+    candidates, pseudo = frame.candidates, frame.pseudo
+    n_segments = (len(candidates.offsets) + step - 2) // step
+    offsets, bar_offsets = np.zeros(n_segments + 1, np.int64), np.zeros(n_segments + 1, np.int64)
+    places, bars = np.empty(len(candidates.r), np.int64), np.empty(len(pseudo.r_bar), np.int64)
+    n = p = 0
+    for k in range(n_segments):
+        m = k * step
+        for c in range(candidates.offsets[m], candidates.offsets[m + 1]):
+            places[n] = c
+            n += alone.inlier[c]
+        if has_latent:
+            for c in range(pseudo.offsets[m], pseudo.offsets[m + 1]):
+                bars[p] = c
+                p += 1
+        offsets[k + 1], bar_offsets[k + 1] = n, p
+    places, bars = places[:n], bars[:p]
+    return Inliers(
+        offsets,
+        candidates.r[places],
+        candidates.z[places] - frame.prior_mean,
+        alone.log_length_scale[places],
+        bar_offsets,
+        pseudo.r_bar[bars],
+        pseudo.log_extent[bars],
+        pseudo.kind[bars],
+    )
+
+
+@jit()
+def _maximise(
+    space: ThetaSpace,
+    free: IntArray,
+    inliers: Inliers,
+    slope_std: float,
+    is_map: bool,
+    max_evaluations: int,
+    theta: FloatArray,
+    outcome: FloatArray,
+) -> int:
+    """See the plain `maximise`; `free` are the places of the free entries."""
+    n_data = len(inliers.r)
+    for i in range(len(theta)):
+        theta[i] = min(max(theta[i], space.lower[i]), space.upper[i])
+    outcome[0], outcome[1] = -math.inf, CONVERGED
+    if len(free) == 0 or n_data == 0:
+        return 0
+    gradient, slope = np.empty(len(theta)), np.empty(len(free))
+    search = search_from(theta[free], space.lower[free], space.upper[free])
+    n_evaluations, status = 0, BUDGET
+    while n_evaluations < max_evaluations:
+        for i in range(len(free)):
+            theta[free[i]] = search.trial[i]
+        value = log_likelihood(theta, inliers, slope_std, not is_map, gradient)
+        for i in range(len(free)):
+            k = free[i]
+            slope[i] = gradient[k]
+            if is_map:
+                value += log_prior(theta[k], space.centre[k], space.prior_std)
+                slope[i] += slope_of_prior(theta[k], space.centre[k], space.prior_std)
+            slope[i] /= n_data
+        n_evaluations += 1
+        if n_evaluations == 1 and not math.isfinite(value):
+            status = FAILED
+            break
+        if take_outcome(search, value / n_data, slope) or not propose(search):
+            status = CONVERGED
+            break
+    for i in range(len(free)):
+        theta[free[i]] = search.x[i]
+    outcome[0], outcome[1] = search.value[0] * n_data, status
+    return n_evaluations
