@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.compiled.relief import height_at
+from gp_ground_seg.core.compiled.relief import find_places
 from gp_ground_seg.core.frame import (
     NOT_FINITE,
     BoolArray,
@@ -41,10 +41,12 @@ from gp_ground_seg.core.pipeline.labels import (
     vote_of,
     whole_units,
 )
-from gp_ground_seg.core.pipeline.relief import Relief
+from gp_ground_seg.core.pipeline.relief import Relief, height_in
 
 # Plain integers, as compiled code has no enumerations.
 _UNKNOWN, _GROUND, _OBSTACLE = int(Label.UNKNOWN), int(Label.GROUND), int(Label.OBSTACLE)
+BLOCK = 512
+"""Points measured at a time, so that their places in the relief stay in the nearest cache."""
 VOTER_FLAG = 2**38
 """Added to the sum of votes for each voter: more than the votes of all of them."""
 
@@ -79,23 +81,51 @@ def survey(
 
     For `pieces` see `fit_pieces`, for `sums` `gp_ground_seg.core.compiled.roughness`.
     """
-    nearest, outside = scan.grid.edges[0], len(sums) - 1
     for occupied in scan.tiles.occupied:
         sums[np.uintp(occupied), 0] = sums[np.uintp(occupied), 1] = 0
-    x, y, z = scan.xyz.T[0], scan.xyz.T[1], scan.xyz.T[2]
-    tile, cell, r = scan.tiles.tile, scan.grid.cell, scan.grid.r
-    for i in range(len(cell)):
-        c = np.uintp(cell[i] if cell[i] >= 0 else len(pieces) - 1)
-        away = max(np.float64(r[i]), nearest)
-        over = np.float64(z[i])
-        if not is_level and cell[i] >= 0:
-            over -= height_at(relief.pieces, np.float64(x[i]), np.float64(y[i]))
-        h = over - (pieces[c, 0] + pieces[c, 1] * away)
-        height[i] = h
+    x, y, tile = scan.xyz.T[0], scan.xyz.T[1], scan.tiles.tile
+    land = relief.pieces.reshape(-1, 4)
+    u, v, piece = np.zeros(BLOCK), np.zeros(BLOCK), np.zeros(BLOCK, np.int32)
+    for first in range(0, len(tile), BLOCK):
+        block = slice(first, min(first + BLOCK, len(tile)))
+        if not is_level:
+            find_places(x[block], y[block], u, v, piece)
+        _measure(scan, block, pieces, land, u, v, piece, height[block])
+        _add_squares(tile[block], height[block], is_face, units, sums)
+
+
+@jit(part=True)
+def _measure(
+    scan: Scan,
+    block: slice,
+    pieces: FloatArray,
+    land: FloatArray,
+    u: FloatArray,
+    v: FloatArray,
+    piece: CellArray,
+    height: FloatArray,
+) -> None:
+    """Heights of the points of a block over the surface and the land."""
+    z, r, cell = scan.xyz.T[2][block], scan.grid.r[block], scan.grid.cell[block]
+    nearest, outside = scan.grid.edges[0], len(pieces) - 1
+    for i in range(len(height)):
+        c = np.uintp(cell[i] if cell[i] >= 0 else outside)
+        p = np.uintp(piece[i] if cell[i] >= 0 else 0)
+        over = np.float64(z[i]) - height_in(land[p], u[i], v[i])
+        height[i] = over - (pieces[c, 0] + pieces[c, 1] * max(np.float64(r[i]), nearest))
+
+
+@jit(part=True)
+def _add_squares(
+    tile: CellArray, height: FloatArray, is_face: BoolArray, units: float, sums: IntArray
+) -> None:
+    """Add the returns near the surface to the sums of their tiles."""
+    outside = len(sums) - 1
+    for i in range(len(height)):
         t = np.uintp(tile[i] if tile[i] >= 0 else outside)
-        if is_near(h) and not is_face[t]:
+        if is_near(height[i]) and not is_face[t]:
             sums[t, 0] += 1
-            sums[t, 1] += int(whole_units(h * h, units))
+            sums[t, 1] += int(whole_units(height[i] * height[i], units))
 
 
 class VoteBuffers(NamedTuple):

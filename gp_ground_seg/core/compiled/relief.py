@@ -10,7 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gp_ground_seg.core.frame import BoolArray, Candidates, FloatArray, IntArray
+from gp_ground_seg.core.frame import (
+    BoolArray,
+    Candidates,
+    CellArray,
+    FloatArray,
+    IntArray,
+    PointArray,
+)
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig
 from gp_ground_seg.core.pipeline.relief import (
@@ -110,6 +117,17 @@ def height_at(pieces: FloatArray, x: float, y: float) -> float:
     u, v = from_first_middle(x), from_first_middle(y)
     height: float = height_in(pieces[np.uintp(u), np.uintp(v)], u, v)
     return height
+
+
+@jit()
+def find_places(
+    x: PointArray, y: PointArray, u: FloatArray, v: FloatArray, piece: CellArray
+) -> None:
+    """Set `u`, `v` and the piece, counted over all, of places (P,) [m], in a loop of vectors."""
+    n = np.int32(N_SIDES - 1)
+    for i in range(len(x)):
+        along_u, along_v = from_first_middle(np.float64(x[i])), from_first_middle(np.float64(y[i]))
+        u[i], v[i], piece[i] = along_u, along_v, np.int32(along_u) * n + np.int32(along_v)
 
 
 @jit()
