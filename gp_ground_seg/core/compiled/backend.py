@@ -48,7 +48,6 @@ from gp_ground_seg.core.pipeline.lines import lines_through
 from gp_ground_seg.core.pipeline.points import copy_points, points_in
 from gp_ground_seg.core.pipeline.polar_grid import grid_geometry
 from gp_ground_seg.core.pipeline.relief import Relief
-from gp_ground_seg.core.pipeline.roughness import N_LEVELS
 from gp_ground_seg.core.pipeline.tilt import Direction
 
 
@@ -218,7 +217,7 @@ class NumbaBackend:
         pieces = take('pieces', (scan.grid.n_segments * scan.grid.n_bins + 1, 2), np.float64)
         sums = take('height_sums', (n_tiles + 1, 2), np.int64)
         blocks = take('block_rows', ((math.isqrt(n_tiles) + 2) ** 2,), np.int32)
-        counts = take('counts', (N_LEVELS * (len(scan.tiles.occupied) + 1),), np.int32)
+        counts = take('counts', (roughness_.N_WORDS * (len(scan.tiles.occupied) + 1),), np.uint64)
         roughness = take('roughness', (n_tiles + 1,), np.float64)
         result = Labelled(np.empty(n_points, np.uint8), np.empty(n_points), np.empty(n_points))
         labels.fit_pieces(surface, pieces)
