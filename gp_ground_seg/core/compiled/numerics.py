@@ -36,7 +36,7 @@ def branch(condition: bool, a: Any, b: Any) -> Any:
 
 
 def exp_neg(x: float) -> float:
-    """``exp(-x)``, to an error of 1e-14 for x >= 0, and of 1e-11 of its size for -10 < x < 0.
+    """``exp(-x)``, to an error of 2e-14 for x >= 0, and of 1e-11 of its size for -10 < x < 0.
 
     The Taylor polynomial of ``exp(-x / 128)``, squared seven times: no branch, no
     table, no call, so that it runs on four numbers at a time. The remainder of the
