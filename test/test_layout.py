@@ -57,7 +57,7 @@ ONLY_IN = {
 }
 PRIVATE = ('numba.core', 'numba.np', 'llvmlite')
 
-MAX_LINES, MAX_FILES = 500, 136
+MAX_LINES, MAX_FILES = 500, 138
 MAX_PARAMETERS, MAX_PARAMETERS_COMPILED = 8, 12
 MAX_BODY, MAX_BODY_COMPILED = 40, 60
 """Lines of a function, without its docstring."""
