@@ -240,7 +240,7 @@ def test_scans_without_labels_have_points_that_differ_and_time_only(strict, tmp_
         (['ROOT', '--against', 'paper', '--sequences', '99'], 'no sequence 99'),
         (['ROOT', '--against', 'paper', '--peer', 'patchworkpp'], '--against: compares with p'),
         *((['SCAN', '--against', 'paper', option, '2'], f'{option}: ')
-          for option in ('--sequences', '--frame-step', '--cut', '--worst', '--workers')),
+          for option in ('--sequences', '--frame-step', '--cut', '--workers')),
         (['SCAN'], 'no sequences/*/velodyne folder below it (SemanticKITTI layout); scans without '
          'labels need --against'),
     ],

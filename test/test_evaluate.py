@@ -21,7 +21,7 @@ from gp_ground_seg.lab.experiments.variants import SimulatedFrame, load_simulate
 from gp_ground_seg.lab.scoring import evaluate as runner
 from gp_ground_seg.lab.scoring import metrics
 from gp_ground_seg.lab.scoring.evaluate import OurMethod
-from gp_ground_seg.lab.scoring.metrics import ClassCount, Confusion, height_error
+from gp_ground_seg.lab.scoring.metrics import Confusion, height_error
 from gp_ground_seg.lab.scoring.objects import Share
 from gp_ground_seg.lab.scoring.patchworkpp import PatchworkppMethod
 
@@ -44,12 +44,11 @@ def test_times():
 def test_pooling_sums_counts_and_does_not_average_ratios():
     large, small = Confusion(tp=90, fp=10), Confusion(fn=1)
     score = runner.MethodScore('x', tuple(
-        runner.ScanScore(name, '0', 0.0, {}, {'groundgrid': one}, classes={40: ClassCount(4, 3)})
+        runner.ScanScore(name, '0', 0.0, {}, {'groundgrid': one})
         for name, one in (('08', large), ('00', small))
     ))  # fmt: skip
     assert score.iou == score.pooled('groundgrid').iou == 90 / 101
     assert score.of('00').confusion == small
-    assert score.classes == {40: ClassCount(8, 6)}
     assert [name for name, _ in score.by_sequence()] == [*score.sequences, 'all']
     assert score.sequences == ['08', '00']
     parts = [score.of('00'), score.of('08')]
@@ -152,7 +151,6 @@ def test_scores_of_a_rule_known_by_hand(tmp_path):
     assert score.pooled('groundgrid') == Confusion(n_road, n_false, 0, n_right)
     assert (tree & (points[:, 2] < -1.2975)).sum() == 200
     assert score.pooled('patchwork') == Confusion(n_road + 200, n_false, 0, n_right + 300)
-    assert (score.classes[0], score.classes[70]) == (ClassCount(50, 50), ClassCount(500, 200))
     # The rule has a surface at its height.
     expected = height_error(points[road, 2].astype(float), np.full(n_road, -1.5))
     assert score.height == expected
@@ -165,22 +163,17 @@ class GuessedProbabilities(HeightRule):
         return np.clip(-0.5 - self.points[:, 2], 0.0, 1.0).astype(np.float32)
 
 
-def test_errors_of_classes_and_of_rings_are_all_errors_and_sequences_are_pooled(tmp_path):
+def test_errors_of_rings_are_all_errors_and_sequences_are_pooled(tmp_path):
     write_streets(tmp_path, s00=2, s08=1)
     rules = HeightRule('misses', -1.72), GuessedProbabilities('invents', -1.0)
     misses, invents = evaluate(tmp_path, *rules)
     assert misses.confusion.fn > 0 and invents.confusion.fp > 0
     for score in (misses, invents):
-        found = metrics.class_errors(score.classes)
-        assert sum(one.missed for one in found) == score.confusion.fn
-        assert sum(one.false for one in found) == score.confusion.fp
         assert sum((ring.confusion for ring in score.rings), Confusion()) == score.confusion
     assert misses.calibration.n_total == 0
     parts, pooled = [invents.of(s).calibration for s in ('00', '08')], invents.calibration
     n_scored = sum(ring.confusion.points for ring in invents.rings)
     assert pooled.n_total == sum(part.n_total for part in parts) == n_scored
-    mean = sum(part.brier * part.n_total for part in parts) / n_scored
-    assert pooled.brier == pytest.approx(mean)
 
 
 def test_data_that_does_not_fit_is_an_error_and_a_refused_scan_is_named(tmp_path):
@@ -287,7 +280,7 @@ def evaluated(root, tmp_path_factory):
     """Files of a run beside Patchwork++."""
     folder = tmp_path_factory.mktemp('evaluated')
     words = ['--json', folder / 'a.json']
-    assert run('evaluate', root, *words, '--worst', 2, '--peer', 'patchworkpp') == 0
+    assert run('evaluate', root, *words, '--peer', 'patchworkpp') == 0
     return folder
 
 
@@ -333,27 +326,12 @@ def test_tables_hold_the_sums_of_the_frames(root, evaluated, capfd):
     assert document['environment']['versions']['pypatchworkpp']
     for row in frames:
         assert row['points'] == len(street()[0])
-        has_errors = row['groundgrid_fp'] + row['groundgrid_fn'] > 0
-        assert row['main_error_class'] in (('road', 'building') if has_errors else ('',))
         # Pose and state of learning are those of our method only.
         assert (row.get('status') in ('converged', 'budget')) == (row['method'] != 'patchworkpp')
 
 
-def test_classes_rings_and_probabilities(evaluated):
+def test_rings_heights_and_probabilities(evaluated):
     document = json.loads((evaluated / 'a.json').read_text())
-    classes = {row['class']: row for row in document['classes']}
-    assert (classes['road']['counts_as'], classes['road']['points']) == ('ground', 12_000)
-    assert classes['building']['counts_as'] == 'obstacle'
-    assert classes['building']['missed'] is classes['road']['false'] is None
-    assert {classes[n]['counts_as'] for n in ('vegetation', 'unlabelled')} == {'left out'}
-    assert classes['vegetation']['share_of_errors'] is None
-    for name in ('share_of_points', 'share_of_errors'):
-        assert sum(row[name] or 0.0 for row in classes.values()) == pytest.approx(1.0)
-    ious = sorted(
-        f['groundgrid_iou'] for f in document['rows'] if f['method'] == 'gp_ground_seg'
-    )  # fmt: skip
-    assert [row['iou'] for row in document['worst']] == ious[:2]
-    assert {row['most errors on'] for row in document['worst']} <= {'road', 'building'}
     rings = {row['range']: row for row in document['rings']}
     assert rings['> 50 m']['iou'] is rings['> 50 m']['patchworkpp_iou'] is None
     assert sum(row['share_of_errors'] for row in rings.values()) == pytest.approx(1.0)
@@ -366,6 +344,9 @@ def test_classes_rings_and_probabilities(evaluated):
         assert row['rmse'] == pytest.approx(math.sqrt(squares / sum(n)))
         assert row['patchworkpp_rmse'] > 0.0
         assert abs(row['bias']) < 0.005
+        for name in ('within_1', 'within_2'):
+            within = np.dot(n, [one[f'{name}_all'] for one in parts])
+            assert row[name] == pytest.approx(within / sum(n))
     pooled = document['probabilities'][-1]
     bins = [row for row in document['reliability'] if row['sequence'] == 'all']
     assert sum(row['points'] for row in bins) == pooled['points']
@@ -401,7 +382,6 @@ def test_settings_change_the_result_and_are_said(root, tmp_path, capsys):
         (['--set', 'label.ground_tolerence=1'], 'label.ground_tolerance'),
         (['--json', '/no/such/folder/x.json'], '/no/such/folder'),
         (['--json', 'MINE'], '--force replaces it'),
-        (['--per-frame', 'MINE'], '--force replaces it'),
         (
             ['--set', 'sensor.height=0', '--peer', 'patchworkpp'],
             'sensor.height = 0 set sensor.origin_z above 0',
@@ -430,7 +410,7 @@ def test_frames_without_a_scored_point_and_a_root_without_sequences(tmp_path, ca
     root = write_streets(tmp_path / 'kitti', s00=1)
     label = root / 'sequences/00/labels/000000.label'
     label.write_bytes(bytes(len(label.read_bytes())))  # all unlabelled
-    assert run('evaluate', root, '--worst', 2) == 0
+    assert run('evaluate', root) == 0
     capsys.readouterr()
     assert run('evaluate', tmp_path, '--json', tmp_path / 'a.json') == 2
     assert 'SemanticKITTI layout' in error_line(capsys)

@@ -74,7 +74,7 @@ def test_any_name_is_read_written_and_shown_escaped(tmp_path, monkeypatch, capsy
         ['segment', f'{name}.mcap', '-o', f'{name}_ground.mcap'],
         ['segment', root, '-o', f'{name}_out'],
         ['plot', 'scan', f'{name}.bin', '-o', f'{name}.svg'],
-        ['evaluate', root, '--per-frame', f'{name}.csv', '--json', f'{name}.json'],
+        ['evaluate', root, '--json', f'{name}.json'],
         ['evaluate', f'{name}.mcap', '--against', f'{name}.yaml'],
         ['config', 'check', f'{name}.yaml'],
     ):

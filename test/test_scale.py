@@ -2,7 +2,6 @@
 
 import ast
 import contextlib
-import csv
 import json
 import logging
 import os
@@ -365,15 +364,3 @@ def test_local_paths_need_neither_dask_nor_fsspec(more, root, tmp_path):
     )
     command = [sys.executable, '-c', code, 'segment', root, '-o', tmp_path / 'out', *more]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-
-
-def test_a_row_for_each_frame(root, tmp_path, capsys):
-    path = tmp_path / 'frames.csv'
-    command = ['evaluate', root, '--per-frame', path, '--json', tmp_path / 'all.json']
-    assert run(*command) == 0
-    assert f'each frame: {path}' in capsys.readouterr().out
-    rows = json.loads((tmp_path / 'all.json').read_text())['rows']
-    with path.open(newline='') as file:
-        found = list(csv.DictReader(file))
-    for name, kind in (('sequence', str), ('index', str), ('groundgrid_iou', float)):
-        assert [kind(row[name]) for row in found] == [row[name] for row in rows]

@@ -47,7 +47,7 @@ SETTINGS = ['', '=', 'a=b', 'grid.n_bins', 'grid.n_bins=[', 'grid.n_bins=!!int x
             'grid.n_bins=' + '9' * 5000, 'frame.x=\udcff', 'grid.n_bins=&a 9']  # fmt: skip
 ROS = ['-p', '-r', ':=', 'a:=', '-p x', '--params-file missing.yaml', '--params-file noise.yaml',
        '--params-file good/scan.bin', '-p grid.n_bins:=x', '-p grid.n_bins:=-1']  # fmt: skip
-WRITTEN = ('output', 'json', 'save', 'html', 'per_frame')
+WRITTEN = ('output', 'json', 'save', 'html')
 RIGHT = {
     'sequence': '00', 'sequences': '00', 'preset': 'paper', 'topic': '/points',
     'scheduler': 'tcp://127.0.0.1:1', 'sensors': 'vlp-16', 'scenes': 'flat', 'seeds': '1',

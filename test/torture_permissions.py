@@ -58,7 +58,6 @@ WRITERS = [
     'segment good/drive.bag -o IN/out',
     'plot scan good/scan.bin -o IN/out.png',
     'evaluate good/root --json IN/out.json',
-    'evaluate good/root --per-frame IN/out.csv',
     'bench good/root --json IN/out.json',
     'experiment steps good/root --json IN/out.json',
     'kitti-to-bag good/root --sequence 00 IN/out.mcap',

@@ -59,7 +59,6 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --set faces.max_normal_z=0 --against default
   gp-ground-seg evaluate drive.mcap --config my.yaml --against default      no labels
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
-  gp-ground-seg evaluate KITTI_ROOT --worst 9 --per-frame frames.csv
   gp-ground-seg evaluate s3://bucket/kitti --workers 8
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). With --workers
@@ -81,14 +80,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         parser,
         ROOT,
         *OF_FRAMES,
-        ('--per-frame', 'write the numbers of each frame as CSV', {'metavar': 'FILE'}),
         (
             '--cut',
             f'height [m] at which objects are cut, to count low things (default: {CUT_HEIGHT}); '
             '0 = no low things: each method segments a frame once',
             {'metavar': 'HEIGHT', 'type': partial(options.above_zero, or_zero=True)},
         ),
-        ('--worst', 'list the N frames with the lowest IoU', options.NUMBER),
         ('--against', 'compare with this parameter file or preset', {'metavar': 'NAME'}),
         (
             '--peer',
@@ -107,8 +104,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(arguments: argparse.Namespace) -> int:
     """Evaluate, write the files, print the tables."""
     config = options.read_config(arguments)
-    files = {'json': 'every number', 'per_frame': 'each frame'}
-    with options.staged_options(arguments, *files) as parts, ExitStack() as stack:
+    with options.staged_options(arguments, 'json') as parts, ExitStack() as stack:
         items, load = _items(arguments)
         chosen: list[Method] = [OurMethod(config)]
         changed: list[str] = []
@@ -120,21 +116,19 @@ def run(arguments: argparse.Namespace) -> int:
         runner = stack.enter_context(options.runner(arguments, 'evaluate'))
         scores = score_methods(items, chosen, load, runner=runner)
         cut = _cut_of(arguments)
-        report = tables.evaluation(scores, config, arguments.worst, runner.n_workers, cut)
+        report = tables.evaluation(scores, config, runner.n_workers, cut)
         report.facts.update(data=arguments.root, cut=cut)
         environment = results.describe_environment(*(['pypatchworkpp'] if arguments.peer else []))
         environment['n_workers'] = runner.n_workers
         if 'json' in parts:
             report.write(parts['json'], environment)
-        if 'per_frame' in parts:
-            results.write_rows(report.rows, parts['per_frame'])
     if changed:
         print(f'{shown(arguments.against)} -> given:', *changed, '', sep='\n')
     lines = [results.parameters_line(report.facts['config_changes'])]
     lines.append(results.machine_line(environment, report.fit))
     print(results.written(report.tables.values(), lines, markdown=arguments.markdown))
-    for name in parts:
-        print(f'{files[name]}: {shown(getattr(arguments, name))}')
+    if 'json' in parts:
+        print(f'every number: {shown(arguments.json)}')
     print('', *_result_lines(scores), sep='\n')
     return 0
 
@@ -169,7 +163,7 @@ def _items(
             f'{root}: no sequences/*/velodyne folder below it (SemanticKITTI layout); scans '
             'without labels need --against'
         )
-    for name in ('sequences', 'frame_step', 'cut', 'worst', 'workers', 'scheduler'):
+    for name in ('sequences', 'frame_step', 'cut', 'workers', 'scheduler'):
         if getattr(arguments, name) is not None:
             option = name.replace('_', '-')
             raise DataError(f'--{option}: {root} has no sequences/*/velodyne below it')

@@ -27,10 +27,10 @@ REMOVED: dict[str, str] = {
     f'{PROGRAM} experiment sensor-pose': (
         f'use {PROGRAM} evaluate ROOT --set sensor.height=VALUE --against default'
     ),
-    f'{PROGRAM} experiment coverage': (
-        f'use {PROGRAM} evaluate ROOT --json FILE, which has within_1 and within_2 of each frame'
-    ),
+    f'{PROGRAM} experiment coverage': f'use the table of heights of {PROGRAM} evaluate ROOT',
     f'{PROGRAM} experiment pseudo-inputs --plot': 'use the table, or --json FILE',
+    f'{PROGRAM} evaluate --per-frame': 'use --json FILE: its rows are the frames',
+    f'{PROGRAM} evaluate --worst': 'use --json FILE: its rows are the frames, with their IoU',
     f'{PROGRAM} pose': f'use {PROGRAM} segment INPUT, which prints height and tilt',
     f'{PROGRAM} compare': f'use {PROGRAM} evaluate ROOT --against FILE_OR_PRESET',
     f'{PROGRAM} view': f'use {PROGRAM} tune INPUT, or Foxglove on what segment writes',

@@ -30,7 +30,6 @@ from gp_ground_seg.lab.scoring.metrics import (
     CONVENTIONS,
     GROUNDGRID,
     Calibration,
-    ClassCount,
     Confusion,
     HeightError,
     Labels,
@@ -163,7 +162,6 @@ class ScanScore:
     stages: dict[str, float] = field(default_factory=dict)  # seconds, if the method reports them
     confusions: dict[str, Confusion] = field(default_factory=dict)  # as `KnownScan.truths`
     height: HeightError = field(default_factory=HeightError)
-    classes: dict[int, ClassCount] = field(default_factory=dict)
     rings: tuple[RingScore, ...] = ()  # by `metrics.RING_TITLES`, where the truth is known
     objects: ObjectCounts = field(default_factory=dict)
     shares: Shares = field(default_factory=dict)
@@ -230,14 +228,6 @@ class MethodScore:
     def iou(self) -> float:
         """Intersection over union of `confusion`."""
         return self.confusion.iou
-
-    @property
-    def classes(self) -> dict[int, ClassCount]:
-        """Counts by class, by ascending class number."""
-        counts: dict[int, ClassCount] = {}
-        for number, count in (item for scan in self.scans for item in scan.classes.items()):
-            counts[number] = counts.get(number, ClassCount()) + count
-        return dict(sorted(counts.items()))
 
     @property
     def rings(self) -> tuple[RingScore, ...]:
@@ -393,7 +383,6 @@ def _score(
         scan.sequence, scan.index, seconds, result.stages,
         {key: metrics.count_confusion(label, truth) for key, truth in scan.truths.items()},
         _height_error(scan, result, slice(None), max_nlpd),
-        {} if scan.semantic is None else metrics.count_classes(label, scan.semantic),
         _score_rings(scan, result, max_nlpd),
         {} if scan.objects is None else count_objects(scan.points, label, scan.objects),
         shares, result.pose, result.fit, scan.cluster or scan.sequence,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -46,24 +46,8 @@ it must not move with ``sensor.height``, which is a parameter of the method."""
 LOW_VEGETATION_Z = -0.75 * SENSOR_HEIGHT
 """Height [m, sensor frame] below which Patchwork's evaluation counts vegetation as ground."""
 
-CLASS_NAMES = {
-    0: 'unlabelled', 1: 'outlier', 10: 'car', 11: 'bicycle', 13: 'bus', 15: 'motorcycle',
-    16: 'on rails', 18: 'truck', 20: 'other vehicle', 30: 'person', 31: 'bicyclist',
-    32: 'motorcyclist', 40: 'road', 44: 'parking', 48: 'sidewalk', 49: 'other ground',
-    50: 'building', 51: 'fence', 52: 'other structure', 60: 'lane marking', 70: 'vegetation',
-    71: 'trunk', 72: 'terrain', 80: 'pole', 81: 'traffic sign', 99: 'other object',
-    252: 'moving car', 253: 'moving bicyclist', 254: 'moving person',
-    255: 'moving motorcyclist', 256: 'moving on rails', 257: 'moving bus', 258: 'moving truck',
-    259: 'moving other vehicle',
-}  # fmt: skip
-"""Classes of SemanticKITTI (Behley et al., ICCV 2019), the low 16 bits of a label."""
 UNLABELLED, OUTLIER, VEGETATION = 0, 1, 70
 GROUND_CLASSES = (40, 44, 48, 49, 60, 72)
-
-
-def class_name(number: int) -> str:
-    """Name of a class in words; ``class 77`` where SemanticKITTI has no such number."""
-    return CLASS_NAMES.get(number, f'class {number}')
 
 
 @dataclass(frozen=True)
@@ -215,52 +199,6 @@ def check_lengths(n_points: int, **values: Any) -> None:
 
 
 @dataclass(frozen=True)
-class ClassCount(Sums):
-    """Points of one semantic class, and how many of them were labelled ground."""
-
-    n_points: int = 0
-    n_ground: int = 0
-
-
-def count_classes(label: Labels, semantic: npt.NDArray[np.integer]) -> dict[int, ClassCount]:
-    """Count the points of each semantic class that occurs, by ascending class number."""
-    points = np.bincount(semantic)
-    ground = np.bincount(semantic[label == Label.GROUND], minlength=len(points))
-    return {
-        int(number): ClassCount(int(points[number]), int(ground[number]))
-        for number in np.flatnonzero(points)
-    }
-
-
-class ClassErrors(NamedTuple):
-    """Points of a class: what they count as, and the ground missed and invented on them."""
-
-    number: int
-    truth: Label
-    n_points: int
-    n_ground: int
-    missed: int
-    false: int
-
-    @property
-    def errors(self) -> int:
-        """Both kinds."""
-        return self.missed + self.false
-
-
-def class_errors(classes: Mapping[int, ClassCount]) -> list[ClassErrors]:
-    """Errors by class in the GroundGrid convention, the largest first."""
-    found = []
-    for number, count in classes.items():
-        n_points, n_ground = count.n_points, count.n_ground
-        truth = Label(int(GROUNDGRID.truth(np.array([number]), np.zeros(1))[0]))
-        missed = n_points - n_ground if truth is Label.GROUND else 0
-        false = n_ground if truth is Label.OBSTACLE else 0
-        found.append(ClassErrors(number, truth, n_points, n_ground, missed, false))
-    return sorted(found, key=lambda entry: (-entry.errors, -entry.n_points, entry.number))
-
-
-@dataclass(frozen=True)
 class Calibration(Sums):
     """Probabilities of ground against the truth, as sums; ratios over nothing are NaN.
 
@@ -274,7 +212,6 @@ class Calibration(Sums):
         default_factory=lambda: np.zeros(N_BINS, dtype=np.int64)
     )
     sum_p: FloatArray = field(default_factory=lambda: np.zeros(N_BINS))
-    sum_squared_error: float = 0.0  # of probability minus truth, 1 for ground, over all bins
 
     @property
     def n_total(self) -> int:
@@ -294,11 +231,6 @@ class Calibration(Sums):
         """
         return ratio(float(np.abs(self.n_ground - self.sum_p).sum()), self.n_total)
 
-    @property
-    def brier(self) -> float:
-        """Brier score, the mean of (p - truth)^2."""
-        return ratio(self.sum_squared_error, self.n_total)
-
 
 def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Calibration:
     """Compare probabilities of ground, (N,), with true labels, (N,).
@@ -316,7 +248,6 @@ def count_calibration(p_ground: npt.NDArray[np.floating], truth: Labels) -> Cali
         n_points=np.bincount(bin_of, minlength=N_BINS),
         n_ground=np.bincount(bin_of[ground], minlength=N_BINS),
         sum_p=np.bincount(bin_of, p, minlength=N_BINS).astype(np.float64),
-        sum_squared_error=float(np.sum((p - ground) ** 2)),
     )
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import itertools
 import json
 import math
 import os
 import platform
 import subprocess
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -147,23 +145,6 @@ def write_json(document: Any, path: str | Path) -> None:
     """Write a document as JSON, NaN as null."""
     text = json.dumps(_plain(document), indent=2, allow_nan=False) + '\n'
     Path(path).write_text(text, encoding='utf-8')
-
-
-def write_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write rows as CSV; a cell within a cell gets a column, as ``objects_vehicle``."""
-    flat = [dict(_flat(row)) for row in rows]
-    with path.open('w', newline='', encoding='utf-8') as file:
-        writer = csv.DictWriter(file, list(dict.fromkeys(itertools.chain(*flat))))
-        writer.writeheader()
-        writer.writerows(flat)
-
-
-def _flat(row: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    for key, value in row.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f'{prefix}{key}_')
-        else:
-            yield prefix + key, _plain(value)
 
 
 def describe_environment(*packages: str) -> dict[str, Any]:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 import statistics
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.lab.scoring import metrics, report
 from gp_ground_seg.lab.scoring.comparison import (
@@ -40,7 +38,6 @@ from gp_ground_seg.lab.scoring.objects import (
 )
 from gp_ground_seg.lab.scoring.report import Column, Report, Row, Table, percent
 
-COUNTS_AS = {Label.GROUND: 'ground', Label.OBSTACLE: 'obstacle', Label.UNKNOWN: 'left out'}
 RATIO_TITLES = {'f1': 'F1', 'iou': 'IoU'}
 SHARE_TITLES = {
     LOW_THINGS: ('low returns', percent('as ground')),
@@ -53,7 +50,6 @@ SHARE_TITLES = {
 def evaluation(
     scores: Sequence[MethodScore],
     config: Config,
-    n_worst: int = 0,
     n_workers: int = 0,
     cut: float = CUT_HEIGHT,
 ) -> Report:
@@ -74,13 +70,10 @@ def evaluation(
         tables['measures'] = difference_table(ours, other)
     if ours.has_labels:
         tables['rings'] = _ring_table(scores)
-        tables['classes'] = _class_table(ours)
         tables['objects'] = object_table(scores)
         tables['low_things'] = _share_table(scores, cut)
         tables['probabilities'] = _calibration_table(ours)
         tables['heights'] = _height_table(scores)
-        if n_worst:
-            tables['worst'] = _worst_table(ours, n_worst)
     tables['times'] = _time_table(scores, n_workers)
     return make_report(
         tables, scores, config,
@@ -118,9 +111,6 @@ def scan_rows(scores: Sequence[MethodScore]) -> list[dict[str, Any]]:
             row |= {f'{name}_all': getattr(scan.height, name) for name in of_height}
         if scan.calibration.n_total:
             row['ece'] = scan.calibration.ece
-        if scan.classes:
-            main = metrics.class_errors(scan.classes)[0]
-            row['main_error_class'] = metrics.class_name(main.number) if main.errors else ''
         row |= {name: dataclasses.asdict(share) for name, share in scan.shares.items()}
         if scan.objects:
             row['objects'] = {
@@ -215,33 +205,6 @@ def _ring_table(scores: Sequence[MethodScore]) -> Table:
     return Table(rows, 'Horizontal range (GroundGrid convention)  [%]')
 
 
-def _class_table(score: MethodScore) -> Table:
-    """Classes by what they count as, and in that by their number of errors."""
-    found = metrics.class_errors(score.classes)
-    n_errors, n_points = score.confusion.errors, sum(entry.n_points for entry in found)
-    rows: list[Row] = [
-        [
-            (Column('class'), metrics.class_name(entry.number)),
-            (Column('counts as', key='counts_as'), COUNTS_AS[entry.truth]),
-            (Column('points', '_d'), entry.n_points),
-            (percent('of points', 'share_of_points'), entry.n_points / n_points),
-            (percent('as ground', 'share_as_ground'), entry.n_ground / entry.n_points),
-            (percent('missed'),
-             entry.missed / entry.n_points if entry.truth is Label.GROUND else None),
-            (percent('false'),
-             entry.false / entry.n_points if entry.truth is Label.OBSTACLE else None),
-            (percent('of errors', 'share_of_errors'),
-             None if entry.truth is Label.UNKNOWN else metrics.ratio(entry.errors, n_errors)),
-        ]
-        for entry in sorted(found, key=lambda entry: list(COUNTS_AS).index(entry.truth))
-    ]  # fmt: skip
-    title = (
-        'Classes (GroundGrid convention): share of all points; of the class, what was labelled '
-        'ground, what is missed ground and what is false ground; share of all errors  [%]'
-    )
-    return Table(rows, title)
-
-
 def object_table(scores: Sequence[MethodScore]) -> Table:
     """Lay out what of objects each method calls ground, by class and range."""
     counts = [
@@ -334,13 +297,12 @@ def _calibration_table(score: MethodScore) -> Table:
             (Column('sequence'), name),
             (Column('points', '_d'), part.calibration.n_total),
             (Column('ECE', '.4f', 'ece'), part.calibration.ece),
-            (Column('Brier', '.4f', 'brier'), part.calibration.brier),
         ]
         for name, part in score.by_sequence()
     ]
     title = (
         'Probabilities (GroundGrid convention): expected calibration error over '
-        f'{metrics.N_BINS} bins, Brier score'
+        f'{metrics.N_BINS} bins'
     )
     return Table(rows, title, n_sums=1)
 
@@ -359,6 +321,8 @@ def _height_table(scores: Sequence[MethodScore]) -> Table:
                 (report.centimetres('bias'), found.bias),
                 (report.centimetres('RMSE', 'rmse'), found.rmse),
                 (report.centimetres('median', 'median_absolute'), found.median_absolute),
+                (percent('in 1 std', 'within_1', '.1f'), found.within_1),
+                (percent('in 2 std', 'within_2', '.1f'), found.within_2),
                 *(
                     (report.centimetres(f'{peer.title} RMSE', f'{peer.name}_rmse'), height.rmse)
                     for peer, height in zip(scores[1:], others, strict=True)
@@ -366,30 +330,10 @@ def _height_table(scores: Sequence[MethodScore]) -> Table:
             ]
         )
     title = (
-        'Height of the ground under returns labelled ground, those without a model left out  [cm]'
+        'Height of the ground under returns labelled ground, those without a model left out [cm]; '
+        'shares within one and two standard deviations  [%]'
     )
     return Table(rows, title, n_sums=1)
-
-
-def _worst_table(score: MethodScore, n_worst: int) -> Table:
-    """Frames with the lowest IoU, and the class that costs them most."""
-    rows: list[Row] = []
-    known = [scan for scan in score.scans if not math.isnan(scan.confusion.iou)]
-    for scan in sorted(known, key=lambda scan: scan.confusion.iou)[:n_worst]:
-        found, main = scan.confusion, metrics.class_errors(scan.classes)[0]
-        share = metrics.ratio(main.errors, found.errors)
-        rows.append(
-            [
-                (Column('sequence'), scan.sequence),
-                (Column('frame'), scan.index),
-                (percent('IoU', 'iou'), found.iou),
-                (Column('false', '_d'), found.fp),
-                (Column('missed', '_d'), found.fn),
-                (Column('most errors on'), metrics.class_name(main.number)),
-                (percent('of errors', 'share_of_errors'), share),
-            ]
-        )
-    return Table(rows, 'Frames with the lowest IoU (GroundGrid convention)  [%]')
 
 
 def _time_table(scores: Sequence[MethodScore], n_workers: int) -> Table:
