@@ -28,7 +28,6 @@ DEV = [
     *FORMATS,
     *SCALE,
     *VISER,
-    'argcomplete>=3.1',
     'cryptography>=42',  # keys of a Dask cluster under test
     'codespell[toml]>=2.3',
     'colcon-common-extensions',
@@ -87,7 +86,6 @@ setup(
         'plot': PLOT,
         'tune': VISER,
         'scale': SCALE,
-        'complete': ['argcomplete>=3.1'],
         'ros': ROS + BAGS + PLOT,
         'test': TEST,
         'docs': DOCS,

@@ -3,7 +3,6 @@
 import importlib
 import inspect
 import logging
-import os
 import re
 import shlex
 import subprocess
@@ -121,30 +120,6 @@ def test_whatever_goes_over_frames_shows_how_far_it_is(module):
     assert ('options.progress(' in source or 'options.runner(' in source) == (
         module not in ('config', 'node', 'plot', 'tune')
     )
-
-
-def completions(line, tmp_path):
-    """What argcomplete tells bash for a line, the cursor at its end."""
-    path = tmp_path / 'said'
-    environment = {
-        **os.environ, '_ARGCOMPLETE': '1', '_ARGCOMPLETE_IFS': '\n', '_ARGCOMPLETE_SHELL': 'bash',
-        '_ARGCOMPLETE_STDOUT_FILENAME': str(path), 'COMP_LINE': line, 'COMP_POINT': str(len(line)),
-    }  # fmt: skip
-    words = [sys.executable, '-m', 'gp_ground_seg']
-    subprocess.run(words, env=environment, check=True, timeout=60)
-    return path.read_text().split()
-
-
-def test_a_shell_completes_commands_options_and_their_values(tmp_path):
-    commands = completions('gp-ground-seg ', tmp_path)
-    assert set(cli.COMMANDS) <= set(commands)
-    assert completions('gp-ground-seg eva', tmp_path) == ['evaluate']
-    assert completions('gp-ground-seg evaluate ROOT --peer patchworkp', tmp_path) == [
-        'patchworkpp'
-    ]
-    assert completions('gp-ground-seg plot scan --colour p', tmp_path) == ['p_ground']
-    source = inspect.getsource(cli)
-    assert '# PYTHON_ARGCOMPLETE_OK' in source[:1024]  # looked for by its global completion
 
 
 @pytest.mark.parametrize('words', [['--help'], ['--version'], ['config', 'dump'], ['node', '-h']])

@@ -52,7 +52,6 @@ ONLY_IN = {
     'matplotlib': ('lab/plotting/',),
     'numba': ('core/jit.py', 'core/compiled/'),
     'viser': ('lab/viewers/html_page.py',),
-    'argcomplete': ('cli/main.py',),
     'pypatchworkpp': ('lab/scoring/patchworkpp.py',),
 }
 PRIVATE = ('numba.core', 'numba.np', 'llvmlite')

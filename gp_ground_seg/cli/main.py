@@ -1,4 +1,3 @@
-# PYTHON_ARGCOMPLETE_OK
 """Entry point of ``gp-ground-seg``: commands, and errors mapped to exit codes."""
 
 from __future__ import annotations
@@ -97,15 +96,6 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         for name in COMMANDS:
             subparsers.add_parser(name)
     return parser
-
-
-def _complete() -> None:
-    """Answer argcomplete, which asks by environment variables how a line may go on, and end."""
-    import argcomplete
-
-    words = os.environ['COMP_LINE'].split()
-    command = next((word for word in words if word in COMMANDS), None)
-    argcomplete.autocomplete(build_parser(command))
 
 
 def _parse(words: list[str]) -> argparse.Namespace:
@@ -213,8 +203,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     It is that of the command, 2 after an error, which takes one line, or 130 when interrupted.
     """
     words = list(sys.argv[1:] if argv is None else argv)
-    if '_ARGCOMPLETE' in os.environ:
-        _complete()
     _prepare_streams()
     code = 2
     try:
