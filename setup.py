@@ -10,8 +10,7 @@ PACKAGE = 'gp_ground_seg'
 BAGS = ['rosbags>=0.11.9']
 FORMATS = ['python-neo-lzf>=0.3']
 PLOT = ['matplotlib>=3.6']
-# 21 MB; s3fs, for s3://, is 36 MB more.
-SCALE = ['distributed>=2025.1', 'fsspec>=2024.2']
+SCALE = ['distributed>=2025.1']  # 21 MB
 VISER = ['viser>=1.1']
 # Jazzy as wheels, for machines without ROS. With ROS from apt, leave this extra out.
 ROS = [
@@ -36,14 +35,12 @@ DEV = [
     'flake8-comprehensions',
     'flake8-docstrings',  # and pydocstyle, which ament_pep257 runs
     'flake8-quotes',
-    'moto[server]>=5.0',
     'mypy>=1.10,<2.5',
     'plyfile>=1.0',
     'pypatchworkpp>=1.4',
     'pypcd4>=1.1',
     'pytest-timeout>=2.3',
     'ruff>=0.6,<0.18',
-    's3fs>=2024.2',
     'scikit-learn>=1.4',
     'selenium>=4.20',
     'setuptools<80',  # colcon's ament_python build needs `setup.py develop` and `install`

@@ -76,6 +76,22 @@ def test_a_removed_command_or_option_says_what_to_use_instead(name, capsys):
         assert command in cli.COMMANDS
 
 
+@pytest.mark.parametrize(
+    'line',
+    [
+        'segment s3://bucket/kitti -o out',
+        'segment a.bin -o gs://bucket/a.label',
+        'evaluate HTTPS://host/kitti --scheduler tcp://127.0.0.1:1',
+        'plot scan file:///a.bin',
+    ],
+)
+def test_a_url_is_refused_with_what_to_use_instead(line, capsys):
+    assert cli.main(line.split()) == 2
+    (url,) = (word for word in line.split() if '://' in word and 'tcp:' not in word)
+    said = 'no URLs; mount the folder (s3fs, rclone), or download the file'
+    assert error_line(capsys) == f'{url}: {said}'
+
+
 def parsers_below(parser):
     """Parsers of a command that have none below them, as words of the command line."""
     below = [one.choices for one in parser._actions if isinstance(one.choices, dict)]

@@ -47,7 +47,6 @@ ONLY_IN = {
     **dict.fromkeys(ROS.split(), ('ros/',)),
     'rosbags': ('data/bags.py',),
     **dict.fromkeys(('dask', 'distributed'), ('lab/scale/cluster.py',)),
-    'fsspec': ('data/files.py',),
     'lzf': ('data/pcd.py',),
     'matplotlib': ('lab/plotting/',),
     'numba': ('core/jit.py', 'core/compiled/'),

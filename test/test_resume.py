@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import threading
 import time
 
 import numpy as np
@@ -19,6 +20,9 @@ from torture_resume import (
     link_output,
     resize_output,
 )
+
+from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.data import files
 
 N_FRAMES = 600  # of the long sequence
 
@@ -199,3 +203,26 @@ def test_ctrl_c_ends_all_processes_with_one_line(long_root, tmp_path):
     assert (out, err) == ('', 'gp-ground-seg: interrupted\n')
     assert process.returncode in INTERRUPTED
     assert_gone(workers)
+
+
+def test_a_file_appears_whole_or_not_at_all(tmp_path):
+    target = tmp_path / 'deep/er/file'
+    stop, seen = threading.Event(), set()
+
+    def watch():
+        while not stop.is_set():
+            if target.exists():
+                seen.add(len(target.read_bytes()))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    for k in range(200):
+        files.write_file(target, bytes([k % 2]) * 100_000)
+    stop.set()
+    watcher.join()
+    assert seen == {100_000} and [p.name for p in target.parent.iterdir()] == ['file']
+    target.unlink()
+    target.mkdir()
+    with pytest.raises(DataError, match='cannot be written'):
+        files.write_file(target, b'')
+    assert [p.name for p in target.parent.iterdir()] == ['file']

@@ -16,7 +16,6 @@ from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.data.cloud_output import FORMATS
-from gp_ground_seg.data.files import AnyPath, UrlPath, as_path
 from gp_ground_seg.data.inputs import Input, holds_bag, list_inputs
 from gp_ground_seg.data.semantic_kitti import list_frames, list_sequences, read_points
 from gp_ground_seg.lab.scale.cluster import Progress
@@ -29,20 +28,18 @@ _OPTIONS = ('topic', 'ground_topic', 'obstacles_topic', 'drop', 'format')
 def is_dataset(arguments: argparse.Namespace) -> bool:
     """Whether output is to appear block by block, rather than all of it at the end."""
     asked = (arguments.workers, arguments.scheduler, arguments.resume, arguments.more)
-    places = (arguments.input, arguments.output or '')
-    is_remote = any(isinstance(as_path(place), UrlPath) for place in places)
-    return any(asked) or is_remote or _is_root(arguments.input)
+    return any(asked) or _is_root(arguments.input)
 
 
 def _is_root(source: str) -> bool:
-    return any(True for _ in as_path(source).glob('sequences/*/velodyne'))
+    return any(True for _ in Path(source).glob('sequences/*/velodyne'))
 
 
 def list_scans(arguments: argparse.Namespace) -> list[Scan]:
     """List the scans of the input; of a SemanticKITTI root, output goes into the same folders."""
     layout = options.scan_layout(arguments)
     if not _is_root(arguments.input):
-        found = list_inputs(as_path(arguments.input), layout)
+        found = list_inputs(arguments.input, layout)
         return [Scan(item.path, f'{item.name}.label', partial(_read, item)) for item in found]
     names = list_sequences(arguments.input)
     frames = [frame for name in names for frame in list_frames(arguments.input, name, layout)]
@@ -76,7 +73,7 @@ def list_bags(arguments: argparse.Namespace, name_of: Callable[[Path], str]) -> 
 def run(
     arguments: argparse.Namespace,
     config: Config,
-    target: AnyPath,
+    target: Path,
     items: Sequence[Scan],
     function: Callable[[Config, Sequence[Scan], Progress], Outcome],
     unit: str = 'frame',
@@ -87,7 +84,7 @@ def run(
     """
     if target.suffix[1:] in FORMATS:
         raise DataError(f'{target}: must be a folder')
-    if isinstance(target, Path) and not target.resolve().parent.is_dir():
+    if not target.resolve().parent.is_dir():
         raise DataError(f'{target}: the folder {target.resolve().parent} does not exist')
     layout = replace(options.scan_layout(arguments), doubts='ignore')
     given = [getattr(arguments, name) for name in _OPTIONS]
@@ -105,11 +102,10 @@ def run(
                 found = run_blocks(runner, function, config, items, manifest, done, group)
                 n_workers = runner.n_workers
             print_summary(found, target, n_workers)
-    if isinstance(target, Path):
-        sweep(target, [item.name for item in items])
+    sweep(target, [item.name for item in items])
 
 
-def print_summary(found: Outcome, target: AnyPath, n_workers: int = 0) -> None:
+def print_summary(found: Outcome, target: Path, n_workers: int = 0) -> None:
     """Print points, ground, time, and height and tilt of the sensor."""
     seconds = found.seconds
     share = f'{found.n_ground / found.n_points:.1%} ground' if found.n_points else 'no ground'

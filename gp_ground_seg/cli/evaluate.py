@@ -13,7 +13,6 @@ from typing import Any
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import ConfigError, DataError, shown
 from gp_ground_seg.core.parameters.config import Config
-from gp_ground_seg.data.files import as_path
 from gp_ground_seg.data.inputs import Input, list_inputs
 from gp_ground_seg.data.semantic_kitti import Frame, labelled_frames
 from gp_ground_seg.lab.scoring import report as results
@@ -59,7 +58,7 @@ EXAMPLES = """\
   gp-ground-seg evaluate KITTI_ROOT --set faces.max_normal_z=0 --against default
   gp-ground-seg evaluate drive.mcap --config my.yaml --against default      no labels
   gp-ground-seg evaluate KITTI_ROOT --peer patchworkpp
-  gp-ground-seg evaluate s3://bucket/kitti --workers 8
+  gp-ground-seg evaluate KITTI_ROOT --workers 8
 
 KITTI_ROOT holds sequences/00/{velodyne/*.bin,labels/*.label} (SemanticKITTI). With --workers
 the scores are the same; the times are not, because frames are computed at the same time.
@@ -153,7 +152,7 @@ def _items(
     arguments: argparse.Namespace,
 ) -> tuple[Any, Callable[[Any], KnownScan]]:
     """Return labelled frames, or with ``--against`` any clouds, and the reader of a cloud."""
-    root = as_path(arguments.root)
+    root = Path(arguments.root)
     if any(root.glob('sequences/*/velodyne')):
         return frames_from_options(arguments), partial(load_kitti, cut=_cut_of(arguments))
     if not root.exists():
@@ -198,6 +197,6 @@ def frames_from_options(arguments: argparse.Namespace) -> list[Frame]:
     """Labelled frames of the options, grouped by sequence."""
     names = arguments.sequences
     chosen = None if names is None else [name for name in names.split(',') if name]
-    frames = labelled_frames(as_path(arguments.root), chosen, options.scan_layout(arguments))
+    frames = labelled_frames(arguments.root, chosen, options.scan_layout(arguments))
     groups = itertools.groupby(frames, key=lambda frame: frame.sequence)
     return [frame for _, group in groups for frame in [*group][:: arguments.frame_step or 1]]

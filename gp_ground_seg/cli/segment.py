@@ -16,7 +16,7 @@ from gp_ground_seg.data.bag_files import BAG_SUFFIXES, SUFFIX_OF_STORAGE
 from gp_ground_seg.data.bag_output import GROUND_TOPIC, OBSTACLES_TOPIC, BagOutput
 from gp_ground_seg.data.cloud_files import SUFFIXES, WRITABLE
 from gp_ground_seg.data.cloud_output import FORMATS, CloudOutput, encode_labels
-from gp_ground_seg.data.files import AnyPath, as_path, stamp, write_file
+from gp_ground_seg.data.files import stamp, write_file
 from gp_ground_seg.data.inputs import holds_bag
 from gp_ground_seg.lab.scale.cluster import Progress
 from gp_ground_seg.lab.scale.dataset import Outcome, Scan, pool, segment_block
@@ -41,7 +41,7 @@ EXAMPLES = """\
   gp-ground-seg segment scan.pcd -o scan.npz --surface
   gp-ground-seg segment drive.mcap                          writes drive_ground.mcap
   gp-ground-seg segment KITTI_ROOT -o OUT --workers 8 --resume
-  gp-ground-seg segment s3://bucket/kitti -o s3://bucket/labels --scheduler tcp://host:8786
+  gp-ground-seg segment KITTI_ROOT -o OUT --scheduler tcp://host:8786
 """
 
 FOR_BAGS: tuple[str, ...] = ('ground_topic', 'obstacles_topic', 'drop')
@@ -54,7 +54,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.usage = '%(prog)s INPUT [BAG ...] [-o OUT] [options]'
     options.add(
         parser,
-        ('input', 'scan, folder of scans, bag, or a root or URL', {'metavar': 'INPUT'}),
+        ('input', 'scan, folder of scans, bag, or a root', {'metavar': 'INPUT'}),
         ('more', 'further bags', {'metavar': 'BAG', 'nargs': '*'}),
         ('-o --output', 'for scans a folder, or a file for a single scan; for bags a folder, or '
          'a .mcap or .db3 file (default: INPUT with _ground added, beside it)',
@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Segment the input, by its kind."""
     config = options.read_config(arguments)
     source = Path(arguments.input)
-    is_bag = '://' not in arguments.input and holds_bag(source)
+    is_bag = holds_bag(source)
     gives_bag = is_bag and arguments.format not in FORMATS
     kind, foreign = ('scans', FOR_SCANS) if gives_bag else ('bags', FOR_BAGS)
     if not (is_bag or arguments.format in FORMATS):
@@ -116,15 +116,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _segment_dataset(arguments: argparse.Namespace, config: Config, is_bag: bool) -> None:
     """Segment a whole data set, or several bags, into a folder."""
-    if arguments.output is None and '://' in arguments.input:
-        raise DataError(f'{arguments.input}: give the folder for the output, -o OUT')
-    target = as_path(arguments.output or _default_output(Path(arguments.input)))
+    target = Path(arguments.output or _default_output(Path(arguments.input)))
     for name in ('format', 'split', 'surface'):
         if getattr(arguments, name) not in (None, False, *SUFFIX_OF_STORAGE):
             raise DataError(f'--{name}: whole data sets give .label files and bags')
     if is_bag or arguments.more:
-        if not isinstance(target, Path):
-            raise DataError(f'{target}: bags are written to folders of this machine')
         bags = dataset.list_bags(arguments, lambda path: _default_output(path).name)
         write_bags = partial(_segment_bags, _bag_output(arguments), target)
         dataset.run(arguments, config, target, bags, write_bags, 'bag')
@@ -143,13 +139,13 @@ def _segment_bags(
     """Segment bags, each into one in the folder `target`."""
     outcomes, segmenter = [], GroundSegmenter(config)
     for bag in progress(bags):
-        source, path = Path(str(bag.path)), target / bag.name
-        outcome = Outcome.of(output.write(source, path, segmenter, force=True))
+        path = target / bag.name
+        outcome = Outcome.of(output.write(bag.path, path, segmenter, force=True))
         outcomes.append(outcome._replace(sizes=[stamp(path)[0]]))
     return pool(outcomes)
 
 
-def _write_labels(path: AnyPath, result: Segmentation) -> int:
+def _write_labels(path: Path, result: Segmentation) -> int:
     data = encode_labels(result)
     write_file(path, data)
     return len(data)

@@ -11,6 +11,7 @@ import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,6 @@ from gp_ground_seg.data.clouds import (
 )
 from gp_ground_seg.data.files import (
     MAX_SCAN_BYTES,
-    AnyPath,
     check_points,
     check_unpacked,
     read_bytes,
@@ -144,7 +144,7 @@ SUFFIXES = ('.bin', *_READERS)
 WRITABLE = tuple(_ENCODERS)
 
 
-def read_file(path: AnyPath, layout: ScanLayout = KITTI) -> Cloud:
+def read_file(path: Path, layout: ScanLayout = KITTI) -> Cloud:
     """Read a file; `layout` is that of ``.bin`` files, says what to do in doubt, and the origin.
 
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, or, where the layout
@@ -169,7 +169,7 @@ def read_file(path: AnyPath, layout: ScanLayout = KITTI) -> Cloud:
     return cloud
 
 
-def encode_file(path: AnyPath, cloud: Cloud, columns: Columns) -> bytes:
+def encode_file(path: Path, cloud: Cloud, columns: Columns) -> bytes:
     """File of a cloud with further values for each point; DataError if none can be.
 
     Its format is that of `path`, one of `WRITABLE`.
@@ -179,7 +179,7 @@ def encode_file(path: AnyPath, cloud: Cloud, columns: Columns) -> bytes:
 
 
 @contextmanager
-def _named(path: AnyPath, what: str) -> Iterator[None]:
+def _named(path: Path, what: str) -> Iterator[None]:
     """Raise what goes wrong in the block as a DataError with the name of the file."""
     try:
         yield

@@ -17,7 +17,6 @@ from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import staged_file, staged_files
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_arrays, encode_file
 from gp_ground_seg.data.clouds import Cloud, Columns
-from gp_ground_seg.data.files import AnyPath
 from gp_ground_seg.data.inputs import Input, Inputs
 
 LABELS = 'label'
@@ -72,7 +71,7 @@ class CloudOutput:
         """
         folder, stem = (target.parent, target.stem) if is_file else (target, None)
         names = [name for scan in scans for name in self.names(scan, stem)]
-        inputs = {Path(str(scan.path)).resolve() for scan in scans}
+        inputs = {scan.path.resolve() for scan in scans}
         for name in names:
             if (folder / name).resolve() in inputs:
                 raise DataError(f'{folder / name}: is the input; name another output')
@@ -85,7 +84,7 @@ class CloudOutput:
                 yield lambda scan: [hidden / name for name in self.names(scan)]
 
     def write(
-        self, scan: Input, segmenter: GroundSegmenter, paths: Sequence[AnyPath]
+        self, scan: Input, segmenter: GroundSegmenter, paths: Sequence[Path]
     ) -> Segmentation:
         """Segment a cloud and write its files, to `paths` in the order of `names`."""
         cloud = scan.read()

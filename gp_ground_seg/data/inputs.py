@@ -16,7 +16,6 @@ from gp_ground_seg.data.bag_files import BAG_SUFFIXES, is_bag
 from gp_ground_seg.data.bags import BagReader
 from gp_ground_seg.data.cloud_files import NUSCENES_SUFFIX, SUFFIXES, read_file
 from gp_ground_seg.data.clouds import Cloud
-from gp_ground_seg.data.files import AnyPath, as_path
 from gp_ground_seg.data.point_cloud2 import decode_cloud, read_fields, read_xyz
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout
 
@@ -50,7 +49,7 @@ class Input:
 
     name: str
     title: str
-    path: AnyPath
+    path: Path
     read: Callable[[], Cloud]
 
 
@@ -62,7 +61,7 @@ class Inputs:
 
     def __init__(
         self,
-        path: AnyPath,
+        path: Path,
         items: Sequence[Input],
         topic: str | None = None,
         n_messages: int = 0,
@@ -83,7 +82,7 @@ class Inputs:
         if self.topic is None:
             yield from self._items
             return
-        with BagReader(str(self.path)) as bag:
+        with BagReader(self.path) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
                 read = partial(_decode, raw, f'{self.path}: {place}', bag.size, self._origin)
@@ -98,7 +97,7 @@ class Inputs:
 
 
 def list_inputs(
-    source: str | AnyPath, layout: ScanLayout = KITTI, topic: str | None = None
+    source: str | Path, layout: ScanLayout = KITTI, topic: str | None = None
 ) -> Inputs:
     """Return the clouds of `source`; DataError if there are none.
 
@@ -113,8 +112,8 @@ def list_inputs(
     topic : str or None
         PointCloud2 topic of a bag, by default the only one.
     """
-    path = as_path(source)
-    if isinstance(path, Path) and holds_bag(path):
+    path = Path(source)
+    if holds_bag(path):
         with BagReader(path) as bag:
             name = bag.pick_point_cloud_topic(topic)
             return Inputs(path, (), name, bag.n_messages(name), layout)
@@ -137,12 +136,12 @@ def holds_bag(path: Path) -> bool:
     return is_bag(path)
 
 
-def _is_scan(path: AnyPath) -> bool:
+def _is_scan(path: Path) -> bool:
     """Whether a file of a folder is taken for a scan."""
     return path.suffix.lower() in _IN_FOLDERS
 
 
-def _find_files(source: AnyPath) -> Sequence[AnyPath]:
+def _find_files(source: Path) -> Sequence[Path]:
     accepted = ', '.join(SUFFIXES)
     if not source.exists():
         raise DataError(f'{source}: no such file or folder')
@@ -155,7 +154,7 @@ def _find_files(source: AnyPath) -> Sequence[AnyPath]:
         return [source]
     for name in _SCAN_FOLDERS:
         folder = source / name
-        if files := sorted((file for file in folder.glob('*') if _is_scan(file)), key=str):
+        if files := sorted(filter(_is_scan, folder.glob('*'))):
             return _without_output(files)
     drives = sorted({str(path.parent) for pattern in _DRIVES for path in source.glob(pattern)})
     hint = ''
@@ -166,7 +165,7 @@ def _find_files(source: AnyPath) -> Sequence[AnyPath]:
     raise DataError(f'{source}: no {accepted}, and not a rosbag2 folder{hint}')
 
 
-def _without_output(files: Sequence[AnyPath]) -> Sequence[AnyPath]:
+def _without_output(files: Sequence[Path]) -> Sequence[Path]:
     """Leave out files that are named as the output of another one."""
     stems = {_stem(file) for file in files}
     kept = [file for file in files if not _is_output(_stem(file), stems)]
@@ -180,7 +179,7 @@ def _is_output(stem: str, stems: Set[str]) -> bool:
     return source != stem and source in stems
 
 
-def _stem(path: AnyPath) -> str:
+def _stem(path: Path) -> str:
     name = path.name
     return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
 

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError
 from gp_ground_seg.core.parameters.config import find_spec
-from gp_ground_seg.data.files import MAX_SCAN_BYTES, AnyPath, read_bytes
+from gp_ground_seg.data.files import MAX_SCAN_BYTES, read_bytes
 
 _LOGGER = logging.getLogger('gp_ground_seg')
 DTYPES = ('float32', 'float64')
@@ -56,7 +57,7 @@ class ScanLayout:
 KITTI = ScanLayout()
 
 
-def read_scan(path: str | AnyPath, layout: ScanLayout) -> npt.NDArray[np.floating]:
+def read_scan(path: str | Path, layout: ScanLayout) -> npt.NDArray[np.floating]:
     """Read a ``.bin`` file, (N, columns), not judged yet.
 
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, or does not hold whole
@@ -81,7 +82,7 @@ def four_columns(table: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
     return points
 
 
-def check_scan(path: str | AnyPath, xyz: npt.NDArray[np.floating], layout: ScanLayout) -> None:
+def check_scan(path: str | Path, xyz: npt.NDArray[np.floating], layout: ScanLayout) -> None:
     """Raise DataError, or warn, as `layout` asks for, where points (N, 3) can be no scan."""
     if layout.doubts == 'ignore':
         return

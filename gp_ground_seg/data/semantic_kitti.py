@@ -6,12 +6,13 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import DataError
-from gp_ground_seg.data.files import AnyPath, UrlPath, as_path, read_bytes
+from gp_ground_seg.data.files import read_bytes
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, check_scan, four_columns, read_scan
 
 _LOGGER = logging.getLogger('gp_ground_seg')
@@ -25,8 +26,8 @@ class Frame:
 
     sequence: str  # name of the sequence folder
     index: str  # name of the file without its ending
-    points_path: AnyPath  # the ``.bin`` file
-    labels_path: AnyPath | None  # the ``.label`` file, if there is one
+    points_path: Path  # the ``.bin`` file
+    labels_path: Path | None  # the ``.label`` file, if there is one
     time: float  # since the start of the sequence [s]
     layout: ScanLayout = KITTI  # of the ``.bin`` file
 
@@ -35,28 +36,24 @@ class Frame:
         return f'{self.sequence}/{self.index}'
 
 
-def list_sequences(root: str | AnyPath) -> list[str]:
+def list_sequences(root: str | Path) -> list[str]:
     """Names of the sequences below ``root/sequences``; raises DataError if there is none."""
-    place = as_path(root)
-    if isinstance(place, UrlPath) and not place.exists():
-        raise DataError(f'{root}: no such file or folder')
-    folder = place / 'sequences'
+    folder = Path(root, 'sequences')
     names = sorted(path.parent.name for path in folder.glob('*/velodyne') if path.is_dir())
     if not names:
         raise DataError(f'{root}: no sequences/*/velodyne folder below it (SemanticKITTI layout)')
     return names
 
 
-def list_frames(root: str | AnyPath, sequence: str, layout: ScanLayout = KITTI) -> list[Frame]:
+def list_frames(root: str | Path, sequence: str, layout: ScanLayout = KITTI) -> list[Frame]:
     """Frames of one sequence, in order; DataError if there are none, or times.txt does not fit."""
-    folder = as_path(root) / 'sequences' / sequence
+    folder = Path(root, 'sequences', sequence)
     if not (folder / 'velodyne').is_dir():
         known = ', '.join(list_sequences(root))
         raise DataError(f'{folder}: no velodyne folder in it; sequences here: {known}')
-    paths: list[AnyPath] = sorted((folder / 'velodyne').glob('*.bin'), key=str)
+    paths = sorted((folder / 'velodyne').glob('*.bin'))
     if not paths:
         raise DataError(f'{folder / "velodyne"}: no .bin file in it')
-    # One listing, as each question takes a store of objects 20 ms.
     labels = {path.stem: path for path in (folder / 'labels').glob('*.label')}
     frames = []
     for path, time in zip(paths, _read_times(folder / 'times.txt', paths), strict=True):
@@ -65,7 +62,7 @@ def list_frames(root: str | AnyPath, sequence: str, layout: ScanLayout = KITTI) 
 
 
 def labelled_frames(
-    root: str | AnyPath, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
+    root: str | Path, sequences: Sequence[str] | None = None, layout: ScanLayout = KITTI
 ) -> list[Frame]:
     """Frames of the named sequences, or of all that have labels, in order.
 
@@ -95,7 +92,7 @@ def labelled_frames(
     return frames
 
 
-def _read_times(path: AnyPath, frames: Sequence[AnyPath]) -> list[float]:
+def _read_times(path: Path, frames: Sequence[Path]) -> list[float]:
     """Time of each frame: line k of times.txt belongs to the file numbered k."""
     if not path.exists():
         return [FRAME_PERIOD * k for k in range(len(frames))]
@@ -116,7 +113,7 @@ def _read_times(path: AnyPath, frames: Sequence[AnyPath]) -> list[float]:
     return times
 
 
-def read_points(path: str | AnyPath, layout: ScanLayout = KITTI) -> npt.NDArray[np.float32]:
+def read_points(path: str | Path, layout: ScanLayout = KITTI) -> npt.NDArray[np.float32]:
     """Points of a ``.bin`` file, x, y, z [m], intensity, (N, 4).
 
     Raises DataError if it cannot be read, is larger than `MAX_SCAN_BYTES`, does not hold whole
@@ -127,12 +124,12 @@ def read_points(path: str | AnyPath, layout: ScanLayout = KITTI) -> npt.NDArray[
     return four_columns(table)
 
 
-def read_labels(path: str | AnyPath, n_points: int) -> npt.NDArray[np.uint16]:
+def read_labels(path: str | Path, n_points: int) -> npt.NDArray[np.uint16]:
     """Semantic classes of a ``.label`` file, (n_points,); DataError if it has another number."""
     return (read_entries(path, n_points) & 0xFFFF).astype(np.uint16)
 
 
-def read_entries(path: str | AnyPath, n_points: int) -> npt.NDArray[np.uint32]:
+def read_entries(path: str | Path, n_points: int) -> npt.NDArray[np.uint32]:
     """Entries of a ``.label`` file, (n_points,): class below, instance in the upper 16 bits."""
     expected = f'expected {4 * n_points} for {n_points} points'
     data = read_bytes(path, 4 * n_points, expected)

@@ -20,7 +20,7 @@ from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
-from gp_ground_seg.data.files import AnyPath, UrlPath, read_bytes, stamp
+from gp_ground_seg.data.files import read_bytes, stamp
 from gp_ground_seg.lab.scale.cluster import Progress, Runner, cut
 
 _LOGGER = logging.getLogger('gp_ground_seg')
@@ -31,7 +31,7 @@ _MAX_MANIFEST_BYTES = 1 << 32
 class Scan(NamedTuple):
     """A scan to label."""
 
-    path: AnyPath
+    path: Path
     name: str  # of the file to write, below the output folder
     read: Callable[[], Any]  # returns the points
 
@@ -76,8 +76,8 @@ def pool(outcomes: Iterable[Outcome]) -> Outcome:
 
 
 def segment_block(
-    write: Callable[[AnyPath, Segmentation], int],
-    target: AnyPath,
+    write: Callable[[Path, Segmentation], int],
+    target: Path,
     config: Config,
     scans: Sequence[Scan],
     progress: Progress,
@@ -108,7 +108,7 @@ class Manifest:
 
     Parameters
     ----------
-    folder : path or URL
+    folder : Path
         Output folder.
     configuration : str
         Digest of all that the output depends on, beside the inputs; see `digest`.
@@ -116,10 +116,12 @@ class Manifest:
         All that are to be labelled.
     """
 
-    def __init__(self, folder: AnyPath, configuration: str, scans: Sequence[Scan]) -> None:
+    def __init__(self, folder: Path, configuration: str, scans: Sequence[Scan]) -> None:
         self._path = folder / MANIFEST
         self._run = {'configuration': configuration, 'version': gp_ground_seg.__version__}
-        self._inputs = {scan.name: [_place(scan.path), *stamp(scan.path)] for scan in scans}
+        self._inputs = {
+            scan.name: [os.path.realpath(scan.path), *stamp(scan.path)] for scan in scans
+        }
         self._text = b''
         self._file: IO[bytes] | None = None
 
@@ -130,7 +132,7 @@ class Manifest:
         other parameters, and if it has output but neither `resume` nor `force` is given.
         """
         is_begun = self._path.exists()
-        if is_begun and not isinstance(self._path, UrlPath):
+        if is_begun:
             self._lock(0)
         sizes = self._output_sizes()
         if resume and is_begun:
@@ -145,7 +147,7 @@ class Manifest:
         """Open the file; the kernel frees its lock with the process, however that ends."""
         try:
             # Not by a link that someone else has planted.
-            number = os.open(str(self._path), os.O_RDWR | os.O_NOFOLLOW | flags, 0o666)
+            number = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW | flags, 0o666)
             self._file = os.fdopen(number, 'rb+', buffering=0)
         except FileExistsError as error:
             raise DataError(f'{self._path.parent}: another run writes to it') from error
@@ -197,7 +199,6 @@ class Manifest:
 
     def _output_sizes(self) -> dict[str, int]:
         """Return the size of each file to write that is there [bytes]."""
-        # Listings, as each question takes a store of objects 20 ms.
         folders = {PurePosixPath(name).parent for name in self._inputs}
         there = {
             str(f / o.name): o for f in folders for o in (self._path.parent / str(f)).glob('*')
@@ -206,9 +207,6 @@ class Manifest:
 
     def begin(self) -> None:
         """Keep the whole lines that were read, none by default; what follows may write output."""
-        if isinstance(self._path, UrlPath):
-            self._path.write_bytes(self._text)
-            return
         self._path.parent.mkdir(parents=True, exist_ok=True)
         if self._file is None:
             self._lock(os.O_CREAT | os.O_EXCL)
@@ -221,22 +219,14 @@ class Manifest:
         items = {n: [*self._inputs[n], size] for n, size in zip(names, sizes, strict=True)}
         entry = {'block': self._text.count(b'\n'), 'items': items, **self._run}
         line = json.dumps(entry).encode() + b'\n'
-        if self._file is not None:
-            self._file.write(line)
-        elif stamp(self._path)[0] != len(self._text):  # an object has no lock
-            raise DataError(f'{self._path}: has changed, another run writes to this folder')
+        assert self._file is not None
+        self._file.write(line)
         self._text += line
-        if isinstance(self._path, UrlPath):  # an object cannot be appended to
-            self._path.write_bytes(self._text)
 
     def close(self) -> None:
         """Free the lock."""
         if self._file is not None:
             self._file.close()
-
-
-def _place(path: AnyPath) -> str:
-    return str(path) if isinstance(path, UrlPath) else os.path.realpath(path)
 
 
 def run_blocks(
