@@ -3,8 +3,13 @@
 import io
 import re
 import struct
+import subprocess
+import sys
+import tempfile
 import zipfile
+from pathlib import Path
 
+import bag_samples
 import numpy as np
 import pytest
 from cli_runner import error_line, run
@@ -12,10 +17,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gp_ground_seg.core.errors import DataError
+from gp_ground_seg.data.bags import BagWriter, cloud_topic
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file, read_file
 from gp_ground_seg.data.clouds import cloud_of, gather, name_columns
 from gp_ground_seg.data.pcd import PcdHeader
 from gp_ground_seg.data.ply import PlyHeader
+from gp_ground_seg.data.point_cloud2 import encode_cloud
 from gp_ground_seg.data.scan_layout import ScanLayout
 
 lzf = pytest.importorskip('lzf', reason='needs the extra formats')
@@ -309,6 +316,13 @@ def zip_of(**members):
     return file.getvalue()
 
 
+def npy_header(shape):
+    file = io.BytesIO()
+    layout = {'descr': '<f4', 'fortran_order': False, 'shape': shape}
+    np.lib.format.write_array_header_1_0(file, layout)
+    return file.getvalue()
+
+
 def npy_bytes(array, **options):
     file = io.BytesIO()
     np.save(file, array, **options)
@@ -320,6 +334,11 @@ LIES = {
     'shape.npy': (
         npy_bytes(XYZ).replace(b'(4, 3)', b'(9999999999, 3)'), r'cannot be read as \.npy \('
     ),
+    'columns.npy': (npy_header((0, 10**12)), '1000000000000 numbers per point'),
+    'columns.npz': (zip_of(points=npy_header((0, 10**9))), '1000000000 numbers per point'),
+    'shape.npz': (
+        zip_of(points=npy_header((10**9, 3)) + bytes(10**6)), r'cannot be read as \.npz \('
+    ),
     'flat.npy': (npy_bytes(np.arange(9.0)), r'array of shape \(9,\): must be \(N, 3\)'),
     'names.npz': (zip_of(a=npy_bytes(XYZ), b=npy_bytes(XYZ)), r'arrays a \(4, 3\), b \(4, 3\):'),
     'flat.npz': (zip_of(a=npy_bytes(np.arange(9.0))), r'arrays a \(9,\): must be x, y, z, or one'),
@@ -328,7 +347,6 @@ LIES = {
     'ragged.txt': (b'1 2 3\n4 5\n', 'the number of columns changed'),
     'none.txt': (b'# nothing\n', 'no line of numbers in it'),
     'bytes.txt': (b'\xff\xfe\x00', 'UnicodeDecodeError'),
-    'long.xyz': (b'1 1 1\n' * 5_000_000, '5000000 points, accepted are at most'),
     'sizes.pcd': (padded_pcd().replace(b'WIDTH 2', b'WIDTH 9'), '4 points, which is not width 9'),
     'many.pcd': (
         padded_pcd().replace(b'WIDTH 2', b'WIDTH 4000000').replace(b'POINTS 4', b'POINTS 8000000'),
@@ -338,6 +356,17 @@ LIES = {
         descriptor_pcd().replace(b'POINTS 4', b'POINTS 400000000')
         .replace(b'WIDTH 4', b'WIDTH 400000000'),
         'its header says 12800000000',
+    ),
+    'packed.pcd': (
+        descriptor_pcd().replace(b'POINTS 4', b'POINTS 40000000')
+        .replace(b'WIDTH 4', b'WIDTH 40000000')
+        .replace(struct.pack('<I', 4 * 32), struct.pack('<I', 40000000 * 32)),
+        'packed bytes cannot hold the 1280000000 of its header',
+    ),
+    'wide.pcd': (
+        padded_pcd().replace(b'COUNT 1', b'COUNT 500000000').replace(b'WIDTH 2', b'WIDTH 0')
+        .replace(b'POINTS 4', b'POINTS 0'),
+        '500000004 numbers per point',
     ),
     'type.pcd': (padded_pcd().replace(b'TYPE F', b'TYPE X'), 'field x: no type X of 4 bytes'),
     'data.pcd': (padded_pcd().replace(b'DATA binary', b'DATA other'), 'DATA other: must be'),
@@ -351,6 +380,49 @@ LIES = {
 }  # fmt: skip
 
 
+def bag_of(suffix, **changes):
+    """Bytes of a bag with one cloud that is not as it says."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, f'a{suffix}')
+        points = bag_samples.cloud()
+        for name, value in changes.items():
+            setattr(points, name, value)
+        with BagWriter(path) as bag:
+            bag.add_topic(cloud_topic('/points'))
+            bag.write('/points', 0, encode_cloud(points))
+        return path.read_bytes()
+
+
+def wide_fields():
+    fields = bag_samples.cloud().fields
+    fields[3].count = 400_000_000
+    return fields
+
+
+def bag_that_lies(suffix):
+    """Bytes of a bag whose first record is said to have 3 GB."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, f'a{suffix}')
+        write = bag_samples.write_ros1_bag if suffix == '.bag' else bag_samples.write_ros2_bag
+        write(path)
+        data = bytearray(path.read_bytes())
+    # Behind the magic of the format; in MCAP behind the kind of the record as well.
+    place, form = (len('#ROSBAG V2.0\n'), '<I') if suffix == '.bag' else (9, '<Q')
+    struct.pack_into(form, data, place, 3_000_000_000)
+    return bytes(data)
+
+
+LIES |= {
+    'points.mcap': (bag_of('.mcap', width=400_000_000), 'bytes: must be at least 8800000000'),
+    'wide.db3': (
+        bag_of('.db3', width=0, data=np.zeros(0, np.uint8), row_step=0, fields=wide_fields()),
+        '400000004 numbers per point',
+    ),
+    'record.mcap': (bag_that_lies('.mcap'), 'cannot be read as a bag'),
+    'record.bag': (bag_that_lies('.bag'), 'cannot be read as a bag'),
+}
+
+
 @pytest.mark.parametrize('name', LIES)
 def test_files_that_cannot_be_are_refused_with_the_reason(tmp_path, name, capsys):
     data, message = LIES[name]
@@ -358,3 +430,22 @@ def test_files_that_cannot_be_are_refused_with_the_reason(tmp_path, name, capsys
     assert run('segment', tmp_path / name, '-o', tmp_path / 'out.pcd') == 2
     assert re.search(message, error_line(capsys))
     assert not (tmp_path / 'out.pcd').exists()
+
+
+PEAK = """
+import sys
+from gp_ground_seg.cli.main import main
+for name in sys.argv[1:]:
+    assert main(['segment', name, '-o', 'out.pcd', '--force']) == 2, name
+print([line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM')][0])
+"""
+
+
+def test_what_a_header_promises_takes_no_memory(tmp_path):
+    for name, (data, _) in LIES.items():
+        (tmp_path / name).write_bytes(data)
+    done = subprocess.run(
+        [sys.executable, '-c', PEAK, *LIES], cwd=tmp_path, capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    assert 1024 * int(done.stdout) < 600_000_000

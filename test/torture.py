@@ -45,10 +45,8 @@ PARTS = {
     'commands killed, interrupted, disk full': Part('torture_writes.py', 40, 20),
     'data sets that change, two runs at once': Part('torture_resume.py', 120, 40),
     'damaged files': Part('torture_files.py', 600, 200),
-    'files of another user': Part('torture_permissions.py', 105, 105),
     'wrong commands': Part('torture_commands.py', 1000, 250),
-    'bombs': Part('torture_bombs.py', 68, 17),
-    'servers': Part('torture_servers.py', 200, 100),
+    'page of tune': Part('torture_servers.py', 200, 100),
     'hostile messages and calls over DDS': Part('torture_ros.py', 400, 200),
 }  # fmt: skip
 

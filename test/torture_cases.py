@@ -1,6 +1,21 @@
 """What the scripts of the torture campaign share."""
 
+import contextlib
+import io
 import sys
+
+from gp_ground_seg.cli import main as cli
+
+
+def answer(words):
+    """Exit code, stdout and stderr of a command in this process."""
+    said, errors = io.StringIO(), io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(errors):
+            code = cli.main([str(word) for word in words])
+    except SystemExit as stop:
+        code = stop.code
+    return code, said.getvalue(), errors.getvalue()
 
 
 def run_cases(run_case):

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from bag_samples import scan, write_ros1_bag, write_ros2_bag
-from torture_cases import run_cases
-from torture_permissions import answer
+from torture_cases import answer, run_cases
 
 from gp_ground_seg.cli import main as cli
 from gp_ground_seg.data.cloud_files import WRITABLE, encode_file

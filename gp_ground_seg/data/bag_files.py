@@ -59,12 +59,6 @@ def storage_of(path: Path) -> str:
     return 'sqlite3' if any('.db3' in file.suffixes for file in files) else 'mcap'
 
 
-def size_of(path: Path) -> int:
-    """Bytes of a bag, all files of a folder together."""
-    files = path.iterdir() if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files)
-
-
 def is_bag_folder(path: Path) -> bool:
     """Whether a folder holds a rosbag2 bag and nothing else."""
     return (path / METADATA_FILE).is_file() and all(

@@ -68,7 +68,7 @@ class BagOutput:
                     if name != topic:
                         continue
                     try:
-                        cloud = decode_cloud(raw, bag.size)
+                        cloud = decode_cloud(raw)
                         result = segmenter.segment(read_xyz(cloud))
                     except PointCloudError as error:
                         place = f'message {n_done} of topic {topic}, recorded at {time} ns'

@@ -5,10 +5,8 @@ The one module that imports rosbags, an optional package; only where a bag is us
 
 from __future__ import annotations
 
-import bz2
 import dataclasses
 import functools
-import itertools
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
@@ -28,11 +26,9 @@ from gp_ground_seg.data.bag_files import (
     check_is_bag,
     reading,
     resolve_storage,
-    size_of,
     storage_of,
     writing,
 )
-from gp_ground_seg.data.files import MAX_UNPACKED_BYTES, check_unpacked
 
 _HEADER = 'std_msgs/msg/Header'
 _RENAMED = {'tf/msg/tfMessage': 'tf2_msgs/msg/TFMessage'}
@@ -124,51 +120,6 @@ def _ros1_topic(connection: Any) -> tuple[BagTopic, Callable[[bytes], Any]]:
     return _topic_of(target, connection.topic, new, qos), convert
 
 
-def _unpack(new: Callable[[], Any], data: bytes, *_: object) -> bytes:
-    """Unpack what a decompressor each of `new` unpacks, frame after frame, up to the limit."""
-    parts: list[bytes] = []
-    size, rest = 0, data
-    while rest:
-        frame = new()
-        # A byte more than is accepted, to see whether there is one.
-        most = max(MAX_UNPACKED_BYTES, 2 * len(data)) - size + 1
-        parts.append(frame.decompress(rest, max_length=most))
-        size += len(parts[-1])
-        check_unpacked(size, len(data))
-        if not frame.eof:
-            raise ValueError('packed data that end early')
-        rest = frame.unused_data or b''
-    return b''.join(parts)
-
-
-@functools.cache
-def _limit_rosbags() -> Callable[[bytes], bytes]:
-    """Make rosbags unpack chunks up to our limit in this process; return what unpacks a message.
-
-    By itself it unpacks whatever a chunk holds: 13 kB of bz2 become 6.4 GB.
-    """
-    from rosbags.rosbag1 import reader as ros1
-    from rosbags.rosbag2 import storage_mcap as mcap
-
-    zstd = functools.partial(_unpack, mcap.zstd.ZstdDecompressor)
-    lz4 = functools.partial(_unpack, require('lz4.frame', 'rosbags').LZ4FrameDecompressor)
-    ros1.decompressors.update(bz2=functools.partial(_unpack, bz2.BZ2Decompressor), lz4=lz4)
-    mcap.DECOMPRESSORS.update(lz4=lz4, zstd=zstd)
-    return zstd
-
-
-def _check_chunks(storage: Any, packed: int) -> None:
-    """Raise PointCloudError for MCAP chunks of one time, unpacked together, beyond the limit."""
-    for file in getattr(storage, 'storages', [storage]):
-        changes: list[tuple[int, bool, int]] = []
-        for chunk in getattr(file, 'chunks', ()):
-            begin, end = chunk.message_start_time, chunk.message_end_time
-            changes.append((begin, False, chunk.uncompressed_size))
-            changes.append((max(begin, end), True, -chunk.uncompressed_size))
-        for size in itertools.accumulate(change for *_, change in sorted(changes)):
-            check_unpacked(size, packed)
-
-
 class BagReader(AbstractContextManager['BagReader']):
     """A bag as ROS 2 topics with CDR messages, to be used in a ``with`` statement.
 
@@ -183,21 +134,13 @@ class BagReader(AbstractContextManager['BagReader']):
         self.path = Path(path)
         self.storage = storage_of(self.path)  # ``ros1``, ``mcap`` or ``sqlite3``
         self._converters: dict[int, Callable[[bytes], Any]] = {}
-        self._unpack: Callable[[bytes], Any] = bytes
         with ExitStack() as stack:
             with reading(self.path):
-                unpack = _limit_rosbags()
                 check_is_bag(self.path)
-                self.size = size_of(self.path)
                 rosbag: Any = rosbag1 if self.storage == 'ros1' else rosbag2
                 reader = rosbag.Reader(self.path)
                 reader.open()
                 stack.callback(reader.close)
-                if self.storage != 'ros1':
-                    _check_chunks(reader.storage, self.size)
-                    if reader.compression_mode == 'message':
-                        metadata = reader.storage.metadata._replace(compression_mode=None)
-                        reader.storage.metadata, self._unpack = metadata, unpack
             self._reader = reader
             self._topics: dict[str, BagTopic] = {}
             for connection in reader.connections:
@@ -276,7 +219,7 @@ class BagReader(AbstractContextManager['BagReader']):
                 if (entry := next(source, None)) is None:
                     break
                 connection, time, raw = entry
-                message = bytes(self._converters.get(connection.id, self._unpack)(raw))
+                message = bytes(self._converters.get(connection.id, bytes)(raw))
             found[connection.topic] += 1
             yield connection.topic, time, message
         for name, topic in wanted.items():

@@ -22,18 +22,14 @@ from gp_ground_seg.data.clouds import (
     Cloud,
     Columns,
     Fields,
+    check_numbers,
     cloud_of,
     count_numbers,
     gather,
     name_columns,
     scatter,
 )
-from gp_ground_seg.data.files import (
-    MAX_SCAN_BYTES,
-    check_points,
-    check_unpacked,
-    read_bytes,
-)
+from gp_ground_seg.data.files import MAX_SCAN_BYTES, read_bytes
 from gp_ground_seg.data.pcd import encode_pcd, read_pcd
 from gp_ground_seg.data.ply import encode_ply, read_ply
 from gp_ground_seg.data.scan_layout import KITTI, ScanLayout, check_scan, four_columns, read_scan
@@ -48,8 +44,6 @@ def _read_numpy(data: bytes) -> tuple[Fields, Columns]:
     found = np.load(io.BytesIO(data), allow_pickle=False)
     if isinstance(found, np.ndarray):
         return _fields_of({TABLE: found})
-    check_unpacked(sum(entry.file_size for entry in found.zip.infolist()), len(data))
-    check_points(0, len(found.files), 0)
     return _fields_of(dict(found))
 
 
@@ -86,7 +80,7 @@ def _read_text(data: bytes) -> tuple[Fields, None]:
     first = next(lines, '')
     delimiter = next((mark for mark in ',;' if mark in first), None)
     words = [word.strip(' "') for word in first.split(delimiter)]
-    check_points(text.count('\n'), len(words), len(data))
+    check_numbers(len(words))
     if not first:
         raise PointCloudError('no line of numbers in it')
     before = 0 if all(map(_is_number, words)) else text.partition(first)[0].count('\n') + 1
@@ -162,7 +156,7 @@ def read_file(path: Path, layout: ScanLayout = KITTI) -> Cloud:
         data = read_bytes(path, MAX_SCAN_BYTES)
         with _named(path, 'cannot be read'), np.errstate(all='ignore'):
             fields, header = _READERS[suffix](data)
-            check_points(len(fields), count_numbers(fields.dtype), len(data))
+            check_numbers(count_numbers(fields.dtype))
             cloud = cloud_of(fields, header)
     cloud = cloud.about(layout.origin)
     check_scan(path, cloud.xyz[:, :3], layout)

@@ -12,12 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from gp_ground_seg.core.errors import PointCloudError
-from gp_ground_seg.data.files import check_points
 
 Fields = npt.NDArray[np.void]
 Columns = dict[str, npt.NDArray[Any]]
 COLUMNS = ('x', 'y', 'z', 'intensity')
 """Names of the first columns of a table without names; the others are column_5, ..."""
+MAX_NUMBERS = 1000
+"""Numbers of a point that are accepted: a header can name more where there is no point."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,15 @@ def cloud_of(fields: Fields, header: Any = None) -> Cloud:
     return Cloud(fields, xyz, header)
 
 
+def check_numbers(n: int) -> None:
+    """Raise PointCloudError if a point has more than `MAX_NUMBERS` numbers."""
+    if n > MAX_NUMBERS:
+        raise PointCloudError(f'{n} numbers per point, accepted are at most {MAX_NUMBERS}')
+
+
 def name_columns(table: npt.NDArray[Any]) -> Fields:
     """Structured array (N,) of a table (N, columns); PointCloudError for too many columns."""
-    check_points(0, table.shape[1], 0)
+    check_numbers(table.shape[1])
     names = [*COLUMNS, *(f'column_{k}' for k in range(5, table.shape[1] + 1))]
     return gather({name: table[:, k] for k, name in enumerate(names[: table.shape[1]])})
 

@@ -7,32 +7,10 @@ import stat
 import uuid
 from pathlib import Path
 
-from gp_ground_seg.core.errors import DataError, PointCloudError, reason_of
+from gp_ground_seg.core.errors import DataError, reason_of
 from gp_ground_seg.data.atomic_output import PARTIAL_MARK
 
 MAX_SCAN_BYTES = 1 << 30  # of a file: 67 million points, a hundred times a dense scan
-MAX_UNPACKED_BYTES = 1 << 27  # of packed data, unless these are at least half of it
-MAX_POINTS = 1 << 22  # of a cloud, unless its file has 12 bytes for each: x, y, z
-MAX_NUMBERS = 1000  # of a point
-
-
-def check_unpacked(size: int, packed: int) -> None:
-    """Raise PointCloudError if `packed` bytes become more than are accepted (1 kB may be 1 GB)."""
-    most = max(MAX_UNPACKED_BYTES, 2 * packed)
-    if size > most:
-        raise PointCloudError(f'{packed} bytes unpack to {size}, accepted are at most {most}')
-
-
-def check_points(n_points: int, n_numbers: int, packed: int) -> None:
-    """Raise PointCloudError if a cloud is larger than accepted in a file of `packed` bytes.
-
-    Each of its points, which may be none, has `n_numbers` numbers.
-    """
-    most = max(MAX_POINTS, packed // 12)
-    if n_points > most:
-        raise PointCloudError(f'{n_points} points, accepted are at most {most} in {packed} bytes')
-    if n_numbers > MAX_NUMBERS:
-        raise PointCloudError(f'{n_numbers} numbers per point, accepted are at most {MAX_NUMBERS}')
 
 
 def read_bytes(path: str | Path, most: int, expected: str = '') -> bytes:

@@ -85,7 +85,7 @@ class Inputs:
         with BagReader(self.path) as bag:
             for k, (_, time, raw) in enumerate(bag.messages([self.topic])):
                 place = f'message {k} of topic {self.topic}, recorded at {time} ns'
-                read = partial(_decode, raw, f'{self.path}: {place}', bag.size, self._origin)
+                read = partial(_decode, raw, f'{self.path}: {place}', self._origin)
                 title = shown(f'{self.path.name}[{k}]')
                 yield Input(f'{k:06d}', title, self.path, read)
 
@@ -184,11 +184,9 @@ def _stem(path: Path) -> str:
     return name.removesuffix(NUSCENES_SUFFIX) if name.endswith(NUSCENES_SUFFIX) else path.stem
 
 
-def _decode(
-    raw: bytes, place: str, packed: int, origin: tuple[float, float, float] | None
-) -> Cloud:
+def _decode(raw: bytes, place: str, origin: tuple[float, float, float] | None) -> Cloud:
     try:
-        message = decode_cloud(raw, packed)
+        message = decode_cloud(raw)
         return Cloud(read_fields(message), read_xyz(message)).about(origin)
     except PointCloudError as error:
         raise DataError(f'{place}: {error}') from error

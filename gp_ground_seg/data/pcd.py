@@ -17,10 +17,10 @@ import numpy as np
 
 from gp_ground_seg.core.errors import PointCloudError, require
 from gp_ground_seg.data.clouds import Cloud, Fields, gather, in_types, read_table
-from gp_ground_seg.data.files import check_unpacked
 
 _END = re.compile(rb'^DATA[ \t]+(\w+)[ \t]*\r?\n', re.MULTILINE)
 _MAX_HEADER_BYTES = 1 << 16
+_MAX_EXPANSION = 88  # of LZF: three bytes repeat 264 at most
 _TYPES = {f'{kind}{n}' for kind in 'iu' for n in (1, 2, 4, 8)} | {'f4', 'f8'}
 
 
@@ -75,9 +75,11 @@ def _read_compressed(data: bytes, dtype: np.dtype[Any], n_points: int) -> Fields
     needed = n_points * dtype.itemsize
     if size != needed:
         raise PointCloudError(f'body of {size} bytes, its header says {needed}')
-    check_unpacked(size, len(data))
+    body = data[8 : 8 + packed]
+    if size > _MAX_EXPANSION * len(body):
+        raise PointCloudError(f'{len(body)} packed bytes cannot hold the {size} of its header')
     # LZF knows no empty text.
-    body = require('lzf', 'python-neo-lzf').decompress(data[8 : 8 + packed], size) if size else b''
+    body = require('lzf', 'python-neo-lzf').decompress(body, size) if size else b''
     columns, start = {}, 0
     for name in dtype.names or ():
         column = np.frombuffer(body, np.dtype([(name, dtype[name])]), n_points, start)

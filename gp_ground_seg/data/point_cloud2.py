@@ -22,8 +22,7 @@ from gp_ground_seg.core.errors import PointCloudError, in_one_line
 from gp_ground_seg.core.pipeline.points import finite_points
 from gp_ground_seg.data.bag_files import POINT_CLOUD2
 from gp_ground_seg.data.bags import jazzy_types
-from gp_ground_seg.data.clouds import gather
-from gp_ground_seg.data.files import check_points
+from gp_ground_seg.data.clouds import check_numbers, gather
 
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 _DATATYPE_NAMES = {datatype: np.dtype(code).name.upper() for datatype, code in _CODES.items()}
@@ -313,10 +312,10 @@ def _new_header(stamp: tuple[int, int], frame_id: str) -> Any:
     return types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](*stamp), frame_id)
 
 
-def decode_cloud(raw: bytes | memoryview, packed: int | None = None) -> CloudMessage:
-    """Message of rosbags from its CDR bytes, which were `packed` bytes in a file.
+def decode_cloud(raw: bytes | memoryview) -> CloudMessage:
+    """Message of rosbags from its CDR bytes.
 
-    Raises PointCloudError if they are no PointCloud2, or one larger than accepted.
+    Raises PointCloudError if they are none, or have more numbers per point than accepted.
     """
     types = jazzy_types()
     try:
@@ -324,8 +323,7 @@ def decode_cloud(raw: bytes | memoryview, packed: int | None = None) -> CloudMes
     except Exception as error:  # Its kind depends on where parsing went astray.
         said = f'{len(raw)} bytes that are no {POINT_CLOUD2}: {in_one_line(error)}'
         raise PointCloudError(said) from error
-    n_numbers = sum(max(field.count, 1) for field in cloud.fields)
-    check_points(cloud.height * cloud.width, n_numbers, len(raw) if packed is None else packed)
+    check_numbers(sum(max(field.count, 1) for field in cloud.fields))
     return cloud
 
 
