@@ -203,21 +203,6 @@ def test_a_file_without_parameters_gets_a_note(tmp_path, capsys, words):
     assert capsys.readouterr().err == note
 
 
-def test_diff_of_files_and_presets(tmp_path, capsys):
-    path = tmp_path / 'my.yaml'
-    path.write_text('learning: {mode: fixed}\nlabel: {ground_tolerance: 0.15}\n')
-    assert run('config', 'diff', 'default', path) == 1
-    assert capsys.readouterr().out == (
-        f'label.ground_tolerance: {Config().label.ground_tolerance} -> 0.15 m\n'
-        f'learning.mode: {Config().learning.mode} -> fixed\n'
-    )
-    assert run('config', 'diff', path, path) == 0
-    assert run('config', 'diff', 'default', REPOSITORY / 'config' / 'default.yaml') == 0
-    assert capsys.readouterr().out == ''
-    assert run('config', 'diff', 'default', 'vlp17') == 2
-    assert 'vlp17: No such file' in capsys.readouterr().err
-
-
 def test_file_goes_over_preset_and_setting_over_file(tmp_path, capsys):
     path = tmp_path / 'my.yaml'
     path.write_text('grid: {n_bins: 77, n_segments: 66}\n')

@@ -136,23 +136,6 @@ def test_large_clouds_that_come_best_effort_are_a_warning(node, link):
     assert '[WARN]' in line and f'{NAMESPACE}/points' in line
 
 
-def test_a_cloud_above_the_limit_is_refused_and_the_next_answered(node, link):
-    link.publisher = add_publisher(link, RELIABLE, 'reliable')
-    assert link.set('input.max_cloud_size', 1).successful
-    link.segment(SMALL)
-    link.publisher.publish(LARGE)
-    status = link.wait_for_status('input', lambda v, _: v['Refused since startup'] == '1')
-    assert status.level == DiagnosticStatus.ERROR
-    said = 'cloud of 1.9 MB: must be at most input.max_cloud_size = 1 MB'
-    assert ros.values_of(status)['Last error'] == said
-    assert said in node.log
-    link.segment(SMALL)
-    assert len(link.ground.messages) == 2
-    assert link.set('input.max_cloud_size', 2).successful
-    parts = link.segment(LARGE)
-    assert sum(part.width for part in parts) == LARGE.width
-
-
 @given(st.lists(st.booleans(), min_size=1))
 def test_gaps_count_what_is_missing_between_arrivals(is_received):
     gaps = SequenceGaps()

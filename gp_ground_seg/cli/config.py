@@ -1,4 +1,4 @@
-"""``config``: the parameters as a file; checks and comparison of parameter files."""
+"""``config``: the parameters as a file; checks of parameter files."""
 
 from __future__ import annotations
 
@@ -17,18 +17,12 @@ EXAMPLES = """\
   gp-ground-seg config dump --config my.yaml --set label.ground_tolerance=0.15
   gp-ground-seg config dump --preset paper       those of the paper, with the reasons
   gp-ground-seg config check my.yaml             unknown names, types, ranges
-  gp-ground-seg config diff default my.yaml      what a file, or a preset, changes
 """
 
 CHECK = """\
 Check names, types, ranges and the rules between parameters, and say who reads the
 file: commands read bare groups too, the node only the form of ROS (/**:
 ros__parameters:). Exit code 2 if anything is wrong.
-"""
-
-DIFF = """\
-Print the parameters that differ. A and B are parameter files or names of presets.
-Exit code 1 if any differ, as that of diff(1).
 """
 
 
@@ -41,7 +35,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     for run, purpose, text in (
         (run_dump, 'print the effective parameters as a ROS parameter file', ''),
         (run_check, 'say everything that is wrong with a parameter file', CHECK),
-        (run_diff, 'compare two parameter files or presets', DIFF),
     ):
         name = run.__name__.removeprefix('run_')
         examples = [line for line in EXAMPLES.splitlines() if f'config {name}' in line]
@@ -51,8 +44,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         added[name].set_defaults(run=run)
     options.add_config(added['dump'])
     added['check'].add_argument('files', metavar='FILE', nargs='+', help='parameter file (YAML)')
-    for side in 'ab':
-        added['diff'].add_argument(side, metavar=side.upper(), help='parameter file or preset')
 
 
 def run_dump(arguments: argparse.Namespace) -> int:
@@ -89,10 +80,3 @@ def run_check(arguments: argparse.Namespace) -> int:
         differ = 'differs' if n_changed == 1 else 'differ'
         print(f'{shown(path)}: good{use}; {given}, {n_changed} {differ} from the defaults')
     return code
-
-
-def run_diff(arguments: argparse.Namespace) -> int:
-    """Print the parameters that differ."""
-    different = options.changed_lines(*map(options.named_config, (arguments.a, arguments.b)))
-    print(*different, sep='\n', end='\n' * bool(different))
-    return 1 if different else 0

@@ -128,11 +128,6 @@ class GroundSegmentationNode(ConfiguredNode):
 
     def _segment(self, cloud: PointCloud2) -> Segmentation:
         """Return the segmentation of a cloud; raise a PointCloudError if it has none."""
-        size, limit = len(cloud.data) / 1e6, self.config.input.max_cloud_size
-        if size > limit:
-            raise PointCloudError(
-                f'cloud of {size:.1f} MB: must be at most input.max_cloud_size = {limit:g} MB'
-            )
         # Code for the other precision would have to be compiled at the first start too.
         points = single_precision(read_xyz(cloud))
         tilt, origin = self._tf.look_up(cloud.header, self.config) if self._tf else (None, None)

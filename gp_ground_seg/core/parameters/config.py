@@ -65,8 +65,6 @@ class FrameConfig:
 class InputConfig:
     """Clouds that are taken; the node only."""
 
-    max_cloud_size: float = advanced(64.0, (0.001, 4294.0),
-        'size of the data of a cloud above which it is refused', 'MB')
     lazy: bool = advanced(False, (),
         'subscribe to clouds only while an output has a subscriber; looked at every second')
 

@@ -18,7 +18,11 @@ REMOVED: dict[str, str] = {
     'learning.scope': 'leave it out: a frame has one set of hyper-parameters',
     'learning.warm_start': 'leave it out: learning starts from the lines of each frame',
     'learning.max_time': 'use learning.max_evaluations',
+    'input.max_cloud_size': 'leave it out: clouds of any size are taken',
     'runtime.n_threads': 'leave it out: a scan takes one thread; --workers takes several scans',
+    f'{PROGRAM} config diff': (
+        f'use diff on two files, each written by {PROGRAM} config dump --config FILE'
+    ),
     f'{PROGRAM} bench --threads': 'leave it out: a scan takes one thread',
     f'{PROGRAM} experiment departures': (
         f'use {PROGRAM} evaluate ROOT --set NAME=VALUE --against default'
