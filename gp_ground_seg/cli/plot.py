@@ -11,30 +11,22 @@ import numpy.typing as npt
 
 from gp_ground_seg.cli import options
 from gp_ground_seg.core.errors import DataError, shown
-from gp_ground_seg.core.ground_model import GroundModel
 from gp_ground_seg.core.parameters.config import Config
 from gp_ground_seg.core.result import Segmentation
 from gp_ground_seg.core.segmenter import GroundSegmenter
 from gp_ground_seg.data.semantic_kitti import read_labels
-from gp_ground_seg.lab.plotting.scan import (
-    CAMERA,
-    VALUES,
-    Place,
-    camera_at,
-    plot_scan_view,
-)
+from gp_ground_seg.lab.plotting.scan import CAMERA, Place, camera_at, plot_scan_view
 from gp_ground_seg.lab.plotting.segment import plot_segment, segment_at
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID
 
 SCAN = """\
 Draw a scan in perspective: ground grey, obstacles orange; with --labels missed ground blue and
-false ground purple. --surface adds the ground model, coloured by length-scale, with profiles of
-twice its standard deviation.
+false ground purple.
 """
 SCAN_EXAMPLES = """\
   gp-ground-seg plot scan 000000.bin -o scan.png
   gp-ground-seg plot scan drive.mcap --frame 20 -o scan.png
-  gp-ground-seg plot scan 000000.pcd --colour height -o scan.svg
+  gp-ground-seg plot scan 000000.pcd -o scan.svg
   gp-ground-seg plot scan 000000.bin --camera 90,30,40 -o from_the_left.pdf
   gp-ground-seg plot scan velodyne/000000.bin --labels labels/000000.label -o errors.png
 """
@@ -91,9 +83,6 @@ def _declare_scan(parser: argparse.ArgumentParser) -> None:
         parser,
         ('--camera', 'where it stands, seen from the middle of the scene: counter-clockwise '
          'from ahead [deg], upwards [deg], away [m] (default: 196,24,32)', camera),
-        ('--colour', 'colour points by class, or by the height over the ground or the '
-         'probability of ground', {'choices': ('class', *VALUES), 'default': 'class'}),
-        ('--surface', 'draw the estimated ground as well', options.FLAG),
     )  # fmt: skip
 
 
@@ -117,13 +106,8 @@ def run(arguments: argparse.Namespace) -> int:
         truth = GROUNDGRID.truth(read_labels(arguments.labels, len(points)), points[:, 2])
     result = GroundSegmenter(config).segment(points)
     if arguments.picture == 'scan':
-        colour = arguments.colour
-        values = None if colour == 'class' else (colour, getattr(result, colour))
-        surface = (GroundModel.of(result), config) if arguments.surface else None
-        said = plot_scan_view(
-            points, result.label, path, title, arguments.camera,
-            truth=truth, values=values, surface=surface,
-        )  # fmt: skip
+        camera = arguments.camera
+        said = plot_scan_view(points, result.label, path, title, camera, truth=truth)
     else:
         segments = _segment_numbers(arguments, config)
         plot_segment(result, config, points, segments, path, truth, title)

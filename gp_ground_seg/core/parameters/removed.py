@@ -37,6 +37,10 @@ REMOVED: dict[str, str] = {
     f'{PROGRAM} experiment pseudo-inputs --plot': 'use the table, or --json FILE',
     f'{PROGRAM} evaluate --per-frame': 'use --json FILE: its rows are the frames',
     f'{PROGRAM} evaluate --worst': 'use --json FILE: its rows are the frames, with their IoU',
+    f'{PROGRAM} plot scan --colour': f'use {PROGRAM} tune INPUT, which colours points',
+    f'{PROGRAM} plot scan --surface': (
+        f'use {PROGRAM} plot segment, or ~/ground_model of the node in RViz'
+    ),
     f'{PROGRAM} pose': f'use {PROGRAM} segment INPUT, which prints height and tilt',
     f'{PROGRAM} compare': f'use {PROGRAM} evaluate ROOT --against FILE_OR_PRESET',
     f'{PROGRAM} view': f'use {PROGRAM} tune INPUT, or Foxglove on what segment writes',

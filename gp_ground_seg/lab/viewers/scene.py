@@ -10,10 +10,9 @@ import numpy.typing as npt
 
 from gp_ground_seg.core.frame import Label
 from gp_ground_seg.core.result import Segmentation
-from gp_ground_seg.data.colours import COLOURS, ramp_colours
+from gp_ground_seg.data.colours import COLOURS, HEIGHTS, ramp_colours
 from gp_ground_seg.data.inputs import Input
 from gp_ground_seg.data.semantic_kitti import read_entries
-from gp_ground_seg.lab.plotting.scan import VALUES
 from gp_ground_seg.lab.plotting.style import GREEN
 from gp_ground_seg.lab.scoring.metrics import GROUNDGRID, Labels, count_confusion
 from gp_ground_seg.lab.scoring.objects import (
@@ -32,7 +31,7 @@ LEGENDS = {
         name: COLOURS[name] for name in ('not scored', 'right', 'missed ground', 'false ground')
     },
 }
-RAMPS = {name: (low, high) for name, (_, low, high) in VALUES.items()}
+RAMPS = {'height': HEIGHTS, 'p_ground': (0.0, 1.0)}
 """Ends of the ramp from dark blue to yellow of the height over the ground [m], and of p_ground."""
 
 
