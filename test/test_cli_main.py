@@ -83,11 +83,15 @@ def test_a_removed_command_or_option_says_what_to_use_instead(name, capsys):
         'segment a.bin -o gs://bucket/a.label',
         'evaluate HTTPS://host/kitti --scheduler tcp://127.0.0.1:1',
         'plot scan file:///a.bin',
+        'segment a.bin -os3://bucket/a.label',
+        'segment a.bin -o=s3://bucket/a.label',
+        'segment a.bin --output=s3://bucket/a.label --scheduler=tcp://127.0.0.1:1',
+        'segment a.bin --config=https://host/a=1.yaml',
     ],
 )
 def test_a_url_is_refused_with_what_to_use_instead(line, capsys):
     assert cli.main(line.split()) == 2
-    (url,) = (word for word in line.split() if '://' in word and 'tcp:' not in word)
+    (url,) = re.findall(r'(?:^| |=|-o)((?!tcp)\w+://\S+)', line)
     said = 'no URLs; mount the folder (s3fs, rclone), or download the file'
     assert error_line(capsys) == f'{url}: {said}'
 

@@ -11,8 +11,8 @@ from gp_ground_seg.core.jit import JIT_ENABLED, jit
 
 @given(st.floats(0.0, 1e300), st.floats(-10.0, 0.0))
 def test_exp_neg_is_the_exponential(x, negative):
-    assert abs(exp_neg(x) - np.exp(-x)) <= 2e-14
-    assert (exp_neg(x) == 0.0) == (x > numerics.NEGLIGIBLE_EXPONENT)
+    assert abs(exp_neg(x) - np.exp(-x)) <= 2e-15
+    assert (exp_neg(x) == 0.0) == (x >= numerics.NEGLIGIBLE_EXPONENT)
     np.testing.assert_allclose(exp_neg(negative), np.exp(-negative), rtol=1e-11)
 
 
@@ -23,7 +23,7 @@ def test_exp_neg_in_single_precision(x):
     # Next to 1 it is as exact as single precision is.
     expected = np.exp(-np.float64(x))
     assert abs(found - expected) <= 6e-8 + 1.5e-7 * (1.0 - expected)
-    assert (found == 0.0) == (x >= 18.0)
+    assert (found == 0.0) == (x >= numerics.NEGLIGIBLE_SINGLE)
 
 
 def test_compiled_code_takes_the_form_of_the_precision_at_hand():

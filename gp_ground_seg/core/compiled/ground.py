@@ -25,6 +25,9 @@ from gp_ground_seg.core.gp.kernels import paciorek
 from gp_ground_seg.core.jit import jit
 from gp_ground_seg.core.parameters.config import GrowthConfig, ObservationConfig
 
+ROUNDING = 1e-6
+"""Least noise of what is observed, in parts of sigma_f^2: the rounding of single precision."""
+
 
 class SegmentSurfaces(NamedTuple):
     """The surface of each segment by itself.
@@ -134,6 +137,7 @@ def grow_surfaces(
     )
     slope = observation.slope_std**2
     sill, noise = variances_of(theta)
+    noise = max(noise, ROUNDING * sill)
     reach = math.exp(theta[3]) if odds > 0.0 else 0.0
     for m in range(0, len(mean), step):
         for j in range(len(frame.knots)):

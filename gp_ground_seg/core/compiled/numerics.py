@@ -6,6 +6,7 @@ Every inner loop runs along a row, so that the compiler can use vector instructi
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,16 +18,6 @@ from gp_ground_seg.core.jit import choose, compiled_form, jit
 LANES = 8
 """Columns of single precision that vector instructions take at once, and a multiple of those of
 double: rows end at multiples of it, because a remainder takes longer than the rest of the row."""
-NEGLIGIBLE_EXPONENT = 40.0
-"""`exp_neg` is zero beyond this x: exp(-40) is 4e-18, below the rounding of one."""
-_HALVINGS = 7
-_SCALE = -1.0 / 2.0**_HALVINGS
-# Factors instead of quotients: a division takes as long as ten multiplications.
-_C2, _C3, _C4, _C5, _C6, _C7 = 1 / 2, 1 / 6, 1 / 24, 1 / 120, 1 / 720, 1 / 5040
-_NEGLIGIBLE_SINGLE, _ZERO, _ONE = np.float32(18.0), np.float32(0.0), np.float32(1.0)
-_S1, _S2, _S3, _S4, _S5, _S6, _S7 = (
-    np.float32((-1.0 / 16.0) ** k / math.factorial(k)) for k in range(1, 8)
-)
 
 
 @compiled_form(choose)
@@ -35,47 +26,41 @@ def branch(condition: bool, a: Any, b: Any) -> Any:
     return a if condition else b
 
 
-def exp_neg(x: float) -> float:
-    """``exp(-x)``, to an error of 2e-14 for x >= 0, and of 1e-11 of its size for -10 < x < 0.
+def _make_exp_neg(number: type, halvings: int, negligible: float) -> Callable[[Any], Any]:
+    """Return ``exp(-x)`` for x >= 0 of a type of numbers; zero from `negligible` on.
 
-    The Taylor polynomial of ``exp(-x / 128)``, squared seven times: no branch, no
-    table, no call, so that it runs on four numbers at a time. The remainder of the
-    polynomial is at most ``x^8 exp(-x) / (128^7 8!)``, 3e-16. Terms are added in pairs,
-    because each multiplication waits for the one before. The tail is exactly zero, because
+    The Taylor polynomial of degree 7 of ``exp(-x / 2^halvings)``, squared as often: no branch, no
+    table, no call, so that vector instructions take several numbers at once. Terms are added in
+    pairs, because each multiplication waits for the one before, and multiplied by factors, because
+    a division takes as long as ten multiplications. It is squared as ``1 + below``, of which
+    `below` is kept: each square of the value itself would double its rounding, and covariances of
+    places close together would be no covariances any more. The tail is exactly zero, because
     derivatives multiply it by the square of a distance in length-scales.
     """
-    y = min(x, NEGLIGIBLE_EXPONENT) * _SCALE
-    square = y * y
-    high = (_C4 + _C5 * y) + square * (_C6 + _C7 * y)
-    value = (1.0 + y) + square * ((_C2 + _C3 * y) + square * high)
-    value *= value
-    value *= value
-    value *= value
-    value *= value
-    value *= value
-    value *= value
-    value *= value
-    return 0.0 if x > NEGLIGIBLE_EXPONENT else value
+    zero, one, end = number(0.0), number(1.0), number(negligible)
+    c1, c2, c3, c4, c5, c6, c7 = (
+        number((-(0.5**halvings)) ** k / math.factorial(k)) for k in range(1, 8)
+    )
+
+    def exp_neg(x: Any) -> Any:
+        y = min(x, end)
+        square = y * y
+        high = (c4 + c5 * y) + square * (c6 + c7 * y)
+        below = c1 * y + square * ((c2 + c3 * y) + square * high)
+        for _ in range(halvings):
+            below = (below + below) + below * below
+        return zero if y >= end else one + below
+
+    return exp_neg
 
 
-def exp_neg_single(x: Any) -> Any:
-    """``exp(-x)`` for x >= 0 in single precision, to an error of 2e-7; zero from 18 on.
-
-    As `exp_neg`, with 16 for 128: ``exp(-18)`` is 1.5e-8, below the rounding of one. It is squared
-    as ``1 + below``, of which `below` is kept: each square of the value itself would double its
-    rounding, and covariances of places close together would be no covariances any more.
-    """
-    y = min(x, _NEGLIGIBLE_SINGLE)
-    square = y * y
-    high = (_S4 + _S5 * y) + square * (_S6 + _S7 * y)
-    below = _S1 * y + square * ((_S2 + _S3 * y) + square * high)
-    below = (below + below) + below * below
-    below = (below + below) + below * below
-    below = (below + below) + below * below
-    below = (below + below) + below * below
-    return _ZERO if y >= _NEGLIGIBLE_SINGLE else _ONE + below
-
-
+NEGLIGIBLE_EXPONENT, NEGLIGIBLE_SINGLE = 40.0, 18.0
+"""x from which ``exp(-x)`` is zero, by precision: it is 4e-18 and 2e-8, below the rounding of
+one."""
+exp_neg = _make_exp_neg(np.float64, 7, NEGLIGIBLE_EXPONENT)
+"""``exp(-x)``, to an error of 1e-15 for x >= 0, and of 1e-11 of its size for -10 < x < 0."""
+exp_neg_single = _make_exp_neg(np.float32, 4, NEGLIGIBLE_SINGLE)
+"""``exp(-x)`` for x >= 0 in single precision, to an error of 2e-7."""
 compiled_form(kernels.exp_neg, single=exp_neg_single)(exp_neg)
 
 

@@ -84,6 +84,8 @@ def estimate_surface(
         u, knot_u = given_log_length_scales(frame, config.length_scale)
     z = candidates.z - frame.prior_mean
     sill, gate_noise = variances_of(theta)
+    largest = prior_variance(sill, slope_std, candidates.r.max(initial=0.0))
+    gate_noise = max(gate_noise, ROUNDING * largest)
     noise = np.full(len(z), gate_noise)
     alone = SegmentSurfaces.empty(len(z), knot_u.shape)
     seed, odds = seeds(frame, theta, config)
@@ -92,9 +94,7 @@ def estimate_surface(
         noise = noise_among(n_near, noise)
     else:
         odds = 0.0
-    model = _Model(
-        frame, theta, z, noise, np.exp(u), np.exp(knot_u), seed, frame.continues_line, odds
-    )
+    model = _Model(frame, sill, gate_noise, z, noise, np.exp(u), np.exp(knot_u), seed, odds)
     everywhere = np.arange(candidates.n_segments)
     looks_aside, none = looks_aside_in(frame, config), np.zeros((2, len(z)))
     prior = prior_variance(sill, slope_std, knots)
@@ -121,9 +121,9 @@ MOST_DOUBT = 30.0
 """Logarithm of odds that are as good as infinite."""
 
 
-ROUNDING = 1e-6
-"""Least noise of what is observed, in parts of sigma_f^2: the rounding of single precision, which
-compiled code has for the covariance."""
+ROUNDING = 1e-12
+"""Least noise of what is observed, in parts of the largest covariance: its rounding. With less, a
+predicted variance could be negative."""
 
 
 class SegmentSurfaces(NamedTuple):
@@ -146,14 +146,14 @@ class _Model(NamedTuple):
     """Values that the segments grow from."""
 
     frame: Frame
-    theta: FloatArray  # (T,)
+    sill: float  # variance of the process [m^2]
+    gate_noise: float  # variance of the noise of a single candidate [m^2]
     z: FloatArray  # (C,) about the prior mean [m]
     # (C,) variance of the noise with which a candidate is observed, unless it joins in doubt
     noise: FloatArray
     length_scale: FloatArray  # (C,) at the candidates [m]
     knot_length_scale: FloatArray  # (M, K) at the knots [m]
     seed: BoolArray  # (C,) candidates that start the inlier set
-    continues_line: BoolArray  # (C,) candidates that join if the one before them has joined
     odds: float  # obstacles for each ground among the candidates; 0: none joins in doubt
 
 
@@ -170,12 +170,8 @@ def fits(
 
 @shared
 def variances_of(theta: Values) -> tuple[Values, Values]:
-    """Variances of the process and of its noise by theta [m^2].
-
-    The noise is at least the rounding of the covariance, else a variance could be negative.
-    """
-    sill, noise = np.exp(2.0 * theta[0]), np.exp(2.0 * theta[1])
-    return sill, np.maximum(noise, ROUNDING * sill)
+    """Variances of the process and of its noise by theta [m^2]."""
+    return np.exp(2.0 * theta[0]), np.exp(2.0 * theta[1])
 
 
 @shared
@@ -228,9 +224,10 @@ def _grow_segments(
     """Inliers and surface of `segments`, into `alone`; `aside` is the evidence at candidates."""
     alone.mean[segments] = alone.std[segments] = np.nan
     offsets = model.frame.candidates.offsets
-    is_below = ~contradicts(*aside, model.z, variances_of(model.theta)[1])
+    is_below = ~contradicts(*aside, model.z, model.gate_noise)
+    continues_line = model.frame.continues_line & is_below
     model = model._replace(
-        seed=model.seed & is_below, continues_line=model.continues_line & is_below
+        frame=model.frame._replace(continues_line=continues_line), seed=model.seed & is_below
     )
     size = offsets[segments + 1] - offsets[segments]
     for batch in batches(np.concatenate([[0], np.cumsum(size)])):
@@ -242,7 +239,6 @@ def _grow_batch(
 ) -> None:
     frame, slope_std = model.frame, config.observation.slope_std
     layout = Padded.of(segments, frame.candidates.offsets)
-    sill, noise = variances_of(model.theta)
     r = layout.take(frame.candidates.r)
     is_wanted = np.isfinite(model.knot_length_scale[segments])
     n_knots = int(is_wanted.sum(axis=1).max())
@@ -252,14 +248,14 @@ def _grow_batch(
     batch = _Batch(
         np.concatenate([r, knots], axis=1),
         np.concatenate([layout.take(model.length_scale, 1.0), knot_l], axis=1),
-        sill,
+        model.sill,
         slope_std,
         layout.take(model.z),
-        noise,
+        model.gate_noise,
         layout.take(model.noise),
         layout.mask,
         model.seed[layout.place] & layout.mask,
-        model.continues_line[layout.place] & layout.mask,
+        frame.continues_line[layout.place] & layout.mask,
         frame.in_face[layout.place],
         Evidence(layout.take(aside.height), layout.take(aside.precision)),
     )

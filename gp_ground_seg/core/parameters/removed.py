@@ -10,7 +10,8 @@ import re
 from collections.abc import Sequence
 
 PROGRAM = 'gp-ground-seg'
-_URL = re.compile('(?!tcp:|tls:)[a-z][a-z0-9+.-]*://', re.IGNORECASE)  # not of a scheduler
+# By itself or joined to its option; not of a scheduler.
+_URL = re.compile(r'(?:-\w=?|--[\w-]+=)?((?!tcp:|tls:)[a-z][a-z0-9+.-]*://.*)', re.IGNORECASE)
 REMOVED: dict[str, str] = {
     'learning.mode=every_k': 'use every_frame, or fixed, which takes less time',
     'learning.mode=first_frame': 'use every_frame, or fixed with your values in observation',
@@ -61,8 +62,8 @@ def removal(name: str, value: object = None) -> str:
 
 def removal_of_words(words: Sequence[str]) -> str:
     """Say what to use instead of removed words or URLs of a command line; empty without any."""
-    if url := next(filter(_URL.match, words), ''):
-        return f'{url}: no URLs; mount the folder (s3fs, rclone), or download the file'
+    if url := next(filter(None, map(_URL.fullmatch, words)), None):
+        return f'{url[1]}: no URLs; mount the folder (s3fs, rclone), or download the file'
     options = (word.partition('=')[0] for word in words if word.startswith('-'))
     starts = [' '.join((PROGRAM, *words[:n])) for n in (1, 2)]
     names = starts + [f'{start} {option}' for option in options for start in starts]

@@ -271,13 +271,14 @@ def _processes(n_workers: int) -> Iterator[Executor]:
 
     They are spawned: a fork of a process with threads, as of numba or BLAS, may hang.
     """
-    context = multiprocessing.get_context('spawn')
+    context, others = multiprocessing.get_context('spawn'), multiprocessing.active_children()
     executor = ProcessPoolExecutor(n_workers, context, _end_with_parent)
     try:
         yield executor
     except BaseException:
-        for process in [*executor._processes.values()]:
-            process.terminate()
+        for process in multiprocessing.active_children():
+            if process not in others:
+                process.terminate()
         raise
     finally:
         executor.shutdown(cancel_futures=True)
